@@ -1,0 +1,1 @@
+"""LOAM's scan-to-map stage as a GTSAM factor graph."""

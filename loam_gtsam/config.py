@@ -1,0 +1,439 @@
+"""Every number of the estimator: named, with unit, meaning and source.
+
+The configuration is a tree of frozen dataclasses. ``Config()`` is the default; :func:`preset`
+returns a named one; :func:`load_config` reads YAML (a file may name a preset and override part of
+it); :func:`dump_config` writes YAML with the meaning of every key as a comment.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import io
+import types
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.error import YAMLError
+
+from loam_gtsam.types import ConfigError
+
+
+def _param(
+    default: Any,
+    doc: str,
+    *,
+    unit: str = "",
+    source: str = "",
+    low: float | None = None,
+    high: float | None = None,
+) -> Any:
+    """A dataclass field with its meaning; ``low`` and ``high`` bound a number (inclusive)."""
+    return field(
+        default=default,
+        metadata={"doc": doc, "unit": unit, "source": source, "low": low, "high": high},
+    )
+
+
+def _check(where: str, value: Any, hint: Any, meta: Mapping[str, Any]) -> None:
+    """Raise ConfigError unless ``value`` has type ``hint`` and lies in its bounds."""
+    origin, args = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        if value not in args:
+            raise ConfigError(
+                f"{where}: expected one of {', '.join(args)}; got {value!r}"
+                f"{_nearest(str(value), args, listing=False)}"
+            )
+        return
+    if origin in (types.UnionType, typing.Union):
+        if value is None:
+            return
+        hint = next(arg for arg in args if arg is not type(None))
+    if origin is tuple:
+        if not isinstance(value, tuple) or len(value) != len(args):
+            raise ConfigError(f"{where}: expected {len(args)} values, got {value!r}")
+        for entry in value:
+            _check(where, entry, args[0], meta)
+        return
+    wanted: Any = (int, float) if hint is float else hint
+    if not isinstance(value, wanted) or (isinstance(value, bool) and hint is not bool):
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+    if isinstance(value, (int, float)) and not isinstance(value, bool):
+        low, high = meta.get("low"), meta.get("high")
+        if (
+            value != value
+            or (low is not None and value < low)
+            or (high is not None and value > high)
+        ):
+            bounds = [f"at least {low}"] * (low is not None) + [f"at most {high}"] * (
+                high is not None
+            )
+            raise ConfigError(
+                f"{where}: expected {' and '.join(bounds) or 'a number'}, got {value!r}"
+            )
+
+
+def _where(source: str, located: Any, key: str) -> str:
+    """``file:line`` of a key if the parser kept it."""
+    try:
+        return f"{source}:{located.lc.key(key)[0] + 1}"
+    except (AttributeError, KeyError, TypeError):
+        return source
+
+
+def _nearest(name: str, known: Any, listing: bool = True) -> str:
+    close = difflib.get_close_matches(name, [str(entry) for entry in known], n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return hint + (f" (known: {', '.join(sorted(map(str, known)))})" if listing else "")
+
+
+class _Section:
+    """Checks bounds and choices of every field at construction."""
+
+    __slots__ = ()
+
+    def __post_init__(self) -> None:
+        hints = typing.get_type_hints(type(self))
+        for item in dataclasses.fields(self):  # type: ignore[arg-type]
+            where = f"{type(self).__name__}.{item.name}"
+            _check(where, getattr(self, item.name), hints[item.name], item.metadata)
+
+
+@dataclass(frozen=True, slots=True)
+class SensorConfig(_Section):
+    """What the sweep looks like, where the data does not say it itself."""
+
+    model: Literal["auto", "vlp16", "hdl32", "hdl64", "os1-16", "os1-32", "os1-64", "os1-128"] = (
+        _param("auto", "elevation table for rings from elevation; auto detects it from the data")
+    )
+    rings: Literal["auto", "field", "rows", "elevation"] = _param(
+        "auto", "where beam numbers come from; auto tries the three in this order"
+    )
+    times: Literal["auto", "field", "azimuth", "none"] = _param(
+        "auto", "where per-point times come from; none runs without de-skew"
+    )
+    spin: Literal["auto", "clockwise", "counterclockwise"] = _param(
+        "auto", "sense of rotation seen from above, for times from azimuth"
+    )
+    start_azimuth_deg: float = _param(
+        180.0,
+        "azimuth (from x towards y) at which a sweep starts",
+        unit="degrees",
+        low=-360.0,
+        high=360.0,
+    )
+    period: float = _param(0.1, "duration of a sweep, for times from azimuth", unit="s", low=1e-4)
+    stamp: Literal["start", "middle", "end"] = _param(
+        "start", "which moment of the sweep its stamp is, for times from azimuth"
+    )
+    min_range: float = _param(
+        0.5, "nearer points are dropped", unit="m", source="A-LOAM uses 0.3 to 5", low=0.0
+    )
+    max_range: float = _param(120.0, "farther points are dropped", unit="m", low=0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureConfig(_Section):
+    """Scan registration: which points become edge and plane features."""
+
+    sectors: int = _param(6, "sectors per ring", source="LOAM", low=1)
+    half_window: int = _param(5, "neighbours on either side in the curvature", source="LOAM", low=1)
+    edge_curvature: float = _param(
+        0.1, "least curvature |sum of differences|^2 of an edge", unit="m^2", source="LOAM", low=0.0
+    )
+    plane_curvature: float = _param(
+        0.1, "largest curvature of a plane point", unit="m^2", source="LOAM", low=0.0
+    )
+    sharp_per_sector: int = _param(2, "sharp edges a sector", source="LOAM", low=0)
+    edges_per_sector: int = _param(20, "edges a sector", source="LOAM", low=0)
+    flat_per_sector: int = _param(4, "flat plane points a sector", source="LOAM", low=0)
+    max_gap: float = _param(
+        0.05,
+        "squared distance between neighbours at which suppression stops",
+        unit="m^2",
+        source="LOAM",
+        low=0.0,
+    )
+    occlusion_gap: float = _param(
+        0.1,
+        "squared distance between neighbours that may be an occlusion",
+        unit="m^2",
+        source="LOAM",
+        low=0.0,
+    )
+    occlusion_ratio: float = _param(
+        0.1,
+        "the two are on one ray if their scaled distance over range is below this",
+        source="LOAM",
+        low=0.0,
+    )
+    grazing_ratio: float = _param(
+        0.0002,
+        "a point is grazing if both squared gaps exceed this times its squared range",
+        source="LOAM",
+        low=0.0,
+    )
+    plane_voxel: float = _param(
+        0.2, "voxel for the plane points of one ring", unit="m", source="LOAM", low=0.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class DeskewConfig(_Section):
+    """Removal of the motion distortion."""
+
+    enabled: bool = _param(True, "de-skew with the guess, and again with the solution")
+    reference: Literal["start", "end", "stamp"] = _param(
+        "start", "the moment of the sweep the pose belongs to"
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class OdometryConfig(_Section):
+    """The guess the mapper starts from."""
+
+    method: Literal["constant_velocity", "scan_to_scan"] = _param(
+        "constant_velocity", "where the guess comes from"
+    )
+    iterations: int = _param(25, "scan-to-scan iterations", source="LOAM", low=1)
+    max_distance: float = _param(5.0, "scan-to-scan match distance", unit="m", source="LOAM", low=0)
+    ring_gap: int = _param(2, "rings searched above and below", source="LOAM", low=1)
+
+
+@dataclass(frozen=True, slots=True)
+class MapConfig(_Section):
+    """The cube map."""
+
+    cube_size: float = _param(50.0, "edge length of a cube", unit="m", source="LOAM", low=1.0)
+    window: tuple[int, int, int] = _param(
+        (21, 21, 11), "cubes kept in memory along x, y, z", source="LOAM", low=1
+    )
+    window_margin: int = _param(
+        3,
+        "the window shifts when the sensor's cube is this near its edge",
+        unit="cubes",
+        source="LOAM",
+        low=0,
+    )
+    neighbourhood: tuple[int, int, int] = _param(
+        (5, 5, 5), "cubes around the sensor's that are matched against", source="LOAM", low=1
+    )
+    field_of_view: bool = _param(
+        True, "match only cubes with a corner 30 to 150 degrees off the up axis", source="LOAM"
+    )
+    edge_voxel: float = _param(0.2, "voxel of the edge map", unit="m", source="LOAM", low=0.01)
+    plane_voxel: float = _param(0.4, "voxel of the plane map", unit="m", source="LOAM", low=0.01)
+    insertion: Literal["centroid", "settled"] = _param(
+        "centroid",
+        "centroid re-filters a cube with its new points as LOAM does; settled keeps the first "
+        "point of a voxel",
+    )
+    archive_megabytes: float = _param(
+        512.0,
+        "memory for cubes that left the window; beyond it the oldest go to archive_dir, "
+        "or are dropped and counted if that is not set",
+        unit="MB",
+        low=0.0,
+    )
+    archive_dir: str | None = _param(None, "folder for archived cubes; null keeps them in memory")
+
+
+@dataclass(frozen=True, slots=True)
+class MatchingConfig(_Section):
+    """Association of features with the map."""
+
+    neighbours: int = _param(5, "map points a feature is matched with", source="LOAM", low=3)
+    max_distance: float = _param(
+        1.0, "distance of the farthest of them", unit="m", source="LOAM", low=0.0
+    )
+    line_ratio: float = _param(
+        3.0, "a line needs its largest eigenvalue above this times the second", source="LOAM", low=1
+    )
+    plane_tolerance: float = _param(
+        0.2, "farthest of the five from the plane", unit="m", source="LOAM", low=0.0
+    )
+    weight_slope: float = _param(
+        0.9,
+        "weight = 1 - slope * |distance| (over sqrt(range) for planes); 0 turns it off",
+        source="LOAM",
+        low=0.0,
+    )
+    min_weight: float = _param(
+        0.1, "a match with a smaller weight is dropped", source="LOAM", low=0.0, high=1.0
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class SolverConfig(_Section):
+    """The per-frame solve."""
+
+    iterations: int = _param(10, "associations at most", source="LOAM", low=1)
+    inner_iterations: int = _param(2, "Levenberg-Marquardt iterations per association", low=1)
+    rotation_tolerance_deg: float = _param(
+        0.05,
+        "stop when an association moves the pose less than this",
+        unit="degrees",
+        source="LOAM",
+        low=0.0,
+    )
+    translation_tolerance: float = _param(
+        0.0005, "and less than this", unit="m", source="LOAM", low=0.0
+    )
+    min_matches: int = _param(50, "fewer matches: no solve", source="LOAM", low=6)
+    min_map_edges: int = _param(10, "the local map needs more edge points", source="LOAM", low=0)
+    min_map_planes: int = _param(100, "and more plane points", source="LOAM", low=0)
+    edge_sigma: float = _param(
+        0.1, "standard deviation of a point-to-line distance", unit="m", low=1e-6
+    )
+    plane_sigma: float = _param(
+        0.1, "standard deviation of a point-to-plane distance", unit="m", low=1e-6
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Config(_Section):
+    """The whole configuration."""
+
+    sensor: SensorConfig = _param(SensorConfig(), "the sweep, where the data does not say it")
+    features: FeatureConfig = _param(FeatureConfig(), "edge and plane features")
+    deskew: DeskewConfig = _param(DeskewConfig(), "motion distortion")
+    odometry: OdometryConfig = _param(OdometryConfig(), "the guess")
+    map: MapConfig = _param(MapConfig(), "the cube map")
+    matching: MatchingConfig = _param(MatchingConfig(), "association with the map")
+    solver: SolverConfig = _param(SolverConfig(), "the per-frame solve")
+
+
+PRESETS: dict[str, Config] = {"default": Config()}
+
+
+def preset(name: str) -> Config:
+    """The configuration called ``name``.
+
+    Raises
+    ------
+    ConfigError
+        If there is no such preset.
+    """
+    if name not in PRESETS:
+        raise ConfigError(f"unknown preset {name!r}{_nearest(name, PRESETS)}")
+    return PRESETS[name]
+
+
+def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
+    """Build a configuration from nested mappings; absent keys keep the preset's value.
+
+    Parameters
+    ----------
+    data : as in the YAML file; the optional key ``preset`` names what is overridden
+    source : what to call the input in error messages
+
+    Raises
+    ------
+    ConfigError
+        Naming the key, its line if known, what was expected and what came.
+    """
+    if not isinstance(data, Mapping):
+        raise ConfigError(f"{source}: expected a mapping of sections, got {type(data).__name__}")
+    name = data.get("preset", "default")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ConfigError(
+            f"{_where(source, data, 'preset')}: unknown preset {name!r}"
+            f"{_nearest(str(name), PRESETS)}"
+        )
+    rest = {key: value for key, value in data.items() if key != "preset"}
+    return _override(PRESETS[name], rest, data, source, "")
+
+
+def config_to_dict(config: Config) -> dict[str, Any]:
+    """Nested plain dictionaries; the inverse of :func:`config_from_dict`."""
+    return dataclasses.asdict(config)
+
+
+def load_config(path: str | Path) -> Config:
+    """Read a YAML file.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is not YAML, or does not fit.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: cannot read the configuration: {error}") from error
+    return parse_config(text, str(path))
+
+
+def parse_config(text: str, source: str = "config") -> Config:
+    """As :func:`load_config`, from text."""
+    try:
+        data = YAML(typ="rt").load(text)
+    except YAMLError as error:
+        raise ConfigError(f"{source}: not valid YAML: {error}") from error
+    return config_from_dict({} if data is None else data, source)
+
+
+def dump_config(config: Config) -> str:
+    """YAML text in which every key is explained by a comment."""
+    yaml = YAML()
+    yaml.width = 100
+    out = io.StringIO()
+    yaml.dump(_commented(config, 0), out)
+    return out.getvalue()
+
+
+def _commented(section: Any, indent: int) -> CommentedMap:
+    result = CommentedMap()
+    for item in dataclasses.fields(section):
+        value = getattr(section, item.name)
+        if dataclasses.is_dataclass(value):
+            result[item.name] = _commented(value, indent + 2)
+        elif isinstance(value, tuple):
+            sequence = CommentedSeq(value)
+            sequence.fa.set_flow_style()
+            result[item.name] = sequence
+        else:
+            result[item.name] = value
+        meta = item.metadata
+        text = meta["doc"]
+        if meta["unit"]:
+            text += f" [{meta['unit']}]"
+        if meta["source"]:
+            text += f" ({meta['source']})"
+        hint = typing.get_type_hints(type(section))[item.name]
+        if typing.get_origin(hint) is Literal:
+            text += "; one of: " + ", ".join(typing.get_args(hint))
+        result.yaml_set_comment_before_after_key(item.name, before=text, indent=indent)
+    return result
+
+
+def _override(section: Any, data: Mapping[str, Any], located: Any, source: str, prefix: str) -> Any:
+    names = {item.name: item for item in dataclasses.fields(section)}
+    hints = typing.get_type_hints(type(section))
+    changes: dict[str, Any] = {}
+    for key, value in data.items():
+        full = f"{prefix}{key}"
+        where = _where(source, located, key)
+        if key not in names:
+            raise ConfigError(f"{where}: unknown key {full!r}{_nearest(str(key), names)}")
+        current = getattr(section, key)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, Mapping):
+                raise ConfigError(
+                    f"{where}: {full} is a section, expected a mapping, got {value!r}"
+                )
+            changes[key] = _override(current, value, value, source, f"{full}.")
+            continue
+        hint = hints[key]
+        if hint is float and isinstance(value, int) and not isinstance(value, bool):
+            value = float(value)
+        elif typing.get_origin(hint) is tuple and isinstance(value, list):
+            value = tuple(value)
+        _check(f"{where}: {full}", value, hint, names[key].metadata)
+        changes[key] = value
+    return dataclasses.replace(section, **changes)

@@ -1,0 +1,54 @@
+"""What a data set is to the rest of the package."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol, runtime_checkable
+
+from loam_gtsam.types import BadSweep, FeatureSweep, ImuSamples, Scan, Trajectory
+
+Sweep = Scan | FeatureSweep | BadSweep
+
+
+@dataclass(slots=True)
+class DatasetInfo:
+    """What a loader understood of its input, for people.
+
+    Attributes
+    ----------
+    kind : e.g. "KITTI folder", "ROS 1 bag"
+    path : where it was read from
+    facts : label -> value, in the order to show them (topics, fields, unit of time, beams, ...)
+    problems : one sentence each: what is missing or odd, and what was or can be done about it
+    """
+
+    kind: str
+    path: str
+    facts: dict[str, str] = field(default_factory=dict)
+    problems: list[str] = field(default_factory=list)
+
+
+@runtime_checkable
+class Dataset(Protocol):
+    """A sequence of sweeps. Iterating twice gives the same sweeps twice."""
+
+    name: str
+    sensor: Mapping[str, Any]
+    """Fields of ``SensorConfig`` that the layout of the data implies; the user's own win."""
+
+    def __len__(self) -> int: ...
+
+    def __iter__(self) -> Iterator[Sweep]: ...
+
+    def info(self) -> DatasetInfo:
+        """What was understood; may read the first sweeps, never the whole data."""
+        ...
+
+    @property
+    def imu(self) -> ImuSamples | None: ...
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """Reference poses if the data comes with them."""
+        ...

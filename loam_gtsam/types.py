@@ -1,0 +1,305 @@
+"""The values that travel through the package, and its errors.
+
+Conventions (the same everywhere):
+
+* Frames: ``lidar`` is x forward, y left, z up; ``map`` is fixed. A name says which frames it
+  relates: ``map_T_lidar`` maps lidar coordinates into map coordinates.
+* Poses are :class:`gtsam.Pose3`; tangent vectors are ordered ``[rotation (rad), translation (m)]``
+  and perturb on the right (body frame), as in GTSAM.
+* Stamps are integer nanoseconds; offsets inside a sweep are float seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+
+class LoamError(Exception):
+    """Base of every error this package raises on purpose."""
+
+
+class ConfigError(LoamError, ValueError):
+    """A configuration has an unknown key, a wrong type or a value out of range."""
+
+
+class InputError(LoamError, ValueError):
+    """An array handed to the library has the wrong shape, dtype or content."""
+
+
+class DatasetError(LoamError):
+    """A file, folder, topic or field could not be read or understood."""
+
+
+class SweepError(LoamError):
+    """One sweep cannot be used; the mapper turns it into a frame status and goes on."""
+
+
+@dataclass(frozen=True, slots=True)
+class Scan:
+    """One sweep of the sensor, as it was measured (not de-skewed).
+
+    Parameters
+    ----------
+    points : (N, 3) float array, metres, lidar frame. NaN and infinite rows are allowed.
+    stamp : nanoseconds; ``times`` count from here.
+    times : (N,) seconds from ``stamp`` at which each point was measured, or None if unknown.
+    rings : (N,) integer beam number of each point, or None if unknown. Any consistent order.
+    span : (first, last) seconds from ``stamp`` covered by the whole sweep. When None, the
+        smallest and largest of ``times`` are used.
+    rows : number of rows if the points are a full row-major range image (``rows`` x columns),
+        else 0.
+
+    Raises
+    ------
+    InputError
+        If a shape or a dtype is wrong.
+    """
+
+    points: NDArray[np.floating]
+    stamp: int
+    times: NDArray[np.floating] | None = None
+    rings: NDArray[np.integer] | None = None
+    span: tuple[float, float] | None = None
+    rows: int = 0
+
+    def __post_init__(self) -> None:
+        points = self.points
+        if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"Scan.points: expected an (N, 3) array, got {_describe(points)}")
+        if points.dtype.kind != "f":
+            raise InputError(f"Scan.points: expected a float dtype, got {points.dtype}")
+        for name, kinds in (("times", "f"), ("rings", "iu")):
+            column = getattr(self, name)
+            if column is None:
+                continue
+            if not isinstance(column, np.ndarray) or column.shape != points.shape[:1]:
+                raise InputError(
+                    f"Scan.{name}: expected shape ({len(points)},), one value per point, "
+                    f"got {_describe(column)}"
+                )
+            if column.dtype.kind not in kinds:
+                kind = "float" if kinds == "f" else "integer"
+                raise InputError(f"Scan.{name}: expected a {kind} dtype, got {column.dtype}")
+        if self.rows and len(points) % self.rows:
+            raise InputError(f"Scan.rows: {len(points)} points do not divide into {self.rows} rows")
+
+
+@dataclass(frozen=True, slots=True)
+class Features:
+    """Edge and plane points of one sweep, at the positions they were measured (not de-skewed).
+
+    Attributes
+    ----------
+    stamp : nanoseconds of the reference time, the time the pose of this frame belongs to.
+    edges, planes : (E, 3) and (P, 3) float64, metres, lidar frame at each point's own time.
+    edge_times, plane_times : seconds from ``stamp``; all zero if already de-skewed.
+    edge_rings, plane_rings : integer beam numbers.
+    sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
+        (used by scan-to-scan odometry).
+    span : (first, last) seconds from ``stamp`` covered by the sweep.
+    """
+
+    stamp: int
+    edges: FloatArray
+    planes: FloatArray
+    edge_times: FloatArray
+    plane_times: FloatArray
+    edge_rings: IntArray
+    plane_rings: IntArray
+    sharp: IntArray
+    flat: IntArray
+    span: tuple[float, float] = (0.0, 0.0)
+
+    @classmethod
+    def from_points(
+        cls, stamp: int, edges: NDArray[np.floating], planes: NDArray[np.floating]
+    ) -> Features:
+        """Features that are already de-skewed, e.g. from another front end.
+
+        Parameters
+        ----------
+        stamp : nanoseconds
+        edges, planes : (E, 3) and (P, 3) float arrays, metres, lidar frame
+
+        Raises
+        ------
+        InputError
+            If a shape or a dtype is wrong.
+        """
+        for name, points in (("edges", edges), ("planes", planes)):
+            if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
+                raise InputError(f"{name}: expected an (N, 3) array, got {_describe(points)}")
+            if points.dtype.kind != "f":
+                raise InputError(f"{name}: expected a float dtype, got {points.dtype}")
+        n_edges, n_planes = len(edges), len(planes)
+        return cls(
+            stamp=stamp,
+            edges=edges.astype(np.float64),
+            planes=planes.astype(np.float64),
+            edge_times=np.zeros(n_edges),
+            plane_times=np.zeros(n_planes),
+            edge_rings=np.zeros(n_edges, np.int64),
+            plane_rings=np.zeros(n_planes, np.int64),
+            sharp=np.arange(n_edges),
+            flat=np.arange(n_planes),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FeatureSweep:
+    """Features and odometry of one sweep made by another front end (e.g. LOAM's own topics).
+
+    Attributes
+    ----------
+    features : de-skewed features
+    odom_T_lidar : pose of the same moment in that front end's drifting frame
+    cloud : (N, 3) de-skewed full-resolution points of the same moment, or None
+    """
+
+    features: Features
+    odom_T_lidar: gtsam.Pose3
+    cloud: NDArray[np.floating] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BadSweep:
+    """A sweep its loader could not read; the run goes on with a predicted pose."""
+
+    stamp: int
+    message: str
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSamples:
+    """A stretch of IMU data.
+
+    Attributes
+    ----------
+    stamps : (N,) int64 nanoseconds
+    orientation : (N, 4) quaternions x y z w of ``world_R_imu`` (world z up), or None if the IMU
+        has no attitude output
+    gyro : (N, 3) rad/s, imu frame
+    acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest
+    """
+
+    stamps: IntArray
+    orientation: FloatArray | None
+    gyro: FloatArray
+    acceleration: FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Poses over time.
+
+    Attributes
+    ----------
+    stamps : (N,) int64 nanoseconds
+    map_T_lidar : (N, 4, 4) float64
+    """
+
+    stamps: IntArray
+    map_T_lidar: FloatArray
+
+    def __post_init__(self) -> None:
+        if self.map_T_lidar.shape != (len(self.stamps), 4, 4):
+            raise InputError(
+                f"Trajectory: expected poses of shape ({len(self.stamps)}, 4, 4), "
+                f"got {self.map_T_lidar.shape}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.stamps)
+
+    @property
+    def length(self) -> float:
+        """Metres travelled."""
+        steps = np.diff(self.map_T_lidar[:, :3, 3], axis=0)
+        return float(np.linalg.norm(steps, axis=1).sum())
+
+
+class FrameStatus(StrEnum):
+    """What happened to one frame. Only ``OK`` and ``NOT_CONVERGED`` poses come from a solve."""
+
+    OK = "ok"
+    NOT_CONVERGED = "not_converged"
+    """Solved, but the last step was still above the stop rule at the iteration limit."""
+    FIRST = "first"
+    """Nothing to match against yet: the guess is the pose, and the map starts here."""
+    SPARSE_MAP = "sparse_map"
+    """The local map has too few points to solve; the guess is the pose, the sweep is inserted."""
+    FEW_MATCHES = "few_matches"
+    """Too few matches: the guess is the pose and the sweep is not inserted."""
+    UNUSABLE_SCAN = "unusable_scan"
+    """The sweep has no usable points or features; the pose is predicted."""
+    BAD_STAMP = "bad_stamp"
+    """The stamp is not later than the one before; the sweep is skipped, the pose repeated."""
+
+    @property
+    def solved(self) -> bool:
+        return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED)
+
+
+@dataclass(frozen=True, slots=True)
+class MapUpdate:
+    """What :meth:`loam_gtsam.Mapper.register` says about one frame.
+
+    Attributes
+    ----------
+    stamp : nanoseconds the pose belongs to (the reference time of the sweep)
+    map_T_lidar : the pose
+    status, message : what happened, and a sentence for people when it was not ``OK``
+    n_edges, n_planes : features offered, after the voxel filter
+    n_edge_matches, n_plane_matches : matches in the last association
+    iterations : associations made
+    solver_iterations : Levenberg-Marquardt iterations, over all associations
+    error_before, error_after : cost (half the weighted, whitened squared residuals plus priors)
+        at the guess and at the solution, each with its own matches
+    information : (6, 6) at the solution: scan matches and priors, tangent order of the package.
+        Zero when the frame was not solved.
+    twist : (6,) body velocity of the sweep (rad/s, m/s) used for its de-skew
+    timings : seconds per stage
+    """
+
+    stamp: int
+    map_T_lidar: gtsam.Pose3
+    status: FrameStatus
+    message: str = ""
+    n_edges: int = 0
+    n_planes: int = 0
+    n_edge_matches: int = 0
+    n_plane_matches: int = 0
+    iterations: int = 0
+    solver_iterations: int = 0
+    error_before: float = 0.0
+    error_after: float = 0.0
+    information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    twist: FloatArray = field(default_factory=lambda: np.zeros(6))
+    timings: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """(6, 6) inverse of ``information``; NaN when the frame was not solved or is singular."""
+        if not self.status.solved:
+            return np.full((6, 6), np.nan)
+        try:
+            return np.linalg.inv(self.information)
+        except np.linalg.LinAlgError:
+            return np.full((6, 6), np.nan)
+
+
+def _describe(value: object) -> str:
+    """Shape and dtype of an array, or the type of anything else."""
+    if isinstance(value, np.ndarray):
+        return f"shape {value.shape} of {value.dtype}"
+    return type(value).__name__

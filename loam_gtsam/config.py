@@ -128,8 +128,10 @@ class SensorConfig(_Section):
         high=360.0,
     )
     period: float = _param(0.1, "duration of a sweep, for times from azimuth", unit="s", low=1e-4)
-    stamp: Literal["start", "middle", "end"] = _param(
-        "start", "which moment of the sweep its stamp is, for times from azimuth"
+    stamp: Literal["auto", "start", "middle", "end"] = _param(
+        "auto",
+        "which moment of the sweep its stamp is, for times from azimuth; auto is what the data "
+        "set's layout implies (KITTI: middle), else start",
     )
     min_range: float = _param(
         0.5, "nearer points are dropped", unit="m", source="A-LOAM uses 0.3 to 5", low=0.0
@@ -257,6 +259,21 @@ class MatchingConfig(_Section):
     plane_tolerance: float = _param(
         0.2, "farthest of the five from the plane", unit="m", source="LOAM", low=0.0
     )
+    plane_ratio: float = _param(
+        0.1,
+        "a plane needs its second eigenvalue above this times the largest: five points along one "
+        "ring of a sparse sensor have no normal",
+        low=0.0,
+        high=1.0,
+    )
+    point_sigma: float = _param(
+        0.03, "standard deviation of a measured point about a surface", unit="m", low=1e-6
+    )
+    fit_uncertainty: bool = _param(
+        True,
+        "a match's variance includes that of the line or plane at the point (regression leverage); "
+        "false gives every match point_sigma",
+    )
     weight_slope: float = _param(
         0.9,
         "weight = 1 - slope * |distance| (over sqrt(range) for planes); 0 turns it off",
@@ -287,12 +304,6 @@ class SolverConfig(_Section):
     min_matches: int = _param(50, "fewer matches: no solve", source="LOAM", low=6)
     min_map_edges: int = _param(10, "the local map needs more edge points", source="LOAM", low=0)
     min_map_planes: int = _param(100, "and more plane points", source="LOAM", low=0)
-    edge_sigma: float = _param(
-        0.1, "standard deviation of a point-to-line distance", unit="m", low=1e-6
-    )
-    plane_sigma: float = _param(
-        0.1, "standard deviation of a point-to-plane distance", unit="m", low=1e-6
-    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,8 +124,10 @@ def fit_lines(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     return centres, symmetric_eigenvector(covariance, eigenvalues[:, 2]), eigenvalues
 
 
-def fit_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least-squares plane ``n . q + d = 0`` through each group of points, about its centroid.
+def fit_planes(
+    neighbours: FloatArray,
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Least-squares plane through each group of points, about its centroid.
 
     Parameters
     ----------
@@ -133,15 +135,16 @@ def fit_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArr
 
     Returns
     -------
+    centres : (N, 3) a point on each plane (the mean)
     normals : (N, 3) unit
-    offsets : (N,) d, metres
-    deviations : (N,) largest distance of one of the k points from the plane, metres
+    directions : (N, 3) unit, in the plane, along its widest extent
+    eigenvalues : (N, 3) of the covariance, ascending: across the plane, along its narrow and its
+        wide extent
     """
     centres, covariance = _moments(neighbours)
-    normals = symmetric_eigenvector(covariance, symmetric_eigenvalues(covariance)[:, 0])
-    offsets = -np.einsum("ni,ni->n", normals, centres)
-    distances = np.einsum("nki,ni->nk", neighbours, normals) + offsets[:, None]
-    return normals, offsets, np.abs(distances).max(axis=1)
+    eigenvalues = symmetric_eigenvalues(covariance)
+    normals = symmetric_eigenvector(covariance, eigenvalues[:, 0])
+    return centres, normals, symmetric_eigenvector(covariance, eigenvalues[:, 2]), eigenvalues
 
 
 def _moments(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -153,7 +156,7 @@ def _moments(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
     """One integer per voxel of edge length ``size`` (21 bits an axis: +-1,048,576 voxels)."""
-    cells = np.floor(points / size).astype(np.int64) + (1 << 20)
+    cells = np.floor(points[:, :3] / size).astype(np.int64) + (1 << 20)
     keys: IntArray = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
     return keys
 
@@ -163,12 +166,13 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
 
     Parameters
     ----------
-    points : (N, 3) metres
+    points : (N, C) with C >= 3: metres in the first three columns, anything that can be averaged
+        (e.g. times) in the others
     size : edge length of a voxel, metres; 0 returns the points as they are
 
     Returns
     -------
-    (M, 3) float64, M <= N
+    (M, C) float64, M <= N
     """
     if size <= 0.0 or len(points) == 0:
         return np.asarray(points, dtype=np.float64)
@@ -180,9 +184,3 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     counts = np.diff(np.append(first, len(keys)))
     centroids: FloatArray = sums / counts[:, None]
     return centroids
-
-
-def voxel_first(points: NDArray[np.floating], size: float) -> IntArray:
-    """Indices of the first point of each voxel, ascending."""
-    _, first = np.unique(voxel_keys(points, size), return_index=True)
-    return np.sort(first).astype(np.int64)

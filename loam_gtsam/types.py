@@ -40,6 +40,10 @@ class DatasetError(LoamError):
     """A file, folder, topic or field could not be read or understood."""
 
 
+class OutputError(LoamError):
+    """A file or a picture could not be written."""
+
+
 class SweepError(LoamError):
     """One sweep cannot be used; the mapper turns it into a frame status and goes on."""
 

@@ -1,0 +1,234 @@
+"""One run from the command line: output folder, progress, signals, files, summary."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from loam_gtsam import visualization
+from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.evaluation import absolute_error, align, interpolate
+from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
+from loam_gtsam.pipeline import OnFrame, RunResult, run
+from loam_gtsam.types import DatasetError, InputError, MapUpdate, OutputError, Trajectory
+
+PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
+TRUTH_FILE = "truth.tum"
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SHOW_CURSOR = b"\x1b[?25h"
+
+
+@dataclass(frozen=True, slots=True)
+class RunOptions:
+    """Options that ``run`` and ``demo`` share; see their help."""
+
+    frames: int | None
+    output: Path | None
+    overwrite: bool
+    plot: bool | None
+    profile: bool
+    quiet: bool
+
+
+def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
+    """Run, write, report; returns the exit code.
+
+    Raises
+    ------
+    LoamError
+        If the run cannot start or its results cannot be written, or what ended the run early
+        (after what was computed until then has been written).
+    """
+    plot = visualization.available() if options.plot is None else options.plot
+    if plot and not visualization.available():
+        raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
+    wanted = options.output or Path("loam_gtsam_output") / _file_name(dataset.name)
+    folder = make_folder(free_folder(wanted, options.overwrite))
+    total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
+    with stop_requests() as stop:
+        started = time.perf_counter()
+        with _progress(dataset.name, total, stop, options.quiet) as on_frame:
+            result = run(
+                dataset, config, max_frames=options.frames, on_frame=on_frame, keep_partial=True
+            )
+        seconds = time.perf_counter() - started
+        if not result.updates:
+            raise DatasetError(
+                f"{dataset.name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
+            )
+        accuracy, truth = compare(result.trajectory, dataset.truth)
+        files = _write(result, dataset, folder, plot, accuracy, truth)
+    if not options.quiet:
+        console = Console()
+        if options.profile:
+            console.print(profile_table(result.updates))
+        console.print(summary(result, dataset.name, seconds, accuracy))
+        if stop.signum is not None:
+            name = signal.Signals(stop.signum).name
+            done = f"after frame {len(result.updates)} of {total}"
+            console.print(f"Stopped by {name} {done}; what was computed until then is written.")
+        console.print(f"Written to {folder}: {', '.join(files)}", markup=False, soft_wrap=True)
+    if result.error is not None:
+        raise result.error
+    if stop.signum is not None:
+        return 128 + stop.signum
+    if all(update.status in NOT_MAPPED for update in result.updates):
+        raise DatasetError(
+            f"{dataset.name}: none of the {len(result.updates)} sweeps could be used; the first: "
+            f"{result.updates[0].message}; see also: loam-gtsam inspect"
+        )
+    return 0
+
+
+def free_folder(wanted: Path, overwrite: bool) -> Path:
+    """``wanted``, or, if that holds a run that must not be replaced, a new folder beside it."""
+    known = (*RUN_FILES, *PLOT_FILES, TRUTH_FILE)
+    if overwrite or not any((wanted / name).exists() for name in known):
+        return wanted
+    wanted = wanted if wanted.name not in ("", "..") else wanted.resolve()
+    candidates = (wanted.with_name(f"{wanted.name}-{n}") for n in itertools.count(2))
+    return next(folder for folder in candidates if not folder.exists())
+
+
+def compare(
+    trajectory: Trajectory, truth: Trajectory | None
+) -> tuple[dict[str, Any], Trajectory | None]:
+    """Accuracy for the summary, and the truth in the map frame for the picture."""
+    if truth is None:
+        return {}, None
+    try:
+        error = absolute_error(trajectory, truth)
+    except InputError as problem:
+        return {"problem": str(problem)}, None
+    there = interpolate(truth, error.stamps)
+    here = interpolate(trajectory, error.stamps)
+    map_T_truth = align(there.map_T_lidar[:, :3, 3], here.map_T_lidar[:, :3, 3])
+    accuracy = {
+        "ate_rmse_m": error.rmse,
+        "ate_max_m": error.maximum,
+        "compared_poses": len(error.stamps),
+        "compared_length_m": there.length,
+    }
+    return accuracy, Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
+
+
+def _write(
+    result: RunResult,
+    dataset: Dataset,
+    folder: Path,
+    plot: bool,
+    accuracy: dict[str, Any],
+    truth: Trajectory | None,
+) -> list[str]:
+    """Write all files; names of what was written."""
+    # A picture or a truth of the run that is being replaced would not belong to this one.
+    for name in (*PLOT_FILES, TRUTH_FILE):
+        (folder / name).unlink(missing_ok=True)
+    info = asdict(dataset.info())
+    extra = {"accuracy": accuracy or None, "input": info}
+    write_run(result, folder, dataset=f"{info['kind']} {info['path']}", extra=extra)
+    files = list(RUN_FILES)
+    if dataset.truth is not None:
+        write_tum(folder / TRUTH_FILE, dataset.truth)
+        files.append(TRUTH_FILE)
+    if plot:
+        trajectory = result.trajectory
+        visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth)
+        visualization.plot_map(
+            folder / "map.png", result.edge_points, result.plane_points, trajectory
+        )
+        visualization.plot_timings(folder / "timings.png", result.updates)
+        files.extend(PLOT_FILES)
+    return files
+
+
+@dataclass(slots=True)
+class StopRequest:
+    """The signal that asked the run to stop, if one did."""
+
+    signum: int | None = None
+
+
+@contextmanager
+def stop_requests() -> Iterator[StopRequest]:
+    """Note the first Ctrl-C or SIGTERM instead of acting on it; the second ends the process.
+
+    An exception raised by a signal could surface anywhere, a solver's callback included, and
+    leave half a frame in the map. A note can be read between two frames.
+    """
+    stop = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # only the main thread may set handlers
+        return
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        stop.signum = signum
+        # The system's own action needs no interpreter: it ends a long native call as well.
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        if sys.stderr.isatty():
+            # Unbuffered, for a signal may arrive in the middle of a buffered write.
+            os.write(sys.stderr.fileno(), _SHOW_CURSOR)
+
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, note)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def _progress(name: str, total: int, stop: StopRequest, quiet: bool) -> Iterator[OnFrame]:
+    """A progress bar on stderr; gives the function to call after each frame."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[rate]}"),
+        TextColumn("{task.fields[status]}", style="dim"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task(name, total=total, rate="", status="")
+        started = time.perf_counter()
+
+        def on_frame(number: int, update: MapUpdate) -> None:
+            rate = (number + 1) / (time.perf_counter() - started)
+            bar.update(
+                task, completed=number + 1, rate=f"{rate:.1f} frames/s", status=str(update.status)
+            )
+            if stop.signum is not None:
+                raise KeyboardInterrupt  # run() ends here, between two frames
+
+        yield on_frame
+
+
+def _file_name(name: str) -> str:
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "run"

@@ -1,0 +1,297 @@
+"""The command line: ``loam-gtsam demo | run | inspect | config``.
+
+The only place that catches :class:`~loam_gtsam.types.LoamError`. Exit codes: 0 done, 1 an error
+(one message on stderr), 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM.
+"""
+
+from __future__ import annotations
+
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+from typer.core import TyperGroup
+
+from loam_gtsam.config import (
+    Config,
+    config_from_dict,
+    config_to_dict,
+    dump_config,
+    load_config,
+    preset,
+)
+from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.export import replacing
+from loam_gtsam.types import LoamError, OutputError
+
+_DEBUG = "loam_gtsam.debug"
+
+
+class _Group(TyperGroup):
+    """Turns the package's errors into one message and an exit code."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except LoamError as error:
+            if ctx.meta.get(_DEBUG):
+                raise
+            typer.secho("error: ", fg=typer.colors.RED, bold=True, err=True, nl=False)
+            typer.echo(str(error), err=True)
+            raise typer.Exit(1) from None
+        except KeyboardInterrupt:
+            typer.echo("stopped; nothing was computed yet", err=True)
+            raise typer.Exit(130) from None
+
+
+app = typer.Typer(
+    cls=_Group,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    help="LOAM's scan-to-map LiDAR mapping as a GTSAM factor graph.",
+)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        for name in ("loam_gtsam", "gtsam", "numpy"):
+            typer.echo(f"{name} {version(name)}")
+        typer.echo(f"python {platform.python_version()}")
+        raise typer.Exit
+
+
+def _set_debug(ctx: typer.Context, wanted: bool) -> bool:
+    if wanted:
+        ctx.meta[_DEBUG] = True
+    return wanted
+
+
+DataPath = Annotated[
+    str,
+    typer.Argument(
+        metavar="PATH",
+        help="A folder of .bin sweeps (KITTI), a ROS 1 or ROS 2 bag, an .mcap or .db3 file, "
+        "or a built-in world such as sim:street_loop.",
+    ),
+]
+Topic = Annotated[str | None, typer.Option(help="Topic of the sweeps; guessed if there is one.")]
+ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU; guessed if there is one.")]
+LoaderOptions = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--option",
+        metavar="KEY=VALUE",
+        help="Option of the loader, e.g. time_unit=ns; may be given repeatedly.",
+    ),
+]
+Sensor = Annotated[
+    str | None, typer.Option(help="Sensor model (sensor.model), e.g. vlp16, hdl64, os1-128.")
+]
+Preset = Annotated[str | None, typer.Option(help="Named configuration to start from.")]
+ConfigFile = Annotated[
+    Path | None, typer.Option("--config", metavar="FILE", help="YAML configuration.")
+]
+Overrides = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set", metavar="SECTION.KEY=VALUE", help="Change one value; may be given repeatedly."
+    ),
+]
+Output = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="DIR",
+        help="Folder for the results [default: loam_gtsam_output/NAME]. If it holds an earlier "
+        "run, a new folder beside it is used (DIR-2, DIR-3, ...).",
+    ),
+]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an earlier run in DIR.")]
+Plot = Annotated[
+    bool | None,
+    typer.Option("--plot/--no-plot", help="Draw pictures [default: if matplotlib is installed]."),
+]
+Profile = Annotated[bool, typer.Option("--profile", help="Show the time per stage.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+Debug = Annotated[
+    bool, typer.Option("--debug", callback=_set_debug, help="Show the traceback of an error.")
+]
+
+
+@app.callback()
+def _root(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_show_version, is_eager=True, help="Show versions."),
+    ] = False,
+) -> None:
+    pass
+
+
+@app.command()
+def demo(
+    scene: Annotated[str, typer.Option(help="Built-in scene.")] = "street_loop",
+    frames: Annotated[int, typer.Option(min=1, help="Number of sweeps.")] = 100,
+    output: Output = None,
+    overwrite: Overwrite = False,
+    plot: Plot = None,
+    profile: Profile = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Map a built-in simulated world and compare with its exact truth; downloads nothing."""
+    from loam_gtsam._cli_run import RunOptions, execute
+    from loam_gtsam.datasets.simulation import SimulatedWorld
+
+    world = SimulatedWorld(scene, frames=frames)
+    code = execute(world, Config(), RunOptions(frames, output, overwrite, plot, profile, quiet))
+    if not quiet and code == 0:
+        typer.echo(
+            "\nNext: loam-gtsam inspect PATH   what is understood of your own data\n"
+            "      loam-gtsam run PATH       map it\n"
+            "      loam-gtsam config         every parameter, explained"
+        )
+    raise typer.Exit(code)
+
+
+@app.command()
+def run(
+    path: DataPath,
+    topic: Topic = None,
+    imu_topic: ImuTopic = None,
+    loader_options: LoaderOptions = None,
+    sensor: Sensor = None,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")] = None,
+    output: Output = None,
+    overwrite: Overwrite = False,
+    plot: Plot = None,
+    profile: Profile = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Map a data set and write trajectory, map, report and pictures.
+
+    Ctrl-C stops after the current sweep and writes what was computed; a second one stops at once.
+    """
+    from loam_gtsam._cli_run import RunOptions, execute
+
+    settings = _settings(preset, config, sensor, overrides)
+    dataset = _open(path, topic, imu_topic, loader_options)
+    options = RunOptions(frames, output, overwrite, plot, profile, quiet)
+    raise typer.Exit(execute(dataset, settings, options))
+
+
+@app.command()
+def inspect(
+    path: DataPath,
+    topic: Topic = None,
+    imu_topic: ImuTopic = None,
+    loader_options: LoaderOptions = None,
+    sensor: Sensor = None,
+    preset: Preset = None,
+    config: ConfigFile = None,
+    overrides: Overrides = None,
+    debug: Debug = False,
+) -> None:
+    """Show what is understood of a data set: topics, fields, times, beams, problems.
+
+    Exits with 0 if it can be run and with 1 if not.
+    """
+    from loam_gtsam._cli_report import inspection
+
+    settings = _settings(preset, config, sensor, overrides)
+    dataset = _open(path, topic, imu_topic, loader_options)
+    report, runnable = inspection(dataset, settings)
+    Console().print(report)
+    raise typer.Exit(0 if runnable else 1)
+
+
+@app.command("config")
+def show_config(
+    preset_name: Annotated[str, typer.Option("--preset", help="Named configuration.")] = "default",
+    output: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write to a file instead of the screen.")
+    ] = None,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace FILE.")] = False,
+    debug: Debug = False,
+) -> None:
+    """Print a configuration; every key is explained by a comment."""
+    text = dump_config(preset(preset_name))
+    if output is None:
+        typer.echo(text, nl=False)
+        return
+    if output.exists() and not overwrite:
+        raise OutputError(f"{output}: the file exists; add --overwrite or choose another name")
+    with replacing(output) as file:
+        file.write(text.encode("utf-8"))
+
+
+def _open(
+    path: str, topic: str | None, imu_topic: str | None, loader_options: list[str] | None
+) -> Dataset:
+    from loam_gtsam.datasets import open_dataset
+
+    options: dict[str, Any] = dict(_key_value("--option", entry) for entry in loader_options or [])
+    return open_dataset(path, topic=topic, imu_topic=imu_topic, **options)
+
+
+def _key_value(option: str, entry: str) -> tuple[str, Any]:
+    """``KEY=VALUE`` with the value read as YAML."""
+    key, separator, text = entry.partition("=")
+    if not separator or not key.strip():
+        raise typer.BadParameter(f"{option} {entry}: expected KEY=VALUE")
+    try:
+        return key.strip(), YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        raise typer.BadParameter(f"{option} {entry}: {text!r} is not a YAML value") from error
+
+
+def _settings(
+    preset_name: str | None, file: Path | None, sensor: str | None, overrides: list[str] | None
+) -> Config:
+    """The configuration of a command: preset or file, then --sensor, then each --set in turn."""
+    if preset_name is not None and file is not None:
+        raise typer.BadParameter(
+            "give --preset or --config, not both; a file names its preset with 'preset: NAME'"
+        )
+    config = load_config(file) if file is not None else preset(preset_name or "default")
+    if sensor is not None:
+        config = _override(config, "sensor.model", sensor, f"--sensor {sensor}")
+    for entry in overrides or []:
+        key, value = _key_value("--set", entry)
+        if "." not in key:
+            raise typer.BadParameter(f"--set {entry}: expected SECTION.KEY=VALUE")
+        config = _override(config, key, value, f"--set {entry}")
+    return config
+
+
+def _override(config: Config, key: str, value: Any, source: str) -> Config:
+    """``config`` with one value changed; the error names ``source``."""
+    tree = config_to_dict(config)
+    *sections, last = key.split(".")
+    branch = tree
+    for section in sections:
+        below = branch.get(section)
+        if not isinstance(below, dict):
+            below = branch[section] = {}
+        branch = below
+    branch[last] = value
+    return config_from_dict(tree, source)
+
+
+def main() -> None:
+    """Entry point of ``loam-gtsam``."""
+    app(prog_name="loam-gtsam")
+
+
+if __name__ == "__main__":
+    main()

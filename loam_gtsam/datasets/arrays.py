@@ -1,0 +1,138 @@
+"""Sweeps that are already in memory."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.tables import describe_imu, describe_stamps
+from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
+
+
+class ArrayDataset:
+    """Sweeps from numpy arrays, or ready :class:`Scan` objects.
+
+    Parameters
+    ----------
+    scans : arrays of shape (N, 3) or (N, 4) in metres, lidar frame (a fourth column, intensity,
+        is ignored); or Scan objects, which carry everything below themselves
+    stamps : integer nanoseconds, one per array
+    stamps_s : instead of ``stamps``: float seconds
+    times : per array (N,) seconds from its stamp at which each point was measured
+    rings : per array (N,) integer beam numbers
+    imu, truth : handed through
+    name : for output files
+    sensor : fields of ``SensorConfig`` these sweeps imply
+
+    Raises
+    ------
+    InputError
+        If a shape, a dtype or a number of entries is wrong.
+    """
+
+    def __init__(
+        self,
+        scans: Iterable[Scan | NDArray[Any]],
+        stamps: Sequence[int] | NDArray[np.integer] | None = None,
+        *,
+        stamps_s: Sequence[float] | NDArray[np.floating] | None = None,
+        times: Sequence[NDArray[np.floating]] | None = None,
+        rings: Sequence[NDArray[np.integer]] | None = None,
+        imu: ImuSamples | None = None,
+        truth: Trajectory | None = None,
+        name: str = "arrays",
+        sensor: Mapping[str, Any] | None = None,
+    ) -> None:
+        entries = list(scans)
+        self.name = name
+        self.sensor: Mapping[str, Any] = dict(sensor or {})
+        self._imu = imu
+        self._truth = truth
+        self._scans: list[Scan] = []
+        ready = [entry for entry in entries if isinstance(entry, Scan)]
+        if ready:
+            columns = (stamps, stamps_s, times, rings)
+            if len(ready) != len(entries) or any(column is not None for column in columns):
+                raise InputError(
+                    "scans: Scan objects carry their own stamps, times and rings; give only Scan "
+                    "objects and none of stamps, stamps_s, times, rings"
+                )
+            self._scans = ready
+            return
+        nanoseconds = _stamps(stamps, stamps_s)
+        for label, column in (("stamps", nanoseconds), ("times", times), ("rings", rings)):
+            if column is not None and len(column) != len(entries):
+                raise InputError(f"{label}: expected {len(entries)} entries, got {len(column)}")
+        for index, entry in enumerate(entries):
+            if not isinstance(entry, np.ndarray) or entry.ndim != 2 or entry.shape[1] not in (3, 4):
+                got = entry.shape if isinstance(entry, np.ndarray) else type(entry).__name__
+                raise InputError(f"scans[{index}]: expected an (N, 3) or (N, 4) array, got {got}")
+            try:
+                scan = Scan(
+                    points=entry[:, :3],
+                    stamp=int(nanoseconds[index]),
+                    times=times[index] if times is not None else None,
+                    rings=rings[index] if rings is not None else None,
+                )
+            except InputError as error:
+                raise InputError(f"scans[{index}]: {error}") from error
+            self._scans.append(scan)
+
+    def __len__(self) -> int:
+        return len(self._scans)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return iter(self._scans)
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """As given."""
+        return self._imu
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """As given."""
+        return self._truth
+
+    def info(self) -> DatasetInfo:
+        """What was given."""
+        info = DatasetInfo("arrays", self.name, {"sweeps": str(len(self))})
+        stamps = np.array([scan.stamp for scan in self._scans], dtype=np.int64)
+        describe_stamps(stamps, info.facts, info.problems)
+        for label in ("times", "rings"):
+            missing = sum(getattr(scan, label) is None for scan in self._scans)
+            info.facts[f"point {label}"] = (
+                f"given for {len(self) - missing} of {len(self)} sweeps" if self._scans else "none"
+            )
+        info.facts["IMU"] = describe_imu(self._imu) if self._imu is not None else "none"
+        if not self._scans:
+            info.problems.append("no sweeps")
+        return info
+
+
+def _stamps(stamps: Any, stamps_s: Any) -> IntArray:
+    if (stamps is None) == (stamps_s is None):
+        raise InputError(
+            "give the stamps of the sweeps once: stamps (integer nanoseconds) or stamps_s "
+            "(float seconds)"
+        )
+    if stamps is not None:
+        values = np.asarray(stamps)
+        if values.ndim != 1 or (values.dtype.kind not in "iu" and values.size):
+            raise InputError(
+                f"stamps: expected 1-D integer nanoseconds, got {values.ndim}-D {values.dtype}; "
+                "use stamps_s for seconds"
+            )
+        return values.astype(np.int64)
+    seconds = np.asarray(stamps_s)
+    if seconds.ndim != 1 or seconds.dtype.kind not in "fiu" or not np.isfinite(seconds).all():
+        raise InputError("stamps_s: expected a 1-D sequence of finite seconds")
+    # Whole and fractional seconds apart: their product with 1e9 would lose the last digits.
+    whole = np.floor(seconds)
+    fraction = np.rint((seconds - whole) * 1e9)
+    nanoseconds: IntArray = whole.astype(np.int64) * 10**9 + fraction.astype(np.int64)
+    return nanoseconds

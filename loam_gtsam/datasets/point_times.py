@@ -1,0 +1,207 @@
+"""What the per-point times of a driver mean: their unit, their clock, and where the stamp sits.
+
+Drivers agree on nothing here: Velodyne writes seconds from the stamp, Ouster nanoseconds,
+Hesai and Robosense absolute seconds, Livox absolute nanoseconds. The numbers themselves tell the
+unit, because a sweep lasts 0.02 to 1 s and the units are a thousand apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray
+
+Unit = Literal["s", "ms", "us", "ns"]
+Moment = Literal["start", "middle", "end"]
+
+SWEEP_SECONDS = (0.02, 1.0)
+"""Shortest and longest plausible sweep: spinning sensors run at 5 to 20 Hz, with room to spare.
+The ratio is below 1000, so at most one unit fits."""
+_NANOSECONDS: dict[str, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_TRIM = 100
+"""One value in this many is set aside at either end before the span is measured."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeDecision:
+    """How the point times of a data set are read.
+
+    Attributes
+    ----------
+    field : name of the column
+    unit : of its numbers
+    clock : ``offset`` if they count from the sweep's stamp, ``stamp`` if they are absolute in the
+        clock of the stamp, ``own`` if they are absolute in another clock
+    anchor : moment of the sweep that is put at the stamp; None if the numbers themselves say
+        where the stamp is
+    span : first and last time of the sweep this was decided on, seconds from its stamp
+    """
+
+    field: str
+    unit: Unit
+    clock: Literal["offset", "stamp", "own"]
+    anchor: Moment | None
+    span: tuple[float, float]
+
+    def __str__(self) -> str:
+        clock = {
+            "offset": "relative to the stamp",
+            "stamp": "absolute",
+            "own": "absolute, in another clock than the stamp",
+        }[self.clock]
+        anchor = f", sweep {self.anchor} put at the stamp" if self.anchor else ""
+        first, last = self.span
+        return (
+            f"field {self.field!r} in {self.unit}, {clock}{anchor}: "
+            f"{first:+.4f} .. {last:+.4f} s from the stamp"
+        )
+
+
+def decide_times(
+    values: NDArray[Any],
+    stamp: int,
+    *,
+    field: str,
+    unit: str | None = None,
+    stamp_is: str | None = None,
+) -> TimeDecision:
+    """Decide from the numbers of one sweep what they mean.
+
+    Parameters
+    ----------
+    values : (N,) point times as the driver wrote them
+    stamp : of the sweep, nanoseconds
+    field : what to call them in messages
+    unit : ``s``, ``ms``, ``us`` or ``ns``; None decides
+    stamp_is : put the ``start``, ``middle`` or ``end`` of the sweep at the stamp, whatever the
+        numbers say; None decides
+
+    Raises
+    ------
+    DatasetError
+        If the numbers fit no unit, or an option is unknown.
+    """
+    check_time_options(unit, stamp_is)
+    relative, base = _split(values)
+    low, high = _robust_bounds(relative, field)
+    if unit is None:
+        unit = _fitting_unit(float(base) + low, float(base) + high, high - low, field)
+    scale = 1e-9 * _NANOSECONDS[unit]
+    anchor: Any = stamp_is
+    clock: Literal["offset", "stamp", "own"]
+    # Both ends: an absolute time near zero (a simulated clock) is told from an offset by the stamp.
+    first = float(base) * scale + low * scale
+    to_stamp = (_to_ns(base, unit) - stamp) * 1e-9 + low * scale
+    near_zero = max(abs(first), abs(first + (high - low) * scale)) <= SWEEP_SECONDS[1]
+    if near_zero and abs(first) <= abs(to_stamp):
+        clock = "offset"
+    elif abs(to_stamp) <= SWEEP_SECONDS[1]:
+        clock = "stamp"
+    else:
+        clock = "own"
+        anchor = anchor or "start"
+    decision = TimeDecision(field, unit, clock, anchor, (0.0, 0.0))  # type: ignore[arg-type]
+    times, outlier = apply_times(values, stamp, decision)
+    inliers = times[~outlier]
+    span = (float(inliers.min()), float(inliers.max()))
+    return TimeDecision(field, unit, clock, anchor, span)  # type: ignore[arg-type]
+
+
+def apply_times(
+    values: NDArray[Any], stamp: int, decision: TimeDecision
+) -> tuple[FloatArray, BoolArray]:
+    """Seconds from the stamp for each point of a sweep.
+
+    Returns
+    -------
+    times : (N,) seconds; outliers are clipped to the rest of the sweep
+    outlier : (N,) True where the value is not finite or far outside the sweep
+
+    Raises
+    ------
+    DatasetError
+        If the sweep does not lie where ``decision`` says it should.
+    """
+    if len(values) == 0:
+        return np.zeros(0), np.zeros(0, np.bool_)
+    scale = 1e-9 * _NANOSECONDS[decision.unit]
+    relative, base = _split(values)
+    low, high = _robust_bounds(relative, decision.field)
+    margin = 0.5 * (high - low) + SWEEP_SECONDS[0] / scale
+    with np.errstate(invalid="ignore"):
+        outlier: BoolArray = ~((relative >= low - margin) & (relative <= high + margin))
+    inliers = relative[~outlier]
+    first, last = float(inliers.min()) * scale, float(inliers.max()) * scale
+    if decision.anchor is not None:
+        weight = {"start": 0.0, "middle": 0.5, "end": 1.0}[decision.anchor]
+        shift = -(first + weight * (last - first))
+    elif decision.clock == "stamp":
+        shift = (_to_ns(base, decision.unit) - stamp) * 1e-9
+    else:
+        shift = float(base) * scale
+    # Twice the longest sweep: a stamp may trail its sweep by the latency of the driver.
+    if max(abs(first + shift), abs(last + shift)) > 2.0 * SWEEP_SECONDS[1]:
+        raise DatasetError(
+            f"point times ({decision}): this sweep lies {first + shift:.3f} .. "
+            f"{last + shift:.3f} s from its stamp; expected within {2.0 * SWEEP_SECONDS[1]:g} s"
+        )
+    times = relative * scale + shift
+    times[outlier] = np.clip(np.nan_to_num(times[outlier]), first + shift, last + shift)
+    return times, outlier
+
+
+def check_time_options(unit: str | None, stamp_is: str | None) -> None:
+    """Raise DatasetError unless both options are known."""
+    for name, value, known in (
+        ("time_unit", unit, get_args(Unit)),
+        ("stamp_is", stamp_is, get_args(Moment)),
+    ):
+        if value is not None and value not in known:
+            raise DatasetError(f"{name}: expected one of {', '.join(known)}; got {value!r}")
+
+
+def _fitting_unit(low: float, high: float, span: float, field: str) -> str:
+    for unit, nanoseconds in _NANOSECONDS.items():
+        if SWEEP_SECONDS[0] <= span * nanoseconds * 1e-9 <= SWEEP_SECONDS[1]:
+            return unit
+    raise DatasetError(
+        f"point-time field {field!r}: values {low:.9g} .. {high:.9g} (span {span:.6g}) fit no "
+        f"unit; tried {', '.join(_NANOSECONDS)} for a sweep of {SWEEP_SECONDS[0]:g} to "
+        f"{SWEEP_SECONDS[1]:g} s. Give time_unit if you know it, another time_field, or "
+        "time_field='none' to ignore the field"
+    )
+
+
+def _split(values: NDArray[Any]) -> tuple[FloatArray, int | float]:
+    """Differences to a base value, exact also for absolute integer nanoseconds."""
+    if values.dtype.kind in "iu":
+        base = values[len(values) // 2] if len(values) else values.dtype.type(0)
+        # Modulo 2**64, so a wild unsigned outlier cannot overflow; then read as signed.
+        wide = values.astype(np.int64).view(np.uint64) - np.int64(base).view(np.uint64)
+        return wide.view(np.int64).astype(np.float64), int(np.int64(base))
+    wide_values = values.astype(np.float64)
+    finite = wide_values[np.isfinite(wide_values)]
+    start = float(finite[0]) if len(finite) else 0.0
+    with np.errstate(over="ignore", invalid="ignore"):
+        return wide_values - start, start
+
+
+def _to_ns(base: int | float, unit: str) -> int:
+    return round(base * _NANOSECONDS[unit])
+
+
+def _robust_bounds(relative: FloatArray, field: str) -> tuple[float, float]:
+    """Smallest and largest finite value once the outermost ones are set aside."""
+    finite = relative[np.isfinite(relative)]
+    count = len(finite)
+    if count == 0:
+        raise DatasetError(
+            f"point-time field {field!r}: all {len(relative)} values are NaN or infinite"
+        )
+    trim = max(1, count // _TRIM) if count > 4 else 0
+    ordered = np.partition(finite, [trim, count - 1 - trim])
+    return float(ordered[trim]), float(ordered[count - 1 - trim])

@@ -1,0 +1,196 @@
+"""Small text files of numbers, and what their stamps tell."""
+
+from __future__ import annotations
+
+from decimal import Decimal, InvalidOperation
+from pathlib import Path
+
+import numpy as np
+
+from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
+
+DEFAULT_PERIOD_NS = 100_000_000
+"""10 Hz, the usual rate of a spinning lidar."""
+STANDARD_GRAVITY = 9.80665
+"""m/s^2, CGPM 1901."""
+
+
+def seconds_to_ns(text: str) -> int:
+    """Decimal seconds as integer nanoseconds; no detour over binary floating point.
+
+    Raises
+    ------
+    ValueError
+        If the text is not a finite number that fits 64 bits.
+    """
+    try:
+        nanoseconds = Decimal(text.strip()) * 10**9
+        value = int(nanoseconds.to_integral_value())
+    except (InvalidOperation, OverflowError) as error:
+        raise ValueError(f"not a time in seconds: {text.strip()!r}") from error
+    if abs(value) >= 2**63:
+        raise ValueError(f"out of range: {text.strip()!r}")
+    return value
+
+
+def read_lines(path: Path) -> list[str]:
+    """Lines of a text file without trailing blank ones."""
+    try:
+        return path.read_text(encoding="utf-8").rstrip().splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: cannot read: {error}") from error
+
+
+def read_stamps(path: Path) -> IntArray:
+    """One time in seconds per line, as nanoseconds."""
+    stamps = []
+    for number, line in enumerate(read_lines(path), start=1):
+        try:
+            stamps.append(seconds_to_ns(line))
+        except ValueError as error:
+            raise DatasetError(
+                f"{path}:{number}: expected a time in seconds, got {line.strip()!r}"
+            ) from error
+    return np.array(stamps, dtype=np.int64)
+
+
+def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
+    """Rows of a time in seconds and numbers; ``#`` starts a comment line.
+
+    Parameters
+    ----------
+    path : file
+    columns : names of the columns, the first being the time
+    separator : as for ``str.split``
+
+    Returns
+    -------
+    stamps : (N,) nanoseconds
+    values : (N, len(columns) - 1)
+
+    Raises
+    ------
+    DatasetError
+        Naming the line that does not fit.
+    """
+    count = len(columns.split())
+    stamps, rows = [], []
+    for number, line in enumerate(read_lines(path), start=1):
+        if line.lstrip().startswith("#"):
+            continue
+        cells = line.split(separator)
+        try:
+            if len(cells) != count:
+                raise ValueError(f"{len(cells)} columns")
+            stamps.append(seconds_to_ns(cells[0]))
+            rows.append([float(cell) for cell in cells[1:]])
+        except ValueError as error:
+            raise DatasetError(
+                f"{path}:{number}: expected {count} numbers ({columns}), got {line.strip()!r}"
+            ) from error
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), count - 1)
+    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
+    if len(bad):
+        raise DatasetError(f"{path}: row {bad[0] + 1} of {len(rows)} holds NaN or infinity")
+    return np.array(stamps, dtype=np.int64), values
+
+
+def read_tum(path: Path) -> Trajectory:
+    """TUM trajectory: ``t x y z qx qy qz qw`` per line, seconds and metres."""
+    stamps, values = read_table(path, "t x y z qx qy qz qw", None)
+    return Trajectory(stamps, poses_from_quaternions(values[:, :3], values[:, 3:], str(path)))
+
+
+def poses_from_quaternions(
+    translations: FloatArray, quaternions: FloatArray, source: str
+) -> FloatArray:
+    """(N, 4, 4) transforms from (N, 3) metres and (N, 4) quaternions x y z w of any length."""
+    # A rotation matrix does not need the length to be exactly 1, but it needs a direction.
+    norms = np.linalg.norm(quaternions, axis=1)
+    bad = np.flatnonzero(~((norms > 0.5) & (norms < 2.0) & np.isfinite(translations).all(axis=1)))
+    if len(bad):
+        raise DatasetError(
+            f"{source}: pose {bad[0] + 1} of {len(norms)} is not a pose: translation "
+            f"{translations[bad[0]].tolist()}, quaternion {quaternions[bad[0]].tolist()}"
+        )
+    x, y, z, w = (quaternions / norms[:, None]).T
+    poses = np.zeros((len(norms), 4, 4))
+    poses[:, 0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    poses[:, 0, 1] = 2.0 * (x * y - z * w)
+    poses[:, 0, 2] = 2.0 * (x * z + y * w)
+    poses[:, 1, 0] = 2.0 * (x * y + z * w)
+    poses[:, 1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    poses[:, 1, 2] = 2.0 * (y * z - x * w)
+    poses[:, 2, 0] = 2.0 * (x * z - y * w)
+    poses[:, 2, 1] = 2.0 * (y * z + x * w)
+    poses[:, 2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    poses[:, :3, 3] = translations
+    poses[:, 3, 3] = 1.0
+    return poses
+
+
+def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:
+    """IMU samples in order of time, in SI units; what had to be put right goes to ``problems``.
+
+    Parameters
+    ----------
+    stamps : (N,) nanoseconds
+    values : (N, 10) quaternion x y z w (zero where unknown), rad/s, m/s^2
+    problems : is appended to
+    """
+    keep = np.flatnonzero(np.isfinite(values).all(axis=1))
+    order = keep[np.argsort(stamps[keep], kind="stable")]
+    later = np.diff(stamps[order], prepend=np.iinfo(np.int64).min // 2) > 0
+    if dropped := len(stamps) - int(later.sum()):
+        problems.append(f"IMU: {dropped} samples with NaN or a repeated stamp left out")
+    if (np.diff(stamps) < 0).any():
+        problems.append("IMU: stamps out of order, sorted")
+    order = order[later]
+    if len(order) == 0:
+        problems.append("IMU: no usable samples")
+        return None
+    stamps, values = stamps[order], values[order]
+    orientation, gyro, acceleration = values[:, :4].copy(), values[:, 4:7], values[:, 7:]
+    norms = np.linalg.norm(orientation, axis=1, keepdims=True)
+    unknown = bool((np.abs(norms - 1.0) > 0.1).any())
+    if unknown:
+        problems.append("IMU: no orientation (quaternions are not of unit length)")
+    median = float(np.median(np.linalg.norm(acceleration, axis=1)))
+    if 0.8 < median < 1.2:
+        problems.append(f"IMU: acceleration of {median:.2f} at rest is in g, converted to m/s^2")
+        acceleration = acceleration * STANDARD_GRAVITY
+    return ImuSamples(stamps, None if unknown else orientation / norms, gyro, acceleration)
+
+
+def describe_imu(samples: ImuSamples) -> str:
+    """Count and rate for people."""
+    orientation = "with" if samples.orientation is not None else "without"
+    return (
+        f"{len(samples.stamps)} samples, {describe_rate(samples.stamps)}, {orientation} orientation"
+    )
+
+
+def describe_rate(stamps: IntArray) -> str:
+    """Median rate for people."""
+    steps = np.diff(stamps)
+    median = float(np.median(steps)) if len(steps) else 0.0
+    return f"{1e9 / median:.2f} Hz" if median > 0.0 else "unknown rate"
+
+
+def describe_stamps(stamps: IntArray, facts: dict[str, str], problems: list[str]) -> None:
+    """Range and rate of sweep stamps; disorder and gaps go to ``problems``."""
+    if len(stamps) == 0:
+        return
+    facts["stamps"] = f"{stamps[0] * 1e-9:.6f} .. {stamps[-1] * 1e-9:.6f} s"
+    facts["rate"] = describe_rate(stamps)
+    steps = np.diff(stamps)
+    for what, which in (
+        ("equal the one before", np.flatnonzero(steps == 0)),
+        ("are earlier than the one before", np.flatnonzero(steps < 0)),
+        # half a period late is jitter, a whole one is a missing sweep
+        ("come after a gap", np.flatnonzero(steps > 1.8 * max(float(np.median(steps)), 1.0)))
+        if len(steps) > 2
+        else ("", np.zeros(0, np.int64)),
+    ):
+        if len(which):
+            problems.append(f"{len(which)} stamps {what}, first at sweep {which[0] + 1}")

@@ -1,0 +1,390 @@
+"""Trajectories, maps and reports as files that other tools read.
+
+Every file is written beside its final name and then renamed: whatever interrupts a write leaves
+the old file or the new one, never half of one.
+
+Poses are ``map_T_lidar`` (x forward, y left, z up) in all formats; no camera axes anywhere.
+"""
+
+# ruff: noqa: D102 (the properties of the protocol are documented where they are implemented)
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from decimal import Decimal, InvalidOperation
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.config import Config, dump_config
+from loam_gtsam.types import (
+    DatasetError,
+    FloatArray,
+    InputError,
+    MapUpdate,
+    OutputError,
+    Trajectory,
+)
+
+_NS = 10**9
+_MAX_MESSAGES = 20
+"""Messages of frames kept in ``summary.json``; ``run.npz`` has them all."""
+
+EDGE_COLOUR, PLANE_COLOUR = (214, 96, 32), (110, 125, 140)
+"""Red, green, blue of the two kinds of map points in the PLY file."""
+
+_PLY_VERTEX = np.dtype(
+    [("xyz", "<f8", 3), ("rgb", "u1", 3), ("label", "u1")],
+)
+
+RUN_FILES = (
+    "trajectory.tum",
+    "trajectory_kitti.txt",
+    "run.npz",
+    "map.ply",
+    "config.yaml",
+    "summary.json",
+)
+"""What :func:`write_run` writes."""
+
+
+class Run(Protocol):
+    """What is written of a run; :class:`loam_gtsam.pipeline.RunResult` is one."""
+
+    @property
+    def config(self) -> Config: ...
+    @property
+    def updates(self) -> tuple[MapUpdate, ...]: ...
+    @property
+    def edge_points(self) -> FloatArray: ...
+    @property
+    def plane_points(self) -> FloatArray: ...
+    @property
+    def map_stats(self) -> Mapping[str, Mapping[str, int]]: ...
+    @property
+    def interrupted(self) -> bool: ...
+    @property
+    def error(self) -> Exception | None: ...
+    @property
+    def trajectory(self) -> Trajectory: ...
+    @property
+    def status_counts(self) -> dict[str, int]: ...
+
+
+@contextmanager
+def replacing(path: str | Path) -> Iterator[BinaryIO]:
+    """A binary file that takes the place of ``path`` when the block ends without an error.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; ``path`` is then as it was.
+    """
+    path = Path(path)
+    # The same folder, for a rename is atomic only within one file system.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot write the file: {error.strerror or error}; "
+            "choose another folder or free some space"
+        ) from error
+    finally:
+        with suppress(OSError):
+            temporary.unlink(missing_ok=True)
+
+
+def write_tum(
+    path: str | Path, trajectory: Trajectory, *, comments: Mapping[str, str] | None = None
+) -> None:
+    """Write ``stamp x y z qx qy qz qw`` per line (TUM format, as evo reads it).
+
+    Parameters
+    ----------
+    trajectory : stamps become seconds with nine decimals, exactly
+    comments : written as ``# key: value`` at the top
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    notes = dict(comments or {}) | {"columns": "stamp_s x y z qx qy qz qw (map_T_lidar)"}
+    lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
+    poses = trajectory.map_T_lidar
+    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else []
+    for stamp, xyz, quaternion in zip(
+        trajectory.stamps.tolist(), poses[:, :3, 3], quaternions, strict=True
+    ):
+        numbers = [f"{value:.9f}" for value in xyz] + [f"{value:.12f}" for value in quaternion]
+        lines.append(" ".join([_seconds(stamp), *numbers]))
+    _write_text(path, "\n".join(lines) + "\n")
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Read a TUM file; stamps are exact to the nanosecond.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read, naming the line that does not fit.
+    """
+    try:
+        text = Path(path).read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"{path}: cannot read the trajectory: {error}") from error
+    stamps: list[int] = []
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        words = line.split()
+        if not words or words[0].startswith("#"):
+            continue
+        try:
+            stamp = int((Decimal(words[0]) * _NS).to_integral_value())
+            row = [float(word) for word in words[1:]]
+        except (InvalidOperation, ValueError, OverflowError) as error:
+            raise DatasetError(f"{path}:{number}: not numbers: {line[:80]!r}") from error
+        if len(row) != 7 or not np.isfinite(row).all() or not any(row[3:]):
+            raise DatasetError(
+                f"{path}:{number}: expected 8 finite numbers, stamp x y z qx qy qz qw with a "
+                f"quaternion that is not zero; got {line[:80]!r}"
+            )
+        stamps.append(stamp)
+        rows.append(row)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rows:
+        values = np.array(rows)
+        poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
+        poses[:, :3, 3] = values[:, :3]
+    return Trajectory(np.array(stamps, np.int64), poses)
+
+
+def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
+    """Write the upper three rows of each pose, row by row, 12 numbers a line (KITTI format).
+
+    The axes are those of the lidar, not KITTI's camera.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    rows = trajectory.map_T_lidar[:, :3, :].reshape(-1, 12).tolist()
+    _write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
+
+
+def stage_seconds(updates: Sequence[MapUpdate]) -> tuple[tuple[str, ...], FloatArray]:
+    """Names of the S stages in order, and (N, S) seconds; NaN where a stage did not run."""
+    names = tuple(dict.fromkeys(name for update in updates for name in update.timings))
+    rows = [[update.timings.get(name, np.nan) for name in names] for update in updates]
+    return names, np.array(rows, np.float64).reshape(len(updates), len(names))
+
+
+def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
+    """Write everything that is known about each of the N frames; no pickle is needed to read it.
+
+    Parameters
+    ----------
+    updates : of a run, frames with a bad stamp included
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+
+    Notes
+    -----
+    Keys: ``stamps`` (N,) int64 ns; ``map_T_lidar`` (N, 4, 4); ``status`` and ``messages`` (N,)
+    strings; ``covariances`` (N, 6, 6), NaN for frames that were not solved; ``information``
+    (N, 6, 6); ``twists`` (N, 6) rad/s and m/s; ``n_edges``, ``n_planes``, ``n_edge_matches``,
+    ``n_plane_matches``, ``iterations``, ``solver_iterations`` (N,) int64; ``error_before``,
+    ``error_after`` (N,); ``stage_names`` (S,) strings and ``stage_seconds`` (N, S), NaN where a
+    stage did not run. See :class:`loam_gtsam.types.MapUpdate` for their meaning.
+    """
+    count = len(updates)
+    names, seconds = stage_seconds(updates)
+    arrays: dict[str, NDArray[Any]] = {
+        "stamps": np.array([u.stamp for u in updates], np.int64),
+        "map_T_lidar": _stack([u.map_T_lidar.matrix() for u in updates], (count, 4, 4)),
+        "status": np.array([str(u.status) for u in updates], np.str_),
+        "messages": np.array([u.message for u in updates], np.str_),
+        "covariances": _stack([u.covariance for u in updates], (count, 6, 6)),
+        "information": _stack([u.information for u in updates], (count, 6, 6)),
+        "twists": _stack([u.twist for u in updates], (count, 6)),
+        "stage_names": np.array(names, np.str_),
+        "stage_seconds": seconds,
+    }
+    for name in ("n_edges", "n_planes", "n_edge_matches", "n_plane_matches",
+                 "iterations", "solver_iterations"):  # fmt: skip
+        arrays[name] = np.array([getattr(u, name) for u in updates], np.int64)
+    for name in ("error_before", "error_after"):
+        arrays[name] = np.array([getattr(u, name) for u in updates], np.float64)
+    with replacing(path) as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+
+
+def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.floating]) -> None:
+    """Write a map as a binary little-endian PLY file.
+
+    Coordinates are double: single precision is down to 1 mm at 10 km and to 0.5 m in UTM
+    northings. ``label`` is 0 for edge and 1 for plane points, which also differ in colour.
+
+    Parameters
+    ----------
+    edges, planes : (E, 3) and (P, 3) metres, map frame
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong.
+    OutputError
+        If the file cannot be written.
+    """
+    for name, points in (("edges", edges), ("planes", planes)):
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise InputError(f"write_ply: {name}: expected shape (N, 3), got {points.shape}")
+    vertices = np.zeros(len(edges) + len(planes), _PLY_VERTEX)
+    vertices["xyz"] = np.concatenate((edges, planes))
+    vertices["label"] = np.arange(len(vertices)) >= len(edges)
+    vertices["rgb"] = np.array((EDGE_COLOUR, PLANE_COLOUR), np.uint8)[vertices["label"]]
+    properties = [f"property double {axis}" for axis in "xyz"]
+    properties += [f"property uchar {name}" for name in ("red", "green", "blue", "label")]
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        "comment map frame, metres; label 0: edge, 1: plane",
+        f"element vertex {len(vertices)}",
+        *properties,
+        "end_header",
+    ]
+    with replacing(path) as file:
+        file.write(("\n".join(header) + "\n").encode("ascii"))
+        file.write(vertices.data)
+
+
+def write_run(
+    result: Run,
+    directory: str | Path,
+    *,
+    dataset: str = "",
+    extra: Mapping[str, Any] | None = None,
+) -> None:
+    """Write all of :data:`RUN_FILES`; files of the same names are replaced.
+
+    ``summary.json`` comes last: where it is, the others are complete.
+
+    Parameters
+    ----------
+    result : complete or interrupted
+    directory : made if it does not exist
+    dataset : what was run, for the records
+    extra : further entries of the summary (plain numbers, strings, lists and mappings)
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be made or a file cannot be written.
+    """
+    folder = make_folder(directory)
+    trajectory = result.trajectory
+    records = {"made by": f"loam_gtsam {package_version()}", "data set": dataset}
+    if result.interrupted or result.error:
+        records["incomplete"] = "the run ended early"
+    write_tum(folder / "trajectory.tum", trajectory, comments=records)
+    write_kitti(folder / "trajectory_kitti.txt", trajectory)
+    write_npz(folder / "run.npz", result.updates)
+    write_ply(folder / "map.ply", result.edge_points, result.plane_points)
+    _write_text(folder / "config.yaml", dump_config(result.config))
+    summary = summarise(result) | {"dataset": dataset} | dict(extra or {})
+    _write_text(folder / "summary.json", json.dumps(_plain(summary), indent=2) + "\n")
+
+
+def summarise(result: Run) -> dict[str, Any]:
+    """What ``summary.json`` says about a run; lengths in metres, times in the unit of the name."""
+    trajectory = result.trajectory
+    seconds = np.nansum(stage_seconds(result.updates)[1], axis=1)
+    messages = [f"frame {n}: {u.status}: {u.message}" for n, u in enumerate(result.updates)
+                if u.message]  # fmt: skip
+    return {
+        "loam_gtsam": package_version(),
+        "frames": len(result.updates),
+        "poses": len(trajectory),
+        "interrupted": result.interrupted,
+        "error": None if result.error is None else f"{type(result.error).__name__}: {result.error}",
+        "status_counts": result.status_counts,
+        "messages": messages[:_MAX_MESSAGES],
+        "path_length_m": trajectory.length,
+        "duration_s": float(np.ptp(trajectory.stamps)) / _NS if len(trajectory) else 0.0,
+        "frame_ms_median": 1e3 * float(np.median(seconds)) if len(seconds) else None,
+        "edge_points": len(result.edge_points),
+        "plane_points": len(result.plane_points),
+        "map_stats": {name: dict(stats) for name, stats in result.map_stats.items()},
+    }
+
+
+def make_folder(directory: str | Path) -> Path:
+    """Make a folder and check that files can be written there.
+
+    Raises
+    ------
+    OutputError
+        If not.
+    """
+    folder = Path(directory)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot make this output folder: {error.strerror or error}"
+        ) from error
+    probe = folder / ".loam_gtsam_probe"
+    with replacing(probe):
+        pass
+    probe.unlink(missing_ok=True)
+    return folder
+
+
+def package_version() -> str:
+    """Version of the installed package."""
+    try:
+        return version("loam_gtsam")
+    except PackageNotFoundError:  # a source tree on the path
+        return "unknown"
+
+
+def _seconds(stamp: int) -> str:
+    """Decimal seconds of integer nanoseconds; a float would round today's stamps to 0.2 us."""
+    whole, rest = divmod(abs(stamp), _NS)
+    return f"{'-' if stamp < 0 else ''}{whole}.{rest:09d}"
+
+
+def _stack(rows: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:
+    return np.array(rows, np.float64).reshape(shape)
+
+
+def _plain(value: Any) -> Any:
+    """As JSON takes it: NaN and infinity, which it cannot say, become null."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(entry) for entry in value]
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return int(value) if isinstance(value, np.integer) else value
+
+
+def _write_text(path: str | Path, text: str) -> None:
+    with replacing(path) as file:
+        file.write(text.encode("utf-8"))

@@ -1,0 +1,473 @@
+"""Scan matching as GTSAM factors: point to line, point to plane, one by one or a scan at once.
+
+Residuals (``q = R p + t``, pose ``map_T_lidar = (R, t)``, right perturbation ``[rot, trans]``):
+
+* plane ``n . q + d = 0``: one row ``n . q + d``;
+* line through ``c`` along ``u``: two rows ``e_i . (q - c)`` with ``e_1, e_2`` an orthonormal basis
+  of the complement of ``u``. Their norm is LOAM's point-to-line distance, without its division by
+  zero on the line.
+
+A line match is thus two plane rows with normals ``e_i`` and offsets ``-e_i . c``, and every row
+reads ``r = n . (R p) + n . t + d`` with derivative ``[p x R^T n, R^T n]``.
+
+A row is *linear* in the 13 numbers ``z(T) = [vec(R), t, 1]``. A scan of M weighted rows is
+therefore ``r = L z(T)`` with a constant (M, 13) matrix L, and any S with ``S^T S = L^T L`` gives
+the same cost, gradient and Gauss-Newton Hessian at every pose: :func:`scan_match_factor` hands
+GTSAM 13 rows however many matches a scan has.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike
+
+from loam_gtsam.types import FloatArray, InputError
+
+Residual = Callable[[gtsam.Values], tuple[FloatArray, Sequence[FloatArray]]]
+"""Maps values to (residual (m,), one Jacobian (m, dim) per key)."""
+
+
+def point_to_plane_residual(
+    map_T_lidar: gtsam.Pose3, point: FloatArray, normal: FloatArray, offset: float
+) -> tuple[FloatArray, FloatArray]:
+    """Signed distance of a point from the plane ``normal . q + offset = 0``.
+
+    Parameters
+    ----------
+    map_T_lidar : pose
+    point : (3,) metres, lidar frame
+    normal : (3,) unit, map frame
+    offset : metres
+
+    Returns
+    -------
+    residual : (1,) metres
+    jacobian : (1, 6)
+    """
+    return _row_residuals(
+        map_T_lidar, point[None, :], normal[None, :], np.array([offset], dtype=np.float64)
+    )
+
+
+def point_to_line_residual(
+    map_T_lidar: gtsam.Pose3, point: FloatArray, centre: FloatArray, direction: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Offset of a point from the line through ``centre`` along ``direction``, in two components.
+
+    Parameters
+    ----------
+    map_T_lidar : pose
+    point : (3,) metres, lidar frame
+    centre : (3,) metres, map frame
+    direction : (3,) unit, map frame
+
+    Returns
+    -------
+    residual : (2,) metres, its norm is the distance
+    jacobian : (2, 6)
+    """
+    basis = complement_basis(direction[None, :])[0]
+    return _row_residuals(map_T_lidar, np.vstack([point, point]), basis, -basis @ centre)
+
+
+def complement_basis(directions: FloatArray) -> FloatArray:
+    """Two unit vectors orthogonal to each direction and to one another.
+
+    Parameters
+    ----------
+    directions : (N, 3) unit
+
+    Returns
+    -------
+    (N, 2, 3)
+
+    Notes
+    -----
+    Branch-free construction of Duff et al., Building an Orthonormal Basis, Revisited,
+    JCGT 6(1), 2017; well conditioned for every direction.
+    """
+    x, y, z = directions.T
+    sign = np.where(z >= 0.0, 1.0, -1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    second = np.stack([b, sign + y * y * a, -y], axis=1)
+    return np.stack([first, second], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class MatchRows:
+    """Matches as whitened plane rows: ``r = scale * (n . (R p + t) + d)``.
+
+    Attributes
+    ----------
+    points : (M, 3) metres, lidar frame
+    normals : (M, 3) unit, map frame
+    offsets : (M,) metres
+    scales : (M,) match weight over standard deviation, 1 / metres
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    offsets: FloatArray
+    scales: FloatArray
+
+    def __post_init__(self) -> None:
+        count = len(self.points)
+        expected = {
+            "points": (count, 3),
+            "normals": (count, 3),
+            "offsets": (count,),
+            "scales": (count,),
+        }
+        for name, shape in expected.items():
+            array = getattr(self, name)
+            if not isinstance(array, np.ndarray) or array.shape != shape:
+                raise InputError(f"MatchRows.{name}: expected shape {shape}, got {np.shape(array)}")
+            if not np.isfinite(array).all():
+                raise InputError(f"MatchRows.{name}: contains NaN or infinite values")
+
+    def residuals(self, map_T_lidar: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
+        """Whitened residuals (M,) and Jacobian (M, 6) at a pose."""
+        residual, jacobian = _row_residuals(map_T_lidar, self.points, self.normals, self.offsets)
+        return self.scales * residual, self.scales[:, None] * jacobian
+
+
+def line_rows(
+    points: ArrayLike,
+    centres: ArrayLike,
+    directions: ArrayLike,
+    weights: ArrayLike,
+    sigmas: ArrayLike,
+) -> MatchRows:
+    """Rows of M point-to-line matches (2 M rows).
+
+    Parameters
+    ----------
+    points : (M, 3) metres, lidar frame
+    centres, directions : (M, 3) each; metres and unit, map frame
+    weights : (M,) multiply row and residual, as LOAM's s does
+    sigmas : standard deviations of the distances, metres; (M,) or one for all
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong or a value not finite.
+    """
+    p, c, u = _points("points", points), _points("centres", centres), _points("dirs", directions)
+    _same_length(points=p, centres=c, directions=u, weights=np.atleast_1d(weights))
+    basis = complement_basis(u)
+    offsets = -np.einsum("nij,nj->ni", basis, c)
+    return MatchRows(
+        np.repeat(p, 2, axis=0),
+        basis.reshape(-1, 3),
+        offsets.reshape(-1),
+        np.repeat(np.asarray(weights, np.float64) / np.asarray(sigmas, np.float64), 2),
+    )
+
+
+def plane_rows(
+    points: ArrayLike,
+    normals: ArrayLike,
+    offsets: ArrayLike,
+    weights: ArrayLike,
+    sigmas: ArrayLike,
+) -> MatchRows:
+    """Rows of M point-to-plane matches.
+
+    Parameters
+    ----------
+    points : (M, 3) metres, lidar frame
+    normals : (M, 3) unit, map frame
+    offsets : (M,) metres
+    weights : (M,) multiply row and residual, as LOAM's s does
+    sigmas : standard deviations of the distances, metres; (M,) or one for all
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong or a value not finite.
+    """
+    return MatchRows(
+        _points("points", points),
+        _points("normals", normals),
+        np.asarray(offsets, np.float64),
+        np.asarray(weights, np.float64) / np.asarray(sigmas, np.float64),
+    )
+
+
+def concatenate_rows(parts: Sequence[MatchRows]) -> MatchRows:
+    """All rows of several sets of matches."""
+    return MatchRows(
+        *(
+            np.concatenate([getattr(part, name) for part in parts])
+            for name in ("points", "normals", "offsets", "scales")
+        )
+    )
+
+
+def checked_factor(
+    noise: gtsam.noiseModel.Base, keys: Sequence[int], residual: Residual
+) -> gtsam.CustomFactor:
+    """A CustomFactor that turns a faulty residual function into a Python error.
+
+    GTSAM itself crashes the process on a Jacobian of the wrong shape and silently accepts one with
+    the wrong number of columns, so shapes, dtypes and finiteness are checked here.
+
+    Parameters
+    ----------
+    noise : model of the residual's dimension
+    keys : the variables, in the order of the Jacobians
+    residual : see :data:`Residual`
+
+    Raises
+    ------
+    InputError
+        From GTSAM's error and linearize calls, when ``residual`` returns something unusable.
+    """
+    keys = list(keys)
+    rows = noise.dim()
+
+    def call(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        error, derivatives = residual(values)
+        error = _checked_block("residual", error, (rows,))
+        if jacobians is not None:
+            if len(derivatives) != len(keys):
+                raise InputError(
+                    f"factor: expected {len(keys)} Jacobians, one per key, got {len(derivatives)}"
+                )
+            for slot, (key, block) in enumerate(zip(keys, derivatives, strict=True)):
+                shape = (rows, _dimension(values, key))
+                jacobians[slot] = np.asfortranarray(
+                    _checked_block(f"Jacobian {slot}", block, shape)
+                )
+        return error
+
+    return gtsam.CustomFactor(noise, keys, call)
+
+
+def point_to_plane_factor(
+    key: int,
+    point: ArrayLike,
+    normal: ArrayLike,
+    offset: float,
+    noise: gtsam.noiseModel.Base,
+) -> gtsam.CustomFactor:
+    """One point-to-plane match as a factor on the pose ``key``.
+
+    Parameters
+    ----------
+    key : of a Pose3 ``map_T_lidar``
+    point, normal : (3,) metres in the lidar frame, unit in the map frame
+    offset : metres, the plane is ``normal . q + offset = 0``
+    noise : 1-dimensional; may be robust
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a value not finite, or the normal not of unit length.
+    """
+    p, n = _vector("point", point), _unit("normal", normal)
+    if not np.isfinite(offset):
+        raise InputError(f"offset: expected a finite number, got {offset}")
+    _noise_dimension(noise, 1)
+    return _pose_factor(
+        key, noise, partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
+    )
+
+
+def point_to_line_factor(
+    key: int,
+    point: ArrayLike,
+    centre: ArrayLike,
+    direction: ArrayLike,
+    noise: gtsam.noiseModel.Base,
+) -> gtsam.CustomFactor:
+    """One point-to-line match as a factor on the pose ``key``.
+
+    Parameters
+    ----------
+    key : of a Pose3 ``map_T_lidar``
+    point : (3,) metres, lidar frame
+    centre, direction : (3,) a point on the line and its unit direction, map frame
+    noise : 2-dimensional; may be robust
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a value not finite, or the direction not of unit length.
+    """
+    p, c, u = _vector("point", point), _vector("centre", centre), _unit("direction", direction)
+    _noise_dimension(noise, 2)
+    return _pose_factor(key, noise, partial(point_to_line_residual, point=p, centre=c, direction=u))
+
+
+def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
+    """All matches of a scan as one 13-row factor on the pose ``key``.
+
+    Its error, gradient, Gauss-Newton Hessian and optimum are those of the sum of the per-match
+    factors with sigma ``1 / scale`` (module docstring), at a cost per evaluation that does not
+    depend on the number of matches.
+
+    Parameters
+    ----------
+    key : of a Pose3 ``map_T_lidar``
+    rows : the whitened matches, at least one
+
+    Raises
+    ------
+    InputError
+        If there are no rows.
+    """
+    if len(rows.points) == 0:
+        raise InputError("scan_match_factor: expected at least one match, got none")
+    anchor, root = _compressed(rows)
+    return _pose_factor(
+        key,
+        gtsam.noiseModel.Unit.Create(len(root)),
+        partial(_compressed_residual, anchor=anchor, root=root),
+    )
+
+
+def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:
+    """An anchor (3,) in the map and S (13, 13) with ``|S z|^2 = sum r^2``.
+
+    Map coordinates are taken from the anchor, a point on the planes, so that the entries of L stay
+    of the size of a scan however far the map extends, and the squared form loses no digits.
+    """
+    normals = rows.scales[:, None] * rows.normals
+    offsets = rows.scales * rows.offsets
+    anchor, *_ = np.linalg.lstsq(normals.T @ normals, -normals.T @ offsets, rcond=1e-9)
+    matrix = np.empty((len(offsets), 13))
+    np.multiply(normals[:, :, None], rows.points[:, None, :], out=_as_3x3(matrix))
+    matrix[:, 9:12] = normals
+    matrix[:, 12] = offsets + normals @ anchor
+    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    root: FloatArray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
+    return anchor, root
+
+
+def _as_3x3(matrix: FloatArray) -> FloatArray:
+    """View of the first nine columns as (M, 3, 3)."""
+    view: FloatArray = np.lib.stride_tricks.as_strided(
+        matrix, (len(matrix), 3, 3), (matrix.strides[0], 3 * matrix.strides[1], matrix.strides[1])
+    )
+    return view
+
+
+_GENERATORS = np.zeros((3, 3, 3))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _GENERATORS[_i, _k, _j], _GENERATORS[_i, _j, _k] = 1.0, -1.0
+
+
+def _compressed_residual(
+    map_T_lidar: gtsam.Pose3, anchor: FloatArray, root: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    rotation = map_T_lidar.rotation().matrix()
+    z = np.empty(13)
+    z[:9] = rotation.ravel()
+    z[9:12] = map_T_lidar.translation() - anchor
+    z[12] = 1.0
+    derivative = np.zeros((13, 6))
+    # d(R)/d(omega_i) = R [e_i]x, d(t)/d(v) = R
+    derivative[:9, :3] = (rotation @ _GENERATORS).reshape(3, 9).T
+    derivative[9:12, 3:] = rotation
+    return root @ z, root @ derivative
+
+
+def _row_residuals(
+    map_T_lidar: gtsam.Pose3, points: FloatArray, normals: FloatArray, offsets: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (M,) and Jacobian (M, 6) of plane rows."""
+    rotation = map_T_lidar.rotation().matrix()
+    local = normals @ rotation
+    residual = np.einsum("ij,ij->i", local, points) + normals @ map_T_lidar.translation() + offsets
+    return residual, np.hstack([np.cross(points, local), local])
+
+
+def _pose_factor(
+    key: int,
+    noise: gtsam.noiseModel.Base,
+    residual: Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]],
+) -> gtsam.CustomFactor:
+    """A factor on one pose whose residual is ours and needs no checking per call."""
+
+    def call(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        error, derivative = residual(values.atPose3(key))
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(derivative)
+        return error
+
+    return gtsam.CustomFactor(noise, [key], call)
+
+
+def _dimension(values: gtsam.Values, key: int) -> int:
+    """Tangent dimension of a variable."""
+    one = gtsam.Values()
+    one.insert(key, _at(values, key))
+    return int(one.dim())
+
+
+def _at(values: gtsam.Values, key: int) -> object:
+    for getter in (values.atPose3, values.atVector, values.atRot3, values.atPoint3):
+        try:
+            return getter(key)
+        except RuntimeError:
+            continue
+    raise InputError(f"factor: variable {gtsam.DefaultKeyFormatter(key)} has an unsupported type")
+
+
+def _checked_block(name: str, block: object, shape: tuple[int, ...]) -> FloatArray:
+    try:
+        array = np.asarray(block, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"factor {name}: expected an array of shape {shape}: {error}") from error
+    if array.shape != shape:
+        raise InputError(f"factor {name}: expected shape {shape}, got {array.shape}")
+    if not np.isfinite(array).all():
+        raise InputError(f"factor {name}: contains NaN or infinite values")
+    return array
+
+
+def _points(name: str, value: ArrayLike) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InputError(f"{name}: expected an (M, 3) array, got shape {array.shape}")
+    return array
+
+
+def _same_length(**arrays: FloatArray) -> None:
+    lengths = {name: len(array) for name, array in arrays.items()}
+    if len(set(lengths.values())) > 1:
+        raise InputError(f"matches: expected equal lengths, got {lengths}")
+
+
+def _vector(name: str, value: ArrayLike) -> FloatArray:
+    array = np.asarray(value, dtype=np.float64)
+    if array.shape != (3,):
+        raise InputError(f"{name}: expected shape (3,), got {array.shape}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{name}: contains NaN or infinite values: {array}")
+    return array
+
+
+def _unit(name: str, value: ArrayLike) -> FloatArray:
+    array = _vector(name, value)
+    length = float(np.linalg.norm(array))
+    if abs(length - 1.0) > 1e-6:
+        raise InputError(f"{name}: expected unit length, got length {length:.6g}")
+    return array
+
+
+def _noise_dimension(noise: gtsam.noiseModel.Base, dimension: int) -> None:
+    if noise.dim() != dimension:
+        raise InputError(f"noise: expected dimension {dimension}, got {noise.dim()}")

@@ -1,0 +1,220 @@
+"""Association of features with the map: five nearest neighbours, a line or a plane through them.
+
+The matches are immutable arrays, so that the same ones can be given to different solvers.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import MatchingConfig
+from loam_gtsam.cubemap import CubeIndex, CubeMap
+from loam_gtsam.geometry import fit_lines, fit_planes, transform
+from loam_gtsam.types import FloatArray, IntArray
+
+_TINY = 1e-9
+
+
+@dataclass(frozen=True, slots=True)
+class EdgeMatches:
+    """Points matched with lines of the map.
+
+    Attributes
+    ----------
+    points : (M, 3) metres, lidar frame
+    centres, directions : (M, 3) a point on each line and its unit direction, map frame
+    distances : (M,) metres from the line at association
+    sigmas : (M,) standard deviation of the distance, metres
+    weights : (M,) LOAM's s, in (min_weight, 1]
+    indices : (M,) which features these are
+    """
+
+    points: FloatArray
+    centres: FloatArray
+    directions: FloatArray
+    distances: FloatArray
+    sigmas: FloatArray
+    weights: FloatArray
+    indices: IntArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class PlaneMatches:
+    """Points matched with planes ``n . q + d = 0`` of the map.
+
+    Attributes
+    ----------
+    points : (M, 3) metres, lidar frame
+    normals, offsets : (M, 3) unit and (M,) metres, map frame
+    distances : (M,) signed metres from the plane at association
+    sigmas : (M,) standard deviation of the distance, metres
+    weights : (M,) LOAM's s, in (min_weight, 1]
+    indices : (M,) which features these are
+    """
+
+    points: FloatArray
+    normals: FloatArray
+    offsets: FloatArray
+    distances: FloatArray
+    sigmas: FloatArray
+    weights: FloatArray
+    indices: IntArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(frozen=True, slots=True)
+class ScanMatches:
+    """All matches of one scan at one pose."""
+
+    edges: EdgeMatches
+    planes: PlaneMatches
+
+    def __len__(self) -> int:
+        return len(self.edges) + len(self.planes)
+
+
+def associate(
+    edges: FloatArray,
+    planes: FloatArray,
+    map_T_lidar: gtsam.Pose3,
+    edge_map: CubeMap,
+    plane_map: CubeMap,
+    config: MatchingConfig,
+    edge_cubes: tuple[CubeIndex, ...],
+    plane_cubes: tuple[CubeIndex, ...],
+) -> ScanMatches:
+    """Match de-skewed features with the map at a pose.
+
+    Parameters
+    ----------
+    edges, planes : (E, 3) and (P, 3) metres, lidar frame
+    map_T_lidar : pose at which to associate
+    edge_map, plane_map : the maps
+    edge_cubes, plane_cubes : cubes to search, from :meth:`CubeMap.neighbourhood`
+    """
+    pose = map_T_lidar.matrix()
+    edges_map, planes_map = transform(pose, edges), transform(pose, planes)
+    near = edge_map.nearest(edges_map, config.neighbours, config.max_distance, edge_cubes)
+    edge_matches = match_lines(edges, edges_map, *near, config)
+    near = plane_map.nearest(planes_map, config.neighbours, config.max_distance, plane_cubes)
+    return ScanMatches(edge_matches, match_planes(planes, planes_map, *near, config))
+
+
+def match_lines(
+    points: FloatArray,
+    points_map: FloatArray,
+    neighbours: FloatArray,
+    squared_distances: FloatArray,
+    config: MatchingConfig,
+) -> EdgeMatches:
+    """Lines through neighbours that form one (LOAM, Section VI; constants in the config).
+
+    Parameters
+    ----------
+    points, points_map : (N, 3) features in the lidar and in the map frame
+    neighbours : (N, k, 3) their nearest map points
+    squared_distances : (N, k) m^2, ascending, inf where missing
+    """
+    near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
+    centres, directions, eigenvalues = fit_lines(neighbours[near])
+    is_line = eigenvalues[:, 2] > config.line_ratio * eigenvalues[:, 1]
+    away = points_map[near] - centres
+    along = np.einsum("ni,ni->n", away, directions)
+    distances = np.sqrt(np.maximum(np.einsum("ni,ni->n", away, away) - along**2, 0.0))
+    weights = 1.0 - config.weight_slope * distances
+    keep = is_line & (weights > config.min_weight)
+    # A line in space has four parameters, two for each of the directions across it.
+    leverage = along**2 / np.maximum(eigenvalues[:, 2], _TINY)
+    sigmas = _sigmas(eigenvalues[:, 1], leverage, 2, neighbours.shape[1], config)
+    indices = near[keep]
+    return EdgeMatches(
+        points[indices],
+        centres[keep],
+        directions[keep],
+        distances[keep],
+        sigmas[keep],
+        weights[keep],
+        indices,
+    )
+
+
+def match_planes(
+    points: FloatArray,
+    points_map: FloatArray,
+    neighbours: FloatArray,
+    squared_distances: FloatArray,
+    config: MatchingConfig,
+) -> PlaneMatches:
+    """Planes through neighbours that form one (LOAM, Section VI; constants in the config).
+
+    Parameters are those of :func:`match_lines`.
+
+    Notes
+    -----
+    Two deliberate deviations from the published code: the plane is fitted about the centroid, so
+    that a plane through the map's origin is no special case, and the range in the weight is that of
+    the point from the sensor (as in LIO-SAM), not from the map's origin.
+    """
+    near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
+    centres, normals, wide, eigenvalues = fit_planes(neighbours[near])
+    across = np.einsum("nki,ni->nk", neighbours[near] - centres[:, None, :], normals)
+    is_plane = np.abs(across).max(axis=1, initial=0.0) <= config.plane_tolerance
+    is_plane &= eigenvalues[:, 1] > config.plane_ratio * eigenvalues[:, 2]
+    away = points_map[near] - centres
+    distances = np.einsum("ni,ni->n", away, normals)
+    ranges = np.linalg.norm(points[near], axis=1)
+    weights = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(np.maximum(ranges, _TINY))
+    keep = is_plane & (weights > config.min_weight)
+    along = np.einsum("ni,ni->n", away, wide)
+    aside = np.einsum("ni,ni->n", away, np.cross(normals, wide))
+    leverage = along**2 / np.maximum(eigenvalues[:, 2], _TINY)
+    leverage += aside**2 / np.maximum(eigenvalues[:, 1], _TINY)
+    sigmas = _sigmas(eigenvalues[:, 0], leverage, 3, neighbours.shape[1], config)
+    indices = near[keep]
+    return PlaneMatches(
+        points[indices],
+        normals[keep],
+        -np.einsum("ni,ni->n", normals[keep], centres[keep]),
+        distances[keep],
+        sigmas[keep],
+        weights[keep],
+        indices,
+    )
+
+
+def _sigmas(
+    roughness: FloatArray,
+    leverage: FloatArray,
+    parameters: int,
+    neighbours: int,
+    config: MatchingConfig,
+) -> FloatArray:
+    """Standard deviation of the distance of a new point from a fitted line or plane.
+
+    The variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)`` (Draper and Smith,
+    Applied Regression Analysis, 3rd ed., section 3.1): large where the neighbours span a direction
+    badly and the point lies off to that side, as across the rings of a sparse sensor, and where
+    they scatter. s^2 is the residual variance of the k neighbours with its degrees of freedom, and
+    at least that of a point.
+
+    Parameters
+    ----------
+    roughness : (M,) mean squared distance of the neighbours across the line or plane, m^2
+    leverage : (M,) squared distance from the centre in units of the neighbours' own variances
+    parameters : of the fit, per direction across it
+    """
+    variance = np.full(len(roughness), config.point_sigma**2)
+    if config.fit_uncertainty:
+        freedom = max(neighbours - parameters, 1)
+        scatter = np.maximum(roughness * neighbours / freedom, variance)
+        variance = scatter * (1.0 + (1.0 + leverage) / neighbours)
+    sigmas: FloatArray = np.sqrt(variance)
+    return sigmas

@@ -1,0 +1,191 @@
+"""From sweeps to a trajectory and a map: :class:`Pipeline` one by one, :func:`run` a data set."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import Config, SensorConfig
+from loam_gtsam.datasets.base import Dataset, Sweep
+from loam_gtsam.features import extract_features
+from loam_gtsam.mapper import Mapper
+from loam_gtsam.odometry import Odometry, make_odometry
+from loam_gtsam.types import (
+    BadSweep,
+    FeatureSweep,
+    FloatArray,
+    FrameStatus,
+    MapUpdate,
+    SweepError,
+    Trajectory,
+)
+
+OnFrame = Callable[[int, MapUpdate], None]
+"""Called after each frame with its number and result."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunResult:
+    """What a run computed, complete or not.
+
+    Attributes
+    ----------
+    config : as used, with what the data set implied about the sensor
+    updates : one per sweep
+    edge_points, plane_points : the whole map, (E, 3) and (P, 3) metres
+    map_stats : counters of the edge and the plane map (cubes, points, evictions, ...)
+    interrupted : the run was stopped (Ctrl-C) before the data set ended
+    error : what ended the run early, if it was to be kept (``keep_partial``)
+    """
+
+    config: Config
+    updates: tuple[MapUpdate, ...]
+    edge_points: FloatArray
+    plane_points: FloatArray
+    map_stats: Mapping[str, Mapping[str, int]]
+    interrupted: bool
+    error: Exception | None = None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """One pose per sweep with a valid stamp."""
+        good = [u for u in self.updates if u.status is not FrameStatus.BAD_STAMP]
+        poses = np.array([u.map_T_lidar.matrix() for u in good]).reshape(-1, 4, 4)
+        return Trajectory(np.array([u.stamp for u in good], np.int64), poses)
+
+    @property
+    def status_counts(self) -> dict[str, int]:
+        """How many frames ended in which status."""
+        return dict(Counter(str(u.status) for u in self.updates))
+
+
+class Pipeline:
+    """Feature extraction, odometry guess and mapping, one sweep at a time."""
+
+    def __init__(self, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self.mapper = Mapper(self.config)
+        self.odometry: Odometry = make_odometry(self.config.odometry)
+        self._last_odom: gtsam.Pose3 | None = None
+
+    def process(self, sweep: Sweep) -> MapUpdate:
+        """Register one sweep; what it contains never raises, see the status of the result."""
+        started = time.perf_counter()
+        try:
+            if isinstance(sweep, BadSweep):
+                return self.mapper.skip(sweep.stamp, sweep.message)
+            if isinstance(sweep, FeatureSweep):
+                return self._process_features(sweep)
+            features = extract_features(sweep, self.config)
+        except SweepError as error:
+            return self.mapper.skip(sweep.stamp, str(error))
+        extracted = time.perf_counter()
+        guess = self.odometry.guess(features, self.mapper.last)
+        guessed = time.perf_counter()
+        update = self.mapper.register(features, guess.map_T_lidar, guess.twist)
+        timings = {"features": extracted - started, "odometry": guessed - extracted}
+        return replace(update, timings=timings | dict(update.timings))
+
+    def _process_features(self, sweep: FeatureSweep) -> MapUpdate:
+        """The guess is the last pose, moved by the increment of the recorded odometry (LOAM)."""
+        last, last_odom = self.mapper.last, self._last_odom
+        self._last_odom = sweep.odom_T_lidar
+        if last is None or last_odom is None:
+            return self.mapper.register(sweep.features)
+        pose = last.map_T_lidar.compose(last_odom.between(sweep.odom_T_lidar))
+        return self.mapper.register(sweep.features, pose)
+
+
+def effective_config(config: Config, dataset: Dataset) -> Config:
+    """The configuration with what the data set's layout says about the sensor.
+
+    A field the user changed from its default wins.
+    """
+    default = SensorConfig()
+    implied = {
+        name: value
+        for name, value in dataset.sensor.items()
+        if getattr(config.sensor, name) == getattr(default, name)
+    }
+    return replace(config, sensor=replace(config.sensor, **implied))
+
+
+def run(
+    dataset: Dataset,
+    config: Config | None = None,
+    *,
+    max_frames: int | None = None,
+    on_frame: OnFrame | None = None,
+    keep_partial: bool = False,
+) -> RunResult:
+    """Map a data set.
+
+    Parameters
+    ----------
+    dataset : see :mod:`loam_gtsam.datasets`
+    max_frames : stop after so many sweeps
+    on_frame : e.g. to show progress
+    keep_partial : if an error ends the run after some sweeps, return what was computed until
+        then, with ``error`` set, instead of raising
+
+    Returns
+    -------
+    RunResult
+        On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
+
+    Raises
+    ------
+    DatasetError
+        If the data set cannot be read.
+    """
+    config = effective_config(config or Config(), dataset)
+    pipeline = Pipeline(config)
+    updates: list[MapUpdate] = []
+    interrupted = False
+    error: Exception | None = None
+    try:
+        for number, (sweep, seconds) in enumerate(_timed(dataset)):
+            if number == max_frames:
+                break
+            update = pipeline.process(sweep)
+            update = replace(update, timings={"read": seconds} | dict(update.timings))
+            updates.append(update)
+            if on_frame is not None:
+                on_frame(number, update)
+    except KeyboardInterrupt:
+        interrupted = True
+    except Exception as caught:
+        if not (keep_partial and updates):
+            raise
+        error = caught
+    mapper = pipeline.mapper
+    edges, planes = mapper.map_points()
+    return RunResult(
+        config=config,
+        updates=tuple(updates),
+        edge_points=edges,
+        plane_points=planes,
+        map_stats={
+            name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
+            for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
+        },
+        interrupted=interrupted,
+        error=error,
+    )
+
+
+def _timed(dataset: Dataset) -> Iterator[tuple[Sweep, float]]:
+    """The sweeps, each with the seconds it took to read."""
+    sweeps = iter(dataset)
+    while True:
+        started = time.perf_counter()
+        try:
+            sweep = next(sweeps)
+        except StopIteration:
+            return
+        yield sweep, time.perf_counter() - started

@@ -1,0 +1,241 @@
+"""Where beam numbers come from: a field, the order of the points, or their elevation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.types import FloatArray
+
+MAX_RINGS = 256
+"""More rings than any spinning sensor has: the field is not a beam number."""
+
+ELEVATIONS: dict[str, FloatArray] = {
+    # Velodyne VLP-16 user manual, table of laser angles.
+    "vlp16": np.linspace(-15.0, 15.0, 16),
+    # Velodyne HDL-32E user manual, firing sequence: 4/3 degrees apart, one beam at zero.
+    "hdl32": np.linspace(-23.0, 8.0, 32) * 4.0 / 3.0,
+    # HDL-64E: 1/3 degree apart in the upper block and 1/2 in the lower, as in A-LOAM.
+    "hdl64": np.concatenate((-8.83 - np.arange(31, -1, -1) / 2.0, 2.0 - np.arange(31, -1, -1) / 3)),
+}
+"""Nominal beam elevations in degrees, ascending."""
+
+_OUSTER_BEAMS = {"os1-16": 16, "os1-32": 32, "os1-64": 64, "os1-128": 128}
+"""Ouster calibrates the angles of each unit, so only the number of beams is nominal."""
+
+_BEAM_HEIGHTS = (0.0, 0.03618)
+"""Metres of the beams' origin above that of the points: 0, or the z of Ouster's
+``lidar_to_sensor_transform`` if the driver reports points in the sensor's own frame."""
+
+_BIN = 0.02
+"""Degrees. Histogram bin; the nearest beams in use (OS1-128) are 0.28 degrees apart."""
+
+_CORE = 0.25
+"""Fraction of the beam spacing around a beam that counts as hit. Elevations that have nothing to
+do with the beams fall there half of the time."""
+
+_CORE_SHARE = 0.9
+"""Least share of points in the cores for a set of beams to be believed."""
+
+_STRAY = 0.1
+"""A peak in the histogram of elevations is a beam if it has this share of the height of the
+typical peak (the one the median point belongs to); lower ones are stray returns."""
+
+
+@dataclass(frozen=True, slots=True)
+class RingAssignment:
+    """The beam of each point.
+
+    Attributes
+    ----------
+    rings : (N,) uint16 beam numbers, 0 to ``count - 1``; neighbours in number are neighbours in
+        elevation
+    count : number of beams seen
+    method : "field", "rows", "file order" or "elevation"
+    note : one sentence for people
+    ring_major : the points came ring after ring
+    """
+
+    rings: NDArray[np.uint16]
+    count: int
+    method: str
+    note: str
+    ring_major: bool
+
+
+def _assignment(rings: NDArray[np.integer], count: int, method: str, note: str) -> RingAssignment:
+    short = rings.astype(np.uint16, copy=False)
+    major = bool(np.all(short[1:] >= short[:-1]) or np.all(short[1:] <= short[:-1]))
+    return RingAssignment(short, count, method, note, major)
+
+
+def rings_from_labels(labels: NDArray[np.integer], xyz: NDArray[np.float32]) -> RingAssignment:
+    """Number the rings of a ring field by their mean elevation, lowest first.
+
+    The HDL-64's laser numbers, for one, do not follow elevation, and scan-to-scan odometry looks
+    for neighbours in adjacent rings.
+    """
+    low, high = int(labels.min()), int(labels.max())
+    if high - low < 65536:
+        compact = (labels.astype(np.int64) - low).astype(np.uint16)
+    else:
+        compact = np.unique(labels, return_inverse=True)[1].astype(np.int64)
+    counts = np.bincount(compact)
+    with np.errstate(divide="ignore"):
+        slope = np.minimum(np.abs(xyz[2]) / np.hypot(xyz[0], xyz[1]), 1e6) * np.sign(xyz[2])
+    mean = np.bincount(compact, weights=slope) / np.maximum(counts, 1)
+    mean[counts == 0] = np.inf
+    rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")
+    count = int(np.count_nonzero(counts))
+    note = f"{count} rings from the ring field (values {low} to {high})"
+    return _assignment(rank[compact], count, "field", note)
+
+
+def rings_from_rows(row_of: NDArray[np.integer]) -> RingAssignment:
+    """Rings of a range image; empty rows are left out."""
+    filled = np.bincount(row_of) > 0
+    rank = np.cumsum(filled) - 1
+    count = int(filled.sum())
+    return _assignment(
+        rank[row_of], count, "rows", f"{count} rings from the rows of the range image"
+    )
+
+
+def rings_from_file_order(
+    azimuth: NDArray[np.float32],
+) -> tuple[RingAssignment | None, str]:
+    """Rings of points written ring after ring, from the azimuth's jumps back.
+
+    KITTI's raw HDL-64E files carry no ring numbers, and their elevations are too irregular for a
+    nominal table, but the azimuth runs once around per ring.
+
+    Parameters
+    ----------
+    azimuth : (N,) radians, in file order
+
+    Returns
+    -------
+    assignment : None if the points are not written ring after ring
+    reason : one clause for people
+    """
+    step = np.diff(azimuth)
+    step -= np.float32(2.0 * np.pi) * np.rint(step * np.float32(0.5 / np.pi))
+    sign = 1.0 if np.count_nonzero(step > 0.0) >= np.count_nonzero(step < 0.0) else -1.0
+    forward = float(np.mean(step * np.float32(sign) > 0.0))
+    if forward < 0.95:
+        return None, f"azimuth does not run one way in file order ({forward:.0%} of steps do)"
+    # Where rings are cut: at a quarter turn if the file begins near one (its first point need not
+    # be the first column), else just before the first point.
+    first = float(np.rad2deg(azimuth[0]))
+    quarter = 90.0 * round(first / 90.0)
+    cut = quarter if abs(first - quarter) < 5.0 else first - sign * 0.5
+    turned = azimuth * np.float32(sign) - np.float32(sign * np.deg2rad(cut))
+    turned -= np.float32(2.0 * np.pi) * np.floor(turned * np.float32(0.5 / np.pi))
+    jumps = np.diff(turned) < -np.deg2rad(20.0)
+    rings = np.concatenate(([0], np.cumsum(jumps)))
+    count = int(rings[-1]) + 1
+    if not 2 <= count <= MAX_RINGS:
+        return None, f"azimuth runs around {count} time(s) in file order"
+    note = f"{count} rings from the order of the points (azimuth runs around once per ring)"
+    return _assignment(rings, count, "file order", note), note
+
+
+def rings_from_elevation(xyz: NDArray[np.float32], model: str) -> tuple[RingAssignment | None, str]:
+    """Rings from elevation: by a nominal table, or by the beams the data itself shows.
+
+    Parameters
+    ----------
+    xyz : (3, N) metres, lidar frame
+    model : ``sensor.model``; "auto" takes the Velodyne table that fits, else the beams that
+        stand out in the histogram of elevations
+
+    Returns
+    -------
+    assignment : None if nothing fits
+    reason : one clause for people
+    """
+    distance = np.hypot(xyz[0], xyz[1])
+    elevation = np.rad2deg(np.arctan2(xyz[2], distance))
+    if model in ELEVATIONS:
+        table = ELEVATIONS[model]
+        inside = float(np.mean((elevation > table[0] - 1.0) & (elevation < table[-1] + 1.0)))
+        if inside < _CORE_SHARE:
+            return None, (
+                f"only {inside:.0%} of the points lie between the lowest and highest beam of "
+                f"{model} ({table[0]:g} to {table[-1]:g} degrees)"
+            )
+        return _by_table(elevation, model)
+    if model == "auto":
+        shares = {name: _core_share(elevation, table) for name, table in ELEVATIONS.items()}
+        best = max(shares, key=lambda name: shares[name])
+        if shares[best] >= _CORE_SHARE:
+            return _by_table(elevation, best)
+    heights = [
+        (_core_share(tilted, beams), height, tilted, beams)
+        for height in _BEAM_HEIGHTS
+        for tilted in [np.rad2deg(np.arctan2(xyz[2] - np.float32(height), distance))]
+        for beams in [_beams_in(tilted)]
+    ]
+    share, height, tilted, beams = max(heights, key=lambda entry: entry[0])
+    limit = _OUSTER_BEAMS.get(model, MAX_RINGS)
+    if share < _CORE_SHARE or len(beams) > limit:
+        return None, (
+            f"no table of {', '.join(ELEVATIONS)} fits, and the elevations show no clear beams "
+            f"({share:.0%} of the points near one of {len(beams)}, at most {limit} expected)"
+        )
+    note = (
+        f"{len(beams)} rings from the beams in the elevations "
+        f"({beams[0]:.2f} to {beams[-1]:.2f} degrees, origin {1000 * height:.0f} mm up)"
+    )
+    return _assignment(_nearest(tilted, beams), len(beams), "elevation", note), note
+
+
+def _by_table(elevation: NDArray[np.float32], model: str) -> tuple[RingAssignment, str]:
+    nearest = _nearest(elevation, ELEVATIONS[model])
+    filled = np.bincount(nearest, minlength=len(ELEVATIONS[model])) > 0
+    count = int(filled.sum())
+    note = (
+        f"{count} rings from elevation by the table of {model}, "
+        f"{_core_share(elevation, ELEVATIONS[model]):.0%} of the points well on a beam"
+    )
+    return _assignment((np.cumsum(filled) - 1)[nearest], count, "elevation", note), note
+
+
+def _nearest(elevation: NDArray[np.float32], beams: FloatArray) -> NDArray[np.integer]:
+    """Index of the nearest of ascending beams."""
+    between = (0.5 * (beams[1:] + beams[:-1])).astype(np.float32)
+    nearest: NDArray[np.integer] = np.searchsorted(between, elevation)
+    return nearest
+
+
+def _core_share(elevation: NDArray[np.float32], beams: FloatArray) -> float:
+    """Share of points within a quarter of the beam spacing of a beam."""
+    if len(beams) < 2:
+        return 0.0
+    sample = elevation[:: max(1, len(elevation) // 8192)]
+    gaps = np.diff(beams)
+    spacing = np.minimum(np.append(gaps, np.inf), np.concatenate(([np.inf], gaps)))
+    nearest = _nearest(sample, beams)
+    return float(np.mean(np.abs(sample - beams[nearest]) < _CORE * spacing[nearest]))
+
+
+def _beams_in(elevation: NDArray[np.float32]) -> FloatArray:
+    """Peaks of the histogram of elevations, degrees, ascending."""
+    low = float(elevation.min()) - 10 * _BIN
+    histogram = np.bincount(((elevation - low) / _BIN).astype(np.int64))
+    padded = np.pad(histogram.astype(np.float64), 10)
+    smooth = np.convolve(padded, np.ones(5), "same")
+    highest = np.lib.stride_tricks.sliding_window_view(np.pad(smooth, 8), 17).max(axis=1)
+    peaks = np.flatnonzero((smooth == highest) & (smooth > 0.0))
+    peaks = peaks[np.diff(peaks, prepend=-100) > 8]  # the first bin of a flat top
+    heights = np.sort(smooth[peaks])
+    half = heights[np.searchsorted(np.cumsum(heights), 0.5 * heights.sum())]
+    peaks = peaks[smooth[peaks] >= _STRAY * half]
+    # The mean around a peak, for a flat top begins off its centre.
+    window = peaks[:, None] + np.arange(-5, 6)
+    weight = np.pad(padded, 5)[window + 5]
+    centre = (weight * window).sum(axis=1) / weight.sum(axis=1)
+    beams: FloatArray = low + (centre - 10 + 0.5) * _BIN
+    return beams

@@ -1,0 +1,223 @@
+"""Pictures of a run as PNG files. Needs the ``plot`` extra; nothing is shown on a screen."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.export import replacing, stage_seconds
+from loam_gtsam.types import FloatArray, IntArray, MapUpdate, OutputError, Trajectory
+
+_INK, _FAINT, _PATH, _TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
+_STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d")
+_DPI = 110
+_HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
+_MAX_BYTES = 300_000
+"""Larger pictures are reduced to ``_PALETTE`` colours: they are for READMEs and reports."""
+_PALETTE = 64
+_MAP_CELLS = 700
+"""Cells along the longer side of the top view; a picture has about as many pixels."""
+_MIN_CELL = 0.1
+"""Metres. The map is voxel-filtered: smaller cells would be mostly empty."""
+
+
+def available() -> bool:
+    """Whether matplotlib is installed."""
+    return importlib.util.find_spec("matplotlib") is not None
+
+
+def plot_trajectory(
+    path: str | Path, trajectory: Trajectory, truth: Trajectory | None = None
+) -> None:
+    """Draw the path from above, and its height.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    trajectory : ``map_T_lidar``
+    truth : reference poses in the map frame (align them first), or None
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = _figure(9.0, 7.0)
+    top, side = figure.subplots(2, 1, height_ratios=(4, 1))
+    if truth is not None:
+        xyz = truth.map_T_lidar[:, :3, 3]
+        top.plot(xyz[:, 0], xyz[:, 1], color=_TRUTH, lw=3.0, label="truth")
+        side.plot(_travelled(xyz), xyz[:, 2], color=_TRUTH, lw=3.0)
+    xyz = trajectory.map_T_lidar[:, :3, 3]
+    top.plot(xyz[:, 0], xyz[:, 1], color=_PATH, lw=1.4, label="estimate")
+    top.plot(xyz[:1, 0], xyz[:1, 1], "o", color=_INK, ms=6, label="start")
+    side.plot(_travelled(xyz), xyz[:, 2], color=_PATH, lw=1.4)
+    top.set_aspect("equal", adjustable="datalim")
+    top.set(xlabel="x [m]", ylabel="y [m]", title=f"{trajectory.length:.1f} m travelled")
+    top.legend(frameon=False)
+    side.set(xlabel="distance travelled [m]", ylabel="z [m]")
+    _save(figure, path)
+
+
+def plot_map(
+    path: str | Path,
+    edges: NDArray[np.floating],
+    planes: NDArray[np.floating],
+    trajectory: Trajectory | None = None,
+) -> None:
+    """Draw the map from above, coloured by height, with the path.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    edges, planes : (E, 3) and (P, 3) metres, map frame
+    trajectory : drawn on top, or None
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = _figure(9.0, 7.0)
+    axes = figure.subplots()
+    points = np.concatenate((edges, planes)).astype(np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    if len(points):
+        image = _top_view(axes, points)
+        bar = figure.colorbar(image, ax=axes, shrink=0.55, aspect=30, pad=0.02)
+        bar.set_label("height [m]")
+        bar.outline.set_visible(False)
+    if trajectory is not None and len(trajectory):
+        xyz = trajectory.map_T_lidar[:, :3, 3]
+        axes.plot(xyz[:, 0], xyz[:, 1], color="white", lw=3.0)
+        axes.plot(xyz[:, 0], xyz[:, 1], color=_PATH, lw=1.6)
+        axes.plot(xyz[:1, 0], xyz[:1, 1], "o", color=_PATH, mec="white", ms=7)
+    axes.set_aspect("equal")
+    axes.margins(0.02)
+    axes.set(xlabel="x [m]", ylabel="y [m]")
+    _save(figure, path)
+
+
+def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
+    """Draw the time per stage over the frames, stacked.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    updates : of a run
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = _figure(9.0, 4.0)
+    axes = figure.subplots()
+    names, seconds = stage_seconds(updates)
+    if names:
+        milliseconds = 1e3 * np.nan_to_num(seconds)
+        colours = [_STAGE_COLOURS[i % len(_STAGE_COLOURS)] for i in range(len(names))]
+        labels = [
+            f"{name}  {median:.1f} ms"
+            for name, median in zip(names, np.median(milliseconds, axis=0), strict=True)
+        ]
+        axes.stackplot(np.arange(len(updates)), milliseconds.T, labels=labels, colors=colours, lw=0)
+        # A rare slow frame (start-up, a busy machine) would flatten everything else.
+        axes.set_ylim(0.0, 1.3 * float(np.percentile(milliseconds.sum(axis=1), 98)) + 1e-9)
+        axes.set_xlim(0, max(len(updates) - 1, 1))
+        handles, texts = axes.get_legend_handles_labels()
+        axes.legend(
+            handles[::-1], texts[::-1], frameon=False, title="median",
+            loc="center left", bbox_to_anchor=(1.0, 0.5),
+        )  # fmt: skip
+    axes.set(xlabel="frame", ylabel="time [ms]")
+    _save(figure, path)
+
+
+def _top_view(axes: Any, points: FloatArray) -> Any:
+    """Greatest height per cell; cells with fewer points are fainter."""
+    # A few stray points far away would leave everything else small and of one colour.
+    low, high = np.percentile(points, (0.2, 99.8), axis=0)
+    points = points[((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2])).all(axis=1)]
+    size = max(float((high - low)[:2].max()) / _MAP_CELLS, _MIN_CELL)
+    columns, rows = ((high - low)[:2] / size).astype(np.int64) + 1
+    cells: IntArray = ((points[:, :2] - low[:2]) / size).astype(np.int64)
+    flat = cells[:, 1] * columns + cells[:, 0]
+    count = np.bincount(flat, minlength=columns * rows)
+    height = np.full(columns * rows, np.nan)
+    order = np.argsort(points[:, 2], kind="stable")
+    height[flat[order]] = points[order, 2]  # the last one written, the highest, stays
+    opacity = np.clip(0.4 + 0.3 * np.log1p(count), 0.0, 1.0) * (count > 0)
+    return axes.imshow(
+        height.reshape(rows, columns),
+        alpha=opacity.reshape(rows, columns),
+        extent=(low[0], low[0] + columns * size, low[1], low[1] + rows * size),
+        origin="lower",
+        cmap=_height_colours(),
+        vmin=low[2],
+        vmax=max(high[2], low[2] + 1e-3),
+        interpolation="nearest",
+    )
+
+
+def _height_colours() -> Any:
+    """Pale ground, dark walls: what stands out of the ground stands out of the page."""
+    from matplotlib.colors import LinearSegmentedColormap
+
+    return LinearSegmentedColormap.from_list("height", _HEIGHT_COLOURS)
+
+
+def _travelled(xyz: FloatArray) -> FloatArray:
+    """(N,) metres from the start along (N, 3) positions."""
+    steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
+    travelled: FloatArray = np.concatenate(([0.0], np.cumsum(steps)))[: len(xyz)]
+    return travelled
+
+
+def _figure(width: float, height: float) -> Any:
+    """An empty figure, free of matplotlib's global state and of any display."""
+    try:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+    except ImportError as error:
+        raise OutputError(
+            'pictures need matplotlib; install it with: pip install "loam_gtsam[plot]"'
+        ) from error
+    figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def _save(figure: Any, path: str | Path) -> None:
+    """Common style, then the PNG."""
+    for axes in figure.axes:
+        axes.tick_params(colors=_INK, length=0, labelsize=9)
+        axes.xaxis.label.set_color(_INK)
+        axes.yaxis.label.set_color(_INK)
+        axes.title.set_color(_INK)
+        for spine in axes.spines.values():
+            spine.set_color(_FAINT)
+        if axes.get_label() != "<colorbar>":
+            axes.grid(True, color=_FAINT, lw=0.5)
+            axes.set_axisbelow(True)
+    png = io.BytesIO()
+    figure.savefig(png, format="png", bbox_inches="tight", pad_inches=0.12)
+    if png.tell() > _MAX_BYTES:
+        png = _with_palette(png)
+    with replacing(path) as file:
+        file.write(png.getvalue())
+
+
+def _with_palette(png: io.BytesIO) -> io.BytesIO:
+    """The same picture in few colours, a third of the size or less."""
+    from PIL import Image  # comes with matplotlib
+
+    smaller = io.BytesIO()
+    Image.open(png).convert("RGB").quantize(_PALETTE).save(smaller, format="png", optimize=True)
+    return smaller

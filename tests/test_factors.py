@@ -1,0 +1,248 @@
+"""Factors: derivatives, equivalence of the stacked and per-match forms, bad input."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam import factors
+from loam_gtsam.types import InputError
+
+KEY = gtsam.symbol("x", 0)
+POSES = [
+    gtsam.Pose3(),
+    gtsam.Pose3.Expmap(np.array([1e-7, -2e-7, 1e-7, 1e-6, 0, -1e-6])),
+    gtsam.Pose3.Expmap(np.array([0.3, -0.5, 1.2, 4.0, -2.0, 1.0])),
+    gtsam.Pose3.Expmap(np.array([0.0, 0.0, np.pi - 1e-3, 2000.0, -3000.0, 40.0])),
+    gtsam.Pose3.Expmap(np.array([2.0, -2.0, 0.5, -1.0, 7.0, 0.2])),
+]
+
+
+def unit(rng, count):
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def numerical_jacobian(residual, pose, step=1e-6):
+    columns = []
+    for axis in np.eye(6):
+        ahead = residual(pose.retract(step * axis))
+        behind = residual(pose.retract(-step * axis))
+        columns.append((ahead - behind) / (2 * step))
+    return np.stack(columns, axis=1)
+
+
+def make_matches(rng, pose, n_lines=40, n_planes=60, noise=0.05):
+    """Matches that a pose near ``pose`` satisfies."""
+    lines = rng.uniform(-20, 20, (n_lines, 3))
+    planes = rng.uniform(-20, 20, (n_planes, 3))
+    rotation, translation = pose.rotation().matrix(), pose.translation()
+    directions, normals = unit(rng, n_lines), unit(rng, n_planes)
+    centres = lines @ rotation.T + translation + rng.normal(0, noise, (n_lines, 3))
+    offsets = -np.einsum("ni,ni->n", normals, planes @ rotation.T + translation)
+    offsets += rng.normal(0, noise, n_planes)
+    weights = rng.uniform(0.1, 1.0, n_lines), rng.uniform(0.1, 1.0, n_planes)
+    return lines, centres, directions, weights[0], planes, normals, offsets, weights[1]
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_jacobians_equal_numerical_derivatives(pose):
+    rng = np.random.default_rng(1)
+    point, centre, offset = rng.uniform(-20, 20, 3), rng.uniform(-20, 20, 3), 3.0
+    for axis in [*np.eye(3), *-np.eye(3), *unit(rng, 4)]:
+
+        def line(p, u=axis):
+            return factors.point_to_line_residual(p, point, centre, u)
+
+        def plane(p, n=axis):
+            return factors.point_to_plane_residual(p, point, n, offset)
+
+        for residual in (line, plane):
+            numerical = numerical_jacobian(lambda p, f=residual: f(p)[0], pose)
+            np.testing.assert_allclose(residual(pose)[1], numerical, atol=2e-5)
+
+
+def test_residuals_in_closed_form():
+    turn = gtsam.Pose3(gtsam.Rot3.Rz(np.pi / 2), np.array([1.0, 0.0, 2.0]))
+    # (1, 0, 0) goes to (1, 1, 2)
+    point = np.array([1.0, 0.0, 0.0])
+    residual, _ = factors.point_to_plane_residual(turn, point, np.array([0.0, 1.0, 0.0]), -0.25)
+    np.testing.assert_allclose(residual, [0.75], atol=1e-12)
+    residual, _ = factors.point_to_line_residual(
+        turn, point, np.array([0.0, 1.0, 50.0]), np.array([0.0, 0.0, 1.0])
+    )
+    np.testing.assert_allclose(np.linalg.norm(residual), 1.0)
+
+
+def test_line_residual_is_loams_distance_and_smooth_on_the_line():
+    rng = np.random.default_rng(2)
+    for direction in [*unit(rng, 20), np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 1.0])]:
+        point, centre = rng.normal(size=3), rng.normal(size=3)
+        residual, _ = factors.point_to_line_residual(POSES[2], point, centre, direction)
+        moved = POSES[2].transformFrom(point)
+        distance = np.linalg.norm(np.cross(moved - centre, direction))
+        np.testing.assert_allclose(np.linalg.norm(residual), distance, rtol=1e-10)
+        on_line = POSES[2].transformTo(centre + 3 * direction)
+        residual, jacobian = factors.point_to_line_residual(
+            POSES[2], on_line, centre, direction
+        )
+        np.testing.assert_allclose(residual, 0, atol=1e-12)
+        assert np.linalg.matrix_rank(jacobian) == 2
+
+
+@pytest.mark.parametrize("pose", POSES)
+def test_stacked_factor_equals_sum_of_match_factors(pose):
+    rng = np.random.default_rng(3)
+    sigma = 0.1
+    lines, centres, directions, w_line, planes, normals, offsets, w_plane = make_matches(rng, pose)
+    single = gtsam.NonlinearFactorGraph()
+    for p, c, u, w in zip(lines, centres, directions, w_line, strict=True):
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma / w)
+        single.add(factors.point_to_line_factor(KEY, p, c, u, noise))
+    for p, n, d, w in zip(planes, normals, offsets, w_plane, strict=True):
+        noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma / w)
+        single.add(factors.point_to_plane_factor(KEY, p, n, d, noise))
+    rows = factors.concatenate_rows(
+        [
+            factors.line_rows(lines, centres, directions, w_line, sigma),
+            factors.plane_rows(planes, normals, offsets, w_plane, sigma),
+        ]
+    )
+    stacked = gtsam.NonlinearFactorGraph()
+    stacked.add(factors.scan_match_factor(KEY, rows))
+
+    def solve(graph, start):
+        values = gtsam.Values()
+        values.insert(KEY, start)
+        params = gtsam.LevenbergMarquardtParams()
+        params.setRelativeErrorTol(1e-15)
+        params.setAbsoluteErrorTol(1e-15)
+        result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        return result.atPose3(KEY)
+
+    for delta in (np.zeros(6), np.array([0.1, -0.2, 0.05, 0.4, 0.3, -0.5])):
+        values = gtsam.Values()
+        values.insert(KEY, pose.retract(delta))
+        assert stacked.error(values) == pytest.approx(single.error(values), rel=1e-9)
+        ours, theirs = stacked.linearize(values), single.linearize(values)
+        hessian, gradient = ours.hessian()
+        expected_hessian, expected_gradient = theirs.hessian()
+        scale = np.abs(expected_hessian).max()
+        np.testing.assert_allclose(hessian, expected_hessian, atol=1e-10 * scale)
+        np.testing.assert_allclose(
+            gradient, expected_gradient, atol=1e-9 * np.abs(expected_gradient).max() + 1e-7
+        )
+    start = pose.retract(np.array([0.02, -0.02, 0.03, 0.1, 0.2, -0.1]))
+    difference = solve(single, start).localCoordinates(solve(stacked, start))
+    assert np.abs(difference).max() < 1e-8
+
+
+def test_uncompressed_rows_agree_with_factor():
+    rng = np.random.default_rng(4)
+    lines, centres, directions, weights, *_ = make_matches(rng, POSES[2])
+    rows = factors.line_rows(lines, centres, directions, weights, 0.1)
+    residual, jacobian = rows.residuals(POSES[4])
+    np.testing.assert_allclose(
+        jacobian, numerical_jacobian(lambda p: rows.residuals(p)[0], POSES[4]), atol=1e-4
+    )
+    values = gtsam.Values()
+    values.insert(KEY, POSES[4])
+    error = factors.scan_match_factor(KEY, rows).error(values)
+    assert error == pytest.approx(0.5 * residual @ residual, rel=1e-10)
+
+
+def test_one_plane_leaves_three_directions_free():
+    """A rank-deficient scan compresses without error and without inventing information."""
+    rng = np.random.default_rng(5)
+    points = np.column_stack([rng.uniform(-10, 10, (100, 2)), np.full(100, -1.7)])
+    rows = factors.plane_rows(
+        points, np.tile([0.0, 0.0, 1.0], (100, 1)), np.full(100, 1.7), np.ones(100), 0.1
+    )
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factors.scan_match_factor(KEY, rows))
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose3())
+    hessian, _ = graph.linearize(values).hessian()
+    eigenvalues = np.linalg.eigvalsh(hessian)
+    assert (eigenvalues[:3] < 1e-6 * eigenvalues[-1]).all()
+    assert (eigenvalues[3:] > 1e3).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda n: factors.point_to_plane_factor(KEY, [1, 2], [0, 0, 1], 0.0, n(1)), "point"),
+        (lambda n: factors.point_to_plane_factor(KEY, [1, 2, 3], [0, 0, 2], 0.0, n(1)), "unit"),
+        (lambda n: factors.point_to_plane_factor(KEY, [1, 2, 3], [0, 0, 1], np.nan, n(1)), "off"),
+        (lambda n: factors.point_to_plane_factor(KEY, [1, 2, 3], [0, 0, 1], 0.0, n(2)), "noise"),
+        (lambda n: factors.point_to_line_factor(KEY, [1, 2, 3], [0, np.inf, 1], [0, 0, 1], n(2)),
+         "centre"),
+        (lambda n: factors.point_to_line_factor(KEY, [1, 2, 3], [0, 0, 1], [0, 0, 0], n(2)),
+         "unit"),
+        (lambda n: factors.plane_rows(np.ones((4, 3)), np.ones((3, 3)), np.ones(4), np.ones(4), 1),
+         "normals"),
+        (lambda n: factors.plane_rows(np.ones((4, 2)), np.ones((4, 3)), np.ones(4), np.ones(4), 1),
+         "points"),
+        (lambda n: factors.line_rows(np.ones((4, 3)), np.ones((4, 3)), np.ones((4, 3)), [1], 1),
+         "lengths"),
+        (lambda n: factors.plane_rows([[np.nan] * 3], [[0, 0, 1.0]], [0.0], [1.0], 1), "NaN"),
+        (lambda n: factors.scan_match_factor(KEY, factors.plane_rows(
+            np.empty((0, 3)), np.empty((0, 3)), [], [], 1)), "at least one"),
+    ],
+)  # fmt: skip
+def test_faulty_shapes_are_errors(call, message):
+    with pytest.raises(InputError, match=message):
+        call(lambda dim: gtsam.noiseModel.Isotropic.Sigma(dim, 1.0))
+
+
+@pytest.mark.parametrize(
+    ("residual", "message"),
+    [
+        (lambda v: (np.zeros(3), [np.zeros((2, 6))]), "residual"),
+        (lambda v: (np.ones(2), [np.zeros((6, 2))]), "Jacobian 0"),
+        (lambda v: (np.ones(2), [np.zeros((2, 5))]), "Jacobian 0"),
+        (lambda v: (np.ones(2), []), "one per key"),
+        (lambda v: (np.ones(2), [None]), "Jacobian 0"),
+        (lambda v: (np.array([0.0, np.nan]), [np.zeros((2, 6))]), "NaN"),
+        (lambda v: ("text", [np.zeros((2, 6))]), "residual"),
+    ],
+)
+def test_a_users_faulty_factor_is_a_python_error(residual, message):
+    factor = factors.checked_factor(gtsam.noiseModel.Unit.Create(2), [KEY], residual)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose3())
+    with pytest.raises(InputError, match=message):
+        gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+
+
+def test_a_users_sound_factor_solves():
+    def height(values):
+        pose = values.atPose3(KEY)
+        row = np.zeros((1, 6))
+        row[0, 3:] = pose.rotation().matrix()[2]
+        return pose.translation()[2:] - 1.5, [row]
+
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(KEY, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
+    graph.add(factors.checked_factor(gtsam.noiseModel.Isotropic.Sigma(1, 1e-3), [KEY], height))
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose3())
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize().atPose3(KEY)
+    assert result.translation()[2] == pytest.approx(1.5, abs=1e-5)
+
+
+def test_checked_factor_takes_several_variables():
+    other = gtsam.symbol("v", 0)
+
+    def rest(values):
+        return values.atVector(other), [np.zeros((3, 6)), np.eye(3)]
+
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(gtsam.PriorFactorPose3(KEY, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
+    graph.add(factors.checked_factor(gtsam.noiseModel.Unit.Create(3), [KEY, other], rest))
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose3())
+    values.insert(other, np.array([1.0, 2.0, 3.0]))
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
+    np.testing.assert_allclose(result.atVector(other), 0, atol=1e-9)

@@ -97,7 +97,7 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
         facts = {"shown": f"sweep {number}"} | facts
         runnable = True
         break
-    if not runnable and not problems:
+    if len(dataset) == 0:
         problems.append("no sweeps in it")
     parts: list[Any] = [table]
     if facts:

@@ -137,7 +137,7 @@ def _root(
 @app.command()
 def demo(
     scene: Annotated[str, typer.Option(help="Built-in scene.")] = "street_loop",
-    frames: Annotated[int, typer.Option(min=1, help="Number of sweeps.")] = 100,
+    frames: Annotated[int, typer.Option(min=1, help="Number of sweeps.")] = 150,
     output: Output = None,
     overwrite: Overwrite = False,
     plot: Plot = None,

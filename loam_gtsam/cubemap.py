@@ -33,9 +33,11 @@ CubeIndex = tuple[int, int, int]
 _COS_VIEW = np.sqrt(3.0) / 2.0  # cos 30 degrees: LOAM's field of view is 30 to 150 off the up axis
 _VOXEL_LIMIT = (1 << 20) - 1  # voxels on either side of the origin that voxel_keys tells apart
 _ROUNDING = 1e-6  # metres; far above the rounding of a cube border, far below any distance of use
+_RECENT = 0.05  # a tree is rebuilt when points added since exceed this share of those in it
 # Measured on 100,000 voxel-sorted points: build 5.5 ms, against 8.4 ms with scipy's leaf of 16 and
 # 18 ms balanced and compact; queries are as fast.
 _TREE = {"leafsize": 32, "balanced_tree": False, "compact_nodes": False}
+_NO_POINTS: FloatArray = np.empty((0, 3))
 
 _log = logging.getLogger(__name__)
 
@@ -183,9 +185,10 @@ class CubeMap:
 
         With the policy ``centroid`` a voxel holds the mean of the point it had and the new ones,
         the old one counting once: what LOAM's voxel filter does to a cube after each sweep. With
-        ``settled`` the first point of a voxel stays, and a cube in which no new voxel got occupied
-        is unchanged and keeps its tree. Points outside the window, or beyond the voxel grid
-        (about 2^20 voxels from the origin), are not taken and counted in ``stats.outside``.
+        ``settled`` the first point of a voxel stays, a cube in which no new voxel got occupied is
+        unchanged, and the others keep their tree while few of their points are new. Points outside
+        the window, or beyond the voxel grid (about 2^20 voxels from the origin), are not taken and
+        counted in ``stats.outside``.
 
         Parameters
         ----------
@@ -250,8 +253,8 @@ class CubeMap:
 
         Notes
         -----
-        Between points at equal distance the choice depends on the map's points only: of two
-        cubes the one of lower index wins, inside a cube scipy's order of traversal decides.
+        The same calls in the same order give the same answer. Between points at equal distance
+        that of the cube of lower index goes first; inside a cube the order is unspecified.
         """
         queries = _finite(queries, "queries", (None, 3))
         if k < 1:
@@ -271,21 +274,15 @@ class CubeMap:
             rows = np.concatenate((alone, shared))
             if len(rows) == 0:
                 continue
-            cube = self._cubes[index]
-            distances, found = cube.tree.query(
-                queries.take(rows, axis=0), k, distance_upper_bound=max_distance
+            new_points, new_squared = self._cubes[index].nearest(
+                queries.take(rows, axis=0), k, max_distance
             )
-            new_squared = (distances * distances).reshape(-1, k)
-            new_points = cube.points.take(found.reshape(-1, k), axis=0, mode="clip")
-            new_points[np.isinf(new_squared)] = np.nan
             n = len(alone)
             points[alone], squared[alone] = new_points[:n], new_squared[:n]
             if len(shared):
-                both = np.concatenate((squared[shared], new_squared[n:]), axis=1)
-                pick = np.argsort(both, axis=1, kind="stable")[:, :k]
-                squared[shared] = np.take_along_axis(both, pick, axis=1)
-                pool = np.concatenate((points[shared], new_points[n:]), axis=1)
-                points[shared] = np.take_along_axis(pool, pick[:, :, None], axis=1)
+                points[shared], squared[shared] = _merge(
+                    points[shared], squared[shared], new_points[n:], new_squared[n:]
+                )
         return points, squared
 
     def points(
@@ -309,7 +306,7 @@ class CubeMap:
                     if stored is not None:
                         everywhere[index] = stored
             parts = [everywhere[index] for index in sorted(everywhere)]
-        return np.concatenate([np.empty((0, 3)), *parts])
+        return np.concatenate([_NO_POINTS, *parts])
 
     def count(self, cubes: Iterable[CubeIndex] | None = None) -> int:
         """Points in the given cubes, or in the whole window."""
@@ -357,25 +354,47 @@ class _Voxels(NamedTuple):
 
 
 class _Cube:
-    """Points sorted by voxel key, at most one a voxel, and their tree while they do not change."""
+    """Points sorted by voxel key, at most one a voxel, and a search structure.
 
-    __slots__ = ("_tree", "keys", "points")
+    A tree is kept while the points in it do not change. Points added later are searched in a small
+    tree of their own until there are too many. Measured (100,000 points, 800 queries): the first
+    search after an insert takes 2.5 ms instead of 7.5 ms, later ones 1.5 ms instead of 1.2 ms.
+    """
+
+    __slots__ = ("_recent", "_recent_tree", "_tree", "keys", "points")
 
     def __init__(self, keys: IntArray, points: FloatArray) -> None:
         self.keys = keys
         self.points = points
         self._tree: Any = None
+        self._recent_tree: Any = None
+        self._recent: FloatArray = _NO_POINTS
 
     @classmethod
     def empty(cls) -> _Cube:
-        return cls(np.empty(0, dtype=np.int64), np.empty((0, 3)))
+        return cls(np.empty(0, dtype=np.int64), _NO_POINTS)
 
-    @property
-    def tree(self) -> Any:
-        """Scipy cKDTree over ``points``; it shares their memory."""
-        if self._tree is None:
+    def nearest(
+        self, queries: FloatArray, k: int, max_distance: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`CubeMap.nearest`, in this cube."""
+        if self._tree is None or len(self._recent) > _RECENT * self._tree.n:
+            self._forget_tree()
             self._tree = cKDTree(self.points, **_TREE)
-        return self._tree
+        points, squared = _query(self._tree, queries, k, max_distance)
+        if len(self._recent):
+            if self._recent_tree is None:
+                self._recent_tree = cKDTree(self._recent, **_TREE)
+            more_points, more_squared = _query(self._recent_tree, queries, k, max_distance)
+            rows = np.flatnonzero(more_squared[:, 0] < squared[:, -1])
+            points[rows], squared[rows] = _merge(
+                points[rows], squared[rows], more_points[rows], more_squared[rows]
+            )
+        return points, squared
+
+    def _forget_tree(self) -> None:
+        self._tree = self._recent_tree = None
+        self._recent = _NO_POINTS
 
     def average(self, new: _Voxels) -> None:
         """Mean of the point a voxel has, if any, and the new ones."""
@@ -388,7 +407,7 @@ class _Cube:
         highs[taken] = np.maximum(highs[taken], old)
         # Rounding may put a mean just outside its points, and so into another voxel or cube.
         means = np.clip(sums / counts[:, None], lows, highs)
-        self._tree = None
+        self._forget_tree()  # it shares the memory of the points
         self.points[at[taken]] = means[taken]
         self._add(new.keys[~taken], means[~taken])
 
@@ -396,8 +415,10 @@ class _Cube:
         """The first point of each voxel that is free."""
         _, taken = self._find(new.keys)
         if not taken.all():
-            self._tree = None
             self._add(new.keys[~taken], new.firsts[~taken])
+            if self._tree is not None:
+                self._recent = np.concatenate((self._recent, new.firsts[~taken]))
+                self._recent_tree = None
 
     def _find(self, keys: IntArray) -> tuple[IntArray, BoolArray]:
         """Where the keys are or belong, and which are there."""
@@ -548,6 +569,31 @@ def _touching(
     for cell, start, stop in zip(cells, starts, stops, strict=True):
         touched = ((low[shared] <= cell) & (cell <= high[shared])).all(axis=1)
         yield alone[start:stop], shared[touched]
+
+
+def _query(
+    tree: Any, queries: FloatArray, k: int, max_distance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Points (M, k, 3) and squared distances (M, k) from a tree; NaN and infinite if missing."""
+    distances, found = tree.query(queries, k, distance_upper_bound=max_distance)
+    squared = (distances * distances).reshape(-1, k)
+    points = tree.data.take(found.reshape(-1, k), axis=0, mode="clip")
+    points[np.isinf(squared)] = np.nan
+    return points, squared
+
+
+def _merge(
+    points: FloatArray, squared: FloatArray, more_points: FloatArray, more_squared: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """The k nearest of two answers; at equal distance the first answer goes first."""
+    k = squared.shape[1]
+    squared = np.concatenate((squared, more_squared), axis=1)
+    points = np.concatenate((points, more_points), axis=1)
+    pick = np.argsort(squared, axis=1, kind="stable")[:, :k]
+    return (
+        np.take_along_axis(points, pick[:, :, None], axis=1),
+        np.take_along_axis(squared, pick, axis=1),
+    )
 
 
 def _index(cell: IntArray) -> CubeIndex:

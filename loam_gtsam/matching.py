@@ -125,20 +125,20 @@ def match_lines(
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
     centres, directions, eigenvalues = fit_lines(neighbours[near])
-    is_line = eigenvalues[:, 2] > config.line_ratio * eigenvalues[:, 1]
-    away = points_map[near] - centres
-    along = np.einsum("ni,ni->n", away, directions)
-    distances = np.sqrt(np.maximum(np.einsum("ni,ni->n", away, away) - along**2, 0.0))
+    is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
+    away = points_map[near].T - centres
+    along = _dot(away, directions)
+    distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))
     weights = 1.0 - config.weight_slope * distances
     keep = is_line & (weights > config.min_weight)
     # A line in space has four parameters, two for each of the directions across it.
-    leverage = along**2 / np.maximum(eigenvalues[:, 2], _TINY)
-    sigmas = _sigmas(eigenvalues[:, 1], leverage, 2, neighbours.shape[1], config)
+    leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
+    sigmas = _sigmas(eigenvalues[1], leverage, 2, neighbours.shape[1], config)
     indices = near[keep]
     return EdgeMatches(
         points[indices],
-        centres[keep],
-        directions[keep],
+        centres.T[keep],
+        directions.T[keep],
         distances[keep],
         sigmas[keep],
         weights[keep],
@@ -164,30 +164,38 @@ def match_planes(
     the point from the sensor (as in LIO-SAM), not from the map's origin.
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
-    centres, normals, wide, eigenvalues = fit_planes(neighbours[near])
-    across = np.einsum("nki,ni->nk", neighbours[near] - centres[:, None, :], normals)
-    is_plane = np.abs(across).max(axis=1, initial=0.0) <= config.plane_tolerance
-    is_plane &= eigenvalues[:, 1] > config.plane_ratio * eigenvalues[:, 2]
-    away = points_map[near] - centres
-    distances = np.einsum("ni,ni->n", away, normals)
-    ranges = np.linalg.norm(points[near], axis=1)
+    group = neighbours[near]
+    centres, normals, wide, eigenvalues = fit_planes(group)
+    offsets = -_dot(normals, centres)
+    across = _dot(group.transpose(2, 1, 0), normals[:, None, :]) + offsets
+    is_plane = np.abs(across).max(axis=0, initial=0.0) <= config.plane_tolerance
+    is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
+    away = points_map[near].T - centres
+    distances = _dot(away, normals)
+    ranges = np.sqrt(_dot(points[near].T, points[near].T))
     weights = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(np.maximum(ranges, _TINY))
     keep = is_plane & (weights > config.min_weight)
-    along = np.einsum("ni,ni->n", away, wide)
-    aside = np.einsum("ni,ni->n", away, np.cross(normals, wide))
-    leverage = along**2 / np.maximum(eigenvalues[:, 2], _TINY)
-    leverage += aside**2 / np.maximum(eigenvalues[:, 1], _TINY)
-    sigmas = _sigmas(eigenvalues[:, 0], leverage, 3, neighbours.shape[1], config)
+    along = _dot(away, wide)
+    aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)
+    leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
+    leverage += aside / np.maximum(eigenvalues[1], _TINY)
+    sigmas = _sigmas(eigenvalues[0], leverage, 3, neighbours.shape[1], config)
     indices = near[keep]
     return PlaneMatches(
         points[indices],
-        normals[keep],
-        -np.einsum("ni,ni->n", normals[keep], centres[keep]),
+        normals.T[keep],
+        offsets[keep],
         distances[keep],
         sigmas[keep],
         weights[keep],
         indices,
     )
+
+
+def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Dot products along the first axis, of length three."""
+    product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
 
 
 def _sigmas(

@@ -20,7 +20,7 @@ _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 _MAX_BYTES = 300_000
 """Larger pictures are reduced to ``_PALETTE`` colours: they are for READMEs and reports."""
-_PALETTE = 64
+_PALETTE = 128
 _MAP_CELLS = 700
 """Cells along the longer side of the top view; a picture has about as many pixels."""
 _MIN_CELL = 0.1
@@ -219,5 +219,7 @@ def _with_palette(png: io.BytesIO) -> io.BytesIO:
     from PIL import Image  # comes with matplotlib
 
     smaller = io.BytesIO()
-    Image.open(png).convert("RGB").quantize(_PALETTE).save(smaller, format="png", optimize=True)
+    # Maximum coverage keeps a colour that few pixels have: that of the path.
+    picture = Image.open(png).convert("RGB").quantize(_PALETTE, Image.Quantize.MAXCOVERAGE)
+    picture.save(smaller, format="png", optimize=True)
     return smaller

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from itertools import product
+from itertools import pairwise, product
 from pathlib import Path
 
 import gtsam
@@ -395,30 +395,53 @@ def test_rounding_cannot_move_a_centroid_out_of_its_voxel() -> None:
     np.testing.assert_array_equal(cube_map.points(), points[:1])
 
 
-def test_settled_keeps_first_points_and_trees() -> None:
+def test_settled_keeps_the_first_point_of_a_voxel() -> None:
     cube_map = CubeMap(small(insertion="settled"), 0.5)
     cube_map.insert(np.array([[0.1, 0.1, 0.1], [0.2, 0.1, 0.1], [4.1, 0.1, 0.1]]))
-    before = cube_map.points()
-    np.testing.assert_array_equal(before, [[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]])
-    cubes = cube_map.neighbourhood(np.eye(4))
-    cube_map.nearest(np.zeros((1, 3)), 1, 9.0, cubes)
-    trees = [cube_map._cubes[index].tree for index in cubes]
+    np.testing.assert_array_equal(cube_map.points(), [[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]])
     cube_map.insert(np.array([[0.3, 0.3, 0.3], [4.4, 0.1, 0.1], [4.6, 0.1, 0.1]]))
-    np.testing.assert_array_equal(cube_map.points(), [*before, [4.6, 0.1, 0.1]])
-    same = [cube_map._cubes[index].tree is tree for index, tree in zip(cubes, trees, strict=True)]
-    assert same == [True, False]
-    assert cube_map.nearest(np.array([[4.6, 0.1, 0.1]]), 1, 0.1, cubes)[1] == 0.0
+    np.testing.assert_array_equal(
+        cube_map.points(), [[0.1, 0.1, 0.1], [4.1, 0.1, 0.1], [4.6, 0.1, 0.1]]
+    )
 
 
-def test_centroid_drops_the_trees_it_changed() -> None:
+def test_settled_trees_are_kept_until_many_points_are_new_and_stay_exact() -> None:
+    cube_map = CubeMap(MapConfig(insertion="settled"), 0.4)
+    rng = np.random.default_rng(5)
+    cube_map.insert(rng.uniform(-8.0, 8.0, (3000, 3)))
+    queries = rng.uniform(-8.0, 8.0, (300, 3))
+    trees = []
+    for _ in range(15):
+        got = cube_map.nearest(queries, 5, 1.5, [(0, 0, 0)])
+        want = brute_force(cube_map.points(), queries, 5, 1.5)
+        np.testing.assert_array_equal(got[0], want[0])
+        np.testing.assert_allclose(got[1], want[1], rtol=1e-12)
+        trees.append(cube_map._cubes[0, 0, 0]._tree)
+        cube_map.insert(rng.uniform(-8.0, 8.0, (30, 3)))  # 1 % of the tree
+    assert [a is b for a, b in pairwise(trees)].count(False) == 2
+
+
+def test_settled_keeps_everything_of_an_unchanged_cube() -> None:
+    cube_map = CubeMap(small(insertion="settled"), 0.5)
+    points = np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]])
+    cube_map.insert(points)
+    cube_map.nearest(points, 1, 9.0, [(0, 0, 0), (1, 0, 0)])
+    before = {index: (cube._tree, cube.points) for index, cube in cube_map._cubes.items()}
+    cube_map.insert(points + 0.1)
+    for index, cube in cube_map._cubes.items():
+        assert cube._tree is before[index][0]
+        assert cube.points is before[index][1]
+
+
+def test_centroid_drops_only_the_trees_it_changed() -> None:
     cube_map = CubeMap(SMALL, 0.5)
     cube_map.insert(np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]]))
     cubes = cube_map.neighbourhood(np.eye(4))
     cube_map.nearest(np.zeros((1, 3)), 1, 9.0, cubes)
-    trees = [cube_map._cubes[index].tree for index in cubes]
+    kept = cube_map._cubes[1, 0, 0]._tree
     cube_map.insert(np.array([[0.3, 0.1, 0.1]]))
-    same = [cube_map._cubes[index].tree is tree for index, tree in zip(cubes, trees, strict=True)]
-    assert same == [False, True]
+    assert cube_map._cubes[0, 0, 0]._tree is None
+    assert cube_map._cubes[1, 0, 0]._tree is kept
     assert cube_map.nearest(np.array([[0.2, 0.1, 0.1]]), 1, 0.5, cubes)[1] < 1e-30
 
 

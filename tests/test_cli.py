@@ -1,0 +1,424 @@
+"""The command line: what it writes, says and returns, above all when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from loam_gtsam import _cli_run, cli, visualization
+from loam_gtsam.config import Config, config_to_dict, load_config
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.simulation import SimulatedWorld
+from loam_gtsam.export import RUN_FILES, read_tum
+from loam_gtsam.types import BadSweep, DatasetError, Scan
+
+FRAMES = 4
+PLOTS = visualization.available()
+
+
+def loam(*arguments: object) -> Result:
+    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+
+
+@pytest.fixture(autouse=True)
+def _wide_screen_in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "300")
+
+
+class FakeDataset:
+    """Sweeps from a list; an exception in it is raised when its turn comes."""
+
+    name = "fake [bold]data[/bold]"
+    sensor: dict[str, object] = {}  # noqa: RUF012
+    imu = None
+    truth = None
+
+    def __init__(self, items):
+        self.items = items
+
+    def __len__(self):
+        return len(self.items)
+
+    def __iter__(self):
+        for item in self.items:
+            if isinstance(item, Exception):
+                raise item
+            yield item
+
+    def info(self):
+        return DatasetInfo("fake", "nowhere", {"fields": "x [y] z"}, ["a [red]small[/red] problem"])
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Scan]:
+    return list(SimulatedWorld("room", frames=FRAMES))
+
+
+@pytest.fixture
+def opens(monkeypatch):
+    """Make every path open as a list of sweeps."""
+
+    def patch(items):
+        monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: FakeDataset(items))
+
+    return patch
+
+
+def files_in(folder: Path | str) -> set[str]:
+    return {path.name for path in Path(folder).iterdir()}
+
+
+def one_line(result: Result) -> str:
+    return " ".join(result.output.split())
+
+
+# -- what a good run gives ---------------------------------------------------------------------
+
+
+def test_demo_writes_everything_and_says_how_accurate_it_is():
+    result = loam("demo", "--scene", "room", "--frames", FRAMES, "--profile")
+    assert result.exit_code == 0, result.output
+    folder = Path("loam_gtsam_output/room_vlp16")
+    plots = set(_cli_run.PLOT_FILES) if PLOTS else set()
+    assert files_in(folder) == {*RUN_FILES, "truth.tum"} | plots
+    accuracy = json.loads((folder / "summary.json").read_text())["accuracy"]
+    assert accuracy["compared_poses"] == FRAMES
+    assert accuracy["ate_rmse_m"] < 0.05
+    assert f"ATE {accuracy['ate_rmse_m']:.3f} m" in one_line(result)
+    assert str(folder) in one_line(result)
+    for word in ("features", "match", "median", "95 %", "share", "loam-gtsam run PATH"):
+        assert word in result.output
+
+
+def test_run_opens_built_in_worlds_and_uses_every_option():
+    result = loam(
+        "run", "sim:room?frames=9", "--frames", 3, "--output", "out", "--no-plot",
+        "--sensor", "vlp16", "--set", "solver.iterations=7", "--set", "map.window=[11, 11, 5]",
+        "--set", "deskew.enabled=false", "--option", "seed=3",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert files_in("out") == {*RUN_FILES, "truth.tum"}
+    config = load_config("out/config.yaml")
+    assert config.sensor.model == "vlp16"
+    assert config.solver.iterations == 7
+    assert config.map.window == (11, 11, 5)
+    assert config.deskew.enabled is False
+    assert len(read_tum("out/trajectory.tum")) == 3
+    assert json.loads(Path("out/summary.json").read_text())["input"]["facts"]["seed"] == "3"
+
+
+def test_a_configuration_file_is_used_and_set_wins_over_it():
+    Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
+    arguments = ["run", "sim:room", "--frames", 1, "--no-plot", "--output", "out"]
+    result = loam(*arguments, "--config", "mine.yaml", "--set", "solver.iterations=4")
+    assert result.exit_code == 0, result.output
+    solver = load_config("out/config.yaml").solver
+    assert (solver.iterations, solver.min_matches) == (4, 20)
+
+
+def test_an_earlier_run_is_kept_unless_overwrite_is_given(opens, scans):
+    opens(scans[:2])
+    for folder in ("out", "out-2", "out-3"):
+        result = loam("run", "x", "--no-plot", "--output", "out")
+        assert result.exit_code == 0
+        assert f"Written to {folder}: " in one_line(result)
+    Path("out/trajectory.png").write_text("of the earlier run")
+    opens(scans[:3])
+    assert loam("run", "x", "--no-plot", "--output", "out", "--overwrite").exit_code == 0
+    assert len(read_tum("out/trajectory.tum")) == 3
+    assert len(read_tum("out-2/trajectory.tum")) == 2
+    assert files_in("out") == set(RUN_FILES)
+    assert not Path("out-4").exists()
+
+
+def test_a_folder_with_other_files_is_used_as_it_is(opens, scans):
+    opens(scans[:1])
+    Path("out").mkdir()
+    Path("out/notes.md").write_text("mine")
+    assert loam("run", "x", "--no-plot", "--output", "out").exit_code == 0
+    assert files_in("out") == {*RUN_FILES, "notes.md"}
+
+
+def test_quiet_prints_nothing(opens, scans):
+    opens(scans[:2])
+    result = loam("run", "x", "--quiet", "--output", "out")
+    assert (result.exit_code, result.output) == (0, "")
+    assert "summary.json" in files_in("out")
+
+
+def test_text_of_the_data_is_never_taken_for_markup(opens, scans):
+    opens(scans[:2])
+    assert "fake [bold]data[/bold]" in loam("run", "x", "--no-plot").output
+    output = loam("inspect", "x").output
+    assert "x [y] z" in output
+    assert "a [red]small[/red] problem" in output
+
+
+# -- what is odd, and what is wrong ------------------------------------------------------------
+
+
+def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
+    bad = [BadSweep(scans[2].stamp + n, f"damaged {n}") for n in range(1, 7)]
+    opens([*scans[:3], *bad])
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 0
+    assert "1 first, 2 ok, 6 unusable_scan" in result.output
+    assert [n for n in range(1, 7) if f"damaged {n}" in result.output] == [1, 2, 3]
+    assert "and 3 more" in result.output
+    with np.load("out/run.npz") as data:
+        assert data["messages"][-1] == "damaged 6"
+
+
+def test_a_run_in_which_no_sweep_is_usable_fails(opens):
+    opens([BadSweep(n, f"damaged {n}") for n in range(3)])
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 1
+    assert "none of the 3 sweeps could be used; the first: damaged 0" in one_line(result)
+    assert "run.npz" in files_in("out")
+
+
+def test_an_empty_data_set_fails(opens):
+    opens([])
+    result = loam("run", "x", "--output", "out")
+    assert result.exit_code == 1
+    assert "no sweeps" in result.output
+    assert files_in("out") == set()
+
+
+@pytest.mark.parametrize("error", [DatasetError("the bag breaks off"), RuntimeError("oops")])
+def test_an_error_in_the_middle_keeps_what_was_computed(opens, scans, error):
+    opens([*scans[:3], error, scans[3]])
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 1
+    assert len(read_tum("out/trajectory.tum")) == 3
+    assert str(error) in json.loads(Path("out/summary.json").read_text())["error"]
+    if isinstance(error, DatasetError):
+        assert "error: the bag breaks off" in result.output
+    else:  # a mistake of ours keeps its traceback
+        assert result.exception is error
+
+
+def test_an_error_before_the_first_frame_is_told(opens):
+    opens([DatasetError("the bag is damaged")])
+    result = loam("run", "x", "--output", "out")
+    assert result.exit_code == 1
+    assert "error: the bag is damaged" in result.output
+
+
+def test_errors_are_one_message_and_debug_shows_the_traceback():
+    result = loam("run", "missing/folder")
+    assert result.exit_code == 1
+    assert result.output.startswith("error: missing/folder: ")
+    assert "Traceback" not in result.output
+    assert isinstance(loam("run", "missing/folder", "--debug").exception, DatasetError)
+
+
+def test_an_output_folder_that_cannot_be_made_is_found_before_the_run(opens):
+    opens([RuntimeError("the run has begun")])
+    Path("file").write_text("")
+    result = loam("run", "x", "--output", "file/out")
+    assert result.exit_code == 1
+    assert "file/out: cannot make this output folder" in one_line(result)
+
+
+def test_plots_without_matplotlib(opens, scans, monkeypatch):
+    monkeypatch.setattr(visualization, "available", lambda: False)
+    opens(scans[:1])
+    assert loam("run", "x", "--output", "a").exit_code == 0
+    assert files_in("a") == set(RUN_FILES)
+    result = loam("run", "x", "--output", "b", "--plot")
+    assert result.exit_code == 1
+    assert 'pip install "loam_gtsam[plot]"' in result.output
+    assert not Path("b").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--set", "solver.iteratons=3"], 1, "did you mean 'iterations'"),
+        (["--set", "solver.iterations=many"], 1, "--set solver.iterations=many"),
+        (["--set", "solver.iterations.x=1"], 1, "expected int"),
+        (["--set", "solver=1"], 2, "expected SECTION.KEY=VALUE"),
+        (["--set", "solver.iterations"], 2, "expected KEY=VALUE"),
+        (["--set", "solver.iterations={"], 2, "is not a YAML value"),
+        (["--option", "=1"], 2, "expected KEY=VALUE"),
+        (["--option", "nonsense=1"], 1, "nonsense"),
+        (["--sensor", "vlp17"], 1, "did you mean 'vlp16'"),
+        (["--preset", "nothing"], 1, "unknown preset 'nothing'"),
+        (["--config", "absent.yaml"], 1, "absent.yaml: cannot read"),
+        (["--preset", "default", "--config", "x.yaml"], 2, "not both"),
+        (["--frames", "0"], 2, "--frames"),
+        (["--nonsense"], 2, "nonsense"),
+    ],
+)
+def test_wrong_options_say_what_was_expected(arguments, code, message):
+    result = loam("run", "sim:room", "--quiet", "--no-plot", *arguments)
+    assert result.exit_code == code, result.output
+    assert message in one_line(result)
+
+
+# -- the other commands ------------------------------------------------------------------------
+
+
+def test_inspect_shows_what_was_understood():
+    result = loam("inspect", "sim:room")
+    assert result.exit_code == 0, result.output
+    for text in (
+        "simulated world",
+        "16 rings from the ring field",
+        "per-point times",
+        "can be run",
+    ):
+        assert text in one_line(result)
+
+
+def test_inspect_looks_past_a_bad_first_sweep(opens, scans):
+    opens([BadSweep(0, "damaged"), scans[0]])
+    result = loam("inspect", "x")
+    assert result.exit_code == 0
+    assert "sweep 0: damaged" in result.output
+    assert "sweep 1" in result.output
+
+
+@pytest.mark.parametrize(
+    ("items", "problem"),
+    [
+        ([BadSweep(n, f"damaged {n}") for n in range(9)], "sweep 4: damaged 4"),
+        ([Scan(np.full((50, 3), np.nan), 0)], "sweep of 50 points, 0 finite"),
+        ([], "no sweeps"),
+    ],
+)
+def test_inspect_fails_on_what_cannot_be_run(opens, items, problem):
+    opens(items)
+    result = loam("inspect", "x")
+    assert result.exit_code == 1
+    assert problem in one_line(result)
+    assert "cannot be run" in result.output
+    assert "damaged 5" not in result.output
+
+
+def test_config_prints_and_writes_what_can_be_loaded():
+    result = loam("config")
+    assert result.exit_code == 0
+    assert "# edge length of a cube [m] (LOAM)" in result.output
+    assert loam("config", "--output", "c.yaml").exit_code == 0
+    assert Path("c.yaml").read_text() == result.output
+    assert config_to_dict(load_config("c.yaml")) == config_to_dict(Config())
+
+
+def test_config_does_not_replace_a_file_unasked():
+    Path("c.yaml").write_text("mine")
+    result = loam("config", "--output", "c.yaml")
+    assert result.exit_code == 1
+    assert "c.yaml: the file exists" in result.output
+    assert Path("c.yaml").read_text() == "mine"
+    assert loam("config", "--output", "c.yaml", "--overwrite").exit_code == 0
+    assert Path("c.yaml").read_text() != "mine"
+
+
+def test_version_names_what_matters_in_a_bug_report():
+    result = loam("--version")
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.output.splitlines()] == [
+        "loam_gtsam", "gtsam", "numpy", "python",
+    ]  # fmt: skip
+
+
+# -- stopping ----------------------------------------------------------------------------------
+
+_ENDLESS = """
+import itertools, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal
+import loam_gtsam.datasets
+from loam_gtsam.cli import main
+from loam_gtsam.datasets.simulation import SimulatedWorld
+
+pause = float(sys.argv.pop())
+
+class Endless(SimulatedWorld):
+    def __iter__(self):
+        first = next(iter(super().__iter__()))
+        for number in itertools.count():
+            if number == 3:
+                print("ready", flush=True)
+                time.sleep(pause)
+            yield first.__class__(
+                first.points, first.stamp + number * 10**8, first.times, first.rings, first.span
+            )
+
+loam_gtsam.datasets.open_dataset = lambda *a, **k: Endless("room", frames=1000)
+main()
+"""
+
+
+def start_endless_run(pause: float) -> subprocess.Popen[str]:
+    """A run that goes on for ever; returns when it reads its fourth sweep, ``pause`` s long."""
+    command = ["run", "x", "--output", "out", "--no-plot", str(pause)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _ENDLESS, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"COLUMNS": "300"},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_stops_after_the_frame_and_everything_is_written(number):
+    process = start_endless_run(pause=0.05)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, errors
+    assert errors == ""
+    frames = len(read_tum("out/trajectory.tum"))
+    assert frames >= 4
+    assert f"Stopped by {number.name} after frame {frames} of 1000" in output
+    assert files_in("out") >= set(RUN_FILES)
+    assert not [name for name in files_in("out") if name.endswith(".tmp")]
+    with np.load("out/run.npz") as data:
+        assert len(data["stamps"]) == frames
+    summary = json.loads(Path("out/summary.json").read_text())
+    assert (summary["interrupted"], summary["frames"]) == (True, frames)
+
+
+def test_a_second_signal_ends_the_process_at_once():
+    process = start_endless_run(pause=600.0)
+    for _ in range(300):
+        process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=0.1)
+            break
+        except subprocess.TimeoutExpired:
+            continue
+    assert process.returncode == -signal.SIGINT
+    assert files_in("out") == set()
+
+
+def test_handlers_are_put_back():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with _cli_run.stop_requests() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.signum == signal.SIGTERM
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_an_ignored_signal_stays_ignored(monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with _cli_run.stop_requests() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stop.signum is None
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -27,8 +27,14 @@ _MIN_PATH = 10.0
 """Metres. An error in per cent of a shorter path says nothing."""
 
 
-def summary(result: RunResult, name: str, seconds: float, accuracy: dict[str, Any]) -> Group:
-    """Frames, statuses, accuracy, and the first messages of frames that were not fine."""
+def summary(
+    result: RunResult,
+    name: str,
+    seconds: float,
+    accuracy: dict[str, Any],
+    problems: Sequence[str] = (),
+) -> Group:
+    """Frames, statuses, accuracy, and the first messages of what was not fine."""
     table = _table(name)
     frames = len(result.updates)
     table.add_row("frames", f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)")
@@ -48,7 +54,8 @@ def summary(result: RunResult, name: str, seconds: float, accuracy: dict[str, An
         share = f" ({100.0 * error / length:.3f} % of the path)" if length >= _MIN_PATH else ""
         text = f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
         table.add_row("accuracy", text)
-    return Group(table, *_notes(result.updates))
+    about_input = [Text(f"  input: {problem}", style="yellow") for problem in problems]
+    return Group(table, *about_input, *_notes(result.updates))
 
 
 def _notes(updates: Sequence[MapUpdate]) -> list[Text]:

@@ -28,11 +28,11 @@ from rich.progress import (
 from loam_gtsam import visualization
 from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.evaluation import absolute_error, align, interpolate
 from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
 from loam_gtsam.pipeline import OnFrame, RunResult, run
-from loam_gtsam.types import DatasetError, InputError, MapUpdate, OutputError, Trajectory
+from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
 
 PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
 TRUTH_FILE = "truth.tum"
@@ -79,12 +79,13 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
                 f"{dataset.name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
             )
         accuracy, truth = compare(result.trajectory, dataset.truth)
-        files = _write(result, dataset, folder, plot, accuracy, truth)
+        info = _input_info(dataset)
+        files = _write(result, dataset, info, folder, plot, accuracy, truth)
     if not options.quiet:
         console = Console()
         if options.profile:
             console.print(profile_table(result.updates))
-        console.print(summary(result, dataset.name, seconds, accuracy))
+        console.print(summary(result, dataset.name, seconds, accuracy, info.problems))
         if stop.signum is not None:
             name = signal.Signals(stop.signum).name
             done = f"after frame {len(result.updates)} of {total}"
@@ -120,11 +121,12 @@ def compare(
         return {}, None
     try:
         error = absolute_error(trajectory, truth)
-    except InputError as problem:
+    except ValueError as problem:  # no overlap in time, or stamps of the truth that repeat
         return {"problem": str(problem)}, None
     there = interpolate(truth, error.stamps)
-    here = interpolate(trajectory, error.stamps)
-    map_T_truth = align(there.map_T_lidar[:, :3, 3], here.map_T_lidar[:, :3, 3])
+    inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
+    here = trajectory.map_T_lidar[inside]
+    map_T_truth = align(there.map_T_lidar[:, :3, 3], here[:, :3, 3])
     accuracy = {
         "ate_rmse_m": error.rmse,
         "ate_max_m": error.maximum,
@@ -134,9 +136,18 @@ def compare(
     return accuracy, Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
 
 
+def _input_info(dataset: Dataset) -> DatasetInfo:
+    """What is known of the input after the run; must not cost the results if it is damaged."""
+    try:
+        return dataset.info()
+    except LoamError as error:
+        return DatasetInfo("data set", dataset.name, problems=[str(error)])
+
+
 def _write(
     result: RunResult,
     dataset: Dataset,
+    info: DatasetInfo,
     folder: Path,
     plot: bool,
     accuracy: dict[str, Any],
@@ -146,9 +157,8 @@ def _write(
     # A picture or a truth of the run that is being replaced would not belong to this one.
     for name in (*PLOT_FILES, TRUTH_FILE):
         (folder / name).unlink(missing_ok=True)
-    info = asdict(dataset.info())
-    extra = {"accuracy": accuracy or None, "input": info}
-    write_run(result, folder, dataset=f"{info['kind']} {info['path']}", extra=extra)
+    extra = {"accuracy": accuracy or None, "input": asdict(info)}
+    write_run(result, folder, dataset=f"{info.kind} {info.path}", extra=extra)
     files = list(RUN_FILES)
     if dataset.truth is not None:
         write_tum(folder / TRUTH_FILE, dataset.truth)

@@ -18,7 +18,7 @@ from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.export import RUN_FILES, read_tum
-from loam_gtsam.types import BadSweep, DatasetError, Scan
+from loam_gtsam.types import BadSweep, DatasetError, Scan, Trajectory
 
 FRAMES = 4
 PLOTS = visualization.available()
@@ -192,6 +192,34 @@ def test_an_empty_data_set_fails(opens):
     assert result.exit_code == 1
     assert "no sweeps" in result.output
     assert files_in("out") == set()
+
+
+def test_a_truth_that_cannot_be_compared_is_told_and_costs_nothing(opens, scans, monkeypatch):
+    opens(scans)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    first, last = scans[0].stamp, scans[-1].stamp
+    for stamps, problem in (([1, 2, 3, 4], "3 or more poses"), ([first, first, last, last], "")):
+        truth = Trajectory(np.array(stamps, np.int64), poses)
+        monkeypatch.setattr(FakeDataset, "truth", truth)
+        result = loam("run", "x", "--no-plot", "--output", "out", "--overwrite")
+        assert result.exit_code == 0, result.output
+        assert problem in result.output
+        assert problem in json.loads(Path("out/summary.json").read_text())["accuracy"]["problem"]
+        assert len(read_tum("out/trajectory.tum")) == len(scans)
+
+
+def test_what_is_odd_about_the_input_is_told_after_a_run(opens, scans, monkeypatch):
+    opens(scans[:1])
+    assert "input: a [red]small[/red] problem" in loam("run", "x", "--no-plot").output
+
+    def damaged(self):
+        raise DatasetError("the index is gone")
+
+    monkeypatch.setattr(FakeDataset, "info", damaged)
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 0
+    assert "input: the index is gone" in result.output
+    assert files_in("out") == set(RUN_FILES)
 
 
 @pytest.mark.parametrize("error", [DatasetError("the bag breaks off"), RuntimeError("oops")])

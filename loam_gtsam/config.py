@@ -230,8 +230,8 @@ class MapConfig(_Section):
     )
     edge_voxel: float = _param(0.2, "voxel of the edge map", unit="m", source="LOAM", low=0.01)
     plane_voxel: float = _param(0.4, "voxel of the plane map", unit="m", source="LOAM", low=0.01)
-    insertion: Literal["centroid", "settled"] = _param(
-        "centroid",
+    insertion: Literal["settled", "centroid"] = _param(
+        "settled",
         "centroid re-filters a cube with its new points as LOAM does; settled keeps the first "
         "point of a voxel",
     )
@@ -254,7 +254,10 @@ class MatchingConfig(_Section):
         1.0, "distance of the farthest of them", unit="m", source="LOAM", low=0.0
     )
     line_ratio: float = _param(
-        3.0, "a line needs its largest eigenvalue above this times the second", source="LOAM", low=1
+        10.0,
+        "a line needs its largest eigenvalue above this times the second",
+        source="LOAM uses 3",
+        low=1.0,
     )
     plane_tolerance: float = _param(
         0.2, "farthest of the five from the plane", unit="m", source="LOAM", low=0.0
@@ -263,6 +266,15 @@ class MatchingConfig(_Section):
         0.1,
         "a plane needs its second eigenvalue above this times the largest: five points along one "
         "ring of a sparse sensor have no normal",
+        low=0.0,
+        high=1.0,
+    )
+    max_ring_cosine: float = _param(
+        0.5, "an edge line may not run along the ring: largest cosine between the two", low=0.0
+    )
+    min_incidence_sine: float = _param(
+        0.05,
+        "a plane may not contain the viewing ray: least sine of the angle between the two",
         low=0.0,
         high=1.0,
     )

@@ -103,9 +103,9 @@ def associate(
     pose = map_T_lidar.matrix()
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
     near = edge_map.nearest(edges_map, config.neighbours, config.max_distance, edge_cubes)
-    edge_matches = match_lines(edges, edges_map, *near, config)
+    edge_matches = match_lines(edges, edges_map, *near, pose, config)
     near = plane_map.nearest(planes_map, config.neighbours, config.max_distance, plane_cubes)
-    return ScanMatches(edge_matches, match_planes(planes, planes_map, *near, config))
+    return ScanMatches(edge_matches, match_planes(planes, planes_map, *near, pose, config))
 
 
 def match_lines(
@@ -113,19 +113,27 @@ def match_lines(
     points_map: FloatArray,
     neighbours: FloatArray,
     squared_distances: FloatArray,
+    map_T_lidar: FloatArray,
     config: MatchingConfig,
 ) -> EdgeMatches:
     """Lines through neighbours that form one (LOAM, Section VI; constants in the config).
+
+    An edge is found as a break along its ring, so its line crosses the ring. Neighbours that lie
+    along the ring are not an edge but the trace of one beam on rough ground or foliage, which
+    moves with the sensor: such lines are rejected, or they would hold the pose where it was.
 
     Parameters
     ----------
     points, points_map : (N, 3) features in the lidar and in the map frame
     neighbours : (N, k, 3) their nearest map points
     squared_distances : (N, k) m^2, ascending, inf where missing
+    map_T_lidar : (4, 4) the pose; the rings go round its z axis
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
     centres, directions, eigenvalues = fit_lines(neighbours[near])
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
+    ring = _cross(map_T_lidar[:3, 2], points_map[near].T - map_T_lidar[:3, 3:])
+    is_line &= np.abs(_dot(directions, ring)) <= config.max_ring_cosine * _norm(ring)
     away = points_map[near].T - centres
     along = _dot(away, directions)
     distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))
@@ -151,9 +159,14 @@ def match_planes(
     points_map: FloatArray,
     neighbours: FloatArray,
     squared_distances: FloatArray,
+    map_T_lidar: FloatArray,
     config: MatchingConfig,
 ) -> PlaneMatches:
     """Planes through neighbours that form one (LOAM, Section VI; constants in the config).
+
+    Scattered returns of one beam (foliage, grass) lie in the surface that the beam sweeps. A plane
+    through them is no surface of the world but that of the scan, and holds the pose where it was;
+    it shows by containing the viewing ray, and is rejected.
 
     Parameters are those of :func:`match_lines`.
 
@@ -172,7 +185,9 @@ def match_planes(
     is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
     away = points_map[near].T - centres
     distances = _dot(away, normals)
-    ranges = np.sqrt(_dot(points[near].T, points[near].T))
+    rays = points_map[near].T - map_T_lidar[:3, 3:]
+    ranges = _norm(rays)
+    is_plane &= np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
     weights = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(np.maximum(ranges, _TINY))
     keep = is_plane & (weights > config.min_weight)
     along = _dot(away, wide)
@@ -195,6 +210,25 @@ def match_planes(
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
     """Dot products along the first axis, of length three."""
     product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
+
+
+def _norm(vectors: FloatArray) -> FloatArray:
+    """Lengths of vectors along the first axis."""
+    length: FloatArray = np.sqrt(_dot(vectors, vectors))
+    return length
+
+
+def _cross(vector: FloatArray, others: FloatArray) -> FloatArray:
+    """Cross products of one vector (3,) with others (3, N)."""
+    x, y, z = vector
+    product: FloatArray = np.stack(
+        [
+            y * others[2] - z * others[1],
+            z * others[0] - x * others[2],
+            x * others[1] - y * others[0],
+        ]
+    )
     return product
 
 

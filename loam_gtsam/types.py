@@ -251,6 +251,7 @@ class FrameStatus(StrEnum):
 
     @property
     def solved(self) -> bool:
+        """Whether the pose comes from a solve."""
         return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED)
 
 

@@ -82,9 +82,7 @@ def test_line_residual_is_loams_distance_and_smooth_on_the_line():
         distance = np.linalg.norm(np.cross(moved - centre, direction))
         np.testing.assert_allclose(np.linalg.norm(residual), distance, rtol=1e-10)
         on_line = POSES[2].transformTo(centre + 3 * direction)
-        residual, jacobian = factors.point_to_line_residual(
-            POSES[2], on_line, centre, direction
-        )
+        residual, jacobian = factors.point_to_line_residual(POSES[2], on_line, centre, direction)
         np.testing.assert_allclose(residual, 0, atol=1e-12)
         assert np.linalg.matrix_rank(jacobian) == 2
 

@@ -46,7 +46,9 @@ class Dataset(Protocol):
         ...
 
     @property
-    def imu(self) -> ImuSamples | None: ...
+    def imu(self) -> ImuSamples | None:
+        """All IMU data if there is any."""
+        ...
 
     @property
     def truth(self) -> Trajectory | None:

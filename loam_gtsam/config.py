@@ -314,8 +314,12 @@ class SolverConfig(_Section):
         0.0005, "and less than this", unit="m", source="LOAM", low=0.0
     )
     min_matches: int = _param(50, "fewer matches: no solve", source="LOAM", low=6)
-    min_map_edges: int = _param(10, "the local map needs more edge points", source="LOAM", low=0)
-    min_map_planes: int = _param(100, "and more plane points", source="LOAM", low=0)
+    min_map_edges: int = _param(
+        0, "least edge points of the local map for a solve", source="LOAM uses 11", low=0
+    )
+    min_map_planes: int = _param(
+        50, "least plane points of the local map", source="A-LOAM uses 51, LOAM 101", low=0
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -69,11 +69,7 @@ class Mapper:
         clock = _Clock()
         last = self.last
         if last is not None and features.stamp <= last.stamp:
-            return self.skip(
-                features.stamp,
-                f"stamp {features.stamp} ns is not later than the last one, {last.stamp} ns",
-                FrameStatus.BAD_STAMP,
-            )
+            return self.skip(features.stamp, "")
         predicted = ConstantVelocity().guess(features, last)
         start = Guess(
             predicted.map_T_lidar if guess is None else guess,
@@ -93,26 +89,31 @@ class Mapper:
         self.last = update
         return update
 
-    def skip(
-        self, stamp: int, message: str, status: FrameStatus = FrameStatus.UNUSABLE_SCAN
-    ) -> MapUpdate:
+    def skip(self, stamp: int, message: str) -> MapUpdate:
         """Account for a sweep that cannot be used: the pose is predicted, the map unchanged.
 
         Parameters
         ----------
         stamp : nanoseconds
         message : why
-        status : ``UNUSABLE_SCAN`` or ``BAD_STAMP``
+
+        Returns
+        -------
+        MapUpdate
+            With status ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp is not later than the last
+            one.
         """
         last = self.last
         if last is None:
-            return MapUpdate(stamp, gtsam.Pose3(), status, message)
-        seconds = max(stamp - last.stamp, 0) * 1e-9
-        pose = advance(last.map_T_lidar, last.twist, seconds)
-        update = MapUpdate(stamp, pose, status, message, twist=last.twist)
-        if stamp > last.stamp:
-            self.last = update
-        return update
+            return MapUpdate(stamp, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN, message)
+        if stamp <= last.stamp:
+            message = f"stamp {stamp} ns is not later than the last one, {last.stamp} ns"
+            return MapUpdate(
+                stamp, last.map_T_lidar, FrameStatus.BAD_STAMP, message, twist=last.twist
+            )
+        pose = advance(last.map_T_lidar, last.twist, (stamp - last.stamp) * 1e-9)
+        self.last = MapUpdate(stamp, pose, FrameStatus.UNUSABLE_SCAN, message, twist=last.twist)
+        return self.last
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
@@ -129,21 +130,29 @@ class Mapper:
     ) -> MapUpdate:
         """Match the sweep with the map around the guess, solve, insert."""
         middle = advance(guess.map_T_lidar, guess.twist, sweep.middle)
+        sizes = []
         for cubes in (self.edge_map, self.plane_map):
             cubes.recenter(middle.translation())
-        edge_cubes = self.edge_map.neighbourhood(middle.matrix())
-        plane_cubes = self.plane_map.neighbourhood(middle.matrix())
+            sizes.append(cubes.count(cubes.neighbourhood(middle.matrix())))
         config = self.config.solver
-        n_edges, n_planes = self.edge_map.count(edge_cubes), self.plane_map.count(plane_cubes)
-        if n_edges <= config.min_map_edges or n_planes <= config.min_map_planes:
+        if sizes[0] < config.min_map_edges or sizes[1] < config.min_map_planes:
+            self._first = None
             message = (
-                f"the local map has {n_edges} edge and {n_planes} plane points; more than "
+                f"the local map has {sizes[0]} edge and {sizes[1]} plane points; at least "
                 f"{config.min_map_edges} and {config.min_map_planes} are needed"
             )
             return self._insert(sweep, guess, FrameStatus.SPARSE_MAP, message, clock)
 
+        associations = 0
+
         def matches_at(map_T_lidar: gtsam.Pose3) -> ScanMatches:
+            nonlocal associations
             clock.lap("solve")
+            associations += 1
+            if associations == 2 and self._first is None:
+                # The first solve knows the motion better than the guess. Once is enough: further
+                # rounds cost associations and change nothing that can be measured.
+                sweep.deskew(self._twist(sweep, map_T_lidar, guess.twist))
             matches = associate(
                 sweep.edges,
                 sweep.planes,
@@ -151,8 +160,6 @@ class Mapper:
                 self.edge_map,
                 self.plane_map,
                 self.config.matching,
-                edge_cubes,
-                plane_cubes,
             )
             clock.lap("match")
             return matches
@@ -241,11 +248,11 @@ class _Sweep:
     """The voxel-filtered features of a sweep, de-skewed to its middle."""
 
     def __init__(self, features: Features, config: Config) -> None:
-        moving = config.deskew.enabled
-        self.middle = 0.5 * (features.span[0] + features.span[1]) if moving else 0.0
+        first, end = features.span
+        self._moving = config.deskew.enabled and end > first
+        self.middle = 0.5 * (first + end) if self._moving else 0.0
         self.reference_stamp = features.stamp
         self.stamp = features.stamp + round(self.middle * 1e9)
-        self._moving = moving
         self._edges, self._planes = (
             voxel_filter(np.column_stack([points, times]), size)
             for points, times, size in (
@@ -302,6 +309,9 @@ def _report(
     )
     if solution is None:
         return update
+    # The solve is about the middle of the sweep; a right perturbation there is, at the reference
+    # time, the same one seen through the motion between the two.
+    to_middle = gtsam.Pose3.Expmap(-result.twist * sweep.middle).AdjointMap()
     return replace(
         update,
         n_edge_matches=len(solution.matches.edges),
@@ -310,5 +320,5 @@ def _report(
         solver_iterations=solution.solver_iterations,
         error_before=solution.error_before,
         error_after=solution.error_after,
-        information=solution.information,
+        information=to_middle.T @ solution.information @ to_middle,
     )

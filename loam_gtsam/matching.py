@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import MatchingConfig
-from loam_gtsam.cubemap import CubeIndex, CubeMap
+from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import fit_lines, fit_planes, transform
 from loam_gtsam.types import FloatArray, IntArray
 
@@ -88,24 +88,24 @@ def associate(
     edge_map: CubeMap,
     plane_map: CubeMap,
     config: MatchingConfig,
-    edge_cubes: tuple[CubeIndex, ...],
-    plane_cubes: tuple[CubeIndex, ...],
 ) -> ScanMatches:
-    """Match de-skewed features with the map at a pose.
+    """Match de-skewed features with the cubes around a pose.
 
     Parameters
     ----------
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
     map_T_lidar : pose at which to associate
     edge_map, plane_map : the maps
-    edge_cubes, plane_cubes : cubes to search, from :meth:`CubeMap.neighbourhood`
     """
     pose = map_T_lidar.matrix()
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
-    near = edge_map.nearest(edges_map, config.neighbours, config.max_distance, edge_cubes)
-    edge_matches = match_lines(edges, edges_map, *near, pose, config)
-    near = plane_map.nearest(planes_map, config.neighbours, config.max_distance, plane_cubes)
-    return ScanMatches(edge_matches, match_planes(planes, planes_map, *near, pose, config))
+    k, limit = config.neighbours, config.max_distance
+    near_edges = edge_map.nearest(edges_map, k, limit, edge_map.neighbourhood(pose))
+    near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
+    return ScanMatches(
+        match_lines(edges, edges_map, *near_edges, pose, config),
+        match_planes(planes, planes_map, *near_planes, pose, config),
+    )
 
 
 def match_lines(

@@ -1,1 +1,144 @@
-"""LOAM's scan-to-map stage as a GTSAM factor graph."""
+"""LOAM's scan-to-map LiDAR estimator as a GTSAM factor graph.
+
+Three ways in, from one call to every step:
+
+* :func:`run` maps a data set, which :func:`open_dataset` opens;
+* :class:`Pipeline` takes one sweep at a time;
+* :func:`extract_features`, :class:`ConstantVelocity` and :class:`Mapper` are the steps themselves,
+  and :mod:`loam_gtsam.factors` has the factors for a graph of your own.
+
+Conventions are in :mod:`loam_gtsam.types`.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from loam_gtsam import datasets
+from loam_gtsam.config import Config as Config
+from loam_gtsam.config import dump_config as dump_config
+from loam_gtsam.config import load_config as load_config
+from loam_gtsam.config import preset as preset
+from loam_gtsam.cubemap import CubeMap as CubeMap
+from loam_gtsam.datasets import Dataset as Dataset
+from loam_gtsam.datasets import DatasetInfo as DatasetInfo
+from loam_gtsam.datasets import open_dataset as open_dataset
+from loam_gtsam.evaluation import AbsoluteError as AbsoluteError
+from loam_gtsam.evaluation import absolute_error as absolute_error
+from loam_gtsam.export import package_version
+from loam_gtsam.export import read_tum as read_tum
+from loam_gtsam.export import write_run as write_run
+from loam_gtsam.export import write_tum as write_tum
+from loam_gtsam.factors import MatchRows as MatchRows
+from loam_gtsam.factors import checked_factor as checked_factor
+from loam_gtsam.factors import concatenate_rows as concatenate_rows
+from loam_gtsam.factors import line_rows as line_rows
+from loam_gtsam.factors import plane_rows as plane_rows
+from loam_gtsam.factors import point_to_line_factor as point_to_line_factor
+from loam_gtsam.factors import point_to_plane_factor as point_to_plane_factor
+from loam_gtsam.factors import scan_match_factor as scan_match_factor
+from loam_gtsam.features import extract_features as extract_features
+from loam_gtsam.mapper import Mapper as Mapper
+from loam_gtsam.matching import ScanMatches as ScanMatches
+from loam_gtsam.matching import associate as associate
+from loam_gtsam.odometry import ConstantVelocity as ConstantVelocity
+from loam_gtsam.odometry import ScanToScan as ScanToScan
+from loam_gtsam.pipeline import Pipeline as Pipeline
+from loam_gtsam.pipeline import RunResult as RunResult
+from loam_gtsam.pipeline import run as run
+from loam_gtsam.solvers import POSE_KEY as POSE_KEY
+from loam_gtsam.solvers import GtsamSolver as GtsamSolver
+from loam_gtsam.solvers import Solution as Solution
+from loam_gtsam.solvers import match_rows as match_rows
+from loam_gtsam.types import BadSweep as BadSweep
+from loam_gtsam.types import ConfigError as ConfigError
+from loam_gtsam.types import DatasetError as DatasetError
+from loam_gtsam.types import Features as Features
+from loam_gtsam.types import FeatureSweep as FeatureSweep
+from loam_gtsam.types import FrameStatus as FrameStatus
+from loam_gtsam.types import ImuSamples as ImuSamples
+from loam_gtsam.types import InputError as InputError
+from loam_gtsam.types import LoamError as LoamError
+from loam_gtsam.types import MapUpdate as MapUpdate
+from loam_gtsam.types import OutputError as OutputError
+from loam_gtsam.types import Scan as Scan
+from loam_gtsam.types import SweepError as SweepError
+from loam_gtsam.types import Trajectory as Trajectory
+
+if TYPE_CHECKING:
+    from loam_gtsam.datasets import ArrayDataset as ArrayDataset
+    from loam_gtsam.datasets import BagDataset as BagDataset
+    from loam_gtsam.datasets import KittiDataset as KittiDataset
+    from loam_gtsam.datasets import LoamTopicsDataset as LoamTopicsDataset
+    from loam_gtsam.datasets import SimulatedWorld as SimulatedWorld
+    from loam_gtsam.datasets import decode_pointcloud2 as decode_pointcloud2
+
+__version__ = package_version()
+
+_LOADERS = (
+    "ArrayDataset",
+    "BagDataset",
+    "KittiDataset",
+    "LoamTopicsDataset",
+    "SimulatedWorld",
+    "decode_pointcloud2",
+)
+"""Imported when first used: no bag reader for a folder, no ray caster for a bag."""
+
+__all__ = [
+    "POSE_KEY",
+    "AbsoluteError",
+    "BadSweep",
+    "Config",
+    "ConfigError",
+    "ConstantVelocity",
+    "CubeMap",
+    "Dataset",
+    "DatasetError",
+    "DatasetInfo",
+    "FeatureSweep",
+    "Features",
+    "FrameStatus",
+    "GtsamSolver",
+    "ImuSamples",
+    "InputError",
+    "LoamError",
+    "MapUpdate",
+    "Mapper",
+    "MatchRows",
+    "OutputError",
+    "Pipeline",
+    "RunResult",
+    "Scan",
+    "ScanMatches",
+    "ScanToScan",
+    "Solution",
+    "SweepError",
+    "Trajectory",
+    "absolute_error",
+    "associate",
+    "checked_factor",
+    "concatenate_rows",
+    "dump_config",
+    "extract_features",
+    "line_rows",
+    "load_config",
+    "match_rows",
+    "open_dataset",
+    "plane_rows",
+    "point_to_line_factor",
+    "point_to_plane_factor",
+    "preset",
+    "read_tum",
+    "run",
+    "scan_match_factor",
+    "write_run",
+    "write_tum",
+    *_LOADERS,
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in _LOADERS:
+        return getattr(datasets, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

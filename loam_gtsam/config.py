@@ -373,7 +373,8 @@ def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
             f"{_nearest(str(name), PRESETS)}"
         )
     rest = {key: value for key, value in data.items() if key != "preset"}
-    return _override(PRESETS[name], rest, data, source, "")
+    config: Config = _override(PRESETS[name], rest, data, source, "")
+    return config
 
 
 def config_to_dict(config: Config) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -386,9 +387,9 @@ def _row_residuals(
     map_T_lidar: gtsam.Pose3, points: FloatArray, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Residuals (M,) and Jacobian (M, 6) of plane rows."""
-    rotation = map_T_lidar.rotation().matrix()
-    local = normals @ rotation
-    residual = np.einsum("ij,ij->i", local, points) + normals @ map_T_lidar.translation() + offsets
+    map_T: FloatArray = map_T_lidar.matrix()
+    local = normals @ map_T[:3, :3]
+    residual = np.einsum("ij,ij->i", local, points) + normals @ map_T[:3, 3] + offsets
     return residual, np.hstack([np.cross(points, local), local])
 
 
@@ -417,7 +418,7 @@ def _dimension(values: gtsam.Values, key: int) -> int:
     return int(one.dim())
 
 
-def _at(values: gtsam.Values, key: int) -> object:
+def _at(values: gtsam.Values, key: int) -> Any:
     for getter in (values.atPose3, values.atVector, values.atRot3, values.atPoint3):
         try:
             return getter(key)

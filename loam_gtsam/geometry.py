@@ -49,18 +49,20 @@ def move_points(
     """
     points = np.asarray(points, dtype=np.float64)
     omega, velocity = twist[:3], twist[3:]
-    shift = np.outer(times, velocity)
+    shift: FloatArray = np.outer(times, velocity).astype(np.float64, copy=False)
     rate = float(np.linalg.norm(omega))
     if rate < _SMALL_ANGLE:
-        return points + shift
+        shift += points
+        return shift
     axis = omega / rate
     angle = rate * np.asarray(times, dtype=np.float64)
-    sine, cosine = np.sin(angle)[:, None], np.cos(angle)[:, None]
+    # 1 - cos a, written so that a slow rotation does not cancel in it and then blow up over |w|.
+    sine, versine = np.sin(angle)[:, None], 2.0 * np.sin(0.5 * angle)[:, None] ** 2
     cross = np.cross(axis, points)
-    moved = points + sine * cross + (1.0 - cosine) * np.cross(axis, cross)
+    moved: FloatArray = points + sine * cross + versine * np.cross(axis, cross)
     # V(a k) v t = t v + (1 - cos a)/|w| k x v + (t - sin(a)/|w|) k x (k x v)
     axis_v = np.cross(axis, velocity)
-    moved += shift + (1.0 - cosine) / rate * axis_v
+    moved += shift + versine / rate * axis_v
     moved += (angle[:, None] - sine) / rate * np.cross(axis, axis_v)
     return moved
 
@@ -71,7 +73,8 @@ def move_points(
 
 def moments(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (3, N) and covariance (6, N: xx, yy, zz, xy, yz, xz) of (N, k, 3) groups of points."""
-    x, y, z = np.ascontiguousarray(neighbours.transpose(2, 1, 0))
+    # Always a copy: what follows writes to it.
+    x, y, z = np.array(neighbours.transpose(2, 1, 0), dtype=np.float64, order="C")
     count = neighbours.shape[1]
     means = np.stack([x.sum(axis=0), y.sum(axis=0), z.sum(axis=0)]) / count
     x -= means[0]
@@ -124,7 +127,8 @@ def symmetric_eigenvector(matrices: FloatArray, eigenvalues: FloatArray) -> Floa
     if degenerate.any():
         vector[:, degenerate] = [[0.0], [0.0], [1.0]]
         norm[degenerate] = 1.0
-    return vector / norm
+    vector /= norm
+    return vector
 
 
 def fit_lines(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -204,7 +204,8 @@ class _RingSearch:
             return candidates[:, 0]
         away = self.points[candidates] - queries[:, None, :]
         squared = np.where(missing, np.inf, np.einsum("nki,nki->nk", away, away))
-        return candidates[np.arange(len(queries)), squared.argmin(axis=1)]
+        nearest: IntArray = candidates[np.arange(len(queries)), squared.argmin(axis=1)]
+        return nearest
 
 
 def _normalised(vectors: FloatArray) -> tuple[FloatArray, BoolArray]:

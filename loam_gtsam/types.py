@@ -298,7 +298,8 @@ class MapUpdate:
         if not self.status.solved:
             return np.full((6, 6), np.nan)
         try:
-            return np.linalg.inv(self.information)
+            inverse: FloatArray = np.linalg.inv(self.information).astype(np.float64, copy=False)
+            return inverse
         except np.linalg.LinAlgError:
             return np.full((6, 6), np.nan)
 

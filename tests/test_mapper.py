@@ -1,0 +1,305 @@
+"""The mapper: poses, reference times, statuses, priors, what it reports."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.simulation import SimulatedWorld
+from loam_gtsam.features import extract_features
+from loam_gtsam.mapper import Mapper
+from loam_gtsam.solvers import POSE_KEY, GtsamSolver
+from loam_gtsam.types import Features, FrameStatus
+
+SECOND = 1_000_000_000
+
+
+def with_deskew(**changes):
+    return replace(Config(), deskew=replace(Config().deskew, **changes))
+
+
+def with_solver(**changes):
+    return replace(Config(), solver=replace(Config().solver, **changes))
+
+
+def room_features(map_T_lidar, stamp, rng, count=6000, noise=0.0):
+    """Features of a 12 x 8 x 4 m room with six poles, seen exactly from a pose."""
+    sides = np.array([6.0, 4.0, 2.0])
+    walls = rng.uniform(-1, 1, (count, 3)) * sides
+    axis = rng.integers(0, 3, count)
+    rows = np.arange(count)
+    walls[rows, axis] = np.sign(walls[rows, axis]) * sides[axis]
+    poles = np.repeat([[x, y, 0.0] for x in (-4.0, 0.5, 3.0) for y in (-2.5, 2.0)], 60, axis=0)
+    poles[:, 2] = rng.uniform(-2, 2, len(poles))
+    local = gtsam.Pose3(np.linalg.inv(map_T_lidar.matrix()))
+    moved = [local.transformFrom(points.T).T for points in (poles, walls)]
+    moved = [points + rng.normal(0, noise, points.shape) for points in moved]
+    return Features.from_points(stamp, *moved)
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+@pytest.fixture
+def mapped(rng):
+    """A mapper that has seen the room ten times from the origin."""
+    mapper = Mapper()
+    for i in range(10):
+        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
+    return mapper
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.3])
+def test_closed_form_room_is_solved_exactly(mapped, rng, scale):
+    truth = gtsam.Pose3.Expmap(scale * np.array([0.05, -0.1, 0.2, 0.5, -0.4, 0.3]))
+    update = mapped.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
+    assert update.status is FrameStatus.OK
+    error = truth.localCoordinates(update.map_T_lidar)
+    assert np.abs(error[:3]).max() < 1e-3
+    assert np.abs(error[3:]).max() < 2e-3
+    assert update.error_after < update.error_before
+    assert update.n_edge_matches > 100
+    assert update.n_plane_matches > 500
+    assert np.linalg.eigvalsh(update.information).min() > 0
+
+
+def test_first_sweep_is_the_origin_and_has_no_covariance(rng):
+    update = Mapper().register(room_features(gtsam.Pose3(), 0, rng))
+    assert update.status is FrameStatus.FIRST
+    assert update.map_T_lidar.equals(gtsam.Pose3(), 0.0)
+    assert np.isnan(update.covariance).all()
+
+
+def test_a_guess_places_the_first_sweep(rng):
+    start = gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([100.0, -20.0, 3.0]))
+    mapper = Mapper()
+    assert mapper.register(room_features(gtsam.Pose3(), 0, rng), guess=start).map_T_lidar.equals(
+        start, 1e-12
+    )
+    update = mapper.register(room_features(gtsam.Pose3(), SECOND // 10, rng))
+    assert np.abs(start.localCoordinates(update.map_T_lidar)).max() < 5e-3
+
+
+@pytest.mark.parametrize("reference", ["start", "end", "stamp"])
+def test_poses_belong_to_the_stated_reference_time(reference):
+    world = SimulatedWorld("street_loop", frames=66, columns=900)  # at 10 m/s: 1 m a sweep
+    scans = [world[i] for i in range(60, 66)]
+    config = with_deskew(reference=reference)
+    mapper = Mapper(config)
+    updates = [mapper.register(extract_features(scan, config)) for scan in scans]
+    offset = SECOND // 10 if reference == "end" else 0
+    expected = np.array([scan.stamp + offset for scan in scans])
+    assert np.array_equal([u.stamp for u in updates], expected)
+    # The first reference pose is the origin of the map.
+    truth = world.truth_at(expected).map_T_lidar
+    truth = np.linalg.inv(truth[0]) @ truth
+    for pose, update in zip(truth, updates, strict=True):
+        error = gtsam.Pose3(pose).localCoordinates(update.map_T_lidar)
+        assert np.abs(error[:3]).max() < 0.01
+        assert np.abs(error[3:]).max() < 0.12
+
+
+def test_deskew_matters_and_can_be_turned_off():
+    world = SimulatedWorld("room", frames=30, columns=900)
+    errors = {}
+    for enabled in (True, False):
+        config = with_deskew(enabled=enabled)
+        mapper = Mapper(config)
+        updates = [mapper.register(extract_features(scan, config)) for scan in world]
+        errors[enabled] = np.mean(
+            [
+                np.linalg.norm(u.map_T_lidar.translation() - pose[:3, 3])
+                for u, pose in zip(updates, world.truth.map_T_lidar, strict=True)
+            ]
+        )
+    assert errors[True] < 0.5 * errors[False]
+
+
+def test_a_wrong_twist_hardly_moves_the_middle_of_the_sweep():
+    """Why poses are kept there: the error of the de-skew cancels to first order."""
+    world = SimulatedWorld("room", frames=26, columns=900, range_noise=0.0)
+    features = [extract_features(scan, Config()) for scan in world]
+    middles = []
+    # One association only: the second would already use a better twist.
+    for wrong in (np.zeros(6), np.array([0, 0, 0.2, 0.3, 0, 0])):
+        mapper = Mapper(with_solver(iterations=1, inner_iterations=5))
+        for item in features[:-1]:
+            last = mapper.register(item)
+        solved = {}
+
+        class Spy(GtsamSolver):
+            def solve(self, associate, guess, priors=(), solved=solved):
+                solved["pose"] = (solution := super().solve(associate, guess, priors)).map_T_lidar
+                return solution
+
+        mapper.solver = Spy(mapper.config.solver)
+        mapper.register(features[-1], twist=last.twist + wrong)
+        middles.append(solved["pose"])
+    moved = middles[0].localCoordinates(middles[1])
+    # At the start of the sweep it would be 0.05 s of the wrong twist: 10 mrad and 15 mm.
+    assert abs(moved[2]) < 3e-3
+    assert abs(moved[3]) < 3e-3
+
+
+def test_a_run_that_starts_in_motion_rebuilds_its_first_sweep():
+    world = SimulatedWorld("street_loop", frames=64, columns=900)
+    scans = [world[i] for i in range(60, 64)]
+    mapper = Mapper()
+    updates = [mapper.register(extract_features(scan, mapper.config)) for scan in scans]
+    truth = world.truth.map_T_lidar[60:64]
+    truth = np.linalg.inv(truth[0]) @ truth
+    step = np.linalg.norm(truth[1][:3, 3])
+    assert step > 0.5  # metres between sweeps
+    for update, pose in zip(updates, truth, strict=True):
+        error = np.linalg.norm(update.map_T_lidar.translation() - pose[:3, 3])
+        assert error < 0.1 * step, update.status  # 0.5 without
+
+
+def test_duplicate_and_earlier_stamps_are_skipped(mapped, rng):
+    before, points = mapped.last, mapped.plane_map.count()
+    for stamp in (before.stamp, before.stamp - 1, 0):
+        update = mapped.register(room_features(gtsam.Pose3(), stamp, rng))
+        assert update.status is FrameStatus.BAD_STAMP
+        assert str(before.stamp) in update.message
+        assert update.map_T_lidar.equals(before.map_T_lidar, 0.0)
+    assert mapped.last is before
+    assert mapped.plane_map.count() == points
+    assert mapped.register(room_features(gtsam.Pose3(), before.stamp + 1, rng)).status.solved
+
+
+def test_no_features_predict_the_pose_and_leave_the_map(rng):
+    mapper = Mapper()
+    for i in range(4):
+        pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * i, 0.0, 0.0]))
+        mapper.register(room_features(pose, i * SECOND // 10, rng), guess=pose)
+    points = mapper.plane_map.count()
+    empty = Features.from_points(4 * SECOND // 10, np.zeros((0, 3)), np.zeros((0, 3)))
+    update = mapper.register(empty)
+    assert update.status is FrameStatus.UNUSABLE_SCAN
+    assert mapper.plane_map.count() == points
+    expected = mapper.last.map_T_lidar.translation()
+    np.testing.assert_allclose(expected, [0.4, 0.0, 0.0], atol=0.02)
+
+
+def test_sparse_map_inserts_at_the_guess(rng):
+    mapper = Mapper()
+    few = Features.from_points(0, rng.uniform(-5, 5, (20, 3)), rng.uniform(-5, 5, (30, 3)))
+    mapper.register(few)
+    guess = gtsam.Pose3(gtsam.Rot3(), np.array([0.5, 0.0, 0.0]))
+    update = mapper.register(room_features(guess, SECOND // 10, rng), guess=guess)
+    assert update.status is FrameStatus.SPARSE_MAP
+    assert "50" in update.message
+    assert update.map_T_lidar.equals(guess, 1e-12)
+    assert mapper.register(room_features(guess, SECOND // 5, rng), guess=guess).status.solved
+
+
+def test_few_matches_keep_the_guess_and_do_not_insert(mapped, rng):
+    points = mapped.plane_map.count()
+    far = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([30.0, 10.0, 0.0]))
+    update = mapped.register(room_features(gtsam.Pose3(), SECOND, rng), guess=far)
+    assert update.status is FrameStatus.FEW_MATCHES
+    assert update.map_T_lidar.equals(far, 1e-9)
+    assert mapped.plane_map.count() == points
+    assert not update.information.any()
+    # and the run goes on
+    back = mapped.register(room_features(gtsam.Pose3(), 2 * SECOND, rng), guess=gtsam.Pose3())
+    assert back.status.solved
+
+
+def test_the_iteration_limit_is_reported(rng):
+    mapper = Mapper(with_solver(iterations=1))
+    for i in range(3):
+        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
+    truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.2, 0.0, 0.0]))
+    update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
+    assert update.status is FrameStatus.NOT_CONVERGED
+    assert update.iterations == 1
+    assert "1 associations" in update.message
+
+
+def test_priors_are_factors_beside_the_scan(mapped, rng):
+    features = room_features(gtsam.Pose3(), SECOND, rng)
+    tight = gtsam.noiseModel.Isotropic.Sigma(6, 1e-5)
+    lifted = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 0.05]))
+    update = mapped.register(features, priors=[gtsam.PriorFactorPose3(POSE_KEY, lifted, tight)])
+    np.testing.assert_allclose(update.map_T_lidar.translation(), [0, 0, 0.05], atol=2e-3)
+    assert update.covariance[5, 5] < 1.1e-10
+
+
+def test_information_is_that_of_the_reference_time():
+    """A rotation of the pose at the start moves the middle, 0.05 s later, sideways."""
+    world = SimulatedWorld("street_loop", frames=64, columns=900)
+    mapper = Mapper()
+    seen = []
+
+    class Spy(GtsamSolver):
+        def solve(self, associate, guess, priors=()):
+            seen.append(super().solve(associate, guess, priors))
+            return seen[-1]
+
+    mapper.solver = Spy(mapper.config.solver)
+    for i in range(60, 64):
+        update = mapper.register(extract_features(world[i], mapper.config))
+    middle = seen[-1]
+    motion = update.map_T_lidar.between(middle.map_T_lidar)
+    assert np.linalg.norm(motion.translation()) > 0.3
+    # J maps a perturbation at the start to one at the middle; numerically, column by column.
+    jacobian = (
+        np.stack(
+            [
+                motion.inverse()
+                .compose(gtsam.Pose3.Expmap(1e-6 * axis))
+                .compose(motion)
+                .logmap(gtsam.Pose3())
+                for axis in np.eye(6)
+            ],
+            axis=1,
+        )
+        / -1e-6
+    )
+    expected = jacobian.T @ middle.information @ jacobian
+    np.testing.assert_allclose(update.information, expected, rtol=1e-3, atol=1e-3 * expected.max())
+
+
+def test_cubes_left_behind_are_evicted_counted_and_kept(rng):
+    config = replace(
+        Config(), map=replace(Config().map, cube_size=10.0, window=(5, 5, 5), window_margin=1)
+    )
+    mapper = Mapper(config)
+    total = 0
+    for i in range(8):  # a new room, out of sight of the last one, at every sweep
+        pose = gtsam.Pose3(gtsam.Rot3(), np.array([80.0 * i, 0.0, 0.0]))
+        update = mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng), guess=pose)
+        assert update.status in (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
+        total += update.n_planes
+    stats = mapper.plane_map.stats
+    assert stats.evicted >= 7
+    assert stats.archived == stats.evicted - stats.restored
+    assert stats.dropped_points == 0
+    # One point a voxel, and voxels of the map cut those of the sweep differently.
+    assert 0.5 * total < len(mapper.map_points()[1]) <= total
+    home = mapper.register(
+        room_features(gtsam.Pose3(), 2 * SECOND, rng), guess=gtsam.Pose3.Expmap(np.full(6, 0.01))
+    )
+    assert home.status.solved
+    assert mapper.plane_map.stats.restored > 0
+    assert np.abs(home.map_T_lidar.logmap(gtsam.Pose3())).max() < 5e-3
+
+
+def test_same_input_same_bits():
+    world = SimulatedWorld("room", frames=8, columns=900)
+
+    def poses():
+        mapper = Mapper()
+        return np.array(
+            [
+                mapper.register(extract_features(scan, mapper.config)).map_T_lidar.matrix()
+                for scan in world
+            ]
+        )
+
+    assert np.array_equal(poses(), poses())

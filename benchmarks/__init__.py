@@ -1,0 +1,1 @@
+"""Accuracy and speed on known data, beside other systems: ``python -m benchmarks``."""

@@ -10,7 +10,8 @@ from loam_gtsam import Pipeline, Scan, SimulatedWorld
 #   times  (N,) float seconds from the stamp, or None: then from the azimuth, see docs/inputs.md
 #   rings  (N,) integer beam numbers, or None: then from row order or elevation
 arrays = [
-    (scan.points, scan.stamp, scan.times, scan.rings) for scan in SimulatedWorld("room", frames=10)
+    (scan.points, scan.stamp, scan.times, scan.rings)
+    for scan in SimulatedWorld("room", sensor="hdl32", frames=10)
 ]
 nothing = np.empty((0, 3), np.float32)
 arrays[5] = (nothing, arrays[5][1], None, None)  # a sensor drops out now and then

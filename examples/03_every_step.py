@@ -9,7 +9,7 @@ import numpy as np
 
 from loam_gtsam import Config, ConstantVelocity, Mapper, SimulatedWorld, extract_features
 
-world = SimulatedWorld("room", frames=6)
+world = SimulatedWorld("room", sensor="hdl32", frames=6)
 config = Config()
 config = replace(config, matching=replace(config.matching, max_distance=0.8))  # any parameter
 
@@ -20,7 +20,9 @@ for scan in world:
     guess = odometry.guess(features, mapper.last)  # pose and body velocity
     update = mapper.register(features, guess.map_T_lidar, guess.twist)
 
-print(f"features: {len(features.edges)} edge and {len(features.planes)} plane points, before voxels")
+print(
+    f"features: {len(features.edges)} edge and {len(features.planes)} plane points, before voxels"
+)
 print(f"guess at:  {guess.map_T_lidar.translation().round(3)} m")
 print(f"solved at: {update.map_T_lidar.translation().round(3)} m, status {update.status}")
 truth = world.truth.map_T_lidar[-1]

@@ -29,7 +29,7 @@ from loam_gtsam import visualization
 from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
-from loam_gtsam.evaluation import absolute_error, align, interpolate
+from loam_gtsam.evaluation import absolute_error, align, align_rotations, interpolate
 from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
 from loam_gtsam.pipeline import OnFrame, RunResult, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
@@ -126,7 +126,8 @@ def compare(
     there = interpolate(truth, error.stamps)
     inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
     here = trajectory.map_T_lidar[inside]
-    map_T_truth = align(there.map_T_lidar[:, :3, 3], here[:, :3, 3])
+    turn = align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
+    map_T_truth = align(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
     accuracy = {
         "ate_rmse_m": error.rmse,
         "ate_max_m": error.maximum,

@@ -190,7 +190,7 @@ class DeskewConfig(_Section):
     """Removal of the motion distortion."""
 
     enabled: bool = _param(True, "de-skew with the guess, and again with the solution")
-    reference: Literal["start", "end", "stamp"] = _param(
+    reference: Literal["start", "middle", "end", "stamp"] = _param(
         "start", "the moment of the sweep the pose belongs to"
     )
 
@@ -459,7 +459,10 @@ def _override(section: Any, data: Mapping[str, Any], located: Any, source: str, 
             continue
         hint = hints[key]
         if hint is float and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            try:
+                value = float(value)
+            except OverflowError:
+                raise ConfigError(f"{where}: {full}: the number is too large") from None
         elif typing.get_origin(hint) is tuple and isinstance(value, list):
             value = tuple(value)
         _check(f"{where}: {full}", value, hint, names[key].metadata)

@@ -1,4 +1,4 @@
-"""Trajectory errors, defined as evo and the KITTI benchmark define them."""
+"""Trajectory errors. Positions are compared as evo does; for orientations see AbsoluteError."""
 
 from __future__ import annotations
 
@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
+from loam_gtsam.geometry import transform
 from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
+
+_NO_SPREAD = 1e-9
+"""Ratio of the second to the first singular value below which positions lie on a line (the ratio
+of the spreads is its root: 3 cm across a line of a kilometre)."""
+_LENGTHS = 8
+_LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+"""Number of path lengths of the relative error (KITTI's 8), and what they are multiples of."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -17,7 +25,9 @@ class AbsoluteError:
     Attributes
     ----------
     rmse, median, maximum : metres, of the positions after alignment
-    rotation_rmse_deg : degrees, of the orientations after alignment
+    rotation_rmse_deg : degrees, of the orientations after the rotation that fits *them* best. The
+        one that fits the positions would not do: on a nearly straight path it leaves the roll
+        about the path to the noise of the positions.
     translations : (N,) metres per pose
     stamps : (N,) nanoseconds of the poses that were compared
     """
@@ -30,20 +40,53 @@ class AbsoluteError:
     stamps: IntArray
 
 
-def align(estimate: FloatArray, reference: FloatArray) -> FloatArray:
+def align(
+    estimate: FloatArray, reference: FloatArray, rotation: FloatArray | None = None
+) -> FloatArray:
     """Rigid transform ``reference_T_estimate`` (4, 4) that best maps (N, 3) positions on others.
+
+    Parameters
+    ----------
+    estimate, reference : (N, 3) metres
+    rotation : (3, 3) decides what the positions leave open: the roll about the line if they lie on
+        one, everything if they do not move. :func:`align_rotations` is a good one; identity if
+        None.
 
     References
     ----------
     Umeyama, Least-squares estimation of transformation parameters, PAMI 13(4), 1991; no scale.
     """
     mean_e, mean_r = estimate.mean(axis=0), reference.mean(axis=0)
-    u, _, vt = np.linalg.svd((reference - mean_r).T @ (estimate - mean_e))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt)) or 1.0])
+    moments = (reference - mean_r).T @ (estimate - mean_e)
+    spread = np.linalg.svd(moments, compute_uv=False)
+    if spread[1] <= _NO_SPREAD * spread[0]:
+        moments = moments + (_NO_SPREAD * spread[0] or 1.0) * (
+            np.eye(3) if rotation is None else rotation
+        )
     result = np.eye(4)
-    result[:3, :3] = u @ sign @ vt
+    result[:3, :3] = _nearest_rotation(moments)
     result[:3, 3] = mean_r - result[:3, :3] @ mean_e
     return result
+
+
+def align_rotations(estimate: FloatArray, reference: FloatArray) -> FloatArray:
+    """Rotation ``reference_R_estimate`` (3, 3) that best maps (N, 3, 3) orientations on others.
+
+    The chordal mean of ``reference estimate^T``: it minimises the sum of squared Frobenius norms
+    of ``reference - R estimate``.
+
+    References
+    ----------
+    Hartley, Trumpf, Dai and Li, Rotation averaging, IJCV 103, 2013 (the chordal L2 mean).
+    """
+    return _nearest_rotation(np.einsum("nij,nkj->ik", reference, estimate))
+
+
+def _nearest_rotation(matrix: FloatArray) -> FloatArray:
+    """The rotation R that maximises ``trace(R^T matrix)``."""
+    u, _, vt = np.linalg.svd(matrix)
+    rotation: FloatArray = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return rotation
 
 
 def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
@@ -52,8 +95,9 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
     Raises
     ------
     InputError
-        If a stamp lies outside the trajectory.
+        If a stamp lies outside the trajectory, or the trajectory's own stamps do not increase.
     """
+    _check_stamps("interpolate", trajectory)
     if len(stamps) and (
         stamps.min() < trajectory.stamps[0] or stamps.max() > trajectory.stamps[-1]
     ):
@@ -78,34 +122,204 @@ def absolute_error(
 
     Parameters
     ----------
-    aligned : fit a rigid transform (SE(3), Umeyama) first; else compare as they are
+    aligned : fit positions by a rigid transform (SE(3), :func:`align`) and orientations by a
+        rotation (:func:`align_rotations`) first; else compare as they are
 
     Raises
     ------
     InputError
-        If fewer than three poses overlap in time.
+        If fewer than three poses overlap in time, or the reference's stamps do not increase.
     """
-    inside = (estimate.stamps >= reference.stamps[0]) & (estimate.stamps <= reference.stamps[-1])
-    if inside.sum() < 3:
-        raise InputError(
-            f"absolute_error: expected 3 or more poses inside the reference's time span "
-            f"{reference.stamps[0]} to {reference.stamps[-1]} ns, got {int(inside.sum())}"
-        )
-    poses, stamps = estimate.map_T_lidar[inside], estimate.stamps[inside]
-    truth = interpolate(reference, stamps).map_T_lidar
+    stamps, poses, truth = _common("absolute_error", estimate, reference)
+    positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
     if aligned:
-        poses = align(poses[:, :3, 3], truth[:, :3, 3]) @ poses
-    errors = np.linalg.norm(poses[:, :3, 3] - truth[:, :3, 3], axis=1)
-    difference = np.swapaxes(truth[:, :3, :3], 1, 2) @ poses[:, :3, :3]
-    angles = np.degrees(Rotation.from_matrix(difference).magnitude())
+        rotations = align_rotations(rotations, truth[:, :3, :3]) @ rotations
+        positions = transform(align(positions, truth[:, :3, 3]), positions)
+    errors = np.linalg.norm(positions - truth[:, :3, 3], axis=1)
+    difference = np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations
     return AbsoluteError(
         rmse=_rms(errors),
         median=float(np.median(errors)),
         maximum=float(errors.max()),
-        rotation_rmse_deg=_rms(angles),
+        rotation_rmse_deg=_rms(_angles_deg(difference)),
         translations=errors,
         stamps=stamps,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class RelativeError:
+    """Relative pose error (RPE) over path lengths, as KITTI's odometry benchmark has it.
+
+    Attributes
+    ----------
+    translation_percent, rotation_deg_per_m : mean over all pairs of all lengths
+    lengths : (L,) metres along the reference
+    pairs : (L,) number of pairs of each length
+    translations, rotations : (L,) mean of each length, per cent and degrees per metre; NaN where
+        there is no pair
+    """
+
+    translation_percent: float
+    rotation_deg_per_m: float
+    lengths: FloatArray
+    pairs: IntArray
+    translations: FloatArray
+    rotations: FloatArray
+
+
+def path_lengths(path: float) -> FloatArray:
+    """Lengths over which relative errors are taken on a path of so many metres.
+
+    Eight multiples u, 2 u, ... 8 u, where u is the largest of 0.1, 0.2, 0.5, 1, ... 100 m with
+    16 u <= ``path``: from every pose of the first half the longest is still possible. From 1600 m
+    on these are KITTI's 100, 200, ... 800 m.
+
+    Raises
+    ------
+    InputError
+        If the path is shorter than 1.6 m.
+    """
+    fitting = [unit for unit in _LENGTH_UNITS if 2 * _LENGTHS * unit <= path]
+    if not fitting:
+        raise InputError(
+            f"relative_error: expected a path of {2 * _LENGTHS * _LENGTH_UNITS[0]:g} m or more, "
+            f"got {path:.3g} m; give the lengths"
+        )
+    return fitting[-1] * np.arange(1.0, _LENGTHS + 1.0)
+
+
+def relative_error(
+    estimate: Trajectory, reference: Trajectory, lengths: FloatArray | None = None
+) -> RelativeError:
+    """RPE over the poses whose stamps lie inside the reference, which is interpolated.
+
+    Parameters
+    ----------
+    lengths : (L,) metres along the reference; :func:`path_lengths` of its path if None
+
+    Raises
+    ------
+    InputError
+        If fewer than three poses overlap in time, the reference's stamps do not increase, or the
+        path is too short for any pair.
+
+    Notes
+    -----
+    For each length d and each start i, the end j is the first pose more than d along the
+    reference after i. With the relative motions Q of the reference and P of the estimate,
+    ``E = Q^-1 P`` counts ``|translation(E)| / d`` and ``angle(E) / d``. KITTI's development kit
+    takes every tenth start; here every pose is one, as the paths are shorter.
+
+    References
+    ----------
+    Geiger, Lenz and Urtasun, Are we ready for autonomous driving?, CVPR 2012, section 2.4.
+    """
+    _, poses, truth = _common("relative_error", estimate, reference)
+    travelled = distance_travelled(truth[:, :3, 3])
+    path = float(travelled[-1])
+    lengths = path_lengths(path) if lengths is None else np.asarray(lengths, np.float64)
+    translations, rotations = [], []
+    for length in lengths:
+        ends = np.searchsorted(travelled, travelled + length, side="right")
+        starts = np.flatnonzero(ends < len(travelled))
+        ends = ends[starts]
+        wanted = _inverse(truth[starts]) @ truth[ends]
+        error = _inverse(wanted) @ _inverse(poses[starts]) @ poses[ends]
+        translations.append(100.0 / length * np.linalg.norm(error[:, :3, 3], axis=1))
+        rotations.append(_angles_deg(error[:, :3, :3]) / length)
+    pairs = np.array([len(errors) for errors in translations], np.int64)
+    if not pairs.sum():
+        raise InputError(
+            f"relative_error: expected lengths below the path of {path:.3g} m, got "
+            f"{', '.join(f'{length:g}' for length in lengths) or 'none'}"
+        )
+    return RelativeError(
+        translation_percent=float(np.mean(np.concatenate(translations))),
+        rotation_deg_per_m=float(np.mean(np.concatenate(rotations))),
+        lengths=lengths,
+        pairs=pairs,
+        translations=np.array([e.mean() if len(e) else np.nan for e in translations]),
+        rotations=np.array([e.mean() if len(e) else np.nan for e in rotations]),
+    )
+
+
+def pose_differences(
+    estimate: Trajectory, reference: Trajectory
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """How far two trajectories are apart, pose by pose, both seen from the first common moment.
+
+    Parameters
+    ----------
+    estimate, reference : the reference is interpolated at the stamps of the other
+
+    Returns
+    -------
+    stamps, metres, degrees : (N,) each, of the poses inside the reference's time span
+
+    Raises
+    ------
+    InputError
+        If fewer than three poses overlap in time, or the reference's stamps do not increase.
+    """
+    stamps, poses, others = _common("pose_differences", estimate, reference)
+    here, there = _inverse(poses[:1]) @ poses, _inverse(others[:1]) @ others
+    metres = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
+    rotation = np.swapaxes(there[:, :3, :3], 1, 2) @ here[:, :3, :3]
+    return stamps, metres, _angles_deg(rotation)
+
+
+def distance_travelled(positions: FloatArray) -> FloatArray:
+    """(N,) metres from the start along (N, 3) positions."""
+    steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
+    travelled: FloatArray = np.concatenate(([0.0], np.cumsum(steps)))[: len(positions)]
+    return travelled
+
+
+def _common(
+    caller: str, estimate: Trajectory, reference: Trajectory
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Stamps and poses of the estimate inside the reference's time span, and the reference's."""
+    _check_stamps(caller, reference)
+    inside = (estimate.stamps >= reference.stamps[0]) & (estimate.stamps <= reference.stamps[-1])
+    if inside.sum() < 3:
+        raise InputError(
+            f"{caller}: expected 3 or more poses inside the reference's time span "
+            f"{reference.stamps[0]} to {reference.stamps[-1]} ns, got {int(inside.sum())}"
+        )
+    stamps = estimate.stamps[inside]
+    return stamps, estimate.map_T_lidar[inside], interpolate(reference, stamps).map_T_lidar
+
+
+def _inverse(poses: FloatArray) -> FloatArray:
+    """(N, 4, 4) inverses of rigid transforms."""
+    result = np.tile(np.eye(4), (len(poses), 1, 1))
+    result[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
+    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], poses[:, :3, 3])
+    return result
+
+
+def _angles_deg(rotations: FloatArray) -> FloatArray:
+    """(N,) degrees of (N, 3, 3) rotations."""
+    if not len(rotations):
+        return np.zeros(0)
+    angles: FloatArray = np.degrees(Rotation.from_matrix(rotations).magnitude())
+    return angles
+
+
+def _check_stamps(caller: str, trajectory: Trajectory) -> None:
+    """Raise InputError unless there is something to interpolate between."""
+    if len(trajectory) < 2:
+        raise InputError(
+            f"{caller}: expected 2 or more poses to interpolate between, got {len(trajectory)}"
+        )
+    repeated = np.flatnonzero(np.diff(trajectory.stamps) <= 0)
+    if len(repeated):
+        at = int(repeated[0]) + 1
+        raise InputError(
+            f"{caller}: expected increasing stamps, got {trajectory.stamps[at]} at index {at} "
+            f"after {trajectory.stamps[at - 1]}; sort the poses and drop repeated ones"
+        )
 
 
 def _rms(values: FloatArray) -> float:

@@ -232,7 +232,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     for name in ("error_before", "error_after"):
         arrays[name] = np.array([getattr(u, name) for u in updates], np.float64)
     with replacing(path) as file:
-        np.savez_compressed(file, **arrays)
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
 def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.floating]) -> None:

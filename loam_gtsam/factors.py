@@ -345,7 +345,8 @@ def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:
     """
     normals = rows.scales[:, None] * rows.normals
     offsets = rows.scales * rows.offsets
-    anchor, *_ = np.linalg.lstsq(normals.T @ normals, -normals.T @ offsets, rcond=1e-9)
+    solved, *_ = np.linalg.lstsq(normals.T @ normals, -normals.T @ offsets, rcond=1e-9)
+    anchor: FloatArray = solved.astype(np.float64, copy=False)
     matrix = np.empty((len(offsets), 13))
     np.multiply(normals[:, :, None], rows.points[:, None, :], out=_as_3x3(matrix))
     matrix[:, 9:12] = normals
@@ -387,9 +388,9 @@ def _row_residuals(
     map_T_lidar: gtsam.Pose3, points: FloatArray, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Residuals (M,) and Jacobian (M, 6) of plane rows."""
-    map_T: FloatArray = map_T_lidar.matrix()
-    local = normals @ map_T[:3, :3]
-    residual = np.einsum("ij,ij->i", local, points) + normals @ map_T[:3, 3] + offsets
+    rotation = map_T_lidar.rotation().matrix()
+    local = normals @ rotation
+    residual = np.einsum("ij,ij->i", local, points) + normals @ map_T_lidar.translation() + offsets
     return residual, np.hstack([np.cross(points, local), local])
 
 

@@ -2,7 +2,7 @@
 
 The rules are those of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in Real-time, RSS
 2014, section V.A, and the published code's scan registration): curvature along each ring of the
-raw sweep, rejection of occluded and grazing points, and picks by sector. Three things differ from
+raw sweep, rejection of occluded and grazing points, and picks by sector. Two things differ from
 the published code:
 
 * Picks are made for all sectors at once, edges of the whole sweep before its plane points. The
@@ -11,7 +11,6 @@ the published code:
   that would suppress each other, the one in the earlier sector stays.
 * Flat picks stand in ``Features.planes`` as they were measured, before the rest, which is
   voxel-filtered; the published code puts them into the filter too.
-* A window never reaches into the next ring.
 """
 
 from __future__ import annotations
@@ -271,7 +270,8 @@ def _assemble(
 ) -> Features:
     """Gather positions, times from the reference time, and rings."""
     span = sweep.span
-    reference = {"start": span[0], "end": span[1], "stamp": 0.0}[config.deskew.reference]
+    moments = {"start": span[0], "middle": 0.5 * sum(span), "end": span[1], "stamp": 0.0}
+    reference = moments[config.deskew.reference]
     times = sweep.times - reference
     ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
 

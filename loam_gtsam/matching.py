@@ -133,7 +133,7 @@ def match_lines(
     centres, directions, eigenvalues = fit_lines(neighbours[near])
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
     ring = _cross(map_T_lidar[:3, 2], points_map[near].T - map_T_lidar[:3, 3:])
-    is_line &= np.abs(_dot(directions, ring)) <= config.max_ring_cosine * _norm(ring)
+    is_line &= np.abs(_dot(directions, ring)) <= (config.max_ring_cosine + _TINY) * _norm(ring)
     away = points_map[near].T - centres
     along = _dot(away, directions)
     distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))

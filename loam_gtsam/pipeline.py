@@ -75,12 +75,12 @@ class Pipeline:
 
     def process(self, sweep: Sweep) -> MapUpdate:
         """Register one sweep; what it contains never raises, see the status of the result."""
+        if isinstance(sweep, BadSweep):
+            return self.mapper.skip(sweep.stamp, sweep.message)
+        if isinstance(sweep, FeatureSweep):
+            return self._process_features(sweep)
         started = time.perf_counter()
         try:
-            if isinstance(sweep, BadSweep):
-                return self.mapper.skip(sweep.stamp, sweep.message)
-            if isinstance(sweep, FeatureSweep):
-                return self._process_features(sweep)
             features = extract_features(sweep, self.config)
         except SweepError as error:
             return self.mapper.skip(sweep.stamp, str(error))

@@ -84,14 +84,14 @@ def test_a_guess_places_the_first_sweep(rng):
     assert np.abs(start.localCoordinates(update.map_T_lidar)).max() < 5e-3
 
 
-@pytest.mark.parametrize("reference", ["start", "end", "stamp"])
+@pytest.mark.parametrize("reference", ["start", "middle", "end", "stamp"])
 def test_poses_belong_to_the_stated_reference_time(reference):
     world = SimulatedWorld("street_loop", frames=66, columns=900)  # at 10 m/s: 1 m a sweep
     scans = [world[i] for i in range(60, 66)]
     config = with_deskew(reference=reference)
     mapper = Mapper(config)
     updates = [mapper.register(extract_features(scan, config)) for scan in scans]
-    offset = SECOND // 10 if reference == "end" else 0
+    offset = {"middle": SECOND // 20, "end": SECOND // 10}.get(reference, 0)
     expected = np.array([scan.stamp + offset for scan in scans])
     assert np.array_equal([u.stamp for u in updates], expected)
     # The first reference pose is the origin of the map.

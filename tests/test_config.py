@@ -1,0 +1,195 @@
+"""Configuration: YAML there and back, and every way in which a file can be wrong."""
+
+import dataclasses
+import typing
+
+import pytest
+
+from loam_gtsam.config import (
+    PRESETS,
+    Config,
+    MapConfig,
+    MatchingConfig,
+    SensorConfig,
+    SolverConfig,
+    config_from_dict,
+    config_to_dict,
+    dump_config,
+    load_config,
+    parse_config,
+    preset,
+)
+from loam_gtsam.types import ConfigError, LoamError
+
+
+def fields_of(section):
+    """(section class, field) of every number, text and choice of the tree."""
+    for item in dataclasses.fields(section):
+        value = getattr(section, item.name)
+        if dataclasses.is_dataclass(value):
+            yield from fields_of(value)
+        else:
+            yield type(section), item
+
+
+FIELDS = list(fields_of(Config()))
+BOUNDS = [
+    (owner, item, end)
+    for owner, item in FIELDS
+    for end in ("low", "high")
+    if item.metadata[end] is not None
+]
+
+
+def name_of(value):
+    return value.name if isinstance(value, dataclasses.Field) else getattr(value, "__name__", value)
+
+
+# -- there and back --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_survives_yaml_and_dictionaries(name):
+    config = preset(name)
+    assert parse_config(dump_config(config)) == config
+    assert config_from_dict(config_to_dict(config)) == config
+    assert parse_config(f"preset: {name}") == config
+
+
+def test_values_other_than_the_default_survive_too():
+    config = Config(
+        sensor=SensorConfig(model="hdl64", spin="clockwise", min_range=1.25),
+        map=MapConfig(window=(7, 9, 3), field_of_view=False, archive_dir="/somewhere: odd #name"),
+        matching=MatchingConfig(neighbours=6, weight_slope=0.0),
+        solver=SolverConfig(translation_tolerance=1e-5),
+    )
+    assert parse_config(dump_config(config)) == config != Config()
+    assert dump_config(parse_config(dump_config(config))) == dump_config(config)
+
+
+def test_every_key_is_dumped_below_a_comment_with_its_unit_and_source():
+    lines = dump_config(Config()).splitlines()
+    for owner, item in FIELDS:
+        meta = item.metadata
+        assert meta["doc"], item.name
+        at = [i for i, line in enumerate(lines) if line.strip().startswith(f"{item.name}:")]
+        comments = []
+        for i in at:
+            start = i
+            while lines[start - 1].strip().startswith("#"):
+                start -= 1
+            comments.append(" ".join(line.strip(" #") for line in lines[start:i]))
+        found = [text for text in comments if meta["doc"] in text]
+        assert found, f"{owner.__name__}.{item.name} has no comment"
+        assert any(meta["unit"] in text and meta["source"] in text for text in found)
+
+
+def test_an_empty_file_is_the_default_and_absent_keys_keep_it(tmp_path):
+    assert parse_config("") == parse_config("# only a comment\n") == Config()
+    file = tmp_path / "some.yaml"
+    file.write_text("solver: {iterations: 3}\nmap:\n  window: [9, 9, 5]\n")
+    config = load_config(file)
+    assert config.solver == SolverConfig(iterations=3)
+    assert config.map == MapConfig(window=(9, 9, 5))
+    assert config.matching == MatchingConfig()
+
+
+def test_an_integer_serves_as_a_float_and_null_as_none():
+    config = parse_config("map: {cube_size: 40, archive_dir: null}")
+    assert config.map.cube_size == 40.0
+    assert isinstance(config.map.cube_size, float)
+    assert config.map.archive_dir is None
+
+
+def test_the_tree_is_frozen():
+    for section in (Config(), Config().solver):
+        name = dataclasses.fields(section)[0].name
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            setattr(section, name, getattr(section, name))
+
+
+# -- what is refused -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("solver:\n  iterationz: 3", ("here.yaml:2", "solver.iterationz", "'iterations'")),
+        ("\nsolvr: {}", ("here.yaml:2", "unknown key 'solvr'", "'solver'")),
+        ("qqq: 1", ("here.yaml:1", "unknown key 'qqq'", "known:", "matching")),
+        ("1: 2", ("unknown key '1'",)),
+        ("map:\n  cube_size: wide", ("here.yaml:2", "map.cube_size", "expected float", "'wide'")),
+        ("solver:\n\n  iterations: 2.5", ("here.yaml:3", "expected int", "2.5")),
+        ("solver: {iterations: true}", ("expected int", "True")),
+        ("map: {cube_size: true}", ("expected float", "True")),
+        ("map: {field_of_view: 1}", ("expected bool", "1")),
+        ("map: {archive_dir: 3}", ("map.archive_dir", "expected str", "3")),
+        ("map: {cube_size: null}", ("expected float", "None")),
+        ("map: {cube_size: .nan}", ("map.cube_size", "at least 1.0", "nan")),
+        ("sensor: {start_azimuth_deg: .nan}", ("start_azimuth_deg", "nan")),
+        ("map: {window: [9, 9]}", ("map.window", "expected 3 values")),
+        ("map: {window: 9}", ("map.window", "expected 3 values", "9")),
+        ("map: {window: [9, 9, 5.5]}", ("map.window", "expected int", "5.5")),
+        ("map: {window: [9, 9, 0]}", ("map.window", "at least 1", "0")),
+        ("sensor: {model: vlp17}", ("sensor.model", "expected one of", "did you mean 'vlp16'")),
+        ("sensor: {model: [vlp16]}", ("sensor.model", "expected one of")),
+        ("solver: 3", ("here.yaml:1", "solver is a section", "3")),
+        ("solver:", ("solver is a section", "None")),
+        ("preset: defualt", ("here.yaml:1", "unknown preset 'defualt'", "'default'")),
+        ("preset: [default]", ("unknown preset",)),
+        ("- solver", ("expected a mapping", "here.yaml")),
+        ("just words", ("expected a mapping", "here.yaml")),
+        ("solver: [unclosed", ("here.yaml", "not valid YAML")),
+        ("solver: {}\nsolver: {}", ("here.yaml", "not valid YAML", "duplicate")),
+        ("a: \0", ("here.yaml", "not valid YAML")),
+    ],
+)
+def test_a_wrong_file_is_refused_with_key_and_line(text, words):
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text, "here.yaml")
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize(("owner", "item", "end"), BOUNDS, ids=name_of)
+def test_every_bound_accepts_itself_and_refuses_what_lies_beyond(owner, item, end):
+    limit = item.metadata[end]
+    hint = typing.get_type_hints(owner)[item.name]
+    whole = hint is not float
+    step = (1 if whole else 1e-9) * (-1 if end == "low" else 1)
+    at, beyond = (int(limit), int(limit) + step) if whole else (float(limit), limit + step)
+    if typing.get_origin(hint) is tuple:
+        at, beyond = (at,) * 3, (at, at, beyond)
+    assert getattr(owner(**{item.name: at}), item.name) == at
+    with pytest.raises(ConfigError, match=rf"{owner.__name__}\.{item.name}: expected at"):
+        owner(**{item.name: beyond})
+
+
+def test_bounds_are_stated_together():
+    with pytest.raises(ConfigError, match=r"at least 0\.0 and at most 1\.0, got 1\.5"):
+        MatchingConfig(min_weight=1.5)
+
+
+def test_a_constructor_refuses_too():
+    with pytest.raises(ConfigError, match=r"SolverConfig\.iterations: expected int"):
+        SolverConfig(iterations=True)
+    with pytest.raises(ConfigError, match=r"MapConfig\.window: expected 3 values"):
+        MapConfig(window=(1, 2))
+    with pytest.raises(ConfigError, match=r"Config\.solver"):
+        Config(solver={"iterations": 3})
+
+
+def test_an_unknown_preset_names_the_nearest():
+    with pytest.raises(ConfigError, match=r"unknown preset 'defaults'; did you mean 'default'"):
+        preset("defaults")
+
+
+def test_an_unreadable_file_is_a_config_error(tmp_path):
+    latin = tmp_path / "latin.yaml"
+    latin.write_bytes(b"map: {archive_dir: \xe9\xe8}")
+    for path in (tmp_path / "absent.yaml", tmp_path, latin):
+        with pytest.raises(ConfigError, match="cannot read the configuration") as caught:
+            load_config(path)
+        assert str(path) in str(caught.value)
+    assert issubclass(ConfigError, LoamError)
+    assert issubclass(ConfigError, ValueError)

@@ -1,0 +1,86 @@
+"""Every example runs, and does what it says."""
+
+from __future__ import annotations
+
+import runpy
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[1] / "examples"
+Names = dict[str, Any]
+
+
+def built_in_scene(names: Names, output: str) -> None:
+    assert names["error"].rmse < 0.02
+    written = {file.name for file in Path("loam_gtsam_output/example_01").iterdir()}
+    assert {"trajectory.tum", "run.npz", "map.ply", "summary.json"} <= written
+
+
+def numpy_arrays(names: Names, output: str) -> None:
+    lines = output.splitlines()
+    assert [number for number, line in enumerate(lines) if "unusable_scan" in line] == [5]
+    assert names["update"].status == "ok"
+    assert len(names["planes"]) > 1000
+
+
+def every_step(names: Names, output: str) -> None:
+    update, truth = names["update"], names["truth"]
+    assert names["mapper"].config.matching.max_distance == 0.8
+    assert update.status == "ok"
+    assert np.linalg.norm(update.map_T_lidar.translation() - truth[:3, 3]) < 0.02
+    assert update.error_after < update.error_before
+
+
+def own_prior(names: Names, output: str) -> None:
+    free, target = names["free"], names["target"]
+    assert abs(names["held"] - target) < 1e-3  # the last prior is far stronger than the scan
+    assert names["after"] < names["sigma"]
+    # A prior as strong as the scan meets it half way, up to new matches at the new place.
+    held, _ = names["height_with"]([names["height_prior"](target, names["sigma"])])
+    assert held == pytest.approx(0.5 * (free + target), abs=0.005)
+
+
+def factors_by_hand(names: Names, output: str) -> None:
+    assert names["graph"].size() == 1
+    assert names["difference"] < 1e-9
+    moved = gtsam.Pose3().localCoordinates(names["optima"][0])
+    assert np.linalg.norm(moved) > 1e-3  # it was not there from the start
+
+
+def ouster_sweeps(names: Names, output: str) -> None:
+    assert [update.status for update in names["result"].updates] == ["first", "ok", "ok"]
+    steps = np.linalg.norm(np.diff(names["positions"], axis=0), axis=1)
+    np.testing.assert_allclose(steps, (0.225, 0.245), atol=0.01)
+    assert "point times: field 't_ns' in ns" in output
+
+
+CHECKS: dict[str, Callable[[Names, str], None]] = {
+    "01_map_a_built_in_scene.py": built_in_scene,
+    "02_numpy_arrays.py": numpy_arrays,
+    "03_every_step.py": every_step,
+    "04_own_prior.py": own_prior,
+    "05_factors_by_hand.py": factors_by_hand,
+    "06_ouster_sweeps.py": ouster_sweeps,
+}
+
+
+def test_every_example_is_checked() -> None:
+    assert sorted(file.name for file in FOLDER.glob("*.py")) == sorted(CHECKS)
+
+
+@pytest.mark.parametrize("name", CHECKS)
+def test_example(
+    name: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", [name])
+    names = runpy.run_path(str(FOLDER / name), run_name="__main__")
+    CHECKS[name](names, capsys.readouterr().out)

@@ -1,0 +1,260 @@
+"""Geometry on arrays: against GTSAM, numpy.linalg.eigh and closed forms."""
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from loam_gtsam.geometry import (
+    fit_lines,
+    fit_planes,
+    moments,
+    move_points,
+    symmetric_eigenvalues,
+    symmetric_eigenvector,
+    transform,
+    voxel_filter,
+    voxel_keys,
+)
+
+RATES = (0.0, 1e-12, 1e-10, 0.9e-9, 1.1e-9, 1e-8, 1e-6, 1e-3, 0.5, 8.0, 60.0)
+AXES = [*np.eye(3), np.array([1.0, -2.0, 2.0]) / 3.0]
+
+
+def packed(matrices):
+    """(N, 3, 3) as the (6, N) of the geometry module."""
+    return np.stack(
+        [matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))]
+    )
+
+
+def random_rotation(rng):
+    return gtsam.Rot3.Expmap(rng.normal(size=3)).matrix()
+
+
+def same_axis(a, b):
+    """Sine of the angle between unit vectors, whose signs are arbitrary; (3, N) each."""
+    return np.linalg.norm(np.cross(a, b, axis=0), axis=0)
+
+
+# -- rigid motion ----------------------------------------------------------------------------------
+
+
+def test_transform_equals_gtsam():
+    rng = np.random.default_rng(0)
+    pose = gtsam.Pose3.Expmap(rng.normal(size=6))
+    points = rng.normal(size=(20, 3))
+    expected = np.array([pose.transformFrom(point) for point in points])
+    np.testing.assert_allclose(transform(pose.matrix(), points), expected, atol=1e-14)
+    assert transform(pose.matrix(), points.astype(np.float32)).dtype == np.float64
+
+
+@pytest.mark.parametrize("rate", RATES)
+def test_move_points_equals_the_exponential_map_point_by_point(rate):
+    rng = np.random.default_rng(1)
+    points, times = rng.uniform(-100, 100, (12, 3)), rng.uniform(-0.2, 0.2, 12)
+    times[0] = 0.0
+    for axis in AXES:
+        twist = np.concatenate([rate * axis, [20.0, -3.0, 1.0]])
+        expected = [
+            gtsam.Pose3.Expmap(twist * t).transformFrom(p)
+            for p, t in zip(points, times, strict=True)
+        ]
+        np.testing.assert_allclose(
+            move_points(points, twist, times),
+            expected,
+            rtol=0,
+            atol=2e-11 + 25 * (rate < 1e-9) * rate,
+        )
+
+
+@pytest.mark.parametrize("rate", [1.01e-9, 1e-8, 1e-7, 1e-6])
+def test_a_slow_turn_keeps_its_digits(rate):
+    """The path bends by |w| |v| t^2 / 2; 1 - cos(|w| t) would round it to nothing."""
+    moved = move_points(np.zeros((1, 3)), np.array([0, 0, rate, 20.0, 0, 0]), np.array([1.0]))
+    assert moved[0, 1] == pytest.approx(0.5 * rate * 20.0, rel=1e-9)
+
+
+def test_move_points_leaves_its_input_alone_and_takes_float32_and_none():
+    points = np.arange(6, dtype=np.float32).reshape(2, 3)
+    twist, times = np.array([0.1, 0.2, 0.3, 1.0, 2.0, 3.0]), np.array([0.1, 0.2])
+    before = points.copy()
+    moved = move_points(points, twist, times)
+    assert moved.dtype == np.float64
+    assert not np.allclose(moved, points)
+    np.testing.assert_array_equal(points, before)
+    assert move_points(points[:0], twist, times[:0]).shape == (0, 3)
+    still = move_points(points, np.zeros(6), times)
+    np.testing.assert_array_equal(still, points)
+    assert not np.shares_memory(still, points)
+
+
+twists = st.lists(st.floats(-3, 3), min_size=6, max_size=6).map(np.array)
+
+
+@settings(max_examples=40, deadline=None)
+@given(twist=twists, a=st.floats(-1, 1), b=st.floats(-1, 1))
+def test_moving_twice_adds_the_times(twist, a, b):
+    points = np.array([[0.0, 0, 0], [10, -20, 3], [1e-3, 0, 50]])
+    step = move_points(move_points(points, twist, np.full(3, a)), twist, np.full(3, b))
+    once = move_points(points, twist, np.full(3, a + b))
+    np.testing.assert_allclose(step, once, atol=1e-7)
+    away = once[1:] - once[:-1]
+    np.testing.assert_allclose(
+        np.linalg.norm(away, axis=1), np.linalg.norm(np.diff(points, axis=0), axis=1), rtol=1e-7
+    )
+
+
+# -- eigenvalues -----------------------------------------------------------------------------------
+
+
+def matrices_of(kind, rng):
+    if kind == "random":
+        a = rng.normal(size=(200, 3, 3))
+        return a + a.swapaxes(1, 2)
+    if kind == "covariance":
+        a = rng.normal(size=(200, 3, 5)) * rng.uniform(1e-3, 10, (200, 3, 1))
+        return a @ a.swapaxes(1, 2)
+    if kind in ("rank 1", "rank 2"):
+        a = rng.normal(size=(200, 3, int(kind[-1])))
+        return a @ a.swapaxes(1, 2)
+    if kind == "diagonal":
+        return np.stack([np.diag(d) for d in rng.permuted(np.tile([1.0, 2, 5], (20, 1)), axis=1)])
+    if kind == "isotropic":
+        return np.eye(3)[None] * rng.uniform(0.1, 10, (20, 1, 1))
+    return np.zeros((3, 3, 3))
+
+
+@pytest.mark.parametrize(
+    "kind", ["random", "covariance", "rank 1", "rank 2", "diagonal", "isotropic", "zero"]
+)
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_eigenvalues_and_vectors_equal_eigh(kind, scale):
+    matrices = scale * matrices_of(kind, np.random.default_rng(2))
+    expected, vectors = np.linalg.eigh(matrices)
+    size = np.abs(expected).max(axis=1)
+    found = symmetric_eigenvalues(packed(matrices))
+    # Half the digits where two eigenvalues meet: the price of the closed form.
+    np.testing.assert_allclose(found.T / np.maximum(size, 1e-300)[:, None],
+                               expected / np.maximum(size, 1e-300)[:, None], atol=3e-8)  # fmt: skip
+    assert (np.diff(found, axis=0) >= -1e-15 * size).all()
+    for which in (0, 2):
+        vector = symmetric_eigenvector(packed(matrices), found[which])
+        np.testing.assert_allclose(np.linalg.norm(vector, axis=0), 1.0, atol=1e-12)
+        gap = np.abs(expected[:, which] - expected[:, 1]) > 0.05 * size
+        assert gap.any() or kind in ("isotropic", "zero", "rank 1")
+        assert (same_axis(vector[:, gap], vectors[gap, :, which].T) < 1e-6).all()
+
+
+# -- lines and planes ------------------------------------------------------------------------------
+
+
+def test_moments_are_those_of_numpy_and_leave_the_input_alone():
+    rng = np.random.default_rng(3)
+    groups = rng.normal(size=(4, 6, 3))
+    # This memory order is the one the computation works in: it must copy all the same.
+    groups = np.ascontiguousarray(groups.transpose(2, 1, 0)).transpose(2, 1, 0)
+    before = groups.copy()
+    means, covariance = moments(groups)
+    np.testing.assert_array_equal(groups, before)
+    np.testing.assert_allclose(means.T, groups.mean(axis=1), atol=1e-15)
+    expected = np.stack([np.cov(group.T, bias=True) for group in groups])
+    np.testing.assert_allclose(covariance, packed(expected), atol=1e-14)
+
+
+@pytest.mark.parametrize("centre", [(0, 0, 0), (3, -4, 5), (1e4, -1e4, 1e3)])
+@pytest.mark.parametrize("axis", AXES)
+def test_lines_in_closed_form(axis, centre):
+    group = np.array(centre) + np.outer([-0.4, -0.2, 0.0, 0.2, 0.4], axis)
+    centres, directions, eigenvalues = fit_lines(group[None])
+    np.testing.assert_allclose(centres[:, 0], centre, atol=1e-11)
+    assert same_axis(directions, axis[:, None])[0] < 1e-7
+    np.testing.assert_allclose(eigenvalues[:, 0], [0, 0, 0.08], atol=1e-8)
+
+
+@pytest.mark.parametrize("centre", [(0, 0, 0), (3, -4, 5), (1e4, -1e4, 1e3)])
+@pytest.mark.parametrize("normal", AXES)
+def test_planes_in_closed_form(normal, centre):
+    """Through the origin too, where LOAM's form n.q = -1 has no answer."""
+    wide = np.cross(normal, [0.6, 0.0, 0.8])
+    wide /= np.linalg.norm(wide)
+    narrow = np.cross(normal, wide)
+    cross = np.array([[1, 0], [-1, 0], [0, 0.5], [0, -0.5], [0, 0]])
+    group = np.array(centre) + cross @ np.stack([wide, narrow])
+    centres, normals, directions, eigenvalues = fit_planes(group[None])
+    np.testing.assert_allclose(centres[:, 0], centre, atol=1e-11)
+    assert same_axis(normals, normal[:, None])[0] < 1e-7
+    assert same_axis(directions, wide[:, None])[0] < 1e-7
+    np.testing.assert_allclose(eigenvalues[:, 0], [0, 0.1, 0.4], atol=1e-8)
+
+
+def test_noisy_fits_equal_eigh():
+    rng = np.random.default_rng(4)
+    groups = rng.uniform(-50, 50, (300, 1, 3)) + rng.normal(size=(300, 5, 3)) * [1.0, 0.3, 0.05]
+    groups = groups @ random_rotation(rng).T
+    away = groups - groups.mean(axis=1, keepdims=True)
+    expected, vectors = np.linalg.eigh(away.swapaxes(1, 2) @ away / 5)
+    centres, directions, eigenvalues = fit_lines(groups)
+    np.testing.assert_allclose(centres.T, groups.mean(axis=1), atol=1e-12)
+    np.testing.assert_allclose(eigenvalues.T, expected, atol=1e-9)
+    _, normals, wide, _ = fit_planes(groups)
+    np.testing.assert_array_equal(wide, directions)
+    clear = (expected[:, 0] < 0.5 * expected[:, 1]) & (expected[:, 1] < 0.5 * expected[:, 2])
+    assert clear.sum() > 150
+    assert (same_axis(directions, vectors[:, :, 2].T)[clear] < 1e-6).all()
+    assert (same_axis(normals, vectors[:, :, 0].T)[clear] < 1e-6).all()
+
+
+def test_identical_points_and_no_groups_give_finite_unit_vectors():
+    centres, directions, eigenvalues = fit_lines(np.full((2, 5, 3), 7.0))
+    np.testing.assert_array_equal(centres, 7.0)
+    np.testing.assert_array_equal(eigenvalues, 0.0)
+    np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0)
+    assert [part.shape for part in fit_planes(np.empty((0, 5, 3)))] == [(3, 0)] * 4
+
+
+# -- voxels ----------------------------------------------------------------------------------------
+
+
+def reference_filter(points, size):
+    """Centroids by a dictionary, in order of the voxels."""
+    voxels = {}
+    for point in points:
+        voxels.setdefault(tuple(np.floor(point[:3] / size).astype(int)), []).append(point)
+    return np.array([np.mean(voxels[key], axis=0) for key in sorted(voxels)])
+
+
+@pytest.mark.parametrize("columns", [3, 4, 5])
+@pytest.mark.parametrize("size", [0.2, 0.4, 3.0])
+def test_voxel_filter_equals_a_dictionary(columns, size):
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-2, 2, (400, columns))  # negative coordinates too; the rest is averaged
+    expected = reference_filter(points, size)
+    found = voxel_filter(points, size)
+    assert 1 < len(expected) < 400
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    shuffled = voxel_filter(points[rng.permutation(400)], size)
+    np.testing.assert_allclose(shuffled, found, atol=1e-12)
+
+
+def test_voxels_do_not_straddle_zero():
+    points = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
+    assert len(voxel_filter(points, 1.0)) == 2
+    assert len(voxel_filter(points + 0.5, 1.0)) == 1
+
+
+def test_voxel_filter_off_and_empty():
+    points = np.array([[1.0, 2, 3], [1.0, 2, 3]], dtype=np.float32)
+    np.testing.assert_array_equal(voxel_filter(points, 0.0), points)
+    assert voxel_filter(points, 0.0).dtype == np.float64
+    assert len(voxel_filter(points, 0.1)) == 1
+    assert voxel_filter(np.empty((0, 4)), 0.2).shape == (0, 4)
+
+
+def test_voxel_keys_tell_every_voxel_apart_and_sort_by_x_y_z():
+    far = (1 << 20) - 1
+    steps = np.array([-far - 1, -far, -1, 0, 1, far])
+    cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
+    keys = voxel_keys((cells + 0.5) * 0.25, 0.25)
+    assert (np.diff(keys) > 0).all()

@@ -9,7 +9,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -103,9 +103,10 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     return 0
 
 
-def free_folder(wanted: Path, overwrite: bool) -> Path:
+def free_folder(
+    wanted: Path, overwrite: bool, known: Sequence[str] = (*RUN_FILES, *PLOT_FILES, TRUTH_FILE)
+) -> Path:
     """``wanted``, or, if that holds a run that must not be replaced, a new folder beside it."""
-    known = (*RUN_FILES, *PLOT_FILES, TRUTH_FILE)
     if overwrite or not any((wanted / name).exists() for name in known):
         return wanted
     wanted = wanted if wanted.name not in ("", "..") else wanted.resolve()

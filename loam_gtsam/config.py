@@ -190,6 +190,12 @@ class DeskewConfig(_Section):
     """Removal of the motion distortion."""
 
     enabled: bool = _param(True, "de-skew with the guess, and again with the solution")
+    refine: bool = _param(
+        True,
+        "de-skew again with the solution, and register the first two sweeps anew when their motion "
+        "is known; false de-skews once, with the guess",
+        source="LOAM de-skews once",
+    )
     reference: Literal["start", "middle", "end", "stamp"] = _param(
         "start", "the moment of the sweep the pose belongs to"
     )
@@ -259,6 +265,12 @@ class MatchingConfig(_Section):
         source="LOAM uses 3",
         low=1.0,
     )
+    plane_fit: Literal["centroid", "unit_offset"] = _param(
+        "centroid",
+        "the plane is fitted about the centroid, or by A n = -1, which cannot represent a plane "
+        "through the map origin",
+        source="LOAM and A-LOAM use unit_offset",
+    )
     plane_tolerance: float = _param(
         0.2, "farthest of the five from the plane", unit="m", source="LOAM", low=0.0
     )
@@ -292,6 +304,11 @@ class MatchingConfig(_Section):
         source="LOAM",
         low=0.0,
     )
+    weight_range: Literal["lidar", "map"] = _param(
+        "lidar",
+        "whether the range in a plane's weight is that from the sensor or from the map origin",
+        source="LIO-SAM uses lidar, LOAM map",
+    )
     min_weight: float = _param(
         0.1, "a match with a smaller weight is dropped", source="LOAM", low=0.0, high=1.0
     )
@@ -301,8 +318,14 @@ class MatchingConfig(_Section):
 class SolverConfig(_Section):
     """The per-frame solve."""
 
+    method: Literal["gtsam", "loam", "aloam"] = _param(
+        "gtsam",
+        "factor graph; LOAM's Gauss-Newton on Euler angles; A-LOAM's robust Levenberg-Marquardt",
+    )
     iterations: int = _param(10, "associations at most", source="LOAM", low=1)
-    inner_iterations: int = _param(2, "Levenberg-Marquardt iterations per association", low=1)
+    inner_iterations: int = _param(
+        2, "Levenberg-Marquardt iterations per association", source="A-LOAM uses 4", low=1
+    )
     rotation_tolerance_deg: float = _param(
         0.05,
         "stop when an association moves the pose less than this",
@@ -313,12 +336,36 @@ class SolverConfig(_Section):
     translation_tolerance: float = _param(
         0.0005, "and less than this", unit="m", source="LOAM", low=0.0
     )
+    step_sigmas: float = _param(
+        0.5,
+        "or when it moves the pose less than this many of its standard deviations; 0 turns it off",
+        low=0.0,
+    )
     min_matches: int = _param(50, "fewer matches: no solve", source="LOAM", low=6)
     min_map_edges: int = _param(
         0, "least edge points of the local map for a solve", source="LOAM uses 11", low=0
     )
     min_map_planes: int = _param(
         50, "least plane points of the local map", source="A-LOAM uses 51, LOAM 101", low=0
+    )
+    degeneracy_threshold: float = _param(
+        100.0,
+        "method loam: the step is projected out of eigenvectors of A^T A with smaller eigenvalues "
+        "(mixed rad and m); 0 turns it off",
+        source="LOAM",
+        low=0.0,
+    )
+    degeneracy_projector: Literal["correct", "published"] = _param(
+        "correct",
+        "method loam: V^-1 V2 with eigenvectors as rows, or with columns as in the published Eigen "
+        "port, which is no projection onto the good directions; only to study it",
+    )
+    huber_delta: float = _param(
+        0.1,
+        "method aloam: residual at which the loss turns linear; 0 turns it off",
+        unit="m",
+        source="A-LOAM",
+        low=0.0,
     )
 
 
@@ -335,7 +382,42 @@ class Config(_Section):
     solver: SolverConfig = _param(SolverConfig(), "the per-frame solve")
 
 
-PRESETS: dict[str, Config] = {"default": Config()}
+_CLASSICAL_MATCHING = MatchingConfig(
+    line_ratio=3.0,
+    plane_fit="unit_offset",
+    plane_ratio=0.0,
+    max_ring_cosine=1.0,
+    min_incidence_sine=0.0,
+    fit_uncertainty=False,
+    weight_range="map",
+)
+
+PRESETS: dict[str, Config] = {
+    "default": Config(),
+    # Zhang and Singh, LOAM (RSS 2014), constants of the published laserMapping.
+    "loam": Config(
+        deskew=DeskewConfig(refine=False),
+        odometry=OdometryConfig(method="scan_to_scan"),
+        map=MapConfig(insertion="centroid"),
+        matching=_CLASSICAL_MATCHING,
+        solver=SolverConfig(method="loam", min_map_edges=11, min_map_planes=101),
+    ),
+    # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings.
+    "aloam": Config(
+        deskew=DeskewConfig(refine=False),
+        odometry=OdometryConfig(method="scan_to_scan"),
+        map=MapConfig(neighbourhood=(5, 5, 3), field_of_view=False, insertion="centroid"),
+        matching=dataclasses.replace(_CLASSICAL_MATCHING, weight_slope=0.0),
+        solver=SolverConfig(
+            method="aloam",
+            iterations=2,
+            inner_iterations=4,
+            min_matches=6,  # A-LOAM has no minimum; fewer cannot fix a pose
+            min_map_edges=11,
+            min_map_planes=51,
+        ),
+    ),
+}
 
 
 def preset(name: str) -> Config:

@@ -14,7 +14,8 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
+from loam_gtsam.classical import ALoamSolver, ClassicalSolver
+from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import move_points, transform, voxel_filter
 from loam_gtsam.matching import ScanMatches, associate
@@ -32,12 +33,13 @@ class Mapper:
     Parameters
     ----------
     config : the whole configuration; ``map``, ``matching``, ``solver`` and ``deskew`` are used
-    solver : anything with :meth:`loam_gtsam.solvers.ScanSolver.solve`
+    solver : anything with :meth:`loam_gtsam.solvers.ScanSolver.solve`; the one that ``solver.method``
+        names if None
     """
 
     def __init__(self, config: Config | None = None, solver: ScanSolver | None = None) -> None:
         self.config = config or Config()
-        self.solver = solver or GtsamSolver(self.config.solver)
+        self.solver = solver or make_solver(self.config.solver)
         self.last: MapUpdate | None = None
         self._new_map()
         self._first: tuple[_Sweep, gtsam.Pose3] | None = None
@@ -82,7 +84,8 @@ class Mapper:
         clock.lap("prepare")
 
         if last is None:
-            self._first = sweep, start.map_T_lidar
+            if self.config.deskew.refine:
+                self._first = sweep, start.map_T_lidar
             update = self._insert(sweep, start, FrameStatus.FIRST, "the map starts here", clock)
         else:
             update = self._solve(sweep, start, priors, clock)
@@ -149,7 +152,7 @@ class Mapper:
             nonlocal associations
             clock.lap("solve")
             associations += 1
-            if associations == 2 and self._first is None:
+            if associations == 2 and self._first is None and self.config.deskew.refine:
                 # The first solve knows the motion better than the guess. Once is enough: further
                 # rounds cost associations and change nothing that can be measured.
                 sweep.deskew(self._twist(sweep, map_T_lidar, guess.twist))
@@ -242,6 +245,16 @@ class Mapper:
         self.edge_map.insert(transform(middle.matrix(), sweep.edges))
         self.plane_map.insert(transform(middle.matrix(), sweep.planes))
         self._last_middle = sweep.stamp, middle
+
+
+def make_solver(config: SolverConfig) -> ScanSolver:
+    """The solver that ``config.method`` names."""
+    solvers: dict[str, type[GtsamSolver | ClassicalSolver | ALoamSolver]] = {
+        "gtsam": GtsamSolver,
+        "loam": ClassicalSolver,
+        "aloam": ALoamSolver,
+    }
+    return solvers[config.method](config)
 
 
 class _Sweep:

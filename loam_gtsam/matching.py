@@ -12,7 +12,7 @@ import numpy as np
 
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import fit_lines, fit_planes, transform
+from loam_gtsam.geometry import fit_lines, fit_planes, moments, transform
 from loam_gtsam.types import FloatArray, IntArray
 
 _TINY = 1e-9
@@ -174,21 +174,25 @@ def match_planes(
     -----
     Two deliberate deviations from the published code: the plane is fitted about the centroid, so
     that a plane through the map's origin is no special case, and the range in the weight is that of
-    the point from the sensor (as in LIO-SAM), not from the map's origin.
+    the point from the sensor (as in LIO-SAM), not from the map's origin. ``plane_fit: unit_offset``
+    and ``weight_range: map`` give the published forms.
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
     group = neighbours[near]
     centres, normals, wide, eigenvalues = fit_planes(group)
     offsets = -_dot(normals, centres)
+    if config.plane_fit == "unit_offset":
+        normals, offsets = _unit_offset_planes(group)
     across = _dot(group.transpose(2, 1, 0), normals[:, None, :]) + offsets
     is_plane = np.abs(across).max(axis=0, initial=0.0) <= config.plane_tolerance
     is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
     away = points_map[near].T - centres
-    distances = _dot(away, normals)
+    distances = _dot(points_map[near].T, normals) + offsets
     rays = points_map[near].T - map_T_lidar[:3, 3:]
     ranges = _norm(rays)
     is_plane &= np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
-    weights = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(np.maximum(ranges, _TINY))
+    reach = _norm(points_map[near].T) if config.weight_range == "map" else ranges
+    weights = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(np.maximum(reach, _TINY))
     keep = is_plane & (weights > config.min_weight)
     along = _dot(away, wide)
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)
@@ -205,6 +209,31 @@ def match_planes(
         weights[keep],
         indices,
     )
+
+
+def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Planes by the least squares A n = -1 of LOAM and A-LOAM; unit normals (3, N), offsets (N,).
+
+    With mean m and covariance C of the points the solution is ``n = -a / (det C + m . a)`` with
+    ``a = adj(C) m`` (Sherman and Morrison on ``A^T A = k (C + m m^T)``): no inverse, and nothing
+    is lost where the points lie exactly in a plane. Where ``a`` vanishes (they lie in a plane
+    through the map origin, or on one line) there is no such plane; the offset is then infinite,
+    which fails the plane test.
+    """
+    means, (xx, yy, zz, xy, yz, xz) = moments(neighbours)
+    rows = (
+        (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy),
+        (xz * yz - xy * zz, xx * zz - xz * xz, xy * xz - xx * yz),
+        (xy * yz - xz * yy, xy * xz - xx * yz, xx * yy - xy * xy),
+    )
+    across = np.stack([x * means[0] + y * means[1] + z * means[2] for x, y, z in rows])
+    determinant = xx * rows[0][0] + xy * rows[0][1] + xz * rows[0][2]
+    scale = determinant + _dot(means, across)
+    length = _norm(across)
+    proper = (length > 0.0) & (scale != 0.0)
+    normals = -np.sign(scale) * across / np.where(proper, length, 1.0)
+    offsets = np.where(proper, np.abs(scale) / np.where(proper, length, 1.0), np.inf)
+    return normals, offsets
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:

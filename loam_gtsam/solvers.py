@@ -124,22 +124,30 @@ class GtsamSolver:
             moved = result.atPose3(POSE_KEY)
             step = pose.localCoordinates(moved)
             pose = moved
-            converged = within_tolerance(step, config)
-            if converged or iteration == config.iterations:
-                information = graph.linearize(result).hessian()[0]
+            information = graph.linearize(result).hessian()[0]
+            converged = within_tolerance(step, information, config)
+            if converged:
                 break
         return Solution(
             pose, True, converged, matches, iteration, steps, error_before, error_after, information
         )
 
 
-def within_tolerance(step: FloatArray, config: SolverConfig) -> bool:
-    """LOAM's stop rule: whether a (6,) step is below the rotation and translation tolerances."""
+def within_tolerance(step: FloatArray, information: FloatArray, config: SolverConfig) -> bool:
+    """Whether a (6,) step is small enough to stop: LOAM's rule, or small for what is known.
+
+    In a direction that the scan hardly fixes, re-association goes to and fro by more than LOAM's
+    half millimetre for ever. Such steps are far below the standard deviation in that direction.
+
+    Parameters
+    ----------
+    step : (6,) tangent, rad and m
+    information : (6, 6) of the pose
+    """
     rotation = np.degrees(np.linalg.norm(step[:3]))
     translation = np.linalg.norm(step[3:])
-    return bool(
-        rotation < config.rotation_tolerance_deg and translation < config.translation_tolerance
-    )
+    small = rotation < config.rotation_tolerance_deg and translation < config.translation_tolerance
+    return bool(small or step @ information @ step < config.step_sigmas**2)
 
 
 def match_rows(matches: ScanMatches) -> MatchRows:

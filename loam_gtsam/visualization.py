@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.util
 import io
-from collections.abc import Sequence
+import itertools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,8 @@ from loam_gtsam.types import FloatArray, IntArray, MapUpdate, OutputError, Traje
 
 _INK, _FAINT, _PATH, _TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
 _STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d")
+_RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8", "#7a5230")
+"""Of the solvers of a comparison, in the order they were named."""
 _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 _MAX_BYTES = 300_000
@@ -137,6 +140,105 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
             loc="center left", bbox_to_anchor=(1.0, 0.5),
         )  # fmt: skip
     axes.set(xlabel="frame", ylabel="time [ms]")
+    _save(figure, path)
+
+
+def plot_trajectories(
+    path: str | Path, trajectories: Mapping[str, Trajectory], truth: Trajectory | None = None
+) -> None:
+    """Draw several paths from above, and their heights.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    trajectories : by name, all in one frame (align them first)
+    truth : reference poses in the same frame, or None
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = _figure(9.0, 7.5)
+    top, side = figure.subplots(2, 1, height_ratios=(4, 1))
+    lines = [] if truth is None else [("truth", truth, _TRUTH, 4.0)]
+    named = zip(trajectories.items(), itertools.cycle(_RUN_COLOURS), strict=False)
+    lines += [(name, trajectory, colour, 1.3) for (name, trajectory), colour in named]
+    for name, trajectory, colour, width in lines:
+        xyz = trajectory.map_T_lidar[:, :3, 3]
+        top.plot(xyz[:, 0], xyz[:, 1], color=colour, lw=width, label=name)
+        side.plot(_travelled(xyz), xyz[:, 2], color=colour, lw=width)
+    top.set_aspect("equal", adjustable="datalim")
+    top.set(xlabel="x [m]", ylabel="y [m]")
+    top.legend(frameon=False)
+    side.set(xlabel="distance travelled [m]", ylabel="z [m]")
+    _save(figure, path)
+
+
+def plot_curves(
+    path: str | Path,
+    panels: Mapping[str, Mapping[str, tuple[NDArray[Any], FloatArray]]],
+    xlabel: str,
+    *,
+    log: bool = False,
+) -> None:
+    """Draw one curve per solver, in one or more panels above each other.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    panels : label of the vertical axis -> solver -> (N,) x and (N,) y; a solver has the colour of
+        its place in the first panel
+    log : logarithmic vertical axes; values of zero are left out
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = _figure(9.0, 1.0 + 2.8 * len(panels))
+    rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, (ylabel, curves) in zip(rows, panels.items(), strict=True):
+        for (name, (x, y)), colour in zip(
+            curves.items(), itertools.cycle(_RUN_COLOURS), strict=False
+        ):
+            axes.plot(x, np.where(y > 0.0, y, np.nan) if log else y, color=colour, lw=1.4,
+                      label=name)  # fmt: skip
+        if log:
+            axes.set_yscale("log")
+        else:
+            axes.set_ylim(bottom=0.0)
+        axes.set_ylabel(ylabel)
+        if curves:
+            axes.legend(frameon=False)
+    rows[-1].set_xlabel(xlabel)
+    _save(figure, path)
+
+
+def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> None:
+    """Draw the time a frame takes as one bar per solver, split into stages.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    stages : solver -> stage -> milliseconds
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = _figure(9.0, 1.4 + 0.5 * len(stages))
+    axes = figure.subplots()
+    names = list(dict.fromkeys(stage for row in stages.values() for stage in row))
+    left = np.zeros(len(stages))
+    for stage, colour in zip(names, itertools.cycle(_STAGE_COLOURS), strict=False):
+        width = np.array([row.get(stage, 0.0) for row in stages.values()])
+        axes.barh(list(stages), width, left=left, color=colour, height=0.6, label=stage)
+        left += width
+    axes.invert_yaxis()
+    axes.set_xlabel("median time per stage [ms]")
+    axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
     _save(figure, path)
 
 

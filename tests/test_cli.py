@@ -171,7 +171,7 @@ def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
     opens([*scans[:3], *bad])
     result = loam("run", "x", "--no-plot", "--output", "out")
     assert result.exit_code == 0
-    assert "6 unusable_scan" in result.output
+    assert "1 first, 2 ok, 6 unusable_scan" in result.output
     assert [n for n in range(1, 7) if f"damaged {n}" in result.output] == [1, 2, 3]
     assert "and 3 more" in result.output
     with np.load("out/run.npz") as data:

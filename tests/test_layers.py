@@ -12,11 +12,12 @@ LAYERS = (
     ("types", "config", "geometry"),
     ("rings", "sweep", "features", "cubemap", "matching", "imu_prior"),
     ("factors",),
-    ("solvers", "pose_graph"),
+    ("solvers", "classical", "pose_graph"),
     ("odometry", "loop_closure"),
     ("mapper",),
     ("pipeline",),
-    ("_cli_report", "_cli_run", "cli"),
+    ("comparison",),
+    ("_cli_report", "_report_html", "_cli_run", "_cli_compare", "cli"),
 )
 """From the bottom up; a module imports from lower layers, or as SAME_LAYER says."""
 
@@ -26,20 +27,25 @@ SAME_LAYER = {
     "sweep": {"rings"},
     "features": {"sweep"},
     "matching": {"cubemap"},
+    "classical": {"solvers"},
     "_cli_run": {"_cli_report"},
-    "cli": {"_cli_run", "_cli_report"},
+    "_cli_compare": {"_cli_run", "_cli_report", "_report_html"},
+    "cli": {"_cli_run", "_cli_report", "_cli_compare"},
 }
 
 LEAVES = {
     "datasets": {"datasets"},
     "evaluation": set(),
     "export": set(),
+    "peers": set(),
     "visualization": {"export"},
 }
-"""Leaves see layer 0 and these; of the layers, only the pipeline (the protocol) and the command
-line see them."""
+"""Leaves see layer 0 and these; of the layers, only the command line and LEAF_USERS see them."""
 
-LEAF_USERS = {"pipeline": {"datasets.base"}}
+LEAF_USERS = {
+    "pipeline": {"datasets.base"},
+    "comparison": {"datasets.base", "evaluation", "peers"},
+}
 
 PRINTERS = {"cli", "_cli_run", "_cli_report"}
 MODULES = sorted(ROOT.rglob("*.py"))

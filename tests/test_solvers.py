@@ -134,7 +134,17 @@ def test_the_same_input_gives_the_same_bits():
 @pytest.mark.parametrize("axis", [np.array([0.0, 0, -1]), np.array([2.0, -1, 2]) / 3])
 def test_the_stop_rule_bounds_rotation_and_translation(degrees, metres, within, axis):
     step = np.concatenate([np.radians(degrees) * axis, metres * axis])
-    assert within_tolerance(step, CONFIG) is within
+    assert within_tolerance(step, 1e12 * np.eye(6), CONFIG) is within
+
+
+@pytest.mark.parametrize(("metres", "within"), [(0.0049, True), (0.0051, False)])
+def test_a_step_far_below_what_is_known_is_small_enough(metres, within):
+    """A direction known to 1 cm: half a standard deviation is 5 mm."""
+    information = np.diag([1e12, 1e12, 1e12, 1e12, 1e12, 1e4])
+    step = np.array([0.0, 0.0, 0.0, 0.0, 0.0, metres])
+    assert within_tolerance(step, information, CONFIG) is within
+    assert not within_tolerance(step, information, changed(step_sigmas=0.0))
+    assert not within_tolerance(np.roll(step, 2), information, CONFIG)
 
 
 def test_the_iteration_limit_is_reported_as_not_converged():
@@ -148,7 +158,7 @@ def test_the_iteration_limit_is_reported_as_not_converged():
     assert solve(
         changed(iterations=1, rotation_tolerance_deg=5.0, translation_tolerance=1.0)
     ).converged
-    never = solve(changed(iterations=4, translation_tolerance=0.0))
+    never = solve(changed(iterations=4, translation_tolerance=0.0, step_sigmas=0.0))
     assert (never.converged, never.iterations) == (False, 4)
 
 

@@ -15,6 +15,7 @@ from loam_gtsam.geometry import voxel_filter, voxel_keys
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 
 ALL_AROUND = MapConfig(field_of_view=False)
+CENTROID = MapConfig(insertion="centroid")
 SMALL = MapConfig(
     cube_size=4.0, window=(5, 5, 3), window_margin=1, neighbourhood=(3, 3, 3), field_of_view=False
 )
@@ -360,7 +361,7 @@ def test_voxels_are_anchored_at_the_map_origin() -> None:
     """In 0.4 m voxels, 0.39 and 0.41 are apart and 0.41 and 0.79 together, also left of zero."""
     x = np.array([0.39, 0.41, 0.79, -0.01, -0.39, -0.41])
     points = np.stack([x, 0.0 * x, 0.0 * x], axis=1)
-    cube_map = CubeMap(MapConfig(), 0.4)
+    cube_map = CubeMap(CENTROID, 0.4)
     cube_map.insert(points)
     np.testing.assert_allclose(cube_map.points()[:, 0], [-0.41, -0.2, 0.39, 0.6], atol=1e-15)
     # A border voxel (24.8 to 25.2) that two cubes share has a point in each of them.
@@ -369,7 +370,7 @@ def test_voxels_are_anchored_at_the_map_origin() -> None:
 
 
 def test_centroid_counts_the_old_point_once() -> None:
-    cube_map = CubeMap(MapConfig(), 0.4)
+    cube_map = CubeMap(CENTROID, 0.4)
     cube_map.insert(np.array([[0.0, 0.1, 0.1], [0.2, 0.1, 0.1]]))
     cube_map.insert(np.array([[0.3, 0.1, 0.1]]))
     np.testing.assert_allclose(cube_map.points(), [[0.2, 0.1, 0.1]])
@@ -377,7 +378,7 @@ def test_centroid_counts_the_old_point_once() -> None:
 
 def test_centroid_equals_the_voxel_filter_of_the_union() -> None:
     old, new = np.random.default_rng(2).uniform(-20.0, 20.0, (2, 3000, 3)) * (1, 1, 0.05)
-    cube_map = CubeMap(MapConfig(), 0.4)
+    cube_map = CubeMap(CENTROID, 0.4)
     cube_map.insert(old)
     union = np.concatenate((voxel_filter(old, 0.4), new))
     cube_map.insert(new)
@@ -389,7 +390,7 @@ def test_rounding_cannot_move_a_centroid_out_of_its_voxel() -> None:
     points = np.full((6, 3), 1.4)
     plain = np.add.reduce(points, axis=0)[None] / 6.0
     assert voxel_keys(plain, 0.2) != voxel_keys(points[:1], 0.2)
-    cube_map = CubeMap(MapConfig(), 0.2)
+    cube_map = CubeMap(CENTROID, 0.2)
     cube_map.insert(points)
     cube_map.insert(points[:5])
     np.testing.assert_array_equal(cube_map.points(), points[:1])

@@ -435,7 +435,7 @@ def test_settled_keeps_everything_of_an_unchanged_cube() -> None:
 
 
 def test_centroid_drops_only_the_trees_it_changed() -> None:
-    cube_map = CubeMap(SMALL, 0.5)
+    cube_map = CubeMap(small(insertion="centroid"), 0.5)
     cube_map.insert(np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]]))
     cubes = cube_map.neighbourhood(np.eye(4))
     cube_map.nearest(np.zeros((1, 3)), 1, 9.0, cubes)

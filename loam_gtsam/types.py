@@ -82,6 +82,11 @@ class Scan:
             raise InputError(f"Scan.points: expected an (N, 3) array, got {_describe(points)}")
         if points.dtype.kind != "f":
             raise InputError(f"Scan.points: expected a float dtype, got {points.dtype}")
+        if not isinstance(self.stamp, (int, np.integer)):
+            raise InputError(
+                f"Scan.stamp: expected integer nanoseconds, got {self.stamp!r}; "
+                "round(seconds * 1e9) makes them of seconds"
+            )
         for name, kinds in (("times", "f"), ("rings", "iu")):
             column = getattr(self, name)
             if column is None:
@@ -92,8 +97,8 @@ class Scan:
                     f"got {_describe(column)}"
                 )
             if column.dtype.kind not in kinds:
-                kind = "float" if kinds == "f" else "integer"
-                raise InputError(f"Scan.{name}: expected a {kind} dtype, got {column.dtype}")
+                kind = "a float" if kinds == "f" else "an integer"
+                raise InputError(f"Scan.{name}: expected {kind} dtype, got {column.dtype}")
         if self.rows and len(points) % self.rows:
             raise InputError(f"Scan.rows: {len(points)} points do not divide into {self.rows} rows")
 

@@ -15,6 +15,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from loam_gtsam import datasets
+from loam_gtsam.classical import ALoamSolver as ALoamSolver
+from loam_gtsam.classical import ClassicalSolver as ClassicalSolver
 from loam_gtsam.config import Config as Config
 from loam_gtsam.config import dump_config as dump_config
 from loam_gtsam.config import load_config as load_config
@@ -39,6 +41,7 @@ from loam_gtsam.factors import point_to_plane_factor as point_to_plane_factor
 from loam_gtsam.factors import scan_match_factor as scan_match_factor
 from loam_gtsam.features import extract_features as extract_features
 from loam_gtsam.mapper import Mapper as Mapper
+from loam_gtsam.mapper import make_solver as make_solver
 from loam_gtsam.matching import ScanMatches as ScanMatches
 from loam_gtsam.matching import associate as associate
 from loam_gtsam.odometry import ConstantVelocity as ConstantVelocity
@@ -87,8 +90,10 @@ _LOADERS = (
 
 __all__ = [
     "POSE_KEY",
+    "ALoamSolver",
     "AbsoluteError",
     "BadSweep",
+    "ClassicalSolver",
     "Config",
     "ConfigError",
     "ConstantVelocity",
@@ -123,6 +128,7 @@ __all__ = [
     "extract_features",
     "line_rows",
     "load_config",
+    "make_solver",
     "match_rows",
     "open_dataset",
     "plane_rows",

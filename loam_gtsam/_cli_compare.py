@@ -2,53 +2,123 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-import math
 import signal
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
 from loam_gtsam import visualization
-from loam_gtsam._cli_run import (
+from loam_gtsam._cli_report import NOT_MAPPED
+from loam_gtsam._cli_run import RunOptions, file_name, frame_progress, free_folder, stop_requests
+from loam_gtsam._compare_files import (
+    ACCURACY_COLUMNS,
+    COLUMNS,
+    PICTURES,
+    REPORT_FILE,
+    TABLE_FILES,
     TRUTH_FILE,
-    RunOptions,
-    dataset_file_name,
-    frame_progress,
-    free_folder,
-    stop_requests,
+    Results,
+    best,
+    cell,
+    spread,
+    write,
 )
-from loam_gtsam._report_html import write_report
-from loam_gtsam.comparison import (
-    Comparison,
-    Contender,
-    FrameDifferences,
-    Scores,
-    SolverRun,
-    compare,
-    frame_differences,
-    score,
-)
-from loam_gtsam.config import Config, config_to_dict
+from loam_gtsam.comparison import Contender, compare
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.evaluation import absolute_error, align, distance_travelled, interpolate
-from loam_gtsam.export import make_folder, replacing, stage_seconds, write_tum
-from loam_gtsam.types import DatasetError, FloatArray, InputError, OutputError, Trajectory
+from loam_gtsam.export import make_folder
+from loam_gtsam.types import DatasetError, OutputError
 
-TABLE_FILES = ("comparison.csv", "comparison.json", "frames.csv")
-PICTURES = {
-    "trajectories.png": "Trajectories",
-    "errors.png": "Position error over the distance travelled",
-    "differences.png": "Differences from the first-named solver, frame by frame",
-    "stages.png": "Time per stage",
-}
-REPORT_FILE = "report.html"
+
+def execute(
+    dataset: Dataset, contenders: Sequence[Contender], shared_guess: bool, options: RunOptions
+) -> int:
+    """Compare, write, report; returns the exit code.
+
+    Raises
+    ------
+    LoamError
+        If the comparison cannot start or its results cannot be written, or what ended it early
+        (after what was computed until then has been written).
+    """
+    plot = visualization.available() if options.plot is None else options.plot
+    if plot and not visualization.available():
+        raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
+    wanted = options.output or Path("loam_gtsam_output") / f"{file_name(dataset.name)}_compare"
+    known = (*TABLE_FILES, *PICTURES, REPORT_FILE, TRUTH_FILE)
+    folder = make_folder(free_folder(wanted, options.overwrite, known))
+    total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
+    with stop_requests() as stop:
+        started = time.perf_counter()
+        with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
+            comparison = compare(
+                dataset,
+                contenders,
+                max_frames=options.frames,
+                shared_guess=shared_guess,
+                on_frame=on_frame,
+            )
+        seconds = time.perf_counter() - started
+        # What an earlier comparison left would not belong to this one.
+        for file in (*(folder / name for name in known), *folder.glob("trajectory_*.tum")):
+            file.unlink(missing_ok=True)
+        results = Results.of(comparison, shared_guess)
+        files = write(results, folder, plot)
+    if not options.quiet:
+        console = Console()
+        console.print(_summary(results, seconds))
+        if stop.signum is not None:
+            name = signal.Signals(stop.signum).name
+            done = f"after frame {comparison.frames} of {total}"
+            console.print(f"Stopped by {name} {done}; what was computed until then is written.")
+        console.print(f"Written to {folder}: {', '.join(files)}", markup=False, soft_wrap=True)
+    if comparison.error is not None:
+        raise comparison.error
+    if stop.signum is not None:
+        return 128 + stop.signum
+    if all(u.status in NOT_MAPPED for run in comparison.runs for u in run.updates):
+        message = next((u.message for u in comparison.runs[0].updates if u.message), "")
+        raise DatasetError(
+            f"{dataset.name}: no solver could use any of the {comparison.frames} sweeps; the "
+            f"first: {message}; see also: loam-gtsam inspect"
+        )
+    return 0
+
+
+def _summary(results: Results, seconds: float) -> Group:
+    title = Text(f"{results.comparison.name}  ({seconds:.1f} s)", style="bold")
+    winners = best(results)
+    # Two tables, accuracy and cost, for together they do not fit a terminal of 80 columns.
+    parts: list[Any] = []
+    for heading, columns in (
+        (title, range(ACCURACY_COLUMNS)),
+        (None, range(ACCURACY_COLUMNS, len(COLUMNS))),
+    ):
+        table = Table("solver", title=heading, title_justify="left", box=None)
+        for index in columns:
+            table.add_column(Text(COLUMNS[index].title), justify="right")
+        for number, (run, scores) in enumerate(results.rows):
+            cells = [
+                Text(
+                    cell(scores, COLUMNS[index]),
+                    style="bold green" if (number, index + 1) in winners else "",
+                )
+                for index in columns
+            ]
+            table.add_row(Text(run.name), *cells)
+        parts.append(table)
+    if results.differences:
+        header = Text(f"Difference from {results.comparison.runs[0].name}", style="bold")
+        apart = Table("solver", title=header, title_justify="left", box=None)
+        for name in ("median [mm]", "95 %", "max", "median [deg]", "95 %", "max"):
+            apart.add_column(Text(name), justify="right")
+        for name, difference in results.differences.items():
+            numbers = [f"{1e3 * v:.2f}" for v in spread(difference.metres)]
+            numbers += [f"{v:.4f}" for v in spread(difference.degrees)]
+            apart.add_row(Text(name), *numbers)
+        parts.append(apart)
+    return Group(*parts, *(Text(f"  {note}", style="dim") for note in results.notes))

@@ -64,12 +64,12 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     plot = visualization.available() if options.plot is None else options.plot
     if plot and not visualization.available():
         raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
-    wanted = options.output or Path("loam_gtsam_output") / _file_name(dataset.name)
+    wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     folder = make_folder(free_folder(wanted, options.overwrite))
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
     with stop_requests() as stop:
         started = time.perf_counter()
-        with _progress(dataset.name, total, stop, options.quiet) as on_frame:
+        with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             result = run(
                 dataset, config, max_frames=options.frames, on_frame=on_frame, keep_partial=True
             )
@@ -216,7 +216,7 @@ def stop_requests() -> Iterator[StopRequest]:
 
 
 @contextmanager
-def _progress(name: str, total: int, stop: StopRequest, quiet: bool) -> Iterator[OnFrame]:
+def frame_progress(name: str, total: int, stop: StopRequest, quiet: bool) -> Iterator[OnFrame]:
     """A progress bar on stderr; gives the function to call after each frame."""
     console = Console(stderr=True)
     columns = (
@@ -242,5 +242,6 @@ def _progress(name: str, total: int, stop: StopRequest, quiet: bool) -> Iterator
         yield on_frame
 
 
-def _file_name(name: str) -> str:
+def file_name(name: str) -> str:
+    """A name of a data set as that of a file or folder."""
     return re.sub(r"[^\w.-]+", "_", name).strip("._") or "run"

@@ -24,7 +24,7 @@ from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows, concatenate_rows, line_rows, plane_rows
 from loam_gtsam.geometry import transform
 from loam_gtsam.matching import ScanMatches
-from loam_gtsam.solvers import Associate, Solution, within_tolerance
+from loam_gtsam.solvers import Associate, Solution
 from loam_gtsam.types import FloatArray, InputError
 
 # LOAM's (rx, ry, rz) are (pitch, yaw, roll) and its (x, y, z) are (left, up, forward): both are the
@@ -38,8 +38,6 @@ _MAX_RADIUS = 1e16
 _DIAGONAL = (1e-6, 1e32)
 _MIN_DECREASE = 1e-3
 """A step is taken if the cost falls by more than this share of what the linear model says."""
-_FUNCTION_TOLERANCE = 1e-6
-"""Relative change of the cost at which the inner solve ends."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,26 +151,26 @@ class ALoamSolver:
         first, steps = pose, 0
         radius, shrink = _START_RADIUS, 2.0
         cost, normal, gradient = _robust(rows, pairs, delta, pose)
-        start = cost
-        for steps in range(1, self.config.inner_iterations + 1):
+        start, settled = cost, False
+        while steps < self.config.inner_iterations and not settled:
+            steps += 1
             damping = np.clip(normal.diagonal(), *_DIAGONAL) / radius
-            step = np.linalg.solve(normal + np.diag(damping), -gradient)
+            damped = np.linalg.solve(normal + np.diag(damping), gradient)
+            step: FloatArray = np.negative(damped, dtype=np.float64)
             expected = -float(step @ (gradient + 0.5 * normal @ step))
             moved = _add_global(pose, step)
             new_cost, new_normal, new_gradient = _robust(rows, pairs, delta, moved)
             change = cost - new_cost
-            if expected > 0.0 and change > _MIN_DECREASE * expected:
+            if abs(change) <= self.config.cost_tolerance * cost:
+                settled = True  # and, as in Ceres, this last small step is not taken
+            elif expected > 0.0 and change > _MIN_DECREASE * expected:
                 quality = 2.0 * change / expected - 1.0
                 radius = min(radius / max(1.0 / 3.0, 1.0 - quality**3), _MAX_RADIUS)
                 shrink = 2.0
-                settled = change <= _FUNCTION_TOLERANCE * cost
                 pose, cost, normal, gradient = moved, new_cost, new_normal, new_gradient
             else:
                 radius /= shrink
                 shrink *= 2.0
-                settled = abs(change) <= _FUNCTION_TOLERANCE * cost
-            if settled:
-                break
         turn = _turn(pose)
         information = turn.T @ normal @ turn
         return _Optimum(pose, first.localCoordinates(pose), steps, start, cost, information)
@@ -283,7 +281,7 @@ def _alternate(
         pose, steps = optimum.map_T_lidar, steps + optimum.steps
         if iteration == 1:
             error_before = optimum.error_before
-        converged = within_tolerance(optimum.step, config)
+        converged = _is_small(optimum.step, config)
         if converged and stop:
             break
     return Solution(
@@ -297,6 +295,13 @@ def _alternate(
         optimum.error_after,
         optimum.information,
     )
+
+
+def _is_small(step: FloatArray, config: SolverConfig) -> bool:
+    """LOAM's stop rule on (6,) rotation and translation, and nothing else."""
+    rotation, translation = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
+    limit = np.radians(config.rotation_tolerance_deg)
+    return bool(rotation < limit and translation < config.translation_tolerance)
 
 
 def _solve_by_qr(normal: FloatArray, right: FloatArray) -> FloatArray:
@@ -325,7 +330,9 @@ def _add_global(map_T_lidar: gtsam.Pose3, step: FloatArray) -> gtsam.Pose3:
 
 def _turn(map_T_lidar: gtsam.Pose3) -> FloatArray:
     """(6, 6) derivative of a step along the map's axes by the package's tangent vector."""
-    return np.kron(np.eye(2), map_T_lidar.rotation().matrix())
+    turn = np.zeros((6, 6))
+    turn[:3, :3] = turn[3:, 3:] = map_T_lidar.rotation().matrix()
+    return turn
 
 
 def _robust(

@@ -1,4 +1,4 @@
-"""The command line: ``loam-gtsam demo | run | inspect | config``.
+"""The command line: ``loam-gtsam demo | run | compare | inspect | config``.
 
 The only place that catches :class:`~loam_gtsam.types.LoamError`. Exit codes: 0 done, 1 an error
 (one message on stderr), 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM.
@@ -191,6 +191,66 @@ def run(
 
 
 @app.command()
+def compare(
+    path: DataPath,
+    solvers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--solver",
+            metavar="NAME",
+            help="gtsam, another preset (loam, aloam), a configuration file (.yaml), or a peer "
+            "(kiss-icp, small-gicp, genz-icp; see docs/compare.md); may be given repeatedly. "
+            "Without truth the first one is the reference [default: gtsam and all presets].",
+        ),
+    ] = None,
+    shared_guess: Annotated[
+        bool,
+        typer.Option(
+            "--shared-guess",
+            help="All solvers of this package start from the guesses of the first of them.",
+        ),
+    ] = False,
+    topic: Topic = None,
+    imu_topic: ImuTopic = None,
+    loader_options: LoaderOptions = None,
+    sensor: Sensor = None,
+    overrides: Overrides = None,
+    frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the results [default: loam_gtsam_output/NAME_compare]. If it holds "
+            "an earlier comparison, a new folder beside it is used (DIR-2, DIR-3, ...).",
+        ),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace an earlier comparison in DIR.")
+    ] = False,
+    plot: Plot = None,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Run several solvers on the same sweeps: tables, plots and a report in one HTML file.
+
+    Ctrl-C stops after the current sweep and writes what was computed; a second one stops at once.
+    """
+    from loam_gtsam._cli_compare import execute
+    from loam_gtsam._cli_run import RunOptions
+    from loam_gtsam.comparison import Contender, contender, solver_names
+    from loam_gtsam.peers import PEERS
+
+    names = solvers or [name for name in solver_names() if name not in PEERS]
+    contenders = []
+    for entry in map(contender, names):
+        changed = entry.config and _changed(entry.config, sensor, overrides)
+        contenders.append(Contender(entry.name, changed))
+    dataset = _open(path, topic, imu_topic, loader_options)
+    options = RunOptions(frames, output, overwrite, plot, False, quiet)
+    raise typer.Exit(execute(dataset, contenders, shared_guess, options))
+
+
+@app.command()
 def inspect(
     path: DataPath,
     topic: Topic = None,
@@ -264,6 +324,11 @@ def _settings(
             "give --preset or --config, not both; a file names its preset with 'preset: NAME'"
         )
     config = load_config(file) if file is not None else preset(preset_name or "default")
+    return _changed(config, sensor, overrides)
+
+
+def _changed(config: Config, sensor: str | None, overrides: list[str] | None) -> Config:
+    """``config`` with --sensor, then each --set in turn."""
     if sensor is not None:
         config = _override(config, "sensor.model", sensor, f"--sensor {sensor}")
     for entry in overrides or []:

@@ -367,6 +367,13 @@ class SolverConfig(_Section):
         source="A-LOAM",
         low=0.0,
     )
+    cost_tolerance: float = _param(
+        1e-6,
+        "method aloam: a step that changes the cost by less than this share ends the inner "
+        "iterations and is not taken",
+        source="Ceres default",
+        low=0.0,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -400,7 +407,7 @@ PRESETS: dict[str, Config] = {
         odometry=OdometryConfig(method="scan_to_scan"),
         map=MapConfig(insertion="centroid"),
         matching=_CLASSICAL_MATCHING,
-        solver=SolverConfig(method="loam", min_map_edges=11, min_map_planes=101),
+        solver=SolverConfig(method="loam", step_sigmas=0.0, min_map_edges=11, min_map_planes=101),
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings.
     "aloam": Config(
@@ -412,6 +419,7 @@ PRESETS: dict[str, Config] = {
             method="aloam",
             iterations=2,
             inner_iterations=4,
+            step_sigmas=0.0,
             min_matches=6,  # A-LOAM has no minimum; fewer cannot fix a pose
             min_map_edges=11,
             min_map_planes=51,

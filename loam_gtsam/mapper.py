@@ -33,8 +33,8 @@ class Mapper:
     Parameters
     ----------
     config : the whole configuration; ``map``, ``matching``, ``solver`` and ``deskew`` are used
-    solver : anything with :meth:`loam_gtsam.solvers.ScanSolver.solve`; the one that ``solver.method``
-        names if None
+    solver : anything with :meth:`loam_gtsam.solvers.ScanSolver.solve`; :func:`make_solver` makes
+        it from the configuration if None
     """
 
     def __init__(self, config: Config | None = None, solver: ScanSolver | None = None) -> None:

@@ -15,9 +15,9 @@ LAYERS = (
     ("solvers", "classical", "pose_graph"),
     ("odometry", "loop_closure"),
     ("mapper",),
-    ("pipeline",),
+    ("pipeline", "estimators"),
     ("comparison",),
-    ("_cli_report", "_report_html", "_cli_run", "_cli_compare", "cli"),
+    ("_cli_report", "_report_html", "_compare_files", "_cli_run", "_cli_compare", "cli"),
 )
 """From the bottom up; a module imports from lower layers, or as SAME_LAYER says."""
 
@@ -29,7 +29,8 @@ SAME_LAYER = {
     "matching": {"cubemap"},
     "classical": {"solvers"},
     "_cli_run": {"_cli_report"},
-    "_cli_compare": {"_cli_run", "_cli_report", "_report_html"},
+    "_compare_files": {"_report_html"},
+    "_cli_compare": {"_cli_report", "_cli_run", "_compare_files"},
     "cli": {"_cli_run", "_cli_report", "_cli_compare"},
 }
 
@@ -44,10 +45,11 @@ LEAVES = {
 
 LEAF_USERS = {
     "pipeline": {"datasets.base"},
+    "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
 }
 
-PRINTERS = {"cli", "_cli_run", "_cli_report"}
+PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

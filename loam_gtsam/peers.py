@@ -1,0 +1,288 @@
+"""Other systems on the same sweeps, through their own Python packages: all of them optional.
+
+Every peer runs with its own defaults and gets the raw points and their times. What is set
+differently, and which moment of the sweep its pose belongs to, stands with its class.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.geometry import move_points
+from loam_gtsam.types import FloatArray, InputError, LoamError, Trajectory
+
+
+class PeerError(LoamError):
+    """A peer is not installed, not known, or cannot be imported."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimedPoints:
+    """The usable points of a sweep, for systems that want arrays.
+
+    Attributes
+    ----------
+    points : (N, 3) float64, metres, lidar frame at each point's own time
+    times : (N,) seconds from the stamp: those of the data, else from the azimuth as ours
+    span : (first, last) seconds from the stamp covered by the sweep
+    """
+
+    points: FloatArray
+    times: FloatArray
+    span: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class PeerPose:
+    """A pose (4, 4) in the peer's own map, when it is valid (nanoseconds), what it took."""
+
+    stamp: int
+    map_T_lidar: FloatArray
+    seconds: float
+
+
+class Peer(ABC):
+    """Another system, one sweep at a time.
+
+    Attributes
+    ----------
+    name : as on the command line
+    package : its distribution, what pip installs
+    module : what is imported
+    alone : its instances share state within a process; only one may run at a time
+    poses : so far
+    """
+
+    name: str
+    package: str
+    module: str
+    alone: bool = False
+
+    def __init__(self) -> None:
+        self.poses: list[PeerPose] = []
+
+    def register(self, stamp: int, sweep: TimedPoints) -> PeerPose:
+        """Register a sweep; only the registration itself is timed.
+
+        Parameters
+        ----------
+        stamp : nanoseconds, what the times of the sweep count from
+
+        Raises
+        ------
+        InputError
+            If the peer cannot take this sweep.
+        """
+        started = time.perf_counter()
+        pose, moment = self._register(stamp, sweep)
+        seconds = time.perf_counter() - started
+        self.poses.append(PeerPose(stamp + round(moment * 1e9), pose, seconds))
+        return self.poses[-1]
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """One pose per sweep, at the moment it belongs to."""
+        poses = np.array([pose.map_T_lidar for pose in self.poses]).reshape(-1, 4, 4)
+        return Trajectory(np.array([pose.stamp for pose in self.poses], np.int64), poses)
+
+    @property
+    @abstractmethod
+    def map_points(self) -> int:
+        """Points of its map at this moment (voxels, if it keeps distributions)."""
+
+    @abstractmethod
+    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
+        """Pose (4, 4), and the moment it belongs to in seconds from the stamp."""
+
+    def _check_times(self, times: FloatArray) -> None:
+        if len(times) == 0 or times.min() >= times.max():
+            raise InputError(f"{self.name}: expected points of different times to de-skew with")
+
+
+class KissIcp(Peer):
+    """KISS-ICP (Vizzo et al., RA-L 2023).
+
+    Notes
+    -----
+    Version 1.3 de-skews to the time of the *last* point (a point at the end of the sweep is left
+    where it was), so its pose belongs there and is compared with the truth of that moment. Without
+    de-skew a pose fits the sweep as a whole best at its middle. It uses all cores.
+
+    Parameters
+    ----------
+    deskew : use its own de-skew, as by default
+    """
+
+    name, package, module = "kiss-icp", "kiss-icp", "kiss_icp"
+
+    def __init__(self, deskew: bool = True) -> None:
+        super().__init__()
+        settings = _module(self, "config").KISSConfig()
+        settings.data.deskew = deskew
+        if settings.mapping.voxel_size is None:  # as its own load_config does
+            settings.mapping.voxel_size = settings.data.max_range / 100.0
+        self.deskew = deskew
+        self._icp = _module(self, "kiss_icp").KissICP(settings)
+
+    @property
+    def map_points(self) -> int:
+        """See :attr:`Peer.map_points`."""
+        return len(self._icp.local_map.point_cloud())
+
+    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
+        if self.deskew:
+            self._check_times(sweep.times)  # it would end the process
+        self._icp.register_frame(sweep.points, sweep.times)
+        moment = float(sweep.times.max()) if self.deskew else sum(sweep.span) / 2.0
+        return np.array(self._icp.last_pose), moment
+
+
+class KissIcpNoDeskew(KissIcp):
+    """KISS-ICP on the sweeps as they are: better where its constant velocity fits badly."""
+
+    name = "kiss-icp-no-deskew"
+
+    def __init__(self) -> None:
+        super().__init__(deskew=False)
+
+
+class GenzIcp(Peer):
+    """GenZ-ICP (Lee et al., RA-L 2025).
+
+    Notes
+    -----
+    Its de-skew is off by default, for data that are de-skewed already; it is on here. Version 0.3
+    takes times from 0 to 1 and de-skews to 0.5, so that its pose belongs to the middle, as it does
+    without de-skew. Two instances that take turns in one process disturb each other: on 40 sweeps
+    of KITTI the ATE of each changed several times over with the other beside it.
+
+    Parameters
+    ----------
+    deskew : use its own de-skew
+    """
+
+    name, package, module = "genz-icp", "genz-icp", "genz_icp"
+    alone = True
+
+    def __init__(self, deskew: bool = True) -> None:
+        super().__init__()
+        settings = _module(self, "config").GenZConfig()
+        settings.data.deskew = deskew
+        self.deskew = deskew
+        self._icp = _module(self, "genz_icp").GenZICP(settings)
+
+    @property
+    def map_points(self) -> int:
+        """See :attr:`Peer.map_points`."""
+        return len(self._icp.local_map.point_cloud())
+
+    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
+        times = sweep.times
+        if not self.deskew:
+            self._icp.register_frame(sweep.points, np.zeros(0))
+            return np.array(self._icp.last_pose), sum(sweep.span) / 2.0
+        self._check_times(times)
+        first, last = float(times.min()), float(times.max())
+        self._icp.register_frame(sweep.points, (times - first) / (last - first))
+        return np.array(self._icp.last_pose), (first + last) / 2.0
+
+
+class GenzIcpNoDeskew(GenzIcp):
+    """GenZ-ICP on the sweeps as they are, its own default."""
+
+    name = "genz-icp-no-deskew"
+
+    def __init__(self) -> None:
+        super().__init__(deskew=False)
+
+
+class SmallGicp(Peer):
+    """Odometry with small_gicp (Koide, JOSS 2024): each sweep against a map of Gaussian voxels.
+
+    Notes
+    -----
+    small_gicp is a registration library. What makes an odometry of it is the usual and simple:
+    points are de-skewed to the middle of the sweep by the motion between its last two poses, which
+    also is the guess; a solved sweep is added to the map. The sizes are the defaults of its
+    own functions and examples: 0.25 m downsampling, 1 m voxels. One thread, its default.
+    """
+
+    name, package, module = "small-gicp", "small_gicp", "small_gicp"
+    downsampling = 0.25
+    voxel = 1.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._gicp = _module(self)
+        self._map = self._gicp.GaussianVoxelMap(self.voxel)
+        self._twist = np.zeros(6)
+        self._last: tuple[int, gtsam.Pose3] | None = None
+
+    @property
+    def map_points(self) -> int:
+        """See :attr:`Peer.map_points`."""
+        return int(self._map.size())
+
+    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
+        middle = sum(sweep.span) / 2.0
+        now = stamp + round(middle * 1e9)
+        points = move_points(sweep.points, self._twist, sweep.times - middle)
+        cloud, _ = self._gicp.preprocess_points(points, self.downsampling)
+        pose = gtsam.Pose3()
+        if self._last is not None:
+            before, last = self._last
+            seconds = (now - before) * 1e-9
+            guess = last.compose(gtsam.Pose3.Expmap(self._twist * seconds))
+            found = self._gicp.align(self._map, cloud, guess.matrix())
+            pose = gtsam.Pose3(found.T_target_source)
+            self._twist = gtsam.Pose3.Logmap(last.between(pose)) / seconds
+        self._last = now, pose
+        self._map.insert(cloud, pose.matrix())
+        return pose.matrix(), middle
+
+
+PEERS: dict[str, type[Peer]] = {
+    peer.name: peer for peer in (KissIcp, KissIcpNoDeskew, SmallGicp, GenzIcp, GenzIcpNoDeskew)
+}
+"""By the name on the command line."""
+
+
+def make_peer(name: str) -> Peer:
+    """The peer called ``name``, with its defaults.
+
+    Raises
+    ------
+    PeerError
+        If there is no such peer, or it is not installed.
+    """
+    if name not in PEERS:
+        raise PeerError(f"unknown peer {name!r} (known: {', '.join(sorted(PEERS))})")
+    return PEERS[name]()
+
+
+def version(package: str) -> str:
+    """Installed version of a package, or "not installed"."""
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _module(peer: Peer, name: str = "") -> Any:
+    """A module of the peer's package."""
+    try:
+        return importlib.import_module(f"{peer.module}.{name}" if name else peer.module)
+    except ImportError as error:
+        raise PeerError(
+            f"{peer.name} cannot be imported ({error}); install it with: "
+            f"pip install {peer.package}, "
+            'or all peers with: pip install "loam_gtsam[bench]"'
+        ) from error

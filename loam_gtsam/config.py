@@ -275,7 +275,7 @@ class MatchingConfig(_Section):
         0.2, "farthest of the five from the plane", unit="m", source="LOAM", low=0.0
     )
     plane_ratio: float = _param(
-        0.1,
+        0.2,
         "a plane needs its second eigenvalue above this times the largest: five points along one "
         "ring of a sparse sensor have no normal",
         low=0.0,

@@ -290,6 +290,17 @@ class MatchingConfig(_Section):
         low=0.0,
         high=1.0,
     )
+    keep_translation: float = _param(
+        0.02,
+        "lines and planes are kept, and only distances and weights renewed, while the pose has "
+        "moved less than this since the search",
+        unit="m",
+        source="LOAM searches anew each time: 0",
+        low=0.0,
+    )
+    keep_rotation_deg: float = _param(
+        0.05, "and has turned less than this", unit="degrees", source="LOAM: 0", low=0.0
+    )
     point_sigma: float = _param(
         0.03, "standard deviation of a measured point about a surface", unit="m", low=1e-6
     )
@@ -335,6 +346,12 @@ class SolverConfig(_Section):
     )
     translation_tolerance: float = _param(
         0.0005, "and less than this", unit="m", source="LOAM", low=0.0
+    )
+    kernel_width: float = _param(
+        1.345,
+        "width of the Huber kernel on the matches, in units of their scatter; .inf turns it off",
+        source="95 % efficiency on normal noise",
+        low=0.1,
     )
     step_sigmas: float = _param(
         0.5,
@@ -397,6 +414,7 @@ _CLASSICAL_MATCHING = MatchingConfig(
     min_incidence_sine=0.0,
     fit_uncertainty=False,
     weight_range="map",
+    keep_translation=0.0,
 )
 
 PRESETS: dict[str, Config] = {

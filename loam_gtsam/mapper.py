@@ -18,7 +18,7 @@ from loam_gtsam.classical import ALoamSolver, ClassicalSolver
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import move_points, transform, voxel_filter
-from loam_gtsam.matching import ScanMatches, associate
+from loam_gtsam.matching import ScanMatches, associate, renew
 from loam_gtsam.odometry import ConstantVelocity, Guess, advance
 from loam_gtsam.solvers import Associate, GtsamSolver, ScanSolver, Solution
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
@@ -147,23 +147,33 @@ class Mapper:
             return self._insert(sweep, guess, FrameStatus.SPARSE_MAP, message, clock)
 
         associations = 0
+        found: tuple[CubeMap, gtsam.Pose3, ScanMatches] | None = None
 
         def matches_at(map_T_lidar: gtsam.Pose3) -> ScanMatches:
-            nonlocal associations
+            nonlocal associations, found
             clock.lap("solve")
             associations += 1
             if associations == 2 and self._first is None and self.config.deskew.refine:
                 # The first solve knows the motion better than the guess. Once is enough: further
                 # rounds cost associations and change nothing that can be measured.
                 sweep.deskew(self._twist(sweep, map_T_lidar, guess.twist))
-            matches = associate(
-                sweep.edges,
-                sweep.planes,
-                map_T_lidar,
-                self.edge_map,
-                self.plane_map,
-                self.config.matching,
-            )
+                found = None
+            if (
+                found is not None
+                and found[0] is self.plane_map
+                and self._near(found[1], map_T_lidar)
+            ):
+                matches = renew(found[2], map_T_lidar, self.config.matching)
+            else:
+                matches = associate(
+                    sweep.edges,
+                    sweep.planes,
+                    map_T_lidar,
+                    self.edge_map,
+                    self.plane_map,
+                    self.config.matching,
+                )
+                found = self.plane_map, map_T_lidar, matches
             clock.lap("match")
             return matches
 
@@ -182,6 +192,15 @@ class Mapper:
             status = FrameStatus.NOT_CONVERGED
             message = f"the pose still moved after {solution.iterations} associations"
         return self._insert(sweep, result, status, message, clock, solution)
+
+    def _near(self, searched: gtsam.Pose3, map_T_lidar: gtsam.Pose3) -> bool:
+        """Whether matches found at one pose may be kept at another."""
+        moved = searched.localCoordinates(map_T_lidar)
+        config = self.config.matching
+        return bool(
+            np.degrees(np.linalg.norm(moved[:3])) < config.keep_rotation_deg
+            and np.linalg.norm(moved[3:]) < config.keep_translation
+        )
 
     def _twist(self, sweep: _Sweep, middle: gtsam.Pose3, otherwise: FloatArray) -> FloatArray:
         """Body velocity from the middle of the last sweep to that of this one."""

@@ -5,7 +5,8 @@ The matches are immutable arrays, so that the same ones can be given to differen
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import fit_lines, fit_planes, moments, transform
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _TINY = 1e-9
 
@@ -108,6 +109,45 @@ def associate(
     )
 
 
+def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig) -> ScanMatches:
+    """The same lines and planes with distances and weights at another pose near by."""
+    pose = map_T_lidar.matrix()
+    e, p = matches.edges, matches.planes
+    away = (transform(pose, e.points) - e.centres).T
+    along = _dot(away, e.directions.T)
+    distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))
+    weights = _line_weights(distances, config)
+    keep = weights > config.min_weight
+    edges = replace(e, distances=distances, weights=weights)
+    edges = edges if keep.all() else _subset(edges, keep)
+    points_map = transform(pose, p.points)
+    distances = _dot(points_map.T, p.normals.T) + p.offsets
+    reach = points_map if config.weight_range == "map" else p.points
+    weights = _plane_weights(distances, _norm(reach.T), config)
+    keep = weights > config.min_weight
+    planes = replace(p, distances=distances, weights=weights)
+    return ScanMatches(edges, planes if keep.all() else _subset(planes, keep))
+
+
+_Matches = TypeVar("_Matches", EdgeMatches, PlaneMatches)
+
+
+def _subset(matches: _Matches, keep: BoolArray) -> _Matches:
+    return type(matches)(*(getattr(matches, item.name)[keep] for item in fields(matches)))
+
+
+def _line_weights(distances: FloatArray, config: MatchingConfig) -> FloatArray:
+    weights: FloatArray = 1.0 - config.weight_slope * distances
+    return weights
+
+
+def _plane_weights(distances: FloatArray, ranges: FloatArray, config: MatchingConfig) -> FloatArray:
+    weights: FloatArray = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(
+        np.maximum(ranges, _TINY)
+    )
+    return weights
+
+
 def match_lines(
     points: FloatArray,
     points_map: FloatArray,
@@ -137,7 +177,7 @@ def match_lines(
     away = points_map[near].T - centres
     along = _dot(away, directions)
     distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))
-    weights = 1.0 - config.weight_slope * distances
+    weights = _line_weights(distances, config)
     keep = is_line & (weights > config.min_weight)
     # A line in space has four parameters, two for each of the directions across it.
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
@@ -192,7 +232,7 @@ def match_planes(
     ranges = _norm(rays)
     is_plane &= np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
     reach = _norm(points_map[near].T) if config.weight_range == "map" else ranges
-    weights = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(np.maximum(reach, _TINY))
+    weights = _plane_weights(distances, reach, config)
     keep = is_plane & (weights > config.min_weight)
     along = _dot(away, wide)
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)

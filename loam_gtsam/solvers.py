@@ -26,6 +26,9 @@ from loam_gtsam.types import FloatArray
 POSE_KEY: int = gtsam.symbol("x", 0)
 """Key of the frame's pose ``map_T_lidar`` in every graph handed to a solver."""
 
+_TO_SIGMA = 1.4826
+"""Median absolute deviation to standard deviation, for a normal distribution."""
+
 Associate = Callable[[gtsam.Pose3], ScanMatches]
 
 
@@ -110,7 +113,7 @@ class GtsamSolver:
                     guess, False, False, matches, iteration, steps, 0.0, 0.0, np.zeros((6, 6))
                 )
             graph = gtsam.NonlinearFactorGraph()
-            graph.add(scan_match_factor(POSE_KEY, match_rows(matches)))
+            graph.add(scan_match_factor(POSE_KEY, match_rows(matches, config.kernel_width)))
             for factor in priors:
                 graph.add(factor)
             values = gtsam.Values()
@@ -150,12 +153,33 @@ def within_tolerance(step: FloatArray, information: FloatArray, config: SolverCo
     return bool(small or step @ information @ step < config.step_sigmas**2)
 
 
-def match_rows(matches: ScanMatches) -> MatchRows:
-    """The matches as whitened rows: each scaled by its weight over its standard deviation."""
+def match_rows(matches: ScanMatches, kernel_width: float = np.inf) -> MatchRows:
+    """The matches as whitened rows: each scaled by its weight over its standard deviation.
+
+    Parameters
+    ----------
+    kernel_width : of a Huber kernel, in units of the scatter of the whitened distances; infinite
+        for none
+
+    Notes
+    -----
+    The kernel is applied as iteratively re-weighted least squares: a row whose whitened distance u
+    exceeds ``k s`` is scaled by ``sqrt(k s / u)`` (Huber, Robust Statistics, 1981). The unit s is
+    ``max(1, 1.4826 median(u))``: far from the optimum all distances are large, and a fixed unit
+    would silence them all. Kernels that fall off faster (Cauchy) lose the pose in foliage, where
+    many matches agree on a wrong one.
+    """
     e, p = matches.edges, matches.planes
+    edge_units, plane_units = e.distances / e.sigmas, np.abs(p.distances) / p.sigmas
+    edge_weights, plane_weights = e.weights, p.weights
+    if len(matches) and np.isfinite(kernel_width):
+        scatter = _TO_SIGMA * float(np.median(np.concatenate([edge_units, plane_units])))
+        width = kernel_width * max(1.0, scatter)
+        edge_weights = edge_weights * np.sqrt(width / np.maximum(edge_units, width))
+        plane_weights = plane_weights * np.sqrt(width / np.maximum(plane_units, width))
     return concatenate_rows(
         [
-            line_rows(e.points, e.centres, e.directions, e.weights, e.sigmas),
-            plane_rows(p.points, p.normals, p.offsets, p.weights, p.sigmas),
+            line_rows(e.points, e.centres, e.directions, edge_weights, e.sigmas),
+            plane_rows(p.points, p.normals, p.offsets, plane_weights, p.sigmas),
         ]
     )

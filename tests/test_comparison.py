@@ -621,7 +621,12 @@ def test_ctrl_c_ends_it_between_two_sweeps(command, dataset, fake, monkeypatch):
         return real(self, stamp, sweep)
 
     monkeypatch.setattr(FakePeer, "_register", interrupting)
-    result = command("--solver", "fake", "--solver", "gtsam", "--no-plot", "--output", "out")
+    # A test run in the background inherits an ignored SIGINT, which the command respects.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        result = command("--solver", "fake", "--solver", "gtsam", "--no-plot", "--output", "out")
+    finally:
+        signal.signal(signal.SIGINT, before)
     assert result.exit_code == 130, result.output
     assert "Stopped by SIGINT after frame 3 of 6" in result.output
     assert [row["frame"] for row in rows("out/frames.csv")] == ["0", "1", "2"] * 2

@@ -6,6 +6,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from loam_gtsam import mapper as mapper_module
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.features import extract_features
@@ -263,6 +264,25 @@ def test_information_is_that_of_the_reference_time():
     )
     expected = jacobian.T @ middle.information @ jacobian
     np.testing.assert_allclose(update.information, expected, rtol=1e-3, atol=1e-3 * expected.max())
+
+
+@pytest.mark.parametrize(("metres", "searches"), [(0.0, 2), (1.0, 1)])
+def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres, searches):
+    config = replace(
+        Config(),
+        deskew=replace(Config().deskew, refine=False),
+        matching=replace(Config().matching, keep_translation=metres, keep_rotation_deg=5.0),
+        solver=replace(Config().solver, iterations=2, step_sigmas=0.0, translation_tolerance=0.0),
+    )
+    mapper = Mapper(config)
+    for i in range(3):
+        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
+    calls = []
+    real = mapper_module.associate
+    monkeypatch.setattr(mapper_module, "associate", lambda *args: calls.append(1) or real(*args))
+    truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
+    update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
+    assert (update.iterations, len(calls)) == (2, searches)
 
 
 def test_cubes_left_behind_are_evicted_counted_and_kept(rng):

@@ -9,7 +9,7 @@ import pytest
 from loam_gtsam.config import MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
-from loam_gtsam.matching import associate, match_lines, match_planes
+from loam_gtsam.matching import ScanMatches, associate, match_lines, match_planes, renew
 
 CONFIG = MatchingConfig()
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -401,3 +401,44 @@ def test_no_features_give_no_matches():
     assert len(matches) == 0
     assert matches.edges.directions.shape == (0, 3)
     assert matches.planes.offsets.shape == (0,)
+
+
+# -- matches kept near by ----------------------------------------------------------------------
+
+
+def both():
+    return ScanMatches(
+        one(match_lines, [5.0, 0.1, 0.3], line_group()),
+        one(match_planes, [4.8, 0.1, 0.3], plane_group()),
+    )
+
+
+def test_renewed_matches_keep_their_shapes_and_measure_anew():
+    shift = gtsam.Pose3(gtsam.Rot3(), np.array([0.05, -0.02, 0.0]))
+    before, after = both(), renew(both(), shift, CONFIG)
+    np.testing.assert_array_equal(after.edges.directions, before.edges.directions)
+    np.testing.assert_array_equal(after.planes.normals, before.planes.normals)
+    np.testing.assert_allclose(after.edges.distances, [np.hypot(0.05, 0.08)], atol=1e-9)
+    np.testing.assert_allclose(np.abs(after.planes.distances), [0.15], atol=1e-9)
+    np.testing.assert_allclose(after.edges.weights, 1 - 0.9 * after.edges.distances)
+    reach = np.linalg.norm([4.8, 0.1, 0.3])
+    np.testing.assert_allclose(after.planes.weights, [1 - 0.9 * 0.15 / np.sqrt(reach)], atol=1e-9)
+
+
+def test_renewed_at_the_same_pose_nothing_changes():
+    before, after = both(), renew(both(), gtsam.Pose3(), CONFIG)
+    for kind in ("edges", "planes"):
+        for field in dataclasses.fields(getattr(before, kind)):
+            np.testing.assert_allclose(
+                getattr(getattr(after, kind), field.name),
+                getattr(getattr(before, kind), field.name),
+                atol=1e-12,
+            )
+
+
+def test_a_renewed_match_that_is_too_far_is_dropped():
+    far = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 1.0, 0.0]))
+    after = renew(both(), far, CONFIG)
+    assert (len(after.edges), len(after.planes)) == (0, 1)
+    away = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
+    assert len(renew(both(), away, CONFIG)) == 0

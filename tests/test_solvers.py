@@ -265,3 +265,37 @@ def test_rows_are_scaled_by_weight_over_sigma():
     expected = np.concatenate([np.repeat(e.weights / e.sigmas, 2), p.weights / p.sigmas])
     np.testing.assert_allclose(rows.scales, expected)
     assert rows.points.shape == (8, 3)
+
+
+def plane_matches(distances, sigma=0.1):
+    count = len(distances)
+    return ScanMatches(
+        EdgeMatches(*(np.zeros((0, 3)) for _ in range(3)), *(np.zeros(0) for _ in range(3)),
+                    np.zeros(0, np.int64)),
+        PlaneMatches(
+            np.zeros((count, 3)),
+            np.tile([0.0, 0.0, 1.0], (count, 1)),
+            distances,
+            distances,
+            np.full(count, sigma),
+            np.ones(count),
+            np.arange(count),
+        ),
+    )  # fmt: skip
+
+
+def test_the_kernel_scales_down_what_is_far_for_its_sigma_and_nothing_else():
+    distances = np.array([0.01, -0.02, 0.05, -0.1, 0.13, 1.345, -13.45])
+    rows = match_rows(plane_matches(distances), kernel_width=1.345)  # median 1 sigma
+    scatter = 1.4826  # of a median of one sigma
+    width = 0.1 * 1.345 * scatter
+    expected = np.sqrt(width / np.maximum(np.abs(distances), width)) / 0.1
+    np.testing.assert_allclose(rows.scales, expected)
+    assert (rows.scales[:5] == 10.0).all()
+    np.testing.assert_allclose(match_rows(plane_matches(distances)).scales, 10.0)
+
+
+def test_the_kernel_has_a_unit_of_its_own_far_from_the_optimum():
+    """All distances large alike: nothing is an outlier, nothing is silenced."""
+    rows = match_rows(plane_matches(np.full(9, 5.0)), kernel_width=1.345)
+    np.testing.assert_allclose(rows.scales, 10.0)

@@ -1,0 +1,688 @@
+"""Where do the factor graph and the classical solvers differ? ``python -m benchmarks.study``.
+
+Single solves against a map built from exact poses, so that nothing but the solve (with its own
+association and map policy) makes the difference: convergence basin, outliers, degenerate corridor,
+cost at the optimum. The same numbers come out on every run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, fields, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from loam_gtsam.config import Config, MapConfig, preset
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.features import extract_features
+from loam_gtsam.geometry import move_points, transform, voxel_filter
+from loam_gtsam.mapper import make_solver
+from loam_gtsam.matching import ScanMatches, associate
+from loam_gtsam.solvers import POSE_KEY, Solution, match_rows
+from loam_gtsam.types import FloatArray
+
+SCENES = ("street_loop", "room", "corridor", "trees")
+METRES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+DEGREES = (0.5, 1.0, 2.0, 5.0, 10.0)
+SHARES = (0.0, 0.1, 0.2, 0.3)
+SHARE = 0.2
+"""Of outliers, where changes of the default are compared."""
+NEAR = (0.05, 0.5)
+"""Metres and degrees from the solution found from the truth that count as the same solution."""
+GUESS = (0.1, 0.5)
+"""Metres and degrees: error of the guess wherever it is not what is studied."""
+ALONG = 0.3
+"""Metres: error of the guess along the bare corridor."""
+SHIFT = 0.5
+"""Metres: how far the moving object has moved since it was mapped."""
+HUBER, CAUCHY = 1.345, 2.385
+"""In standard deviations: 95 % efficiency for normal residuals (Holland and Welsch, 1977)."""
+SHORT_RANGE = 25.0
+"""Metres seen in the bare corridor, ..."""
+INSIDE = 60
+"""... and sweeps later than in the other scenes: so neither of its ends is seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Variant:
+    """A solver as studied.
+
+    Attributes
+    ----------
+    kernel : robust weight per match, renewed at each association: "", "huber", "cauchy", or
+        "scaled cauchy", whose unit is the spread of the residuals where that exceeds their sigmas
+    prior : a prior on the guess, as a motion model would give it (0.05 m, 0.5 degrees)
+    """
+
+    name: str
+    config: Config
+    kernel: str = ""
+    prior: bool = False
+
+
+BEFORE = replace(
+    Config(),
+    solver=replace(Config().solver, kernel_width=math.inf),
+    matching=replace(Config().matching, plane_ratio=0.1),
+)
+"""The default as it was before this study changed it."""
+
+
+def _default(name: str, section: str, **changes: object) -> Variant:
+    config = BEFORE
+    return Variant(name, replace(config, **{section: replace(getattr(config, section), **changes)}))
+
+
+MAIN = (
+    Variant("default", BEFORE),
+    Variant("loam", preset("loam")),
+    Variant("aloam", preset("aloam")),
+)
+CHANGES = (
+    _default("inner 1", "solver", inner_iterations=1),
+    _default("inner 4", "solver", inner_iterations=4),
+    _default("outer 30", "solver", iterations=30),
+    _default("no s weight", "matching", weight_slope=0.0),
+    _default("one sigma", "matching", fit_uncertainty=False),
+    _default("reach 2 m", "matching", max_distance=2.0),
+    _default("centroid map", "map", insertion="centroid"),
+    Variant("huber", BEFORE, kernel="huber"),
+    Variant("cauchy", BEFORE, kernel="cauchy"),
+    Variant("scaled cauchy", BEFORE, kernel="scaled cauchy"),
+)
+CORRIDOR = (
+    MAIN[0],
+    Variant("default + prior", BEFORE, prior=True),
+    MAIN[1],
+    Variant(
+        "loam, no projector",
+        replace(MAIN[1].config, solver=replace(MAIN[1].config.solver, degeneracy_threshold=0.0)),
+    ),
+    Variant(
+        "loam, published projector",
+        replace(
+            MAIN[1].config, solver=replace(MAIN[1].config.solver, degeneracy_projector="published")
+        ),
+    ),
+    MAIN[2],
+)
+
+
+ROBUST = next(variant for variant in CHANGES if variant.name == "cauchy")
+"""The change that is drawn beside the main ones."""
+COLOURS = {"default": "#2b7a9b", "loam": "#e4572e", "aloam": "#7a5195", "cauchy": "#3a9d5d"}
+LABELS = {
+    "metres": "error of the guess, m",
+    "degrees": "error of the guess, degrees",
+    "random outliers": "random points, %",
+    "moving outliers": "moved by 0.5 m, %",
+    "basin": "same solution, %",
+    "outliers": "error, m (dotted: 95 %)",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much is done: frame of the first target, their number, spacing, starts on each."""
+
+    first: int = 60
+    targets: int = 5
+    spacing: int = 5
+    starts: int = 4
+    columns: int | None = None
+    mapped: int = 20
+
+
+FULL = Effort()
+QUICK = Effort(first=32, targets=1, starts=2, columns=600, mapped=6)
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """One solve.
+
+    Attributes
+    ----------
+    level : of what ``study`` varies: metres, degrees, or share of outliers
+    success : within :data:`NEAR` of the solution found from the truth
+    metres, degrees : from the truth; along, across : the same split by the corridor's axis, metres
+    """
+
+    study: str
+    scene: str
+    solver: str
+    level: float
+    success: bool
+    metres: float
+    degrees: float
+    along: float
+    across: float
+    iterations: int
+    converged: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Measured:
+    """A number that is no trial: a cost at an optimum, or an eigenvalue."""
+
+    study: str
+    scene: str
+    solver: str
+    name: str
+    value: float
+
+
+Result = Trial | Measured
+
+
+class Sweep:
+    """Features of a sweep, de-skewed to its middle with the exact motion."""
+
+    def __init__(self, world: SimulatedWorld, number: int) -> None:
+        config = Config()
+        features = extract_features(world.sweep(number), config)
+        half = 0.5 * features.span[1]
+        stamps = features.stamp + np.round(np.array([0.0, half, 2.0 * half]) * 1e9).astype(np.int64)
+        start, self.truth, end = map(gtsam.Pose3, world.truth_at(stamps).map_T_lidar)
+        twist = gtsam.Pose3.Logmap(start.between(end)) / (2.0 * half)
+        self.edges, self.planes = (
+            move_points(kept[:, :3], twist, kept[:, 3] - half)
+            for kept in (
+                voxel_filter(np.column_stack([points, times]), size)
+                for points, times, size in (
+                    (features.edges, features.edge_times, config.map.edge_voxel),
+                    (features.planes, features.plane_times, config.map.plane_voxel),
+                )
+            )
+        )
+
+
+class Place:
+    """Maps of one scene, one for each way to keep a map."""
+
+    def __init__(self, world: SimulatedWorld, variants: Iterable[Variant]) -> None:
+        self.along = np.asarray(world.world_T_start)[0, :3]
+        self.maps: dict[MapConfig, tuple[CubeMap, CubeMap]] = {}
+        for config in (variant.config.map for variant in variants):
+            self.maps[config] = (
+                CubeMap(config, config.edge_voxel),
+                CubeMap(config, config.plane_voxel),
+            )
+
+    def insert(self, sweep: Sweep) -> None:
+        """Add a sweep at its true pose."""
+        pose = sweep.truth.matrix()
+        for maps in self.maps.values():
+            for cubes, points in zip(maps, (sweep.edges, sweep.planes), strict=True):
+                cubes.recenter(pose[:3, 3])
+                cubes.insert(transform(pose, points))
+
+    def matches(
+        self, variant: Variant, edges: FloatArray, planes: FloatArray, pose: gtsam.Pose3
+    ) -> ScanMatches:
+        """Matches of a variant at a pose, before its robust kernel."""
+        config = variant.config
+        return associate(edges, planes, pose, *self.maps[config.map], config.matching)
+
+    def solve(
+        self, variant: Variant, edges: FloatArray, planes: FloatArray, guess: gtsam.Pose3
+    ) -> Solution:
+        """One frame, as the mapper would do it but without a second de-skew."""
+
+        def matches_at(pose: gtsam.Pose3) -> ScanMatches:
+            return robust(self.matches(variant, edges, planes, pose), variant.kernel)
+
+        priors = []
+        if variant.prior:
+            sigmas = np.repeat([np.radians(0.5), 0.05], 3)
+            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+            priors.append(gtsam.PriorFactorPose3(POSE_KEY, guess, noise))
+        return make_solver(variant.config.solver).solve(matches_at, guess, priors)
+
+
+def robust(matches: ScanMatches, kernel: str) -> ScanMatches:
+    """The matches with weights of a robust kernel on distance over sigma, frozen as they are now.
+
+    A match's row is multiplied by its weight, so the kernel's weight enters by its square root.
+    """
+    if not kernel:
+        return matches
+    edges, planes = matches.edges, matches.planes
+    pulls = [np.abs(part.distances) / part.sigmas for part in (edges, planes)]
+    unit = 1.0
+    if kernel.startswith("scaled"):
+        unit = max(1.0, 1.4826 * float(np.median(np.concatenate(pulls))))
+
+    def shrunk(weights: FloatArray, pull: FloatArray) -> FloatArray:
+        pull = pull / unit
+        if kernel == "huber":
+            factor = HUBER / np.maximum(pull, HUBER)
+        else:
+            factor = 1.0 / (1.0 + (pull / CAUCHY) ** 2)
+        shrunken: FloatArray = weights * np.sqrt(factor)
+        return shrunken
+
+    return ScanMatches(
+        replace(edges, weights=shrunk(edges.weights, pulls[0])),
+        replace(planes, weights=shrunk(planes.weights, pulls[1])),
+    )
+
+
+def disturbed(
+    truth: gtsam.Pose3, metres: float, degrees: float, rng: np.random.Generator
+) -> gtsam.Pose3:
+    """The pose, moved and turned by so much in random directions."""
+    turn, shift = rng.standard_normal((2, 3))
+    turn *= np.radians(degrees) / np.linalg.norm(turn)
+    shift *= metres / np.linalg.norm(shift)
+    return truth.compose(gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift))
+
+
+def with_random_points(points: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:
+    """Replace a share of (N, 3) points by others, uniform in the box of all."""
+    count = round(share * len(points))
+    if not count:  # no points, no box
+        return points
+    which = rng.permutation(len(points))[:count]
+    out = points.copy()
+    out[which] = rng.uniform(points.min(axis=0), points.max(axis=0), (count, 3))
+    return out
+
+
+def with_moving_object(
+    points: FloatArray, share: float, azimuth: float, shift: FloatArray
+) -> FloatArray:
+    """Shift the share of (N, 3) points nearest in azimuth (rad) to one by ``shift`` (3,)."""
+    off = np.angle(np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - azimuth)))
+    which = np.argsort(np.abs(off), kind="stable")[: round(share * len(points))]
+    out = points.copy()
+    out[which] += shift
+    return out
+
+
+def study_scene(scene: str, effort: Effort) -> list[Result]:
+    """Basin, outliers and costs of one scene; the bare corridor has a study of its own."""
+    bare = scene == "corridor_bare"
+    variants = CORRIDOR if bare else (*MAIN, *CHANGES)
+    first = effort.first + (INSIDE if bare else 0)
+    last = first + effort.spacing * (effort.targets - 1)
+    world = SimulatedWorld(
+        scene,
+        frames=last + 1,
+        columns=effort.columns,
+        max_range=SHORT_RANGE if bare else 100.0,
+    )
+    place = Place(world, variants)
+    results: list[Result] = []
+    for number in range(first - effort.mapped, last + 1):
+        sweep = Sweep(world, number)
+        if number >= first and (number - first) % effort.spacing == 0:
+            seed = (sum(map(ord, scene)), number)
+            if bare:
+                results += bare_corridor(place, sweep, effort, seed)
+            else:
+                for variant in variants:
+                    results += basin(place, variant, sweep, scene, effort, seed)
+                    results += outliers(place, variant, sweep, scene, effort, seed)
+                results += costs(place, sweep, scene)
+        place.insert(sweep)
+    return results
+
+
+def basin(
+    place: Place,
+    variant: Variant,
+    sweep: Sweep,
+    scene: str,
+    effort: Effort,
+    seed: tuple[int, int],
+) -> Iterator[Trial]:
+    """Solves from the truth and from errors of the guess."""
+    solve = partial(place.solve, variant, sweep.edges, sweep.planes)
+    trial = partial(_trial, scene=scene, variant=variant, truth=sweep.truth, along=place.along)
+    goal = solve(sweep.truth)
+    yield trial("from truth", level=0.0, solution=goal, goal=goal)
+    changed = variant in CHANGES  # of these, only what may differ
+    levels = [("metres", level, (level, 0.0)) for level in METRES[4 * changed :]]
+    levels += [("degrees", level, (0.0, level)) for level in DEGREES[3 * changed :]]
+    starts = effort.starts // 2 if changed else effort.starts
+    for study, level, error in levels:
+        # The same starts for every solver.
+        rng = np.random.default_rng([*seed, round(100 * level), len(study)])
+        for _ in range(starts):
+            found = solve(disturbed(sweep.truth, *error, rng))
+            yield trial(study, level=level, solution=found, goal=goal)
+
+
+def outliers(
+    place: Place,
+    variant: Variant,
+    sweep: Sweep,
+    scene: str,
+    effort: Effort,
+    seed: tuple[int, int],
+) -> Iterator[Trial]:
+    """Solves of a sweep with random points, or with a sector that has moved since."""
+    trial = partial(_trial, scene=scene, variant=variant, truth=sweep.truth, along=place.along)
+    goal = place.solve(variant, sweep.edges, sweep.planes, sweep.truth)
+    for share in (SHARE,) if variant in CHANGES else SHARES:
+        for start in range(effort.starts // 2):
+            rng = np.random.default_rng([*seed, round(100 * share), start, 3])
+            guess = disturbed(sweep.truth, *GUESS, rng)
+            azimuth, heading = rng.uniform(-np.pi, np.pi, 2)
+            shift = SHIFT * np.array([np.cos(heading), np.sin(heading), 0.0])
+            changes: dict[str, Callable[[FloatArray], FloatArray]] = {
+                "random outliers": partial(with_random_points, share=share, rng=rng),
+                "moving outliers": partial(
+                    with_moving_object, share=share, azimuth=azimuth, shift=shift
+                ),
+            }
+            for study, change in changes.items():
+                found = place.solve(variant, change(sweep.edges), change(sweep.planes), guess)
+                yield trial(study, level=share, solution=found, goal=goal)
+
+
+def costs(place: Place, sweep: Sweep, scene: str) -> Iterator[Measured]:
+    """Each solution under each cost, all on the matches at the truth, per match."""
+    found = {
+        variant.name: place.solve(variant, sweep.edges, sweep.planes, sweep.truth).map_T_lidar
+        for variant in MAIN
+    }
+    for variant in MAIN:
+        matches = place.matches(variant, sweep.edges, sweep.planes, sweep.truth)
+        for name, pose in found.items():
+            value = cost(matches, pose, variant.name) / len(matches)
+            yield Measured("cost", scene, name, f"under {variant.name}", value)
+
+
+def cost(matches: ScanMatches, pose: gtsam.Pose3, of: str) -> float:
+    """What a main variant minimises: whitened squares, metres squared, or Huber's in metres."""
+    e, p = matches.edges, matches.planes
+    if of != "default":
+        matches = ScanMatches(
+            replace(e, sigmas=np.ones(len(e))), replace(p, sigmas=np.ones(len(p)))
+        )
+    residual, _ = match_rows(matches).residuals(pose)
+    squares = residual**2
+    squares = np.concatenate([squares[: 2 * len(e)].reshape(-1, 2).sum(1), squares[2 * len(e) :]])
+    if of == "aloam":
+        delta = preset("aloam").solver.huber_delta
+        far = squares > delta**2
+        squares[far] = 2.0 * delta * np.sqrt(squares[far]) - delta**2
+    return 0.5 * float(squares.sum())
+
+
+def bare_corridor(
+    place: Place, sweep: Sweep, effort: Effort, seed: tuple[int, int]
+) -> Iterator[Result]:
+    """Solves where the way along cannot be seen, from a guess that is wrong in it."""
+    scene = "corridor_bare"
+    for variant in CORRIDOR:
+        trial = partial(_trial, scene=scene, variant=variant, truth=sweep.truth, along=place.along)
+        solve = partial(place.solve, variant, sweep.edges, sweep.planes)
+        goal = solve(sweep.truth)
+        yield trial("from truth", level=0.0, solution=goal, goal=goal)
+        for number, value in enumerate(np.linalg.eigvalsh(goal.information)):
+            yield Measured("eigenvalue", scene, variant.name, str(number + 1), float(value))
+        for start in range(effort.starts):
+            rng = np.random.default_rng([*seed, start])
+            guess = disturbed(sweep.truth, *GUESS, rng)
+            side = np.sign(rng.uniform(-1.0, 1.0))
+            error = guess.translation() - sweep.truth.translation()
+            shift = side * ALONG - error @ place.along
+            guess = gtsam.Pose3(guess.rotation(), guess.translation() + shift * place.along)
+            yield trial("wrong along", level=ALONG, solution=solve(guess), goal=goal)
+
+
+def _trial(
+    study: str,
+    *,
+    scene: str,
+    variant: Variant,
+    level: float,
+    truth: gtsam.Pose3,
+    along: FloatArray,
+    solution: Solution,
+    goal: Solution,
+) -> Trial:
+    pose = solution.map_T_lidar
+    metres, degrees = _apart(pose, truth)
+    near = _apart(pose, goal.map_T_lidar)
+    error = pose.translation() - truth.translation()
+    ahead = float(error @ along)
+    return Trial(
+        study,
+        scene,
+        variant.name,
+        level,
+        solution.solved and near[0] < NEAR[0] and near[1] < NEAR[1],
+        metres,
+        degrees,
+        abs(ahead),
+        float(np.linalg.norm(error - ahead * along)),
+        solution.iterations,
+        solution.converged,
+    )
+
+
+def _apart(a: gtsam.Pose3, b: gtsam.Pose3) -> tuple[float, float]:
+    """Metres and degrees between two poses."""
+    turn = np.linalg.norm(gtsam.Rot3.Logmap(a.rotation().between(b.rotation())))
+    return float(np.linalg.norm(a.translation() - b.translation())), float(np.degrees(turn))
+
+
+# -- tables ------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """All trials of one kind: share of successes (percent), and errors in metres and degrees."""
+
+    study: str
+    scene: str
+    solver: str
+    level: float
+    trials: int
+    success: float
+    mean_m: float
+    median_m: float
+    p95_m: float
+    median_deg: float
+    p95_deg: float
+    along_m: float
+    across_m: float
+    iterations: float
+    converged: float
+
+
+def summary(results: Iterable[Result]) -> list[Row]:
+    """One row for each study, scene, solver and level, in the order in which they came."""
+    groups: dict[tuple[str, str, str, float], list[Trial]] = {}
+    for result in results:
+        if isinstance(result, Trial):
+            key = (result.study, result.scene, result.solver, result.level)
+            groups.setdefault(key, []).append(result)
+    rows = []
+    for key, trials in groups.items():
+        metres, degrees = [t.metres for t in trials], [t.degrees for t in trials]
+        rows.append(
+            Row(
+                *key,
+                len(trials),
+                100.0 * float(np.mean([t.success for t in trials])),
+                float(np.mean(metres)),
+                float(np.median(metres)),
+                float(np.percentile(metres, 95.0)),
+                float(np.median(degrees)),
+                float(np.percentile(degrees, 95.0)),
+                float(np.median([t.along for t in trials])),
+                float(np.median([t.across for t in trials])),
+                float(np.mean([t.iterations for t in trials])),
+                100.0 * float(np.mean([t.converged for t in trials])),
+            )
+        )
+    return rows
+
+
+def averages(results: Iterable[Result]) -> list[Measured]:
+    """Mean over the targets of each number that is no trial."""
+    groups: dict[tuple[str, str, str, str], list[float]] = {}
+    for result in results:
+        if isinstance(result, Measured):
+            key = (result.study, result.scene, result.solver, result.name)
+            groups.setdefault(key, []).append(result.value)
+    return [Measured(*key, float(np.mean(values))) for key, values in groups.items()]
+
+
+def write_csv(path: Path, rows: Sequence[Row] | Sequence[Measured]) -> None:
+    """Every field with four significant digits."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    names = [item.name for item in fields(rows[0])]
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(names)
+        for row in rows:
+            values = [getattr(row, name) for name in names]
+            writer.writerow([f"{v:.4g}" if isinstance(v, float) else v for v in values])
+
+
+def draw(folder: Path, rows: Sequence[Row], numbers: Sequence[Measured]) -> None:
+    """The figures ``study_*.png``."""
+    mpl.use("Agg")
+    mpl.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})
+    folder.mkdir(parents=True, exist_ok=True)
+    scenes = list(dict.fromkeys(row.scene for row in rows if row.study == "metres"))
+    for name, draw_panel, kinds in (
+        ("basin", _draw_basin, (("metres", METRES), ("degrees", DEGREES))),
+        ("outliers", _draw_outliers, (("random outliers", SHARES), ("moving outliers", SHARES))),
+    ):
+        figure, axes = plt.subplots(
+            2, len(scenes), figsize=(1.5 + 2.6 * len(scenes), 5.2), squeeze=False, sharey=True
+        )
+        for line, (study, levels) in zip(axes, kinds, strict=True):
+            for panel, scene in zip(line, scenes, strict=True):
+                here = [row for row in rows if (row.study, row.scene) == (study, scene)]
+                draw_panel(panel, here, levels)
+                panel.set(title=scene, xlabel=LABELS[study])
+        axes[0, 0].legend(frameon=False)
+        for panel in axes[:, 0]:
+            panel.set_ylabel(LABELS[name])
+        _save(figure, folder / f"study_{name}.png")
+    _draw_changes(folder, rows, scenes)
+    _draw_corridor(folder, rows, numbers)
+
+
+def _draw_basin(panel: Axes, rows: Sequence[Row], levels: Sequence[float]) -> None:
+    for offset, variant in enumerate((*MAIN, ROBUST)):
+        own = {row.level: row.success for row in rows if row.solver == variant.name}
+        shares = [own.get(level, np.nan) for level in levels]
+        # A little apart, or equal rates would hide each other.
+        panel.plot(np.arange(len(levels)) + 0.05 * offset, shares, "o-", ms=4, **_style(variant))
+    panel.set_xticks(range(len(levels)), [f"{level:g}" for level in levels])
+    panel.set_ylim(-5.0, 105.0)
+
+
+def _draw_outliers(panel: Axes, rows: Sequence[Row], levels: Sequence[float]) -> None:
+    for variant in (*MAIN, ROBUST):
+        own = [row for row in rows if row.solver == variant.name]
+        x = [100.0 * row.level for row in own]
+        panel.semilogy(x, [row.median_m for row in own], "o-", ms=4, **_style(variant))
+        panel.semilogy(x, [row.p95_m for row in own], ":", lw=1.0, color=_style(variant)["color"])
+    panel.set_xticks([100.0 * level for level in levels])
+    panel.grid(axis="y", alpha=0.3)
+
+
+def _draw_changes(folder: Path, rows: Sequence[Row], scenes: Sequence[str]) -> None:
+    """Errors of the changes of the default, over those of the default itself."""
+    kinds = (("from truth", 0.0), ("moving outliers", SHARE), ("random outliers", SHARE))
+    names = [v.name for v in (*CHANGES, *MAIN[1:])]
+    figure, axes = plt.subplots(1, len(kinds), figsize=(11.0, 3.6), sharey=True)
+    for panel, (study, level) in zip(axes, kinds, strict=True):
+        error = {
+            (r.scene, r.solver): r.mean_m for r in rows if r.study == study and r.level == level
+        }
+        for mark, scene in zip("os^D", scenes, strict=False):
+            ratios = [error[scene, name] / error[scene, "default"] for name in names]
+            panel.semilogx(ratios, range(len(names)), mark, ms=5, alpha=0.8, label=scene)
+        panel.axvline(1.0, color="0.6", lw=1.0)
+        panel.set_xticks([0.25, 0.5, 1, 2, 4], ["1/4", "1/2", "1", "2", "4"])
+        panel.minorticks_off()
+        panel.grid(axis="x", alpha=0.3)
+        panel.set(
+            title=f"{study}, {level:.0%}" if level else study, xlabel="mean error over default's"
+        )
+    axes[0].set_yticks(range(len(names)), names)
+    axes[0].invert_yaxis()
+    axes[-1].legend(frameon=False, fontsize=8)
+    _save(figure, folder / "study_changes.png")
+
+
+def _draw_corridor(folder: Path, rows: Sequence[Row], numbers: Sequence[Measured]) -> None:
+    names = [variant.name for variant in CORRIDOR]
+    own = {row.solver: row for row in rows if row.study == "wrong along"}
+    figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 3.4))
+    places = np.arange(len(names))
+    left.barh(places - 0.2, [own[name].along_m for name in names], 0.4, label="along")
+    left.barh(places + 0.2, [own[name].across_m for name in names], 0.4, label="across")
+    left.axvline(ALONG, color="0.6", ls="--", lw=1.0, label="guess, along")
+    left.set_yticks(places, names)
+    left.invert_yaxis()
+    left.set(xscale="log", xlabel="median error, m")
+    left.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.4, 1.0))
+    for variant in MAIN:
+        values = [n.value for n in numbers if (n.study, n.solver) == ("eigenvalue", variant.name)]
+        right.semilogy(range(1, 7), values, "o-", **_style(variant))
+    right.axhline(100.0, color="0.6", ls="--", lw=1.0)
+    right.text(4.0, 110.0, "LOAM's threshold", va="bottom", fontsize=8)
+    right.set(xlabel="eigenvalue of the information", ylim=(50.0, None))
+    right.legend(frameon=False)
+    _save(figure, folder / "study_corridor.png")
+
+
+def _style(variant: Variant) -> dict[str, Any]:
+    return {"color": COLOURS[variant.name], "label": variant.name}
+
+
+def _save(figure: Figure, path: Path) -> None:
+    figure.tight_layout()
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+    plt.close(figure)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.study", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="one sweep of one scene, two starts")
+    root = Path(__file__).resolve().parents[1]
+    parser.add_argument("--output", type=Path, help="for study/*.csv, images/study_*.png; "
+                        "docs, or benchmarks/results with --quick")  # fmt: skip
+    options = parser.parse_args(arguments)
+    folder = options.output or root / ("benchmarks/results" if options.quick else "docs")
+    effort, scenes = (QUICK, ("room",)) if options.quick else (FULL, SCENES)
+    with ProcessPoolExecutor(2) as pool:
+        parts = pool.map(partial(study_scene, effort=effort), (*scenes, "corridor_bare"))
+        results = [result for part in parts for result in part]
+    rows, numbers = summary(results), averages(results)
+    write_csv(folder / "study" / "trials.csv", rows)
+    write_csv(folder / "study" / "numbers.csv", numbers)
+    draw(folder / "images", rows, numbers)
+    print(f"{sum(isinstance(r, Trial) for r in results)} solves; tables in {folder / 'study'}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

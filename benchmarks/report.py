@@ -138,7 +138,7 @@ def _csv_row(result: CaseResult) -> dict[str, str]:
 
 
 def _markdown(results: Sequence[CaseResult]) -> Iterator[str]:
-    yield "<!-- made by: python -m benchmarks -->"
+    yield "# Benchmarks\n\nMade by `python -m benchmarks`; also as [CSV](benchmarks.csv).\n"
     yield "; ".join(f"{name} {value}" for name, value in machine()) + "."
     for paragraph in _EXPLANATION:
         yield f"\n{paragraph}"

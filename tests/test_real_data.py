@@ -36,7 +36,7 @@ def test_ouster(shared_data):
     """Each step within 2.5 cm of the reference poses, the two together within 1.5 cm.
 
     The reference poses are no truth: plane-based registrations between the sweeps by other means
-    agree with ours to millimetres, see docs/benchmarks.md.
+    agree with ours to millimetres, see docs/benchmarks.
     """
     config = replace(Config(), deskew=replace(Config().deskew, reference="middle"))
     result = run(open_dataset(shared_data / "ouster_os1_128"), config)

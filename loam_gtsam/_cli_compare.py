@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,14 @@ from rich.text import Text
 
 from loam_gtsam import visualization
 from loam_gtsam._cli_report import NOT_MAPPED
-from loam_gtsam._cli_run import RunOptions, file_name, frame_progress, free_folder, stop_requests
+from loam_gtsam._cli_run import (
+    RunOptions,
+    file_name,
+    frame_progress,
+    free_folder,
+    say_written,
+    stop_requests,
+)
 from loam_gtsam._compare_files import (
     ACCURACY_COLUMNS,
     COLUMNS,
@@ -71,11 +77,7 @@ def execute(
     if not options.quiet:
         console = Console()
         console.print(_summary(results, seconds))
-        if stop.signum is not None:
-            name = signal.Signals(stop.signum).name
-            done = f"after frame {comparison.frames} of {total}"
-            console.print(f"Stopped by {name} {done}; what was computed until then is written.")
-        console.print(f"Written to {folder}: {', '.join(files)}", markup=False, soft_wrap=True)
+        say_written(console, stop, comparison.frames, total, folder, files)
     if comparison.error is not None:
         raise comparison.error
     if stop.signum is not None:

@@ -86,11 +86,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         if options.profile:
             console.print(profile_table(result.updates))
         console.print(summary(result, dataset.name, seconds, accuracy, info.problems))
-        if stop.signum is not None:
-            name = signal.Signals(stop.signum).name
-            done = f"after frame {len(result.updates)} of {total}"
-            console.print(f"Stopped by {name} {done}; what was computed until then is written.")
-        console.print(f"Written to {folder}: {', '.join(files)}", markup=False, soft_wrap=True)
+        say_written(console, stop, len(result.updates), total, folder, files)
     if result.error is not None:
         raise result.error
     if stop.signum is not None:
@@ -181,6 +177,17 @@ class StopRequest:
     """The signal that asked the run to stop, if one did."""
 
     signum: int | None = None
+
+
+def say_written(
+    console: Console, stop: StopRequest, frames: int, total: int, folder: Path, files: list[str]
+) -> None:
+    """The last lines of a run: whether it was stopped, and where its files are."""
+    if stop.signum is not None:
+        name = signal.Signals(stop.signum).name
+        done = f"after frame {frames} of {total}"
+        console.print(f"Stopped by {name} {done}; what was computed until then is written.")
+    console.print(f"Written to {folder}: {', '.join(files)}", markup=False, soft_wrap=True)
 
 
 @contextmanager

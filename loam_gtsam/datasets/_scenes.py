@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
+from scipy.ndimage import gaussian_filter1d
 
 from loam_gtsam.datasets._raycast import Ground, Solids
 from loam_gtsam.types import FloatArray
@@ -188,16 +190,83 @@ def build_corridor_bare(seed: int) -> Scene:
     return _in_corridor("corridor_bare", Solids(boxes=np.array(_shell())))
 
 
+def build_shaken(seed: int) -> Scene:
+    """The room, its sensor shaken as in a careless hand: 2 rad/s in yaw, 0.15 rad of roll and pitch
+    at 1 to 2 Hz.
+    """
+    return replace(build_room(seed), name="shaken", sway=(0.03, 0.15, 0.15, 0.31), frames=120)
+
+
+def build_slopes(seed: int) -> Scene:
+    """A winding road over a hill and through a dip 16 m below it, at grades up to 12 %.
+
+    Houses line its first half, trees and rocks the second. It starts on the slope, so that a map
+    in the frame of the first pose is tilted by 5 degrees.
+    """
+    rng = np.random.default_rng([seed, 0, 5])
+    # The third harmonic makes the grade more even, and so the climb longer at the same grade.
+    number, amplitude, phase = 2.0 * np.pi / _HILL, 7.2, -0.25 * np.pi
+    waves = [
+        [amplitude, number, 0.0, phase],
+        [-amplitude / 9.0, 3.0 * number, 0.0, 3.0 * phase],
+    ]
+    ground = Ground(np.vstack([waves, _rolling(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
+    bends = np.array(
+        [[0, 0], [80, 14], [175, -6], [265, 16], [350, 0], [400, -4]], dtype=np.float64
+    )
+    legs = [(_Kerb(a, b, left, ground), left) for a, b in pairwise(bends) for left in (True, False)]
+    boxes: list[list[float]] = []
+    posts: list[list[float]] = []
+    trunks: list[list[float]] = []
+    crowns: list[list[float]] = []
+    stones: list[list[float]] = []
+    for kerb, inside in legs[:4]:
+        boxes += _facades(rng, kerb, inside)
+        for s in np.arange(9.0, kerb.length - 8.0, 12.0) + rng.uniform(0.0, 4.0):
+            x, y, z = kerb.place(s, 6.8)
+            posts.append([x, y, 0.1, z - _DEEP, z + 6.0])
+    for kerb, _ in legs[4:]:
+        for s in np.arange(2.0, kerb.length, 2.2):
+            x, y, z = kerb.place(s, float(rng.uniform(6.0, 40.0)))
+            if rng.random() < 0.25:
+                stones.append([x, y, z, *rng.uniform(0.4, 1.6, 3)])
+            else:
+                top, wide = z + rng.uniform(4.0, 7.0), rng.uniform(1.0, 2.0)
+                trunks.append([x, y, rng.uniform(0.1, 0.35), z - _DEEP, top])
+                crowns.append([x, y, top, wide, wide, rng.uniform(1.2, 2.4)])
+    along = np.arange(8.0, 392.0, 8.0)
+    across = np.interp(along, bends[:, 0], bends[:, 1])
+    return Scene(
+        name="slopes",
+        solids=Solids(
+            np.array(boxes),
+            np.array(posts + trunks),
+            np.array(crowns + stones),
+            np.arange(len(crowns) + len(stones)) < len(crowns),
+            ground,
+        ),
+        waypoints=np.stack([along, gaussian_filter1d(across, 2.0, mode="nearest")], axis=1),
+        closed=False,
+        speed=8.0,
+        height=1.8,
+        sway=(0.01, 0.006, 0.006, 0.002),
+    )
+
+
 BUILDERS: dict[str, Callable[[int], Scene]] = {
     "room": build_room,
     "street_loop": build_street_loop,
     "trees": build_trees,
     "corridor": build_corridor,
     "corridor_bare": build_corridor_bare,
+    "slopes": build_slopes,
+    "shaken": build_shaken,
 }
 
 _CORRIDOR = 320.0
 """Metres."""
+_HILL = 390.0
+"""Metres from crest to crest of the road over the slopes."""
 
 
 class _Kerb:

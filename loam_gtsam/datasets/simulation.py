@@ -71,8 +71,8 @@ class SimulatedWorld:
     scene : one of :data:`SCENES`, or a :class:`Scene` of your own
     sensor : one of :data:`SENSORS`
     frames : sweeps; None is the scene's own number: once round and two seconds more for
-        ``street_loop``, to the end for the corridors. Closed paths (room, street_loop, trees) are
-        driven round and round, open ones have an end.
+        ``street_loop``, to the end for the corridors and the slopes. Closed paths (room, shaken,
+        street_loop, trees) are driven round and round, open ones have an end.
     seed : of the place and of all noise
     range_noise : standard deviation along the beam, metres
     dropout : share of returns that are lost

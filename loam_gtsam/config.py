@@ -148,6 +148,15 @@ class FeatureConfig(_Section):
     edge_curvature: float = _param(
         0.1, "least curvature |sum of differences|^2 of an edge", unit="m^2", source="LOAM", low=0.0
     )
+    range_noise: float = _param(
+        0.02,
+        "standard deviation of the sensor's ranges: a plane point must lie where its ring scatters "
+        "about a smooth surface by less than four times this, which foliage does not; 0 turns the "
+        "test off",
+        unit="m",
+        source="LOAM takes all points that are not edges",
+        low=0.0,
+    )
     plane_curvature: float = _param(
         0.1, "largest curvature of a plane point", unit="m^2", source="LOAM", low=0.0
     )
@@ -195,6 +204,11 @@ class DeskewConfig(_Section):
         "de-skew again with the solution, and register the first two sweeps anew when their motion "
         "is known; false de-skews once, with the guess",
         source="LOAM de-skews once",
+    )
+    rotation: Literal["auto", "orientation", "constant_velocity"] = _param(
+        "auto",
+        "rotation within a sweep: auto takes the gyro of an IMU if it covers the sweep, else a "
+        "constant velocity; orientation takes the IMU's attitude instead of its gyro",
     )
     reference: Literal["start", "middle", "end", "stamp"] = _param(
         "start", "the moment of the sweep the pose belongs to"
@@ -255,6 +269,23 @@ class MapConfig(_Section):
 class MatchingConfig(_Section):
     """Association of features with the map."""
 
+    max_edges: int = _param(
+        1000,
+        "edge features matched at most, evenly spread over the sweep; 0: all. All enter the map",
+        source="LOAM matches all",
+        low=0,
+    )
+    max_planes: int = _param(4000, "and plane features", source="LOAM matches all", low=0)
+    rough_edges: int = _param(
+        150, "edge features matched at most while the pose is only known roughly", low=1
+    )
+    rough_planes: int = _param(
+        500,
+        "and plane features: a first solve with few matches, which brings the pose so near that "
+        "the others are searched for once; 0: no such solve",
+        source="LOAM has none",
+        low=0,
+    )
     neighbours: int = _param(5, "map points a feature is matched with", source="LOAM", low=3)
     max_distance: float = _param(
         1.0, "distance of the farthest of them", unit="m", source="LOAM", low=0.0
@@ -333,7 +364,7 @@ class SolverConfig(_Section):
         "gtsam",
         "factor graph; LOAM's Gauss-Newton on Euler angles; A-LOAM's robust Levenberg-Marquardt",
     )
-    iterations: int = _param(10, "associations at most", source="LOAM", low=1)
+    iterations: int = _param(10, "associations of a solve at most", source="LOAM", low=1)
     inner_iterations: int = _param(
         2, "Levenberg-Marquardt iterations per association", source="A-LOAM uses 4", low=1
     )
@@ -365,6 +396,25 @@ class SolverConfig(_Section):
     min_map_planes: int = _param(
         50, "least plane points of the local map", source="A-LOAM uses 51, LOAM 101", low=0
     )
+    degeneracy: Literal["prior", "project", "off"] = _param(
+        "prior",
+        "method gtsam, along directions that a scan does not fix: the expected motion takes over "
+        "with its own covariance; it is kept exactly, as LOAM does; or the scan is believed",
+        source="LOAM projects",
+    )
+    min_aligned: float = _param(
+        10.0,
+        "a direction is weak if fewer matches than this fix it, counted as if their normals "
+        "pointed that way",
+        low=0.0,
+    )
+    acceleration_sigma: float = _param(
+        2.0,
+        "what the constant-velocity motion is believed to within, along weak directions",
+        unit="m/s^2",
+        low=1e-6,
+    )
+    turn_sigma: float = _param(2.0, "and for the rotation", unit="rad/s^2", low=1e-6)
     degeneracy_threshold: float = _param(
         100.0,
         "method loam: the step is projected out of eigenvectors of A^T A with smaller eigenvalues "
@@ -394,6 +444,74 @@ class SolverConfig(_Section):
 
 
 @dataclass(frozen=True, slots=True)
+class ImuConfig(_Section):
+    """Use of an inertial measurement unit; nothing here matters without one."""
+
+    enabled: bool = _param(True, "false: as if there were no IMU")
+    prior: Literal["off", "blend", "equivalent", "sigma"] = _param(
+        "equivalent",
+        "how roll and pitch of the IMU act on the pose: not at all; mixed in after the solve; by a "
+        "factor of the weight's share of what the scan knows, which gives the same mean; by a "
+        "gravity direction of the given sigma",
+        source="LOAM blends",
+    )
+    weight: float = _param(
+        0.002,
+        "share of the IMU's roll and pitch (blend, equivalent)",
+        source="LOAM",
+        low=0.0,
+        high=0.999,
+    )
+    sigma_deg: float = _param(
+        0.5,
+        "standard deviation of the IMU's gravity direction, its slow errors included (sigma; and "
+        "equivalent where the scan or the angles cannot do it)",
+        unit="degrees",
+        low=1e-4,
+    )
+    level: bool = _param(
+        True, "the map's z axis points up from the start; false: the map is the first pose's frame"
+    )
+    still_seconds: float = _param(
+        0.5, "window before the first sweep in which the platform may be at rest", unit="s", low=0.0
+    )
+    max_gap: float = _param(0.1, "a longer gap between samples is not bridged", unit="s", low=1e-3)
+    lidar_R_imu_deg: tuple[float, float, float] = _param(
+        (0.0, 0.0, 0.0),
+        "roll, pitch, yaw of the rotation Rz Ry Rx that takes IMU vectors into the lidar frame",
+        unit="degrees",
+    )
+    lidar_t_imu: tuple[float, float, float] = _param(
+        (0.0, 0.0, 0.0), "position of the IMU in the lidar frame (pre-integration)", unit="m"
+    )
+    filter_seconds: float = _param(
+        20.0,
+        "time constant of the gravity filter that stands in for a missing orientation",
+        unit="s",
+        low=0.1,
+    )
+    preintegration: bool = _param(
+        False,
+        "predict every pose from gyro and accelerometer, with velocity and biases estimated over "
+        "the last frames, and let the prediction take over where the scan says nothing",
+    )
+    lag: int = _param(20, "frames in the pre-integration's graph", low=2)
+    gravity: float = _param(9.81, "of the place", unit="m/s^2", low=0.0)
+    gyro_noise: float = _param(
+        2e-4, "white noise density of the gyro", unit="rad/s/sqrt(Hz)", low=1e-9
+    )
+    acceleration_noise: float = _param(
+        2e-3, "white noise density of the accelerometer", unit="m/s^2/sqrt(Hz)", low=1e-9
+    )
+    gyro_bias_walk: float = _param(
+        2e-5, "random walk of the gyro's bias", unit="rad/s^2/sqrt(Hz)", low=1e-12
+    )
+    acceleration_bias_walk: float = _param(
+        2e-4, "random walk of the accelerometer's bias", unit="m/s^3/sqrt(Hz)", low=1e-12
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Config(_Section):
     """The whole configuration."""
 
@@ -404,9 +522,14 @@ class Config(_Section):
     map: MapConfig = _param(MapConfig(), "the cube map")
     matching: MatchingConfig = _param(MatchingConfig(), "association with the map")
     solver: SolverConfig = _param(SolverConfig(), "the per-frame solve")
+    imu: ImuConfig = _param(ImuConfig(), "roll, pitch and rotation from an IMU")
 
 
+_CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0)
 _CLASSICAL_MATCHING = MatchingConfig(
+    max_edges=0,
+    max_planes=0,
+    rough_planes=0,
     line_ratio=3.0,
     plane_fit="unit_offset",
     plane_ratio=0.0,
@@ -421,15 +544,18 @@ PRESETS: dict[str, Config] = {
     "default": Config(),
     # Zhang and Singh, LOAM (RSS 2014), constants of the published laserMapping.
     "loam": Config(
-        deskew=DeskewConfig(refine=False),
+        features=_CLASSICAL_FEATURES,
+        deskew=DeskewConfig(refine=False, rotation="constant_velocity"),
         odometry=OdometryConfig(method="scan_to_scan"),
         map=MapConfig(insertion="centroid"),
         matching=_CLASSICAL_MATCHING,
         solver=SolverConfig(method="loam", step_sigmas=0.0, min_map_edges=11, min_map_planes=101),
+        imu=ImuConfig(prior="blend"),
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings.
     "aloam": Config(
-        deskew=DeskewConfig(refine=False),
+        features=_CLASSICAL_FEATURES,
+        deskew=DeskewConfig(refine=False, rotation="constant_velocity"),
         odometry=OdometryConfig(method="scan_to_scan"),
         map=MapConfig(neighbourhood=(5, 5, 3), field_of_view=False, insertion="centroid"),
         matching=dataclasses.replace(_CLASSICAL_MATCHING, weight_slope=0.0),
@@ -442,6 +568,7 @@ PRESETS: dict[str, Config] = {
             min_map_edges=11,
             min_map_planes=51,
         ),
+        imu=ImuConfig(enabled=False),
     ),
 }
 

@@ -2,13 +2,16 @@
 
 The rules are those of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in Real-time, RSS
 2014, section V.A, and the published code's scan registration): curvature along each ring of the
-raw sweep, rejection of occluded and grazing points, and picks by sector. Two things differ from
+raw sweep, rejection of occluded and grazing points, and picks by sector. Three things differ from
 the published code:
 
 * Picks are made for all sectors at once, edges of the whole sweep before its plane points. The
   published code goes sector by sector, so that near a border (within half a window) which of two
   neighbouring points is picked can differ. Counts and spacing hold all the same: of two picks
   that would suppress each other, the one in the earlier sector stays.
+* A plane point must lie where its ring is smooth (:func:`roughness`, ``features.range_noise``). In
+  foliage, which is not, five neighbours make a plane only by chance; the matches with such planes
+  follow the pose from which the map was first seen, and hold it fast.
 * Flat picks stand in ``Features.planes`` as they were measured, before the rest, which is
   voxel-filtered; the published code puts them into the filter too.
 """
@@ -22,6 +25,12 @@ from loam_gtsam.config import Config, FeatureConfig
 from loam_gtsam.sweep import OrganisedSweep, organise
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError
 
+_ROUGH = 4.0
+"""Standard deviations of range noise: no smooth surface scatters by that much."""
+_LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
+"""Residual sum of squares of a straight line through five even samples, from their second
+differences a, b, c: ``0.4 (a^2 + c^2) + 0.7 b^2 + 0.8 b (a + c) + 0.4 a c``, the quadratic form of
+``(D D^T)^-1`` with D the second differences of five samples."""
 _KEY_BITS = 18
 """Bits per axis of a voxel key, which leaves 9 for the ring: +-131,072 voxels."""
 
@@ -75,6 +84,8 @@ def extract_features(scan: Scan, config: Config) -> Features:
         linked, window, free,
     )  # fmt: skip
     rest = inside
+    if settings.range_noise > 0.0:
+        rest &= roughness(sweep.xyz) < _ROUGH * settings.range_noise
     rest[edges] = False
     rest[flat] = False
     return _assemble(scan, config, sweep, edges, rank, flat, np.flatnonzero(rest))
@@ -115,6 +126,67 @@ def curvature(xyz: NDArray[np.float32], half_window: int) -> NDArray[np.float32]
     result = np.zeros(xyz.shape[1], dtype=np.float32)
     result[half_window : half_window + inner] = _squared_norm(total)
     return result
+
+
+def kinks(xyz: NDArray[np.float32], half_window: int, which: IntArray) -> FloatArray:
+    """How far points are off the surface through their neighbours on the ring, along their beams.
+
+    The inverse range along a ring is a sinusoid of the azimuth on *every* plane, so its sum of
+    differences to the neighbours vanishes on a wall however grazed, where that of the points
+    themselves (:func:`curvature`) is large because they are spread unevenly.
+
+    Parameters
+    ----------
+    xyz : (3, N) metres, ring after ring in firing order
+    half_window : w, neighbours on either side
+    which : (M,) points, with their windows inside a ring
+
+    Returns
+    -------
+    (M,) metres, the sum of 2 w differences over the standard deviation that it has for unit range
+    noise, ``sqrt(4 w^2 + 2 w)``
+    """
+    window = which[:, None] + np.arange(-half_window, half_window + 1)
+    squared = _squared_norm(xyz[:, window]).astype(np.float64)
+    inverse = 1.0 / np.sqrt(squared)
+    total = inverse.sum(axis=1) - (2 * half_window + 1) * inverse[:, half_window]
+    unit = float(np.sqrt(4.0 * half_window**2 + 2.0 * half_window))
+    sums: FloatArray = np.abs(total) * squared[:, half_window] / unit
+    return sums
+
+
+def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scatter along the beam of five consecutive points of a ring about a smooth surface.
+
+    A straight line is fitted to the inverse ranges (see :func:`kinks`); its residuals have three
+    degrees of freedom, the second differences. Of the windows that end at, are centred on and
+    begin at a point the smoothest counts, so that points next to an edge are not rough.
+
+    Parameters
+    ----------
+    xyz : (3, N) metres, ring after ring in firing order
+
+    Returns
+    -------
+    (N,) metres, a standard deviation; infinite within two points of the ends
+    """
+    squared = _squared_norm(xyz)
+    inverse = 1.0 / np.sqrt(squared)
+    count = len(inverse)
+    best = np.full(count, np.inf, dtype=np.float32)
+    if count < 5:
+        return best
+    second = (inverse[:-2] - 2.0 * inverse[1:-1] + inverse[2:]) * squared[1:-1]
+    left, centre, right = second[:-2], second[1:-1], second[2:]
+    outer, inner, beside, across = _LINE_RESIDUALS
+    scatter = outer * (left * left + right * right) + inner * (centre * centre)
+    scatter += beside * (centre * (left + right)) + across * (left * right)
+    middle = best[2:-2]
+    middle[:] = scatter
+    middle[2:] = np.minimum(middle[2:], scatter[:-2])
+    middle[:-2] = np.minimum(middle[:-2], scatter[2:])
+    rough: NDArray[np.float32] = np.sqrt(np.maximum(best, 0.0) / np.float32(3.0))
+    return rough
 
 
 def squared_gaps(xyz: NDArray[np.float32], ring_starts: IntArray) -> NDArray[np.float32]:
@@ -296,6 +368,7 @@ def _assemble(
         sharp=np.arange(np.count_nonzero(rank < config.features.sharp_per_sector)),
         flat=np.arange(len(flat)),
         span=(span[0] - reference, span[1] - reference),
+        edge_kinks=kinks(sweep.xyz, config.features.half_window, edges),
     )
 
 

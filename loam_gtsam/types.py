@@ -116,6 +116,9 @@ class Features:
     sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
         (used by scan-to-scan odometry).
     span : (first, last) seconds from ``stamp`` covered by the sweep.
+    edge_kinks : (E,) metres by which each edge stands out of its ring, in the unit in which range
+        noise has its own standard deviation (:func:`loam_gtsam.features.kinks`); None if unknown:
+        all edges then count as real ones.
     """
 
     stamp: int
@@ -128,6 +131,7 @@ class Features:
     sharp: IntArray
     flat: IntArray
     span: tuple[float, float] = (0.0, 0.0)
+    edge_kinks: FloatArray | None = None
 
     @classmethod
     def from_points(
@@ -238,11 +242,14 @@ class Trajectory:
 
 
 class FrameStatus(StrEnum):
-    """What happened to one frame. Only ``OK`` and ``NOT_CONVERGED`` poses come from a solve."""
+    """What happened to one frame; see :attr:`solved` for which poses come from a solve."""
 
     OK = "ok"
     NOT_CONVERGED = "not_converged"
     """Solved, but the last step was still above the stop rule at the iteration limit."""
+    DEGENERATE = "degenerate"
+    """Solved, but the scan says nothing about some direction, which the expected motion decided;
+    the message names it."""
     FIRST = "first"
     """Nothing to match against yet: the guess is the pose, and the map starts here."""
     SPARSE_MAP = "sparse_map"
@@ -257,7 +264,31 @@ class FrameStatus(StrEnum):
     @property
     def solved(self) -> bool:
         """Whether the pose comes from a solve."""
-        return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED)
+        return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED, FrameStatus.DEGENERATE)
+
+
+class SweepMotion(StrEnum):
+    """Where the rotation within a sweep came from; its translation is a constant velocity."""
+
+    NONE = "none"
+    """Not de-skewed: the points have no times of their own, or ``deskew.enabled`` is off."""
+    CONSTANT_VELOCITY = "constant_velocity"
+    GYRO = "gyro"
+    ORIENTATION = "orientation"
+
+
+class TiltPrior(StrEnum):
+    """How the IMU's roll and pitch acted on a pose (``imu.prior``)."""
+
+    NONE = "none"
+    """No IMU, not asked for, or the frame was not solved."""
+    BLEND = "blend"
+    EQUIVALENT = "equivalent"
+    GRAVITY = "gravity"
+    """The gravity direction: mode ``sigma``, or stepping in near a pitch of 90 degrees, and for
+    ``equivalent`` where the scan knows less of the tilt than the IMU does."""
+    DROPPED = "dropped"
+    """Asked for, but there is no orientation of that moment (a gap, or the end of the stream)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -277,7 +308,13 @@ class MapUpdate:
         at the guess and at the solution, each with its own matches
     information : (6, 6) at the solution: scan matches and priors, tangent order of the package.
         Zero when the frame was not solved.
-    twist : (6,) body velocity of the sweep (rad/s, m/s) used for its de-skew
+    twist : (6,) body velocity at ``stamp`` (rad/s, m/s) used for the de-skew of the sweep; where
+        an IMU gives the rotation within the sweep, its mean
+    sweep_motion : where that rotation came from
+    tilt_prior : how the IMU's roll and pitch acted
+    localizability : (6,) how many matches fix each of ``directions``, counted as if their normals
+        pointed that way, the weakest first; NaN where it was not looked at
+    directions : (6, 6) rows, tangent vectors that move the matched points by 1 m; NaN likewise
     timings : seconds per stage
     """
 
@@ -295,6 +332,10 @@ class MapUpdate:
     error_after: float = 0.0
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
     twist: FloatArray = field(default_factory=lambda: np.zeros(6))
+    sweep_motion: SweepMotion = SweepMotion.NONE
+    tilt_prior: TiltPrior = TiltPrior.NONE
+    localizability: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    directions: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
     timings: Mapping[str, float] = field(default_factory=dict)
 
     @property

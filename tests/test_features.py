@@ -14,7 +14,9 @@ from loam_gtsam.features import (
     _voxel_per_ring,
     curvature,
     extract_features,
+    kinks,
     pick,
+    roughness,
     sector_bounds,
     squared_gaps,
     unreliable_points,
@@ -25,6 +27,7 @@ from loam_gtsam.sweep import organise
 from loam_gtsam.types import Features, Scan, SweepError
 
 LOAM = FeatureConfig()
+ROUGH_TOO = Config(features=FeatureConfig(range_noise=0.0))
 AROUND = np.arange(-179.9, 180.0, 0.2)
 AHEAD = np.arange(-50.1, 50.2, 0.2)
 
@@ -344,7 +347,7 @@ def test_limit_of_zero_picks_nothing() -> None:
 
 
 def test_rest_is_the_voxel_filtered_remainder_of_each_ring() -> None:
-    scan, config = noisy_scan(2), Config()
+    scan, config = noisy_scan(2), ROUGH_TOO
     sweep = organise(scan, config)
     features = extract_features(scan, config)
     used = rows_of(features.edges, scan, sweep.index)
@@ -393,7 +396,8 @@ def test_flat_points_are_below_the_bound(bound: float) -> None:
 
 def test_voxel_of_zero_keeps_every_point() -> None:
     scan = noisy_scan()
-    features = extract_features(scan, Config(features=FeatureConfig(plane_voxel=0.0)))
+    every = FeatureConfig(plane_voxel=0.0, range_noise=0.0)
+    features = extract_features(scan, Config(features=every))
     assert len(features.edges) + len(features.planes) == len(scan.points) - 4 * 10
 
 
@@ -439,13 +443,72 @@ def test_rings_too_short_for_a_window_are_refused_and_one_long_one_is_enough() -
     with pytest.raises(SweepError, match="longest of 4 rings has 10 points, at least 11"):
         extract_features(scan, Config())
     longer = noisy_scan(0, points_per_ring=11)
-    assert len(extract_features(longer, Config()).planes) > 0
+    assert len(extract_features(longer, ROUGH_TOO).planes) > 0
 
 
 def test_one_ring_is_refused() -> None:
     scan = noisy_scan(0, rings=1)
     with pytest.raises(SweepError, match=r"1 ring\(s\) from field.*expected 2 to 256"):
         extract_features(scan, Config())
+
+
+# --- noise and surfaces -----------------------------------------------------------------------
+
+
+def along_wall(distance: float, azimuths: np.ndarray, noise: np.ndarray | float = 0.0):
+    """(3, N) one ring on a wall at y = distance, ranges off by noise."""
+    ranges = distance / np.sin(azimuths) + noise
+    return np.stack([ranges * np.cos(azimuths), ranges * np.sin(azimuths), 0 * ranges]).astype("f4")
+
+
+GRAZED = np.deg2rad(np.arange(6.0, 174.0, 0.2))
+
+
+def test_a_wall_is_smooth_and_straight_however_grazed() -> None:
+    wall = along_wall(1.7, GRAZED)
+    middle = np.arange(5, len(GRAZED) - 5)
+    assert curvature(wall, 5)[:20].max() > 1.0  # what LOAM's curvature takes for an edge
+    assert roughness(wall)[middle].max() < 2e-3
+    assert kinks(wall, 5, middle).max() < 2e-3
+
+
+def test_roughness_and_kinks_are_in_units_of_the_range_noise() -> None:
+    rng = np.random.default_rng(0)
+    wall = along_wall(8.0, GRAZED, 0.02 * rng.normal(size=len(GRAZED)))
+    middle = np.arange(5, len(GRAZED) - 5)
+    assert np.sqrt(np.mean(kinks(wall, 5, middle) ** 2)) == pytest.approx(0.02, rel=0.2)
+    smooth = roughness(wall)[middle]
+    assert 0.008 < np.median(smooth) < 0.02  # the smoothest of three windows
+    # One window alone: the residual variance of a fitted line, as numpy finds it.
+    few = along_wall(8.0, GRAZED[:5], 0.02 * rng.normal(size=5))
+    squared = np.sum(few.astype(float) ** 2, axis=0)
+    inverse, place = 1 / np.sqrt(squared), np.arange(5)
+    off = (inverse - np.polyval(np.polyfit(place, inverse, 1), place)) * squared[2]
+    assert roughness(few)[2] == pytest.approx(np.sqrt(np.sum(off**2) / 3), rel=0.1)
+
+
+def test_next_to_a_step_a_surface_is_smooth_and_the_step_is_a_kink() -> None:
+    step = along_wall(8.0, GRAZED, np.where(np.arange(len(GRAZED)) < 400, 0.0, 3.0))
+    rough = roughness(step)
+    assert rough[390:410].max() < 0.01
+    # Five neighbours are beyond the step: 5 * 3 m * (8 m / 11 m), or its inverse, over sqrt(110).
+    expected = np.array([0.0, 15.0 * 8 / 11, 15.0 * 11 / 8]) / np.sqrt(110)
+    assert kinks(step, 5, np.array([380, 399, 400])) == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(0.02, True), (0.3, False)])
+def test_foliage_gives_no_planes_and_a_noisy_wall_does(noise: float, kept: bool) -> None:
+    scan = world(lambda azimuth: np.full(len(azimuth), 12.0))
+    ranges = np.linalg.norm(scan.points, axis=1)
+    off = noise * np.random.default_rng(1).normal(size=len(ranges))
+    scan = replace(scan, points=scan.points * (1 + off / ranges)[:, None])
+    bare = len(extract_features(scan, ROUGH_TOO).planes)
+    share = len(extract_features(scan, Config()).planes) / bare
+    assert share > 0.9 if kept else share < 0.4
+
+
+def test_too_short_a_sweep_is_rough_everywhere() -> None:
+    assert np.isinf(roughness(along_wall(8.0, GRAZED[:4]))).all()
 
 
 # --- real data --------------------------------------------------------------------------------

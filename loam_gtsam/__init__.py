@@ -40,7 +40,9 @@ from loam_gtsam.factors import point_to_line_factor as point_to_line_factor
 from loam_gtsam.factors import point_to_plane_factor as point_to_plane_factor
 from loam_gtsam.factors import scan_match_factor as scan_match_factor
 from loam_gtsam.features import extract_features as extract_features
+from loam_gtsam.imu import ImuBuffer as ImuBuffer
 from loam_gtsam.mapper import Mapper as Mapper
+from loam_gtsam.mapper import PoseContext as PoseContext
 from loam_gtsam.mapper import make_solver as make_solver
 from loam_gtsam.matching import ScanMatches as ScanMatches
 from loam_gtsam.matching import associate as associate
@@ -66,6 +68,8 @@ from loam_gtsam.types import MapUpdate as MapUpdate
 from loam_gtsam.types import OutputError as OutputError
 from loam_gtsam.types import Scan as Scan
 from loam_gtsam.types import SweepError as SweepError
+from loam_gtsam.types import SweepMotion as SweepMotion
+from loam_gtsam.types import TiltPrior as TiltPrior
 from loam_gtsam.types import Trajectory as Trajectory
 
 if TYPE_CHECKING:
@@ -105,6 +109,7 @@ __all__ = [
     "Features",
     "FrameStatus",
     "GtsamSolver",
+    "ImuBuffer",
     "ImuSamples",
     "InputError",
     "LoamError",
@@ -113,12 +118,15 @@ __all__ = [
     "MatchRows",
     "OutputError",
     "Pipeline",
+    "PoseContext",
     "RunResult",
     "Scan",
     "ScanMatches",
     "ScanToScan",
     "Solution",
     "SweepError",
+    "SweepMotion",
+    "TiltPrior",
     "Trajectory",
     "absolute_error",
     "associate",

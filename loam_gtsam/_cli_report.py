@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.export import stage_seconds
 from loam_gtsam.features import extract_features
-from loam_gtsam.pipeline import RunResult, effective_config
+from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buffer
 from loam_gtsam.sweep import assign_rings, assign_times, usable_columns
 from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Scan, SweepError
 
@@ -55,7 +55,51 @@ def summary(
         text = f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
         table.add_row("accuracy", text)
     about_input = [Text(f"  input: {problem}", style="yellow") for problem in problems]
+    if result.imu is not None:
+        for label, value in imu_facts(result.imu).items():
+            table.add_row(label, value)
+        about_input += [Text(f"  {line}", style="yellow") for line in _imu_problems(result.imu)]
     return Group(table, *about_input, *_notes(result.updates))
+
+
+def imu_facts(imu: ImuSummary) -> dict[str, str]:
+    """Label -> value, of what was made of an IMU."""
+    level = imu.level
+    if level is None:
+        up = "unknown: no orientation"
+    else:
+        angles = f"roll {np.degrees(level.roll):.2f}, pitch {np.degrees(level.pitch):.2f} deg"
+        state = "at rest" if level.source == "still" else "moving"
+        up = f"{angles}, from {level.samples} samples, {state}"
+    rates = " ".join(f"{1e3 * rate:+.2f}" for rate in imu.gyro_bias)
+    return {
+        "IMU, level": up,
+        "IMU, orientation": _ORIENTATIONS[imu.report.orientation],
+        "IMU, tilt": _counts(imu.tilt_priors),
+        "IMU, de-skew": _counts(imu.sweep_motions),
+        "IMU, gyro": f"bias {rates} mrad/s",
+    }
+
+
+_ORIENTATIONS = {
+    "ahrs": "its own",
+    "gravity_filter": "from gyro and acceleration (imu.filter_seconds)",
+    "none": "none",
+}
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in counts.items())
+
+
+def _imu_problems(imu: ImuSummary) -> list[str]:
+    problems = list(imu.report.problems)
+    if not imu.gyro_trusted:
+        problems.append(
+            "IMU: its gyro turned unlike the scans and was given up; check imu.lidar_R_imu_deg, "
+            "units and stamps"
+        )
+    return [*problems, imu.problem] if imu.problem else problems
 
 
 def _notes(updates: Sequence[MapUpdate]) -> list[Text]:
@@ -107,6 +151,13 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     if len(dataset) == 0:
         problems.append("no sweeps in it")
     parts: list[Any] = [table]
+    imu = imu_buffer(dataset, config)
+    if imu is not None:
+        report = imu.report
+        orientation = _ORIENTATIONS[report.orientation]
+        used = f"{report.samples} samples at {report.rate:.0f} Hz, orientation {orientation}"
+        table.add_row("IMU, used", used)
+        problems += report.problems
     if facts:
         sweep_table = _table("First usable sweep")
         for label, value in facts.items():

@@ -24,7 +24,7 @@ from loam_gtsam.evaluation import (
     relative_error,
 )
 from loam_gtsam.peers import PEERS, make_peer
-from loam_gtsam.pipeline import OnFrame, effective_config
+from loam_gtsam.pipeline import OnFrame, effective_config, imu_buffer
 from loam_gtsam.types import (
     ConfigError,
     DatasetError,
@@ -193,7 +193,9 @@ def compare(
         )
     configs, notes = _common_configs(contenders, dataset)
     estimators: list[Ours | Theirs] = [
-        Theirs(make_peer(entry.name)) if config is None else Ours(entry.name, config)
+        Theirs(make_peer(entry.name))
+        if config is None
+        else Ours(entry.name, config, imu_buffer(dataset, config))
         for entry, config in zip(contenders, configs, strict=True)
     ]
     first = next((config for config in configs if config is not None), None)
@@ -354,8 +356,9 @@ def _common_configs(
             first = entry.name, config
         name, common = first
         shared = {section: getattr(common, section) for section in _SHARED}
-        # How often a sweep is de-skewed anew is part of the method, and stays.
-        shared["deskew"] = replace(common.deskew, refine=config.deskew.refine)
+        # How often a sweep is de-skewed anew, and by what, is part of the method, and stays.
+        own = config.deskew
+        shared["deskew"] = replace(common.deskew, refine=own.refine, rotation=own.rotation)
         for section, value in shared.items():
             if getattr(config, section) != value:
                 notes.append(f"{entry.name}: section {section} is that of {name}")

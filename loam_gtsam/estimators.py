@@ -12,6 +12,7 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.features import extract_features
+from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.odometry import make_odometry
 from loam_gtsam.peers import Peer, TimedPoints, version
@@ -147,12 +148,17 @@ def _prepared(sweep: Sweep, config: Config, ours: bool, theirs: bool) -> Prepare
 
 
 class Ours:
-    """A mapper with its own odometry."""
+    """A mapper with its own odometry.
 
-    def __init__(self, name: str, config: Config) -> None:
+    Parameters
+    ----------
+    imu : of its own, for it learns the bias of the gyro; None does without
+    """
+
+    def __init__(self, name: str, config: Config, imu: ImuBuffer | None = None) -> None:
         self.name, self.config = name, config
-        self.mapper = Mapper(config)
-        self.odometry = make_odometry(config.odometry)
+        self.mapper = Mapper(config, imu=imu)
+        self.odometry = make_odometry(config.odometry, self.mapper.imu_aid)
         self.updates: list[MapUpdate] = []
 
     def register(self, sweep: Prepared, given: Step | None) -> Step | None:
@@ -170,7 +176,8 @@ class Ours:
             guess, twist = last.map_T_lidar.compose(step.last_T_guess), step.twist
         elif sweep.recorded is None:
             own = self.odometry.guess(sweep.features, last)
-            guess, twist = own.map_T_lidar, own.twist
+            # The first sweep is where the mapper puts it.
+            guess, twist = None if last is None else own.map_T_lidar, own.twist
         seconds = time.perf_counter() - started
         update = self.mapper.register(sweep.features, guess, twist)
         timings = {"features": sweep.seconds, "odometry": seconds} | dict(update.timings)

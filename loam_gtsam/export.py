@@ -73,6 +73,8 @@ class Run(Protocol):
     @property
     def error(self) -> Exception | None: ...
     @property
+    def imu(self) -> Any: ...
+    @property
     def trajectory(self) -> Trajectory: ...
     @property
     def status_counts(self) -> dict[str, int]: ...
@@ -211,7 +213,8 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     (N, 6, 6); ``twists`` (N, 6) rad/s and m/s; ``n_edges``, ``n_planes``, ``n_edge_matches``,
     ``n_plane_matches``, ``iterations``, ``solver_iterations`` (N,) int64; ``error_before``,
     ``error_after`` (N,); ``stage_names`` (S,) strings and ``stage_seconds`` (N, S), NaN where a
-    stage did not run. See :class:`loam_gtsam.types.MapUpdate` for their meaning.
+    stage did not run; ``sweep_motions`` and ``tilt_priors`` (N,) strings. See
+    :class:`loam_gtsam.types.MapUpdate` for their meaning.
     """
     count = len(updates)
     names, seconds = stage_seconds(updates)
@@ -223,6 +226,8 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         "covariances": _stack([u.covariance for u in updates], (count, 6, 6)),
         "information": _stack([u.information for u in updates], (count, 6, 6)),
         "twists": _stack([u.twist for u in updates], (count, 6)),
+        "sweep_motions": np.array([str(u.sweep_motion) for u in updates], np.str_),
+        "tilt_priors": np.array([str(u.tilt_prior) for u in updates], np.str_),
         "stage_names": np.array(names, np.str_),
         "stage_seconds": seconds,
     }
@@ -331,6 +336,32 @@ def summarise(result: Run) -> dict[str, Any]:
         "edge_points": len(result.edge_points),
         "plane_points": len(result.plane_points),
         "map_stats": {name: dict(stats) for name, stats in result.map_stats.items()},
+        "imu": None if result.imu is None else _imu_part(result.imu),
+    }
+
+
+def _imu_part(imu: Any) -> dict[str, Any]:
+    """Of a :class:`loam_gtsam.pipeline.ImuSummary`."""
+    level, report = imu.level, imu.report
+    return {
+        "samples": report.samples,
+        "rate_hz": report.rate,
+        "gaps": report.gaps,
+        "orientation": report.orientation,
+        "level": None
+        if level is None
+        else {
+            "roll_deg": float(np.degrees(level.roll)),
+            "pitch_deg": float(np.degrees(level.pitch)),
+            "map_up": level.map_up.tolist(),
+            "source": level.source,
+            "samples": level.samples,
+        },
+        "tilt_priors": dict(imu.tilt_priors),
+        "sweep_motions": dict(imu.sweep_motions),
+        "gyro_bias_rad_s": imu.gyro_bias.tolist(),
+        "gyro_trusted": imu.gyro_trusted,
+        "problems": [*report.problems, *([imu.problem] if imu.problem else [])],
     }
 
 

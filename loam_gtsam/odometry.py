@@ -47,15 +47,36 @@ def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsa
     return map_T_lidar.compose(gtsam.Pose3.Expmap(twist * seconds))
 
 
+class Turns(Protocol):
+    """Tells how the lidar turned: an :class:`~loam_gtsam.imu.ImuBuffer`, or the mapper's IMU."""
+
+    def between(self, first: int, second: int) -> gtsam.Rot3 | None:
+        """``first_R_second`` of two stamps, None if unknown."""
+        ...
+
+
 class ConstantVelocity:
-    """The motion of the last sweep goes on."""
+    """The motion of the last sweep goes on; an IMU tells how the lidar turned meanwhile."""
+
+    def __init__(self, imu: Turns | None = None) -> None:
+        self.imu = imu
 
     def guess(self, features: Features, last: MapUpdate | None) -> Guess:
         """See :meth:`Odometry.guess`."""
+        return self.at(features.stamp, last)
+
+    def at(self, stamp: int, last: MapUpdate | None) -> Guess:
+        """The guess for a moment, nanoseconds."""
         if last is None:
             return Guess(gtsam.Pose3(), np.zeros(6))
-        seconds = (features.stamp - last.stamp) * 1e-9
-        return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)
+        seconds = (stamp - last.stamp) * 1e-9
+        turned = None if self.imu is None else self.imu.between(last.stamp, stamp)
+        if turned is None:
+            return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)
+        # With the rotation known it is the velocity in the map that stays, not that of the body.
+        moved = last.map_T_lidar.compose(gtsam.Pose3(turned, last.twist[3:] * seconds))
+        velocity = turned.matrix().T @ last.twist[3:]
+        return Guess(moved, np.concatenate([last.twist[:3], velocity]))
 
 
 _REASSOCIATE_EVERY = 5
@@ -79,13 +100,14 @@ class ScanToScan:
     velocity over the sweep (Zhang and Singh, LOAM, RSS 2014, Section V).
     """
 
-    def __init__(self, config: OdometryConfig) -> None:
+    def __init__(self, config: OdometryConfig, imu: Turns | None = None) -> None:
         self.config = config
+        self._start = ConstantVelocity(imu)
         self._previous: Features | None = None
 
     def guess(self, features: Features, last: MapUpdate | None) -> Guess:
         """See :meth:`Odometry.guess`."""
-        guess = ConstantVelocity().guess(features, last)
+        guess = self._start.guess(features, last)
         previous, self._previous = self._previous, features
         first, end = features.span
         if previous is None or last is None or end <= first:
@@ -215,6 +237,6 @@ def _normalised(vectors: FloatArray) -> tuple[FloatArray, BoolArray]:
     return vectors / np.where(proper, length, 1.0)[:, None], proper
 
 
-def make_odometry(config: OdometryConfig) -> Odometry:
+def make_odometry(config: OdometryConfig, imu: Turns | None = None) -> Odometry:
     """The odometry named by the configuration."""
-    return ScanToScan(config) if config.method == "scan_to_scan" else ConstantVelocity()
+    return ScanToScan(config, imu) if config.method == "scan_to_scan" else ConstantVelocity(imu)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import gtsam
@@ -13,7 +13,10 @@ import numpy as np
 from loam_gtsam.config import Config, SensorConfig
 from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.features import extract_features
-from loam_gtsam.mapper import Mapper
+from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
+from loam_gtsam.imu_aid import ImuAid
+from loam_gtsam.imu_prior import Level
+from loam_gtsam.mapper import ExtraFactors, Mapper
 from loam_gtsam.odometry import Odometry, make_odometry
 from loam_gtsam.types import (
     BadSweep,
@@ -30,6 +33,29 @@ OnFrame = Callable[[int, MapUpdate], None]
 
 
 @dataclass(frozen=True, slots=True)
+class ImuSummary:
+    """What was made of the IMU in a run.
+
+    Attributes
+    ----------
+    report : on the samples
+    level : which way is up in the map, and how it was found; None if unknown
+    gyro_bias : (3,) rad/s, lidar frame, as learnt in the end
+    sweep_motions, tilt_priors : how many frames had which
+    gyro_trusted : whether the gyro still agreed with the scans in the end
+    problem : a sentence if the rotation of the IMU to the lidar looks wrong, else empty
+    """
+
+    report: ImuReport
+    level: Level | None
+    gyro_bias: FloatArray
+    sweep_motions: Mapping[str, int]
+    tilt_priors: Mapping[str, int]
+    gyro_trusted: bool
+    problem: str
+
+
+@dataclass(frozen=True, slots=True)
 class RunResult:
     """What a run computed, complete or not.
 
@@ -41,6 +67,7 @@ class RunResult:
     map_stats : counters of the edge and the plane map (cubes, points, evictions, ...)
     interrupted : the run was stopped (Ctrl-C) before the data set ended
     error : what ended the run early, if it was to be kept (``keep_partial``)
+    imu : what was made of the IMU; None without one
     """
 
     config: Config
@@ -50,6 +77,7 @@ class RunResult:
     map_stats: Mapping[str, Mapping[str, int]]
     interrupted: bool
     error: Exception | None = None
+    imu: ImuSummary | None = None
 
     @property
     def trajectory(self) -> Trajectory:
@@ -65,12 +93,25 @@ class RunResult:
 
 
 class Pipeline:
-    """Feature extraction, odometry guess and mapping, one sweep at a time."""
+    """Feature extraction, odometry guess and mapping, one sweep at a time.
 
-    def __init__(self, config: Config | None = None) -> None:
+    Parameters
+    ----------
+    imu : samples must be in it before the sweeps they belong to; None does without
+    extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
+    """
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        imu: ImuBuffer | None = None,
+        extra_factors: ExtraFactors | None = None,
+    ) -> None:
         self.config = config or Config()
-        self.mapper = Mapper(self.config)
-        self.odometry: Odometry = make_odometry(self.config.odometry)
+        self.mapper = Mapper(self.config, imu=imu, extra_factors=extra_factors)
+        # By way of the mapper, which gives up a gyro that turns unlike the scans.
+        self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu_aid)
         self._last_odom: gtsam.Pose3 | None = None
 
     def process(self, sweep: Sweep) -> MapUpdate:
@@ -85,9 +126,12 @@ class Pipeline:
         except SweepError as error:
             return self.mapper.skip(sweep.stamp, str(error))
         extracted = time.perf_counter()
-        guess = self.odometry.guess(features, self.mapper.last)
+        last = self.mapper.last
+        guess = self.odometry.guess(features, last)
         guessed = time.perf_counter()
-        update = self.mapper.register(features, guess.map_T_lidar, guess.twist)
+        # The first sweep is where the mapper puts it.
+        pose = None if last is None else guess.map_T_lidar
+        update = self.mapper.register(features, pose, guess.twist)
         timings = {"features": extracted - started, "odometry": guessed - extracted}
         return replace(update, timings=timings | dict(update.timings))
 
@@ -115,6 +159,12 @@ def effective_config(config: Config, dataset: Dataset) -> Config:
     return replace(config, sensor=replace(config.sensor, **implied))
 
 
+def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
+    """The data set's IMU, None if there is none or it is not to be used."""
+    samples = dataset.imu if config.imu.enabled else None
+    return None if samples is None else ImuBuffer(config.imu, samples)
+
+
 def run(
     dataset: Dataset,
     config: Config | None = None,
@@ -122,6 +172,7 @@ def run(
     max_frames: int | None = None,
     on_frame: OnFrame | None = None,
     keep_partial: bool = False,
+    extra_factors: ExtraFactors | None = None,
 ) -> RunResult:
     """Map a data set.
 
@@ -132,6 +183,7 @@ def run(
     on_frame : e.g. to show progress
     keep_partial : if an error ends the run after some sweeps, return what was computed until
         then, with ``error`` set, instead of raising
+    extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
 
     Returns
     -------
@@ -144,7 +196,8 @@ def run(
         If the data set cannot be read.
     """
     config = effective_config(config or Config(), dataset)
-    pipeline = Pipeline(config)
+    imu = imu_buffer(dataset, config)
+    pipeline = Pipeline(config, imu=imu, extra_factors=extra_factors)
     updates: list[MapUpdate] = []
     interrupted = False
     error: Exception | None = None
@@ -176,6 +229,22 @@ def run(
         },
         interrupted=interrupted,
         error=error,
+        imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+    )
+
+
+def _imu_summary(aid: ImuAid, updates: Sequence[MapUpdate]) -> ImuSummary:
+    solved = [update for update in updates if update.status.solved]
+    stamps = np.array([update.stamp for update in solved], np.int64)
+    poses = np.array([update.map_T_lidar.matrix() for update in solved]).reshape(-1, 4, 4)
+    return ImuSummary(
+        report=aid.buffer.report,
+        level=aid.level,
+        gyro_bias=aid.buffer.gyro_bias,
+        sweep_motions=Counter(str(update.sweep_motion) for update in updates),
+        tilt_priors=Counter(str(update.tilt_prior) for update in updates),
+        gyro_trusted=aid.gyro is not None,
+        problem=extrinsic_problem(aid.buffer, stamps, poses) if len(solved) > 1 else "",
     )
 
 

@@ -18,7 +18,7 @@ from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.export import RUN_FILES, read_tum
-from loam_gtsam.types import BadSweep, DatasetError, Scan, Trajectory
+from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
 
 FRAMES = 4
 PLOTS = visualization.available()
@@ -450,3 +450,47 @@ def test_an_ignored_signal_stays_ignored(monkeypatch):
             assert stop.signum is None
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+# -- the IMU in what is said -----------------------------------------------------------------------
+
+
+def test_run_says_what_was_made_of_the_imu():
+    result = loam("run", "sim:room", "--frames", 3, "--no-plot", "--output", "out")
+    said = one_line(result)
+    assert "IMU, level roll -" in said.replace("roll 0", "roll -0")
+    assert "samples, at rest" in said
+    assert "IMU, orientation its own" in said
+    assert "IMU, tilt 1 none, 2 equivalent" in said
+    assert "IMU, de-skew 3 gyro" in said
+    assert "mrad/s" in said
+    assert "given up" not in said
+
+
+def test_run_without_an_imu_says_nothing_of_it():
+    off = ["--set", "imu.enabled=false"]
+    result = loam("run", "sim:room", "--frames", 2, "--no-plot", "--output", "out", *off)
+    assert result.exit_code == 0
+    assert "IMU" not in result.output
+    assert json.loads(Path("out/summary.json").read_text())["imu"] is None
+
+
+def test_run_says_that_the_imu_is_mounted_otherwise():
+    turned = ["--set", "imu.lidar_R_imu_deg=[180.0, 0.0, 0.0]"]
+    result = loam("run", "sim:shaken?columns=900", "--frames", 40, "--no-plot", *turned)
+    assert result.exit_code == 0
+    said = one_line(result)
+    assert "its gyro turned unlike the scans and was given up" in said
+    assert "fit those of the scans better by 180 degrees" in said
+
+
+def test_inspect_says_what_is_understood_of_the_imu(opens, scans, monkeypatch):
+    said = one_line(loam("inspect", "sim:room"))
+    assert "samples at 200 Hz, orientation its own" in said
+    assert "IMU, used" not in loam("inspect", "sim:room", "--set", "imu.enabled=false").output
+    opens(scans[:1])
+    assert "IMU, used" not in loam("inspect", "x").output
+    imu = SimulatedWorld("room", frames=2).imu
+    broken = ImuSamples(imu.stamps, 3.0 * imu.orientation, imu.gyro, imu.acceleration)
+    monkeypatch.setattr(FakeDataset, "imu", broken)
+    assert "not of unit length" in one_line(loam("inspect", "x"))

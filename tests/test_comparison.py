@@ -283,6 +283,31 @@ def test_our_solver_gives_what_run_gives(dataset):
     assert scores.iterations >= 1
 
 
+@pytest.mark.parametrize("names", [("gtsam", "loam", "aloam"), ("loam", "gtsam")])
+def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, names):
+    """Each has its own IMU, blend or prior, and de-skew; the map of each is level."""
+    dataset = ListDataset(sweeps, world.truth)
+    dataset.imu = world.imu
+    result = compare(dataset, [contender(name) for name in names])
+    for name, entry in zip(names, result.runs, strict=True):
+        assert entry.config.deskew.rotation == contender(name).config.deskew.rotation
+        alone = run(dataset, entry.config)
+        np.testing.assert_array_equal(poses(entry), poses(alone))
+        tilts = {str(update.tilt_prior) for update in entry.updates[1:]}
+        assert tilts == {{"gtsam": "equivalent", "loam": "blend", "aloam": "none"}[name]}
+        motions = {str(update.sweep_motion) for update in entry.updates}
+        assert motions == {"gyro" if name == "gtsam" else "constant_velocity"}
+
+
+def test_what_one_learns_of_the_gyro_is_not_told_to_the_next(sweeps, world):
+    dataset = ListDataset(sweeps, world.truth)
+    dataset.imu = world.imu
+    runs = compare(dataset, [Contender(name, Config()) for name in "ab"]).runs
+    np.testing.assert_array_equal(poses(runs[0]), poses(runs[1]))
+    for one, other in zip(runs[0].updates, runs[1].updates, strict=True):
+        np.testing.assert_array_equal(one.twist, other.twist)
+
+
 def test_features_are_extracted_once_for_all(dataset, monkeypatch):
     calls = []
     real = estimators.extract_features

@@ -193,3 +193,43 @@ def test_an_unreadable_file_is_a_config_error(tmp_path):
         assert str(path) in str(caught.value)
     assert issubclass(ConfigError, LoamError)
     assert issubclass(ConfigError, ValueError)
+
+
+# -- the IMU in the presets ------------------------------------------------------------------------
+
+
+def test_presets_use_the_imu_as_their_systems_do():
+    assert preset("default").imu.prior == "equivalent"
+    assert preset("loam").imu.prior == "blend"
+    assert not preset("aloam").imu.enabled
+    assert {name: preset(name).imu.weight for name in PRESETS} == dict.fromkeys(PRESETS, 0.002)
+    assert {name: preset(name).deskew.rotation for name in PRESETS} == {
+        "default": "auto",
+        "loam": "constant_velocity",
+        "aloam": "constant_velocity",
+    }
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("imu: {prior: blended}", ("imu.prior", "off, blend, equivalent, sigma", "'blend'")),
+        ("imu: {lidar_R_imu_deg: [0, 90]}", ("imu.lidar_R_imu_deg", "expected 3 values")),
+        ("imu: {lidar_t_imu: 0.1}", ("imu.lidar_t_imu", "expected 3 values")),
+        ("imu: {weight: 1.0}", ("imu.weight", "at most 0.999")),
+        ("deskew: {rotation: gyro}", ("deskew.rotation", "auto, orientation, constant_velocity")),
+    ],
+)
+def test_a_wrong_use_of_the_imu_is_refused(text, words):
+    with pytest.raises(ConfigError) as caught:
+        parse_config(text)
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_extrinsics_survive_yaml():
+    config = parse_config(
+        "imu: {lidar_R_imu_deg: [180.0, 0.0, 90.0], lidar_t_imu: [0.1, 0.0, 0.2]}"
+    )
+    assert config.imu.lidar_R_imu_deg == (180.0, 0.0, 90.0)
+    assert parse_config(dump_config(config)) == config

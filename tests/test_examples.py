@@ -11,6 +11,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from loam_gtsam import POSE_KEY, PoseContext
+
 FOLDER = Path(__file__).resolve().parents[1] / "examples"
 Names = dict[str, Any]
 
@@ -58,6 +60,44 @@ def ouster_sweeps(names: Names, output: str) -> None:
     assert "point times: field 't_ns' in ns" in output
 
 
+def gps_factor(names: Names, output: str) -> None:
+    assert names["alone"].max() > 5.0
+    assert np.median(names["with_gps"][names["had_one"]]) < 0.15
+    # Frames 27 to 32 lie in the hole, 57 to 59 after the last fix.
+    assert names["had_one"] == [*range(1, 27), *range(33, 57)]
+
+
+def ground_and_wheels(names: Names, output: str) -> None:
+    alone, held = names["errors"].values()
+    assert alone[0] > 5.0
+    assert held[0] < 0.02 * names["travelled"]
+    assert held[1] < 0.02
+    pose = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.5, 3.0, 1.0, 0.1]))
+    factor = names["floor"](PoseContext(POSE_KEY, 0, pose, None))
+
+    def whitened(at: gtsam.Pose3) -> Any:
+        values = gtsam.Values()
+        values.insert(POSE_KEY, at)
+        return values, factor.noiseModel().whiten(factor.unwhitenedError(values))
+
+    jacobian = factor.linearize(whitened(pose)[0]).jacobian()[0]
+    numerical = [
+        (whitened(pose.retract(1e-6 * axis))[1] - whitened(pose.retract(-1e-6 * axis))[1]) / 2e-6
+        for axis in np.eye(6)
+    ]
+    np.testing.assert_allclose(jacobian, np.transpose(numerical), atol=1e-4)
+    free = names["wheels"](PoseContext(POSE_KEY, 0, pose, None))
+    assert free == []  # nothing to count from at the first sweep
+
+
+def imu_in_a_corridor(names: Names, output: str) -> None:
+    constant, inertial = names["errors"]
+    assert len(names["blind"]) > 40
+    assert all(" x;" in update.message for update in names["blind"])
+    assert abs(inertial) < 0.02 * names["world"].truth.length
+    assert abs(inertial) < 0.5 * abs(constant)
+
+
 CHECKS: dict[str, Callable[[Names, str], None]] = {
     "01_map_a_built_in_scene.py": built_in_scene,
     "02_numpy_arrays.py": numpy_arrays,
@@ -65,6 +105,9 @@ CHECKS: dict[str, Callable[[Names, str], None]] = {
     "04_own_prior.py": own_prior,
     "05_factors_by_hand.py": factors_by_hand,
     "06_ouster_sweeps.py": ouster_sweeps,
+    "07_gps_factor.py": gps_factor,
+    "08_ground_and_wheels.py": ground_and_wheels,
+    "09_imu_in_a_corridor.py": imu_in_a_corridor,
 }
 
 

@@ -253,3 +253,33 @@ def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
         with pytest.raises(OutputError, match="cannot make this output folder"):
             export.make_folder(tmp_path / blocked)
     assert list(export.make_folder(tmp_path / "new" / "one").iterdir()) == []
+
+
+# -- of an IMU -------------------------------------------------------------------------------------
+
+
+def test_what_an_imu_did_is_written_frame_by_frame_and_summed_up(tmp_path):
+    from loam_gtsam.datasets.simulation import SimulatedWorld
+    from loam_gtsam.pipeline import run
+
+    world = SimulatedWorld("room", frames=3, columns=450)
+    result = run(world)
+    export.write_run(result, tmp_path / "with")
+    with np.load(tmp_path / "with/run.npz") as arrays:
+        assert arrays["sweep_motions"].tolist() == ["gyro"] * 3
+        assert arrays["tilt_priors"].tolist() == ["none", "equivalent", "equivalent"]
+    imu = json.loads((tmp_path / "with/summary.json").read_text())["imu"]
+    assert imu["samples"] == len(world.imu.stamps)
+    assert imu["rate_hz"] == pytest.approx(200.0)
+    assert (imu["orientation"], imu["gaps"], imu["problems"]) == ("ahrs", 0, [])
+    assert imu["level"]["source"] == "still"
+    assert imu["level"]["roll_deg"] == pytest.approx(np.degrees(result.imu.level.roll))
+    assert imu["level"]["map_up"] == [0.0, 0.0, 1.0]
+    assert imu["gyro_bias_rad_s"] == result.imu.gyro_bias.tolist()
+    assert imu["gyro_trusted"] is True
+    assert imu["tilt_priors"] == {"none": 1, "equivalent": 2}
+    assert imu["sweep_motions"] == {"gyro": 3}
+    export.write_run(make_result(), tmp_path / "without")
+    assert json.loads((tmp_path / "without/summary.json").read_text())["imu"] is None
+    with np.load(tmp_path / "without/run.npz") as arrays:
+        assert set(arrays["sweep_motions"].tolist()) == {"none"}

@@ -68,6 +68,45 @@ def test_the_configuration_names_the_odometry():
     assert isinstance(make_odometry(OdometryConfig(method="scan_to_scan")), ScanToScan)
 
 
+class Gyro:
+    """Turns evenly about an axis of the body; None beyond its last moment."""
+
+    def __init__(self, rate, until=STAMP + 10 * PERIOD):
+        self.rate, self.until = np.array(rate), until
+
+    def between(self, first, second):
+        if second > self.until:
+            return None
+        return gtsam.Rot3.Expmap(self.rate * (second - first) * 1e-9)
+
+
+def test_a_gyro_turns_the_guess_and_the_velocity_stays_in_the_map():
+    rate = np.array([0.5, -0.2, 2.0])
+    guess = ConstantVelocity(Gyro(rate)).guess(empty(), update())
+    turned = gtsam.Rot3.Expmap(0.1 * rate)
+    assert guess.map_T_lidar.rotation().equals(START.rotation().compose(turned), 1e-12)
+    moved = START.rotation().matrix() @ TWIST[3:] * 0.1
+    np.testing.assert_allclose(guess.map_T_lidar.translation(), START.translation() + moved)
+    np.testing.assert_allclose(turned.matrix() @ guess.twist[3:], TWIST[3:], atol=1e-12)
+    np.testing.assert_array_equal(guess.twist[:3], TWIST[:3])
+
+
+def test_without_the_gyro_of_that_moment_it_is_constant_velocity():
+    gone = ConstantVelocity(Gyro([0.5, -0.2, 2.0], until=STAMP)).guess(empty(), update())
+    plain = ConstantVelocity().guess(empty(), update())
+    assert np.array_equal(gone.map_T_lidar.matrix(), plain.map_T_lidar.matrix())
+    np.testing.assert_array_equal(gone.twist, plain.twist)
+
+
+@pytest.mark.parametrize("method", ["constant_velocity", "scan_to_scan"])
+def test_every_odometry_starts_from_the_gyro(method):
+    """Scan to scan too, while it has nothing to compare with."""
+    odometry = make_odometry(OdometryConfig(method=method), Gyro([0.0, 0.0, 2.0]))
+    expected = ConstantVelocity(Gyro([0.0, 0.0, 2.0])).guess(empty(), update())
+    found = odometry.guess(empty(), update())
+    assert np.array_equal(found.map_T_lidar.matrix(), expected.map_T_lidar.matrix())
+
+
 # -- scan to scan ----------------------------------------------------------------------------------
 
 

@@ -1,0 +1,198 @@
+"""A sweep in motion: its features, de-skewed to the middle of the sweep.
+
+Within a frame, poses belong to the *middle* of the sweep: there an error of the motion used for
+the de-skew cancels to first order, while at the start or the end it would shift the whole sweep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import gtsam
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.config import Config
+from loam_gtsam.geometry import move_points, voxel_filter
+from loam_gtsam.imu import ImuBuffer
+from loam_gtsam.types import Features, FloatArray, SweepMotion
+
+_DISTINCT = 3.0
+"""Standard deviations of range noise by which a distinct edge stands out of its ring."""
+
+_Turn = Callable[[FloatArray], FloatArray]
+"""From (K,) seconds after the middle of a sweep to (K, 3) rotation vectors ``middle_R_then``."""
+
+
+class MovingSweep:
+    """The voxel-filtered features of a sweep.
+
+    Rotation within the sweep comes from the gyro (or the orientation) of an IMU if there is one
+    that covers the sweep; translation, and without an IMU rotation too, from a constant velocity.
+
+    Parameters
+    ----------
+    features : of the sweep
+    config : ``deskew`` and the voxel sizes of ``map`` are used
+    imu : None for constant velocity
+
+    Attributes
+    ----------
+    reference_stamp : nanoseconds of the moment the frame's pose is handed out for
+    stamp : nanoseconds of the middle of the sweep
+    middle : seconds from the one to the other; 0 if the features do not move
+    edges, planes : (E, 3) and (P, 3) metres, seen from the middle of the sweep
+    distinct : (E,) whether an edge stands out of its ring by more than range noise makes it
+    motion : what the rotation comes from
+    """
+
+    def __init__(self, features: Features, config: Config, imu: ImuBuffer | None = None) -> None:
+        first, end = features.span
+        moving = config.deskew.enabled and end > first
+        self.middle = 0.5 * (first + end) if moving else 0.0
+        self.reference_stamp = features.stamp
+        self.stamp = features.stamp + round(self.middle * 1e9)
+        kinks = features.edge_kinks
+        if kinks is None:
+            kinks = np.full(len(features.edges), np.inf)
+        edges = np.column_stack([features.edges, features.edge_times, kinks])
+        planes = np.column_stack([features.planes, features.plane_times])
+        filtered = [
+            voxel_filter(edges, config.map.edge_voxel),
+            voxel_filter(planes, config.map.plane_voxel),
+        ]
+        self.distinct = filtered[0][:, 4] > _DISTINCT * config.features.range_noise
+        self._points = [part[:, :3] for part in filtered]
+        self._seconds = [part[:, 3] - self.middle for part in filtered]
+        self.edges, self.planes = self._points
+        self.motion = SweepMotion.CONSTANT_VELOCITY if moving else SweepMotion.NONE
+        self._turn: _Turn | None = None
+        self._span = np.array([first, 0.0, end]) - self.middle
+        if moving and imu is not None and config.deskew.rotation != "constant_velocity":
+            moments = np.concatenate([self._span, *self._seconds])
+            if config.deskew.rotation == "orientation":
+                self._turn = _by_orientation(imu, self.stamp, moments, config.imu.max_gap)
+                motion = SweepMotion.ORIENTATION
+            else:
+                self._turn = _by_gyro(imu, self.stamp, moments)
+                motion = SweepMotion.GYRO
+            if self._turn is not None:
+                self.motion = motion
+                self._turned = [
+                    _rotated(points, self._turn(seconds))
+                    for points, seconds in zip(self._points, self._seconds, strict=True)
+                ]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether there is no feature at all."""
+        return len(self.edges) + len(self.planes) == 0
+
+    def deskew(self, twist: FloatArray) -> None:
+        """Set ``edges`` and ``planes`` for a (6,) body velocity at the reference time."""
+        if self.motion is SweepMotion.NONE:
+            return
+        if self._turn is None:
+            self.edges, self.planes = (
+                move_points(points, twist, seconds)
+                for points, seconds in zip(self._points, self._seconds, strict=True)
+            )
+            return
+        velocity = self._middle_R_reference() @ twist[3:]
+        self.edges, self.planes = (
+            points + np.outer(seconds, velocity)
+            for points, seconds in zip(self._turned, self._seconds, strict=True)
+        )
+
+    def middle_T_reference(self, twist: FloatArray) -> gtsam.Pose3:
+        """The lidar at the reference time seen from the middle of the sweep."""
+        if self._turn is None:
+            return gtsam.Pose3.Expmap(-twist * self.middle)
+        rotation = self._middle_R_reference()
+        return gtsam.Pose3(gtsam.Rot3(rotation), rotation @ twist[3:] * -self.middle)
+
+    def twist_since(self, last: tuple[int, gtsam.Pose3], map_T_middle: gtsam.Pose3) -> FloatArray:
+        """(6,) body velocity at the reference time, from the middle of another sweep to this one's.
+
+        Parameters
+        ----------
+        last : stamp and pose of the middle of an earlier sweep
+        """
+        seconds = (self.stamp - last[0]) * 1e-9
+        if self._turn is None:
+            twist: FloatArray = gtsam.Pose3.Logmap(last[1].between(map_T_middle)) / seconds
+            return twist
+        away = np.asarray(map_T_middle.translation()) - last[1].translation()
+        map_R_reference = map_T_middle.rotation().matrix() @ self._middle_R_reference()
+        before, _, after = self._turn(self._span)
+        rate = (after - before) / (self._span[2] - self._span[0])
+        return np.concatenate([rate, map_R_reference.T @ away / seconds])
+
+    def twist_at_reference(self, rate: FloatArray, velocity: FloatArray) -> FloatArray:
+        """(6,) body velocity at the reference time.
+
+        Parameters
+        ----------
+        rate : (3,) rad/s
+        velocity : (3,) m/s at the middle of the sweep, in the lidar's axes there
+        """
+        if self._turn is not None:
+            velocity = self._middle_R_reference().T @ velocity
+        return np.concatenate([rate, velocity])
+
+    def _middle_R_reference(self) -> FloatArray:
+        assert self._turn is not None
+        matrix: FloatArray = Rotation.from_rotvec(
+            self._turn(np.array([-self.middle]))[0]
+        ).as_matrix()
+        return matrix
+
+
+def _by_gyro(imu: ImuBuffer, stamp: int, moments: FloatArray) -> _Turn | None:
+    """How the lidar turned during a sweep, None if the gyro does not cover all its moments."""
+    if imu.turn(stamp, moments) is None:
+        return None
+
+    def turn(seconds: FloatArray) -> FloatArray:
+        turns = imu.turn(stamp, seconds)
+        assert turns is not None  # all moments are covered
+        return turns
+
+    return turn
+
+
+def _by_orientation(
+    imu: ImuBuffer, stamp: int, moments: FloatArray, max_gap: float
+) -> _Turn | None:
+    """As :func:`_by_gyro`, from the attitudes, between which turns are interpolated."""
+    first, end = moments.min(), moments.max()
+    begins, ends = (stamp + round(float(seconds) * 1e9) for seconds in (first, end))
+    samples = imu.window(begins, ends)
+    middle = imu.orientation(stamp)
+    before, after = imu.orientation(begins), imu.orientation(ends)
+    if middle is None or before is None or after is None or samples.orientation is None:
+        return None
+    known = np.isfinite(samples.orientation[:, 0])
+    times = np.concatenate([[first], (samples.stamps[known] - stamp) * 1e-9, [end]])
+    if np.diff(times).max() > max_gap:
+        return None
+    inside = Rotation.from_quat(samples.orientation[known]).as_matrix()
+    world = np.concatenate([[before.matrix()], inside, [after.matrix()]])
+    turns = Rotation.from_matrix(middle.matrix().T @ world).as_rotvec()
+
+    def turn(seconds: FloatArray) -> FloatArray:
+        return np.stack([np.interp(seconds, times, angle) for angle in turns.T], axis=-1)
+
+    return turn
+
+
+def _rotated(points: FloatArray, turns: FloatArray) -> FloatArray:
+    """Each point turned by its own rotation vector (Rodrigues' formula)."""
+    angle = np.sqrt(np.einsum("ij,ij->i", turns, turns))
+    safe = np.maximum(angle, 1e-12)
+    first = np.cross(turns, points)
+    second = np.cross(turns, first)
+    sine = (np.sin(safe) / safe)[:, None]
+    versine = (2.0 * np.sin(0.5 * safe) ** 2 / safe**2)[:, None]
+    rotated: FloatArray = points + sine * first + versine * second
+    return rotated

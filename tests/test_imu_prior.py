@@ -1,0 +1,446 @@
+"""The IMU's roll and pitch as a blend and as factors: means, Jacobians, steep pitch, levelling."""
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.imu import ImuBuffer
+from loam_gtsam.imu_prior import (
+    STEEPEST_PITCH,
+    blend,
+    blend_direction,
+    blended_angles,
+    equivalent_prior,
+    find_level,
+    gravity_factor,
+    roll_pitch,
+    roll_pitch_factor,
+    roll_pitch_jacobian,
+    tilt_information,
+    too_steep,
+)
+from loam_gtsam.solvers import POSE_KEY, fuse
+from loam_gtsam.types import ImuSamples
+
+FLAT = gtsam.Rot3()
+WEIGHTS = (0.0005, 0.002, 0.05, 0.5)
+START = 1_700_000_000_000_000_000
+
+
+def rot(roll, pitch, yaw):
+    """Rz Ry Rx, degrees."""
+    return gtsam.Rot3.RzRyRx(*np.radians([roll, pitch, yaw]))
+
+
+def scan_information(rng, count=200):
+    """Of random planes seen from 2 to 35 m, known to 2 to 10 cm: all of it correlated."""
+    points = rng.uniform(-20, 20, (count, 3))
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    rows = np.hstack([np.cross(points, normals), normals]) / rng.uniform(0.02, 0.1, (count, 1))
+    return rows.T @ rows
+
+
+def random_case(rng, pull=0.02):
+    """level_R_map, the scan's pose, its information, and the IMU's rotation ``pull`` rad away."""
+    tilt = rng.uniform(-np.pi / 3, np.pi / 3, 2)
+    level_R_map = gtsam.Rot3.Expmap(rng.normal(size=3))
+    level_R_lidar = gtsam.Rot3.RzRyRx(*tilt, rng.uniform(-3, 3))
+    pose = gtsam.Pose3(level_R_map.inverse().compose(level_R_lidar), rng.normal(0, 50, 3))
+    measured = gtsam.Rot3.RzRyRx(*(tilt + rng.uniform(-pull, pull, 2)), rng.uniform(-3, 3))
+    return level_R_map, pose, scan_information(rng), measured
+
+
+def fused(pose, information, measured, weight, level_R_map=FLAT, information_of_tilt=None):
+    """The pose with the equivalent prior, or with one of a given information."""
+    level_R_lidar = level_R_map.compose(pose.rotation())
+    prior = equivalent_prior(level_R_lidar, information, measured, weight)
+    if information_of_tilt is not None:
+        prior = type(prior)(prior.roll_pitch, weight / (1 - weight) * information_of_tilt)
+    return fuse(pose, information, [roll_pitch_factor(POSE_KEY, prior, level_R_map)])[0]
+
+
+def numerical(function, pose, step=1e-6):
+    """Derivative by the tangent vector at a pose, central differences."""
+    columns = [
+        (function(pose.retract(step * axis)) - function(pose.retract(-step * axis))) / (2 * step)
+        for axis in np.eye(6)
+    ]
+    return np.stack(columns, axis=1)
+
+
+def jacobian_of(factor, pose):
+    """Whitened error and its derivative, as GTSAM linearises the factor."""
+    values = gtsam.Values()
+    values.insert(POSE_KEY, pose)
+    jacobian, right = factor.linearize(values).jacobian()
+    return -right, jacobian
+
+
+def whitened(factor, pose):
+    values = gtsam.Values()
+    values.insert(POSE_KEY, pose)
+    return factor.noiseModel().whiten(factor.unwhitenedError(values))
+
+
+# -- angles and Jacobians --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "rotation", [FLAT, rot(1e-4, 0, 0), rot(20, -35, 100), rot(-179.9, 60, 3), rot(120, 84, -90)]
+)
+def test_the_jacobian_of_roll_and_pitch_is_the_numerical_one(rotation):
+    pose = gtsam.Pose3(rotation, np.array([5.0, -3.0, 1.0]))
+    expected = numerical(lambda at: roll_pitch(at.rotation()), pose)
+    np.testing.assert_allclose(roll_pitch_jacobian(rotation), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("pull", [1e-3, 1.0])
+def test_the_jacobian_of_the_roll_pitch_factor_is_the_numerical_one(seed, pull):
+    level_R_map, pose, information, measured = random_case(np.random.default_rng(seed), pull)
+    level_R_lidar = level_R_map.compose(pose.rotation())
+    prior = equivalent_prior(level_R_lidar, information, measured, 0.05)
+    factor = roll_pitch_factor(POSE_KEY, prior, level_R_map)
+    error, jacobian = jacobian_of(factor, pose)
+    expected = numerical(lambda at: whitened(factor, at), pose)
+    np.testing.assert_allclose(jacobian, expected, atol=1e-6 * np.abs(expected).max())
+    away = roll_pitch(level_R_lidar) - prior.roll_pitch
+    assert error @ error == pytest.approx(away @ prior.information @ away)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("away", [1e-4, 0.1, 1.5])
+def test_the_jacobian_of_the_gravity_factor_is_the_numerical_one_at_any_tilt(seed, away):
+    rng = np.random.default_rng(seed)
+    up = gtsam.Rot3.Expmap(rng.normal(size=3)).matrix()[2]
+    pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(0, 50, 3))
+    axis = np.cross(rng.normal(size=3), pose.rotation().matrix().T @ up)
+    axis *= away / np.linalg.norm(axis)
+    # The world's z axis seen by the lidar, turned by so much.
+    lidar_up = gtsam.Rot3.Expmap(axis).matrix() @ pose.rotation().matrix().T @ up
+    measured = gtsam.Rot3(Rotation.align_vectors([[0, 0, 1.0]], [lidar_up])[0].as_matrix())
+    factor = gravity_factor(POSE_KEY, measured, 0.01, up)
+    error, jacobian = jacobian_of(factor, pose)
+    expected = numerical(lambda at: whitened(factor, at), pose)
+    np.testing.assert_allclose(jacobian, expected, atol=1e-5 * np.abs(expected).max())
+    assert np.linalg.norm(error) * 0.01 == pytest.approx(np.sin(away), rel=1e-5)
+    assert np.linalg.matrix_rank(jacobian, tol=1e-6) == 2
+
+
+@pytest.mark.parametrize("tilt", [(0, 0), (30, -40), (10, 90), (200, -90)])
+def test_the_gravity_factor_is_free_of_yaw_and_position(tilt):
+    own = gtsam.Rot3.RzRyRx(*np.radians(tilt), 0.0)
+    factor = gravity_factor(POSE_KEY, own, 0.01, np.array([0.0, 0.0, 1.0]))
+    for yaw in (0.0, 1.0, 3.0):
+        pose = gtsam.Pose3(gtsam.Rot3.Yaw(yaw).compose(own), np.array([yaw, 7.0, -2.0]))
+        assert np.abs(whitened(factor, pose)).max() < 1e-10
+
+
+def test_too_steep_is_85_degrees_of_any_of_them():
+    assert not too_steep(rot(170, 84.9, 10), rot(0, -84.9, 0))
+    assert too_steep(rot(0, 85.1, 0))
+    assert too_steep(rot(0, 0, 0), rot(10, -85.1, 0))
+    assert np.degrees(STEEPEST_PITCH) == pytest.approx(85.0)
+
+
+# -- the blend -------------------------------------------------------------------------------------
+
+
+def test_the_blend_is_loams_formula_to_the_last_bit():
+    rng = np.random.default_rng(0)
+    for _ in range(100):
+        own, imu = (gtsam.Rot3.RzRyRx(*rng.uniform(-1.4, 1.4, 3)) for _ in range(2))
+        roll, pitch = 0.998 * roll_pitch(own) + 0.002 * roll_pitch(imu)
+        assert np.array_equal(blended_angles(own, imu, 0.002), [roll, pitch])
+        expected = gtsam.Rot3.RzRyRx(roll, pitch, own.yaw())
+        position = rng.normal(size=3)
+        found = blend(gtsam.Pose3(own, position), imu, 0.002, FLAT)
+        assert np.array_equal(found.rotation().matrix(), expected.matrix())
+        assert np.array_equal(found.translation(), position)
+
+
+def test_the_blend_happens_about_up_and_not_about_the_axis_of_the_map():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        level_R_map, pose, _, measured = random_case(rng, 0.3)
+        before = level_R_map.compose(pose.rotation())
+        blended = blend(pose, measured, 0.25, level_R_map)
+        after = level_R_map.compose(blended.rotation())
+        mean = 0.75 * roll_pitch(before) + 0.25 * roll_pitch(measured)
+        np.testing.assert_allclose(roll_pitch(after), mean, atol=1e-12)
+        assert after.yaw() == pytest.approx(before.yaw(), abs=1e-12)
+        np.testing.assert_array_equal(blended.translation(), pose.translation())
+
+
+@pytest.mark.parametrize(("own", "imu"), [(179.9, -179.9), (-179.9, 179.9), (179.0, -170.0)])
+@pytest.mark.parametrize("weight", [0.002, 0.5])
+def test_roll_is_taken_the_short_way_round(own, imu, weight):
+    """Upside down: 179.9 and -179.9 degrees are 0.2 degrees apart, and their mean is not 0."""
+    pose = gtsam.Pose3(rot(own, 20, 50), np.zeros(3))
+    measured = rot(imu, 20, 0)
+    expected = own + weight * ((imu - own + 180.0) % 360.0 - 180.0)
+    blended = blend(pose, measured, weight, FLAT)
+    by_factor = fused(pose, scan_information(np.random.default_rng(0)), measured, weight)
+    for found in (blended, by_factor):
+        away = np.degrees(found.rotation().roll()) - expected
+        assert abs((away + 180.0) % 360.0 - 180.0) < 1e-6
+
+
+def test_the_blend_of_the_direction_turns_up_by_its_share_of_the_way():
+    rng = np.random.default_rng(2)
+    up = np.array([0.0, 0.0, 1.0])
+    for _ in range(20):
+        pose = gtsam.Pose3(gtsam.Rot3.Expmap(2 * rng.normal(size=3)), rng.normal(size=3))
+        measured = gtsam.Rot3.Expmap(2 * rng.normal(size=3))
+        own, imu = pose.rotation().matrix()[2], measured.matrix()[2]
+        blended = blend_direction(pose, measured, 0.25, up)
+        there = blended.rotation().matrix()[2]
+        whole = np.arccos(own @ imu)
+        assert np.arccos(own @ there) == pytest.approx(0.25 * whole, abs=1e-7)
+        assert np.arccos(there @ imu) == pytest.approx(0.75 * whole, abs=1e-7)
+        turned = gtsam.Rot3.Logmap(pose.rotation().between(blended.rotation()))
+        assert turned @ own == pytest.approx(0.0, abs=1e-12)  # none about up
+        np.testing.assert_array_equal(blended.translation(), pose.translation())
+
+
+def test_the_blend_of_equal_directions_is_the_pose_itself():
+    pose = gtsam.Pose3(rot(0, 90, 20), np.ones(3))
+    measured = gtsam.Rot3.Yaw(1.0).compose(pose.rotation())
+    found = blend_direction(pose, measured, 0.5, np.array([0.0, 0.0, 1.0]))
+    assert found.equals(pose, 1e-12)
+
+
+# -- the prior that equals the blend ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", WEIGHTS)
+@pytest.mark.parametrize("pull", [1e-3, 0.02, 0.2])
+def test_the_equivalent_prior_has_the_mean_of_the_blend(weight, pull):
+    """Tilts of up to 60 degrees, random scans, maps that are not level. Measured: 3e-9 rad."""
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        level_R_map, pose, information, measured = random_case(rng, pull)
+        before = level_R_map.compose(pose.rotation())
+        found = fused(pose, information, measured, weight, level_R_map)
+        mean = (1 - weight) * roll_pitch(before) + weight * roll_pitch(measured)
+        after = roll_pitch(level_R_map.compose(found.rotation()))
+        np.testing.assert_allclose(after, mean, atol=1e-6)
+        assert np.abs(after - roll_pitch(before)).max() > 1e-3 * weight * pull  # it did act
+
+
+def test_without_its_correction_the_target_misses_the_mean():
+    """Why the prior does not simply aim at the IMU: roll and pitch are not linear in the pose."""
+    rng = np.random.default_rng(3)
+    missed = []
+    for _ in range(40):
+        level_R_map, pose, information, measured = random_case(rng, 0.2)
+        pose = gtsam.Pose3(level_R_map.compose(pose.rotation()), pose.translation())
+        prior = equivalent_prior(pose.rotation(), information, measured, 0.5)
+        plain = type(prior)(roll_pitch(measured), prior.information)
+        found, _ = fuse(pose, information, [roll_pitch_factor(POSE_KEY, plain, FLAT)])
+        mean = 0.5 * (roll_pitch(pose.rotation()) + roll_pitch(measured))
+        missed.append(np.abs(roll_pitch(found.rotation()) - mean).max())
+    assert 1e-4 < max(missed) < 0.1
+
+
+@pytest.mark.parametrize("weight", [0.002, 0.5])
+def test_yaw_and_position_go_where_the_correlations_of_the_scan_take_them(weight):
+    """To first order by L^-1 J^T (J L^-1 J^T)^-1 times what roll and pitch moved."""
+    rng = np.random.default_rng(4)
+    pull = 1e-4
+    for _ in range(20):
+        level_R_map, pose, information, measured = random_case(rng, pull)
+        level_R_lidar = level_R_map.compose(pose.rotation())
+        found = pose.localCoordinates(fused(pose, information, measured, weight, level_R_map))
+        jacobian = roll_pitch_jacobian(level_R_lidar)
+        gain = np.linalg.solve(information, jacobian.T)
+        gain = gain @ np.linalg.inv(jacobian @ gain)
+        expected = gain @ (weight * (roll_pitch(measured) - roll_pitch(level_R_lidar)))
+        assert np.linalg.norm(expected[3:]) > 1e-4 * weight * pull  # there are correlations
+        # What is left is of second order in the pull.
+        np.testing.assert_allclose(found, expected, atol=30.0 * weight * pull**2)
+
+
+def test_without_correlations_yaw_and_position_stay():
+    information = np.diag([3e5, 2e5, 1e5, 1e4, 2e4, 3e4])
+    pose = gtsam.Pose3(FLAT, np.array([4.0, 5.0, 6.0]))
+    found = fused(pose, information, rot(0.5, -0.8, 70), 0.3)
+    np.testing.assert_allclose(found.translation(), pose.translation(), atol=1e-9)
+    assert abs(found.rotation().yaw()) < 1e-4  # of second order in the pull
+    np.testing.assert_allclose(np.degrees(roll_pitch(found.rotation())), [0.15, -0.24], atol=1e-6)
+
+
+def test_the_diagonal_of_the_information_gives_another_weight():
+    """What the scan knows about the tilt once yaw and position are free is less than that."""
+    rng = np.random.default_rng(5)
+    weights = []
+    for _ in range(20):
+        _, pose, information, measured = random_case(rng, 1e-3)
+        pose = gtsam.Pose3(FLAT, pose.translation())
+        measured = rot(0.05, 0.0, 0.0)
+        found = fused(pose, information, measured, 0.002, information_of_tilt=information[:2, :2])
+        weights.append(found.rotation().roll() / measured.roll())
+    assert np.abs(np.array(weights) / 0.002 - 1.0).min() > 1e-4
+    assert np.abs(np.array(weights) / 0.002 - 1.0).max() > 0.03
+    assert min(weights) > 0.002  # always too much
+
+
+def test_a_fixed_sigma_gives_any_weight():
+    weights = []
+    for scale in (0.1, 10.0):
+        information = scale * scan_information(np.random.default_rng(0))
+        pose = gtsam.Pose3()
+        found = fused(pose, information, rot(0.05, 0, 0), 0.5, information_of_tilt=1e5 * np.eye(2))
+        weights.append(np.degrees(found.rotation().roll()) / 0.05)
+    assert weights[0] > 20.0 * weights[1]
+
+
+def test_no_weight_is_no_move():
+    _, pose, information, measured = random_case(np.random.default_rng(6))
+    assert fused(pose, information, measured, 0.0).equals(pose, 1e-12)
+
+
+def test_a_pull_too_far_for_the_correction_leaves_the_target_at_the_imu():
+    information = scan_information(np.random.default_rng(7))
+    near = equivalent_prior(FLAT, information, rot(0, 60, 0), 0.5)
+    assert abs(near.roll_pitch[1] - np.radians(60.0)) > 1e-5
+    # No end in 20 rounds, and past 85 degrees.
+    for own, measured in ((rot(0, 0, 0), rot(12, 86, 0)), (rot(10, 84, 0), rot(12, 86, 0))):
+        far = equivalent_prior(own, information, measured, 0.99)
+        np.testing.assert_allclose(far.roll_pitch, np.radians([12, 86]), rtol=0, atol=1e-12)
+        assert np.linalg.eigvalsh(far.information).min() > 0.0
+
+
+def test_the_information_of_the_tilt_is_the_schur_complement():
+    information = scan_information(np.random.default_rng(8))
+    a, b, c = information[:2, :2], information[:2, 2:], information[2:, 2:]
+    schur = a - b @ np.linalg.solve(c, b.T)
+    # Level: roll and pitch are the first two tangent directions.
+    np.testing.assert_allclose(tilt_information(information, FLAT), schur, rtol=1e-9)
+
+
+def test_a_direction_without_information_is_free():
+    """A corridor along x: x is free, and the tilt is known as well as without it."""
+    information = scan_information(np.random.default_rng(9))
+    information[3] = information[:, 3] = 0.0
+    rest = [0, 1, 2, 4, 5]
+    expected = np.linalg.inv(np.linalg.inv(information[np.ix_(rest, rest)])[:2, :2])
+    np.testing.assert_allclose(tilt_information(information, FLAT), expected, rtol=1e-6)
+    # A wall says nothing about the turn about its normal.
+    information[1] = information[:, 1] = 0.0
+    knows = tilt_information(information, FLAT)
+    assert np.linalg.eigvalsh(knows)[0] < 1e-6 * np.linalg.eigvalsh(knows)[1]
+
+
+# -- steep -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_the_modes_meet_where_they_take_turns(side):
+    """Just below 85 degrees angles are blended, just above directions. Up moves alike."""
+    up = np.array([0.0, 0.0, 1.0])
+    pose = gtsam.Pose3(rot(30, side * 84.99, 100), np.zeros(3))
+    measured = rot(32, side * 84.9, 0)
+    between = np.arccos(pose.rotation().matrix()[2] @ measured.matrix()[2])
+    by_angles = blend(pose, measured, 0.05, FLAT).rotation()
+    by_direction = blend_direction(pose, measured, 0.05, up).rotation()
+    apart = np.arccos(np.clip(by_angles.matrix()[2] @ by_direction.matrix()[2], -1, 1))
+    assert apart < 0.05 * 0.05 * between
+    # What is left is yaw: that of the angles' blend is the share of the roll by definition.
+    turn = np.linalg.norm(gtsam.Rot3.Logmap(by_angles.between(by_direction)))
+    assert turn < 1.01 * 0.05 * np.radians(2.0)
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0, 89.999])
+def test_directions_are_finite_where_angles_are_not(pitch):
+    pose = gtsam.Pose3(rot(0, pitch, 30), np.ones(3))
+    measured = rot(40, np.sign(pitch) * 88.0, 0)
+    blended = blend_direction(pose, measured, 0.002, np.array([0.0, 0.0, 1.0]))
+    turned = gtsam.Rot3.Logmap(pose.rotation().between(blended.rotation()))
+    between = np.arccos(pose.rotation().matrix()[2] @ measured.matrix()[2])
+    assert np.linalg.norm(turned) == pytest.approx(0.002 * between, rel=1e-4)
+    # Angles would turn the lidar by the share of what 40 degrees of roll are, and more.
+    jumped = gtsam.Rot3.Logmap(
+        pose.rotation().between(blend(pose, measured, 0.002, FLAT).rotation())
+    )
+    assert np.linalg.norm(jumped) > 5.0 * np.linalg.norm(turned)
+
+
+# -- levelling -------------------------------------------------------------------------------------
+
+
+def samples_of(level_R_lidar, rate=(0.0, 0.0, 0.0), noise=0.0, seconds=2.0):
+    """A lidar that has ``level_R_lidar`` one second after START and turns evenly; 200 Hz."""
+    times = np.arange(round(200 * seconds)) / 200.0
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(np.outer(times - 1.0, rate))
+    attitude = Rotation.from_matrix(level_R_lidar.matrix()) * turns
+    seen = attitude * Rotation.from_rotvec(noise * rng.normal(size=(len(times), 3)))
+    return ImuSamples(
+        START + np.round(times * 1e9).astype(np.int64),
+        seen.as_quat(),
+        np.tile(np.array(rate, np.float64), (len(times), 1)),
+        attitude.inv().apply([0.0, 0.0, 9.81]),
+    )
+
+
+def level_of(samples, config=None, pose=None, levelled=False):
+    config = config or ImuConfig()
+    pose = pose or gtsam.Pose3()
+    return find_level(ImuBuffer(config, samples), config, START + 10**9, pose, levelled=levelled)
+
+
+def test_up_is_found_in_any_map_and_yaw_is_left_alone():
+    attitude = rot(12, -7, 130)
+    pose = gtsam.Pose3(rot(50, 20, -80), np.ones(3))
+    level = level_of(samples_of(attitude), pose=pose)
+    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-9)
+    found = level.level_R_map.compose(pose.rotation())
+    np.testing.assert_allclose(np.degrees(found.rpy()), [12, -7, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        level.map_up, pose.rotation().matrix() @ attitude.matrix()[2], atol=1e-9
+    )
+    assert level.source == "still"
+    in_level = level_of(samples_of(attitude), levelled=True)
+    assert in_level.level_R_map.equals(FLAT, 0.0)
+    assert (in_level.roll, in_level.pitch) == (level.roll, level.pitch)
+
+
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.8)])
+def test_a_second_of_samples_is_averaged_though_the_lidar_turns(rate):
+    noisy = samples_of(rot(12, -7, 130), rate, noise=0.01)
+    level = level_of(noisy)
+    assert level.samples == 201
+    away = np.array([level.roll, level.pitch]) - np.radians([12, -7])
+    assert np.abs(away).max() < 3.0 * 0.01 / np.sqrt(201.0)
+    assert level.source == ("moving" if any(rate) else "still")
+    # Also where there is little before that moment, so that the turning does not cancel.
+    samples = samples_of(rot(12, -7, 130), rate)
+    recent = ImuSamples(
+        samples.stamps[180:], samples.orientation[180:], samples.gyro[180:],
+        samples.acceleration[180:],
+    )  # fmt: skip
+    level = level_of(recent)
+    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-6)
+    alone = level_of(noisy, ImuConfig(still_seconds=0.0))
+    assert alone.samples == 1
+
+
+def test_samples_without_orientation_do_not_spoil_the_level():
+    samples = samples_of(rot(12, -7, 130))
+    samples.orientation[180:190] = np.nan
+    level = level_of(samples)
+    assert level.samples == 191
+    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-6)
+
+
+def test_no_orientation_at_that_moment_is_no_level():
+    samples = samples_of(rot(12, -7, 130))
+    late = ImuSamples(
+        samples.stamps + 2 * 10**9, samples.orientation, samples.gyro, samples.acceleration
+    )
+    assert level_of(late) is None
+    assert level_of(samples) is not None

@@ -6,7 +6,8 @@ be given to all three. Two differences of meaning:
 * Rows count as measured to 1 m: the matches' standard deviations are not used, as in the
   originals, and ``Solution.information`` is that of these rows. Divided by the variance of a
   residual in m^2 it compares with that of ``GtsamSolver``.
-* There is no place for priors; giving one is an error.
+* There is no place for priors; giving one is an error. A motion prior is not used:
+  :class:`ClassicalSolver` has LOAM's own projector.
 
 Both re-associate in the outer loop. ``R p + t = q`` with the pose ``map_T_lidar = (R, t)``.
 """
@@ -24,7 +25,7 @@ from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows, concatenate_rows, line_rows, plane_rows
 from loam_gtsam.geometry import transform
 from loam_gtsam.matching import ScanMatches
-from loam_gtsam.solvers import Associate, Solution
+from loam_gtsam.solvers import Associate, MotionPrior, Solution
 from loam_gtsam.types import FloatArray, InputError
 
 # LOAM's (rx, ry, rz) are (pitch, yaw, roll) and its (x, y, z) are (left, up, forward): both are the
@@ -77,6 +78,7 @@ class ClassicalSolver:
         associate: Associate,
         guess: gtsam.Pose3,
         priors: Sequence[gtsam.NonlinearFactor] = (),
+        motion: MotionPrior | None = None,
     ) -> Solution:
         """See :meth:`loam_gtsam.solvers.ScanSolver.solve`.
 
@@ -136,6 +138,7 @@ class ALoamSolver:
         associate: Associate,
         guess: gtsam.Pose3,
         priors: Sequence[gtsam.NonlinearFactor] = (),
+        motion: MotionPrior | None = None,
     ) -> Solution:
         """See :meth:`loam_gtsam.solvers.ScanSolver.solve`.
 

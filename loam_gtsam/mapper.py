@@ -1,15 +1,14 @@
 """The mapper: registers one sweep after another with the cube map.
 
-Within a frame, poses belong to the *middle* of the sweep: there an error of the motion used for
-the de-skew cancels to first order, while at the start or the end it would shift the whole sweep.
-The result is handed out at the reference time of the features.
+Within a frame, poses belong to the middle of the sweep (see :mod:`loam_gtsam.deskew`); the result
+is handed out at the reference time of the features.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -17,14 +16,56 @@ import numpy as np
 from loam_gtsam.classical import ALoamSolver, ClassicalSolver
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import move_points, transform, voxel_filter
-from loam_gtsam.matching import ScanMatches, associate, renew
-from loam_gtsam.odometry import ConstantVelocity, Guess, advance
-from loam_gtsam.solvers import Associate, GtsamSolver, ScanSolver, Solution
-from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
+from loam_gtsam.deskew import MovingSweep
+from loam_gtsam.geometry import transform
+from loam_gtsam.imu import ImuBuffer
+from loam_gtsam.imu_aid import ImuAid
+from loam_gtsam.matching import ScanMatches, associate, renew, rough
+from loam_gtsam.odometry import ConstantVelocity, Guess
+from loam_gtsam.solvers import (
+    POSE_KEY,
+    Associate,
+    GtsamSolver,
+    MotionPrior,
+    ScanSolver,
+    Solution,
+)
+from loam_gtsam.types import (
+    ConfigError,
+    Features,
+    FloatArray,
+    FrameStatus,
+    InputError,
+    MapUpdate,
+    TiltPrior,
+)
 
 _START_ROUNDS = 2
 """Times the first two sweeps are registered anew while their motion becomes known."""
+_SHORTEST = 1e-3
+"""Seconds between the middles of two sweeps at least; those of unlike length may even coincide."""
+
+
+@dataclass(frozen=True, slots=True)
+class PoseContext:
+    """What the mapper knows when it asks for a user's own factors.
+
+    Attributes
+    ----------
+    key : of the unknown pose, for the factors
+    stamp : nanoseconds of that pose: the middle of the sweep
+    guess : predicted ``map_T_lidar`` of that moment
+    last : stamp and pose of the middle of the last sweep; None if there is none
+    """
+
+    key: int
+    stamp: int
+    guess: gtsam.Pose3
+    last: tuple[int, gtsam.Pose3] | None
+
+
+ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
+"""Called once for every sweep that is solved; returns factors on ``context.key``."""
 
 
 class Mapper:
@@ -32,17 +73,46 @@ class Mapper:
 
     Parameters
     ----------
-    config : the whole configuration; ``map``, ``matching``, ``solver`` and ``deskew`` are used
+    config : the whole configuration; ``map``, ``matching``, ``solver``, ``deskew`` and ``imu``
+        are used
     solver : anything with :meth:`loam_gtsam.solvers.ScanSolver.solve`; :func:`make_solver` makes
         it from the configuration if None
+    imu : samples may be added to it while the mapper runs
+    extra_factors : a user's own factors for every sweep: GPS, ground level, wheels, ...
+
+    Attributes
+    ----------
+    last : the last update
+    imu_aid : what the mapper makes of the IMU; None without one
+    edge_map, plane_map : the map
+
+    Raises
+    ------
+    ConfigError
+        If the solver has no place for the configured use of the IMU.
     """
 
-    def __init__(self, config: Config | None = None, solver: ScanSolver | None = None) -> None:
+    def __init__(
+        self,
+        config: Config | None = None,
+        solver: ScanSolver | None = None,
+        *,
+        imu: ImuBuffer | None = None,
+        extra_factors: ExtraFactors | None = None,
+    ) -> None:
         self.config = config or Config()
         self.solver = solver or make_solver(self.config.solver)
+        method, prior = self.config.solver.method, self.config.imu.prior
+        if imu is not None and method != "gtsam" and prior in ("equivalent", "sigma"):
+            raise ConfigError(
+                f"imu.prior: {prior} is a factor, and solver.method {method} has no graph to put "
+                "it in; use imu.prior blend or off, or solver.method gtsam"
+            )
+        self.imu_aid = None if imu is None else ImuAid(self.config.imu, imu)
+        self.extra_factors = extra_factors
         self.last: MapUpdate | None = None
         self._new_map()
-        self._first: tuple[_Sweep, gtsam.Pose3] | None = None
+        self._first: tuple[MovingSweep, gtsam.Pose3] | None = None
         self._last_middle: tuple[int, gtsam.Pose3] | None = None
 
     def register(
@@ -57,7 +127,8 @@ class Mapper:
         Parameters
         ----------
         features : of the sweep
-        guess : predicted ``map_T_lidar`` at ``features.stamp``; constant velocity if None
+        guess : predicted ``map_T_lidar`` at ``features.stamp``; constant velocity if None, and for
+            the first sweep the origin, levelled by the IMU
         twist : (6,) predicted body velocity during the sweep, rad/s and m/s; that of the last
             sweep if None
         priors : further factors on :data:`loam_gtsam.solvers.POSE_KEY`, the pose at the middle of
@@ -72,12 +143,15 @@ class Mapper:
         last = self.last
         if last is not None and features.stamp <= last.stamp:
             return self.skip(features.stamp, "")
-        predicted = ConstantVelocity().guess(features, last)
+        imu = None if self.imu_aid is None else self.imu_aid.gyro
+        predicted = ConstantVelocity(imu).guess(features, last)
+        if last is None and self.imu_aid is not None:
+            predicted = replace(predicted, map_T_lidar=self.imu_aid.start(features.stamp, guess))
         start = Guess(
             predicted.map_T_lidar if guess is None else guess,
             predicted.twist if twist is None else np.asarray(twist, np.float64),
         )
-        sweep = _Sweep(features, self.config)
+        sweep = MovingSweep(features, self.config, imu)
         if sweep.is_empty:
             return self.skip(features.stamp, "the sweep has no features")
         sweep.deskew(start.twist)
@@ -114,8 +188,11 @@ class Mapper:
             return MapUpdate(
                 stamp, last.map_T_lidar, FrameStatus.BAD_STAMP, message, twist=last.twist
             )
-        pose = advance(last.map_T_lidar, last.twist, (stamp - last.stamp) * 1e-9)
-        self.last = MapUpdate(stamp, pose, FrameStatus.UNUSABLE_SCAN, message, twist=last.twist)
+        imu = None if self.imu_aid is None else self.imu_aid.gyro
+        guess = ConstantVelocity(imu).at(stamp, last)
+        self.last = MapUpdate(
+            stamp, guess.map_T_lidar, FrameStatus.UNUSABLE_SCAN, message, twist=guess.twist
+        )
         return self.last
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
@@ -126,13 +203,14 @@ class Mapper:
 
     def _solve(
         self,
-        sweep: _Sweep,
+        sweep: MovingSweep,
         guess: Guess,
         priors: Sequence[gtsam.NonlinearFactor],
         clock: _Clock,
     ) -> MapUpdate:
         """Match the sweep with the map around the guess, solve, insert."""
-        middle = advance(guess.map_T_lidar, guess.twist, sweep.middle)
+        guess, motion = self._expected(sweep, guess)
+        middle = _to_middle(sweep, guess)
         sizes = []
         for cubes in (self.edge_map, self.plane_map):
             cubes.recenter(middle.translation())
@@ -147,6 +225,7 @@ class Mapper:
             return self._insert(sweep, guess, FrameStatus.SPARSE_MAP, message, clock)
 
         associations = 0
+        matching = self.config.matching
         found: tuple[CubeMap, gtsam.Pose3, ScanMatches] | None = None
 
         def matches_at(map_T_lidar: gtsam.Pose3) -> ScanMatches:
@@ -163,7 +242,7 @@ class Mapper:
                 and found[0] is self.plane_map
                 and self._near(found[1], map_T_lidar)
             ):
-                matches = renew(found[2], map_T_lidar, self.config.matching)
+                matches = renew(found[2], map_T_lidar, matching)
             else:
                 matches = associate(
                     sweep.edges,
@@ -171,13 +250,24 @@ class Mapper:
                     map_T_lidar,
                     self.edge_map,
                     self.plane_map,
-                    self.config.matching,
+                    matching,
+                    sweep.distinct,
                 )
                 found = self.plane_map, map_T_lidar, matches
             clock.lap("match")
             return matches
 
-        solution = self.solver.solve(matches_at, middle, priors)
+        priors = [*priors, *self._factors(sweep.stamp, middle)]
+        start, rough_iterations = middle, 0
+        if self._first is None and 0 < matching.rough_planes < len(sweep.planes):
+            # Few matches get as near as many do; all of them are then searched for but once.
+            matching = rough(matching)
+            first = self.solver.solve(matches_at, middle, priors, motion)
+            matching, found = self.config.matching, None
+            rough_iterations = first.iterations
+            start = first.map_T_lidar
+        solution = self.solver.solve(matches_at, start, priors, motion)
+        solution = replace(solution, iterations=solution.iterations + rough_iterations)
         clock.lap("solve")
         if not solution.solved:
             message = f"{len(solution.matches)} matches; {config.min_matches} are needed"
@@ -186,12 +276,58 @@ class Mapper:
         twist = self._twist(sweep, solution.map_T_lidar, guess.twist)
         if self._first is not None:
             solution, twist = self._start_again(sweep, solution, twist, matches_at, priors)
-        result = Guess(advance(solution.map_T_lidar, twist, -sweep.middle), twist)
+        solution, result, tilt = self._finish(sweep, solution, twist)
         status, message = FrameStatus.OK, ""
         if not solution.converged:
             status = FrameStatus.NOT_CONVERGED
             message = f"the pose still moved after {solution.iterations} associations"
-        return self._insert(sweep, result, status, message, clock, solution)
+        if solution.weak is not None:
+            status = FrameStatus.DEGENERATE
+            message = f"the scan does not tell {_named(solution)}; the expected motion was kept"
+        return self._insert(sweep, result, status, message, clock, solution, tilt)
+
+    def _factors(self, stamp: int, guess: gtsam.Pose3) -> Sequence[gtsam.NonlinearFactor]:
+        """The IMU's factors and the user's, on the pose of a moment."""
+        factors = [] if self.imu_aid is None else [*self.imu_aid.factors(stamp)]
+        if self.extra_factors is not None:
+            context = PoseContext(POSE_KEY, stamp, guess, self._last_middle)
+            factors += _checked(self.extra_factors(context))
+        return factors
+
+    def _expected(self, sweep: MovingSweep, guess: Guess) -> tuple[Guess, MotionPrior]:
+        """The motion that takes over where the scan says nothing: pre-integrated, or constant."""
+        aid = self.imu_aid
+        predicted = None if aid is None else aid.predict(sweep.stamp)
+        if predicted is not None:
+            velocity = predicted.map_T_lidar.rotation().matrix().T @ predicted.velocity
+            twist = sweep.twist_at_reference(guess.twist[:3], velocity)
+            sweep.deskew(twist)
+            pose = predicted.map_T_lidar.compose(sweep.middle_T_reference(twist))
+            information: FloatArray = np.linalg.inv(predicted.covariance).astype(np.float64)
+            return Guess(pose, twist), MotionPrior(predicted.map_T_lidar, information)
+        assert self._last_middle is not None
+        seconds = max((sweep.stamp - self._last_middle[0]) * 1e-9, _SHORTEST)
+        config = self.config.solver
+        away = 0.5 * seconds**2 * np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
+        return guess, MotionPrior(_to_middle(sweep, guess), np.diag(away**-2.0))
+
+    def _finish(
+        self, sweep: MovingSweep, solution: Solution, twist: FloatArray
+    ) -> tuple[Solution, Guess, TiltPrior]:
+        """The pose at the reference time, with the IMU's roll and pitch."""
+        aid, tilt = self.imu_aid, TiltPrior.NONE
+        if aid is not None:
+            if self._last_middle is not None:
+                now = sweep.stamp, solution.map_T_lidar
+                aid.compare_gyro(self._last_middle, now)
+                aid.observe(self._last_middle, now, solution.scan_information)
+            solution, tilt = aid.tilted(sweep.stamp, solution)
+        pose = solution.map_T_lidar.compose(sweep.middle_T_reference(twist))
+        if aid is not None and aid.config.prior == "blend":
+            pose, tilt = aid.blended(sweep.reference_stamp, pose)
+        if aid is not None:
+            aid.find_level(sweep.reference_stamp, pose)  # for the frames to come
+        return solution, Guess(pose, twist), tilt
 
     def _near(self, searched: gtsam.Pose3, map_T_lidar: gtsam.Pose3) -> bool:
         """Whether matches found at one pose may be kept at another."""
@@ -202,18 +338,16 @@ class Mapper:
             and np.linalg.norm(moved[3:]) < config.keep_translation
         )
 
-    def _twist(self, sweep: _Sweep, middle: gtsam.Pose3, otherwise: FloatArray) -> FloatArray:
+    def _twist(self, sweep: MovingSweep, middle: gtsam.Pose3, otherwise: FloatArray) -> FloatArray:
         """Body velocity from the middle of the last sweep to that of this one."""
-        if self._last_middle is None:
+        last = self._last_middle
+        if last is None or sweep.stamp <= last[0]:  # sweeps of unlike length
             return otherwise
-        stamp, last_middle = self._last_middle
-        moved = gtsam.Pose3.Logmap(last_middle.between(middle))
-        twist: FloatArray = moved / ((sweep.stamp - stamp) * 1e-9)
-        return twist
+        return sweep.twist_since(last, middle)
 
     def _start_again(
         self,
-        sweep: _Sweep,
+        sweep: MovingSweep,
         solution: Solution,
         twist: FloatArray,
         matches_at: Associate,
@@ -229,9 +363,8 @@ class Mapper:
         for _ in range(_START_ROUNDS):
             first.deskew(twist)
             sweep.deskew(twist)
-            middle = advance(pose, twist, first.middle)
             self._new_map()
-            self._add_to_map(first, middle)
+            self._add_to_map(first, _to_middle(first, Guess(pose, twist)))
             again = self.solver.solve(matches_at, solution.map_T_lidar, priors)
             if not again.solved:
                 break
@@ -241,26 +374,26 @@ class Mapper:
 
     def _insert(
         self,
-        sweep: _Sweep,
+        sweep: MovingSweep,
         result: Guess,
         status: FrameStatus,
         message: str,
         clock: _Clock,
         solution: Solution | None = None,
+        tilt: TiltPrior = TiltPrior.NONE,
     ) -> MapUpdate:
         """De-skew with the final motion, add to the map, report."""
         clock.lap("solve")
         sweep.deskew(result.twist)
-        middle = advance(result.map_T_lidar, result.twist, sweep.middle)
-        self._add_to_map(sweep, middle)
+        self._add_to_map(sweep, _to_middle(sweep, result))
         clock.lap("insert")
-        return _report(sweep, result, status, message, clock, solution)
+        return _report(sweep, result, status, message, clock, solution, tilt)
 
     def _new_map(self) -> None:
         self.edge_map = CubeMap(self.config.map, self.config.map.edge_voxel)
         self.plane_map = CubeMap(self.config.map, self.config.map.plane_voxel)
 
-    def _add_to_map(self, sweep: _Sweep, middle: gtsam.Pose3) -> None:
+    def _add_to_map(self, sweep: MovingSweep, middle: gtsam.Pose3) -> None:
         self.edge_map.insert(transform(middle.matrix(), sweep.edges))
         self.plane_map.insert(transform(middle.matrix(), sweep.planes))
         self._last_middle = sweep.stamp, middle
@@ -276,35 +409,32 @@ def make_solver(config: SolverConfig) -> ScanSolver:
     return solvers[config.method](config)
 
 
-class _Sweep:
-    """The voxel-filtered features of a sweep, de-skewed to its middle."""
-
-    def __init__(self, features: Features, config: Config) -> None:
-        first, end = features.span
-        self._moving = config.deskew.enabled and end > first
-        self.middle = 0.5 * (first + end) if self._moving else 0.0
-        self.reference_stamp = features.stamp
-        self.stamp = features.stamp + round(self.middle * 1e9)
-        self._edges, self._planes = (
-            voxel_filter(np.column_stack([points, times]), size)
-            for points, times, size in (
-                (features.edges, features.edge_times, config.map.edge_voxel),
-                (features.planes, features.plane_times, config.map.plane_voxel),
-            )
+def _checked(factors: object) -> Sequence[gtsam.NonlinearFactor]:
+    """What ``extra_factors`` gave, if it can be used: GTSAM's own errors name no cause."""
+    if not isinstance(factors, Sequence):
+        raise InputError(
+            "extra_factors: expected a list of factors, empty if there are none; got "
+            f"{type(factors).__name__}"
         )
-        self.edges, self.planes = self._edges[:, :3], self._planes[:, :3]
-
-    @property
-    def is_empty(self) -> bool:
-        return len(self.edges) + len(self.planes) == 0
-
-    def deskew(self, twist: FloatArray) -> None:
-        """Set ``edges`` and ``planes`` to their positions seen from the middle of the sweep."""
-        if self._moving:
-            self.edges, self.planes = (
-                move_points(features[:, :3], twist, features[:, 3] - self.middle)
-                for features in (self._edges, self._planes)
+    for factor in factors:
+        keys = list(factor.keys()) if isinstance(factor, gtsam.NonlinearFactor) else []
+        if keys != [POSE_KEY]:
+            raise InputError(
+                "extra_factors: expected GTSAM factors whose one key is context.key, "
+                f"{POSE_KEY}; got {type(factor).__name__} on the keys {keys}"
             )
+    return factors
+
+
+def _named(solution: Solution) -> str:
+    """The weak directions in words: metres and rad in lidar axes."""
+    assert solution.localizability is not None
+    names = []
+    for direction in solution.localizability.directions[: solution.n_weak]:
+        unit = direction / np.abs(direction).max()
+        parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
+        names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
+    return " or ".join(names)
 
 
 class _Clock:
@@ -321,13 +451,20 @@ class _Clock:
         self._since = now
 
 
+def _to_middle(sweep: MovingSweep, result: Guess) -> gtsam.Pose3:
+    """The pose at the middle of a sweep, from that at its reference time."""
+    back = sweep.middle_T_reference(result.twist).inverse()
+    return result.map_T_lidar.compose(back)
+
+
 def _report(
-    sweep: _Sweep,
+    sweep: MovingSweep,
     result: Guess,
     status: FrameStatus,
     message: str,
     clock: _Clock,
     solution: Solution | None,
+    tilt: TiltPrior = TiltPrior.NONE,
 ) -> MapUpdate:
     update = MapUpdate(
         stamp=sweep.reference_stamp,
@@ -337,14 +474,16 @@ def _report(
         n_edges=len(sweep.edges),
         n_planes=len(sweep.planes),
         twist=result.twist,
+        sweep_motion=sweep.motion,
+        tilt_prior=tilt,
         timings=clock.seconds,
     )
     if solution is None:
         return update
     # The solve is about the middle of the sweep; a right perturbation there is, at the reference
     # time, the same one seen through the motion between the two.
-    to_middle = gtsam.Pose3.Expmap(-result.twist * sweep.middle).AdjointMap()
-    return replace(
+    to_middle = sweep.middle_T_reference(result.twist).AdjointMap()
+    update = replace(
         update,
         n_edge_matches=len(solution.matches.edges),
         n_plane_matches=len(solution.matches.planes),
@@ -354,3 +493,8 @@ def _report(
         error_after=solution.error_after,
         information=to_middle.T @ solution.information @ to_middle,
     )
+    seen = solution.localizability
+    if seen is None:
+        return update
+    to_reference = sweep.middle_T_reference(result.twist).inverse().AdjointMap()
+    return replace(update, localizability=seen.aligned, directions=seen.directions @ to_reference.T)

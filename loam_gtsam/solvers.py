@@ -13,8 +13,10 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import SolverConfig
+from loam_gtsam.degeneracy import Localizability, localizability
 from loam_gtsam.factors import (
     MatchRows,
+    checked_factor,
     concatenate_rows,
     line_rows,
     plane_rows,
@@ -28,6 +30,15 @@ POSE_KEY: int = gtsam.symbol("x", 0)
 
 _TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a normal distribution."""
+
+_FUSE = gtsam.LevenbergMarquardtParams()
+_FUSE.setVerbosityLM("SILENT")
+_FUSE.setlambdaInitial(1e-12)  # a single pose near its optimum: plain Gauss-Newton steps
+_FUSE.setRelativeErrorTol(1e-14)
+_FUSE.setAbsoluteErrorTol(0.0)
+
+_CERTAIN = 1e10
+"""Information that no factor stands up to: 0.01 mrad and 0.01 mm."""
 
 Associate = Callable[[gtsam.Pose3], ScanMatches]
 
@@ -46,6 +57,8 @@ class Solution:
     error_before, error_after : cost at the guess with the first matches, and at the pose with the
         last ones
     information : (6, 6) of matches and priors at the pose
+    localizability : which motions the first matches say something about; None if not looked at
+    weak : (6, 6) projector onto those they say too little about; None if there are none
     """
 
     map_T_lidar: gtsam.Pose3
@@ -57,6 +70,36 @@ class Solution:
     error_before: float
     error_after: float
     information: FloatArray
+    localizability: Localizability | None = None
+    weak: FloatArray | None = None
+
+    @property
+    def n_weak(self) -> int:
+        """Number of weak directions: the first of ``localizability.directions``."""
+        return 0 if self.weak is None else round(float(np.trace(self.weak)))
+
+    @property
+    def scan_information(self) -> FloatArray:
+        """(6, 6) ``information`` with the weak directions taken out."""
+        if self.weak is None:
+            return self.information
+        keep = np.eye(6) - self.weak
+        kept: FloatArray = keep.T @ self.information @ keep
+        return kept
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPrior:
+    """Where the pose is expected, for the directions in which a scan does not say it.
+
+    Attributes
+    ----------
+    map_T_lidar : expected pose
+    information : (6, 6) of the expectation, tangent order of the package
+    """
+
+    map_T_lidar: gtsam.Pose3
+    information: FloatArray
 
 
 class ScanSolver(Protocol):
@@ -67,6 +110,7 @@ class ScanSolver(Protocol):
         associate: Associate,
         guess: gtsam.Pose3,
         priors: Sequence[gtsam.NonlinearFactor] = (),
+        motion: MotionPrior | None = None,
     ) -> Solution:
         """Find the pose.
 
@@ -75,6 +119,7 @@ class ScanSolver(Protocol):
         associate : gives the matches at a pose
         guess : ``map_T_lidar`` to start from
         priors : further factors on :data:`POSE_KEY`
+        motion : takes over along weak directions; None: they are not looked for
         """
         ...
 
@@ -98,9 +143,12 @@ class GtsamSolver:
         associate: Associate,
         guess: gtsam.Pose3,
         priors: Sequence[gtsam.NonlinearFactor] = (),
+        motion: MotionPrior | None = None,
     ) -> Solution:
         """See :meth:`ScanSolver.solve`."""
         config = self.config
+        seen: Localizability | None = None
+        weak: FloatArray | None = None
         pose = guess
         converged = False
         steps = 0
@@ -112,12 +160,20 @@ class GtsamSolver:
                 return Solution(
                     guess, False, False, matches, iteration, steps, 0.0, 0.0, np.zeros((6, 6))
                 )
-            graph = gtsam.NonlinearFactorGraph()
-            graph.add(scan_match_factor(POSE_KEY, match_rows(matches, config.kernel_width)))
-            for factor in priors:
-                graph.add(factor)
+            if iteration == 1 and motion is not None and config.degeneracy != "off":
+                seen = localizability(matches, pose)
+                weak = seen.projector(config.min_aligned)
             values = gtsam.Values()
             values.insert(POSE_KEY, pose)
+            graph = gtsam.NonlinearFactorGraph()
+            scan = scan_match_factor(POSE_KEY, match_rows(matches, config.kernel_width))
+            if weak is None or motion is None:
+                graph.add(scan)
+            else:
+                graph.add(_without(scan, values, weak))
+                graph.add(_along(motion, weak, config))
+            for factor in priors:
+                graph.add(factor)
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
             if iteration == 1:
                 error_before = optimizer.error()
@@ -132,8 +188,77 @@ class GtsamSolver:
             if converged:
                 break
         return Solution(
-            pose, True, converged, matches, iteration, steps, error_before, error_after, information
+            pose,
+            True,
+            converged,
+            matches,
+            iteration,
+            steps,
+            error_before,
+            error_after,
+            information,
+            seen,
+            weak,
         )
+
+
+def _without(
+    scan: gtsam.NonlinearFactor, values: gtsam.Values, weak: FloatArray
+) -> gtsam.NonlinearFactor:
+    """The scan's factor, linearised, with what it claims about weak directions taken out."""
+    linear = scan.linearize(values)
+    information, right = linear.information(), linear.augmentedInformation()[:-1, -1]
+    keep = np.eye(6) - weak
+    squared = float(linear.augmentedInformation()[-1, -1])
+    hessian = gtsam.HessianFactor(POSE_KEY, keep.T @ information @ keep, keep.T @ right, squared)
+    return gtsam.LinearContainerFactor(hessian, values)
+
+
+def _along(motion: MotionPrior, weak: FloatArray, config: SolverConfig) -> gtsam.NonlinearFactor:
+    """The expected motion as a factor that acts along weak directions only."""
+    information = motion.information
+    if config.degeneracy == "project":
+        information = _CERTAIN * np.eye(6)
+    expected = gtsam.Values()
+    expected.insert(POSE_KEY, motion.map_T_lidar)
+    hessian = gtsam.HessianFactor(POSE_KEY, weak.T @ information @ weak, np.zeros(6), 0.0)
+    return gtsam.LinearContainerFactor(hessian, expected)
+
+
+def fuse(
+    map_T_lidar: gtsam.Pose3,
+    information: FloatArray,
+    factors: Sequence[gtsam.NonlinearFactor],
+) -> tuple[gtsam.Pose3, FloatArray]:
+    """Bring factors that come after the solve together with its solution.
+
+    Parameters
+    ----------
+    map_T_lidar, information : the solution and its (6, 6) information, which may be singular: a
+        quadratic cost about the solution
+    factors : on :data:`POSE_KEY`
+
+    Returns
+    -------
+    pose, information : the optimum of all, and its (6, 6) information
+    """
+    # A root by eigenvalues, for the information may be singular.
+    eigenvalues, vectors = np.linalg.eigh(information)
+    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
+
+    def solved(at: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
+        # Not a PriorFactorPose3, whose Jacobian is that of no displacement.
+        moved = map_T_lidar.between(at.atPose3(POSE_KEY))
+        return root @ gtsam.Pose3.Logmap(moved), [root @ gtsam.Pose3.LogmapDerivative(moved)]
+
+    values = gtsam.Values()
+    values.insert(POSE_KEY, map_T_lidar)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(checked_factor(gtsam.noiseModel.Unit.Create(6), [POSE_KEY], solved))
+    for factor in factors:
+        graph.add(factor)
+    result = gtsam.LevenbergMarquardtOptimizer(graph, values, _FUSE).optimize()
+    return result.atPose3(POSE_KEY), graph.linearize(result).hessian()[0]
 
 
 def within_tolerance(step: FloatArray, information: FloatArray, config: SolverConfig) -> bool:

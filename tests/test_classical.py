@@ -575,7 +575,7 @@ class _Watch:
     def __init__(self):
         self.solves = []
 
-    def solve(self, associate, guess, priors=()):
+    def solve(self, associate, guess, priors=(), motion=None):
         matches = [associate(guess), associate(guess.retract(np.full(6, 1e-3)))]
         self.solves.append([match.planes for match in matches])
         return Solution(guess, True, True, matches[1], 2, 2, 1.0, 0.0, np.eye(6))
@@ -583,7 +583,11 @@ class _Watch:
 
 @pytest.mark.parametrize("refine", [True, False])
 def test_refine_does_the_first_sweeps_and_the_deskew_again(refine):
-    config = replace(Config(), deskew=replace(Config().deskew, refine=refine))
+    config = replace(
+        Config(),
+        deskew=replace(Config().deskew, refine=refine),
+        matching=replace(Config().matching, rough_planes=0),
+    )
     watch = _Watch()
     mapper = Mapper(config, watch)
     rng = np.random.default_rng(0)

@@ -10,9 +10,11 @@ from loam_gtsam import mapper as mapper_module
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.features import extract_features
+from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.mapper import Mapper
+from loam_gtsam.pipeline import imu_buffer
 from loam_gtsam.solvers import POSE_KEY, GtsamSolver
-from loam_gtsam.types import Features, FrameStatus
+from loam_gtsam.types import Features, FrameStatus, ImuSamples, TiltPrior
 
 SECOND = 1_000_000_000
 
@@ -62,7 +64,7 @@ def test_closed_form_room_is_solved_exactly(mapped, rng, scale):
     error = truth.localCoordinates(update.map_T_lidar)
     assert np.abs(error[:3]).max() < 1e-3
     assert np.abs(error[3:]).max() < 2e-3
-    assert update.error_after < update.error_before
+    assert update.error_after < 1.01 * update.error_before  # that of the rough solve's pose
     assert update.n_edge_matches > 100
     assert update.n_plane_matches > 500
     assert np.linalg.eigvalsh(update.information).min() > 0
@@ -127,13 +129,14 @@ def test_a_wrong_twist_hardly_moves_the_middle_of_the_sweep():
     middles = []
     # One association only: the second would already use a better twist.
     for wrong in (np.zeros(6), np.array([0, 0, 0.2, 0.3, 0, 0])):
-        mapper = Mapper(with_solver(iterations=1, inner_iterations=5))
+        once = replace(Config().matching, rough_planes=0)
+        mapper = Mapper(replace(with_solver(iterations=1, inner_iterations=5), matching=once))
         for item in features[:-1]:
             last = mapper.register(item)
         solved = {}
 
         class Spy(GtsamSolver):
-            def solve(self, associate, guess, priors=(), solved=solved):
+            def solve(self, associate, guess, priors=(), motion=None, solved=solved):
                 solved["pose"] = (solution := super().solve(associate, guess, priors)).map_T_lidar
                 return solution
 
@@ -212,7 +215,8 @@ def test_few_matches_keep_the_guess_and_do_not_insert(mapped, rng):
 
 
 def test_the_iteration_limit_is_reported(rng):
-    mapper = Mapper(with_solver(iterations=1))
+    matching = replace(Config().matching, rough_planes=0)
+    mapper = Mapper(replace(with_solver(iterations=1), matching=matching))
     for i in range(3):
         mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.2, 0.0, 0.0]))
@@ -238,7 +242,7 @@ def test_information_is_that_of_the_reference_time():
     seen = []
 
     class Spy(GtsamSolver):
-        def solve(self, associate, guess, priors=()):
+        def solve(self, associate, guess, priors=(), motion=None):
             seen.append(super().solve(associate, guess, priors))
             return seen[-1]
 
@@ -271,7 +275,9 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     config = replace(
         Config(),
         deskew=replace(Config().deskew, refine=False),
-        matching=replace(Config().matching, keep_translation=metres, keep_rotation_deg=5.0),
+        matching=replace(
+            Config().matching, keep_translation=metres, keep_rotation_deg=5.0, rough_planes=0
+        ),
         solver=replace(Config().solver, iterations=2, step_sigmas=0.0, translation_tolerance=0.0),
     )
     mapper = Mapper(config)
@@ -283,6 +289,52 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
     update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
     assert (update.iterations, len(calls)) == (2, searches)
+
+
+class _Watched:
+    """A solver that remembers where it started and how many matches it was given at most."""
+
+    def __init__(self):
+        self.solver = mapper_module.make_solver(Config().solver)
+        self.guesses, self.sizes = [], []
+
+    def solve(self, associate, guess, *others):
+        sizes = []
+
+        def counted(pose):
+            matches = associate(pose)
+            sizes.append((len(matches.edges), len(matches.planes)))
+            return matches
+
+        solution = self.solver.solve(counted, guess, *others)
+        self.guesses.append(guess)
+        self.sizes.append(tuple(np.max(sizes, axis=0)))
+        return solution
+
+
+@pytest.mark.parametrize(
+    ("planes", "solves", "helps"),
+    [(0, 1, False), (10**6, 1, False), (200, 2, True), (30, 2, False)],
+)
+def test_a_rough_solve_comes_first_if_it_has_fewer_features(rng, planes, solves, helps):
+    """Off, no fewer, fewer, and too few to solve: then the second solve starts at the guess."""
+    matching = replace(Config().matching, rough_planes=planes, rough_edges=10, max_planes=1000)
+    watched = _Watched()
+    mapper = Mapper(replace(Config(), matching=matching), watched)
+    for i in range(3):
+        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
+    watched.guesses.clear(), watched.sizes.clear()
+    truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
+    update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
+    assert update.status is FrameStatus.OK
+    assert np.abs(truth.localCoordinates(update.map_T_lidar)).max() < 2e-3
+    assert len(watched.sizes) == solves
+    assert 500 < watched.sizes[-1][1] <= 1000
+    if solves == 2:
+        assert watched.sizes[0][0] <= 10
+        assert watched.sizes[0][1] <= planes
+    near = np.abs(truth.localCoordinates(watched.guesses[-1])).max() < 0.02
+    assert near == helps
 
 
 def test_cubes_left_behind_are_evicted_counted_and_kept(rng):
@@ -323,3 +375,92 @@ def test_same_input_same_bits():
         )
 
     assert np.array_equal(poses(), poses())
+
+
+# -- with an IMU -----------------------------------------------------------------------------------
+
+
+def imu_of(world_R_lidar, seconds=2.0):
+    """An IMU at rest at that attitude, 200 Hz."""
+    stamps = 5_000_000 * np.arange(round(200 * seconds), dtype=np.int64) - SECOND // 2
+    q = world_R_lidar.toQuaternion()
+    rotation = world_R_lidar.matrix()
+    count = len(stamps)
+    samples = ImuSamples(
+        stamps,
+        np.tile([q.x(), q.y(), q.z(), q.w()], (count, 1)),
+        np.zeros((count, 3)),
+        np.tile(9.81 * rotation[2], (count, 1)),
+    )
+    return ImuBuffer(Config().imu, samples)
+
+
+def test_a_start_of_the_users_own_keeps_its_map_and_learns_where_up_is(rng):
+    """A map whose axes the user has chosen, with z nowhere near up."""
+    attitude = gtsam.Rot3.RzRyRx(0.1, -0.2, 0.0)
+    start = gtsam.Pose3(gtsam.Rot3.RzRyRx(1.2, 0.4, 2.0), np.array([3.0, 4.0, 5.0]))
+    mapper = Mapper(imu=imu_of(attitude))
+    first = mapper.register(room_features(gtsam.Pose3(), 0, rng), guess=start)
+    assert first.map_T_lidar.equals(start, 1e-12)
+    up = start.rotation().matrix() @ attitude.matrix()[2]
+    np.testing.assert_allclose(mapper.imu_aid.level.map_up, up, atol=1e-9)
+    update = mapper.register(room_features(gtsam.Pose3(), SECOND // 10, rng), guess=start)
+    assert update.tilt_prior is TiltPrior.EQUIVALENT
+    # The IMU agrees, so it changes nothing.
+    assert np.abs(start.localCoordinates(update.map_T_lidar)).max() < 5e-3
+
+
+def test_the_imu_moves_roll_and_pitch_of_a_frame_by_its_weight(rng):
+    """Frames of one attitude, an IMU that changes its mind by 10 mrad after the start."""
+    results = {}
+    for weight in (0.0, 0.1):
+        config = replace(Config(), imu=replace(Config().imu, weight=weight, still_seconds=0.1))
+        buffer = imu_of(gtsam.Rot3.Roll(0.01))
+        start = imu_of(gtsam.Rot3(), seconds=0.75).window(-SECOND // 2, SECOND // 8)
+        late = buffer.window(SECOND // 8 + 1, 2 * SECOND)
+        mapper = Mapper(config, imu=ImuBuffer(config.imu, start))
+        mapper.imu_aid.buffer.add(late)
+        same = np.random.default_rng(3)
+        mapper.register(room_features(gtsam.Pose3(), 0, same, noise=0.01))
+        update = mapper.register(room_features(gtsam.Pose3(), SECOND // 2, same, noise=0.01))
+        assert update.tilt_prior is TiltPrior.EQUIVALENT
+        results[weight] = update.map_T_lidar.rotation().rpy()
+    moved = results[0.1][:2] - results[0.0][:2]
+    expected = 0.1 * (np.array([0.01, 0.0]) - results[0.0][:2])
+    np.testing.assert_allclose(moved, expected, atol=1e-9)
+
+
+def test_a_frame_that_is_not_solved_has_no_prior(rng):
+    mapper = Mapper(imu=imu_of(gtsam.Rot3()))
+    first = mapper.register(room_features(gtsam.Pose3(), 0, rng))
+    far = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([30.0, 10.0, 0.0]))
+    lost = mapper.register(room_features(gtsam.Pose3(), SECOND // 10, rng), guess=far)
+    assert lost.status is not FrameStatus.OK
+    assert first.tilt_prior is lost.tilt_prior is TiltPrior.NONE
+
+
+def test_sweeps_of_unlike_length_may_share_their_middle():
+    """Stamps go on, the middles of the sweeps do not: no velocity comes of it, and no error."""
+    world = SimulatedWorld("room", frames=4, columns=300)
+    mapper = Mapper(imu=imu_buffer(world, Config()))
+    sweeps = [extract_features(scan, mapper.config) for scan in world]
+    for features in sweeps[:3]:
+        mapper.register(features)
+    long = replace(sweeps[2], stamp=sweeps[2].stamp + 1, span=(0.0, 0.3))
+    middle = mapper.register(long)
+    after = replace(sweeps[3], stamp=long.stamp + 100_000_000, span=(0.0, 0.1))
+    assert long.stamp + 150_000_000 == after.stamp + 50_000_000
+    update = mapper.register(after)
+    for one in (middle, update):
+        assert np.isfinite(one.map_T_lidar.matrix()).all()
+        assert np.isfinite(one.twist).all()
+        assert one.status.solved
+
+
+def test_a_user_may_hand_priors_and_own_factors_together(mapped, rng):
+    """Two heights, equally sure: the frame is half way between them."""
+    noise = gtsam.noiseModel.Diagonal.Sigmas([1e3, 1e3, 1e-5])
+    high, low = (gtsam.GPSFactor(POSE_KEY, np.array([0, 0, z]), noise) for z in (0.04, 0.02))
+    mapped.extra_factors = lambda context: [low]
+    update = mapped.register(room_features(gtsam.Pose3(), SECOND, rng), priors=[high])
+    np.testing.assert_allclose(update.map_T_lidar.translation()[2], 0.03, atol=1e-3)

@@ -8,7 +8,7 @@ import pytest
 
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.matching import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.solvers import POSE_KEY, GtsamSolver, match_rows, within_tolerance
+from loam_gtsam.solvers import POSE_KEY, GtsamSolver, fuse, match_rows, within_tolerance
 
 CONFIG = SolverConfig()
 TRUTH = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
@@ -299,3 +299,90 @@ def test_the_kernel_has_a_unit_of_its_own_far_from_the_optimum():
     """All distances large alike: nothing is an outlier, nothing is silenced."""
     rows = match_rows(plane_matches(np.full(9, 5.0)), kernel_width=1.345)
     np.testing.assert_allclose(rows.scales, 10.0)
+
+
+# -- factors that come after the solve -------------------------------------------------------------
+
+
+def random_information(seed, rank=6):
+    """Of rows in rad and m; directions beyond ``rank`` are free."""
+    rng = np.random.default_rng(seed)
+    vectors = np.linalg.qr(rng.normal(size=(6, 6)))[0][:, :rank]
+    return vectors @ np.diag(10.0 ** rng.uniform(3, 6, rank)) @ vectors.T
+
+
+def pose_prior(offset, sigmas):
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.asarray(sigmas, np.float64))
+    return gtsam.PriorFactorPose3(POSE_KEY, TRUTH.retract(np.asarray(offset)), noise)
+
+
+def test_fusing_nothing_changes_nothing():
+    information = random_information(0)
+    pose, after = fuse(TRUTH, information, [])
+    assert difference(pose, TRUTH) < 1e-12
+    np.testing.assert_allclose(after, information, atol=1e-9 * information.max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_fused_is_the_weighted_mean(seed):
+    """L x + P (x - prior) = 0, to first order in what separates the two."""
+    offset = 1e-4 * np.random.default_rng(seed).normal(size=6)
+    information, sigmas = random_information(seed), np.full(6, 3e-3)
+    pose, after = fuse(TRUTH, information, [pose_prior(offset, sigmas)])
+    weight = np.diag(sigmas**-2.0)
+    expected = np.linalg.solve(information + weight, weight @ offset)
+    np.testing.assert_allclose(TRUTH.localCoordinates(pose), expected, atol=1e-7)
+    scale = information.max() + weight.max()
+    np.testing.assert_allclose(after, information + weight, atol=1e-3 * scale)
+
+
+def test_what_is_fused_is_the_exact_minimum_far_away_too():
+    """A prior half a radian and a metre off: the gradient of the sum is zero, numerically."""
+    offset = np.array([0.3, -0.2, 0.4, 1.0, -0.5, 0.7])
+    information = 1e3 * np.diag([3.0, 1, 2, 1, 4, 2]) + random_information(1)
+    weight = 1e4
+    at_prior = TRUTH.retract(offset)
+
+    # A plain displacement of the position, in the map: its derivative is known exactly.
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, weight**-0.5)
+    pose, _ = fuse(TRUTH, information, [gtsam.GPSFactor(POSE_KEY, at_prior.translation(), noise)])
+    assert 0.01 < np.linalg.norm(pose.translation() - TRUTH.translation()) < 1.3
+
+    def cost(step):
+        moved = pose.retract(step)
+        away = gtsam.Pose3.Logmap(TRUTH.between(moved))
+        gps = moved.translation() - at_prior.translation()
+        return 0.5 * (away @ information @ away + weight * gps @ gps)
+
+    gradient = [(cost(1e-5 * axis) - cost(-1e-5 * axis)) / 2e-5 for axis in np.eye(6)]
+    assert np.abs(gradient).max() < 1e-5 * cost(np.zeros(6))
+
+
+def test_directions_without_information_are_taken_from_the_factors():
+    information = random_information(2, rank=4)
+    offset = np.array([1e-4, -2e-4, 1e-4, 2e-3, 1e-3, -1e-3])
+    pose, after = fuse(TRUTH, information, [pose_prior(offset, np.full(6, 0.1))])
+    values, vectors = np.linalg.eigh(information)
+    free = vectors[:, :2]
+    assert values[1] < 1e-9 * values[-1]
+    moved = TRUTH.localCoordinates(pose)
+    np.testing.assert_allclose(free.T @ moved, free.T @ offset, atol=2e-6)
+    assert np.linalg.norm(vectors[:, 2:].T @ moved) < 0.2 * np.linalg.norm(offset)
+    np.testing.assert_allclose(np.linalg.eigvalsh(after)[:2], 100.0, rtol=0.01)
+
+
+def test_a_direction_that_nobody_knows_stays():
+    """A height alone: the rest of a pose without any information is left where it is."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.01)
+    there = TRUTH.translation() + np.array([0.1, 0.2, 0.3])
+    pose, after = fuse(TRUTH, np.zeros((6, 6)), [gtsam.GPSFactor(POSE_KEY, there, noise)])
+    np.testing.assert_allclose(pose.translation(), there, atol=1e-6)
+    assert np.abs(TRUTH.localCoordinates(pose)[:3]).max() < 1e-9
+    assert np.linalg.matrix_rank(after, tol=1.0) == 3
+
+
+def test_fusing_twice_gives_the_same_bits():
+    arguments = TRUTH, random_information(3), [pose_prior(OFFSET, np.full(6, 0.1))]
+    (a, one), (b, other) = (fuse(*arguments) for _ in range(2))
+    assert same(a, b)
+    assert one.tobytes() == other.tobytes()

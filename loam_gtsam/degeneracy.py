@@ -1,0 +1,106 @@
+"""Which motions a scan says something about, and what to do about the others.
+
+The information of a scan is never singular: the normals of five noisy points are wrong by some
+degrees, and a thousand of them on the bare walls of a corridor seem to say how far along it one is.
+Since the map points that they come from are matched anew at every pose, they say nothing. What
+tells such information from real one is the noise that the normals themselves have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from scipy.linalg import eigh
+
+from loam_gtsam.factors import complement_basis
+from loam_gtsam.matching import ScanMatches
+from loam_gtsam.types import FloatArray
+
+_CLEAR = 3.0
+"""Standard deviations of a normal by which a displacement must be off its surface to be seen."""
+
+
+@dataclass(frozen=True, slots=True)
+class Localizability:
+    """How well a scan fixes its pose, by direction, the weakest first.
+
+    Attributes
+    ----------
+    directions : (6, 6) rows, tangent vectors at the pose (rad, m), each scaled to move the matched
+        points by 1 m (root mean square)
+    aligned : (6,) matches that fix each of them, counted as if the normals pointed that way: the
+        sum of squared cosines between normal and displacement, over the matches that see it at all
+    """
+
+    directions: FloatArray
+    aligned: FloatArray
+
+    def weak(self, least: float) -> FloatArray:
+        """(W, 6) the directions with fewer aligned matches than ``least``."""
+        chosen: FloatArray = self.directions[self.aligned < least]
+        return chosen
+
+    def projector(self, least: float) -> FloatArray | None:
+        """(6, 6) projector onto the weak directions along the others, None if there are none."""
+        mask = self.aligned < least
+        if not mask.any():
+            return None
+        columns = self.directions.T
+        projector: FloatArray = columns @ (mask[:, None] * np.linalg.inv(columns))
+        return projector
+
+
+def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizability:
+    """Find the directions in which information stands out least from what noise makes of it.
+
+    With u the displacement of a point by a motion, n the normal and s its standard deviation in
+    rad, a match contributes ``(n . u)^2`` to the information, of which ``s^2 |u|^2`` is noise. The
+    directions are the generalised eigenvectors of the two sums. Matches with
+    ``|n . u| > 3 s |u|`` see the motion. A line counts as two planes, if it is distinct.
+
+    Parameters
+    ----------
+    matches : of the scan
+    map_T_lidar : the pose at which they were made
+    """
+    rotation = map_T_lidar.rotation().matrix()
+    e, p = matches.edges, matches.planes
+    own = np.ones(len(e), np.bool_) if e.distinct is None else e.distinct
+    line_tilts = np.zeros(len(e)) if e.tilts is None else e.tilts
+    plane_tilts = np.zeros(len(p)) if p.tilts is None else p.tilts
+    basis = complement_basis(e.directions[own]).reshape(-1, 3)
+    points = np.concatenate([np.repeat(e.points[own], 2, axis=0), p.points])
+    normals = np.concatenate([basis, p.normals]) @ rotation
+    tilts = np.concatenate([np.repeat(line_tilts[own], 2), plane_tilts])
+    weights = np.concatenate([np.repeat(e.weights[own] / e.sigmas[own], 2), p.weights / p.sigmas])
+
+    jacobian = np.hstack([np.cross(points, normals), normals]) * weights[:, None]
+    information = jacobian.T @ jacobian
+    noise = _displacements(points, (weights * tilts) ** 2)
+    unit = _displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
+    floor = np.finfo(np.float64).eps * (np.trace(noise) + 1.0)
+    _, columns = eigh(information, noise + floor * (unit + np.eye(6)))
+    scale = np.sqrt(np.einsum("ik,ij,jk->k", columns, unit, columns))
+    directions = columns.T / np.maximum(scale, floor)[:, None]
+
+    moved = directions[:, None, 3:] + np.cross(directions[:, None, :3], points[None])
+    length = np.maximum(np.linalg.norm(moved, axis=2), np.finfo(np.float64).tiny)
+    cosine = np.abs(np.einsum("kni,ni->kn", moved, normals)) / length
+    aligned = np.where(cosine > _CLEAR * tilts, cosine**2, 0.0).sum(axis=1)
+    order = np.argsort(aligned, kind="stable")
+    return Localizability(directions[order], aligned[order])
+
+
+def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """(6, 6) form: the weighted sum of the points' squared displacements by a motion."""
+    first = weights @ points
+    second = (points * weights[:, None]).T @ points
+    form = np.zeros((6, 6))
+    form[:3, :3] = np.trace(second) * np.eye(3) - second
+    x, y, z = first
+    form[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    form[3:, :3] = form[:3, 3:].T
+    form[3:, 3:] = weights.sum() * np.eye(3)
+    return form

@@ -11,7 +11,7 @@ import argparse
 import csv
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -25,15 +25,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from loam_gtsam.config import Config, MapConfig, preset
+from loam_gtsam.config import Config, FeatureConfig, MapConfig, preset
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.deskew import MovingSweep
 from loam_gtsam.features import extract_features
-from loam_gtsam.geometry import move_points, transform, voxel_filter
+from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import make_solver
-from loam_gtsam.matching import ScanMatches, associate
-from loam_gtsam.solvers import POSE_KEY, Solution, match_rows
-from loam_gtsam.types import FloatArray
+from loam_gtsam.matching import ScanMatches, associate, rough
+from loam_gtsam.solvers import MotionPrior, Solution, match_rows
+from loam_gtsam.types import BoolArray, FloatArray
 
 SCENES = ("street_loop", "room", "corridor", "trees")
 METRES = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
@@ -49,7 +50,7 @@ ALONG = 0.3
 """Metres: error of the guess along the bare corridor."""
 SHIFT = 0.5
 """Metres: how far the moving object has moved since it was mapped."""
-HUBER, CAUCHY = 1.345, 2.385
+CAUCHY = 2.385
 """In standard deviations: 95 % efficiency for normal residuals (Holland and Welsch, 1977)."""
 SHORT_RANGE = 25.0
 """Metres seen in the bare corridor, ..."""
@@ -63,50 +64,57 @@ class Variant:
 
     Attributes
     ----------
-    kernel : robust weight per match, renewed at each association: "", "huber", "cauchy", or
-        "scaled cauchy", whose unit is the spread of the residuals where that exceeds their sigmas
-    prior : a prior on the guess, as a motion model would give it (0.05 m, 0.5 degrees)
+    kernel : robust weight per match beside the solver's, renewed at each association: "",
+        "cauchy", or "scaled cauchy", whose unit is the spread of the residuals where that exceeds
+        their sigmas
     """
 
     name: str
     config: Config
     kernel: str = ""
-    prior: bool = False
 
 
-BEFORE = replace(
-    Config(),
-    solver=replace(Config().solver, kernel_width=math.inf),
-    matching=replace(Config().matching, plane_ratio=0.1),
-)
-"""The default as it was before this study changed it."""
+def _changed(name: str, kernel: str = "", **sections: Mapping[str, Any]) -> Variant:
+    """The default with some values of its sections replaced."""
+    config = Config()
+    for section, values in sections.items():
+        config = replace(config, **{section: replace(getattr(config, section), **values)})
+    return Variant(name, config, kernel)
 
 
-def _default(name: str, section: str, **changes: object) -> Variant:
-    config = BEFORE
-    return Variant(name, replace(config, **{section: replace(getattr(config, section), **changes)}))
-
+NO_KERNEL = {"kernel_width": math.inf}
+ALL_MATCHES = {"max_edges": 0, "max_planes": 0, "rough_planes": 0}
 
 MAIN = (
-    Variant("default", BEFORE),
+    Variant("default", Config()),
     Variant("loam", preset("loam")),
     Variant("aloam", preset("aloam")),
 )
 CHANGES = (
-    _default("inner 1", "solver", inner_iterations=1),
-    _default("inner 4", "solver", inner_iterations=4),
-    _default("outer 30", "solver", iterations=30),
-    _default("no s weight", "matching", weight_slope=0.0),
-    _default("one sigma", "matching", fit_uncertainty=False),
-    _default("reach 2 m", "matching", max_distance=2.0),
-    _default("centroid map", "map", insertion="centroid"),
-    Variant("huber", BEFORE, kernel="huber"),
-    Variant("cauchy", BEFORE, kernel="cauchy"),
-    Variant("scaled cauchy", BEFORE, kernel="scaled cauchy"),
+    # As it was before this study was first made.
+    _changed(
+        "first default",
+        features={"range_noise": 0.0},
+        matching={**ALL_MATCHES, "plane_ratio": 0.1},
+        solver={**NO_KERNEL, "degeneracy": "off"},
+    ),
+    _changed("no kernel", solver=NO_KERNEL),
+    _changed("cauchy", "cauchy", solver=NO_KERNEL),
+    _changed("scaled cauchy", "scaled cauchy", solver=NO_KERNEL),
+    _changed("all matches", matching=ALL_MATCHES),
+    _changed("no rough solve", matching={"rough_planes": 0}),
+    _changed("all planes", features={"range_noise": 0.0}),
+    _changed("inner 1", solver={"inner_iterations": 1}),
+    _changed("outer 30", solver={"iterations": 30}),
+    _changed("no s weight", matching={"weight_slope": 0.0}),
+    _changed("one sigma", matching={"fit_uncertainty": False}),
+    _changed("reach 2 m", matching={"max_distance": 2.0}),
+    _changed("centroid map", map={"insertion": "centroid"}),
 )
 CORRIDOR = (
     MAIN[0],
-    Variant("default + prior", BEFORE, prior=True),
+    _changed("default, projected", solver={"degeneracy": "project"}),
+    _changed("default, scan believed", solver={"degeneracy": "off"}),
     MAIN[1],
     Variant(
         "loam, no projector",
@@ -122,9 +130,15 @@ CORRIDOR = (
 )
 
 
-ROBUST = next(variant for variant in CHANGES if variant.name == "cauchy")
+FIRST = CHANGES[0]
 """The change that is drawn beside the main ones."""
-COLOURS = {"default": "#2b7a9b", "loam": "#e4572e", "aloam": "#7a5195", "cauchy": "#3a9d5d"}
+COLOURS = {
+    "default": "#2b7a9b",
+    "loam": "#e4572e",
+    "aloam": "#7a5195",
+    "first default": "#3a9d5d",
+    "default, scan believed": "#8fc1d4",
+}
 LABELS = {
     "metres": "error of the guess, m",
     "degrees": "error of the guess, degrees",
@@ -189,69 +203,88 @@ class Measured:
 Result = Trial | Measured
 
 
-class Sweep:
-    """Features of a sweep, de-skewed to its middle with the exact motion."""
+@dataclass(frozen=True, slots=True)
+class Cloud:
+    """Features of a sweep: (E, 3) and (P, 3) metres, lidar frame; (E,) which edges are distinct."""
 
-    def __init__(self, world: SimulatedWorld, number: int) -> None:
-        config = Config()
-        features = extract_features(world.sweep(number), config)
-        half = 0.5 * features.span[1]
-        stamps = features.stamp + np.round(np.array([0.0, half, 2.0 * half]) * 1e9).astype(np.int64)
+    edges: FloatArray
+    planes: FloatArray
+    distinct: BoolArray
+
+    def changed(self, change: Callable[[FloatArray], FloatArray]) -> Cloud:
+        """The same rows, elsewhere."""
+        return Cloud(change(self.edges), change(self.planes), self.distinct)
+
+
+class Sweep:
+    """A sweep as each variant sees it, de-skewed to its middle with the exact motion.
+
+    Attributes
+    ----------
+    truth : pose at the middle
+    clouds : by the way to extract features
+    """
+
+    def __init__(self, world: SimulatedWorld, number: int, kinds: Iterable[FeatureConfig]) -> None:
+        self.clouds: dict[FeatureConfig, Cloud] = {}
+        scan = world.sweep(number)
+        assert scan.span is not None
+        half = 0.5 * scan.span[1]
+        stamps = scan.stamp + np.round(np.array([0.0, half, 2.0 * half]) * 1e9).astype(np.int64)
         start, self.truth, end = map(gtsam.Pose3, world.truth_at(stamps).map_T_lidar)
         twist = gtsam.Pose3.Logmap(start.between(end)) / (2.0 * half)
-        self.edges, self.planes = (
-            move_points(kept[:, :3], twist, kept[:, 3] - half)
-            for kept in (
-                voxel_filter(np.column_stack([points, times]), size)
-                for points, times, size in (
-                    (features.edges, features.edge_times, config.map.edge_voxel),
-                    (features.planes, features.plane_times, config.map.plane_voxel),
-                )
-            )
-        )
+        for kind in kinds:
+            config = replace(Config(), features=kind)
+            moving = MovingSweep(extract_features(scan, config), config)
+            moving.deskew(twist)
+            self.clouds[kind] = Cloud(moving.edges, moving.planes, moving.distinct)
 
 
 class Place:
-    """Maps of one scene, one for each way to keep a map."""
+    """Maps of one scene, one for each way to extract features and to keep a map."""
 
     def __init__(self, world: SimulatedWorld, variants: Iterable[Variant]) -> None:
         self.along = np.asarray(world.world_T_start)[0, :3]
-        self.maps: dict[MapConfig, tuple[CubeMap, CubeMap]] = {}
-        for config in (variant.config.map for variant in variants):
-            self.maps[config] = (
-                CubeMap(config, config.edge_voxel),
-                CubeMap(config, config.plane_voxel),
+        self.maps: dict[tuple[FeatureConfig, MapConfig], tuple[CubeMap, CubeMap]] = {}
+        for config in (variant.config for variant in variants):
+            self.maps[config.features, config.map] = (
+                CubeMap(config.map, config.map.edge_voxel),
+                CubeMap(config.map, config.map.plane_voxel),
             )
 
     def insert(self, sweep: Sweep) -> None:
         """Add a sweep at its true pose."""
         pose = sweep.truth.matrix()
-        for maps in self.maps.values():
-            for cubes, points in zip(maps, (sweep.edges, sweep.planes), strict=True):
+        for (kind, _), maps in self.maps.items():
+            cloud = sweep.clouds[kind]
+            for cubes, points in zip(maps, (cloud.edges, cloud.planes), strict=True):
                 cubes.recenter(pose[:3, 3])
                 cubes.insert(transform(pose, points))
 
     def matches(
-        self, variant: Variant, edges: FloatArray, planes: FloatArray, pose: gtsam.Pose3
+        self, variant: Variant, cloud: Cloud, pose: gtsam.Pose3, *, few: bool = False
     ) -> ScanMatches:
-        """Matches of a variant at a pose, before its robust kernel."""
+        """Matches of a variant at a pose, before its robust kernel; few for the rough solve."""
         config = variant.config
-        return associate(edges, planes, pose, *self.maps[config.map], config.matching)
+        maps = self.maps[config.features, config.map]
+        matching = rough(config.matching) if few else config.matching
+        return associate(cloud.edges, cloud.planes, pose, *maps, matching, cloud.distinct)
 
-    def solve(
-        self, variant: Variant, edges: FloatArray, planes: FloatArray, guess: gtsam.Pose3
-    ) -> Solution:
+    def solve(self, variant: Variant, cloud: Cloud, guess: gtsam.Pose3) -> Solution:
         """One frame, as the mapper would do it but without a second de-skew."""
 
-        def matches_at(pose: gtsam.Pose3) -> ScanMatches:
-            return robust(self.matches(variant, edges, planes, pose), variant.kernel)
+        def matches_at(pose: gtsam.Pose3, few: bool) -> ScanMatches:
+            return robust(self.matches(variant, cloud, pose, few=few), variant.kernel)
 
-        priors = []
-        if variant.prior:
-            sigmas = np.repeat([np.radians(0.5), 0.05], 3)
-            noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-            priors.append(gtsam.PriorFactorPose3(POSE_KEY, guess, noise))
-        return make_solver(variant.config.solver).solve(matches_at, guess, priors)
+        config = variant.config.solver
+        solver, start = make_solver(config), guess
+        if 0 < variant.config.matching.rough_planes < len(cloud.planes):
+            first = solver.solve(partial(matches_at, few=True), guess)
+            start = first.map_T_lidar if first.solved else guess
+        # What constant velocity is believed to within after a tenth of a second.
+        away = 0.5 * 0.1**2 * np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
+        motion = MotionPrior(guess, np.diag(away**-2.0))
+        return solver.solve(partial(matches_at, few=False), start, (), motion)
 
 
 def robust(matches: ScanMatches, kernel: str) -> ScanMatches:
@@ -268,12 +301,7 @@ def robust(matches: ScanMatches, kernel: str) -> ScanMatches:
         unit = max(1.0, 1.4826 * float(np.median(np.concatenate(pulls))))
 
     def shrunk(weights: FloatArray, pull: FloatArray) -> FloatArray:
-        pull = pull / unit
-        if kernel == "huber":
-            factor = HUBER / np.maximum(pull, HUBER)
-        else:
-            factor = 1.0 / (1.0 + (pull / CAUCHY) ** 2)
-        shrunken: FloatArray = weights * np.sqrt(factor)
+        shrunken: FloatArray = weights / np.sqrt(1.0 + (pull / unit / CAUCHY) ** 2)
         return shrunken
 
     return ScanMatches(
@@ -327,9 +355,10 @@ def study_scene(scene: str, effort: Effort) -> list[Result]:
         max_range=SHORT_RANGE if bare else 100.0,
     )
     place = Place(world, variants)
+    kinds = list(dict.fromkeys(variant.config.features for variant in variants))
     results: list[Result] = []
     for number in range(first - effort.mapped, last + 1):
-        sweep = Sweep(world, number)
+        sweep = Sweep(world, number, kinds)
         if number >= first and (number - first) % effort.spacing == 0:
             seed = (sum(map(ord, scene)), number)
             if bare:
@@ -352,7 +381,7 @@ def basin(
     seed: tuple[int, int],
 ) -> Iterator[Trial]:
     """Solves from the truth and from errors of the guess."""
-    solve = partial(place.solve, variant, sweep.edges, sweep.planes)
+    solve = partial(place.solve, variant, sweep.clouds[variant.config.features])
     trial = partial(_trial, scene=scene, variant=variant, truth=sweep.truth, along=place.along)
     goal = solve(sweep.truth)
     yield trial("from truth", level=0.0, solution=goal, goal=goal)
@@ -378,7 +407,8 @@ def outliers(
 ) -> Iterator[Trial]:
     """Solves of a sweep with random points, or with a sector that has moved since."""
     trial = partial(_trial, scene=scene, variant=variant, truth=sweep.truth, along=place.along)
-    goal = place.solve(variant, sweep.edges, sweep.planes, sweep.truth)
+    cloud = sweep.clouds[variant.config.features]
+    goal = place.solve(variant, cloud, sweep.truth)
     for share in (SHARE,) if variant in CHANGES else SHARES:
         for start in range(effort.starts // 2):
             rng = np.random.default_rng([*seed, round(100 * share), start, 3])
@@ -392,31 +422,35 @@ def outliers(
                 ),
             }
             for study, change in changes.items():
-                found = place.solve(variant, change(sweep.edges), change(sweep.planes), guess)
+                found = place.solve(variant, cloud.changed(change), guess)
                 yield trial(study, level=share, solution=found, goal=goal)
 
 
 def costs(place: Place, sweep: Sweep, scene: str) -> Iterator[Measured]:
     """Each solution under each cost, all on the matches at the truth, per match."""
+    clouds = {variant.name: sweep.clouds[variant.config.features] for variant in MAIN}
     found = {
-        variant.name: place.solve(variant, sweep.edges, sweep.planes, sweep.truth).map_T_lidar
+        variant.name: place.solve(variant, clouds[variant.name], sweep.truth).map_T_lidar
         for variant in MAIN
     }
     for variant in MAIN:
-        matches = place.matches(variant, sweep.edges, sweep.planes, sweep.truth)
+        matches = place.matches(variant, clouds[variant.name], sweep.truth)
         for name, pose in found.items():
             value = cost(matches, pose, variant.name) / len(matches)
             yield Measured("cost", scene, name, f"under {variant.name}", value)
 
 
 def cost(matches: ScanMatches, pose: gtsam.Pose3, of: str) -> float:
-    """What a main variant minimises: whitened squares, metres squared, or Huber's in metres."""
+    """What a main variant minimises: whitened squares with the kernel's weights, metres squared,
+    or Huber's in metres.
+    """
     e, p = matches.edges, matches.planes
     if of != "default":
         matches = ScanMatches(
             replace(e, sigmas=np.ones(len(e))), replace(p, sigmas=np.ones(len(p)))
         )
-    residual, _ = match_rows(matches).residuals(pose)
+    width = Config().solver.kernel_width if of == "default" else math.inf
+    residual, _ = match_rows(matches, width).residuals(pose)
     squares = residual**2
     squares = np.concatenate([squares[: 2 * len(e)].reshape(-1, 2).sum(1), squares[2 * len(e) :]])
     if of == "aloam":
@@ -433,7 +467,7 @@ def bare_corridor(
     scene = "corridor_bare"
     for variant in CORRIDOR:
         trial = partial(_trial, scene=scene, variant=variant, truth=sweep.truth, along=place.along)
-        solve = partial(place.solve, variant, sweep.edges, sweep.planes)
+        solve = partial(place.solve, variant, sweep.clouds[variant.config.features])
         goal = solve(sweep.truth)
         yield trial("from truth", level=0.0, solution=goal, goal=goal)
         for number, value in enumerate(np.linalg.eigvalsh(goal.information)):
@@ -587,7 +621,7 @@ def draw(folder: Path, rows: Sequence[Row], numbers: Sequence[Measured]) -> None
 
 
 def _draw_basin(panel: Axes, rows: Sequence[Row], levels: Sequence[float]) -> None:
-    for offset, variant in enumerate((*MAIN, ROBUST)):
+    for offset, variant in enumerate((*MAIN, FIRST)):
         own = {row.level: row.success for row in rows if row.solver == variant.name}
         shares = [own.get(level, np.nan) for level in levels]
         # A little apart, or equal rates would hide each other.
@@ -597,7 +631,7 @@ def _draw_basin(panel: Axes, rows: Sequence[Row], levels: Sequence[float]) -> No
 
 
 def _draw_outliers(panel: Axes, rows: Sequence[Row], levels: Sequence[float]) -> None:
-    for variant in (*MAIN, ROBUST):
+    for variant in (*MAIN, FIRST):
         own = [row for row in rows if row.solver == variant.name]
         x = [100.0 * row.level for row in own]
         panel.semilogy(x, [row.median_m for row in own], "o-", ms=4, **_style(variant))
@@ -643,7 +677,7 @@ def _draw_corridor(folder: Path, rows: Sequence[Row], numbers: Sequence[Measured
     left.invert_yaxis()
     left.set(xscale="log", xlabel="median error, m")
     left.legend(frameon=False, ncols=3, loc="lower center", bbox_to_anchor=(0.4, 1.0))
-    for variant in MAIN:
+    for variant in (variant for variant in CORRIDOR if variant.name in COLOURS):
         values = [n.value for n in numbers if (n.study, n.solver) == ("eigenvalue", variant.name)]
         right.semilogy(range(1, 7), values, "o-", **_style(variant))
     right.axhline(100.0, color="0.6", ls="--", lw=1.0)

@@ -403,7 +403,7 @@ class SolverConfig(_Section):
         source="LOAM projects",
     )
     min_aligned: float = _param(
-        10.0,
+        8.0,
         "a direction is weak if fewer matches than this fix it, counted as if their normals "
         "pointed that way",
         low=0.0,
@@ -485,7 +485,7 @@ class ImuConfig(_Section):
         (0.0, 0.0, 0.0), "position of the IMU in the lidar frame (pre-integration)", unit="m"
     )
     filter_seconds: float = _param(
-        20.0,
+        60.0,
         "time constant of the gravity filter that stands in for a missing orientation",
         unit="s",
         low=0.1,

@@ -213,7 +213,8 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     (N, 6, 6); ``twists`` (N, 6) rad/s and m/s; ``n_edges``, ``n_planes``, ``n_edge_matches``,
     ``n_plane_matches``, ``iterations``, ``solver_iterations`` (N,) int64; ``error_before``,
     ``error_after`` (N,); ``stage_names`` (S,) strings and ``stage_seconds`` (N, S), NaN where a
-    stage did not run; ``sweep_motions`` and ``tilt_priors`` (N,) strings. See
+    stage did not run; ``sweep_motions`` and ``tilt_priors`` (N,) strings;
+    ``localizability`` (N, 6) and ``directions`` (N, 6, 6). See
     :class:`loam_gtsam.types.MapUpdate` for their meaning.
     """
     count = len(updates)
@@ -228,6 +229,8 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         "twists": _stack([u.twist for u in updates], (count, 6)),
         "sweep_motions": np.array([str(u.sweep_motion) for u in updates], np.str_),
         "tilt_priors": np.array([str(u.tilt_prior) for u in updates], np.str_),
+        "localizability": _stack([u.localizability for u in updates], (count, 6)),
+        "directions": _stack([u.directions for u in updates], (count, 6, 6)),
         "stage_names": np.array(names, np.str_),
         "stage_seconds": seconds,
     }

@@ -42,29 +42,31 @@ def move_points(
 
     Notes
     -----
-    The rotation axis k is the same for all points, so Rodrigues' formula and the SE(3)
-    left Jacobian need one sine and cosine per point and no matrices:
-    ``p' = p + sin(a) k x p + (1 - cos(a)) k x (k x p) + V v t`` with ``a = |w| t``
-    (Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation, eq. 2.14 and 2.36).
+    The screw axis is the same for all points: along k, the direction of w, and through
+    ``c = k x v / |w|``. With ``a = |w| t`` Rodrigues' formula about it needs one sine and cosine
+    per point and no matrices: ``p' = p + sin(a) k x (p - c) + (1 - cos(a)) k x (k x (p - c)) +
+    t (k . v) k`` (Murray, Li, Sastry, A Mathematical Introduction to Robotic Manipulation, eq. 2.14
+    and 2.36). Slow rotations put c far away, but what cancels there is scaled by as small a sine.
     """
-    points = np.asarray(points, dtype=np.float64)
+    # Component arrays, as for the fits below.
+    moved = np.array(points.T, dtype=np.float64, order="C")
+    times = np.asarray(times, dtype=np.float64)
     omega, velocity = twist[:3], twist[3:]
-    shift: FloatArray = np.outer(times, velocity).astype(np.float64, copy=False)
     rate = float(np.linalg.norm(omega))
     if rate < _SMALL_ANGLE:
-        shift += points
-        return shift
-    axis = omega / rate
-    angle = rate * np.asarray(times, dtype=np.float64)
-    # 1 - cos a, written so that a slow rotation does not cancel in it and then blow up over |w|.
-    sine, versine = np.sin(angle)[:, None], 2.0 * np.sin(0.5 * angle)[:, None] ** 2
-    cross = np.cross(axis, points)
-    moved: FloatArray = points + sine * cross + versine * np.cross(axis, cross)
-    # V(a k) v t = t v + (1 - cos a)/|w| k x v + (t - sin(a)/|w|) k x (k x v)
-    axis_v = np.cross(axis, velocity)
-    moved += shift + versine / rate * axis_v
-    moved += (angle[:, None] - sine) / rate * np.cross(axis, axis_v)
-    return moved
+        moved += velocity[:, None] * times
+        return np.ascontiguousarray(moved.T)
+    axis, angle = omega / rate, rate * times
+    cross = np.cross(axis, np.eye(3)).T  # the matrix of k x
+    around = cross @ moved - (cross @ cross @ velocity / rate)[:, None]
+    inward = cross @ around
+    around *= np.sin(angle)
+    # 1 - cos a, written so that it does not cancel.
+    inward *= 2.0 * np.sin(0.5 * angle) ** 2
+    moved += around
+    moved += inward
+    moved += ((axis @ velocity) * axis)[:, None] * times
+    return np.ascontiguousarray(moved.T)
 
 
 # Fits work on component arrays, points last: one pass over contiguous memory per operation, several

@@ -262,7 +262,7 @@ class Mapper:
         if self._first is None and 0 < matching.rough_planes < len(sweep.planes):
             # Few matches get as near as many do; all of them are then searched for but once.
             matching = rough(matching)
-            first = self.solver.solve(matches_at, middle, priors, motion)
+            first = self.solver.solve(matches_at, middle, priors)
             matching, found = self.config.matching, None
             rough_iterations = first.iterations
             start = first.map_T_lidar

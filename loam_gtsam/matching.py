@@ -6,7 +6,7 @@ The matches are immutable arrays, so that the same ones can be given to differen
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
@@ -31,6 +31,9 @@ class EdgeMatches:
     sigmas : (M,) standard deviation of the distance, metres
     weights : (M,) LOAM's s, in (min_weight, 1]
     indices : (M,) which features these are
+    tilts : (M,) standard deviation of the direction, rad; None: exact
+    distinct : (M,) whether the feature stands out of its ring by more than noise makes it; None:
+        all do
     """
 
     points: FloatArray
@@ -40,6 +43,8 @@ class EdgeMatches:
     sigmas: FloatArray
     weights: FloatArray
     indices: IntArray
+    tilts: FloatArray | None = None
+    distinct: BoolArray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -57,6 +62,7 @@ class PlaneMatches:
     sigmas : (M,) standard deviation of the distance, metres
     weights : (M,) LOAM's s, in (min_weight, 1]
     indices : (M,) which features these are
+    tilts : (M,) standard deviation of the normal in its worst direction, rad; None: exact
     """
 
     points: FloatArray
@@ -66,6 +72,7 @@ class PlaneMatches:
     sigmas: FloatArray
     weights: FloatArray
     indices: IntArray
+    tilts: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.points)
@@ -89,23 +96,52 @@ def associate(
     edge_map: CubeMap,
     plane_map: CubeMap,
     config: MatchingConfig,
+    distinct: BoolArray | None = None,
 ) -> ScanMatches:
     """Match de-skewed features with the cubes around a pose.
+
+    Of more than ``max_edges`` and ``max_planes`` features so many are matched, evenly spread over
+    the rows. Features come sorted by voxel, so this spreads them over the sweep.
 
     Parameters
     ----------
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
     map_T_lidar : pose at which to associate
     edge_map, plane_map : the maps
+    distinct : (E,) see :class:`EdgeMatches`; all are if None
     """
     pose = map_T_lidar.matrix()
+    edge_rows, plane_rows = _spread(edges, config.max_edges), _spread(planes, config.max_planes)
+    edges, planes = edges.take(edge_rows, axis=0), planes.take(plane_rows, axis=0)
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
     k, limit = config.neighbours, config.max_distance
     near_edges = edge_map.nearest(edges_map, k, limit, edge_map.neighbourhood(pose))
     near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
+    lines = match_lines(edges, edges_map, *near_edges, pose, config)
+    surfaces = match_planes(planes, planes_map, *near_planes, pose, config)
+    chosen = edge_rows[lines.indices]
     return ScanMatches(
-        match_lines(edges, edges_map, *near_edges, pose, config),
-        match_planes(planes, planes_map, *near_planes, pose, config),
+        replace(lines, indices=chosen, distinct=None if distinct is None else distinct[chosen]),
+        replace(surfaces, indices=plane_rows[surfaces.indices]),
+    )
+
+
+def _spread(features: FloatArray, limit: int) -> IntArray:
+    """Which rows to match: all, or ``limit`` of them at even distances."""
+    count = len(features)
+    return np.arange(limit) * count // limit if 0 < limit < count else np.arange(count)
+
+
+def rough(config: MatchingConfig) -> MatchingConfig:
+    """The configuration for the solve with few matches that comes first."""
+
+    def at_most(limit: int, most: int) -> int:
+        return min(limit, most) if most else limit
+
+    return replace(
+        config,
+        max_edges=at_most(config.rough_edges, config.max_edges),
+        max_planes=at_most(config.rough_planes, config.max_planes),
     )
 
 
@@ -133,7 +169,11 @@ _Matches = TypeVar("_Matches", EdgeMatches, PlaneMatches)
 
 
 def _subset(matches: _Matches, keep: BoolArray) -> _Matches:
-    return type(matches)(*(getattr(matches, item.name)[keep] for item in fields(matches)))
+    columns = {item.name: getattr(matches, item.name) for item in fields(matches)}
+    chosen: dict[str, Any] = {
+        name: None if column is None else column[keep] for name, column in columns.items()
+    }
+    return type(matches)(**chosen)
 
 
 def _line_weights(distances: FloatArray, config: MatchingConfig) -> FloatArray:
@@ -181,7 +221,9 @@ def match_lines(
     keep = is_line & (weights > config.min_weight)
     # A line in space has four parameters, two for each of the directions across it.
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
-    sigmas = _sigmas(eigenvalues[1], leverage, 2, neighbours.shape[1], config)
+    scatter, k = _scatter(eigenvalues[1], 2, neighbours.shape[1], config), neighbours.shape[1]
+    sigmas = _sigmas(scatter, leverage, k, config)
+    tilts = np.sqrt(scatter / (k * np.maximum(eigenvalues[2], _TINY)))
     indices = near[keep]
     return EdgeMatches(
         points[indices],
@@ -191,6 +233,7 @@ def match_lines(
         sigmas[keep],
         weights[keep],
         indices,
+        tilts[keep],
     )
 
 
@@ -238,7 +281,9 @@ def match_planes(
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
-    sigmas = _sigmas(eigenvalues[0], leverage, 3, neighbours.shape[1], config)
+    scatter, k = _scatter(eigenvalues[0], 3, neighbours.shape[1], config), neighbours.shape[1]
+    sigmas = _sigmas(scatter, leverage, k, config)
+    tilts = np.sqrt(scatter / (k * np.maximum(eigenvalues[1], _TINY)))
     indices = near[keep]
     return PlaneMatches(
         points[indices],
@@ -248,6 +293,7 @@ def match_planes(
         sigmas[keep],
         weights[keep],
         indices,
+        tilts[keep],
     )
 
 
@@ -301,31 +347,40 @@ def _cross(vector: FloatArray, others: FloatArray) -> FloatArray:
     return product
 
 
+def _scatter(
+    roughness: FloatArray, parameters: int, neighbours: int, config: MatchingConfig
+) -> FloatArray:
+    """(M,) variance of a map point across its line or plane, m^2, at least that of a point.
+
+    Parameters
+    ----------
+    roughness : (M,) mean squared distance of the neighbours across the line or plane, m^2
+    parameters : of the fit, per direction across it
+    """
+    least = config.point_sigma**2
+    if not config.fit_uncertainty:
+        return np.full(len(roughness), least)
+    freedom = max(neighbours - parameters, 1)
+    return np.maximum(roughness * neighbours / freedom, least)
+
+
 def _sigmas(
-    roughness: FloatArray,
-    leverage: FloatArray,
-    parameters: int,
-    neighbours: int,
-    config: MatchingConfig,
+    scatter: FloatArray, leverage: FloatArray, neighbours: int, config: MatchingConfig
 ) -> FloatArray:
     """Standard deviation of the distance of a new point from a fitted line or plane.
 
     The variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)`` (Draper and Smith,
     Applied Regression Analysis, 3rd ed., section 3.1): large where the neighbours span a direction
     badly and the point lies off to that side, as across the rings of a sparse sensor, and where
-    they scatter. s^2 is the residual variance of the k neighbours with its degrees of freedom, and
-    at least that of a point.
+    they scatter.
 
     Parameters
     ----------
-    roughness : (M,) mean squared distance of the neighbours across the line or plane, m^2
+    scatter : (M,) s^2, see :func:`_scatter`
     leverage : (M,) squared distance from the centre in units of the neighbours' own variances
-    parameters : of the fit, per direction across it
     """
-    variance = np.full(len(roughness), config.point_sigma**2)
+    variance = scatter
     if config.fit_uncertainty:
-        freedom = max(neighbours - parameters, 1)
-        scatter = np.maximum(roughness * neighbours / freedom, variance)
         variance = scatter * (1.0 + (1.0 + leverage) / neighbours)
     sigmas: FloatArray = np.sqrt(variance)
     return sigmas

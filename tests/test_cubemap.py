@@ -142,8 +142,8 @@ def test_border_query_finds_the_eight_cubes_that_meet() -> None:
     np.testing.assert_allclose(squared[0, :8], 3 * 0.3**2)
     assert np.isinf(squared[0, 8])
     assert np.isnan(points[0, 8]).all()
-    # Equal distances: cubes in ascending order.
-    np.testing.assert_allclose(points[0, :8], corner + 0.3 * signs, atol=1e-12)
+    ascending = points[0, np.lexsort(points[0, :8].T[::-1])]
+    np.testing.assert_allclose(ascending, corner + 0.3 * signs, atol=1e-12)
     again = cube_map.nearest(corner[None], 9, 1.0, cubes[::-1] + cubes)
     np.testing.assert_array_equal(again[0], points)
     np.testing.assert_array_equal(again[1], squared)
@@ -412,12 +412,12 @@ def test_settled_trees_are_kept_until_many_points_are_new_and_stay_exact() -> No
     cube_map.insert(rng.uniform(-8.0, 8.0, (3000, 3)))
     queries = rng.uniform(-8.0, 8.0, (300, 3))
     trees = []
-    for _ in range(15):
+    for _ in range(25):
         got = cube_map.nearest(queries, 5, 1.5, [(0, 0, 0)])
         want = brute_force(cube_map.points(), queries, 5, 1.5)
         np.testing.assert_array_equal(got[0], want[0])
         np.testing.assert_allclose(got[1], want[1], rtol=1e-12)
-        trees.append(cube_map._cubes[0, 0, 0]._tree)
+        trees.append(cube_map._searches[0]._tree)
         cube_map.insert(rng.uniform(-8.0, 8.0, (30, 3)))  # 1 % of the tree
     assert [a is b for a, b in pairwise(trees)].count(False) == 2
 
@@ -426,24 +426,69 @@ def test_settled_keeps_everything_of_an_unchanged_cube() -> None:
     cube_map = CubeMap(small(insertion="settled"), 0.5)
     points = np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]])
     cube_map.insert(points)
-    cube_map.nearest(points, 1, 9.0, [(0, 0, 0), (1, 0, 0)])
-    before = {index: (cube._tree, cube.points) for index, cube in cube_map._cubes.items()}
+    cubes = [(0, 0, 0), (1, 0, 0)]
+    cube_map.nearest(points, 1, 9.0, cubes)
+    before = {index: cube.points for index, cube in cube_map._cubes.items()}
+    (search,) = cube_map._searches
     cube_map.insert(points + 0.1)
-    for index, cube in cube_map._cubes.items():
-        assert cube._tree is before[index][0]
-        assert cube.points is before[index][1]
+    cube_map.nearest(points, 1, 9.0, cubes)
+    assert all(cube.points is before[index] for index, cube in cube_map._cubes.items())
+    assert cube_map._searches == [search]
+    assert search._recent == []
 
 
 def test_centroid_drops_only_the_trees_it_changed() -> None:
     cube_map = CubeMap(small(insertion="centroid"), 0.5)
     cube_map.insert(np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]]))
-    cubes = cube_map.neighbourhood(np.eye(4))
-    cube_map.nearest(np.zeros((1, 3)), 1, 9.0, cubes)
-    kept = cube_map._cubes[1, 0, 0]._tree
+    for index in ((0, 0, 0), (1, 0, 0)):
+        cube_map.nearest(np.zeros((1, 3)), 1, 9.0, [index])
+    kept = cube_map._searches[1]
     cube_map.insert(np.array([[0.3, 0.1, 0.1]]))
-    assert cube_map._cubes[0, 0, 0]._tree is None
-    assert cube_map._cubes[1, 0, 0]._tree is kept
+    assert cube_map._searches == [kept]
+    cubes = cube_map.neighbourhood(np.eye(4))
     assert cube_map.nearest(np.array([[0.2, 0.1, 0.1]]), 1, 0.5, cubes)[1] < 1e-30
+
+
+@pytest.mark.parametrize("insertion", ["centroid", "settled"])
+def test_searches_of_changing_cubes_see_all_of_theirs_and_nothing_else(insertion: str) -> None:
+    """Cubes that come and go between searches, as the sensor walks along their border."""
+    rng = np.random.default_rng(8)
+    cube_map = CubeMap(small(insertion=insertion), 0.3)
+    cubes = list(product((-1, 0, 1), repeat=2))
+    built = 0
+    for step in range(60):
+        centre = 2.0 * np.sin([0.3 * step, 0.11 * step, 0.0])
+        cube_map.insert(centre + rng.normal(0.0, 1.5, (40, 3)))
+        here = [(x, y, 0) for x, y in cubes if (x + y + step // 3) % 3]
+        queries = rng.uniform(-5.0, 5.0, (30, 3))
+        earlier = cube_map._searches.copy()
+        got = cube_map.nearest(queries, 3, 2.0, here)
+        built += cube_map._searches[-1] not in earlier
+        want = brute_force(cube_map.points(here), queries, 3, 2.0)
+        np.testing.assert_array_equal(got[0], want[0])
+        assert len(cube_map._searches) <= 2
+    assert built < 60 if insertion == "settled" else built == 60
+
+
+def test_a_sensor_on_a_border_needs_no_new_trees() -> None:
+    cube_map = CubeMap(SMALL, 0.5)
+    cube_map.insert(np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1], [-3.9, 0.1, 0.1]]))
+    sides = [[(0, 0, 0), (1, 0, 0)], [(0, 0, 0), (-1, 0, 0)]]
+    for side in sides:
+        cube_map.nearest(np.zeros((1, 3)), 1, 9.0, side)
+    kept = set(cube_map._searches)
+    for side in [*sides, *sides]:
+        cube_map.nearest(np.zeros((1, 3)), 1, 9.0, side)
+        assert set(cube_map._searches) == kept
+
+
+def test_a_cube_that_was_archived_is_not_searched_from_memory() -> None:
+    cube_map = CubeMap(SMALL, 0.5)
+    cube_map.insert(np.array([[0.1, 0.1, 0.1]]))
+    cube_map.nearest(np.zeros((1, 3)), 1, 9.0, [(0, 0, 0)])
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    assert cube_map._searches == []
+    assert np.isinf(cube_map.nearest(np.zeros((1, 3)), 1, 9.0, [(0, 0, 0)])[1])
 
 
 def test_points_outside_are_counted() -> None:

@@ -18,6 +18,7 @@ if str(ROOT) not in sys.path:  # the benchmarks are not installed with the packa
 
 pytest.importorskip("matplotlib")
 from benchmarks import study  # noqa: E402
+from loam_gtsam.config import Config  # noqa: E402
 from loam_gtsam.matching import EdgeMatches, PlaneMatches, ScanMatches  # noqa: E402
 
 TINY = study.Effort(first=4, targets=1, starts=2, columns=600, mapped=3)
@@ -26,7 +27,7 @@ TINY = study.Effort(first=4, targets=1, starts=2, columns=600, mapped=3)
 @pytest.fixture(scope="module", autouse=True)
 def few_levels() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(study, "CHANGES", (study.ROBUST,))
+        patch.setattr(study, "CHANGES", (study.FIRST,))
         patch.setattr(study, "METRES", (0.05, 2.0))
         patch.setattr(study, "DEGREES", (1.0,))
         patch.setattr(study, "SHARES", (0.0, study.SHARE))
@@ -76,15 +77,21 @@ def test_no_change_of_the_frame_lowers_a_cost_below_that_of_its_minimum(name: st
 def test_kernels_shrink_only_what_is_far() -> None:
     near_and_far = matches([0.0, 0.1, 1.0])
     assert study.robust(near_and_far, "") is near_and_far
-    huber = study.robust(near_and_far, "huber").planes.weights
-    assert huber[:2] == pytest.approx([1.0, 1.0])
-    assert huber[2] ** 2 == pytest.approx(study.HUBER / 10.0)
     cauchy = study.robust(near_and_far, "cauchy").planes.weights
+    assert cauchy[0] == 1.0
     assert cauchy[2] ** 2 == pytest.approx(1.0 / (1.0 + (10.0 / study.CAUCHY) ** 2))
     # Where all residuals are large, the unit grows with them.
     far = matches([1.0, 1.0, -1.0])
     scaled = study.robust(far, "scaled cauchy").planes.weights
     assert np.all(scaled > 2.0 * study.robust(far, "cauchy").planes.weights)
+
+
+def test_a_change_is_the_default_but_for_what_it_names() -> None:
+    changed = study._changed("x", solver={"iterations": 30}).config
+    assert changed == replace(Config(), solver=replace(Config().solver, iterations=30))
+    names = [variant.name for variant in (*study.MAIN, *study.CHANGES, *study.CORRIDOR)]
+    assert study.MAIN[0].config == Config()
+    assert len(set(names)) == len(names) - 3  # the main ones are in the corridor too
 
 
 def test_outliers_are_as_many_as_asked() -> None:
@@ -109,12 +116,14 @@ def test_disturbed_by_what_is_asked() -> None:
     assert np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(off.rotation()))) == pytest.approx(2.0)
 
 
-def test_only_the_projector_keeps_the_wrong_way_along() -> None:
+def test_what_keeps_the_wrong_way_along() -> None:
     effort = replace(TINY, mapped=4)
     trials = study.summary(study.study_scene("corridor_bare", effort))
     along = {row.solver: row.along_m for row in trials if row.study == "wrong along"}
-    assert along["loam"] == pytest.approx(study.ALONG, abs=0.02)
-    assert abs(along["loam, no projector"] - study.ALONG) > 0.02
+    for name in ("default", "default, projected", "loam"):
+        assert along[name] == pytest.approx(study.ALONG, abs=0.02), name
+    for name in ("loam, no projector", "default, scan believed"):
+        assert abs(along[name] - study.ALONG) > 0.02, name
 
 
 def test_command_writes_the_same_numbers_on_every_run(

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.classical import ALoamSolver, ClassicalSolver
-from loam_gtsam.config import Config, SolverConfig
+from loam_gtsam.config import Config, MatchingConfig, SolverConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.deskew import MovingSweep
 from loam_gtsam.geometry import transform
@@ -224,46 +224,14 @@ class Mapper:
             )
             return self._insert(sweep, guess, FrameStatus.SPARSE_MAP, message, clock)
 
-        associations = 0
-        matching = self.config.matching
-        found: tuple[CubeMap, gtsam.Pose3, ScanMatches] | None = None
-
-        def matches_at(map_T_lidar: gtsam.Pose3) -> ScanMatches:
-            nonlocal associations, found
-            clock.lap("solve")
-            associations += 1
-            if associations == 2 and self._first is None and self.config.deskew.refine:
-                # The first solve knows the motion better than the guess. Once is enough: further
-                # rounds cost associations and change nothing that can be measured.
-                sweep.deskew(self._twist(sweep, map_T_lidar, guess.twist))
-                found = None
-            if (
-                found is not None
-                and found[0] is self.plane_map
-                and self._near(found[1], map_T_lidar)
-            ):
-                matches = renew(found[2], map_T_lidar, matching)
-            else:
-                matches = associate(
-                    sweep.edges,
-                    sweep.planes,
-                    map_T_lidar,
-                    self.edge_map,
-                    self.plane_map,
-                    matching,
-                    sweep.distinct,
-                )
-                found = self.plane_map, map_T_lidar, matches
-            clock.lap("match")
-            return matches
-
+        matches_at = _Association(self, sweep, guess, clock)
         priors = [*priors, *self._factors(sweep.stamp, middle)]
         start, rough_iterations = middle, 0
-        if self._first is None and 0 < matching.rough_planes < len(sweep.planes):
+        if self._first is None and 0 < self.config.matching.rough_planes < len(sweep.planes):
             # Few matches get as near as many do; all of them are then searched for but once.
-            matching = rough(matching)
+            matches_at.use(rough(self.config.matching))
             first = self.solver.solve(matches_at, middle, priors)
-            matching, found = self.config.matching, None
+            matches_at.use(self.config.matching)
             rough_iterations = first.iterations
             start = first.map_T_lidar
         solution = self.solver.solve(matches_at, start, priors, motion)
@@ -329,15 +297,6 @@ class Mapper:
             aid.find_level(sweep.reference_stamp, pose)  # for the frames to come
         return solution, Guess(pose, twist), tilt
 
-    def _near(self, searched: gtsam.Pose3, map_T_lidar: gtsam.Pose3) -> bool:
-        """Whether matches found at one pose may be kept at another."""
-        moved = searched.localCoordinates(map_T_lidar)
-        config = self.config.matching
-        return bool(
-            np.degrees(np.linalg.norm(moved[:3])) < config.keep_rotation_deg
-            and np.linalg.norm(moved[3:]) < config.keep_translation
-        )
-
     def _twist(self, sweep: MovingSweep, middle: gtsam.Pose3, otherwise: FloatArray) -> FloatArray:
         """Body velocity from the middle of the last sweep to that of this one."""
         last = self._last_middle
@@ -397,6 +356,56 @@ class Mapper:
         self.edge_map.insert(transform(middle.matrix(), sweep.edges))
         self.plane_map.insert(transform(middle.matrix(), sweep.planes))
         self._last_middle = sweep.stamp, middle
+
+
+class _Association:
+    """The matches of a sweep at a pose, as a solver asks for them."""
+
+    def __init__(self, mapper: Mapper, sweep: MovingSweep, guess: Guess, clock: _Clock) -> None:
+        self._mapper, self._sweep, self._guess, self._clock = mapper, sweep, guess, clock
+        self._calls = 0
+        self.use(mapper.config.matching)
+
+    def use(self, matching: MatchingConfig) -> None:
+        """Go on with another configuration, and without the matches found so far."""
+        self._matching = matching
+        self._found: tuple[CubeMap, gtsam.Pose3, ScanMatches] | None = None
+
+    def __call__(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:
+        mapper, sweep = self._mapper, self._sweep
+        self._clock.lap("solve")
+        self._calls += 1
+        if self._calls == 2 and mapper._first is None and mapper.config.deskew.refine:
+            # The first solve knows the motion better than the guess. Once is enough: further
+            # rounds cost associations and change nothing that can be measured.
+            sweep.deskew(mapper._twist(sweep, map_T_lidar, self._guess.twist))
+            self._found = None
+        matches = self._kept(map_T_lidar)
+        if matches is None:
+            matches = associate(
+                sweep.edges,
+                sweep.planes,
+                map_T_lidar,
+                mapper.edge_map,
+                mapper.plane_map,
+                self._matching,
+                sweep.distinct,
+            )
+            self._found = mapper.plane_map, map_T_lidar, matches
+        self._clock.lap("match")
+        return matches
+
+    def _kept(self, map_T_lidar: gtsam.Pose3) -> ScanMatches | None:
+        """The matches found before, if the map is the same and the pose has hardly moved."""
+        if self._found is None or self._found[0] is not self._mapper.plane_map:
+            return None
+        _, searched, matches = self._found
+        moved = searched.localCoordinates(map_T_lidar)
+        turned, shifted = np.degrees(np.linalg.norm(moved[:3])), np.linalg.norm(moved[3:])
+        config = self._matching
+        if turned < config.keep_rotation_deg and shifted < config.keep_translation:
+            return renew(matches, map_T_lidar, config)
+        return None
 
 
 def make_solver(config: SolverConfig) -> ScanSolver:

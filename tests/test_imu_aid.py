@@ -465,3 +465,66 @@ def test_frames_that_cannot_be_compared_teach_nothing():
 def test_factors_are_on_the_pose_of_the_frame():
     (factor,) = aid_for(rot(1, 0, 0), prior="sigma").factors(NOW)
     assert list(factor.keys()) == [POSE_KEY]
+
+
+# -- pre-integration -------------------------------------------------------------------------------
+
+
+def accelerating(acceleration, seconds=2.0):
+    """A level lidar that starts at NOW with 1 m/s and gathers speed along x."""
+    stamps = NOW - 200_000_000 + 5_000_000 * np.arange(round(200 * seconds))
+    count = len(stamps)
+    level, still = np.tile([0.0, 0, 0, 1], (count, 1)), np.zeros((count, 3))
+    return ImuSamples(stamps, level, still, np.tile([acceleration, 0.0, 9.81], (count, 1)))
+
+
+def at(frame, acceleration):
+    seconds = frame * FRAME * 1e-9
+    along = seconds + 0.5 * acceleration * seconds**2
+    return NOW + frame * FRAME, gtsam.Pose3(gtsam.Rot3(), np.array([along, 0.0, 0.0]))
+
+
+def observed(aid, frames, acceleration, information):
+    for last, now in pairwise(frames):
+        aid.predict(at(now, acceleration)[0])
+        aid.observe(at(last, acceleration), at(now, acceleration), information)
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_pre_integration_predicts_what_constant_velocity_cannot(on):
+    aid = aid_for(accelerating(2.0), preintegration=on)
+    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    stamp, truth = at(8, 2.0)
+    predicted = aid.predict(stamp)
+    if not on:
+        assert predicted is None
+        return
+    error = truth.localCoordinates(predicted.map_T_lidar)
+    assert np.abs(error).max() < 2e-3  # constant velocity is off by 20 mm
+    assert predicted.velocity[0] == pytest.approx(2.6, abs=0.02)
+
+
+def test_where_the_scan_says_nothing_the_prediction_runs_on_and_says_so():
+    aid = aid_for(accelerating(2.0), preintegration=True)
+    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    blind = np.diag([1e6, 1e6, 1e6, 0.0, 1e6, 1e6])
+    sigmas = []
+    for last, now in pairwise(range(7, 14)):
+        predicted = aid.predict(at(now, 2.0)[0])
+        sigmas.append(np.sqrt(predicted.covariance[3, 3]))
+        wrong = at(now, 2.0)[1].compose(gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0])))
+        aid.observe(at(last, 2.0), (at(now, 2.0)[0], wrong), blind)
+    predicted = aid.predict(at(14, 2.0)[0])
+    off = at(14, 2.0)[1].localCoordinates(predicted.map_T_lidar)[3]
+    assert abs(off) < min(0.05, 3.0 * np.sqrt(predicted.covariance[3, 3]))
+    assert np.all(np.diff(sigmas[1:]) > 0)
+
+
+def test_a_gap_in_the_imu_leaves_the_prediction_out_and_it_begins_anew():
+    samples = accelerating(2.0)
+    since = (samples.stamps - NOW) * 1e-9
+    aid = aid_for(part(samples, (since < 0.82) | (since > 1.15)), preintegration=True)
+    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    assert aid.predict(at(10, 2.0)[0]) is None
+    observed(aid, range(11, 15), 2.0, 1e6 * np.eye(6))
+    assert aid.predict(at(15, 2.0)[0]) is not None

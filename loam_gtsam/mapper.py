@@ -440,7 +440,7 @@ def _named(solution: Solution) -> str:
     assert solution.localizability is not None
     names = []
     for direction in solution.localizability.directions[: solution.n_weak]:
-        unit = direction / np.abs(direction).max()
+        unit = direction / direction[np.abs(direction).argmax()]  # its sign means nothing
         parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
         names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
     return " or ".join(names)

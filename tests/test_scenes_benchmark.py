@@ -17,7 +17,7 @@ if str(ROOT) not in sys.path:  # the benchmarks are not installed with the packa
 from benchmarks import scene_tables, scenes  # noqa: E402
 from benchmarks.scene_tables import Row, along, drift, tilt  # noqa: E402
 from loam_gtsam.config import preset  # noqa: E402
-from loam_gtsam.types import FloatArray  # noqa: E402
+from loam_gtsam.types import FloatArray, Trajectory  # noqa: E402
 
 TINY = scenes.Place("slopes", frames=5, columns=1200, aids=("none", "equivalent"))
 ABSENT = Path("no such folder")
@@ -162,6 +162,10 @@ def test_a_recorded_town_has_its_own_imu(tmp_path: Path) -> None:
         pytest.skip("needs the sim_town data, see benchmarks")
     town = scenes.record(scenes.Place(scenes.TOWN), scenes.data_folder())
     assert len(town.sweeps) == len(town.truth) == 60
-    assert [np.isnan(noise) for noise in town.imus] == [True]
-    row = scenes.Row(*["imu", "town", np.nan, "sigma", 1, 2.0], *[0.5] * 5, 0, 0, 0, 1.0)
+    assert list(town.imus) == [scene_tables.RECORDED]
+    start = Trajectory(town.truth.stamps[:4], town.truth.map_T_lidar[:4])
+    runs = scenes.Runs(
+        scenes.Place(scenes.TOWN), replace(town, sweeps=town.sweeps[:4], truth=start)
+    )
+    row = runs.run("imu", "sigma", scenes.AIDS["sigma"], scene_tables.RECORDED)
     assert any("| recorded |" in line for line in scene_tables.markdown("imu", [row]))

@@ -394,3 +394,11 @@ def test_a_scene_of_ones_own():
     floor = points[np.linalg.norm(points, axis=1) > 12.0]
     assert np.allclose(floor[:, 2], -2.0, atol=1e-4)
     assert len(floor) > 1000
+
+
+def test_whole_numbers_are_numbers() -> None:
+    whole, exact = (
+        SimulatedWorld("room", frames=1, columns=60, max_range=far, speed=speed, rate=rate)
+        for far, speed, rate in ((20, 1, 10), (20.0, 1.0, 10.0))
+    )
+    assert np.array_equal(whole[0].points, exact[0].points)

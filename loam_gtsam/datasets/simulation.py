@@ -132,7 +132,7 @@ class SimulatedWorld:
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
-        speed = self.scene.speed if speed is None else speed
+        speed = self.scene.speed if speed is None else float(speed)
         for label, value, least in (
             ("range_noise", range_noise, 0.0),
             ("foliage_noise", foliage_noise, 0.0),
@@ -147,7 +147,7 @@ class SimulatedWorld:
             _at_least(label, value, least)
         if not 0.0 <= dropout < 1.0:
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
-        self._seed, self._rate, self._max_range = seed, rate, max_range
+        self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
         self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
         self._imu_noise = imu_noise
         self._gyro = gyro_noise, gyro_bias

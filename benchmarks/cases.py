@@ -220,7 +220,9 @@ def run_case(case: Case, peers: bool = True) -> CaseResult:
     if case.missing:
         return CaseResult(case.name, case.note, problem="skipped: no data")
     dataset = open_case(case)
-    config = effective_config(Config(), dataset)
+    # The peers have no IMU; what one brings is in `python -m benchmarks.scenes`.
+    alone = replace(Config(), imu=replace(Config().imu, enabled=False))
+    config = effective_config(alone, dataset)
     rivals = [KissIcp(v) for v in case.kiss] if peers and load("kiss_icp") is not None else []
     tee = _Tee(dataset)
 

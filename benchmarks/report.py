@@ -24,9 +24,9 @@ _EXPLANATION = (
     "truth at the moment each system's pose belongs to: ours at the start of the sweep, KISS-ICP's "
     "at its last point (version 1.3 de-skews to there), without de-skew at its middle.",
     "Times: median (95 %) milliseconds a frame. The total is the whole pipeline, for built-in "
-    "worlds without making the sweeps. KISS-ICP gets the same sweeps with the same point times, "
-    "right after ours and sweep by sweep, with its default settings (voxel 1 m, all cores); the "
-    "ratio is our median over its median, neither with reading.",
+    "worlds without making the sweeps. No IMU is used. KISS-ICP gets the same sweeps with the same "
+    "point times, right after ours and sweep by sweep, with its default settings (voxel 1 m, all "
+    "cores); the ratio is our median over its median, neither with reading.",
 )
 
 

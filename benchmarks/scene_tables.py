@@ -14,6 +14,9 @@ from loam_gtsam.types import FloatArray
 NONE = "none"
 """The variant without an IMU, which stands beside every noise of one."""
 
+RECORDED = 0.0
+"""In the place of a noise: the IMU comes with the data."""
+
 METRICS = {
     "ate_m": "ATE [m]",
     "max_m": "Largest error, aligned [m]",
@@ -49,7 +52,7 @@ class Row:
     Attributes
     ----------
     table : key of COLUMNS
-    noise : of the IMU's orientation, rad per axis; NaN without IMU, or if it is recorded
+    noise : of the IMU's orientation, rad per axis, or RECORDED; NaN without IMU
     path_m : of the truth
     ate_m, max_m : of the positions, aligned
     drift_m, tilt_deg, along_percent : see :func:`drift`, :func:`tilt`, :func:`along`
@@ -128,11 +131,13 @@ def markdown(table: str, rows: Sequence[Row]) -> Iterator[str]:
         for place in dict.fromkeys(row.place for row in rows):
             here = [row for row in rows if row.place == place]
             with_imu = [row for row in here if row.variant != NONE]
-            for noise in dict.fromkeys(str(row.noise) for row in with_imu):
-                own = {r.variant: r for r in here if str(r.noise) == noise or r.variant == NONE}
+            # The runs without an IMU, whose noise is NaN, are one line of the solvers' table.
+            noises = [None] if table == "solvers" else [row.noise for row in with_imu]
+            for noise in dict.fromkeys(noises):
+                own = {r.variant: r for r in here if noise in (None, r.noise) or r.variant == NONE}
                 cells = [place, str(here[0].sweeps), f"{here[0].path_m:.1f}"]
                 if table == "imu":
-                    cells.append("recorded" if noise == "nan" else f"{1e3 * float(noise):g}")
+                    cells.append(f"{1e3 * noise:g}" if noise else "recorded")
                 cells += [_cell(own.get(name), metric) for name in variants]
                 yield f"| {' | '.join(cells)} |"
 

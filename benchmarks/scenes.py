@@ -22,7 +22,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from benchmarks.cases import ROOT, data_folder
-from benchmarks.scene_tables import NONE, Row, along, drift, tilt, write
+from benchmarks.scene_tables import NONE, RECORDED, Row, along, drift, tilt, write
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -60,6 +60,7 @@ class Place:
     scene : built-in, or TOWN, which is a folder
     frames, columns, seed : of the simulated world
     solvers, aids : what is run without and with an IMU, of SOLVERS and AIDS
+    noises : of the IMU's orientation, rad
     """
 
     scene: str
@@ -68,6 +69,7 @@ class Place:
     seed: int = 0
     solvers: tuple[str, ...] = SOLVERS
     aids: tuple[str, ...] = ()
+    noises: tuple[float, ...] = NOISES
 
     @property
     def name(self) -> str:
@@ -76,6 +78,7 @@ class Place:
 
 
 TOWN = "sim_town"
+REPEATED = (NONE, "gyro only", "equivalent", "sigma")
 PLACES = (
     Place("street_loop", aids=tuple(AIDS)),
     Place("corridor", aids=tuple(AIDS)),
@@ -85,10 +88,16 @@ PLACES = (
     Place("trees", frames=250, seed=2),
     Place("corridor_bare", solvers=(), aids=(NONE, "equivalent", "pre-integration")),
     Place("shaken", aids=tuple(AIDS)),
+    # How much of a difference is chance: other sweeps, doors and houses.
+    *(
+        Place(scene, seed=seed, solvers=(), aids=REPEATED, noises=NOISES[:1])
+        for scene in ("corridor", "slopes")
+        for seed in (1, 2, 3)
+    ),
     Place(TOWN, aids=tuple(AIDS)),
     Place("room"),
 )
-"""Longest first, for the processes that share them."""
+"""Mostly the longest first, for the processes that share them."""
 QUICK = (
     Place("room", frames=12, columns=600, aids=(NONE, "equivalent")),
     Place("corridor_bare", frames=12, columns=600, solvers=(), aids=(NONE, "pre-integration")),
@@ -102,7 +111,7 @@ class Recording:
     Attributes
     ----------
     truth : one pose a sweep
-    imus : by the noise of their orientation, NaN if unknown
+    imus : by the noise of their orientation, or RECORDED
     world_R_start : (3, 3) attitude of the first pose, z up
     """
 
@@ -121,12 +130,12 @@ def record(place: Place, data: Path) -> Recording:
         start = np.loadtxt(data / TOWN / "start_world.txt")  # x y z, quaternion x y z w
         attitude = Rotation.from_quat(start[3:]).as_matrix()
         sweeps = [sweep for sweep in town if isinstance(sweep, Scan)]
-        return Recording(sweeps, town.sensor, town.truth, {np.nan: town.imu}, attitude)
+        return Recording(sweeps, town.sensor, town.truth, {RECORDED: town.imu}, attitude)
     make = partial(
         SimulatedWorld, place.scene, frames=place.frames, columns=place.columns, seed=place.seed
     )
     world = make()
-    imus = {noise: make(imu_noise=noise).imu for noise in NOISES}
+    imus = {noise: make(imu_noise=noise).imu for noise in place.noises}
     return Recording(list(world), world.sensor, world.truth, imus, world.world_T_start[:3, :3])
 
 

@@ -529,3 +529,19 @@ def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
     config = replace(preset(name), imu=ImuConfig(enabled=False))
     with pytest.raises(InputError, match=r"priors: .* use solver\.method: gtsam"):
         run(data_of(shaken, sweeps[:2]), config, extra_factors=lambda _: [tight(np.zeros(3))])
+
+
+@pytest.mark.parametrize(("seed", "range_noise", "tracked"), [(1, 0.02, True), (1, 0.0, False),
+                                                              (2, 0.02, True)])  # fmt: skip
+def test_foliage_does_not_hold_the_pose(seed, range_noise, tracked):
+    """Without the test for smooth rings the woods keep the attitude of the first sweeps."""
+    world = SimulatedWorld("trees", frames=35, columns=600, seed=seed)
+    config = Config()
+    config = replace(
+        config,
+        features=replace(config.features, range_noise=range_noise),
+        imu=replace(config.imu, enabled=False),
+    )
+    positions = run(world, config).trajectory.map_T_lidar[:, :3, 3]
+    error = np.linalg.norm(positions - world.truth.map_T_lidar[:, :3, 3], axis=1).max()
+    assert error < 0.12 if tracked else error > 0.5

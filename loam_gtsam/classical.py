@@ -278,8 +278,7 @@ def _alternate(
     for iteration in range(1, config.iterations + 1):
         matches = associate(pose)
         if len(matches) < config.min_matches:
-            nothing = np.zeros((6, 6))
-            return Solution(guess, False, False, matches, iteration, steps, 0.0, 0.0, nothing)
+            return Solution.unsolved(guess, matches, iteration, steps)
         optimum = optimise(matches, pose)
         pose, steps = optimum.map_T_lidar, steps + optimum.steps
         if iteration == 1:

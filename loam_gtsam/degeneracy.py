@@ -15,6 +15,7 @@ import numpy as np
 from scipy.linalg import eigh
 
 from loam_gtsam.factors import complement_basis
+from loam_gtsam.geometry import cross
 from loam_gtsam.matching import ScanMatches
 from loam_gtsam.types import FloatArray
 
@@ -76,7 +77,7 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     tilts = np.concatenate([np.repeat(line_tilts[own], 2), plane_tilts])
     weights = np.concatenate([np.repeat(e.weights[own] / e.sigmas[own], 2), p.weights / p.sigmas])
 
-    rows = np.hstack([_cross(points, normals), normals])
+    rows = np.hstack([cross(points.T, normals.T).T, normals])
     information = rows.T @ (rows * (weights**2)[:, None])
     noise = _displacements(points, (weights * tilts) ** 2)
     unit = _displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
@@ -95,12 +96,6 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     aligned = np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0).sum(axis=0)
     order = np.argsort(aligned, kind="stable")
     return Localizability(directions[order], aligned[order])
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(N, 3) cross products, faster than numpy's own."""
-    (ax, ay, az), (bx, by, bz) = a.T, b.T
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
 def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:

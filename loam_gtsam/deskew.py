@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config
-from loam_gtsam.geometry import move_points, voxel_filter
+from loam_gtsam.geometry import cross, move_points, voxel_filter
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.types import Features, FloatArray, SweepMotion
 
@@ -161,14 +161,7 @@ def _rotated(points: FloatArray, turns: FloatArray) -> FloatArray:
     """Each point turned by its own rotation vector (Rodrigues' formula)."""
     axis, point = turns.T.copy(), points.T.copy()  # component arrays are several times faster
     angle = np.maximum(np.sqrt((axis * axis).sum(axis=0)), 1e-12)
-    across = _cross(axis, point)
+    across = cross(axis, point)
     sine, versine = np.sin(angle) / angle, 2.0 * (np.sin(0.5 * angle) / angle) ** 2
-    rotated: FloatArray = (point + sine * across + versine * _cross(axis, across)).T
+    rotated: FloatArray = (point + sine * across + versine * cross(axis, across)).T
     return rotated
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products of vectors (3, N)."""
-    return np.stack(
-        [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
-    )

@@ -32,8 +32,6 @@ _DISAGREEMENT = (np.radians(0.3), 0.5)
 the turn: far above the noise of either, below what a wrong axis or sign makes."""
 _DISTRUST = 5
 """Frames of disagreement, less those of agreement, after which the gyro is not used."""
-
-
 _SCAN_VARIANCE = 4.0
 """By which the scan's information is divided before pre-integration believes it: errors of scans
 against one map last over frames (built-in scenes: mean squared errors of 1 to 4 times the

@@ -143,15 +143,15 @@ class Mapper:
         last = self.last
         if last is not None and features.stamp <= last.stamp:
             return self.skip(features.stamp, "")
-        imu = None if self.imu_aid is None else self.imu_aid.gyro
-        predicted = ConstantVelocity(imu).guess(features, last)
-        if last is None and self.imu_aid is not None:
-            predicted = replace(predicted, map_T_lidar=self.imu_aid.start(features.stamp, guess))
-        start = Guess(
-            predicted.map_T_lidar if guess is None else guess,
-            predicted.twist if twist is None else np.asarray(twist, np.float64),
-        )
-        sweep = MovingSweep(features, self.config, imu)
+        aid = self.imu_aid
+        if last is None and aid is not None:
+            guess = aid.start(features.stamp, guess)
+        if guess is None or twist is None:
+            predicted = ConstantVelocity(aid).guess(features, last)
+            guess = predicted.map_T_lidar if guess is None else guess
+            twist = predicted.twist if twist is None else twist
+        start = Guess(guess, np.asarray(twist, np.float64))
+        sweep = MovingSweep(features, self.config, None if aid is None else aid.gyro)
         if sweep.is_empty:
             return self.skip(features.stamp, "the sweep has no features")
         sweep.deskew(start.twist)
@@ -188,8 +188,7 @@ class Mapper:
             return MapUpdate(
                 stamp, last.map_T_lidar, FrameStatus.BAD_STAMP, message, twist=last.twist
             )
-        imu = None if self.imu_aid is None else self.imu_aid.gyro
-        guess = ConstantVelocity(imu).at(stamp, last)
+        guess = ConstantVelocity(self.imu_aid).at(stamp, last)
         self.last = MapUpdate(
             stamp, guess.map_T_lidar, FrameStatus.UNUSABLE_SCAN, message, twist=guess.twist
         )
@@ -283,18 +282,19 @@ class Mapper:
         self, sweep: MovingSweep, solution: Solution, twist: FloatArray
     ) -> tuple[Solution, Guess, TiltPrior]:
         """The pose at the reference time, with the IMU's roll and pitch."""
-        aid, tilt = self.imu_aid, TiltPrior.NONE
-        if aid is not None:
-            if self._last_middle is not None:
-                now = sweep.stamp, solution.map_T_lidar
-                aid.compare_gyro(self._last_middle, now)
-                aid.observe(self._last_middle, now, solution.scan_information)
-            solution, tilt = aid.tilted(sweep.stamp, solution)
-        pose = solution.map_T_lidar.compose(sweep.middle_T_reference(twist))
-        if aid is not None and aid.config.prior == "blend":
+        aid, to_reference = self.imu_aid, sweep.middle_T_reference(twist)
+        if aid is None:
+            pose = solution.map_T_lidar.compose(to_reference)
+            return solution, Guess(pose, twist), TiltPrior.NONE
+        if self._last_middle is not None:
+            now = sweep.stamp, solution.map_T_lidar
+            aid.compare_gyro(self._last_middle, now)
+            aid.observe(self._last_middle, now, solution.scan_information)
+        solution, tilt = aid.tilted(sweep.stamp, solution)
+        pose = solution.map_T_lidar.compose(to_reference)
+        if tilt is TiltPrior.NONE:
             pose, tilt = aid.blended(sweep.reference_stamp, pose)
-        if aid is not None:
-            aid.find_level(sweep.reference_stamp, pose)  # for the frames to come
+        aid.find_level(sweep.reference_stamp, pose)  # for the frames to come
         return solution, Guess(pose, twist), tilt
 
     def _twist(self, sweep: MovingSweep, middle: gtsam.Pose3, otherwise: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import fit_lines, fit_planes, moments, transform
+from loam_gtsam.geometry import cross, fit_lines, fit_planes, moments, transform
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _TINY = 1e-9
@@ -212,7 +212,7 @@ def match_lines(
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
     centres, directions, eigenvalues = fit_lines(neighbours[near])
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
-    ring = _cross(map_T_lidar[:3, 2], points_map[near].T - map_T_lidar[:3, 3:])
+    ring = cross(map_T_lidar[:3, 2], points_map[near].T - map_T_lidar[:3, 3:])
     is_line &= np.abs(_dot(directions, ring)) <= (config.max_ring_cosine + _TINY) * _norm(ring)
     away = points_map[near].T - centres
     along = _dot(away, directions)
@@ -221,7 +221,8 @@ def match_lines(
     keep = is_line & (weights > config.min_weight)
     # A line in space has four parameters, two for each of the directions across it.
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
-    scatter, k = _scatter(eigenvalues[1], 2, neighbours.shape[1], config), neighbours.shape[1]
+    k = neighbours.shape[1]
+    scatter = _scatter(eigenvalues[1], 2, k, config)
     sigmas = _sigmas(scatter, leverage, k, config)
     tilts = np.sqrt(scatter / (k * np.maximum(eigenvalues[2], _TINY)))
     indices = near[keep]
@@ -281,7 +282,8 @@ def match_planes(
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
-    scatter, k = _scatter(eigenvalues[0], 3, neighbours.shape[1], config), neighbours.shape[1]
+    k = neighbours.shape[1]
+    scatter = _scatter(eigenvalues[0], 3, k, config)
     sigmas = _sigmas(scatter, leverage, k, config)
     tilts = np.sqrt(scatter / (k * np.maximum(eigenvalues[1], _TINY)))
     indices = near[keep]
@@ -332,19 +334,6 @@ def _norm(vectors: FloatArray) -> FloatArray:
     """Lengths of vectors along the first axis."""
     length: FloatArray = np.sqrt(_dot(vectors, vectors))
     return length
-
-
-def _cross(vector: FloatArray, others: FloatArray) -> FloatArray:
-    """Cross products of one vector (3,) with others (3, N)."""
-    x, y, z = vector
-    product: FloatArray = np.stack(
-        [
-            y * others[2] - z * others[1],
-            z * others[0] - x * others[2],
-            x * others[1] - y * others[0],
-        ]
-    )
-    return product
 
 
 def _scatter(

@@ -73,6 +73,14 @@ class Solution:
     localizability: Localizability | None = None
     weak: FloatArray | None = None
 
+    @classmethod
+    def unsolved(
+        cls, guess: gtsam.Pose3, matches: ScanMatches, iterations: int, solver_iterations: int
+    ) -> Solution:
+        """The guess back, after an association gave too few matches."""
+        nothing = np.zeros((6, 6))
+        return cls(guess, False, False, matches, iterations, solver_iterations, 0.0, 0.0, nothing)
+
     @property
     def n_weak(self) -> int:
         """Number of weak directions: the first of ``localizability.directions``."""
@@ -157,9 +165,7 @@ class GtsamSolver:
         for iteration in range(1, config.iterations + 1):
             matches = associate(pose)
             if len(matches) < config.min_matches:
-                return Solution(
-                    guess, False, False, matches, iteration, steps, 0.0, 0.0, np.zeros((6, 6))
-                )
+                return Solution.unsolved(guess, matches, iteration, steps)
             if iteration == 1 and motion is not None and config.degeneracy != "off":
                 seen = localizability(matches, pose)
                 weak = seen.projector(config.min_aligned)
@@ -207,9 +213,9 @@ def _without(
 ) -> gtsam.NonlinearFactor:
     """The scan's factor, linearised, with what it claims about weak directions taken out."""
     linear = scan.linearize(values)
-    information, right = linear.information(), linear.augmentedInformation()[:-1, -1]
+    information, column = linear.information(), linear.augmentedInformation()[:, -1]
+    right, squared = column[:-1], float(column[-1])
     keep = np.eye(6) - weak
-    squared = float(linear.augmentedInformation()[-1, -1])
     hessian = gtsam.HessianFactor(POSE_KEY, keep.T @ information @ keep, keep.T @ right, squared)
     return gtsam.LinearContainerFactor(hessian, values)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from list_dataset import ListDataset
 from typer.testing import CliRunner, Result
 
 from loam_gtsam import _cli_run, cli, visualization
@@ -34,25 +35,10 @@ def _wide_screen_in_an_empty_folder(tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")
 
 
-class FakeDataset:
-    """Sweeps from a list; an exception in it is raised when its turn comes."""
+class FakeDataset(ListDataset):
+    """Its names look like markup."""
 
     name = "fake [bold]data[/bold]"
-    sensor: dict[str, object] = {}  # noqa: RUF012
-    imu = None
-    truth = None
-
-    def __init__(self, items):
-        self.items = items
-
-    def __len__(self):
-        return len(self.items)
-
-    def __iter__(self):
-        for item in self.items:
-            if isinstance(item, Exception):
-                raise item
-            yield item
 
     def info(self):
         return DatasetInfo("fake", "nowhere", {"fields": "x [y] z"}, ["a [red]small[/red] problem"])

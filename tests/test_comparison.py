@@ -14,6 +14,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from list_dataset import ListDataset
 from typer.testing import CliRunner, Result
 
 from loam_gtsam import _report_html, cli, estimators, peers, visualization
@@ -202,24 +203,14 @@ def test_pose_differences_are_seen_from_the_first_common_pose():
 # -- several estimators on the same sweeps ---------------------------------------------------------
 
 
-class ListDataset:
-    """Sweeps from a list; an exception in it is raised when its turn comes."""
+class Sweeps(ListDataset):
+    """With truth, and a name that looks like markup."""
 
     name = "a <b>list</b> [red]"
-    sensor: dict[str, object] = {}  # noqa: RUF012
-    imu = None
 
     def __init__(self, items, truth=None):
-        self.items, self.truth = items, truth
-
-    def __len__(self):
-        return len(self.items)
-
-    def __iter__(self):
-        for item in self.items:
-            if isinstance(item, BaseException):
-                raise item
-            yield item
+        super().__init__(items)
+        self.truth = truth
 
     def info(self):
         return DatasetInfo("list", "nowhere")
@@ -255,7 +246,7 @@ def sweeps(world) -> list[Scan]:
 
 @pytest.fixture
 def dataset(world, sweeps) -> ListDataset:
-    return ListDataset(sweeps, world.truth)
+    return Sweeps(sweeps, world.truth)
 
 
 @pytest.fixture
@@ -286,7 +277,7 @@ def test_our_solver_gives_what_run_gives(dataset):
 @pytest.mark.parametrize("names", [("gtsam", "loam", "aloam"), ("loam", "gtsam")])
 def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, names):
     """Each has its own IMU, blend or prior, and de-skew; the map of each is level."""
-    dataset = ListDataset(sweeps, world.truth)
+    dataset = Sweeps(sweeps, world.truth)
     dataset.imu = world.imu
     result = compare(dataset, [contender(name) for name in names])
     for name, entry in zip(names, result.runs, strict=True):
@@ -300,7 +291,7 @@ def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, names):
 
 
 def test_what_one_learns_of_the_gyro_is_not_told_to_the_next(sweeps, world):
-    dataset = ListDataset(sweeps, world.truth)
+    dataset = Sweeps(sweeps, world.truth)
     dataset.imu = world.imu
     runs = compare(dataset, [Contender(name, Config()) for name in "ab"]).runs
     np.testing.assert_array_equal(poses(runs[0]), poses(runs[1]))
@@ -393,7 +384,7 @@ def test_bad_sweeps_reach_every_solver(sweeps, fake):
     late = replace(sweeps[1], stamp=sweeps[0].stamp)
     empty = replace(sweeps[3], points=np.full_like(sweeps[3].points, np.nan))
     items = [sweeps[0], BadSweep(sweeps[1].stamp, "torn"), sweeps[2], late, empty, sweeps[4]]
-    result = compare(ListDataset(items), [contender("gtsam"), contender("fake")])
+    result = compare(Sweeps(items), [contender("gtsam"), contender("fake")])
     ours, theirs = ([str(u.status) for u in entry.updates] for entry in result.runs)
     assert theirs == ["ok", "unusable_scan", "ok", "bad_stamp", "unusable_scan", "ok"]
     assert ours[1] == ours[4] == "unusable_scan"
@@ -446,7 +437,7 @@ def test_recorded_features_are_for_ours_only(sweeps, fake):
         features = estimators.extract_features(scan, config)
         odom = gtsam.Pose3(gtsam.Rot3(), [0.1 * number, 0.0, 0.0])
         recorded.append(FeatureSweep(features, odom))
-    data = ListDataset(recorded)
+    data = Sweeps(recorded)
     result = compare(data, [contender("gtsam")])
     np.testing.assert_array_equal(poses(result.runs[0]), poses(run(data, config)))
     assert [u.status for u in result.runs[0].updates][1:] == [FrameStatus.OK] * 2
@@ -456,15 +447,15 @@ def test_recorded_features_are_for_ours_only(sweeps, fake):
 
 def test_without_sweeps_there_is_nothing_to_compare():
     with pytest.raises(DatasetError, match="no sweeps in it"):
-        compare(ListDataset([]), [contender("gtsam")])
+        compare(Sweeps([]), [contender("gtsam")])
 
 
 def test_what_came_before_an_error_is_kept(sweeps):
-    result = compare(ListDataset([*sweeps[:2], DatasetError("torn")]), [contender("gtsam")])
+    result = compare(Sweeps([*sweeps[:2], DatasetError("torn")]), [contender("gtsam")])
     assert str(result.error) == "torn"
     assert result.frames == 2
     with pytest.raises(DatasetError, match="torn"):
-        compare(ListDataset([DatasetError("torn")]), [contender("gtsam")])
+        compare(Sweeps([DatasetError("torn")]), [contender("gtsam")])
 
 
 # -- peers -----------------------------------------------------------------------------------------
@@ -490,7 +481,7 @@ def test_an_unknown_peer_is_refused():
 @pytest.mark.parametrize("name", [*PEERS])
 def test_peers_find_the_path(name, world, sweeps):
     pytest.importorskip(PEERS[name].module)
-    result = compare(ListDataset(sweeps, world.truth), [contender(name)])
+    result = compare(Sweeps(sweeps, world.truth), [contender(name)])
     scores = score(result.runs[0], result.truth)
     assert result.runs[0].problem == ""
     assert scores.ate_m < 0.1 * result.truth.length + 0.02

@@ -6,6 +6,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from list_dataset import ListDataset
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, ImuConfig, preset
@@ -28,30 +29,6 @@ from loam_gtsam.types import (
     ImuSamples,
     InputError,
 )
-
-
-class Sweeps:
-    """A data set made of whatever the test wants."""
-
-    name = "test"
-    sensor: dict = {}  # noqa: RUF012
-    imu = None
-    truth = None
-
-    def __init__(self, items):
-        self.items = items
-
-    def __len__(self):
-        return len(self.items)
-
-    def __iter__(self):
-        for item in self.items:
-            if isinstance(item, BaseException):
-                raise item
-            yield item
-
-    def info(self):
-        raise NotImplementedError
 
 
 @pytest.mark.parametrize(
@@ -110,7 +87,7 @@ def test_max_frames_and_on_frame():
 
 def test_interruption_keeps_what_was_computed():
     scans = list(SimulatedWorld("room", frames=3, columns=600))
-    result = run(Sweeps([*scans, KeyboardInterrupt()]))
+    result = run(ListDataset([*scans, KeyboardInterrupt()]))
     assert result.interrupted
     assert len(result.trajectory) == 3
     assert len(result.plane_points) > 0
@@ -118,7 +95,7 @@ def test_interruption_keeps_what_was_computed():
 
 def test_an_error_in_the_data_is_raised_or_kept_with_the_partial_result():
     scans = list(SimulatedWorld("room", frames=2, columns=600))
-    broken = Sweeps([*scans, DatasetError("disk gone")])
+    broken = ListDataset([*scans, DatasetError("disk gone")])
     with pytest.raises(DatasetError, match="disk gone"):
         run(broken)
     result = run(broken, keep_partial=True)
@@ -154,14 +131,14 @@ def test_recorded_odometry_is_the_guess():
         planes = move_points(features.planes, twist, features.plane_times)
         items.append(FeatureSweep(Features.from_points(scan.stamp, edges, planes), odom))
         odom = odom.compose(step).compose(drift)
-    result = run(Sweeps(items))
+    result = run(ListDataset(items))
     assert absolute_error(result.trajectory, world.truth).rmse < 0.03
     guessed = start.between(items[-1].odom_T_lidar).translation()
     assert np.linalg.norm(guessed - truth[29][:3, 3]) > 0.3  # without the map it drifts
 
 
 def test_what_the_data_set_implies_yields_to_the_user():
-    data = Sweeps([])
+    data = ListDataset([])
     data.sensor = {"stamp": "middle", "spin": "clockwise"}
     assert effective_config(Config(), data).sensor.stamp == "middle"
     mine = replace(Config(), sensor=replace(Config().sensor, stamp="end"))
@@ -170,7 +147,7 @@ def test_what_the_data_set_implies_yields_to_the_user():
 
 
 def test_an_empty_data_set_is_an_empty_result():
-    result = run(Sweeps([]))
+    result = run(ListDataset([]))
     assert result.updates == ()
     assert len(result.trajectory) == 0
     assert result.edge_points.shape == (0, 3)
@@ -218,7 +195,7 @@ def test_a_bad_sweep_has_a_status_and_the_run_goes_on(kind, status, says):
     world = SimulatedWorld("street_loop", frames=26, columns=900)
     scans = [world[i] for i in range(20, 26)]
     scans[3] = broken_sweep(kind, scans[3])
-    result = run(Sweeps(scans))
+    result = run(ListDataset(scans))
     bad = result.updates[3]
     assert bad.status == status
     assert says.lower() in bad.message.lower()
@@ -242,14 +219,14 @@ def test_a_bad_sweep_has_a_status_and_the_run_goes_on(kind, status, says):
 def test_a_run_may_begin_with_bad_sweeps(kind):
     scans = list(SimulatedWorld("room", frames=4, columns=900))
     scans[0] = broken_sweep(kind, scans[0])
-    statuses = [update.status for update in run(Sweeps(scans)).updates]
+    statuses = [update.status for update in run(ListDataset(scans)).updates]
     assert statuses[:2] == [FrameStatus.UNUSABLE_SCAN, FrameStatus.FIRST]
     assert statuses[2].solved
 
 
 def test_nothing_but_bad_sweeps():
     items = [BadSweep(i, "unreadable") for i in range(5)]
-    assert run(Sweeps(items)).status_counts == {"unusable_scan": 5}
+    assert run(ListDataset(items)).status_counts == {"unusable_scan": 5}
 
 
 def test_numpy_arrays_go_through():
@@ -444,7 +421,7 @@ def test_recorded_features_are_levelled_too(shaken, sweeps):
     for i in range(3):
         features = replace(extract_features(sweeps[i], Config()), span=(0.0, 0.0))
         items.append(FeatureSweep(features, gtsam.Pose3()))
-    data = Sweeps(items)
+    data = ListDataset(items)
     data.imu = tilted(shaken.imu, gtsam.Rot3.RzRyRx(0.2, -0.1, 0.0))
     result = run(data)
     found = roll_pitch(result.updates[0].map_T_lidar.rotation())

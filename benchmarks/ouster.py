@@ -63,7 +63,7 @@ def run_case(peers: bool = True) -> CaseResult:
     estimates = [reference, ours, Estimate("ours, middle of sweep", _steps(middle))]
     if peers:
         estimates += _peer_estimates(sweeps, twists, reference.steps)
-    stages, _ = stage_times(result)
+    stages = stage_times(result)
     return CaseResult(
         NAME,
         note="real OS1-128, three sweeps; see the table of steps",

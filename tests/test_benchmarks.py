@@ -56,7 +56,7 @@ def test_quick_run_writes_a_row_for_each_case(
     assert [row["sweeps"] for row in rows.values()] == ["6", "4"]
     assert 0.0 < float(rows["room"]["ate_m"]) < 0.1
     stages = [float(rows["room"][f"{stage}_ms_median"]) for stage in ("features", "match", "solve")]
-    assert 0.0 < max(stages) < float(rows["room"]["total_ms_95"])
+    assert 0.0 < max(stages) < float(rows["room"]["wall_ms_95"])
     assert "read_ms_median" not in rows["room"]  # making the sweeps is not reading them
     assert rows["room"]["targets"] == "ATE <= 1 m: met; ATE <= KISS-ICP: not judged"
     text = (tmp_path / "benchmarks.md").read_text(encoding="utf-8")
@@ -97,7 +97,7 @@ def test_profile_lists_functions_by_their_own_time(
     path, text = tool.profile("room", tmp_path)
     assert path.read_text(encoding="utf-8") == text
     assert "tottime" in text
-    assert "matching.py" in text
+    assert "features.py" in text
     with pytest.raises(LoamError, match="LOAM_GTSAM_DATA"):
         tool.profile("sim_town", tmp_path)
     assert tool.main(["--profile", "sim_town", "--output", str(tmp_path)]) == 1
@@ -107,13 +107,19 @@ def test_profile_lists_functions_by_their_own_time(
 
 
 def test_targets_are_judged_both_ways() -> None:
-    case = Case("x", "sim:room", ate_limit=0.05, ate_share=0.001, ms_limit=50.0, rivals=("A", "B"))
+    case = Case(
+        "x", "sim:room", ate_limit=0.05, ate_share=0.001, ms_limit=50.0, ratio_limit=1.0,
+        rivals=("A", "B"),
+    )  # fmt: skip
     good = CaseResult(
-        "x", path=100.0, ate=0.04, stages={"total": (40.0, 90.0)}, peers=(PeerResult("A", 0.041),)
-    )
-    assert [verdict.met for verdict in judge(case, good)] == [True, True, True, True, None]
-    bad = replace(good, ate=0.2, stages={"total": (51.0, 52.0)})
-    assert [verdict.met for verdict in judge(case, bad)] == [False, False, False, False, None]
+        "x", path=100.0, ate=0.04, stages={"wall": (40.0, 90.0)}, ratio=0.9,
+        peers=(PeerResult("A", 0.041),),
+    )  # fmt: skip
+    assert [verdict.met for verdict in judge(case, good)] == [True, True, True, True, True, None]
+    bad = replace(good, ate=0.2, stages={"wall": (51.0, 52.0)}, ratio=1.1)
+    assert [verdict.met for verdict in judge(case, bad)] == [False] * 5 + [None]
+    unknown = replace(good, ratio=float("nan"))
+    assert [verdict.met for verdict in judge(case, unknown)][3] is None
 
 
 def test_peers_that_are_not_installed_are_said_so(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,7 +137,7 @@ def test_kiss_icp_sees_every_sweep() -> None:
     result = cases.run_case(TINY)
     assert [peer.label for peer in result.peers] == ["KISS-ICP"]
     assert 0.0 < result.peers[0].ate < 0.5
-    assert result.ratio == pytest.approx(result.stages["total"][0] / result.peers[0].ms)
+    assert result.ratio == pytest.approx(result.stages["wall"][0] / result.peers[0].ms)
     assert result.verdicts[1].met == (result.ate <= result.peers[0].ate)
 
 

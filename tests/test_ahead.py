@@ -1,0 +1,94 @@
+"""Features extracted ahead, in processes of their own."""
+
+import logging
+import multiprocessing
+import os
+import signal
+
+import numpy as np
+import pytest
+from list_dataset import ListDataset
+
+from loam_gtsam import Config, SimulatedWorld, run
+from loam_gtsam.ahead import extract, extract_ahead
+from loam_gtsam.types import BadSweep, DatasetError, FrameStatus, Scan
+
+pytestmark = pytest.mark.filterwarnings("error")
+
+
+@pytest.fixture(scope="module")
+def sweeps():
+    world = SimulatedWorld("room", frames=6, columns=450)
+    return list(world)
+
+
+def numbered(sweeps):
+    return [(sweep, float(number)) for number, sweep in enumerate(sweeps)]
+
+
+def test_a_run_is_the_same_at_any_number_of_processes(sweeps):
+    broken = Scan(sweeps[2].points[:3], sweeps[2].stamp)
+    mixed = [*sweeps[:2], broken, BadSweep(sweeps[3].stamp, "unreadable"), *sweeps[4:]]
+    results = [run(ListDataset(mixed), workers=workers) for workers in (0, 1, 2)]
+    messages = [[update.message for update in result.updates] for result in results]
+    assert messages[0] == messages[1] == messages[2]
+    assert "unreadable" in messages[0][3]
+    statuses = [update.status for update in results[0].updates]
+    assert statuses[2:4] == [FrameStatus.UNUSABLE_SCAN] * 2
+    poses = [result.trajectory.map_T_lidar for result in results]
+    assert np.array_equal(poses[0], poses[1])
+    assert np.array_equal(poses[0], poses[2])
+
+
+def test_only_the_sweeps_asked_for_are_read(sweeps):
+    read = []
+
+    class Watched(ListDataset):
+        def __iter__(self):
+            for number, sweep in enumerate(super().__iter__()):
+                read.append(number)
+                yield sweep
+
+    assert len(run(Watched(sweeps), max_frames=2, workers=1).updates) == 2
+    assert read == [0, 1]
+
+
+def test_an_error_of_the_data_comes_after_the_sweeps_before_it(sweeps):
+    def source():
+        yield from numbered(sweeps[:2])
+        raise DatasetError("the file ends here")
+
+    ahead = extract_ahead(source(), Config(), 1)
+    for number in (0.0, 1.0):
+        assert next(ahead)[1] == number
+    with pytest.raises(DatasetError, match="ends here"):
+        next(ahead)
+
+
+def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog):
+    ahead = extract_ahead(numbered(sweeps), Config(), 1)
+    next(ahead)
+    with caplog.at_level(logging.WARNING, "loam_gtsam.ahead"):
+        for process in multiprocessing.active_children():
+            os.kill(process.pid, signal.SIGKILL)
+            process.join()
+        rest = list(ahead)
+    assert [number for _, number, _ in rest] == [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert rest[-1][2] is None  # for the pipeline to extract
+    assert "died" in caplog.text
+
+
+def test_without_processes_nothing_is_read_ahead(sweeps):
+    source = iter(numbered(sweeps))
+    sweep, _, extraction = next(extract_ahead(source, Config(), 0))
+    assert sweep is sweeps[0]
+    assert extraction is None
+    assert len(list(source)) == len(sweeps) - 1
+
+
+def test_extraction_says_why_there_are_no_features(sweeps):
+    good, few = extract(sweeps[0], Config()), Scan(np.zeros((3, 3), np.float32), 0)
+    assert good.features is not None
+    assert good.problem == ""
+    assert extract(few, Config()).features is None
+    assert "points" in extract(few, Config()).problem

@@ -8,7 +8,7 @@ tells such information from real one is the noise that the normals themselves ha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -23,6 +23,11 @@ _CLEAR = 3.0
 """Standard deviations of a normal by which a displacement must be off its surface to be seen."""
 
 
+_MOVED = 0.1
+"""Part of the root mean square displacement that a match must have to count in full: the points of
+a pole say nothing about a turn about that pole, whatever the direction of their few millimetres."""
+
+
 @dataclass(frozen=True, slots=True)
 class Localizability:
     """How well a scan fixes its pose, by direction, the weakest first.
@@ -33,10 +38,33 @@ class Localizability:
         points by 1 m (root mean square)
     aligned : (6,) matches that fix each of them, counted as if the normals pointed that way: the
         sum of squared cosines between normal and displacement, over the matches that see it at all
+    information : (6,) of the scan along each of them, 1 / m^2, what noise makes of it included
+    displacement : (6, 6) form whose value for a motion is the mean squared displacement of the
+        matched points, m^2
     """
 
     directions: FloatArray
     aligned: FloatArray
+    information: FloatArray
+    displacement: FloatArray
+
+    def seen_from(self, a_T_b: gtsam.Pose3) -> Localizability:
+        """The same about frame ``a``, if this is about frame ``b``, which moves with it."""
+        to_a, to_b = a_T_b.AdjointMap(), a_T_b.inverse().AdjointMap()
+        form: FloatArray = to_b.T @ self.displacement @ to_b
+        return replace(self, directions=self.directions @ to_a.T, displacement=form)
+
+    def axes(self) -> FloatArray:
+        """(6,) aligned matches that fix rx, ry, rz, x, y, z, with the other five left free.
+
+        The directions and their counts a make the form ``(sum v v^T / a)^-1``. Of that the Schur
+        complement of an axis is taken, and scaled to a motion along the axis that displaces the
+        matched points by 1 m. A direction counts at least one match, or an axis that is off it by
+        a fraction of a degree would have none either.
+        """
+        spread = (self.directions**2 / np.maximum(self.aligned, 1.0)[:, None]).sum(axis=0)
+        counts: FloatArray = 1.0 / (spread * np.diagonal(self.displacement))
+        return counts
 
     def weak(self, least: float) -> FloatArray:
         """(W, 6) the directions with fewer aligned matches than ``least``."""
@@ -91,11 +119,12 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     # |shift + turn x p|^2 for all points and directions, as products of small matrices
     moved = np.outer((points**2).sum(axis=1), (turn**2).sum(axis=1)) - (points @ turn.T) ** 2
     moved += 2.0 * points @ np.cross(shift, turn).T + (shift**2).sum(axis=1)
-    moved = np.maximum(moved, np.finfo(np.float64).tiny)
+    moved = np.maximum(moved, _MOVED**2)
     squared = seen**2 / moved
     aligned = np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0).sum(axis=0)
     order = np.argsort(aligned, kind="stable")
-    return Localizability(directions[order], aligned[order])
+    along = np.einsum("ki,ij,kj->k", directions, information, directions)
+    return Localizability(directions[order], aligned[order], along[order], unit)
 
 
 def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:

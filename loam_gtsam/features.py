@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, FeatureConfig
+from loam_gtsam.posts import Posts, find_posts
 from loam_gtsam.sweep import OrganisedSweep, organise
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError
 
@@ -67,6 +68,13 @@ def extract_features(scan: Scan, config: Config) -> Features:
             f"no features: the longest of {sweep.rings.count} rings has {longest} points, at "
             f"least {2 * window + 1} are needed (rings: {sweep.rings.note})"
         )
+    posts = None
+    if settings.post_depth > 0.0:
+        posts = find_posts(
+            sweep.xyz, sweep.ring_starts, settings.post_depth, settings.post_width, 2 * window
+        )
+        members = posts.members(sweep.xyz.shape[1])
+        inside &= ~members
     bend = curvature(sweep.xyz, window)
     gaps = squared_gaps(sweep.xyz, sweep.ring_starts)
     free = inside & ~unreliable_points(sweep.xyz, gaps, sweep.ring_starts, settings)
@@ -88,7 +96,7 @@ def extract_features(scan: Scan, config: Config) -> Features:
         rest &= roughness(sweep.xyz) < _ROUGH * settings.range_noise
     rest[edges] = False
     rest[flat] = False
-    return _assemble(scan, config, sweep, edges, rank, flat, np.flatnonzero(rest))
+    return _assemble(scan, config, sweep, edges, rank, flat, np.flatnonzero(rest), posts)
 
 
 def _squared_norm(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -131,9 +139,11 @@ def curvature(xyz: NDArray[np.float32], half_window: int) -> NDArray[np.float32]
 def kinks(xyz: NDArray[np.float32], half_window: int, which: IntArray) -> FloatArray:
     """How far points are off the surface through their neighbours on the ring, along their beams.
 
-    The inverse range along a ring is a sinusoid of the azimuth on *every* plane, so its sum of
-    differences to the neighbours vanishes on a wall however grazed, where that of the points
-    themselves (:func:`curvature`) is large because they are spread unevenly.
+    The inverse range is linear in the direction of the beam on *every* plane, so a point of a wall
+    lies, however grazed, where the mean of its neighbours on one side and that on the other say,
+    interpolated by angle. Of the points themselves (:func:`curvature`) the sum of differences is
+    large there because they are spread unevenly, and of evenly weighted inverse ranges it is where
+    a beam was lost.
 
     Parameters
     ----------
@@ -143,16 +153,22 @@ def kinks(xyz: NDArray[np.float32], half_window: int, which: IntArray) -> FloatA
 
     Returns
     -------
-    (M,) metres, the sum of 2 w differences over the standard deviation that it has for unit range
-    noise, ``sqrt(4 w^2 + 2 w)``
+    (M,) the distance along the beam in metres, over the standard deviation that it has for unit
+    range noise, ``sqrt(1 + (a^2 + b^2) / w)`` with a and b = 1 - a the weights of the two sides
     """
-    window = which[:, None] + np.arange(-half_window, half_window + 1)
-    squared = _squared_norm(xyz[:, window]).astype(np.float64)
-    inverse = 1.0 / np.sqrt(squared)
-    total = inverse.sum(axis=1) - (2 * half_window + 1) * inverse[:, half_window]
-    unit = float(np.sqrt(4.0 * half_window**2 + 2.0 * half_window))
-    sums: FloatArray = np.abs(total) * squared[:, half_window] / unit
-    return sums
+    window = xyz[:, which[:, None] + np.arange(-half_window, half_window + 1)].astype(np.float64)
+    inverse = 1.0 / np.sqrt((window * window).sum(axis=0))
+    beams = window * inverse
+    turned = np.sqrt(((beams - beams[:, :, half_window, None]) ** 2).sum(axis=0))
+    before, after = slice(0, half_window), slice(half_window + 1, None)
+    left, right = turned[:, before].mean(axis=1), turned[:, after].mean(axis=1)
+    share = np.divide(right, left + right, out=np.full(len(which), 0.5), where=left + right > 0.0)
+    centre = inverse[:, half_window]
+    expected = share * inverse[:, before].mean(axis=1)
+    expected += (1.0 - share) * inverse[:, after].mean(axis=1)
+    unit = np.sqrt(1.0 + (share**2 + (1.0 - share) ** 2) / half_window)
+    off: FloatArray = np.abs(expected - centre) / (centre**2 * unit)
+    return off
 
 
 def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -339,8 +355,9 @@ def _assemble(
     rank: IntArray,
     flat: IntArray,
     rest: IntArray,
+    posts: Posts | None,
 ) -> Features:
-    """Gather positions, times from the reference time, and rings."""
+    """Gather positions, times from the reference time, and rings; posts are edges, the last."""
     span = sweep.span
     moments = {"start": span[0], "middle": 0.5 * sum(span), "end": span[1], "stamp": 0.0}
     reference = moments[config.deskew.reference]
@@ -357,9 +374,14 @@ def _assemble(
         )
     else:
         rest_points, rest_times, rest_rings = positions(rest), times[rest], ring[rest]
+    edge_points, stands_out = positions(edges), kinks(sweep.xyz, config.features.half_window, edges)
+    if posts is not None:
+        edge_points = np.concatenate((edge_points, posts.points))
+        stands_out = np.concatenate((stands_out, posts.depths))
+        edges = np.concatenate((edges, (posts.first + posts.last) // 2))
     return Features(
         stamp=scan.stamp + round(reference * 1e9),
-        edges=positions(edges),
+        edges=edge_points,
         planes=np.concatenate((positions(flat), rest_points)),
         edge_times=times[edges],
         plane_times=np.concatenate((times[flat], rest_times)),
@@ -368,7 +390,7 @@ def _assemble(
         sharp=np.arange(np.count_nonzero(rank < config.features.sharp_per_sector)),
         flat=np.arange(len(flat)),
         span=(span[0] - reference, span[1] - reference),
-        edge_kinks=kinks(sweep.xyz, config.features.half_window, edges),
+        edge_kinks=stands_out,
     )
 
 

@@ -1,0 +1,113 @@
+"""Thin things that stand alone: poles, trunks, table legs.
+
+LOAM judges a point by five neighbours on either side of it on the same surface, which a pole of
+ten centimetres does not offer: most of its points count as grazed or occluded. Where nothing else
+stands, they are all there is to hold on to.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
+
+_LINKED_BEAMS = 2.5
+"""Beam spacings between two neighbours of a run at most: one lost beam is bridged."""
+_LINKED = 0.2
+"""Metres between two neighbours of a run that are always allowed."""
+_ROUND = 0.25 * np.pi
+"""Mean of ``sqrt(1 - x^2)`` over the width: the points seen on a cylinder lie on average this part
+of its radius before its axis."""
+
+
+@dataclass(frozen=True, slots=True)
+class Posts:
+    """Thin things of a sweep, one for each ring that meets them.
+
+    Attributes
+    ----------
+    points : (M, 3) metres, on the axis of a round post through the points of the run
+    first, last : (M,) first and last point of each run
+    depths : (M,) metres by which they stand before what is beside them; infinite before nothing
+    """
+
+    points: FloatArray
+    first: IntArray
+    last: IntArray
+    depths: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def members(self, count: int) -> BoolArray:
+        """(count,) which points of the sweep belong to one."""
+        step = np.zeros(count + 1, np.int64)
+        np.add.at(step, self.first, 1)
+        np.add.at(step, self.last + 1, -1)
+        inside: BoolArray = np.cumsum(step[:-1]) > 0
+        return inside
+
+
+def find_posts(
+    xyz: NDArray[np.float32],
+    ring_starts: IntArray,
+    depth: float,
+    width: float,
+    most: int,
+) -> Posts:
+    """Runs of a ring that are narrow, and nearer than what is on either side of them.
+
+    Parameters
+    ----------
+    xyz : (3, N) metres, ring after ring in firing order
+    ring_starts : (R + 1,) where each ring begins; the last entry is N
+    depth : metres by which a run stands before the next points on both sides; nothing there will do
+    width : metres across it at most
+    most : points of a run at most
+    """
+    count = int(ring_starts[-1])
+    own = ring_starts[1:] > ring_starts[:-1]
+    heads, tails = ring_starts[:-1][own], ring_starts[1:][own] - 1
+    following = np.arange(1, count + 1)
+    following[tails] = heads  # a ring is closed
+    ranges = np.sqrt((xyz * xyz).sum(axis=0))
+    beams = xyz / ranges
+    turn = beams[:, following] - beams
+    turn = np.sqrt((turn * turn).sum(axis=0))
+    spacing = float(np.median(turn))
+    farther = ranges[following] - ranges
+    reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
+    apart = turn > _LINKED_BEAMS * spacing
+    # On a ring of a few points its end may lie beside its start, and still be a turn away.
+    apart[tails[tails - heads < most]] = True
+    cut = apart | (np.hypot(farther, turn * ranges) > reach)
+    # Runs do not go on from the end of a ring to its start: one that does is cut there.
+    ends = cut.copy()
+    ends[tails] = True
+    last = np.flatnonzero(ends)
+    first = np.concatenate(([0], last[:-1] + 1))
+    gap_after = np.where(apart, np.inf, farther)
+    gap_before = np.empty(count)
+    gap_before[following] = np.where(apart, np.inf, -farther)
+    length = last - first + 1
+    chosen = (length <= most) & cut[last]
+    start_cut = np.empty(count, np.bool_)
+    start_cut[following] = cut
+    chosen &= start_cut[first]
+    depths = np.minimum(gap_before[first], gap_after[last])
+    chosen &= depths > depth
+    first, last, depths, length = first[chosen], last[chosen], depths[chosen], length[chosen]
+    if len(first) == 0:
+        nothing = np.zeros(0, np.int64)
+        return Posts(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
+    sums = np.concatenate([np.zeros((3, 1)), np.cumsum(xyz, axis=1, dtype=np.float64)], axis=1)
+    means = ((sums[:, last + 1] - sums[:, first]) / length).T
+    distance = np.linalg.norm(means, axis=1)
+    across = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) + spacing
+    radii = 0.5 * across * distance
+    narrow = 2.0 * radii <= width
+    points = means * (1.0 + _ROUND * radii / distance)[:, None]
+    return Posts(points[narrow], first[narrow], last[narrow], depths[narrow])

@@ -237,6 +237,7 @@ def test_round_trip_is_bit_identical(tmp_path: Path, megabytes: float, insertion
     assert all(file.suffix == ".npy" for file in files)
     assert len(stayed.points()) > 100
     np.testing.assert_array_equal(travelled.points(archived=True), stayed.points())
+    assert travelled.stats.archived_points == stayed.count()  # in memory or on disk
     travelled.recenter(np.zeros(3))  # comes from +x: its window starts one cube farther on
     stayed.recenter(np.array([8.0, 0.0, 0.0]))
     assert travelled.window == stayed.window == ((-1, -2, -1), (3, 2, 1))
@@ -435,6 +436,28 @@ def test_settled_keeps_everything_of_an_unchanged_cube() -> None:
     assert all(cube.points is before[index] for index, cube in cube_map._cubes.items())
     assert cube_map._searches == [search]
     assert search._recent == []
+
+
+def test_points_that_wait_to_be_merged_in_are_there_all_the_same() -> None:
+    rng = np.random.default_rng(4)
+    waiting, merged = CubeMap(SMALL, 0.2), CubeMap(SMALL, 0.2)
+    waited = 0
+    for points in (rng.uniform(-2.0, 2.0, (4000, 3)), *rng.uniform(-2.0, 2.0, (30, 20, 3))):
+        again = points[:5]  # in voxels that have just been taken
+        for cube_map in (waiting, merged):
+            cube_map.insert(points)
+            cube_map.insert(again)
+        assert len(merged.points()) == waiting.count() == waiting.stats.points
+        (cube,) = waiting._cubes.values()
+        waited += len(cube._new_keys) > 0
+        np.testing.assert_array_equal(
+            waiting.nearest(points, 1, 9.0, [(0, 0, 0)])[0],
+            merged.nearest(points, 1, 9.0, [(0, 0, 0)])[0],
+        )
+    assert 10 < waited < 31  # merged in by themselves now and then
+    keys = voxel_keys(waiting.points(), 0.2)
+    assert np.all(np.diff(keys) > 0)
+    np.testing.assert_array_equal(waiting.points(), merged.points())
 
 
 def test_centroid_drops_only_the_trees_it_changed() -> None:

@@ -33,7 +33,7 @@ def height_with(priors: list[gtsam.CustomFactor]) -> tuple[float, float]:
         update = mapper.register(features, priors=priors if number == len(sweeps) - 1 else [])
     half = 0.5 * sum(sweeps[-1].span)
     middle = update.map_T_lidar.compose(gtsam.Pose3.Expmap(half * update.twist))
-    return middle.translation()[2], float(np.sqrt(update.covariance[5, 5]))
+    return middle.translation()[2], float(np.sqrt(update.raw_covariance[5, 5]))
 
 
 free, sigma = height_with([])

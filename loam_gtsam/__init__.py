@@ -21,6 +21,7 @@ from loam_gtsam.config import Config as Config
 from loam_gtsam.config import dump_config as dump_config
 from loam_gtsam.config import load_config as load_config
 from loam_gtsam.config import preset as preset
+from loam_gtsam.covariance import relative_covariance as relative_covariance
 from loam_gtsam.cubemap import CubeMap as CubeMap
 from loam_gtsam.datasets import Dataset as Dataset
 from loam_gtsam.datasets import DatasetInfo as DatasetInfo
@@ -40,7 +41,15 @@ from loam_gtsam.factors import point_to_line_factor as point_to_line_factor
 from loam_gtsam.factors import point_to_plane_factor as point_to_plane_factor
 from loam_gtsam.factors import scan_match_factor as scan_match_factor
 from loam_gtsam.features import extract_features as extract_features
+from loam_gtsam.graph_files import read_graph as read_graph
+from loam_gtsam.graph_files import write_graph as write_graph
+from loam_gtsam.graph_optimize import SavedGraph as SavedGraph
+from loam_gtsam.graph_optimize import optimize_graph as optimize_graph
 from loam_gtsam.imu import ImuBuffer as ImuBuffer
+from loam_gtsam.keyframes import Keyframe as Keyframe
+from loam_gtsam.keyframes import LoopClosure as LoopClosure
+from loam_gtsam.loop_closure import LoopCloser as LoopCloser
+from loam_gtsam.loop_closure import ScanLoopCloser as ScanLoopCloser
 from loam_gtsam.mapper import Mapper as Mapper
 from loam_gtsam.mapper import PoseContext as PoseContext
 from loam_gtsam.mapper import make_solver as make_solver
@@ -51,6 +60,7 @@ from loam_gtsam.odometry import ScanToScan as ScanToScan
 from loam_gtsam.pipeline import Pipeline as Pipeline
 from loam_gtsam.pipeline import RunResult as RunResult
 from loam_gtsam.pipeline import run as run
+from loam_gtsam.pose_graph import PoseGraph as PoseGraph
 from loam_gtsam.solvers import POSE_KEY as POSE_KEY
 from loam_gtsam.solvers import GtsamSolver as GtsamSolver
 from loam_gtsam.solvers import Solution as Solution
@@ -71,6 +81,7 @@ from loam_gtsam.types import SweepError as SweepError
 from loam_gtsam.types import SweepMotion as SweepMotion
 from loam_gtsam.types import TiltPrior as TiltPrior
 from loam_gtsam.types import Trajectory as Trajectory
+from loam_gtsam.types import Uncertainty as Uncertainty
 
 if TYPE_CHECKING:
     from loam_gtsam.datasets import ArrayDataset as ArrayDataset
@@ -112,15 +123,21 @@ __all__ = [
     "ImuBuffer",
     "ImuSamples",
     "InputError",
+    "Keyframe",
     "LoamError",
+    "LoopCloser",
+    "LoopClosure",
     "MapUpdate",
     "Mapper",
     "MatchRows",
     "OutputError",
     "Pipeline",
     "PoseContext",
+    "PoseGraph",
     "RunResult",
+    "SavedGraph",
     "Scan",
+    "ScanLoopCloser",
     "ScanMatches",
     "ScanToScan",
     "Solution",
@@ -128,6 +145,7 @@ __all__ = [
     "SweepMotion",
     "TiltPrior",
     "Trajectory",
+    "Uncertainty",
     "absolute_error",
     "associate",
     "checked_factor",
@@ -139,13 +157,17 @@ __all__ = [
     "make_solver",
     "match_rows",
     "open_dataset",
+    "optimize_graph",
     "plane_rows",
     "point_to_line_factor",
     "point_to_plane_factor",
     "preset",
+    "read_graph",
     "read_tum",
+    "relative_covariance",
     "run",
     "scan_match_factor",
+    "write_graph",
     "write_run",
     "write_tum",
     *_LOADERS,

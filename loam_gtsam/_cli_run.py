@@ -31,12 +31,14 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.evaluation import absolute_error, align, align_rotations, interpolate
 from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
-from loam_gtsam.pipeline import OnFrame, RunResult, run
+from loam_gtsam.pipeline import Observer, OnFrame, RunResult, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
 
 PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
 TRUTH_FILE = "truth.tum"
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_WORTH_A_PROCESS = 200
+"""Sweeps by which a process has saved the second that it takes to start."""
 _SHOW_CURSOR = b"\x1b[?25h"
 
 
@@ -50,6 +52,8 @@ class RunOptions:
     plot: bool | None
     profile: bool
     quiet: bool
+    bag: Path | None = None
+    workers: int | None = None
 
 
 def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
@@ -67,11 +71,17 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     folder = make_folder(free_folder(wanted, options.overwrite))
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
-    with stop_requests() as stop:
+    with stop_requests() as stop, _bag(options, config) as observe:
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             result = run(
-                dataset, config, max_frames=options.frames, on_frame=on_frame, keep_partial=True
+                dataset,
+                config,
+                max_frames=options.frames,
+                on_frame=on_frame,
+                keep_partial=True,
+                observe=observe,
+                workers=_workers(options, total),
             )
         seconds = time.perf_counter() - started
         if not result.updates:
@@ -87,6 +97,8 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             console.print(profile_table(result.updates))
         console.print(summary(result, dataset.name, seconds, accuracy, info.problems))
         say_written(console, stop, len(result.updates), total, folder, files)
+        if options.bag is not None and options.bag.exists():
+            console.print(f"Bag written to {options.bag}", markup=False, soft_wrap=True)
     if result.error is not None:
         raise result.error
     if stop.signum is not None:
@@ -97,6 +109,26 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             f"{result.updates[0].message}; see also: loam-gtsam inspect"
         )
     return 0
+
+
+def _workers(options: RunOptions, sweeps: int) -> int:
+    """Processes for feature extraction: unless asked for, one if it is worth its start."""
+    if options.workers is not None:
+        return options.workers
+    return int(sweeps > _WORTH_A_PROCESS and (os.cpu_count() or 1) > 1)
+
+
+@contextmanager
+def _bag(options: RunOptions, config: Config) -> Iterator[Observer | None]:
+    """What writes every frame into the bag that was asked for, if one was."""
+    if options.bag is None:
+        yield None
+        return
+    from loam_gtsam.export_bag import BagWriter
+    from loam_gtsam.recording import record
+
+    with BagWriter(options.bag, config.bag, overwrite=options.overwrite) as bag:
+        yield record(bag)
 
 
 def free_folder(

@@ -1,4 +1,4 @@
-"""The command line: ``loam-gtsam demo | run | compare | inspect | config``.
+"""The command line: ``loam-gtsam demo | run | compare | inspect | optimize | config``.
 
 The only place that catches :class:`~loam_gtsam.types.LoamError`. Exit codes: 0 done, 1 an error
 (one message on stderr), 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM.
@@ -52,7 +52,6 @@ class _Group(TyperGroup):
 app = typer.Typer(
     cls=_Group,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
     help="LOAM's scan-to-map LiDAR mapping as a GTSAM factor graph.",
@@ -172,6 +171,23 @@ def run(
     overrides: Overrides = None,
     frames: Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")] = None,
     output: Output = None,
+    bag: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Also write a bag with LOAM's topics: ROS 1 (FILE.bag), ROS 2 (FILE.mcap, or a "
+            "folder if FILE has no suffix).",
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            max=16,
+            help="Processes that extract features ahead of the solve; by default one for more "
+            "than 200 sweeps. The result is the same.",
+        ),
+    ] = None,
     overwrite: Overwrite = False,
     plot: Plot = None,
     profile: Profile = False,
@@ -185,8 +201,10 @@ def run(
     from loam_gtsam._cli_run import RunOptions, execute
 
     settings = _settings(preset, config, sensor, overrides)
+    if bag is not None and bag.resolve() in (Path(path).resolve(), *Path(path).resolve().parents):
+        raise OutputError(f"--bag {bag}: the input must not be replaced; choose another name")
     dataset = _open(path, topic, imu_topic, loader_options)
-    options = RunOptions(frames, output, overwrite, plot, profile, quiet)
+    options = RunOptions(frames, output, overwrite, plot, profile, quiet, bag, workers)
     raise typer.Exit(execute(dataset, settings, options))
 
 
@@ -273,6 +291,48 @@ def inspect(
     report, runnable = inspection(dataset, settings)
     Console().print(report)
     raise typer.Exit(0 if runnable else 1)
+
+
+@app.command()
+def optimize(
+    graph: Annotated[
+        Path,
+        typer.Argument(metavar="GRAPH", help="A pose graph: NAME.g2o, or GTSAM's NAME.graph."),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Where to write it [default: NAME_optimized.*]."),
+    ] = None,
+    trajectory: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Also write the poses as TUM, if the graph has stamps."),
+    ] = None,
+    robust: Annotated[
+        bool,
+        typer.Option("--robust/--plain", help="Switch off loops that contradict the others."),
+    ] = True,
+    max_chi2: Annotated[
+        float,
+        typer.Option(min=0.0, help="Squared Mahalanobis distance from which a loop contradicts."),
+    ] = Config().pose_graph.max_chi2,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files.")] = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Optimise a saved pose graph, robust against wrong loops."""
+    from loam_gtsam._cli_optimize import execute
+
+    raise typer.Exit(
+        execute(
+            graph,
+            output,
+            trajectory,
+            robust=robust,
+            max_chi2=max_chi2,
+            overwrite=overwrite,
+            quiet=quiet,
+        )
+    )
 
 
 @app.command("config")

@@ -157,6 +157,15 @@ class FeatureConfig(_Section):
         source="LOAM takes all points that are not edges",
         low=0.0,
     )
+    post_depth: float = _param(
+        0.5,
+        "a run of a ring too short for the curvature (a pole, a trunk) is an edge where it stands "
+        "before what is on both sides of it by more than this; 0: no such edges",
+        unit="m",
+        source="LOAM takes what its curvature finds",
+        low=0.0,
+    )
+    post_width: float = _param(0.5, "and is narrower than this", unit="m", low=0.0)
     plane_curvature: float = _param(
         0.1, "largest curvature of a plane point", unit="m^2", source="LOAM", low=0.0
     )
@@ -270,12 +279,12 @@ class MatchingConfig(_Section):
     """Association of features with the map."""
 
     max_edges: int = _param(
-        1000,
+        500,
         "edge features matched at most, evenly spread over the sweep; 0: all. All enter the map",
         source="LOAM matches all",
         low=0,
     )
-    max_planes: int = _param(4000, "and plane features", source="LOAM matches all", low=0)
+    max_planes: int = _param(2000, "and plane features", source="LOAM matches all", low=0)
     rough_edges: int = _param(
         150, "edge features matched at most while the pose is only known roughly", low=1
     )
@@ -286,9 +295,21 @@ class MatchingConfig(_Section):
         source="LOAM has none",
         low=0,
     )
+    rough_translation: float = _param(
+        0.1, "it ends once it moves the pose by less than this", unit="m", low=0.0
+    )
+    rough_rotation_deg: float = _param(0.25, "and turns it by less", unit="degrees", low=0.0)
     neighbours: int = _param(5, "map points a feature is matched with", source="LOAM", low=3)
     max_distance: float = _param(
         1.0, "distance of the farthest of them", unit="m", source="LOAM", low=0.0
+    )
+    wide_search: float = _param(
+        4.0,
+        "with fewer matches than solver.min_matches, search again with this times max_distance in "
+        "a map of this times as large voxels, as at the start on open ground, where the rings of "
+        "one sweep are too far apart; 1: no such search",
+        source="LOAM has none",
+        low=1.0,
     )
     line_ratio: float = _param(
         10.0,
@@ -378,9 +399,15 @@ class SolverConfig(_Section):
     translation_tolerance: float = _param(
         0.0005, "and less than this", unit="m", source="LOAM", low=0.0
     )
+    kernel: Literal["huber", "geman_mcclure"] = _param(
+        "huber",
+        "method gtsam: robust kernel on the matches; geman_mcclure all but ignores what is far "
+        "off: for traffic and crowds",
+    )
     kernel_width: float = _param(
         1.345,
-        "width of the Huber kernel on the matches, in units of their scatter; .inf turns it off",
+        "width of the Huber kernel on the matches, in units of their scatter; .inf turns it off. "
+        "That of the other is 2.816 times as wide, which makes them alike on normal noise",
         source="95 % efficiency on normal noise",
         low=0.1,
     )
@@ -444,6 +471,55 @@ class SolverConfig(_Section):
 
 
 @dataclass(frozen=True, slots=True)
+class RelocalizationConfig(_Section):
+    """When a sweep counts as lost, and where its place is searched for."""
+
+    enabled: bool = _param(
+        True,
+        "watch whether sweeps fit the map as the ones before did; false believes every solve",
+        source="LOAM believes",
+    )
+    memory: int = _param(
+        10, "sweeps before, whose median is what is usual; as many must come first", low=1
+    )
+    min_agreement: float = _param(
+        0.8,
+        "lost if the share of matches within three standard deviations is below this times the "
+        "usual one",
+        source="at least 0.88 in the built-in scenes and KITTI, at most 0.75 when kidnapped",
+        low=0.0,
+        high=1.0,
+    )
+    min_share: float = _param(
+        0.4,
+        "or if the share of features that are matched and agree is below this times the usual one",
+        low=0.0,
+        high=1.0,
+    )
+    found_agreement: float = _param(
+        0.9, "found again if the first is above this times the usual one", low=0.0, high=1.0
+    )
+    found_share: float = _param(0.6, "and the second above this", low=0.0, high=1.0)
+    max_acceleration: float = _param(
+        60.0,
+        "a pose farther from the predicted one than this explains is a jump: it goes without "
+        "motion, and the velocity from before stays",
+        unit="m/s^2",
+        low=0.0,
+    )
+    max_turn_acceleration: float = _param(
+        60.0, "the same for the rotation", unit="rad/s^2", low=0.0
+    )
+    radius: float = _param(
+        10.0, "around the prediction that is searched at first", unit="m", low=0.0
+    )
+    radius_growth: float = _param(
+        1.0, "by which the radius grows with every lost sweep", unit="m", low=0.0
+    )
+    max_radius: float = _param(30.0, "and its limit", unit="m", low=0.0, high=100.0)
+
+
+@dataclass(frozen=True, slots=True)
 class ImuConfig(_Section):
     """Use of an inertial measurement unit; nothing here matters without one."""
 
@@ -456,9 +532,9 @@ class ImuConfig(_Section):
         source="LOAM blends",
     )
     weight: float = _param(
-        0.002,
+        0.03,
         "share of the IMU's roll and pitch (blend, equivalent)",
-        source="LOAM",
+        source="LOAM uses 0.002; on slopes that is too little to be seen",
         low=0.0,
         high=0.999,
     )
@@ -512,6 +588,144 @@ class ImuConfig(_Section):
 
 
 @dataclass(frozen=True, slots=True)
+class CovarianceConfig(_Section):
+    """Calibration of the covariances that are handed out; no pose depends on it."""
+
+    match_cell: float = _param(
+        1.6,
+        "residuals of matches in one cell of this size count as one error: they share map points",
+        unit="m",
+        source="neighbours lie within matching.max_distance",
+        low=0.01,
+    )
+    ground_cell: float = _param(
+        0.8, "a cell of this size is new ground when it is matched for the first time", unit="m",
+        low=0.01,
+    )  # fmt: skip
+    drift: float = _param(
+        6.0,
+        "the map's error grows by this many times the share of new ground in a frame's covariance",
+        source="fitted on seeds 100-103 of built-in scenes, see docs/consistency.md",
+        low=0.0,
+    )
+    window: int = _param(
+        10,
+        "frames over which the acceleration, which the constant velocity misses, is averaged",
+        low=1,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PoseGraphConfig(_Section):
+    """Keyframes and the graph of their poses."""
+
+    keyframe_distance: float = _param(
+        2.0, "a frame is a keyframe if it is as far as this from the last one", unit="m", low=0.0
+    )
+    keyframe_angle_deg: float = _param(
+        30.0, "or has turned as much as this", unit="degrees", low=0.0
+    )
+    walk: float = _param(
+        0.02,
+        "drift of the odometry beside what its covariances know, as a random walk: so many times "
+        "the square root of the way between two keyframes",
+        unit="m/sqrt(m)",
+        low=0.0,
+    )
+    turn_walk_deg: float = _param(0.02, "and of its rotation", unit="degrees/sqrt(m)", low=0.0)
+    max_chi2: float = _param(
+        40.0,
+        "a loop is used if its squared Mahalanobis distance (6 freedoms) from what all the others "
+        "say is not above",
+        source="28 is exceeded by one of 10,000 right ones, were all covariances exact",
+        low=0.0,
+    )
+    kernel_width: float = _param(
+        5.0,
+        "width of the Huber kernel on the whitened norm of a loop, in iSAM2; .inf turns it off",
+        source="far above sqrt(6), the norm of a right one",
+        low=0.1,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class LoopConfig(_Section):
+    """Where loops are looked for, and when one is believed."""
+
+    min_way: float = _param(
+        30.0, "keyframes that are not as far as this back on the way are no loop", unit="m", low=0.0
+    )
+    gate: float = _param(10.0, "candidates are within this of the keyframe, and", unit="m", low=0.0)
+    gate_sigmas: float = _param(
+        3.0, "so many standard deviations of both their positions farther, and", low=0.0
+    )
+    gate_drift: float = _param(
+        0.02, "this share of the way between them: drift that the covariances do not know", low=0.0
+    )
+    rings: int = _param(20, "of the place descriptor", source="Scan Context", low=1)
+    sectors: int = _param(60, "of it", source="Scan Context", low=4)
+    reach: float = _param(
+        60.0,
+        "of it; what is farther away is not in it",
+        unit="m",
+        source="Scan Context: 80",
+        low=1.0,
+    )
+    max_unlike: float = _param(
+        0.6,
+        "distance of two descriptors, 0 for equal ones, above which a candidate is not tried",
+        source="Scan Context: 0.2 to 0.6, but there nothing is verified",
+        low=0.0,
+    )
+    tries: int = _param(2, "candidates that are verified for a keyframe at most", low=1)
+    neighbours: int = _param(
+        6, "keyframes on either side of a candidate whose features make up the submap", low=0
+    )
+    search: float = _param(
+        8.0, "around the candidate in which the keyframe is searched for", unit="m", low=1.0
+    )
+    min_share: float = _param(
+        0.5,
+        "share of the features off level ground that must find a match in the submap",
+        low=0.0,
+        high=1.0,
+    )
+    min_agreement: float = _param(
+        0.9,
+        "share of their matches that must lie within three standard deviations",
+        source="right ones 0.97 or more, 3 m along a street 0.75, other wrong ones below 0.5",
+        low=0.0,
+        high=1.0,
+    )
+    min_aligned: float = _param(
+        30.0,
+        "every direction must be fixed by as many matches, counted as for solver.min_aligned",
+        low=0.0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class BagConfig(_Section):
+    """What a run writes into a bag."""
+
+    map_frame: str = _param(
+        "camera_init",
+        "frame_id of poses and clouds; whatever its name, its axes are those of the map",
+        source="LOAM",
+    )
+    lidar_frame: str = _param("aft_mapped", "child_frame_id of the poses", source="LOAM")
+    registered: bool = _param(
+        True, "write /velodyne_cloud_registered, which makes up most of a bag"
+    )
+    surround_every: int = _param(
+        5,
+        "frames from one /laser_cloud_surround to the next; 0 writes none",
+        source="LOAM",
+        low=0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Config(_Section):
     """The whole configuration."""
 
@@ -523,13 +737,21 @@ class Config(_Section):
     matching: MatchingConfig = _param(MatchingConfig(), "association with the map")
     solver: SolverConfig = _param(SolverConfig(), "the per-frame solve")
     imu: ImuConfig = _param(ImuConfig(), "roll, pitch and rotation from an IMU")
+    relocalization: RelocalizationConfig = _param(
+        RelocalizationConfig(), "sweeps that do not fit the map"
+    )
+    covariance: CovarianceConfig = _param(CovarianceConfig(), "calibrated covariances")
+    pose_graph: PoseGraphConfig = _param(PoseGraphConfig(), "keyframes and their graph")
+    loops: LoopConfig = _param(LoopConfig(), "how loops are found and verified")
+    bag: BagConfig = _param(BagConfig(), "what is written into a bag")
 
 
-_CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0)
+_CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0, post_depth=0.0)
 _CLASSICAL_MATCHING = MatchingConfig(
     max_edges=0,
     max_planes=0,
     rough_planes=0,
+    wide_search=1.0,
     line_ratio=3.0,
     plane_fit="unit_offset",
     plane_ratio=0.0,
@@ -550,7 +772,8 @@ PRESETS: dict[str, Config] = {
         map=MapConfig(insertion="centroid"),
         matching=_CLASSICAL_MATCHING,
         solver=SolverConfig(method="loam", step_sigmas=0.0, min_map_edges=11, min_map_planes=101),
-        imu=ImuConfig(prior="blend"),
+        imu=ImuConfig(prior="blend", weight=0.002),
+        relocalization=RelocalizationConfig(enabled=False),
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings.
     "aloam": Config(
@@ -569,6 +792,7 @@ PRESETS: dict[str, Config] = {
             min_map_planes=51,
         ),
         imu=ImuConfig(enabled=False),
+        relocalization=RelocalizationConfig(enabled=False),
     ),
 }
 

@@ -15,7 +15,7 @@ from loam_gtsam.geometry import cross, move_points, voxel_filter
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.types import Features, FloatArray, SweepMotion
 
-_DISTINCT = 3.0
+_DISTINCT = 4.5
 """Standard deviations of range noise by which a distinct edge stands out of its ring."""
 
 
@@ -30,21 +30,31 @@ class MovingSweep:
     features : of the sweep
     config : ``deskew`` and the voxel sizes of ``map`` are used
     imu : None for constant velocity
+    thin : whether to voxel-filter the points, as for matching
 
     Attributes
     ----------
     reference_stamp : nanoseconds of the moment the frame's pose is handed out for
     stamp : nanoseconds of the middle of the sweep
     middle : seconds from the one to the other; 0 if the features do not move
+    duration : seconds of the sweep; 0 likewise
     edges, planes : (E, 3) and (P, 3) metres, seen from the middle of the sweep
     distinct : (E,) whether an edge stands out of its ring by more than range noise makes it
     motion : what the rotation comes from
     """
 
-    def __init__(self, features: Features, config: Config, imu: ImuBuffer | None = None) -> None:
+    def __init__(
+        self,
+        features: Features,
+        config: Config,
+        imu: ImuBuffer | None = None,
+        *,
+        thin: bool = True,
+    ) -> None:
         first, end = features.span
         moving = config.deskew.enabled and end > first
         self.middle = 0.5 * (first + end) if moving else 0.0
+        self.duration = end - first if moving else 0.0
         self.reference_stamp = features.stamp
         self.stamp = features.stamp + round(self.middle * 1e9)
         kinks = features.edge_kinks
@@ -53,8 +63,8 @@ class MovingSweep:
         edges = np.column_stack([features.edges, features.edge_times, kinks])
         planes = np.column_stack([features.planes, features.plane_times])
         filtered = [
-            voxel_filter(edges, config.map.edge_voxel),
-            voxel_filter(planes, config.map.plane_voxel),
+            voxel_filter(edges, config.map.edge_voxel if thin else 0.0),
+            voxel_filter(planes, config.map.plane_voxel if thin else 0.0),
         ]
         self.distinct = filtered[0][:, 4] > _DISTINCT * config.features.range_noise
         self._points = [part[:, :3] for part in filtered]

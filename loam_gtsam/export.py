@@ -27,10 +27,12 @@ from loam_gtsam.config import Config, dump_config
 from loam_gtsam.types import (
     DatasetError,
     FloatArray,
+    FrameStatus,
     InputError,
     MapUpdate,
     OutputError,
     Trajectory,
+    Uncertainty,
 )
 
 _NS = 10**9
@@ -47,6 +49,7 @@ _PLY_VERTEX = np.dtype(
 RUN_FILES = (
     "trajectory.tum",
     "trajectory_kitti.txt",
+    "trajectory_covariance.csv",
     "run.npz",
     "map.ply",
     "config.yaml",
@@ -187,6 +190,35 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     _write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
 
 
+def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
+    """Write the calibrated covariance of every pose that :func:`write_tum` writes, in its order.
+
+    A line has the stamp, the status and the upper triangle of
+    :attr:`loam_gtsam.types.MapUpdate.covariance`, row by row: ``rx_rx rx_ry ... z_z`` in rad^2,
+    rad m and m^2, along the axes of the lidar. Empty where the frame was not solved.
+
+    Parameters
+    ----------
+    updates : of a run; frames with a bad stamp are left out
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    axes = ("rx", "ry", "rz", "x", "y", "z")
+    rows, columns = np.triu_indices(6)
+    names = [f"{axes[i]}_{axes[j]}" for i, j in zip(rows, columns, strict=True)]
+    lines = [",".join(("stamp_s", "status", *names))]
+    for update in updates:
+        if update.status is FrameStatus.BAD_STAMP:
+            continue
+        values = update.covariance[rows, columns]
+        cells = [f"{value:.9g}" if np.isfinite(value) else "" for value in values]
+        lines.append(",".join((_seconds(update.stamp), str(update.status), *cells)))
+    _write_text(path, "\n".join(lines) + "\n")
+
+
 def stage_seconds(updates: Sequence[MapUpdate]) -> tuple[tuple[str, ...], FloatArray]:
     """Names of the S stages in order, and (N, S) seconds; NaN where a stage did not run."""
     names = tuple(dict.fromkeys(name for update in updates for name in update.timings))
@@ -209,12 +241,15 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     Notes
     -----
     Keys: ``stamps`` (N,) int64 ns; ``map_T_lidar`` (N, 4, 4); ``status`` and ``messages`` (N,)
-    strings; ``covariances`` (N, 6, 6), NaN for frames that were not solved; ``information``
-    (N, 6, 6); ``twists`` (N, 6) rad/s and m/s; ``n_edges``, ``n_planes``, ``n_edge_matches``,
+    strings; ``covariances``, ``raw_covariances``, ``own_covariances``, ``shared_covariances`` and
+    ``drift_covariances`` (N, 6, 6), NaN for frames that were not solved; ``follows`` (N,) int64;
+    ``residual_variances`` and ``effective_matches`` (N,); ``information`` (N, 6, 6);
+    ``twists`` (N, 6) rad/s and m/s; ``n_edges``, ``n_planes``, ``n_edge_matches``,
     ``n_plane_matches``, ``iterations``, ``solver_iterations`` (N,) int64; ``error_before``,
     ``error_after`` (N,); ``stage_names`` (S,) strings and ``stage_seconds`` (N, S), NaN where a
     stage did not run; ``sweep_motions`` and ``tilt_priors`` (N,) strings;
-    ``localizability`` (N, 6) and ``directions`` (N, 6, 6). See
+    ``localizability``, ``direction_information`` and ``axis_localizability`` (N, 6) and
+    ``directions`` (N, 6, 6). See
     :class:`loam_gtsam.types.MapUpdate` for their meaning.
     """
     count = len(updates)
@@ -225,15 +260,19 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         "status": np.array([str(u.status) for u in updates], np.str_),
         "messages": np.array([u.message for u in updates], np.str_),
         "covariances": _stack([u.covariance for u in updates], (count, 6, 6)),
+        "raw_covariances": _stack([u.raw_covariance for u in updates], (count, 6, 6)),
         "information": _stack([u.information for u in updates], (count, 6, 6)),
         "twists": _stack([u.twist for u in updates], (count, 6)),
         "sweep_motions": np.array([str(u.sweep_motion) for u in updates], np.str_),
         "tilt_priors": np.array([str(u.tilt_prior) for u in updates], np.str_),
         "localizability": _stack([u.localizability for u in updates], (count, 6)),
         "directions": _stack([u.directions for u in updates], (count, 6, 6)),
+        "direction_information": _stack([u.direction_information for u in updates], (count, 6)),
+        "axis_localizability": _stack([u.axis_localizability for u in updates], (count, 6)),
         "stage_names": np.array(names, np.str_),
         "stage_seconds": seconds,
     }
+    arrays |= _uncertainty_arrays(updates)
     for name in ("n_edges", "n_planes", "n_edge_matches", "n_plane_matches",
                  "iterations", "solver_iterations"):  # fmt: skip
         arrays[name] = np.array([getattr(u, name) for u in updates], np.int64)
@@ -241,6 +280,22 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         arrays[name] = np.array([getattr(u, name) for u in updates], np.float64)
     with replacing(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+
+
+def _uncertainty_arrays(updates: Sequence[MapUpdate]) -> dict[str, NDArray[Any]]:
+    """The parts of the covariances; NaN, and -1 for ``follows``, where there are none."""
+    nothing = np.full((6, 6), np.nan)
+    unknown = Uncertainty(nothing, nothing, None, nothing, np.nan, np.nan)
+    parts = [update.uncertainty or unknown for update in updates]
+    arrays: dict[str, NDArray[Any]] = {
+        f"{name}_covariances": _stack([getattr(part, name) for part in parts], (len(parts), 6, 6))
+        for name in ("own", "shared", "drift")
+    }
+    stamps = [-1 if part.follows is None else part.follows for part in parts]
+    arrays["follows"] = np.array(stamps, np.int64)
+    arrays["residual_variances"] = np.array([part.residual_variance for part in parts], np.float64)
+    arrays["effective_matches"] = np.array([part.effective_matches for part in parts], np.float64)
+    return arrays
 
 
 def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.floating]) -> None:
@@ -312,6 +367,7 @@ def write_run(
         records["incomplete"] = "the run ended early"
     write_tum(folder / "trajectory.tum", trajectory, comments=records)
     write_kitti(folder / "trajectory_kitti.txt", trajectory)
+    write_covariances(folder / "trajectory_covariance.csv", result.updates)
     write_npz(folder / "run.npz", result.updates)
     write_ply(folder / "map.ply", result.edge_points, result.plane_points)
     _write_text(folder / "config.yaml", dump_config(result.config))
@@ -339,7 +395,25 @@ def summarise(result: Run) -> dict[str, Any]:
         "edge_points": len(result.edge_points),
         "plane_points": len(result.plane_points),
         "map_stats": {name: dict(stats) for name, stats in result.map_stats.items()},
+        "localizability": _axes_part(result),
         "imu": None if result.imu is None else _imu_part(result.imu),
+    }
+
+
+def _axes_part(result: Run) -> dict[str, Any] | None:
+    """How well the frames fixed each axis of the lidar; None if that was not looked at."""
+    counts = np.array([u.axis_localizability for u in result.updates], np.float64).reshape(-1, 6)
+    counts = counts[np.isfinite(counts).all(axis=1)]
+    if len(counts) == 0:
+        return None
+    least = result.config.solver.min_aligned
+    return {
+        axis: {
+            "median": float(np.median(column)),
+            "lowest": float(column.min()),
+            "weak_frames": int(np.count_nonzero(column < least)),
+        }
+        for axis, column in zip(("rx", "ry", "rz", "x", "y", "z"), counts.T, strict=True)
     }
 
 

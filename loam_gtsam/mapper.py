@@ -15,13 +15,15 @@ import numpy as np
 
 from loam_gtsam.classical import ALoamSolver, ClassicalSolver
 from loam_gtsam.config import Config, MatchingConfig, SolverConfig
+from loam_gtsam.covariance import PoseErrors
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.deskew import MovingSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.imu_aid import ImuAid
 from loam_gtsam.matching import ScanMatches, associate, renew, rough
-from loam_gtsam.odometry import ConstantVelocity, Guess
+from loam_gtsam.odometry import ConstantVelocity, Guess, advance
+from loam_gtsam.relocalization import Fit, Watch, places, some
 from loam_gtsam.solvers import (
     POSE_KEY,
     Associate,
@@ -42,6 +44,10 @@ from loam_gtsam.types import (
 
 _START_ROUNDS = 2
 """Times the first two sweeps are registered anew while their motion becomes known."""
+_PLACES = 6
+"""Places tried at most when a sweep does not fit where it was solved."""
+_CLEARLY = 1.02
+"""By how much another motion within a sweep must fit better than the one before."""
 _SHORTEST = 1e-3
 """Seconds between the middles of two sweeps at least; those of unlike length may even coincide."""
 
@@ -84,6 +90,7 @@ class Mapper:
     ----------
     last : the last update
     imu_aid : what the mapper makes of the IMU; None without one
+    watch : tells whether sweeps fit the map
     edge_map, plane_map : the map
 
     Raises
@@ -102,6 +109,8 @@ class Mapper:
     ) -> None:
         self.config = config or Config()
         self.solver = solver or make_solver(self.config.solver)
+        # The pose of a rough solve is only where the real one starts.
+        self._rough_solver = solver or make_solver(_loose(self.config))
         method, prior = self.config.solver.method, self.config.imu.prior
         if imu is not None and method != "gtsam" and prior in ("equivalent", "sigma"):
             raise ConfigError(
@@ -110,7 +119,13 @@ class Mapper:
             )
         self.imu_aid = None if imu is None else ImuAid(self.config.imu, imu)
         self.extra_factors = extra_factors
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the map: the next sweep is the first of a new one."""
         self.last: MapUpdate | None = None
+        self.watch = Watch(self.config.relocalization)
+        self._errors = PoseErrors(self.config)
         self._new_map()
         self._first: tuple[MovingSweep, gtsam.Pose3] | None = None
         self._last_middle: tuple[int, gtsam.Pose3] | None = None
@@ -210,12 +225,14 @@ class Mapper:
         """Match the sweep with the map around the guess, solve, insert."""
         guess, motion = self._expected(sweep, guess)
         middle = _to_middle(sweep, guess)
-        sizes = []
-        for cubes in (self.edge_map, self.plane_map):
+        maps = self.edge_map, self.plane_map
+        for cubes in maps:
             cubes.recenter(middle.translation())
-            sizes.append(cubes.count(cubes.neighbourhood(middle.matrix())))
+        around = [cubes.neighbourhood(middle.matrix()) for cubes in maps]
+        sizes = [cubes.count(near) for cubes, near in zip(maps, around, strict=True)]
         config = self.config.solver
-        if sizes[0] < config.min_map_edges or sizes[1] < config.min_map_planes:
+        sparse = sizes[0] < config.min_map_edges or sizes[1] < config.min_map_planes
+        if sparse and not self.watch.lost:
             self._first = None
             message = (
                 f"the local map has {sizes[0]} edge and {sizes[1]} plane points; at least "
@@ -229,29 +246,146 @@ class Mapper:
         if self._first is None and 0 < self.config.matching.rough_planes < len(sweep.planes):
             # Few matches get as near as many do; all of them are then searched for but once.
             matches_at.use(rough(self.config.matching))
-            first = self.solver.solve(matches_at, middle, priors)
+            first = self._rough_solver.solve(matches_at, middle, priors, motion)
             matches_at.use(self.config.matching)
             rough_iterations = first.iterations
             start = first.map_T_lidar
         solution = self.solver.solve(matches_at, start, priors, motion)
         solution = replace(solution, iterations=solution.iterations + rough_iterations)
         clock.lap("solve")
+        relocalized, twist = "", guess.twist
+        if self._doubtful(sweep, solution, matches_at):
+            found = self._search(sweep, guess, solution, matches_at, priors, motion, clock)
+            if isinstance(found, str):
+                self._last_middle = sweep.stamp, middle
+                nothing = Solution.unsolved(middle, solution.matches, solution.iterations, 0)
+                return _report(sweep, guess, FrameStatus.LOST, found, clock, nothing)
+            solution, twist, relocalized = found
         if not solution.solved:
+            # Once may be chance; a sweep that has plenty to match is searched for the next time.
+            self.watch.lost += matches_at.offered >= 2 * config.min_matches
             message = f"{len(solution.matches)} matches; {config.min_matches} are needed"
             self._last_middle = sweep.stamp, middle
             return _report(sweep, guess, FrameStatus.FEW_MATCHES, message, clock, solution)
-        twist = self._twist(sweep, solution.map_T_lidar, guess.twist)
+        if not relocalized:
+            twist = self._twist(sweep, solution.map_T_lidar, guess.twist)
         if self._first is not None:
-            solution, twist = self._start_again(sweep, solution, twist, matches_at, priors)
+            solution, twist = self._start_again(sweep, solution, twist, matches_at, priors, motion)
+        if not matches_at.wide:
+            fit = Fit.of(solution.matches, matches_at.offered)
+            self.watch.accept(fit, solution.map_T_lidar)
         solution, result, tilt = self._finish(sweep, solution, twist)
-        status, message = FrameStatus.OK, ""
+        status, message = FrameStatus.OK, relocalized
         if not solution.converged:
             status = FrameStatus.NOT_CONVERGED
             message = f"the pose still moved after {solution.iterations} associations"
         if solution.weak is not None:
             status = FrameStatus.DEGENERATE
             message = f"the scan does not tell {_named(solution)}; the expected motion was kept"
-        return self._insert(sweep, result, status, message, clock, solution, tilt)
+        if relocalized and message is not relocalized:
+            message = f"{relocalized}; {message}"
+        update = self._insert(sweep, result, status, message, clock, solution, tilt)
+        update = self._errors.calibrated(update, sweep, solution)
+        clock.lap("covariance")
+        return update
+
+    def _doubtful(self, sweep: MovingSweep, solution: Solution, matches_at: _Association) -> bool:
+        """Whether the sweep is to be searched for, instead of believing the solve."""
+        watch = self.watch
+        if not self.config.relocalization.enabled or self._last_middle is None:
+            return False
+        if watch.lost or not solution.solved:
+            return watch.lost > 0
+        assert self.last is not None
+        seconds = max((sweep.stamp - self._last_middle[0]) * 1e-9, _SHORTEST)
+        # Not from the guess, which may be a user's.
+        expected = advance(self._last_middle[1], self.last.twist, seconds)
+        if watch.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
+            return True
+        # Matches of a wide search are unlike the usual ones.
+        fit = Fit.of(solution.matches, matches_at.offered)
+        return not matches_at.wide and watch.misfit(fit)
+
+    def _search(
+        self,
+        sweep: MovingSweep,
+        guess: Guess,
+        solution: Solution,
+        matches_at: _Association,
+        priors: Sequence[gtsam.NonlinearFactor],
+        motion: MotionPrior,
+        clock: _Clock,
+    ) -> tuple[Solution, FloatArray, str] | str:
+        """The solution that fits best, its twist and what happened; or why the sweep is lost.
+
+        A lidar that was moved between two sweeps did not move like that within them: its velocity
+        is that from before, or none.
+        """
+        watch, middle = self.watch, _to_middle(sweep, guess)
+        usual, before = watch.usual, Fit.of(solution.matches, matches_at.offered)
+        lost = watch.lost > 0 or watch.misfit(before)
+        matches_at.stay()
+        start: gtsam.Pose3 | None = solution.map_T_lidar
+        moving = self._twist(sweep, solution.map_T_lidar, guess.twist)
+        twists = [guess.twist, np.zeros(6) if lost else moving]
+        if lost:
+            sweep.deskew(guess.twist)
+            start = self._place(sweep, middle, solution, matches_at, priors, clock)
+        best: tuple[Fit, Solution, FloatArray] | None = None
+        for twist in twists:
+            if start is None:
+                break
+            sweep.deskew(twist)
+            matches_at.use(self.config.matching)
+            here = MotionPrior(start, motion.information)
+            found = self.solver.solve(matches_at, start, priors, here)
+            fit = Fit.of(found.matches, matches_at.offered)
+            if not (found.solved and watch.fits_again(fit)):
+                continue
+            if best is None or fit.total > _CLEARLY * best[0].total:
+                best = fit, found, twist
+        clock.lap("relocalize")
+        if best is not None and best[2] is not moving:
+            moved = f"moved by {_way(middle, best[1].map_T_lidar)}"
+            after = f" after {watch.lost} lost sweeps" if watch.lost else ""
+            return best[1], best[2], f"relocalised{after}, {moved}" if lost else moved
+        if not lost:
+            return solution, moving, ""
+        radius = watch.radius
+        watch.lost += 1
+        return (
+            f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
+            f"usual; nothing fits within {radius:g} m; lost for {watch.lost} sweeps"
+        )
+
+    def _place(
+        self,
+        sweep: MovingSweep,
+        predicted: gtsam.Pose3,
+        solution: Solution,
+        matches_at: _Association,
+        priors: Sequence[gtsam.NonlinearFactor],
+        clock: _Clock,
+    ) -> gtsam.Pose3 | None:
+        """Where around the prediction a few matches fit best; None if nowhere."""
+        around = self.watch.around(predicted)
+        known = [
+            cubes.points(cubes.neighbourhood(pose.matrix()))
+            for pose in around
+            for cubes in (self.edge_map, self.plane_map)
+        ]
+        points = some(sweep.edges, sweep.planes)
+        starts = [solution.map_T_lidar] if solution.solved else []
+        starts += places(points, np.concatenate(known), around, self.watch.radius, _PLACES)
+        clock.lap("relocalize")
+        best: tuple[float, gtsam.Pose3] | None = None
+        for start in starts:
+            matches_at.use(rough(self.config.matching))
+            trial = self.solver.solve(matches_at, start, priors)
+            total = Fit.of(trial.matches, matches_at.offered).total
+            if trial.solved and (best is None or total > best[0]):
+                best = total, trial.map_T_lidar
+        return None if best is None else best[1]
 
     def _factors(self, stamp: int, guess: gtsam.Pose3) -> Sequence[gtsam.NonlinearFactor]:
         """The IMU's factors and the user's, on the pose of a moment."""
@@ -311,6 +445,7 @@ class Mapper:
         twist: FloatArray,
         matches_at: Associate,
         priors: Sequence[gtsam.NonlinearFactor],
+        motion: MotionPrior,
     ) -> tuple[Solution, FloatArray]:
         """Rebuild the map of the first sweep, now that its motion is known.
 
@@ -324,7 +459,7 @@ class Mapper:
             sweep.deskew(twist)
             self._new_map()
             self._add_to_map(first, _to_middle(first, Guess(pose, twist)))
-            again = self.solver.solve(matches_at, solution.map_T_lidar, priors)
+            again = self.solver.solve(matches_at, solution.map_T_lidar, priors, motion)
             if not again.solved:
                 break
             solution = again
@@ -364,7 +499,19 @@ class _Association:
     def __init__(self, mapper: Mapper, sweep: MovingSweep, guess: Guess, clock: _Clock) -> None:
         self._mapper, self._sweep, self._guess, self._clock = mapper, sweep, guess, clock
         self._calls = 0
+        self.wide = False
         self.use(mapper.config.matching)
+
+    @property
+    def offered(self) -> int:
+        """Features to match."""
+        most = self._matching.max_edges or np.inf, self._matching.max_planes or np.inf
+        sweep = self._sweep
+        return int(min(len(sweep.edges), most[0]) + min(len(sweep.planes), most[1]))
+
+    def stay(self) -> None:
+        """Take the sweep as it is de-skewed now."""
+        self._calls = 2
 
     def use(self, matching: MatchingConfig) -> None:
         """Go on with another configuration, and without the matches found so far."""
@@ -382,15 +529,18 @@ class _Association:
             self._found = None
         matches = self._kept(map_T_lidar)
         if matches is None:
-            matches = associate(
-                sweep.edges,
-                sweep.planes,
-                map_T_lidar,
-                mapper.edge_map,
-                mapper.plane_map,
-                self._matching,
-                sweep.distinct,
-            )
+            features = sweep.edges, sweep.planes, map_T_lidar
+            maps = mapper.edge_map, mapper.plane_map
+            matches = associate(*features, *maps, self._matching, sweep.distinct)
+            wide = self._matching.wide_search
+            self.wide = len(matches) < mapper.config.solver.min_matches and wide > 1.0
+            if self.wide:
+                # One sweep alone on open ground: five neighbours lie on one ring. Seen more
+                # coarsely, there are others among them.
+                reach = wide * self._matching.max_distance
+                maps = mapper.edge_map.thinned(wide), mapper.plane_map.thinned(wide)
+                matching = replace(self._matching, max_distance=reach)
+                matches = associate(*features, *maps, matching, sweep.distinct)
             self._found = mapper.plane_map, map_T_lidar, matches
         self._clock.lap("match")
         return matches
@@ -400,8 +550,8 @@ class _Association:
         if self._found is None or self._found[0] is not self._mapper.plane_map:
             return None
         _, searched, matches = self._found
-        moved = searched.localCoordinates(map_T_lidar)
-        turned, shifted = np.degrees(np.linalg.norm(moved[:3])), np.linalg.norm(moved[3:])
+        step = searched.localCoordinates(map_T_lidar)
+        turned, shifted = np.degrees(np.linalg.norm(step[:3])), np.linalg.norm(step[3:])
         config = self._matching
         if turned < config.keep_rotation_deg and shifted < config.keep_translation:
             return renew(matches, map_T_lidar, config)
@@ -416,6 +566,18 @@ def make_solver(config: SolverConfig) -> ScanSolver:
         "aloam": ALoamSolver,
     }
     return solvers[config.method](config)
+
+
+def _loose(config: Config) -> SolverConfig:
+    """The solver for a rough solve: it stops where the next step is the real one's to make."""
+    solver, matching = config.solver, config.matching
+    few, all_of_them = rough(matching).max_planes, matching.max_planes or np.inf
+    return replace(
+        solver,
+        min_aligned=solver.min_aligned * min(few / all_of_them, 1.0),
+        translation_tolerance=max(solver.translation_tolerance, matching.rough_translation),
+        rotation_tolerance_deg=max(solver.rotation_tolerance_deg, matching.rough_rotation_deg),
+    )
 
 
 def _checked(factors: object) -> Sequence[gtsam.NonlinearFactor]:
@@ -444,6 +606,12 @@ def _named(solution: Solution) -> str:
         parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
         names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
     return " or ".join(names)
+
+
+def _way(first: gtsam.Pose3, second: gtsam.Pose3) -> str:
+    """How far it is from one pose to another, in words."""
+    turn = gtsam.Rot3.Logmap(first.rotation().between(second.rotation()))
+    return f"{first.range(second):.2f} m and {np.degrees(np.linalg.norm(turn)):.1f} degrees"
 
 
 class _Clock:
@@ -505,5 +673,11 @@ def _report(
     seen = solution.localizability
     if seen is None:
         return update
-    to_reference = sweep.middle_T_reference(result.twist).inverse().AdjointMap()
-    return replace(update, localizability=seen.aligned, directions=seen.directions @ to_reference.T)
+    seen = seen.seen_from(sweep.middle_T_reference(result.twist).inverse())
+    return replace(
+        update,
+        localizability=seen.aligned,
+        directions=seen.directions,
+        direction_information=seen.information,
+        axis_localizability=seen.axes(),
+    )

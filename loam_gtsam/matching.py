@@ -108,16 +108,27 @@ def associate(
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
     map_T_lidar : pose at which to associate
     edge_map, plane_map : the maps
-    distinct : (E,) see :class:`EdgeMatches`; all are if None
+    distinct : (E,) see :class:`EdgeMatches`; all are if None. They are matched before others, and
+        searched for more widely (``wide_search``) where no line is near.
     """
     pose = map_T_lidar.matrix()
-    edge_rows, plane_rows = _spread(edges, config.max_edges), _spread(planes, config.max_planes)
+    edge_rows = _spread(len(edges), config.max_edges, distinct)
+    plane_rows = _spread(len(planes), config.max_planes)
     edges, planes = edges.take(edge_rows, axis=0), planes.take(plane_rows, axis=0)
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
     k, limit = config.neighbours, config.max_distance
     near_edges = edge_map.nearest(edges_map, k, limit, edge_map.neighbourhood(pose))
     near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
     lines = match_lines(edges, edges_map, *near_edges, pose, config)
+    if distinct is not None and config.wide_search > 1.0 and not distinct.all():
+        # A pole that few beams met has no five points within max_distance.
+        alone = distinct[edge_rows]
+        alone[lines.indices] = False
+        rows, reach = np.flatnonzero(alone), config.wide_search * limit
+        near_edges = edge_map.nearest(edges_map[rows], k, reach, edge_map.neighbourhood(pose))
+        wide = replace(config, max_distance=reach)
+        more = match_lines(edges[rows], edges_map[rows], *near_edges, pose, wide)
+        lines = _joined(lines, replace(more, indices=rows[more.indices]))
     surfaces = match_planes(planes, planes_map, *near_planes, pose, config)
     chosen = edge_rows[lines.indices]
     return ScanMatches(
@@ -126,10 +137,16 @@ def associate(
     )
 
 
-def _spread(features: FloatArray, limit: int) -> IntArray:
-    """Which rows to match: all, or ``limit`` of them at even distances."""
-    count = len(features)
-    return np.arange(limit) * count // limit if 0 < limit < count else np.arange(count)
+def _spread(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
+    """Which of so many to match: all, or ``limit`` evenly; those of ``first`` before others."""
+    if not 0 < limit < count:
+        return np.arange(count)
+    if first is None:
+        return np.arange(limit) * count // limit
+    before, after = np.flatnonzero(first), np.flatnonzero(~first)
+    before = before[_spread(len(before), limit)]
+    left = limit - len(before)
+    return np.sort(np.concatenate([before, after[_spread(len(after), left)]])) if left else before
 
 
 def rough(config: MatchingConfig) -> MatchingConfig:
@@ -174,6 +191,16 @@ def _subset(matches: _Matches, keep: BoolArray) -> _Matches:
         name: None if column is None else column[keep] for name, column in columns.items()
     }
     return type(matches)(**chosen)
+
+
+def _joined(first: EdgeMatches, second: EdgeMatches) -> EdgeMatches:
+    """All matches of both, in the order of the features; ``distinct`` is left out."""
+    columns: dict[str, Any] = {}
+    order = np.argsort(np.concatenate([first.indices, second.indices]), kind="stable")
+    for item in fields(first):
+        parts = getattr(first, item.name), getattr(second, item.name)
+        columns[item.name] = None if parts[0] is None else np.concatenate(parts)[order]
+    return EdgeMatches(**columns)
 
 
 def _line_weights(distances: FloatArray, config: MatchingConfig) -> FloatArray:

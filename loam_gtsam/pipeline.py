@@ -6,13 +6,14 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import islice
 
 import gtsam
 import numpy as np
 
+from loam_gtsam.ahead import Extraction, extract, extract_ahead
 from loam_gtsam.config import Config, SensorConfig
 from loam_gtsam.datasets.base import Dataset, Sweep
-from loam_gtsam.features import extract_features
 from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_aid import ImuAid
 from loam_gtsam.imu_prior import Level
@@ -24,12 +25,13 @@ from loam_gtsam.types import (
     FloatArray,
     FrameStatus,
     MapUpdate,
-    SweepError,
     Trajectory,
 )
 
 OnFrame = Callable[[int, MapUpdate], None]
 """Called after each frame with its number and result."""
+Observer = Callable[[Sweep, MapUpdate, Mapper], None]
+"""Called after each frame with the sweep, its result and the mapper, to look and not to change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,25 +116,29 @@ class Pipeline:
         self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu_aid)
         self._last_odom: gtsam.Pose3 | None = None
 
-    def process(self, sweep: Sweep) -> MapUpdate:
-        """Register one sweep; what it contains never raises, see the status of the result."""
+    def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
+        """Register one sweep; what it contains never raises, see the status of the result.
+
+        Parameters
+        ----------
+        extraction : of its features; made here if None
+        """
         if isinstance(sweep, BadSweep):
             return self.mapper.skip(sweep.stamp, sweep.message)
         if isinstance(sweep, FeatureSweep):
             return self._process_features(sweep)
+        if extraction is None:
+            extraction = extract(sweep, self.config)
+        features, last = extraction.features, self.mapper.last
+        if features is None:
+            return self.mapper.skip(sweep.stamp, extraction.problem)
         started = time.perf_counter()
-        try:
-            features = extract_features(sweep, self.config)
-        except SweepError as error:
-            return self.mapper.skip(sweep.stamp, str(error))
-        extracted = time.perf_counter()
-        last = self.mapper.last
         guess = self.odometry.guess(features, last)
-        guessed = time.perf_counter()
+        guessed = time.perf_counter() - started
         # The first sweep is where the mapper puts it.
         pose = None if last is None else guess.map_T_lidar
         update = self.mapper.register(features, pose, guess.twist)
-        timings = {"features": extracted - started, "odometry": guessed - extracted}
+        timings = {"features": extraction.seconds, "odometry": guessed}
         return replace(update, timings=timings | dict(update.timings))
 
     def _process_features(self, sweep: FeatureSweep) -> MapUpdate:
@@ -173,6 +179,8 @@ def run(
     on_frame: OnFrame | None = None,
     keep_partial: bool = False,
     extra_factors: ExtraFactors | None = None,
+    observe: Observer | None = None,
+    workers: int = 0,
 ) -> RunResult:
     """Map a data set.
 
@@ -184,6 +192,10 @@ def run(
     keep_partial : if an error ends the run after some sweeps, return what was computed until
         then, with ``error`` set, instead of raising
     extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
+    observe : e.g. :func:`loam_gtsam.recording.record`, for a bag
+    workers : processes that extract the features of the sweeps to come (their ``timings`` then
+        count beside the others, not on top). The result is the same. A script that asks for any
+        needs the usual ``if __name__ == "__main__":``.
 
     Returns
     -------
@@ -202,12 +214,13 @@ def run(
     interrupted = False
     error: Exception | None = None
     try:
-        for number, (sweep, seconds) in enumerate(_timed(dataset)):
-            if number == max_frames:
-                break
-            update = pipeline.process(sweep)
+        sweeps = extract_ahead(islice(_timed(dataset), max_frames), config, workers)
+        for number, (sweep, seconds, extraction) in enumerate(sweeps):
+            update = pipeline.process(sweep, extraction)
             update = replace(update, timings={"read": seconds} | dict(update.timings))
             updates.append(update)
+            if observe is not None:
+                observe(sweep, update, pipeline.mapper)
             if on_frame is not None:
                 on_frame(number, update)
     except KeyboardInterrupt:

@@ -6,7 +6,7 @@ A solver is anything with :meth:`ScanSolver.solve`; the mapper does not know whi
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import gtsam
@@ -27,6 +27,10 @@ from loam_gtsam.types import FloatArray
 
 POSE_KEY: int = gtsam.symbol("x", 0)
 """Key of the frame's pose ``map_T_lidar`` in every graph handed to a solver."""
+
+_REDESCENDING = 2.816
+"""Width of a Geman-McClure kernel over that of a Huber kernel of the same efficiency on normal
+noise: 3.787 and 1.345 at 95 %."""
 
 _TO_SIGMA = 1.4826
 """Median absolute deviation to standard deviation, for a normal distribution."""
@@ -109,6 +113,21 @@ class MotionPrior:
     map_T_lidar: gtsam.Pose3
     information: FloatArray
 
+    def factor(self, directions: FloatArray | None = None) -> gtsam.NonlinearFactor:
+        """The expectation on :data:`POSE_KEY`.
+
+        Parameters
+        ----------
+        directions : (6, 6) projector onto those in which it acts; all if None
+        """
+        information = self.information
+        if directions is not None:
+            information = directions.T @ information @ directions
+        expected = gtsam.Values()
+        expected.insert(POSE_KEY, self.map_T_lidar)
+        hessian = gtsam.HessianFactor(POSE_KEY, information, np.zeros(6), 0.0)
+        return gtsam.LinearContainerFactor(hessian, expected)
+
 
 class ScanSolver(Protocol):
     """Solves one frame."""
@@ -155,6 +174,9 @@ class GtsamSolver:
     ) -> Solution:
         """See :meth:`ScanSolver.solve`."""
         config = self.config
+        expected = motion
+        if motion is not None and config.degeneracy == "project":
+            expected = replace(motion, information=_CERTAIN * np.eye(6))
         seen: Localizability | None = None
         weak: FloatArray | None = None
         pose = guess
@@ -166,18 +188,20 @@ class GtsamSolver:
             matches = associate(pose)
             if len(matches) < config.min_matches:
                 return Solution.unsolved(guess, matches, iteration, steps)
-            if iteration == 1 and motion is not None and config.degeneracy != "off":
+            if iteration == 1 and motion is not None:
                 seen = localizability(matches, pose)
-                weak = seen.projector(config.min_aligned)
+                if config.degeneracy != "off":
+                    weak = seen.projector(config.min_aligned)
             values = gtsam.Values()
             values.insert(POSE_KEY, pose)
             graph = gtsam.NonlinearFactorGraph()
-            scan = scan_match_factor(POSE_KEY, match_rows(matches, config.kernel_width))
-            if weak is None or motion is None:
+            rows = match_rows(matches, config.kernel_width, config.kernel)
+            scan = scan_match_factor(POSE_KEY, rows)
+            if weak is None or expected is None:
                 graph.add(scan)
             else:
                 graph.add(_without(scan, values, weak))
-                graph.add(_along(motion, weak, config))
+                graph.add(expected.factor(weak))
             for factor in priors:
                 graph.add(factor)
             optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
@@ -218,17 +242,6 @@ def _without(
     keep = np.eye(6) - weak
     hessian = gtsam.HessianFactor(POSE_KEY, keep.T @ information @ keep, keep.T @ right, squared)
     return gtsam.LinearContainerFactor(hessian, values)
-
-
-def _along(motion: MotionPrior, weak: FloatArray, config: SolverConfig) -> gtsam.NonlinearFactor:
-    """The expected motion as a factor that acts along weak directions only."""
-    information = motion.information
-    if config.degeneracy == "project":
-        information = _CERTAIN * np.eye(6)
-    expected = gtsam.Values()
-    expected.insert(POSE_KEY, motion.map_T_lidar)
-    hessian = gtsam.HessianFactor(POSE_KEY, weak.T @ information @ weak, np.zeros(6), 0.0)
-    return gtsam.LinearContainerFactor(hessian, expected)
 
 
 def fuse(
@@ -284,13 +297,25 @@ def within_tolerance(step: FloatArray, information: FloatArray, config: SolverCo
     return bool(small or step @ information @ step < config.step_sigmas**2)
 
 
-def match_rows(matches: ScanMatches, kernel_width: float = np.inf) -> MatchRows:
+def _kept(units: FloatArray, width: float, kernel: str) -> FloatArray:
+    """By what a kernel of a Huber width scales rows, for their whitened distances."""
+    if kernel == "geman_mcclure":
+        scales: FloatArray = 1.0 / (1.0 + (units / (_REDESCENDING * width)) ** 2)
+        return scales
+    scales = np.sqrt(width / np.maximum(units, width))
+    return scales
+
+
+def match_rows(
+    matches: ScanMatches, kernel_width: float = np.inf, kernel: str = "huber"
+) -> MatchRows:
     """The matches as whitened rows: each scaled by its weight over its standard deviation.
 
     Parameters
     ----------
     kernel_width : of a Huber kernel, in units of the scatter of the whitened distances; infinite
         for none
+    kernel : "huber", or "geman_mcclure" with the same efficiency on normal noise
 
     Notes
     -----
@@ -298,7 +323,9 @@ def match_rows(matches: ScanMatches, kernel_width: float = np.inf) -> MatchRows:
     exceeds ``k s`` is scaled by ``sqrt(k s / u)`` (Huber, Robust Statistics, 1981). The unit s is
     ``max(1, 1.4826 median(u))``: far from the optimum all distances are large, and a fixed unit
     would silence them all. Kernels that fall off faster (Cauchy) lose the pose in foliage, where
-    many matches agree on a wrong one.
+    many matches agree on a wrong one; that of Geman and McClure (1985), which scales by
+    ``1 / (1 + (u / c s)^2)``, did not so far, and stands up to passing objects better. As the unit
+    shrinks with the distances from one association to the next, it tightens by itself.
     """
     e, p = matches.edges, matches.planes
     edge_units, plane_units = e.distances / e.sigmas, np.abs(p.distances) / p.sigmas
@@ -306,8 +333,8 @@ def match_rows(matches: ScanMatches, kernel_width: float = np.inf) -> MatchRows:
     if len(matches) and np.isfinite(kernel_width):
         scatter = _TO_SIGMA * float(np.median(np.concatenate([edge_units, plane_units])))
         width = kernel_width * max(1.0, scatter)
-        edge_weights = edge_weights * np.sqrt(width / np.maximum(edge_units, width))
-        plane_weights = plane_weights * np.sqrt(width / np.maximum(plane_units, width))
+        edge_weights = edge_weights * _kept(edge_units, width, kernel)
+        plane_weights = plane_weights * _kept(plane_units, width, kernel)
     return concatenate_rows(
         [
             line_rows(e.points, e.centres, e.directions, edge_weights, e.sigmas),

@@ -256,6 +256,9 @@ class FrameStatus(StrEnum):
     """The local map has too few points to solve; the guess is the pose, the sweep is inserted."""
     FEW_MATCHES = "few_matches"
     """Too few matches: the guess is the pose and the sweep is not inserted."""
+    LOST = "lost"
+    """The sweep does not fit the map where it was solved, nor anywhere around; the pose is
+    predicted, the sweep is not inserted, and the search goes on with the next one."""
     UNUSABLE_SCAN = "unusable_scan"
     """The sweep has no usable points or features; the pose is predicted."""
     BAD_STAMP = "bad_stamp"
@@ -292,6 +295,30 @@ class TiltPrior(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class Uncertainty:
+    """The parts of a solved pose's error (:mod:`loam_gtsam.covariance`).
+
+    Attributes
+    ----------
+    own : (6, 6) covariance of the error of this frame alone, tangent order of the package
+    shared : (6, 6) covariance of that error (rows) with the own error of the frame before
+        (columns); zero if there is none
+    follows : stamp of that frame before; None if there is none
+    drift : (6, 6) covariance of the map's error since the start, as a perturbation on the *left*:
+        along the axes of the map, about its origin. It never shrinks.
+    residual_variance : of the whitened residuals; 1 if their standard deviations are right
+    effective_matches : independent rows that would know as much as the correlated ones do
+    """
+
+    own: FloatArray
+    shared: FloatArray
+    follows: int | None
+    drift: FloatArray
+    residual_variance: float
+    effective_matches: float
+
+
+@dataclass(frozen=True, slots=True)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.
 
@@ -308,6 +335,10 @@ class MapUpdate:
         at the guess and at the solution, each with its own matches
     information : (6, 6) at the solution: scan matches and priors, tangent order of the package.
         Zero when the frame was not solved.
+    covariance : (6, 6) of the pose in the map, calibrated: the error of this frame and what the map
+        has drifted since its start; tangent order of the package. For the motion between two frames
+        see :func:`loam_gtsam.covariance.relative_covariance`. NaN when the frame was not solved.
+    uncertainty : the parts of it; None when the frame was not solved
     twist : (6,) body velocity at ``stamp`` (rad/s, m/s) used for the de-skew of the sweep; where
         an IMU gives the rotation within the sweep, its mean
     sweep_motion : where that rotation came from
@@ -315,6 +346,11 @@ class MapUpdate:
     localizability : (6,) how many matches fix each of ``directions``, counted as if their normals
         pointed that way, the weakest first; NaN where it was not looked at
     directions : (6, 6) rows, tangent vectors that move the matched points by 1 m; NaN likewise
+    direction_information : (6,) 1 / m^2, of the matches along each of them, noise included; NaN
+        likewise
+    axis_localizability : (6,) how many matches fix each axis of the lidar (rx, ry, rz, x, y, z) if
+        the other five are left free; at least 1; below ``solver.min_aligned`` do not rely on it.
+        NaN likewise
     timings : seconds per stage
     """
 
@@ -331,18 +367,23 @@ class MapUpdate:
     error_before: float = 0.0
     error_after: float = 0.0
     information: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
+    uncertainty: Uncertainty | None = None
     twist: FloatArray = field(default_factory=lambda: np.zeros(6))
     sweep_motion: SweepMotion = SweepMotion.NONE
     tilt_prior: TiltPrior = TiltPrior.NONE
     localizability: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     directions: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
+    direction_information: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    axis_localizability: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     timings: Mapping[str, float] = field(default_factory=dict)
 
     @property
-    def covariance(self) -> FloatArray:
+    def raw_covariance(self) -> FloatArray:
         """(6, 6) inverse of ``information``; NaN when the frame was not solved or is singular.
 
-        From the classical solvers (``solver.method`` loam or aloam), whose rows count as measured
+        It takes every match as independent and the map as exact; ``covariance`` does not. From the
+        classical solvers (``solver.method`` loam or aloam), whose rows count as measured
         to 1 m, it is to be multiplied by the variance of a residual in m^2.
         """
         if not self.status.solved:

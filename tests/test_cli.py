@@ -102,6 +102,18 @@ def test_run_opens_built_in_worlds_and_uses_every_option():
     assert json.loads(Path("out/summary.json").read_text())["input"]["facts"]["seed"] == "3"
 
 
+@pytest.mark.parametrize(
+    ("asked", "sweeps", "cores", "expected"),
+    [(None, 200, 2, 0), (None, 201, 2, 1), (None, 201, 1, 0), (0, 900, 2, 0), (3, 2, 1, 3)],
+)
+def test_a_process_extracts_features_where_it_is_worth_its_start(
+    asked, sweeps, cores, expected, monkeypatch
+):
+    monkeypatch.setattr(_cli_run.os, "cpu_count", lambda: cores)
+    options = _cli_run.RunOptions(None, None, False, None, False, True, workers=asked)
+    assert _cli_run._workers(options, sweeps) == expected
+
+
 def test_a_configuration_file_is_used_and_set_wins_over_it():
     Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
     arguments = ["run", "sim:room", "--frames", 1, "--no-plot", "--output", "out"]
@@ -374,9 +386,10 @@ main()
 """
 
 
-def start_endless_run(pause: float) -> subprocess.Popen[str]:
+def start_endless_run(pause: float, workers: int = 0) -> subprocess.Popen[str]:
     """A run that goes on for ever; returns when it reads its fourth sweep, ``pause`` s long."""
-    command = ["run", "x", "--output", "out", "--no-plot", str(pause)]
+    workers_option = ["--workers", str(workers)]
+    command = ["run", "x", "--output", "out", "--no-plot", *workers_option, str(pause)]
     process = subprocess.Popen(
         [sys.executable, "-c", _ENDLESS, *command],
         stdout=subprocess.PIPE,
@@ -389,15 +402,17 @@ def start_endless_run(pause: float) -> subprocess.Popen[str]:
     return process
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_stops_after_the_frame_and_everything_is_written(number):
-    process = start_endless_run(pause=0.05)
+@pytest.mark.parametrize(
+    ("number", "workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), (signal.SIGINT, 1)]
+)
+def test_a_signal_stops_after_the_frame_and_everything_is_written(number, workers):
+    process = start_endless_run(0.05, workers)
     process.send_signal(number)
     output, errors = process.communicate(timeout=60)
     assert process.returncode == 128 + number, errors
     assert errors == ""
     frames = len(read_tum("out/trajectory.tum"))
-    assert frames >= 4
+    assert frames >= (1 if workers else 4)  # the fourth sweep may have been read ahead
     assert f"Stopped by {number.name} after frame {frames} of 1000" in output
     assert files_in("out") >= set(RUN_FILES)
     assert not [name for name in files_in("out") if name.endswith(".tmp")]

@@ -98,6 +98,21 @@ def imu_in_a_corridor(names: Names, output: str) -> None:
     assert abs(inertial) < 0.5 * abs(constant)
 
 
+def own_loop_closer(names: Names, output: str) -> None:
+    graph = names["graph"]
+    assert len(graph.loops) >= 3
+    assert all(graph.active)
+    assert names["after"] < 0.5 * names["before"]
+
+
+def saved_graph(names: Names, output: str) -> None:
+    assert [loop.on for loop in names["robust"].loops] == [True, False] * 10
+    off, robust = names["off"], names["robust"]
+    assert off(robust.poses) < 0.6 * off(names["saved"].poses)
+    assert off(names["believed"].poses) > 10.0 * off(robust.poses)
+    assert "city.g2o city_optimized.graph" in output
+
+
 CHECKS: dict[str, Callable[[Names, str], None]] = {
     "01_map_a_built_in_scene.py": built_in_scene,
     "02_numpy_arrays.py": numpy_arrays,
@@ -108,6 +123,8 @@ CHECKS: dict[str, Callable[[Names, str], None]] = {
     "07_gps_factor.py": gps_factor,
     "08_ground_and_wheels.py": ground_and_wheels,
     "09_imu_in_a_corridor.py": imu_in_a_corridor,
+    "10_own_loop_closer.py": own_loop_closer,
+    "11_optimise_a_saved_graph.py": saved_graph,
 }
 
 

@@ -17,11 +17,13 @@ from loam_gtsam.config import Config, load_config
 from loam_gtsam.pipeline import RunResult
 from loam_gtsam.types import (
     DatasetError,
+    FloatArray,
     FrameStatus,
     InputError,
     MapUpdate,
     OutputError,
     Trajectory,
+    Uncertainty,
 )
 
 
@@ -33,6 +35,19 @@ def random_trajectory(count: int, seed: int = 0) -> Trajectory:
         poses[:, :3, 3] = rng.normal(0.0, 1000.0, (count, 3))
     stamps = 1_700_000_000_123_456_789 + np.arange(count, dtype=np.int64) * 100_000_007
     return Trajectory(stamps, poses)
+
+
+def symmetric() -> FloatArray:
+    """Every entry of its upper triangle is another one."""
+    upper = np.zeros((6, 6))
+    upper[np.triu_indices(6)] = np.arange(1.0, 22.0)
+    return upper + np.triu(upper, 1).T
+
+
+def uncertainty_of(number: int, trajectory: Trajectory) -> Uncertainty:
+    own = number * np.eye(6)
+    follows = None if number == 1 else int(trajectory.stamps[number - 1])
+    return Uncertainty(own, 0.1 * own, follows, 10.0 * own, 0.3, 100.0 * number)
 
 
 def make_result(count: int = 5, error: Exception | None = None) -> RunResult:
@@ -47,6 +62,8 @@ def make_result(count: int = 5, error: Exception | None = None) -> RunResult:
             n_plane_matches=7 * number,
             error_after=0.5 * number,
             information=np.diag(np.arange(1.0, 7.0)),
+            covariance=np.full((6, 6), np.nan) if number == 0 else number * symmetric(),
+            uncertainty=None if number == 0 else uncertainty_of(number, trajectory),
             twist=np.full(6, float(number)),
             timings={"read": 0.001} | ({"solve": 0.002} if number else {}),
         )
@@ -155,10 +172,38 @@ def test_npz_holds_every_frame_without_pickle(tmp_path):
     np.testing.assert_array_equal(np.isnan(arrays["stage_seconds"]), [[0, 1], *[[0, 0]] * 3])
     np.testing.assert_array_equal(arrays["map_T_lidar"][2], updates[2].map_T_lidar.matrix())
     np.testing.assert_array_equal(arrays["twists"][2], updates[2].twist)
-    assert np.isnan(arrays["covariances"][0]).all()
+    np.testing.assert_array_equal(arrays["covariances"][2], 2.0 * symmetric())
     np.testing.assert_allclose(
-        arrays["covariances"][1] @ arrays["information"][1], np.eye(6), atol=1e-12
+        arrays["raw_covariances"][1] @ arrays["information"][1], np.eye(6), atol=1e-12
     )
+    np.testing.assert_array_equal(arrays["own_covariances"][3], 3.0 * np.eye(6))
+    np.testing.assert_array_equal(arrays["shared_covariances"][2], 0.2 * np.eye(6))
+    np.testing.assert_array_equal(arrays["drift_covariances"][1], 10.0 * np.eye(6))
+    assert arrays["follows"].tolist() == [-1, -1, updates[1].stamp, updates[2].stamp]
+    np.testing.assert_array_equal(arrays["effective_matches"], [np.nan, 100.0, 200.0, 300.0])
+    np.testing.assert_array_equal(arrays["residual_variances"], [np.nan, 0.3, 0.3, 0.3])
+    for name in ("", "raw_", "own_", "shared_", "drift_"):
+        assert np.isnan(arrays[f"{name}covariances"][0]).all()
+
+
+def test_covariances_stand_beside_the_poses(tmp_path):
+    """The same lines as the trajectory; the upper triangle row by row; empty if not solved."""
+    updates = list(make_result(4).updates)
+    bad = MapUpdate(updates[2].stamp, gtsam.Pose3(), FrameStatus.BAD_STAMP)
+    export.write_covariances(tmp_path / "c.csv", [*updates[:3], bad, updates[3]])
+    header, *lines = (tmp_path / "c.csv").read_text("utf-8").splitlines()
+    names = header.split(",")
+    assert names[:5] == ["stamp_s", "status", "rx_rx", "rx_ry", "rx_rz"]
+    assert names[-3:] == ["y_y", "y_z", "z_z"]
+    assert len(lines) == 4
+    assert lines[0].split(",")[1:] == ["first", *[""] * 21]
+    values = lines[2].split(",")
+    seconds, nanoseconds = divmod(updates[2].stamp, 10**9)
+    assert values[:2] == [f"{seconds}.{nanoseconds:09d}", "ok"]
+    row = dict(zip(names[2:], map(float, values[2:]), strict=True))
+    assert row["rx_rx"] == 2.0 * symmetric()[0, 0]
+    assert row["rx_z"] == 2.0 * symmetric()[0, 5]
+    assert row["y_z"] == 2.0 * symmetric()[4, 5]
 
 
 def test_ply_is_exact_and_tells_edges_from_planes(tmp_path):

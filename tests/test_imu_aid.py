@@ -152,7 +152,7 @@ def vague(sigma_deg):
 )
 def test_gravity_takes_over_where_the_scan_knows_less_than_the_imu(sigma_deg, tilt, share):
     """The worked example of docs/maths/imu_prior.md."""
-    aid = aid_for(rot(0.1, 0, 0), sigma_deg=0.5)
+    aid = aid_for(rot(0.1, 0, 0), sigma_deg=0.5, weight=0.002)
     solution = with_information(gtsam.Pose3(), vague(sigma_deg))
     found, by = aid.tilted(NOW, solution)
     assert by is tilt

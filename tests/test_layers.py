@@ -12,7 +12,9 @@ LAYERS = (
     ("types", "config", "geometry", "rotations"),
     (
         "rings",
+        "place",
         "sweep",
+        "posts",
         "features",
         "cubemap",
         "matching",
@@ -21,12 +23,30 @@ LAYERS = (
         "imu",
     ),
     ("factors", "degeneracy", "imu_prior", "deskew", "inertial_factors", "inertial_window"),
-    ("solvers", "classical", "inertial", "pose_graph"),
-    ("odometry", "imu_aid", "loop_closure"),
-    ("mapper",),
-    ("pipeline", "estimators"),
-    ("comparison",),
-    ("_cli_report", "_report_html", "_compare_files", "_cli_run", "_cli_compare", "cli"),
+    ("solvers", "classical", "inertial", "graph_optimize"),
+    (
+        "scan_error",
+        "covariance",
+        "odometry",
+        "imu_aid",
+        "relocalization",
+        "keyframes",
+        "loop_consistency",
+        "pose_graph",
+        "loop_closure",
+    ),
+    ("mapper", "ahead"),
+    ("pipeline", "estimators", "graph_files"),
+    ("comparison", "recording"),
+    (
+        "_cli_report",
+        "_report_html",
+        "_compare_files",
+        "_cli_run",
+        "_cli_compare",
+        "_cli_optimize",
+        "cli",
+    ),
 )
 """From the bottom up; a module imports from lower layers, or as SAME_LAYER says."""
 
@@ -35,7 +55,7 @@ SAME_LAYER = {
     "geometry": {"types"},
     "rotations": {"types"},
     "sweep": {"rings"},
-    "features": {"sweep"},
+    "features": {"sweep", "posts"},
     "matching": {"cubemap"},
     "gravity_filter": {"stillness"},
     "imu": {"stillness", "gravity_filter"},
@@ -43,28 +63,38 @@ SAME_LAYER = {
     "imu_prior": {"factors"},
     "inertial_window": {"inertial_factors"},
     "classical": {"solvers"},
+    "covariance": {"scan_error"},
+    "keyframes": {"covariance"},
+    "loop_consistency": {"keyframes"},
+    "pose_graph": {"keyframes", "loop_consistency"},
+    "loop_closure": {"keyframes", "pose_graph", "relocalization", "scan_error"},
     "_cli_run": {"_cli_report"},
     "_compare_files": {"_report_html"},
     "_cli_compare": {"_cli_report", "_cli_run", "_compare_files"},
-    "cli": {"_cli_run", "_cli_report", "_cli_compare"},
+    "cli": {"_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"},
 }
 
 LEAVES = {
     "datasets": {"datasets"},
     "evaluation": set(),
     "export": set(),
+    "bag_messages": set(),
+    "export_bag": {"bag_messages"},
     "peers": set(),
     "visualization": {"export"},
 }
 """Leaves see layer 0 and these; of the layers, only the command line and LEAF_USERS see them."""
 
 LEAF_USERS = {
+    "ahead": {"datasets.base"},
     "pipeline": {"datasets.base"},
     "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
+    "recording": {"datasets.base"},
+    "graph_files": {"export"},
 }
 
-PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare"}
+PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -95,7 +95,7 @@ CODE = [
     pytest.param(code, id=f"{page.stem}-{number}")
     for page in PAGES
     for number, code in enumerate(blocks(page, "python"))
-    if page.stem in ("README", "own_factor")
+    if page.stem in ("README", "own_factor", "bags_out")
 ]
 
 

@@ -293,12 +293,29 @@ def test_the_kernel_scales_down_what_is_far_for_its_sigma_and_nothing_else():
     np.testing.assert_allclose(rows.scales, expected)
     assert (rows.scales[:5] == 10.0).all()
     np.testing.assert_allclose(match_rows(plane_matches(distances)).scales, 10.0)
+    rows = match_rows(plane_matches(distances), 1.345, "geman_mcclure")
+    expected = 10.0 / (1.0 + (distances / (2.816 * width)) ** 2)
+    np.testing.assert_allclose(rows.scales, expected)
 
 
 def test_the_kernel_has_a_unit_of_its_own_far_from_the_optimum():
     """All distances large alike: nothing is an outlier, nothing is silenced."""
     rows = match_rows(plane_matches(np.full(9, 5.0)), kernel_width=1.345)
     np.testing.assert_allclose(rows.scales, 10.0)
+
+
+def test_both_kernels_are_as_efficient_on_normal_noise():
+    """Asymptotic efficiency of an M-estimator: E[psi']^2 / E[psi^2] (Huber, 1981)."""
+    u = np.linspace(-12.0, 12.0, 24001)
+    density = np.exp(-0.5 * u**2) / np.sqrt(2.0 * np.pi) * (u[1] - u[0])
+    # The zeros keep the unit at one sigma.
+    distances = 0.1 * np.concatenate([u, np.zeros(len(u))])
+    for kernel in ("huber", "geman_mcclure"):
+        rows = match_rows(plane_matches(distances), 1.345, kernel)
+        psi = (0.1 * rows.scales[: len(u)]) ** 2 * u
+        slope = np.gradient(psi, u)
+        efficiency = (slope @ density) ** 2 / (psi**2 @ density)
+        assert efficiency == pytest.approx(0.95, abs=1e-3)
 
 
 # -- factors that come after the solve -------------------------------------------------------------

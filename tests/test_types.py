@@ -55,11 +55,11 @@ def test_length_of_a_trajectory():
     assert Trajectory(np.arange(3), poses).length == pytest.approx(17.0)
 
 
-def test_covariance_is_the_inverse_of_the_information_of_a_solved_frame():
+def test_raw_covariance_is_the_inverse_of_the_information_of_a_solved_frame():
     information = np.diag([1.0, 2.0, 4.0, 5.0, 8.0, 10.0])
     solved = MapUpdate(0, gtsam.Pose3(), FrameStatus.OK, information=information)
-    np.testing.assert_allclose(np.diag(solved.covariance), [1, 0.5, 0.25, 0.2, 0.125, 0.1])
+    np.testing.assert_allclose(np.diag(solved.raw_covariance), [1, 0.5, 0.25, 0.2, 0.125, 0.1])
     unsolved = MapUpdate(0, gtsam.Pose3(), FrameStatus.FIRST, information=information)
     singular = MapUpdate(0, gtsam.Pose3(), FrameStatus.OK)
-    assert np.isnan(unsolved.covariance).all()
-    assert np.isnan(singular.covariance).all()
+    assert np.isnan(unsolved.raw_covariance).all()
+    assert np.isnan(singular.raw_covariance).all()

@@ -77,6 +77,8 @@ class Solids:
     cylinders : (N, 5) vertical: x, y, radius, lowest z, highest z. Mantles without caps.
     ellipsoids : (N, 6) centre x y z, semi-axes along world x y z
     foliage : (N,) which ellipsoids are tree crowns, into which a beam penetrates a little
+    tubes : (N, 5) endless, level and seen from inside: x y z of a point on the axis, yaw of the
+        axis (rad), radius. The sensor must stay in them.
     ground : height field; the sensor must stay above it
     """
 
@@ -85,6 +87,7 @@ class Solids:
     ellipsoids: FloatArray = field(default_factory=lambda: np.zeros((0, 6)))
     foliage: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     ground: Ground = field(default_factory=Ground)
+    tubes: FloatArray = field(default_factory=lambda: np.zeros((0, 5)))
 
 
 def cast_rays(
@@ -145,6 +148,15 @@ def cast_rays(
         closer = near < ranges[part]
         ranges[part][closer] = near[closer]
         soft[part][closer] = solids.foliage[i]
+    for cx, cy, cz, yaw, radius in solids.tubes:
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        x, y, z = (origins - (cx, cy, cz)).T[:, :, None]
+        aside, up = cosine * dy - sine * dx, dz
+        y = cosine * y - sine * x
+        a, b = aside * aside + up * up + _EPSILON, y * aside + z * up
+        c = y * y + z * z - radius * radius
+        # c < 0 inside: one root lies ahead.
+        np.minimum(ranges, (-b + np.sqrt(b * b - a * c)) / a, out=ranges)
     ground = _cast_ground(solids.ground, origins, directions, ranges)
     soft &= ranges <= ground
     np.minimum(ranges, ground, out=ranges)

@@ -12,7 +12,7 @@ from scipy.ndimage import gaussian_filter1d
 from loam_gtsam.datasets._raycast import Ground, Solids
 from loam_gtsam.types import FloatArray
 
-_DEEP = 3.0
+DEEP = 3.0
 """Metres by which things reach below the ground they stand on, so that no slope shows a gap."""
 
 
@@ -46,17 +46,17 @@ def build_room(seed: int) -> Scene:
     """A furnished room, 10 x 8 x 3 m, walked round slowly. The walls stand at |x| = 5, |y| = 4."""
     rng = np.random.default_rng([seed, 0, 1])
     boxes = [
-        _box(-6, -5, -5, 5, -1, 4),
-        _box(5, 6, -5, 5, -1, 4),
-        _box(-6, 6, -5, -4, -1, 4),
-        _box(-6, 6, 4, 5, -1, 4),
-        _box(-6, 6, -5, 5, 3.0, 4),
-        _box(-5, -4.6, -2.5, 0.5, 0, 2.0),  # shelf
-        _box(-1.5, 1.0, 3.5, 4, 0, 0.9),  # sideboard
-        _box(2.5, 3.6, -4, -3.6, 0, 2.1),  # cupboard
-        _box(4.55, 5, -1.0, 1.5, 0, 1.2),  # desk
-        _box(-5, -4.2, 3.2, 4, 0, 3.0),  # duct in a corner
-        _box(-0.8, 0.8, -0.4, 0.4, 0.68, 0.74),  # table in the middle
+        box(-6, -5, -5, 5, -1, 4),
+        box(5, 6, -5, 5, -1, 4),
+        box(-6, 6, -5, -4, -1, 4),
+        box(-6, 6, 4, 5, -1, 4),
+        box(-6, 6, -5, 5, 3.0, 4),
+        box(-5, -4.6, -2.5, 0.5, 0, 2.0),  # shelf
+        box(-1.5, 1.0, 3.5, 4, 0, 0.9),  # sideboard
+        box(2.5, 3.6, -4, -3.6, 0, 2.1),  # cupboard
+        box(4.55, 5, -1.0, 1.5, 0, 1.2),  # desk
+        box(-5, -4.2, 3.2, 4, 0, 3.0),  # duct in a corner
+        box(-0.8, 0.8, -0.4, 0.4, 0.68, 0.74),  # table in the middle
     ]
     boxes += [
         [x, y, rng.uniform(0.3, 0.6), 0.3, 0.25, 0.6, rng.uniform(0.0, np.pi)]
@@ -83,28 +83,19 @@ def build_street_loop(seed: int) -> Scene:
     """
     rng = np.random.default_rng([seed, 0, 2])
     half_x, half_y = 105.0, 55.0
-    ground = _rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
+    ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (half_x, half_y)
     boxes: list[list[float]] = []
     cylinders: list[list[float]] = []
     crowns: list[list[float]] = []
     for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         for inside in (True, False):  # the block inside the loop lies to the left
-            kerb = _Kerb(corner, following, inside, ground)
-            boxes += _facades(rng, kerb, inside)
-            for s in np.arange(22.0, kerb.length - 24.0, 6.5):
-                if rng.random() < 0.45:  # a parked car: body and cabin
-                    near = 4.4 + float(rng.uniform(0.0, 0.3))
-                    boxes.append(kerb.box(s, s + 4.3, near, near + 1.8, 0.25, 0.85))
-                    boxes.append(kerb.box(s + 1.0, s + 3.4, near + 0.15, near + 1.65, 0.85, 1.45))
-            for s in np.arange(18.0, kerb.length - 16.0, 11.0) + rng.uniform(0.0, 4.0):
-                x, y, z = kerb.place(s, 7.2)
-                if rng.random() < 0.5:  # a lamp post
-                    cylinders.append([x, y, 0.1, z - _DEEP, z + 7.0])
-                else:
-                    cylinders.append([x, y, rng.uniform(0.12, 0.25), z - _DEEP, z + 4.0])
-                    size = rng.uniform(1.2, 1.9)
-                    crowns.append([x, y, z + 3.0 + size, size, size, rng.uniform(1.2, 2.2)])
+            kerb = Kerb(corner, following, inside, ground)
+            boxes += facades(rng, kerb, inside, inside)
+            cars, posts, trees = furniture(rng, kerb)
+            boxes += cars
+            cylinders += posts
+            crowns += trees
     return Scene(
         name="street_loop",
         solids=Solids(
@@ -125,7 +116,7 @@ def build_street_loop(seed: int) -> Scene:
 def build_trees(seed: int) -> Scene:
     """Open woodland on slopes: trunks, crowns, rocks, no wall anywhere."""
     rng = np.random.default_rng([seed, 0, 3])
-    ground = _rolling(rng, (1.8, 0.9, 0.2, 0.05), (80.0, 47.0, 16.0, 5.0))
+    ground = rolling(rng, (1.8, 0.9, 0.2, 0.05), (80.0, 47.0, 16.0, 5.0))
     angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
     radius = 42.0 + 7.0 * np.sin(2.0 * angle + 0.5) + 4.0 * np.sin(3.0 * angle)
     path = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -150,7 +141,7 @@ def build_trees(seed: int) -> Scene:
     return Scene(
         name="trees",
         solids=Solids(
-            cylinders=np.column_stack([trunks, thick, z - _DEEP, z + bole + tall]),
+            cylinders=np.column_stack([trunks, thick, z - DEEP, z + bole + tall]),
             ellipsoids=np.vstack([crowns, rocks]),
             foliage=foliage,
             ground=ground,
@@ -174,13 +165,13 @@ def build_corridor(seed: int) -> Scene:
         while s < _CORRIDOR - 4.0:
             # The wall of the shell is 0.2 m behind the panels; what they leave free is a door.
             panel = float(rng.uniform(3.0, 14.0))
-            boxes.append(_box(s, min(s + panel, _CORRIDOR), side * 1.5, side * 1.7, -1, 4))
+            boxes.append(box(s, min(s + panel, _CORRIDOR), side * 1.5, side * 1.7, -1, 4))
             s += panel + float(rng.uniform(0.9, 1.8))
         for s in np.arange(8.0, _CORRIDOR - 8.0, 17.0) + rng.uniform(-4.0, 4.0, 18):
             if rng.random() < 0.5:
                 cylinders.append([s, side * 1.35, 0.15, 0.0, 2.8])
             else:
-                boxes.append(_box(s, s + 0.8, side * 1.15, side * 1.5, 0.0, 1.9))
+                boxes.append(box(s, s + 0.8, side * 1.15, side * 1.5, 0.0, 1.9))
     return _in_corridor("corridor", Solids(boxes=np.array(boxes), cylinders=np.array(cylinders)))
 
 
@@ -210,21 +201,21 @@ def build_slopes(seed: int) -> Scene:
         [amplitude, number, 0.0, phase],
         [-amplitude / 9.0, 3.0 * number, 0.0, 3.0 * phase],
     ]
-    ground = Ground(np.vstack([waves, _rolling(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
+    ground = Ground(np.vstack([waves, rolling(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
     bends = np.array(
         [[0, 0], [80, 14], [175, -6], [265, 16], [350, 0], [400, -4]], dtype=np.float64
     )
-    legs = [(_Kerb(a, b, left, ground), left) for a, b in pairwise(bends) for left in (True, False)]
+    legs = [(Kerb(a, b, left, ground), left) for a, b in pairwise(bends) for left in (True, False)]
     boxes: list[list[float]] = []
     posts: list[list[float]] = []
     trunks: list[list[float]] = []
     crowns: list[list[float]] = []
     stones: list[list[float]] = []
     for kerb, inside in legs[:4]:
-        boxes += _facades(rng, kerb, inside)
+        boxes += facades(rng, kerb, inside, inside)
         for s in np.arange(9.0, kerb.length - 8.0, 12.0) + rng.uniform(0.0, 4.0):
             x, y, z = kerb.place(s, 6.8)
-            posts.append([x, y, 0.1, z - _DEEP, z + 6.0])
+            posts.append([x, y, 0.1, z - DEEP, z + 6.0])
     for kerb, _ in legs[4:]:
         for s in np.arange(2.0, kerb.length, 2.2):
             x, y, z = kerb.place(s, float(rng.uniform(6.0, 40.0)))
@@ -232,7 +223,7 @@ def build_slopes(seed: int) -> Scene:
                 stones.append([x, y, z, *rng.uniform(0.4, 1.6, 3)])
             else:
                 top, wide = z + rng.uniform(4.0, 7.0), rng.uniform(1.0, 2.0)
-                trunks.append([x, y, rng.uniform(0.1, 0.35), z - _DEEP, top])
+                trunks.append([x, y, rng.uniform(0.1, 0.35), z - DEEP, top])
                 crowns.append([x, y, top, wide, wide, rng.uniform(1.2, 2.4)])
     along = np.arange(8.0, 392.0, 8.0)
     across = np.interp(along, bends[:, 0], bends[:, 1])
@@ -269,7 +260,7 @@ _HILL = 390.0
 """Metres from crest to crest of the road over the slopes."""
 
 
-class _Kerb:
+class Kerb:
     """One side of a street, from one corner to the next: s along it, d away from its middle."""
 
     def __init__(
@@ -295,31 +286,57 @@ class _Kerb:
         return [x, y, z + 0.5 * (low + top), *half, self._yaw]
 
 
-def _facades(rng: np.random.Generator, kerb: _Kerb, inside: bool) -> list[list[float]]:
-    """Houses of different width, setback and height, with pilasters, porches and bay windows."""
+def facades(
+    rng: np.random.Generator, kerb: Kerb, begins_inside: bool, ends_inside: bool
+) -> list[list[float]]:
+    """Houses of different width, setback and height, with pilasters, porches and bay windows;
+    from corner to corner, of which the kerb is on the inside or the outside.
+    """
     boxes = []
-    s, end = (15.0, kerb.length - 15.0) if inside else (-14.0, kerb.length + 14.0)
+    s = 15.0 if begins_inside else -14.0
+    end = kerb.length - (15.0 if ends_inside else -14.0)
     while s < end - 6.0:
         width = min(float(rng.uniform(9.0, 22.0)), end - s)
         setback, top = float(rng.uniform(8.5, 12.5)), float(rng.uniform(5.0, 18.0))
-        boxes.append(kerb.box(s, s + width, setback, setback + 12.0, -_DEEP, top))
+        boxes.append(kerb.box(s, s + width, setback, setback + 12.0, -DEEP, top))
         for bay in np.arange(s + 1.5, s + width - 3.0, rng.uniform(3.5, 6.0)):
             out, wide = float(rng.uniform(0.25, 0.9)), float(rng.uniform(0.6, 2.2))
-            low, high = ((-_DEEP, top), (-_DEEP, 2.6), (1.0, 4.5))[rng.integers(3)]
+            low, high = ((-DEEP, top), (-DEEP, 2.6), (1.0, 4.5))[rng.integers(3)]
             boxes.append(kerb.box(bay, bay + wide, setback - out, setback, low, high))
         alley = rng.random() < 0.3
         s += width + (float(rng.uniform(3.0, 8.0)) if alley else 0.0)
     return boxes
 
 
+def furniture(
+    rng: np.random.Generator, kerb: Kerb
+) -> tuple[list[list[float]], list[list[float]], list[list[float]]]:
+    """Rows of parked cars (boxes), of lamp posts and trunks (cylinders) and of crowns."""
+    cars, posts, crowns = [], [], []
+    for s in np.arange(22.0, kerb.length - 24.0, 6.5):
+        if rng.random() < 0.45:  # body and cabin
+            near = 4.4 + float(rng.uniform(0.0, 0.3))
+            cars.append(kerb.box(s, s + 4.3, near, near + 1.8, 0.25, 0.85))
+            cars.append(kerb.box(s + 1.0, s + 3.4, near + 0.15, near + 1.65, 0.85, 1.45))
+    for s in np.arange(18.0, kerb.length - 16.0, 11.0) + rng.uniform(0.0, 4.0):
+        x, y, z = kerb.place(s, 7.2)
+        if rng.random() < 0.5:  # a lamp post
+            posts.append([x, y, 0.1, z - DEEP, z + 7.0])
+        else:
+            posts.append([x, y, rng.uniform(0.12, 0.25), z - DEEP, z + 4.0])
+            size = rng.uniform(1.2, 1.9)
+            crowns.append([x, y, z + 3.0 + size, size, size, rng.uniform(1.2, 2.2)])
+    return cars, posts, crowns
+
+
 def _shell() -> list[list[float]]:
     """Walls at |y| = 1.7, ceiling at 2.8 and ends of a corridor."""
     return [
-        _box(-2, _CORRIDOR + 2, 1.7, 2.7, -1, 4),
-        _box(-2, _CORRIDOR + 2, -2.7, -1.7, -1, 4),
-        _box(-2, _CORRIDOR + 2, -2, 2, 2.8, 4),
-        _box(-2, 0, -2, 2, -1, 4),
-        _box(_CORRIDOR, _CORRIDOR + 2, -2, 2, -1, 4),
+        box(-2, _CORRIDOR + 2, 1.7, 2.7, -1, 4),
+        box(-2, _CORRIDOR + 2, -2.7, -1.7, -1, 4),
+        box(-2, _CORRIDOR + 2, -2, 2, 2.8, 4),
+        box(-2, 0, -2, 2, -1, 4),
+        box(_CORRIDOR, _CORRIDOR + 2, -2, 2, -1, 4),
     ]
 
 
@@ -336,13 +353,13 @@ def _in_corridor(name: str, solids: Solids) -> Scene:
     )
 
 
-def _box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> list[float]:
+def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> list[float]:
     """Row of ``Solids.boxes`` between two corners."""
     centre = [0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * (z0 + z1)]
     return [*centre, 0.5 * abs(x1 - x0), 0.5 * abs(y1 - y0), 0.5 * abs(z1 - z0), 0.0]
 
 
-def _rolling(
+def rolling(
     rng: np.random.Generator, amplitudes: tuple[float, ...], wavelengths: tuple[float, ...]
 ) -> Ground:
     """One wave each, in random directions."""

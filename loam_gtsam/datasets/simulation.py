@@ -15,9 +15,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from loam_gtsam.datasets import _avenue, _bare_scenes, _scenes
+from loam_gtsam.datasets._avenue import build_avenue
 from loam_gtsam.datasets._motion import GRAVITY, Motion
 from loam_gtsam.datasets._raycast import Ground, Solids, cast_rays
-from loam_gtsam.datasets._scenes import BUILDERS, Scene
+from loam_gtsam.datasets._scenes import Scene
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.types import (
     ConfigError,
@@ -29,9 +31,20 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
-__all__ = ["GRAVITY", "SCENES", "SENSORS", "Ground", "Scene", "SimulatedWorld", "Solids"]
+__all__ = [
+    "GRAVITY",
+    "SCENES",
+    "SENSORS",
+    "Ground",
+    "Scene",
+    "SimulatedWorld",
+    "Solids",
+    "build_avenue",
+]
 
-SCENES: tuple[str, ...] = tuple(BUILDERS)
+_BUILDERS = _scenes.BUILDERS | _bare_scenes.BUILDERS | _avenue.BUILDERS
+
+SCENES: tuple[str, ...] = tuple(_BUILDERS)
 """Names of the built-in places."""
 
 SENSORS: dict[str, tuple[FloatArray, int]] = {
@@ -124,12 +137,12 @@ class SimulatedWorld:
         acceleration_noise: float = 0.03,
         acceleration_bias: tuple[float, float, float] = (0.03, -0.02, 0.04),
     ) -> None:
-        if isinstance(scene, str) and scene not in BUILDERS:
+        if isinstance(scene, str) and scene not in _BUILDERS:
             raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
         _at_least("seed", seed, 0)
-        self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
+        self.scene = _BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)

@@ -1,0 +1,76 @@
+"""Which loops agree with each other, through the odometry between their ends.
+
+Pairwise consistency (Mangelson, Dominic, Eustice and Vasudevan, Pairwise Consistent Measurement Set
+Maximization for Robust Multi-Robot Map Merging, ICRA 2018). Equations: docs/maths/pose_graph.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+
+from loam_gtsam.config import PoseGraphConfig
+from loam_gtsam.graph_optimize import chi_squared
+from loam_gtsam.keyframes import Keyframe, LoopClosure, odometry_between
+from loam_gtsam.types import FloatArray
+
+
+class LoopConsistency:
+    """Keeps for every loop the others that it agrees with.
+
+    Parameters
+    ----------
+    config : ``max_chi2``, ``walk`` and ``turn_walk_deg``
+
+    Attributes
+    ----------
+    agreeing : for each loop the numbers of the others
+    """
+
+    def __init__(self, config: PoseGraphConfig) -> None:
+        self.config = config
+        self.agreeing: list[set[int]] = []
+        self._loops: list[LoopClosure] = []
+
+    def add(self, loop: LoopClosure, keyframes: Sequence[Keyframe]) -> int:
+        """Compare a loop with all others; returns its number."""
+        others = {
+            number
+            for number, other in enumerate(self._loops)
+            if consistent(loop, other, keyframes, self.config)
+        }
+        number = len(self._loops)
+        for other in others:
+            self.agreeing[other].add(number)
+        self.agreeing.append(others)
+        self._loops.append(loop)
+        return number
+
+    def clique(self, number: int) -> set[int]:
+        """Loops that agree pairwise, this one among them; as many as are found greedily."""
+        chosen = {number}
+        for other in sorted(self.agreeing[number], key=lambda n: (-len(self.agreeing[n]), n)):
+            if chosen <= self.agreeing[other]:
+                chosen.add(other)
+        return chosen
+
+
+def consistent(
+    one: LoopClosure, two: LoopClosure, keyframes: Sequence[Keyframe], config: PoseGraphConfig
+) -> bool:
+    """Whether two loops and the odometry between their ends make a cycle that closes."""
+
+    def odometry(first: int, second: int) -> tuple[gtsam.Pose3, FloatArray]:
+        return odometry_between(keyframes[first], keyframes[second], config)
+
+    start, start_covariance = odometry(one.earlier, two.earlier)
+    end, end_covariance = odometry(two.later, one.later)
+    rest = two.earlier_T_later.compose(end)
+    by_start, by_loop = rest.inverse().AdjointMap(), end.inverse().AdjointMap()
+    covariance = end_covariance + by_start @ start_covariance @ by_start.T
+    covariance = covariance + by_loop @ two.covariance @ by_loop.T
+    distance = chi_squared(
+        one.earlier_T_later, one.covariance, start.compose(rest), covariance, included=False
+    )
+    return distance <= config.max_chi2

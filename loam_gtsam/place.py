@@ -1,0 +1,94 @@
+"""A descriptor of what a place looks like from one sweep, whatever the heading.
+
+Scan Context (Kim and Kim, Scan Context: Egocentric Spatial Descriptor for Place Recognition within
+3D Point Cloud Map, IROS 2018), of features instead of all points: the height of the highest point
+in each cell of a polar grid. A turn of the lidar shifts its columns; their means do not change.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loam_gtsam.config import LoopConfig
+from loam_gtsam.types import FloatArray, InputError
+
+_BELOW = 3.0
+"""Metres below the lidar from which heights count; lower points count as there."""
+_HIGHEST = 20.0
+"""Metres likewise; what is higher says how far a beam goes up more than what stands there."""
+
+
+def describe(points: FloatArray, config: LoopConfig) -> FloatArray:
+    """Heights in a polar grid around the lidar.
+
+    Parameters
+    ----------
+    points : (N, 3) metres, lidar frame, de-skewed
+    config : ``rings``, ``sectors`` and ``reach``
+
+    Returns
+    -------
+    (rings, sectors)
+        Metres above a level below the lidar; 0 where there is no point. Sectors count from x
+        towards y.
+    """
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise InputError(f"points: expected an (N, 3) array, got shape {points.shape}")
+    rings, sectors = config.rings, config.sectors
+    ranges = np.hypot(points[:, 0], points[:, 1])
+    near = ranges < config.reach
+    turns = np.arctan2(points[near, 1], points[near, 0]) / (2.0 * np.pi)
+    row = (ranges[near] * (rings / config.reach)).astype(np.int64)
+    column = np.floor((turns % 1.0) * sectors).astype(np.int64) % sectors
+    heights = np.clip(points[near, 2] + _BELOW, 0.0, _HIGHEST)
+    grid = np.zeros(rings * sectors)
+    np.maximum.at(grid, row * sectors + column, heights)
+    return grid.reshape(rings, sectors)
+
+
+def heading_free(descriptor: FloatArray) -> FloatArray:
+    """(rings,) what does not change with the heading, for a search tree."""
+    means: FloatArray = descriptor.mean(axis=1)
+    return means
+
+
+def unlike(one: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """How unlike two descriptors are at the heading at which they are most alike.
+
+    Parameters
+    ----------
+    one, other : (rings, sectors)
+
+    Returns
+    -------
+    distance : 0 for equal ones, 1 for those that have nothing in common: one less the mean cosine
+        of the columns that both fill
+    turn : rad about z by which the lidar of ``other`` is turned against that of ``one``
+    """
+    if one.shape != other.shape:
+        raise InputError(f"descriptors: expected equal shapes, got {one.shape} and {other.shape}")
+    sectors = one.shape[1]
+    # Circular correlations over the columns, for all shifts at once.
+    filled = [np.any(grid > 0.0, axis=0, keepdims=True).astype(np.float64) for grid in (one, other)]
+    both = _correlated(*filled)
+    cosines = _correlated(_columns(one), _columns(other))
+    # Few columns that happen to agree are no likeness.
+    counts = np.maximum(both, 0.5 * min(float(part.sum()) for part in filled))
+    likeness = np.divide(cosines, counts, out=np.zeros(sectors), where=counts > 0.5)
+    shift = int(likeness.argmax())
+    turn = 2.0 * np.pi * shift / sectors
+    return 1.0 - float(likeness[shift]), float((turn + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def _columns(grid: FloatArray) -> FloatArray:
+    """Columns of length one; empty ones stay."""
+    lengths = np.linalg.norm(grid, axis=0)
+    unit: FloatArray = np.divide(grid, lengths, out=np.zeros_like(grid), where=lengths > 0.0)
+    return unit
+
+
+def _correlated(one: FloatArray, other: FloatArray) -> FloatArray:
+    """(sectors,) sums over all cells of ``one[:, c + shift] * other[:, c]``."""
+    spectrum = np.fft.rfft(one, axis=1) * np.conj(np.fft.rfft(other, axis=1))
+    sums: FloatArray = np.fft.irfft(spectrum.sum(axis=0), n=one.shape[1])
+    return sums

@@ -8,7 +8,6 @@ any number of workers.
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -22,6 +21,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from scipy.stats import chi2
 
+from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.covariance import relative_covariance
 from loam_gtsam.datasets import SimulatedWorld
@@ -199,14 +199,9 @@ def measure(programme: Iterable[Study], workers: int) -> list[Row]:
 
 def write(rows: Sequence[Row], folder: Path) -> list[Path]:
     """``nees.csv``, ``nees.md`` and ``nees.png``."""
-    folder.mkdir(parents=True, exist_ok=True)
     paths = [folder / name for name in ("nees.csv", "nees.md", "nees.png")]
-    with paths[0].open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*(item.name for item in fields(Row)), "within"])
-        for row in rows:
-            values = [f"{v:.4g}" if isinstance(v, float) else v for v in astuple(row)]
-            writer.writerow([*values, row.within])
+    names = [*(item.name for item in fields(Row)), "within"]
+    write_csv(paths[0], names, ((*astuple(row), row.within) for row in rows), digits=4)
     paths[1].write_text(table(rows), encoding="utf-8")
     draw(rows, paths[2])
     return paths

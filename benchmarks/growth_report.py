@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,6 +13,7 @@ from benchmarks import recorded
 from benchmarks.cases import EvidenceTable, Verdict
 from benchmarks.recorded import RivalResult
 from benchmarks.report import machine
+from benchmarks.tables import write_csv
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.visualization import available, plot_curves
 
@@ -106,11 +106,8 @@ def write(
     for result in results:
         rows = thinned(result)
         path = folder / f"growth_{result.name}.csv"
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(rows)
-            for row in zip(*rows.values(), strict=True):
-                writer.writerow([f"{value:.6g}" for value in row])
+        columns = [np.asarray(values, np.float64).tolist() for values in rows.values()]
+        write_csv(path, list(rows), zip(*columns, strict=True))
         paths.append(path)
         if available():
             paths.append(path.with_suffix(".png"))

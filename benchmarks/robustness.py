@@ -9,7 +9,6 @@ run.
 from __future__ import annotations
 
 import argparse
-import csv
 import sys
 import time
 from collections import Counter
@@ -24,6 +23,7 @@ import numpy as np
 
 from benchmarks.cases import ROOT, data_folder
 from benchmarks.peers import KissIcp, load, timed_points
+from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -319,15 +319,9 @@ def _numbers(row: Row) -> tuple[str, str, str]:
 
 def write(folder: Path, rows: Sequence[Row], page: Path | None = None) -> list[Path]:
     """``robustness.csv``, and the table in a page between its marks if there is one."""
-    folder.mkdir(parents=True, exist_ok=True)
     path = folder / "robustness.csv"
     names = [item.name for item in fields(Row)]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        for row in rows:
-            values = [getattr(row, name) for name in names]
-            writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+    write_csv(path, names, ([getattr(row, name) for name in names] for row in rows))
     table = "\n".join(markdown(rows))
     if page is None:
         page = folder / "robustness.md"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
 
+from benchmarks.tables import write_csv
 from loam_gtsam.types import FloatArray
 
 NONE = "none"
@@ -151,18 +151,12 @@ def _cell(row: Row | None, metric: str) -> str:
 
 def write(folder: Path, rows: Sequence[Row]) -> list[Path]:
     """The tables that have rows, as ``*.csv`` (one row a run) and ``*.md``; their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
     paths = []
     names = [item.name for item in fields(Row)][1:]
     for table in dict.fromkeys(row.table for row in rows):
         path = folder / f"{table}.csv"
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(names)
-            for row in rows:
-                if row.table == table:
-                    values = [getattr(row, name) for name in names]
-                    writer.writerow([f"{v:.6g}" if isinstance(v, float) else v for v in values])
+        here = (row for row in rows if row.table == table)
+        write_csv(path, names, ([getattr(row, name) for name in names] for row in here))
         text = "\n".join(markdown(table, rows)) + "\n"
         path.with_suffix(".md").write_text(text, encoding="utf-8")
         paths += [path, path.with_suffix(".md")]

@@ -8,7 +8,6 @@ cost at the optimum. The same numbers come out on every run.
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -25,6 +24,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from benchmarks.tables import write_csv
 from loam_gtsam.config import Config, FeatureConfig, MapConfig, preset
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld
@@ -32,7 +32,7 @@ from loam_gtsam.deskew import MovingSweep
 from loam_gtsam.features import extract_features
 from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import make_solver
-from loam_gtsam.matching import ScanMatches, associate, rough
+from loam_gtsam.matching import ScanMatches, associate
 from loam_gtsam.solvers import MotionPrior, Solution, match_rows
 from loam_gtsam.types import BoolArray, FloatArray
 
@@ -83,7 +83,7 @@ def _changed(name: str, kernel: str = "", **sections: Mapping[str, Any]) -> Vari
 
 
 NO_KERNEL = {"kernel_width": math.inf}
-ALL_MATCHES = {"max_edges": 0, "max_planes": 0, "rough_planes": 0}
+ALL_MATCHES = {"max_edges": 0, "max_planes": 0}
 
 MAIN = (
     Variant("default", Config()),
@@ -102,7 +102,6 @@ CHANGES = (
     _changed("cauchy", "cauchy", solver=NO_KERNEL),
     _changed("scaled cauchy", "scaled cauchy", solver=NO_KERNEL),
     _changed("all matches", matching=ALL_MATCHES),
-    _changed("no rough solve", matching={"rough_planes": 0}),
     _changed("all planes", features={"range_noise": 0.0}),
     _changed("inner 1", solver={"inner_iterations": 1}),
     _changed("outer 30", solver={"iterations": 30}),
@@ -261,30 +260,23 @@ class Place:
                 cubes.recenter(pose[:3, 3])
                 cubes.insert(transform(pose, points))
 
-    def matches(
-        self, variant: Variant, cloud: Cloud, pose: gtsam.Pose3, *, few: bool = False
-    ) -> ScanMatches:
-        """Matches of a variant at a pose, before its robust kernel; few for the rough solve."""
+    def matches(self, variant: Variant, cloud: Cloud, pose: gtsam.Pose3) -> ScanMatches:
+        """Matches of a variant at a pose, before its robust kernel."""
         config = variant.config
         maps = self.maps[config.features, config.map]
-        matching = rough(config.matching) if few else config.matching
-        return associate(cloud.edges, cloud.planes, pose, *maps, matching, cloud.distinct)
+        return associate(cloud.edges, cloud.planes, pose, *maps, config.matching, cloud.distinct)
 
     def solve(self, variant: Variant, cloud: Cloud, guess: gtsam.Pose3) -> Solution:
         """One frame, as the mapper would do it but without a second de-skew."""
 
-        def matches_at(pose: gtsam.Pose3, few: bool) -> ScanMatches:
-            return robust(self.matches(variant, cloud, pose, few=few), variant.kernel)
+        def matches_at(pose: gtsam.Pose3) -> ScanMatches:
+            return robust(self.matches(variant, cloud, pose), variant.kernel)
 
         config = variant.config.solver
-        solver, start = make_solver(config), guess
-        if 0 < variant.config.matching.rough_planes < len(cloud.planes):
-            first = solver.solve(partial(matches_at, few=True), guess)
-            start = first.map_T_lidar if first.solved else guess
         # What constant velocity is believed to within after a tenth of a second.
         away = 0.5 * 0.1**2 * np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
         motion = MotionPrior(guess, np.diag(away**-2.0))
-        return solver.solve(partial(matches_at, few=False), start, (), motion)
+        return make_solver(config).solve(matches_at, guess, (), motion)
 
 
 def robust(matches: ScanMatches, kernel: str) -> ScanMatches:
@@ -582,16 +574,10 @@ def averages(results: Iterable[Result]) -> list[Measured]:
     return [Measured(*key, float(np.mean(values))) for key, values in groups.items()]
 
 
-def write_csv(path: Path, rows: Sequence[Row] | Sequence[Measured]) -> None:
+def write_fields(path: Path, rows: Sequence[Row] | Sequence[Measured]) -> None:
     """Every field with four significant digits."""
-    path.parent.mkdir(parents=True, exist_ok=True)
     names = [item.name for item in fields(rows[0])]
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(names)
-        for row in rows:
-            values = [getattr(row, name) for name in names]
-            writer.writerow([f"{v:.4g}" if isinstance(v, float) else v for v in values])
+    write_csv(path, names, ([getattr(row, name) for name in names] for row in rows), digits=4)
 
 
 def draw(folder: Path, rows: Sequence[Row], numbers: Sequence[Measured]) -> None:
@@ -711,8 +697,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parts = pool.map(partial(study_scene, effort=effort), (*scenes, "corridor_bare"))
         results = [result for part in parts for result in part]
     rows, numbers = summary(results), averages(results)
-    write_csv(folder / "study" / "trials.csv", rows)
-    write_csv(folder / "study" / "numbers.csv", numbers)
+    write_fields(folder / "study" / "trials.csv", rows)
+    write_fields(folder / "study" / "numbers.csv", numbers)
     draw(folder / "images", rows, numbers)
     print(f"{sum(isinstance(r, Trial) for r in results)} solves; tables in {folder / 'study'}")
     return 0

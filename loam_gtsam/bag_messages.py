@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.types import FloatArray, InputError, MapUpdate, OutputError
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
@@ -55,9 +56,8 @@ def ros_covariance(covariance: FloatArray, map_T_lidar: gtsam.Pose3) -> FloatArr
     rotation = map_T_lidar.rotation().matrix()
     turn = np.zeros((6, 6))
     turn[:3, 3:] = turn[3:, :3] = rotation
-    turned = turn @ covariance @ turn.T
-    symmetric: FloatArray = 0.5 * (turned + turned.T)  # to the last bit: consumers may check
-    return symmetric.reshape(36)
+    # to the last bit: consumers may check
+    return symmetric(turn @ covariance @ turn.T).reshape(36)
 
 
 class Messages:

@@ -92,13 +92,23 @@ def _nearest(name: str, known: Any, listing: bool = True) -> str:
     return hint + (f" (known: {', '.join(sorted(map(str, known)))})" if listing else "")
 
 
+_known_hints: dict[type, dict[str, Any]] = {}
+
+
+def _hints(section: type) -> dict[str, Any]:
+    """The types of its fields, looked up once: a mapper makes a variant of one for every sweep."""
+    if section not in _known_hints:
+        _known_hints[section] = typing.get_type_hints(section)
+    return _known_hints[section]
+
+
 class _Section:
     """Checks bounds and choices of every field at construction."""
 
     __slots__ = ()
 
     def __post_init__(self) -> None:
-        hints = typing.get_type_hints(type(self))
+        hints = _hints(type(self))
         for item in dataclasses.fields(self):  # type: ignore[arg-type]
             where = f"{type(self).__name__}.{item.name}"
             _check(where, getattr(self, item.name), hints[item.name], item.metadata)
@@ -285,20 +295,10 @@ class MatchingConfig(_Section):
         low=0,
     )
     max_planes: int = _param(2000, "and plane features", source="LOAM matches all", low=0)
-    rough_edges: int = _param(
-        150, "edge features matched at most while the pose is only known roughly", low=1
+    trial_edges: int = _param(
+        150, "edge features matched at most where many poses are tried: a search, a loop", low=1
     )
-    rough_planes: int = _param(
-        500,
-        "and plane features: a first solve with few matches, which brings the pose so near that "
-        "the others are searched for once; 0: no such solve",
-        source="LOAM has none",
-        low=0,
-    )
-    rough_translation: float = _param(
-        0.1, "it ends once it moves the pose by less than this", unit="m", low=0.0
-    )
-    rough_rotation_deg: float = _param(0.25, "and turns it by less", unit="degrees", low=0.0)
+    trial_planes: int = _param(500, "and plane features", low=1)
     neighbours: int = _param(5, "map points a feature is matched with", source="LOAM", low=3)
     max_distance: float = _param(
         1.0, "distance of the farthest of them", unit="m", source="LOAM", low=0.0
@@ -343,7 +343,7 @@ class MatchingConfig(_Section):
         high=1.0,
     )
     keep_translation: float = _param(
-        0.02,
+        0.05,
         "lines and planes are kept, and only distances and weights renewed, while the pose has "
         "moved less than this since the search",
         unit="m",
@@ -351,7 +351,7 @@ class MatchingConfig(_Section):
         low=0.0,
     )
     keep_rotation_deg: float = _param(
-        0.05, "and has turned less than this", unit="degrees", source="LOAM: 0", low=0.0
+        0.3, "and has turned less than this", unit="degrees", source="LOAM: 0", low=0.0
     )
     point_sigma: float = _param(
         0.03, "standard deviation of a measured point about a surface", unit="m", low=1e-6
@@ -750,7 +750,6 @@ _CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0, post_depth=0.0)
 _CLASSICAL_MATCHING = MatchingConfig(
     max_edges=0,
     max_planes=0,
-    rough_planes=0,
     wide_search=1.0,
     line_ratio=3.0,
     plane_fit="unit_offset",
@@ -892,7 +891,7 @@ def _commented(section: Any, indent: int) -> CommentedMap:
             text += f" [{meta['unit']}]"
         if meta["source"]:
             text += f" ({meta['source']})"
-        hint = typing.get_type_hints(type(section))[item.name]
+        hint = _hints(type(section))[item.name]
         if typing.get_origin(hint) is Literal:
             text += "; one of: " + ", ".join(typing.get_args(hint))
         result.yaml_set_comment_before_after_key(item.name, before=text, indent=indent)
@@ -901,7 +900,7 @@ def _commented(section: Any, indent: int) -> CommentedMap:
 
 def _override(section: Any, data: Mapping[str, Any], located: Any, source: str, prefix: str) -> Any:
     names = {item.name: item for item in dataclasses.fields(section)}
-    hints = typing.get_type_hints(type(section))
+    hints = _hints(type(section))
     changes: dict[str, Any] = {}
     for key, value in data.items():
         full = f"{prefix}{key}"

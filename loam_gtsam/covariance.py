@@ -15,6 +15,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.deskew import MovingSweep
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.scan_error import SeenGround, scan_error
 from loam_gtsam.solvers import Solution
 from loam_gtsam.types import FloatArray, InputError, MapUpdate, SweepMotion, Uncertainty
@@ -60,7 +61,7 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     if second.follows == earlier.stamp:
         common = second.shared @ to_later.T
         covariance -= common + common.T
-    return _symmetric(covariance)
+    return symmetric(covariance)
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +139,7 @@ class PoseErrors:
             effective_matches=scan.effective_matches,
         )
         self._last = now
-        covariance = _symmetric(own + drifted @ self._drift @ drifted.T)
+        covariance = symmetric(own + drifted @ self._drift @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
     def _own(
@@ -182,7 +183,7 @@ class PoseErrors:
             missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
         own = to_reference @ (own + np.diag(missed)) @ to_reference.T
         now = _Middle(sweep.stamp, middle, covariance, kept, to_reference, reference_stamp)
-        return _symmetric(own), shared, now
+        return symmetric(own), shared, now
 
 
 class _Acceleration:
@@ -215,8 +216,3 @@ class _Acceleration:
         gain = max(1.0 / self._count, 1.0 / self._window)
         squared = ((velocity - before[1]) / seconds) ** 2
         self._mean = self._mean + gain * (squared - noise - self._mean)
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    symmetric: FloatArray = 0.5 * (matrix + matrix.T)
-    return symmetric

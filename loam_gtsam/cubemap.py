@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.geometry import voxel_keys
+from loam_gtsam.geometry import find, voxel_keys
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
 
 CubeIndex = tuple[int, int, int]
@@ -180,7 +180,12 @@ class CubeMap:
             range(int(c) - n // 2, int(c) - n // 2 + n)
             for c, n in zip(cell, self._config.neighbourhood, strict=True)
         ]
-        around = tuple(index for index in product(*ranges) if index in self._cubes)
+        x, y, z = ranges
+        around = tuple(
+            sorted(
+                index for index in self._cubes if index[0] in x and index[1] in y and index[2] in z
+            )
+        )
         if not around or not self._config.field_of_view:
             return around
         rays = (np.array(around)[:, None, :] + _CORNERS) * self._config.cube_size - pose[:3, 3]
@@ -437,7 +442,7 @@ class _Cube:
     def average(self, new: _Voxels) -> None:
         """Mean of the point a voxel has, if any, and the new ones."""
         self._take_in()
-        at, taken = _find(self._keys, new.keys)
+        at, taken = find(self._keys, new.keys)
         old = self._points[at[taken]]
         sums, counts, lows, highs = new.sums, new.counts, new.lows, new.highs
         sums[taken] += old
@@ -451,7 +456,7 @@ class _Cube:
 
     def settle(self, keys: IntArray, points: FloatArray) -> FloatArray:
         """Add the points whose voxels are free, and return them."""
-        free = ~(_find(self._keys, keys)[1] | _find(self._new_keys, keys)[1])
+        free = ~(find(self._keys, keys)[1] | find(self._new_keys, keys)[1])
         keys, points = keys[free], points[free]
         if len(points):
             self._new_keys, self._new_points = _joined(
@@ -575,14 +580,6 @@ def _group(points: FloatArray, keys: IntArray, first: IntArray) -> _Voxels:
         lows=np.minimum.reduceat(points, first, axis=0),
         highs=np.maximum.reduceat(points, first, axis=0),
     )
-
-
-def _find(held: IntArray, keys: IntArray) -> tuple[IntArray, BoolArray]:
-    """Where keys are or belong among sorted ones, and which are there."""
-    at = np.searchsorted(held, keys)
-    taken = at < len(held)
-    taken[taken] = held[at[taken]] == keys[taken]
-    return at, taken
 
 
 def _joined(

@@ -16,16 +16,17 @@ from scipy.linalg import eigh
 
 from loam_gtsam.factors import complement_basis
 from loam_gtsam.geometry import cross
-from loam_gtsam.matching import ScanMatches
+from loam_gtsam.matching import EdgeMatches, ScanMatches, subset
 from loam_gtsam.types import FloatArray
 
 _CLEAR = 3.0
 """Standard deviations of a normal by which a displacement must be off its surface to be seen."""
 
-
 _MOVED = 0.1
 """Part of the root mean square displacement that a match must have to count in full: the points of
 a pole say nothing about a turn about that pole, whatever the direction of their few millimetres."""
+_HELD = 0.5
+"""Part of the least number of matches that lines must be for planes to be left out beside them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,12 +42,14 @@ class Localizability:
     information : (6,) of the scan along each of them, 1 / m^2, what noise makes of it included
     displacement : (6, 6) form whose value for a motion is the mean squared displacement of the
         matched points, m^2
+    by_planes : (6,) those of ``aligned`` that are planes
     """
 
     directions: FloatArray
     aligned: FloatArray
     information: FloatArray
     displacement: FloatArray
+    by_planes: FloatArray
 
     def seen_from(self, a_T_b: gtsam.Pose3) -> Localizability:
         """The same about frame ``a``, if this is about frame ``b``, which moves with it."""
@@ -114,17 +117,76 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     scale = np.sqrt(np.einsum("ik,ij,jk->k", columns, unit, columns))
     directions = columns.T / np.maximum(scale, floor)[:, None]
 
-    seen = rows @ directions.T
+    sight = _sight(points, normals, tilts, directions)
+    aligned, by_planes = sight.sum(axis=0), sight[len(sight) - len(p) :].sum(axis=0)
+    order = np.argsort(aligned, kind="stable")
+    along = np.einsum("ki,ij,kj->k", directions, information, directions)
+    return Localizability(directions[order], aligned[order], along[order], unit, by_planes[order])
+
+
+def unseen_by_planes(
+    matches: ScanMatches, map_T_lidar: gtsam.Pose3, seen: Localizability, least: float
+) -> Localizability | None:
+    """How well the planes alone fix the pose, if there are motions to be left to the lines.
+
+    The few lines of poles say truly how far the pose is off. A thousand planes of rough ground do
+    not, but noise makes them hold it where it was, and together they outweigh the poles.
+
+    Parameters
+    ----------
+    matches : of the scan
+    map_T_lidar : the pose at which they were made
+    seen : how well planes and lines together fix it
+    least : see :meth:`Localizability.weak`
+
+    Returns
+    -------
+    None if planes see all motions, or nothing sees a motion but they and they do so well enough.
+    """
+    if seen.by_planes.min() >= least:
+        return None
+    no_lines = subset(matches.edges, np.zeros(len(matches.edges), np.bool_))
+    planes = localizability(replace(matches, edges=no_lines), map_T_lidar)
+    directions = planes.weak(least)
+    if not len(directions):
+        return None
+    by_lines = line_sight(matches.edges, map_T_lidar, directions).sum(axis=0)
+    held = seen.aligned[0] < least or by_lines.min() >= _HELD * least
+    return planes if held else None
+
+
+def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatArray) -> FloatArray:
+    """(E, W) how far each line sees the motions: what it counts in ``Localizability.aligned``.
+
+    Parameters
+    ----------
+    edges : of the scan
+    map_T_lidar : the pose at which they were made
+    directions : (W, 6), see :class:`Localizability`
+    """
+    tilts = np.zeros(len(edges)) if edges.tilts is None else edges.tilts
+    rotation = map_T_lidar.rotation().matrix()
+    normals = complement_basis(edges.directions).reshape(-1, 3) @ rotation
+    points = np.repeat(edges.points, 2, axis=0)
+    sight = _sight(points, normals, np.repeat(tilts, 2), directions)
+    sight = sight[0::2] + sight[1::2]
+    if edges.distinct is not None:
+        sight[~edges.distinct] = 0.0
+    return sight
+
+
+def _sight(
+    points: FloatArray, normals: FloatArray, tilts: FloatArray, directions: FloatArray
+) -> FloatArray:
+    """(N, W) squared cosines between normals and displacements; 0 where noise may make them."""
     turn, shift = directions[:, :3], directions[:, 3:]
+    seen = cross(points.T, normals.T).T @ turn.T + normals @ shift.T
     # |shift + turn x p|^2 for all points and directions, as products of small matrices
     moved = np.outer((points**2).sum(axis=1), (turn**2).sum(axis=1)) - (points @ turn.T) ** 2
     moved += 2.0 * points @ np.cross(shift, turn).T + (shift**2).sum(axis=1)
     moved = np.maximum(moved, _MOVED**2)
     squared = seen**2 / moved
-    aligned = np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0).sum(axis=0)
-    order = np.argsort(aligned, kind="stable")
-    along = np.einsum("ki,ij,kj->k", directions, information, directions)
-    return Localizability(directions[order], aligned[order], along[order], unit)
+    return np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0)
 
 
 def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:

@@ -27,7 +27,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.types import FloatArray, InputError
+from loam_gtsam.types import BoolArray, FloatArray, InputError
 
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Sequence[FloatArray]]]
 """Maps values to (residual (m,), one Jacobian (m, dim) per key)."""
@@ -137,6 +137,12 @@ class MatchRows:
         """Whitened residuals (M,) and Jacobian (M, 6) at a pose."""
         residual, jacobian = _row_residuals(map_T_lidar, self.points, self.normals, self.offsets)
         return self.scales * residual, self.scales[:, None] * jacobian
+
+    def where(self, chosen: BoolArray) -> MatchRows:
+        """The rows for which an (M,) mask is true."""
+        return MatchRows(
+            self.points[chosen], self.normals[chosen], self.offsets[chosen], self.scales[chosen]
+        )
 
 
 def line_rows(

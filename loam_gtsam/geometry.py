@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _SMALL_ANGLE = 1e-9
 
@@ -212,3 +212,17 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     counts = np.diff(np.append(first, len(keys)))
     centroids: FloatArray = sums / counts[:, None]
     return centroids
+
+
+def find(held: IntArray, keys: IntArray) -> tuple[IntArray, BoolArray]:
+    """Where (N,) keys are or belong among (M,) sorted ones, and which are there."""
+    at = np.searchsorted(held, keys)
+    taken: BoolArray = at < len(held)
+    taken[taken] = held[at[taken]] == keys[taken]
+    return at, taken
+
+
+def symmetric(matrix: FloatArray) -> FloatArray:
+    """The symmetric part of a square matrix: what rounding made of a symmetric one is removed."""
+    part: FloatArray = 0.5 * (matrix + matrix.T)
+    return part

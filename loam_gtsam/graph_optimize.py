@@ -14,6 +14,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.types import BoolArray, FloatArray, InputError
 
 MAX_CHI2 = 40.0
@@ -152,7 +153,7 @@ def chi_squared(
     """
     residual = gtsam.Pose3.Logmap(measured.between(between))
     scatter = noise - covariance if included else noise + covariance
-    values, vectors = np.linalg.eigh(0.5 * (scatter + scatter.T))
+    values, vectors = np.linalg.eigh(symmetric(scatter))
     # Included, where nothing else holds the poses there is nothing to contradict.
     least = 1e-9 * float(np.trace(noise)) / 6.0
     parts = (vectors.T @ residual) ** 2 / np.maximum(values, least)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from loam_gtsam.config import PoseGraphConfig
 from loam_gtsam.covariance import relative_covariance
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.types import BoolArray, FloatArray, InputError, MapUpdate
 
 _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
@@ -103,7 +104,7 @@ def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gauss
     matrix = checked("covariance", covariance, (size, size))
     if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12 * np.abs(matrix).max()):
         raise InputError("covariance: expected a symmetric matrix; give 0.5 * (C + C.T)")
-    values, vectors = np.linalg.eigh(0.5 * (matrix + matrix.T))
+    values, vectors = np.linalg.eigh(symmetric(matrix))
     if values[0] < -1e-6 * np.trace(matrix):
         raise InputError(f"covariance: expected no negative eigenvalue, got {values[0]:.3g}")
     positive = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding, far from the origin

@@ -21,7 +21,7 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.degeneracy import localizability
 from loam_gtsam.geometry import transform
 from loam_gtsam.keyframes import Keyframe, LoopClosure
-from loam_gtsam.matching import ScanMatches, associate, rough
+from loam_gtsam.matching import ScanMatches, associate, trial
 from loam_gtsam.place import describe, heading_free, unlike
 from loam_gtsam.pose_graph import PoseGraph
 from loam_gtsam.relocalization import Fit, places, some
@@ -163,13 +163,13 @@ class ScanLoopCloser:
         rotation = history.pose(candidate).between(history.pose(keyframe.index)).rotation()
         heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
         start = gtsam.Pose3(heading, np.zeros(3))
-        matching = rough(whole.matching)
+        matching = trial(whole.matching)
         best = self._solver.solve(matches_at, start)
         if self._judged(fit(best)) is not None:
             held = np.concatenate([cubes.points() for cubes in maps])
             around = places(some(*features), held, [start], config.search, _STARTS)
             trials = [best, *(self._solver.solve(matches_at, pose) for pose in around)]
-            best = max(trials, key=lambda trial: fit(trial).total)
+            best = max(trials, key=lambda tried: fit(tried).total)
         matching = whole.matching
         solution = self._solver.solve(matches_at, best.map_T_lidar)
         if not solution.solved:

@@ -21,7 +21,7 @@ from loam_gtsam.deskew import MovingSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.imu_aid import ImuAid
-from loam_gtsam.matching import ScanMatches, associate, renew, rough
+from loam_gtsam.matching import ScanMatches, associate, moved, renew, trial
 from loam_gtsam.odometry import ConstantVelocity, Guess, advance
 from loam_gtsam.relocalization import Fit, Watch, places, some
 from loam_gtsam.solvers import (
@@ -109,8 +109,6 @@ class Mapper:
     ) -> None:
         self.config = config or Config()
         self.solver = solver or make_solver(self.config.solver)
-        # The pose of a rough solve is only where the real one starts.
-        self._rough_solver = solver or make_solver(_loose(self.config))
         method, prior = self.config.solver.method, self.config.imu.prior
         if imu is not None and method != "gtsam" and prior in ("equivalent", "sigma"):
             raise ConfigError(
@@ -242,16 +240,7 @@ class Mapper:
 
         matches_at = _Association(self, sweep, guess, clock)
         priors = [*priors, *self._factors(sweep.stamp, middle)]
-        start, rough_iterations = middle, 0
-        if self._first is None and 0 < self.config.matching.rough_planes < len(sweep.planes):
-            # Few matches get as near as many do; all of them are then searched for but once.
-            matches_at.use(rough(self.config.matching))
-            first = self._rough_solver.solve(matches_at, middle, priors, motion)
-            matches_at.use(self.config.matching)
-            rough_iterations = first.iterations
-            start = first.map_T_lidar
-        solution = self.solver.solve(matches_at, start, priors, motion)
-        solution = replace(solution, iterations=solution.iterations + rough_iterations)
+        solution = self.solver.solve(matches_at, middle, priors, motion)
         clock.lap("solve")
         relocalized, twist = "", guess.twist
         if self._doubtful(sweep, solution, matches_at):
@@ -380,11 +369,11 @@ class Mapper:
         clock.lap("relocalize")
         best: tuple[float, gtsam.Pose3] | None = None
         for start in starts:
-            matches_at.use(rough(self.config.matching))
-            trial = self.solver.solve(matches_at, start, priors)
-            total = Fit.of(trial.matches, matches_at.offered).total
-            if trial.solved and (best is None or total > best[0]):
-                best = total, trial.map_T_lidar
+            matches_at.use(trial(self.config.matching))
+            tried = self.solver.solve(matches_at, start, priors)
+            total = Fit.of(tried.matches, matches_at.offered).total
+            if tried.solved and (best is None or total > best[0]):
+                best = total, tried.map_T_lidar
         return None if best is None else best[1]
 
     def _factors(self, stamp: int, guess: gtsam.Pose3) -> Sequence[gtsam.NonlinearFactor]:
@@ -526,7 +515,9 @@ class _Association:
             # The first solve knows the motion better than the guess. Once is enough: further
             # rounds cost associations and change nothing that can be measured.
             sweep.deskew(mapper._twist(sweep, map_T_lidar, self._guess.twist))
-            self._found = None
+            if self._found is not None:
+                cubes, searched, found = self._found
+                self._found = cubes, searched, moved(found, sweep.edges, sweep.planes)
         matches = self._kept(map_T_lidar)
         if matches is None:
             features = sweep.edges, sweep.planes, map_T_lidar
@@ -566,18 +557,6 @@ def make_solver(config: SolverConfig) -> ScanSolver:
         "aloam": ALoamSolver,
     }
     return solvers[config.method](config)
-
-
-def _loose(config: Config) -> SolverConfig:
-    """The solver for a rough solve: it stops where the next step is the real one's to make."""
-    solver, matching = config.solver, config.matching
-    few, all_of_them = rough(matching).max_planes, matching.max_planes or np.inf
-    return replace(
-        solver,
-        min_aligned=solver.min_aligned * min(few / all_of_them, 1.0),
-        translation_tolerance=max(solver.translation_tolerance, matching.rough_translation),
-        rotation_tolerance_deg=max(solver.rotation_tolerance_deg, matching.rough_rotation_deg),
-    )
 
 
 def _checked(factors: object) -> Sequence[gtsam.NonlinearFactor]:

@@ -112,12 +112,13 @@ def associate(
         searched for more widely (``wide_search``) where no line is near.
     """
     pose = map_T_lidar.matrix()
-    edge_rows = _spread(len(edges), config.max_edges, distinct)
-    plane_rows = _spread(len(planes), config.max_planes)
+    edge_rows = spread(len(edges), config.max_edges, distinct)
+    plane_rows = spread(len(planes), config.max_planes)
     edges, planes = edges.take(edge_rows, axis=0), planes.take(plane_rows, axis=0)
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
     k, limit = config.neighbours, config.max_distance
-    near_edges = edge_map.nearest(edges_map, k, limit, edge_map.neighbourhood(pose))
+    around = edge_map.neighbourhood(pose)
+    near_edges = edge_map.nearest(edges_map, k, limit, around)
     near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
     lines = match_lines(edges, edges_map, *near_edges, pose, config)
     if distinct is not None and config.wide_search > 1.0 and not distinct.all():
@@ -125,7 +126,7 @@ def associate(
         alone = distinct[edge_rows]
         alone[lines.indices] = False
         rows, reach = np.flatnonzero(alone), config.wide_search * limit
-        near_edges = edge_map.nearest(edges_map[rows], k, reach, edge_map.neighbourhood(pose))
+        near_edges = edge_map.nearest(edges_map[rows], k, reach, around)
         wide = replace(config, max_distance=reach)
         more = match_lines(edges[rows], edges_map[rows], *near_edges, pose, wide)
         lines = _joined(lines, replace(more, indices=rows[more.indices]))
@@ -137,29 +138,35 @@ def associate(
     )
 
 
-def _spread(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
+def spread(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
     """Which of so many to match: all, or ``limit`` evenly; those of ``first`` before others."""
     if not 0 < limit < count:
         return np.arange(count)
     if first is None:
         return np.arange(limit) * count // limit
     before, after = np.flatnonzero(first), np.flatnonzero(~first)
-    before = before[_spread(len(before), limit)]
+    before = before[spread(len(before), limit)]
     left = limit - len(before)
-    return np.sort(np.concatenate([before, after[_spread(len(after), left)]])) if left else before
+    return np.sort(np.concatenate([before, after[spread(len(after), left)]])) if left else before
 
 
-def rough(config: MatchingConfig) -> MatchingConfig:
-    """The configuration for the solve with few matches that comes first."""
+def trial(config: MatchingConfig) -> MatchingConfig:
+    """The configuration with few matches, to try a pose quickly."""
 
     def at_most(limit: int, most: int) -> int:
         return min(limit, most) if most else limit
 
     return replace(
         config,
-        max_edges=at_most(config.rough_edges, config.max_edges),
-        max_planes=at_most(config.rough_planes, config.max_planes),
+        max_edges=at_most(config.trial_edges, config.max_edges),
+        max_planes=at_most(config.trial_planes, config.max_planes),
     )
+
+
+def moved(matches: ScanMatches, edges: FloatArray, planes: FloatArray) -> ScanMatches:
+    """The same lines and planes for features that were de-skewed anew, (E, 3) and (P, 3) metres."""
+    e, p = matches.edges, matches.planes
+    return ScanMatches(replace(e, points=edges[e.indices]), replace(p, points=planes[p.indices]))
 
 
 def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig) -> ScanMatches:
@@ -172,20 +179,21 @@ def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig
     weights = _line_weights(distances, config)
     keep = weights > config.min_weight
     edges = replace(e, distances=distances, weights=weights)
-    edges = edges if keep.all() else _subset(edges, keep)
+    edges = edges if keep.all() else subset(edges, keep)
     points_map = transform(pose, p.points)
     distances = _dot(points_map.T, p.normals.T) + p.offsets
     reach = points_map if config.weight_range == "map" else p.points
     weights = _plane_weights(distances, _norm(reach.T), config)
     keep = weights > config.min_weight
     planes = replace(p, distances=distances, weights=weights)
-    return ScanMatches(edges, planes if keep.all() else _subset(planes, keep))
+    return ScanMatches(edges, planes if keep.all() else subset(planes, keep))
 
 
 _Matches = TypeVar("_Matches", EdgeMatches, PlaneMatches)
 
 
-def _subset(matches: _Matches, keep: BoolArray) -> _Matches:
+def subset(matches: _Matches, keep: BoolArray) -> _Matches:
+    """Those matches for which a mask is true."""
     columns = {item.name: getattr(matches, item.name) for item in fields(matches)}
     chosen: dict[str, Any] = {
         name: None if column is None else column[keep] for name, column in columns.items()

@@ -16,7 +16,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from loam_gtsam.config import RelocalizationConfig
-from loam_gtsam.matching import ScanMatches
+from loam_gtsam.matching import ScanMatches, spread
 from loam_gtsam.types import FloatArray, IntArray
 
 _AGREE = 3.0
@@ -148,7 +148,7 @@ class Watch:
 def some(edges: FloatArray, planes: FloatArray) -> FloatArray:
     """(N, 3) a few of the features of a sweep, evenly spread, for :func:`places`."""
     parts = [
-        points[np.arange(min(most, len(points))) * len(points) // max(min(most, len(points)), 1)]
+        points[spread(len(points), most)]
         for points, most in ((edges, _SOME[0]), (planes, _SOME[1]))
     ]
     return np.concatenate(parts)

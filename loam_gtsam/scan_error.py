@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loam_gtsam.config import CovarianceConfig
-from loam_gtsam.geometry import transform, voxel_keys
+from loam_gtsam.geometry import find, symmetric, transform, voxel_keys
 from loam_gtsam.solvers import Solution, match_rows
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
@@ -78,8 +78,8 @@ class SeenGround:
         points_map : (N, 3) metres
         """
         keys, numbers = np.unique(voxel_keys(points_map, self._size), return_inverse=True)
-        fresh = ~(_holds(self._new, keys) | _holds(self._young, keys))
-        new = fresh & ~_holds(self._old, keys)
+        fresh = ~(find(self._new, keys)[1] | find(self._young, keys)[1])
+        new = fresh & ~find(self._old, keys)[1]
         self._new = np.sort(np.concatenate((self._new, keys[fresh])), kind="stable")
         if len(self._new) > _WAITING * len(self._young):
             self._young = np.sort(np.concatenate((self._young, self._new)), kind="stable")
@@ -114,6 +114,10 @@ def scan_error(
     pose = solution.map_T_lidar
     rows = match_rows(solution.matches, kernel_width)
     residuals, jacobian = rows.residuals(pose)
+    if solution.unseen is not None:
+        assert solution.beacons is not None
+        told = jacobian @ (np.eye(6) - solution.unseen)
+        jacobian = np.where(solution.beacons[:, None], jacobian, told)
     points = transform(pose.matrix(), rows.points)
     scores = jacobian * residuals[:, None]
     by_ground, new = seen.cells(points)
@@ -132,10 +136,6 @@ def scan_error(
 
     priors = user = np.zeros((6, 6))
     total = information
-    if solution.weak is not None:
-        keep = np.eye(6) - solution.weak
-        information, meat = keep.T @ information @ keep, keep.T @ meat @ keep
-        renewed = keep.T @ renewed @ keep
     if with_priors:
         total = solution.information
         priors = user = _positive(total - information)
@@ -146,10 +146,11 @@ def scan_error(
     if solution.weak is not None:
         # Along weak directions the prior is the expected motion, which starts at the last pose.
         renewed = renewed + solution.weak.T @ priors @ solution.weak
+        keep = np.eye(6) - solution.weak
         user = keep.T @ user @ keep
     return ScanError(
-        covariance=_symmetric(bread @ (meat + priors) @ bread),
-        renewed=_symmetric(bread @ renewed @ bread),
+        covariance=symmetric(bread @ (meat + priors) @ bread),
+        renewed=symmetric(bread @ renewed @ bread),
         user=bread @ user,
         residual_variance=variance,
         effective_matches=effective,
@@ -162,14 +163,6 @@ def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:
     return np.stack(columns, axis=1)
 
 
-def _holds(keys: IntArray, wanted: IntArray) -> BoolArray:
-    """Which of the ``wanted`` are among the sorted ``keys``."""
-    at = np.searchsorted(keys, wanted)
-    held: BoolArray = at < len(keys)
-    held[held] = keys[at[held]] == wanted[held]
-    return held
-
-
 def _solve(information: FloatArray, right: FloatArray) -> FloatArray:
     """Least squares: the matches alone may leave a direction free."""
     return np.linalg.lstsq(information, right, rcond=None)[0].astype(np.float64, copy=False)
@@ -177,11 +170,6 @@ def _solve(information: FloatArray, right: FloatArray) -> FloatArray:
 
 def _positive(matrix: FloatArray) -> FloatArray:
     """The nearest positive semi-definite matrix; what is left of rounding becomes zero."""
-    eigenvalues, vectors = np.linalg.eigh(_symmetric(matrix))
+    eigenvalues, vectors = np.linalg.eigh(symmetric(matrix))
     nearest: FloatArray = ((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T).astype(np.float64)
     return nearest
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    symmetric: FloatArray = 0.5 * (matrix + matrix.T)
-    return symmetric

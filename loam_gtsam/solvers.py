@@ -5,7 +5,7 @@ A solver is anything with :meth:`ScanSolver.solve`; the mapper does not know whi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import SolverConfig
-from loam_gtsam.degeneracy import Localizability, localizability
+from loam_gtsam.degeneracy import Localizability, line_sight, localizability, unseen_by_planes
 from loam_gtsam.factors import (
     MatchRows,
     checked_factor,
@@ -23,7 +23,7 @@ from loam_gtsam.factors import (
     scan_match_factor,
 )
 from loam_gtsam.matching import ScanMatches
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import BoolArray, FloatArray
 
 POSE_KEY: int = gtsam.symbol("x", 0)
 """Key of the frame's pose ``map_T_lidar`` in every graph handed to a solver."""
@@ -63,6 +63,9 @@ class Solution:
     information : (6, 6) of matches and priors at the pose
     localizability : which motions the first matches say something about; None if not looked at
     weak : (6, 6) projector onto those they say too little about; None if there are none
+    unseen : (6, 6) projector onto those that the planes say too little about, where nothing but
+        ``beacons`` and the expected motion counts; None if there are none
+    beacons : (R,) which rows of the matches count there
     """
 
     map_T_lidar: gtsam.Pose3
@@ -76,6 +79,8 @@ class Solution:
     information: FloatArray
     localizability: Localizability | None = None
     weak: FloatArray | None = None
+    unseen: FloatArray | None = None
+    beacons: BoolArray | None = None
 
     @classmethod
     def unsolved(
@@ -179,11 +184,14 @@ class GtsamSolver:
             expected = replace(motion, information=_CERTAIN * np.eye(6))
         seen: Localizability | None = None
         weak: FloatArray | None = None
+        planes: Localizability | None = None
         pose = guess
         converged = False
         steps = 0
         error_before = error_after = 0.0
         information = np.zeros((6, 6))
+        unseen: FloatArray | None = None
+        beacons: BoolArray | None = None
         for iteration in range(1, config.iterations + 1):
             matches = associate(pose)
             if len(matches) < config.min_matches:
@@ -192,15 +200,21 @@ class GtsamSolver:
                 seen = localizability(matches, pose)
                 if config.degeneracy != "off":
                     weak = seen.projector(config.min_aligned)
+                if config.degeneracy == "prior":
+                    planes = unseen_by_planes(matches, pose, seen, config.min_aligned)
             values = gtsam.Values()
             values.insert(POSE_KEY, pose)
             graph = gtsam.NonlinearFactorGraph()
             rows = match_rows(matches, config.kernel_width, config.kernel)
-            scan = scan_match_factor(POSE_KEY, rows)
-            if weak is None or expected is None:
-                graph.add(scan)
-            else:
-                graph.add(_without(scan, values, weak))
+            unseen = weak
+            beacons = np.zeros(len(rows.points), np.bool_)
+            if planes is not None:
+                unseen = planes.projector(config.min_aligned)
+                sight = line_sight(matches.edges, pose, planes.weak(config.min_aligned))
+                beacons[: 2 * len(sight)] = np.repeat(sight.any(axis=1), 2)
+            for factor in _scan_factors(rows, values, unseen, beacons):
+                graph.add(factor)
+            if weak is not None and expected is not None:
                 graph.add(expected.factor(weak))
             for factor in priors:
                 graph.add(factor)
@@ -229,7 +243,22 @@ class GtsamSolver:
             information,
             seen,
             weak,
+            unseen,
+            beacons,
         )
+
+
+def _scan_factors(
+    rows: MatchRows, values: gtsam.Values, unseen: FloatArray | None, beacons: BoolArray
+) -> Iterator[gtsam.NonlinearFactor]:
+    """The scan; of unseen directions, only what the beacons say about them."""
+    if unseen is None:
+        yield scan_match_factor(POSE_KEY, rows)
+        return
+    if beacons.any():
+        yield scan_match_factor(POSE_KEY, rows.where(beacons))
+    if not beacons.all():
+        yield _without(scan_match_factor(POSE_KEY, rows.where(~beacons)), values, unseen)
 
 
 def _without(

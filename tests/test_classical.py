@@ -586,7 +586,6 @@ def test_refine_does_the_first_sweeps_and_the_deskew_again(refine):
     config = replace(
         Config(),
         deskew=replace(Config().deskew, refine=refine),
-        matching=replace(Config().matching, rough_planes=0),
     )
     watch = _Watch()
     mapper = Mapper(config, watch)

@@ -8,7 +8,7 @@ import pytest
 
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.simulation import SimulatedWorld
-from loam_gtsam.degeneracy import localizability
+from loam_gtsam.degeneracy import localizability, unseen_by_planes
 from loam_gtsam.features import extract_features
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.matching import EdgeMatches, PlaneMatches, ScanMatches
@@ -141,6 +141,44 @@ def test_poles_lift_an_open_field_if_they_are_distinct(distinct, weak):
     points[:, 2] = -2.0
     seen = found(surfaces(points, normals), poles(120, distinct))
     assert len(seen.weak(LEAST)) == weak
+
+
+def ground_and_poles(distinct=True):
+    """Planes that hold the guess along x and y by noise, and poles where they truly stand."""
+    points, normals = room(((2, 2.0),), count=1500, extent=(15.0, 15.0, 2.0))
+    points[:, 2] = -2.0
+    planes = surfaces(points, normals, noise=0.05)
+    held = GUESS.matrix()[:3, :3] @ points.T + GUESS.translation()[:, None]
+    offsets = -np.einsum("ij,ij->i", planes.normals, held.T)
+    return ScanMatches(poles(60, distinct), replace(planes, offsets=offsets))
+
+
+@pytest.mark.parametrize(
+    ("policy", "distinct", "off"),
+    [("prior", True, 0.02), ("off", True, 0.09), ("prior", False, 0.5)],
+)
+def test_poles_say_where_they_see_and_planes_do_not(policy, distinct, off):
+    """The noise of a thousand planes holds the guess; the poles know better, if they are any."""
+    matches = ground_and_poles(distinct)
+    solver = GtsamSolver(SolverConfig(degeneracy=policy, kernel_width=np.inf, inner_iterations=5))
+    solution = solver.solve(lambda _: matches, GUESS, (), MotionPrior(GUESS, 1e4 * np.eye(6)))
+    error = np.linalg.norm(POSE.localCoordinates(solution.map_T_lidar)[3:5])
+    assert error == pytest.approx(off, rel=0.3, abs=0.02)
+    assert (solution.n_weak > 0) == (not distinct)
+
+
+def test_planes_are_believed_where_lines_see_too_little():
+    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
+    seen = found(surfaces(points, normals), poles(6, True))
+    args = ScanMatches(poles(6, True), surfaces(points, normals)), POSE, seen
+    assert unseen_by_planes(*args, LEAST) is None  # they see everything
+    thin = surfaces(*room(((1, 6.0), (2, 2.0), (0, 15.0)), count=7))
+    few = ScanMatches(poles(6, True), thin)
+    both = localizability(few, POSE)
+    just = 0.99 * both.aligned[0]
+    assert both.by_planes.min() < just  # but with the lines it is enough
+    assert unseen_by_planes(few, POSE, both, just) is None
+    assert unseen_by_planes(few, POSE, both, 1.1 * both.aligned[0]) is not None
 
 
 def test_directions_do_not_depend_on_the_map_frame():

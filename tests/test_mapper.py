@@ -64,7 +64,7 @@ def test_closed_form_room_is_solved_exactly(mapped, rng, scale):
     error = truth.localCoordinates(update.map_T_lidar)
     assert np.abs(error[:3]).max() < 1e-3
     assert np.abs(error[3:]).max() < 2e-3
-    assert update.error_after < 1.01 * update.error_before  # that of the rough solve's pose
+    assert update.error_after < 1.01 * update.error_before
     assert update.n_edge_matches > 100
     assert update.n_plane_matches > 500
     assert np.linalg.eigvalsh(update.information).min() > 0
@@ -129,8 +129,7 @@ def test_a_wrong_twist_hardly_moves_the_middle_of_the_sweep():
     middles = []
     # One association only: the second would already use a better twist.
     for wrong in (np.zeros(6), np.array([0, 0, 0.2, 0.3, 0, 0])):
-        once = replace(Config().matching, rough_planes=0)
-        mapper = Mapper(replace(with_solver(iterations=1, inner_iterations=5), matching=once))
+        mapper = Mapper(with_solver(iterations=1, inner_iterations=5))
         for item in features[:-1]:
             last = mapper.register(item)
         solved = {}
@@ -215,8 +214,7 @@ def test_few_matches_keep_the_guess_and_do_not_insert(mapped, rng):
 
 
 def test_the_iteration_limit_is_reported(rng):
-    matching = replace(Config().matching, rough_planes=0)
-    mapper = Mapper(replace(with_solver(iterations=1), matching=matching))
+    mapper = Mapper(with_solver(iterations=1))
     for i in range(3):
         mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.2, 0.0, 0.0]))
@@ -275,9 +273,7 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     config = replace(
         Config(),
         deskew=replace(Config().deskew, refine=False),
-        matching=replace(
-            Config().matching, keep_translation=metres, keep_rotation_deg=5.0, rough_planes=0
-        ),
+        matching=replace(Config().matching, keep_translation=metres, keep_rotation_deg=5.0),
         solver=replace(Config().solver, iterations=2, step_sigmas=0.0, translation_tolerance=0.0),
     )
     mapper = Mapper(config)
@@ -289,52 +285,6 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
     update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
     assert (update.iterations, len(calls)) == (2, searches)
-
-
-class _Watched:
-    """A solver that remembers where it started and how many matches it was given at most."""
-
-    def __init__(self):
-        self.solver = mapper_module.make_solver(Config().solver)
-        self.guesses, self.sizes = [], []
-
-    def solve(self, associate, guess, *others):
-        sizes = []
-
-        def counted(pose):
-            matches = associate(pose)
-            sizes.append((len(matches.edges), len(matches.planes)))
-            return matches
-
-        solution = self.solver.solve(counted, guess, *others)
-        self.guesses.append(guess)
-        self.sizes.append(tuple(np.max(sizes, axis=0)))
-        return solution
-
-
-@pytest.mark.parametrize(
-    ("planes", "solves", "helps"),
-    [(0, 1, False), (10**6, 1, False), (200, 2, True), (30, 2, False)],
-)
-def test_a_rough_solve_comes_first_if_it_has_fewer_features(rng, planes, solves, helps):
-    """Off, no fewer, fewer, and too few to solve: then the second solve starts at the guess."""
-    matching = replace(Config().matching, rough_planes=planes, rough_edges=10, max_planes=1000)
-    watched = _Watched()
-    mapper = Mapper(replace(Config(), matching=matching), watched)
-    for i in range(3):
-        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
-    watched.guesses.clear(), watched.sizes.clear()
-    truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
-    update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
-    assert update.status is FrameStatus.OK
-    assert np.abs(truth.localCoordinates(update.map_T_lidar)).max() < 2e-3
-    assert len(watched.sizes) == solves
-    assert 500 < watched.sizes[-1][1] <= 1000
-    if solves == 2:
-        assert watched.sizes[0][0] <= 10
-        assert watched.sizes[0][1] <= planes
-    near = np.abs(truth.localCoordinates(watched.guesses[-1])).max() < 0.02
-    assert near == helps
 
 
 def test_cubes_left_behind_are_evicted_counted_and_kept(rng):

@@ -9,7 +9,7 @@ import pytest
 from loam_gtsam.config import MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
-from loam_gtsam.matching import ScanMatches, associate, match_lines, match_planes, renew, rough
+from loam_gtsam.matching import ScanMatches, associate, match_lines, match_planes, renew, trial
 
 CONFIG = MatchingConfig()
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -406,9 +406,9 @@ def test_at_most_so_many_features_are_matched_at_even_distances(limit, rows):
 
 
 @pytest.mark.parametrize(("most", "expected"), [(0, (20, 70)), (50, (20, 50)), (10, (10, 10))])
-def test_the_rough_configuration_never_matches_more(most, expected):
-    config = changed(max_edges=most, max_planes=most, rough_edges=20, rough_planes=70)
-    assert rough(config) == dataclasses.replace(
+def test_the_configuration_for_trials_never_matches_more(most, expected):
+    config = changed(max_edges=most, max_planes=most, trial_edges=20, trial_planes=70)
+    assert trial(config) == dataclasses.replace(
         config, max_edges=expected[0], max_planes=expected[1]
     )
 

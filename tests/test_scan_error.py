@@ -38,8 +38,9 @@ def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
         information = information + prior
     step = -np.linalg.solve(information, keep.T @ jacobian.T @ residuals)
     return Solution(
-        pose.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information, weak=weak
-    ), step
+        pose.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information, weak=weak,
+        unseen=weak, beacons=np.zeros(count, np.bool_),
+    ), step  # fmt: skip
 
 
 def surroundings(rng, count=1500, axes=3):
@@ -153,6 +154,24 @@ def test_along_a_weak_direction_there_is_the_expected_motion_only():
     assert along @ found.covariance @ along == pytest.approx(0.05**2, rel=1e-6)
     assert along @ found.renewed @ along == pytest.approx(0.05**2, rel=1e-6)
     np.testing.assert_allclose(found.user @ along, 0.0, atol=1e-9)
+
+
+def test_along_unseen_directions_only_the_beacons_count():
+    """1500 walls across x, of which ten count; then the covariance is that of the ten."""
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    along = np.concatenate([np.zeros(3), POSE.rotation().matrix().T @ [1.0, 0.0, 0.0]])
+    unseen = np.outer(along, along)
+    across = np.flatnonzero(np.abs(normals[:, 0]) > 0.5)
+    beacons = np.zeros(len(points), np.bool_)
+    beacons[across[:10]] = True
+    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    rows = match_rows(solution.matches)
+    told = rows.residuals(solution.map_T_lidar)[1] @ (np.eye(6) - unseen)
+    told[beacons] = rows.where(beacons).residuals(solution.map_T_lidar)[1]
+    few = dataclasses.replace(solution, unseen=unseen, beacons=beacons, information=told.T @ told)
+    before, after = (along @ error_of(one).covariance @ along for one in (solution, few))
+    assert 10 < after / before < 200  # 500 walls against 10
 
 
 def test_singular_information_gives_no_covariance():

@@ -131,7 +131,7 @@ def test_command_writes_the_same_numbers_on_every_run(
 ) -> None:
     monkeypatch.setattr(study, "QUICK", TINY)
     assert study.main(["--quick", "--output", str(tmp_path)]) == 0
-    study.write_csv(tmp_path / "again.csv", study.summary(results))
+    study.write_fields(tmp_path / "again.csv", study.summary(results))
     again, rows = table(tmp_path / "again.csv"), table(tmp_path / "study/trials.csv")
     assert rows[: len(again)] == again
     assert {row["scene"] for row in rows} == {"room", "corridor_bare"}

@@ -7,8 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from loam_gtsam.datasets._raycast import Solids
-from loam_gtsam.datasets._scenes import Kerb, Scene, facades, furniture, rolling
+from loam_gtsam.datasets._scenes import CAR, Kerb, Scene, rolling, streets
 from loam_gtsam.types import ConfigError, FloatArray
 
 _STREAM = 8
@@ -48,32 +47,20 @@ def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
     steps = np.diff(corners, axis=0)
     turns = np.sign(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0])
     turns = np.concatenate([turns[:1], turns, turns[-1:]])
-    boxes: list[list[float]] = []
-    cylinders: list[list[float]] = []
-    crowns: list[list[float]] = []
+    sides: list[tuple[np.random.Generator, Kerb, bool, bool]] = []
     for number, (corner, following) in enumerate(pairwise(corners)):
         rng = np.random.default_rng([seed, 1 + number, _STREAM])  # whatever the length
         for side in (1.0, -1.0):
             kerb = Kerb(corner, following, side > 0.0, ground)
-            boxes += facades(rng, kerb, side == turns[number], side == turns[number + 1])
-            cars, posts, trees = furniture(rng, kerb)
-            boxes += cars
-            cylinders += posts
-            crowns += trees
+            sides.append((rng, kerb, side == turns[number], side == turns[number + 1]))
     return Scene(
         name="avenue",
-        solids=Solids(
-            np.array(boxes),
-            np.array(cylinders),
-            np.array(crowns),
-            np.ones(len(crowns), np.bool_),
-            ground,
-        ),
+        solids=streets(sides, ground),
         waypoints=_way(corners, metres),
         closed=False,
         speed=10.0,
         height=1.8,
-        sway=(0.01, 0.006, 0.006, 0.002),
+        sway=CAR,
     )
 
 

@@ -7,11 +7,9 @@ from collections.abc import Callable
 import numpy as np
 
 from loam_gtsam.datasets._raycast import Solids
-from loam_gtsam.datasets._scenes import DEEP, Scene, box, rolling
+from loam_gtsam.datasets._scenes import CAR, DEEP, Scene, box, rolling
 from loam_gtsam.types import FloatArray
 
-_CAR = (0.01, 0.006, 0.006, 0.002)
-"""Heave (m), roll, pitch and yaw (rad) of a car on an even surface."""
 _POLES = 25
 _TERRAIN = 300.0
 """Metres of way between the first and the last pole."""
@@ -20,7 +18,7 @@ _TERRAIN = 300.0
 def build_open_field(seed: int) -> Scene:
     """Flat ground and nothing else: x, y and yaw show in no beam."""
     del seed  # nothing here is random
-    return _along_x("open_field", Solids(), 200.0, wander=2.0, speed=5.0, height=1.8, sway=_CAR)
+    return _along_x("open_field", Solids(), 200.0, wander=2.0, speed=5.0, height=1.8, sway=CAR)
 
 
 def build_single_plane(seed: int) -> Scene:
@@ -44,7 +42,7 @@ def build_single_pole(seed: int) -> Scene:
         closed=True,
         speed=2.0,
         height=1.5,
-        sway=_CAR,
+        sway=CAR,
         frames=250,
     )
 

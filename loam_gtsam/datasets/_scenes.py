@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -14,6 +14,8 @@ from loam_gtsam.types import FloatArray
 
 DEEP = 3.0
 """Metres by which things reach below the ground they stand on, so that no slope shows a gap."""
+CAR = (0.01, 0.006, 0.006, 0.002)
+"""Sway of a car on an even surface: heave (m), roll, pitch and yaw (rad)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,31 +87,19 @@ def build_street_loop(seed: int) -> Scene:
     half_x, half_y = 105.0, 55.0
     ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (half_x, half_y)
-    boxes: list[list[float]] = []
-    cylinders: list[list[float]] = []
-    crowns: list[list[float]] = []
-    for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        for inside in (True, False):  # the block inside the loop lies to the left
-            kerb = Kerb(corner, following, inside, ground)
-            boxes += facades(rng, kerb, inside, inside)
-            cars, posts, trees = furniture(rng, kerb)
-            boxes += cars
-            cylinders += posts
-            crowns += trees
+    sides = (
+        (rng, Kerb(corner, following, inside, ground), inside, inside)
+        for corner, following in zip(corners, np.roll(corners, -1, axis=0), strict=True)
+        for inside in (True, False)  # the block inside the loop lies to the left
+    )
     return Scene(
         name="street_loop",
-        solids=Solids(
-            np.array(boxes),
-            np.array(cylinders),
-            np.array(crowns),
-            np.ones(len(crowns), np.bool_),
-            ground,
-        ),
+        solids=streets(sides, ground),
         waypoints=_rounded_rectangle(half_x, half_y, radius=16.0, wander=0.6),
         closed=True,
         speed=10.0,
         height=1.8,
-        sway=(0.01, 0.006, 0.006, 0.002),
+        sway=CAR,
     )
 
 
@@ -240,7 +230,7 @@ def build_slopes(seed: int) -> Scene:
         closed=False,
         speed=8.0,
         height=1.8,
-        sway=(0.01, 0.006, 0.006, 0.002),
+        sway=CAR,
     )
 
 
@@ -284,6 +274,29 @@ class Kerb:
         x, y, z = self.place(0.5 * (s0 + s1), 0.5 * (d0 + d1))
         half = [0.5 * (s1 - s0), 0.5 * (d1 - d0), 0.5 * (top - low)]
         return [x, y, z + 0.5 * (low + top), *half, self._yaw]
+
+
+def streets(
+    sides: Iterable[tuple[np.random.Generator, Kerb, bool, bool]], ground: Ground
+) -> Solids:
+    """Houses, cars, lamp posts and trees along sides of streets.
+
+    Parameters
+    ----------
+    sides : of each its random numbers, its kerb, and whether it is the inner side of the bends at
+        its two ends
+    """
+    boxes: list[list[float]] = []
+    cylinders: list[list[float]] = []
+    crowns: list[list[float]] = []
+    for rng, kerb, begins_inside, ends_inside in sides:
+        boxes += facades(rng, kerb, begins_inside, ends_inside)
+        cars, posts, trees = furniture(rng, kerb)
+        boxes += cars
+        cylinders += posts
+        crowns += trees
+    foliage = np.ones(len(crowns), np.bool_)
+    return Solids(np.array(boxes), np.array(cylinders), np.array(crowns), foliage, ground)
 
 
 def facades(

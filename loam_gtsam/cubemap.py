@@ -12,13 +12,9 @@ cubes that are searched together: a sweep touches a dozen, most of them with a h
 
 from __future__ import annotations
 
-import logging
-import os
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,10 +22,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.geometry import find, voxel_keys
+from loam_gtsam.cube_archive import Archive, CubeIndex, CubePoints, Owners
+from loam_gtsam.geometry import find, transform, voxel_keys
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
-
-CubeIndex = tuple[int, int, int]
 
 _COS_VIEW = np.sqrt(3.0) / 2.0  # cos 30 degrees: LOAM's field of view is 30 to 150 off the up axis
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # of a cube, from its centre
@@ -42,8 +37,6 @@ _SEARCHES = 2  # trees that are kept: a sensor that stands on the border of a cu
 _TREE = {"leafsize": 32, "balanced_tree": False, "compact_nodes": False}
 _NO_POINTS: FloatArray = np.empty((0, 3))
 _NO_KEYS: IntArray = np.empty(0, dtype=np.int64)
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +71,10 @@ class CubeMap:
     config : cubes, window, neighbourhood, insertion policy and archive
     voxel_size : metres; the voxel grid is anchored at the map origin
 
+    Attributes
+    ----------
+    owner : number that points inserted from now on carry, see :meth:`move`
+
     Raises
     ------
     ConfigError
@@ -90,8 +87,9 @@ class CubeMap:
         self._config = config
         self._voxel_size = float(voxel_size)
         self._cubes: dict[CubeIndex, _Cube] = {}
+        self.owner = 0
         self._searches: list[_Search] = []  # the last one used comes last
-        self._archive = _Archive(config.archive_megabytes, config.archive_dir)
+        self._archive = Archive(config.archive_megabytes, config.archive_dir)
         self._shape = np.array(config.window, dtype=np.int64)
         self._low = -(self._shape // 2)
         self._evicted = self._restored = self._outside = 0
@@ -145,13 +143,13 @@ class CubeMap:
         # Restore first: storing may push the oldest cubes out of the archive.
         for index in self._archive.indices():
             if self._in_window(index):
-                points = self._archive.take(index)
-                if points is not None:
-                    self._cubes[index] = _Cube(voxel_keys(points, self._voxel_size), points)
+                content = self._archive.take(index)
+                if content is not None:
+                    self._cubes[index] = _Cube(self._by_voxel(content))
                     self._restored += 1
         self._searches = [kept for kept in self._searches if kept.cubes.isdisjoint(leaving)]
         for index in leaving:
-            self._archive.store(index, self._cubes.pop(index).points)
+            self._archive.store(index, self._cubes.pop(index).content)
         self._evicted += len(leaving)
         return len(leaving)
 
@@ -212,17 +210,55 @@ class CubeMap:
             If the array is not (N, 3) floats, all finite; the map is then unchanged.
         """
         points = _finite(points_map, "points_map", (None, 3))
+        self._put(points, np.full(len(points), self.owner, np.int32))
+
+    def move(self, moves: Mapping[int, FloatArray]) -> int:
+        """Move points of the window and of the archive, after a loop closure.
+
+        Where one comes to lie in the voxel of another, the one that was not moved stays; of two
+        that were moved, that of the lower owner.
+
+        Parameters
+        ----------
+        moves : (4, 4) rigid transforms in the map frame, by the owner of the points
+
+        Returns
+        -------
+        Points moved.
+        """
+        owners = np.array(sorted(moves), np.int32)
+        taken = [cube.take_out(owners) for cube in self._cubes.values()]
+        for index in self._archive.indices():
+            content = self._archive.take(index)
+            if content is not None:
+                cube = _Cube(self._by_voxel(content))
+                taken.append(cube.take_out(owners))
+                self._archive.store(index, cube.content)
+        self._searches = []
+        count = 0
+        for owner in owners.tolist():
+            parts = [part.points[part.owners == owner] for part in taken]
+            points = transform(moves[owner], np.concatenate([_NO_POINTS, *parts]))
+            self._put(points, np.full(len(points), owner, np.int32), archive=True)
+            count += len(points)
+        return count
+
+    def _put(self, points: FloatArray, owners: Owners, *, archive: bool = False) -> None:
+        """Insert points; with ``archive`` those outside the window go there."""
         cells = self._cells(points)
         inside = ((cells >= self._low) & (cells < self._low + self._shape)).all(axis=1)
         inside &= (np.abs(points) < _VOXEL_LIMIT * self._voxel_size).all(axis=1)
-        self._outside += int(np.count_nonzero(~inside))
-        points, index = points[inside], cells[inside].astype(np.int64)
+        if archive:
+            self._put_away(points[~inside], owners[~inside], cells[~inside])
+        else:
+            self._outside += int(np.count_nonzero(~inside))
+        points, owners, index = points[inside], owners[inside], cells[inside].astype(np.int64)
         if len(points) == 0:
             return
         slots: IntArray = np.ravel_multi_index((index - self._low).T, self._shape)
         keys = voxel_keys(points, self._voxel_size)
         order = np.lexsort((keys, slots))  # stable: points of a voxel stay in the order given
-        points, keys, slots = points[order], keys[order], slots[order]
+        points, keys, slots, owners = points[order], keys[order], slots[order], owners[order]
         first = _starts((slots[1:] != slots[:-1]) | (keys[1:] != keys[:-1]))
         slots = slots[first]
         starts = _starts(slots[1:] != slots[:-1])
@@ -230,10 +266,11 @@ class CubeMap:
         cubes = [self._cubes.setdefault(cell, _Cube()) for cell in found]
         stops = np.append(starts[1:], len(slots)).tolist()
         parts = [slice(*ends) for ends in zip(starts.tolist(), stops, strict=True)]
+        owners = owners[first]
         if self._config.insertion == "settled":
             keys, points = keys[first], points[first]
             added = {
-                cell: cube.settle(keys[part], points[part])
+                cell: cube.settle(_Content(keys[part], points[part], owners[part]))
                 for cell, cube, part in zip(found, cubes, parts, strict=True)
             }
             for search in self._searches:
@@ -241,8 +278,28 @@ class CubeMap:
         else:
             voxels = _group(points, keys, first)
             for cube, part in zip(cubes, parts, strict=True):
-                cube.average(voxels.part(part))
+                cube.average(voxels.part(part), owners[part])
             self._searches = [kept for kept in self._searches if kept.cubes.isdisjoint(found)]
+
+    def _put_away(self, points: FloatArray, owners: Owners, cells: FloatArray) -> None:
+        """Put points into the archive; those beyond the voxel grid are not taken."""
+        far = (np.abs(points) >= _VOXEL_LIMIT * self._voxel_size).any(axis=1)
+        self._outside += int(np.count_nonzero(far))
+        points, owners, cells = points[~far], owners[~far], cells[~far].astype(np.int64)
+        found, numbers = np.unique(cells, axis=0, return_inverse=True)
+        for number, cell in enumerate(found):
+            here = numbers.ravel() == number
+            content = self._archive.take(_index(cell))
+            cube = _Cube() if content is None else _Cube(self._by_voxel(content))
+            new = self._by_voxel(CubePoints(points[here], owners[here]))
+            first = _starts(new.keys[1:] != new.keys[:-1])
+            cube.settle(new.at(first))
+            self._archive.store(_index(cell), cube.content)
+
+    def _by_voxel(self, content: CubePoints) -> _Content:
+        keys = voxel_keys(content.points, self._voxel_size)
+        order = np.argsort(keys, kind="stable")
+        return _Content(keys[order], content.points[order], content.owners[order])
 
     def nearest(
         self,
@@ -320,7 +377,7 @@ class CubeMap:
                 for index in self._archive.indices():
                     stored = self._archive.read(index)
                     if stored is not None:
-                        everywhere[index] = stored
+                        everywhere[index] = stored.points
             parts = [everywhere[index] for index in sorted(everywhere)]
         return np.concatenate([_NO_POINTS, *parts])
 
@@ -417,33 +474,65 @@ class _Search:
         return points, squared
 
 
+class _Content(NamedTuple):
+    """Points in ascending order of their voxel keys, and who owns them."""
+
+    keys: IntArray
+    points: FloatArray
+    owners: Owners
+
+    def at(self, chosen: BoolArray | IntArray) -> _Content:
+        """Some of them: a mask, or rows in ascending order."""
+        return _Content(self.keys[chosen], self.points[chosen], self.owners[chosen])
+
+    def joined(self, new: _Content) -> _Content:
+        """Both; no key is in both."""
+        keys = np.concatenate((self.keys, new.keys))
+        # merges two sorted runs; half of np.insert's time
+        order = np.argsort(keys, kind="stable")
+        return _Content(
+            keys[order],
+            np.concatenate((self.points, new.points)).take(order, axis=0),
+            np.concatenate((self.owners, new.owners))[order],
+        )
+
+
+_EMPTY = _Content(_NO_KEYS, _NO_POINTS, np.empty(0, np.int32))
+
+
 class _Cube:
-    """Points sorted by voxel key, at most one a voxel.
+    """Points, at most one a voxel.
 
     New ones wait beside the others until they are many, or all are asked for: merging takes time
     in proportion to all points of the cube, which get more with every visit.
     """
 
-    __slots__ = ("_keys", "_new_keys", "_new_points", "_points")
+    __slots__ = ("_new", "_old")
 
-    def __init__(self, keys: IntArray = _NO_KEYS, points: FloatArray = _NO_POINTS) -> None:
-        self._keys, self._points = keys, points
-        self._new_keys, self._new_points = _NO_KEYS, _NO_POINTS
+    def __init__(self, content: _Content = _EMPTY) -> None:
+        self._old, self._new = content, _EMPTY
 
     def __len__(self) -> int:
-        return len(self._keys) + len(self._new_keys)
+        return len(self._old.keys) + len(self._new.keys)
 
     @property
     def points(self) -> FloatArray:
         """(N, 3) metres, in the order of their voxels."""
         self._take_in()
-        return self._points
+        return self._old.points
 
-    def average(self, new: _Voxels) -> None:
-        """Mean of the point a voxel has, if any, and the new ones."""
+    @property
+    def content(self) -> CubePoints:
+        """All that is kept of the cube in an archive."""
         self._take_in()
-        at, taken = find(self._keys, new.keys)
-        old = self._points[at[taken]]
+        return CubePoints(self._old.points, self._old.owners)
+
+    def average(self, new: _Voxels, owners: Owners) -> None:
+        """Mean of the point a voxel has, if any, and the new ones; the owner stays."""
+        self._take_in()
+        at, taken = find(self._old.keys, new.keys)
+        held = self._old.points
+        old = held[at[taken]]
         sums, counts, lows, highs = new.sums, new.counts, new.lows, new.highs
         sums[taken] += old
         counts[taken] += 1.0
@@ -451,124 +540,33 @@ class _Cube:
         highs[taken] = np.maximum(highs[taken], old)
         # Rounding may put a mean just outside its points, and so into another voxel or cube.
         means = np.clip(sums / counts[:, None], lows, highs)
-        self._points[at[taken]] = means[taken]
-        self._new_keys, self._new_points = new.keys[~taken], means[~taken]
+        held[at[taken]] = means[taken]
+        self._new = _Content(new.keys[~taken], means[~taken], owners[~taken])
 
-    def settle(self, keys: IntArray, points: FloatArray) -> FloatArray:
+    def settle(self, new: _Content) -> FloatArray:
         """Add the points whose voxels are free, and return them."""
-        free = ~(find(self._keys, keys)[1] | find(self._new_keys, keys)[1])
-        keys, points = keys[free], points[free]
-        if len(points):
-            self._new_keys, self._new_points = _joined(
-                self._new_keys, self._new_points, keys, points
-            )
-            if len(self._new_keys) > _WAITING * len(self._keys):
+        free = ~(find(self._old.keys, new.keys)[1] | find(self._new.keys, new.keys)[1])
+        new = new.at(free)
+        if len(new.points):
+            self._new = self._new.joined(new)
+            if len(self._new.keys) > _WAITING * len(self._old.keys):
                 self._take_in()
-        return points
+        return new.points
+
+    def take_out(self, owners: Owners) -> CubePoints:
+        """Remove the points of some owners, and return them."""
+        self._take_in()
+        out = np.isin(self._old.owners, owners)
+        if not out.any():
+            return CubePoints(_NO_POINTS, _EMPTY.owners)
+        gone = self._old.at(out)
+        self._old = self._old.at(~out)
+        return CubePoints(gone.points, gone.owners)
 
     def _take_in(self) -> None:
         """Put the new ones in their places."""
-        if len(self._new_keys):
-            self._keys, self._points = _joined(
-                self._keys, self._points, self._new_keys, self._new_points
-            )
-            self._new_keys, self._new_points = _NO_KEYS, _NO_POINTS
-
-
-class _Archive:
-    """Points of cubes outside the window: the newest in memory, older ones on disk or dropped."""
-
-    def __init__(self, megabytes: float, folder: str | None) -> None:
-        self._budget = megabytes * 1e6
-        self._bytes = 0
-        self._memory: dict[CubeIndex, FloatArray] = {}  # oldest first
-        self._disk: dict[CubeIndex, int] = {}  # number of points
-        self._folder: Path | None = None
-        self.dropped_cubes = self.dropped_points = 0
-        if folder is not None:
-            try:
-                Path(folder).mkdir(parents=True, exist_ok=True)
-                self._folder = Path(tempfile.mkdtemp(prefix="cubes_", dir=folder))
-            except OSError as error:
-                raise ConfigError(
-                    f"map.archive_dir: cannot make a folder in {folder!r} ({error}); name one that "
-                    "can be written to, or null to keep the archive in memory"
-                ) from error
-
-    def __len__(self) -> int:
-        return len(self._memory) + len(self._disk)
-
-    def indices(self) -> list[CubeIndex]:
-        return [*self._memory, *self._disk]
-
-    def count(self) -> int:
-        """Points."""
-        return sum(map(len, self._memory.values())) + sum(self._disk.values())
-
-    def store(self, index: CubeIndex, points: FloatArray) -> None:
-        self._memory[index] = points
-        self._bytes += points.nbytes
-        while self._bytes > self._budget:
-            oldest = next(iter(self._memory))
-            self._spill(oldest, self._memory.pop(oldest))
-
-    def read(self, index: CubeIndex) -> FloatArray | None:
-        """Points of an archived cube; None, and the cube counts as dropped, if unreadable."""
-        if index in self._memory:
-            return self._memory[index]
-        try:
-            points = np.load(self._path(index), allow_pickle=False)
-            if points.shape != (self._disk[index], 3) or points.dtype != np.float64:
-                raise ValueError(
-                    f"expected ({self._disk[index]}, 3) float64, got {points.shape} {points.dtype}"
-                )
-        except (OSError, ValueError) as error:
-            self._drop(self._disk.pop(index), f"cannot read {self._path(index)}: {error}")
-            return None
-        stored: FloatArray = points
-        return stored
-
-    def take(self, index: CubeIndex) -> FloatArray | None:
-        """The same, and forget it."""
-        points = self.read(index)
-        if index in self._memory:
-            self._bytes -= self._memory.pop(index).nbytes
-        elif index in self._disk:
-            del self._disk[index]
-            self._path(index).unlink(missing_ok=True)
-        return points
-
-    def _spill(self, index: CubeIndex, points: FloatArray) -> None:
-        self._bytes -= points.nbytes
-        if self._folder is None:
-            self._drop(len(points), "archive_megabytes is used up and archive_dir is not set")
-            return
-        path = self._path(index)
-        temporary = path.with_suffix(".tmp")
-        try:
-            with temporary.open("wb") as file:
-                np.save(file, points, allow_pickle=False)
-            os.replace(temporary, path)  # a file under its final name is always whole
-        except OSError as error:
-            self._drop(len(points), f"cannot write {path}: {error}")
-        else:
-            self._disk[index] = len(points)
-
-    def _drop(self, n_points: int, reason: str) -> None:
-        """Count a loss; say it once, as a full disk would say it for every cube."""
-        self.dropped_cubes += 1
-        self.dropped_points += n_points
-        if self.dropped_cubes == 1:
-            _log.warning(
-                "the map archive lost a cube of %d points: %s. Further losses are only counted "
-                "(dropped_cubes, dropped_points)",
-                n_points,
-                reason,
-            )
-
-    def _path(self, index: CubeIndex) -> Path:
-        assert self._folder is not None
-        return self._folder / "cube_{}_{}_{}.npy".format(*index)
+        if len(self._new.keys):
+            self._old, self._new = self._old.joined(self._new), _EMPTY
 
 
 def _group(points: FloatArray, keys: IntArray, first: IntArray) -> _Voxels:
@@ -580,15 +578,6 @@ def _group(points: FloatArray, keys: IntArray, first: IntArray) -> _Voxels:
         lows=np.minimum.reduceat(points, first, axis=0),
         highs=np.maximum.reduceat(points, first, axis=0),
     )
-
-
-def _joined(
-    keys: IntArray, points: FloatArray, new_keys: IntArray, new_points: FloatArray
-) -> tuple[IntArray, FloatArray]:
-    """Two sets of points sorted by key as one; no key is in both."""
-    keys = np.concatenate((keys, new_keys))
-    order = np.argsort(keys, kind="stable")  # merges two sorted runs; half of np.insert's time
-    return keys[order], np.concatenate((points, new_points)).take(order, axis=0)
 
 
 def _starts(changes: BoolArray) -> IntArray:

@@ -449,7 +449,7 @@ def test_points_that_wait_to_be_merged_in_are_there_all_the_same() -> None:
             cube_map.insert(again)
         assert len(merged.points()) == waiting.count() == waiting.stats.points
         (cube,) = waiting._cubes.values()
-        waited += len(cube._new_keys) > 0
+        waited += len(cube._new.keys) > 0
         np.testing.assert_array_equal(
             waiting.nearest(points, 1, 9.0, [(0, 0, 0)])[0],
             merged.nearest(points, 1, 9.0, [(0, 0, 0)])[0],
@@ -590,3 +590,53 @@ def test_bad_archive_dir(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"map\.archive_dir"):
         CubeMap(MapConfig(archive_dir=str(tmp_path / "file")), 0.4)
+
+
+def moved_by(x):
+    move = np.eye(4)
+    move[0, 3] = x
+    return move
+
+
+@pytest.mark.parametrize("archive", ["memory", "disk"])
+def test_points_move_with_their_owner_and_nothing_else_does(tmp_path, archive):
+    """Also those in the archive, out of it and into it."""
+    config = MapConfig(
+        cube_size=10.0, window=(3, 3, 3), window_margin=0,
+        archive_dir=str(tmp_path) if archive == "disk" else None,
+        archive_megabytes=1e-6 if archive == "disk" else 100.0,
+    )  # fmt: skip
+    cubes = CubeMap(config, 0.5)
+    rng = np.random.default_rng(0)
+    parts = [rng.uniform(-4.0, 4.0, (60, 3)) + np.array([x, 0, 0]) for x in (0.0, 10.0, 20.0, 30.0)]
+    for owner, part in enumerate(parts):
+        cubes.recenter(part.mean(axis=0))
+        cubes.owner = owner
+        cubes.insert(part)
+    assert cubes.stats.archived
+    held = {tuple(point) for point in cubes.points(archived=True).round(6).tolist()}
+    count = cubes.move({0: moved_by(30.5), 3: moved_by(-30.5)})  # in, and out
+    after = cubes.points(archived=True)
+    assert 90 < count <= 120
+    assert len(after) == len(held)  # they changed places, and met nothing
+    expected = set()
+    for point in held:
+        shift = 30.5 if point[0] < 5.0 else -30.5 if point[0] > 25.0 else 0.0
+        expected.add((round(point[0] + shift, 6), *point[1:]))
+    assert {tuple(point) for point in after.round(6).tolist()} == expected
+    here = cubes.points()
+    assert len(here) > 0
+    assert (here[:, 0] > 5.0).all()  # those of the window
+
+
+def test_a_moved_point_gives_way_to_one_that_was_there():
+    cubes = CubeMap(MapConfig(), 0.4)
+    for owner, x in enumerate((0.1, 1.1, 2.1)):
+        cubes.owner = owner
+        cubes.insert(np.array([[x, 0.1, 0.1]]))
+    before = cubes.nearest(np.zeros((1, 3)), 1, np.inf, [(0, 0, 0)])[0]
+    assert cubes.move({2: moved_by(-1.9), 1: moved_by(-0.85)}) == 2
+    np.testing.assert_array_equal(cubes.points()[:, 0], [0.1])
+    after = cubes.nearest(np.full((1, 3), 2.0), 1, np.inf, [(0, 0, 0)])[0]
+    np.testing.assert_array_equal(after, before)  # its trees know that
+    assert cubes.move({7: moved_by(1.0)}) == 0

@@ -50,6 +50,7 @@ from loam_gtsam.keyframes import Keyframe as Keyframe
 from loam_gtsam.keyframes import LoopClosure as LoopClosure
 from loam_gtsam.loop_closure import LoopCloser as LoopCloser
 from loam_gtsam.loop_closure import ScanLoopCloser as ScanLoopCloser
+from loam_gtsam.loop_mapping import LoopMapping as LoopMapping
 from loam_gtsam.mapper import Mapper as Mapper
 from loam_gtsam.mapper import PoseContext as PoseContext
 from loam_gtsam.mapper import make_solver as make_solver
@@ -127,6 +128,7 @@ __all__ = [
     "LoamError",
     "LoopCloser",
     "LoopClosure",
+    "LoopMapping",
     "MapUpdate",
     "Mapper",
     "MatchRows",

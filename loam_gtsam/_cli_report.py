@@ -54,6 +54,11 @@ def summary(
         share = f" ({100.0 * error / length:.3f} % of the path)" if length >= _MIN_PATH else ""
         text = f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
         table.add_row("accuracy", text)
+    if result.loops is not None:
+        counts = result.loops.counts()
+        used = f"{counts.pop('on')} of {counts.pop('loops')} found are used"
+        others = [f"{count} {name.replace('_', ' ')}" for name, count in counts.items()]
+        table.add_row("loops", f"{used}; {', '.join(others)}")
     about_input = [Text(f"  input: {problem}", style="yellow") for problem in problems]
     if result.imu is not None:
         for label, value in imu_facts(result.imu).items():

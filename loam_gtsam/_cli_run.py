@@ -31,11 +31,14 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.evaluation import absolute_error, align, align_rotations, interpolate
 from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
+from loam_gtsam.graph_files import write_graph
 from loam_gtsam.pipeline import Observer, OnFrame, RunResult, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
 
 PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
 TRUTH_FILE = "truth.tum"
+LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
+RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, *LOOP_FILES, TRUTH_FILE)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _WORTH_A_PROCESS = 200
 """Sweeps by which a process has saved the second that it takes to start."""
@@ -131,9 +134,7 @@ def _bag(options: RunOptions, config: Config) -> Iterator[Observer | None]:
         yield record(bag)
 
 
-def free_folder(
-    wanted: Path, overwrite: bool, known: Sequence[str] = (*RUN_FILES, *PLOT_FILES, TRUTH_FILE)
-) -> Path:
+def free_folder(wanted: Path, overwrite: bool, known: Sequence[str] = RUN_OUTPUTS) -> Path:
     """``wanted``, or, if that holds a run that must not be replaced, a new folder beside it."""
     if overwrite or not any((wanted / name).exists() for name in known):
         return wanted
@@ -185,7 +186,7 @@ def _write(
 ) -> list[str]:
     """Write all files; names of what was written."""
     # A picture or a truth of the run that is being replaced would not belong to this one.
-    for name in (*PLOT_FILES, TRUTH_FILE):
+    for name in (*PLOT_FILES, *LOOP_FILES, TRUTH_FILE):
         (folder / name).unlink(missing_ok=True)
     extra = {"accuracy": accuracy or None, "input": asdict(info)}
     write_run(result, folder, dataset=f"{info.kind} {info.path}", extra=extra)
@@ -193,9 +194,14 @@ def _write(
     if dataset.truth is not None:
         write_tum(folder / TRUTH_FILE, dataset.truth)
         files.append(TRUTH_FILE)
+    if result.loops is not None:
+        write_tum(folder / LOOP_FILES[0], result.odometry, comments={"frame": "odom"})
+        write_graph(folder / LOOP_FILES[1], result.loops.graph.saved())
+        files.extend(LOOP_FILES)
     if plot:
         trajectory = result.trajectory
-        visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth)
+        loops = None if result.loops is None else result.loops.ends()
+        visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
         visualization.plot_map(
             folder / "map.png", result.edge_points, result.plane_points, trajectory
         )

@@ -7,6 +7,7 @@ The only place that catches :class:`~loam_gtsam.types.LoamError`. Exit codes: 0 
 from __future__ import annotations
 
 import platform
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -179,6 +180,14 @@ def run(
             "folder if FILE has no suffix).",
         ),
     ] = None,
+    loops: Annotated[
+        bool,
+        typer.Option(
+            "--loops",
+            help="Close loops: look for places seen before, let the map follow, and write the "
+            "pose graph (loops.enabled).",
+        ),
+    ] = False,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -201,6 +210,8 @@ def run(
     from loam_gtsam._cli_run import RunOptions, execute
 
     settings = _settings(preset, config, sensor, overrides)
+    if loops:
+        settings = replace(settings, loops=replace(settings.loops, enabled=True))
     if bag is not None and bag.resolve() in (Path(path).resolve(), *Path(path).resolve().parents):
         raise OutputError(f"--bag {bag}: the input must not be replaced; choose another name")
     dataset = _open(path, topic, imu_topic, loader_options)

@@ -646,12 +646,21 @@ class PoseGraphConfig(_Section):
         source="far above sqrt(6), the norm of a right one",
         low=0.1,
     )
+    follow_distance: float = _param(
+        0.05,
+        "map points follow their keyframe once a loop has moved it by more than this, seen from "
+        "the newest one",
+        unit="m",
+        low=0.0,
+    )
+    follow_angle_deg: float = _param(0.1, "or turned it by more than this", unit="degrees", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class LoopConfig(_Section):
     """Where loops are looked for, and when one is believed."""
 
+    enabled: bool = _param(False, "look for loops during a run, and let the map follow")
     min_way: float = _param(
         30.0, "keyframes that are not as far as this back on the way are no loop", unit="m", low=0.0
     )

@@ -78,6 +78,8 @@ class Run(Protocol):
     @property
     def imu(self) -> Any: ...
     @property
+    def loops(self) -> Any: ...
+    @property
     def trajectory(self) -> Trajectory: ...
     @property
     def status_counts(self) -> dict[str, int]: ...
@@ -397,6 +399,7 @@ def summarise(result: Run) -> dict[str, Any]:
         "map_stats": {name: dict(stats) for name, stats in result.map_stats.items()},
         "localizability": _axes_part(result),
         "imu": None if result.imu is None else _imu_part(result.imu),
+        "loops": None if result.loops is None else result.loops.counts(),
     }
 
 

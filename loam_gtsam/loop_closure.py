@@ -31,6 +31,8 @@ from loam_gtsam.types import FloatArray, IntArray
 
 _ALIKE = 10
 """Keyframes with the most similar heading-free descriptors that are compared in full."""
+_NEAR = (0.1, 0.5)
+"""Metres and degrees: a step of a trial that is smaller ends it."""
 _STARTS = 3
 """Poses from the search around a candidate from which a few matches are tried."""
 
@@ -114,6 +116,14 @@ class ScanLoopCloser:
         self.config = self._whole.loops
         self.statistics = LoopStatistics()
         self._solver = GtsamSolver(self._whole.solver)
+        # Of a trial it is enough to be near; what follows it goes the rest of the way.
+        self._rough_solver = GtsamSolver(
+            replace(
+                self._whole.solver,
+                translation_tolerance=_NEAR[0],
+                rotation_tolerance_deg=_NEAR[1],
+            )
+        )
         self._descriptors: list[FloatArray] = []
         self._spreads: list[float] = []
 
@@ -164,11 +174,11 @@ class ScanLoopCloser:
         heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
         start = gtsam.Pose3(heading, np.zeros(3))
         matching = trial(whole.matching)
-        best = self._solver.solve(matches_at, start)
+        best = self._rough_solver.solve(matches_at, start)
         if self._judged(fit(best)) is not None:
             held = np.concatenate([cubes.points() for cubes in maps])
             around = places(some(*features), held, [start], config.search, _STARTS)
-            trials = [best, *(self._solver.solve(matches_at, pose) for pose in around)]
+            trials = [best, *(self._rough_solver.solve(matches_at, pose) for pose in around)]
             best = max(trials, key=lambda tried: fit(tried).total)
         matching = whole.matching
         solution = self._solver.solve(matches_at, best.map_T_lidar)
@@ -243,12 +253,17 @@ class ScanLoopCloser:
         beside = self.config.neighbours
         around = history.keyframes[max(candidate - beside, 0) : candidate + beside + 1]
         # The candidate's own features come first: a voxel keeps the first point it gets.
-        for other in sorted(around, key=lambda other: abs(other.index - candidate)):
-            if keyframe.way - other.way < self.config.min_way and other.index != candidate:
-                continue
-            pose = history.pose(candidate).between(history.pose(other.index)).matrix()
-            for cubes, points in zip(maps, (other.edges, other.planes), strict=True):
-                cubes.insert(transform(pose, points))
+        chosen = [
+            other
+            for other in sorted(around, key=lambda other: abs(other.index - candidate))
+            if keyframe.way - other.way >= self.config.min_way or other.index == candidate
+        ]
+        here = history.pose(candidate)
+        poses = [here.between(history.pose(other.index)).matrix() for other in chosen]
+        kinds = [other.edges for other in chosen], [other.planes for other in chosen]
+        for cubes, parts in zip(maps, kinds, strict=True):
+            moved = [transform(pose, part) for pose, part in zip(poses, parts, strict=True)]
+            cubes.insert(np.concatenate(moved))
         return maps
 
     def _judged(self, fit: Fit) -> Rejection | None:

@@ -7,7 +7,7 @@ is handed out at the reference time of the features.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -92,6 +92,7 @@ class Mapper:
     imu_aid : what the mapper makes of the IMU; None without one
     watch : tells whether sweeps fit the map
     edge_map, plane_map : the map
+    keyframe : to which the points of the frames to come belong, see :meth:`move_map`
 
     Raises
     ------
@@ -117,6 +118,7 @@ class Mapper:
             )
         self.imu_aid = None if imu is None else ImuAid(self.config.imu, imu)
         self.extra_factors = extra_factors
+        self.keyframe = 0
         self.reset()
 
     def reset(self) -> None:
@@ -210,6 +212,21 @@ class Mapper:
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
         return self.edge_map.points(archived=True), self.plane_map.points(archived=True)
+
+    def move_map(self, moves: Mapping[int, FloatArray]) -> int:
+        """Move map points with the keyframes they belong to, after a loop closure.
+
+        The mapper's own pose stays; keep the newest keyframes where they are.
+
+        Parameters
+        ----------
+        moves : (4, 4) rigid transforms in the frame of the map, by keyframe
+
+        Returns
+        -------
+        Points moved.
+        """
+        return sum(cubes.move(moves) for cubes in (self.edge_map, self.plane_map))
 
     # -- the steps of a frame ----------------------------------------------------------------
 
@@ -477,6 +494,7 @@ class Mapper:
         self.plane_map = CubeMap(self.config.map, self.config.map.plane_voxel)
 
     def _add_to_map(self, sweep: MovingSweep, middle: gtsam.Pose3) -> None:
+        self.edge_map.owner = self.plane_map.owner = self.keyframe
         self.edge_map.insert(transform(middle.matrix(), sweep.edges))
         self.plane_map.insert(transform(middle.matrix(), sweep.planes))
         self._last_middle = sweep.stamp, middle

@@ -17,10 +17,13 @@ from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_aid import ImuAid
 from loam_gtsam.imu_prior import Level
+from loam_gtsam.loop_closure import LoopCloser
+from loam_gtsam.loop_mapping import LoopMapping
 from loam_gtsam.mapper import ExtraFactors, Mapper
 from loam_gtsam.odometry import Odometry, make_odometry
 from loam_gtsam.types import (
     BadSweep,
+    Features,
     FeatureSweep,
     FloatArray,
     FrameStatus,
@@ -70,6 +73,8 @@ class RunResult:
     interrupted : the run was stopped (Ctrl-C) before the data set ended
     error : what ended the run early, if it was to be kept (``keep_partial``)
     imu : what was made of the IMU; None without one
+    loops : keyframes and loops; None if none were looked for. ``updates`` are then in the frame
+        ``odom``; ``trajectory`` and the map are corrected
     """
 
     config: Config
@@ -80,10 +85,16 @@ class RunResult:
     interrupted: bool
     error: Exception | None = None
     imu: ImuSummary | None = None
+    loops: LoopMapping | None = None
 
     @property
     def trajectory(self) -> Trajectory:
-        """One pose per sweep with a valid stamp."""
+        """One pose per sweep with a valid stamp, corrected by the loops if there are any."""
+        return self.odometry if self.loops is None else self.loops.graph.trajectory(self.updates)
+
+    @property
+    def odometry(self) -> Trajectory:
+        """One pose per sweep with a valid stamp, as it was found then."""
         good = [u for u in self.updates if u.status is not FrameStatus.BAD_STAMP]
         poses = np.array([u.map_T_lidar.matrix() for u in good]).reshape(-1, 4, 4)
         return Trajectory(np.array([u.stamp for u in good], np.int64), poses)
@@ -101,6 +112,11 @@ class Pipeline:
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
     extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
+    loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
+
+    Attributes
+    ----------
+    loops : keyframes and loops; None if none are looked for
     """
 
     def __init__(
@@ -109,12 +125,16 @@ class Pipeline:
         *,
         imu: ImuBuffer | None = None,
         extra_factors: ExtraFactors | None = None,
+        loop_closer: LoopCloser | None = None,
     ) -> None:
         self.config = config or Config()
         self.mapper = Mapper(self.config, imu=imu, extra_factors=extra_factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
         self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu_aid)
         self._last_odom: gtsam.Pose3 | None = None
+        self.loops: LoopMapping | None = None
+        if self.config.loops.enabled or loop_closer is not None:
+            self.loops = LoopMapping(self.mapper, self.config, loop_closer, imu=imu)
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Register one sweep; what it contains never raises, see the status of the result.
@@ -137,7 +157,7 @@ class Pipeline:
         guessed = time.perf_counter() - started
         # The first sweep is where the mapper puts it.
         pose = None if last is None else guess.map_T_lidar
-        update = self.mapper.register(features, pose, guess.twist)
+        update = self._with_loops(self.mapper.register(features, pose, guess.twist), features)
         timings = {"features": extraction.seconds, "odometry": guessed}
         return replace(update, timings=timings | dict(update.timings))
 
@@ -146,9 +166,24 @@ class Pipeline:
         last, last_odom = self.mapper.last, self._last_odom
         self._last_odom = sweep.odom_T_lidar
         if last is None or last_odom is None:
-            return self.mapper.register(sweep.features)
-        pose = last.map_T_lidar.compose(last_odom.between(sweep.odom_T_lidar))
-        return self.mapper.register(sweep.features, pose)
+            update = self.mapper.register(sweep.features)
+        else:
+            pose = last.map_T_lidar.compose(last_odom.between(sweep.odom_T_lidar))
+            update = self.mapper.register(sweep.features, pose)
+        return self._with_loops(update, sweep.features)
+
+    def _with_loops(self, update: MapUpdate, features: Features) -> MapUpdate:
+        """Show the frame to the pose graph, if there is one."""
+        if self.loops is None or not update.status.solved:
+            return update
+        started = time.perf_counter()
+        self.loops.add(update, features)
+        seconds = time.perf_counter() - started
+        return replace(update, timings=dict(update.timings) | {"loops": seconds})
+
+    def map_points(self) -> tuple[FloatArray, FloatArray]:
+        """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
+        return (self.mapper if self.loops is None else self.loops).map_points()
 
 
 def effective_config(config: Config, dataset: Dataset) -> Config:
@@ -179,6 +214,7 @@ def run(
     on_frame: OnFrame | None = None,
     keep_partial: bool = False,
     extra_factors: ExtraFactors | None = None,
+    loop_closer: LoopCloser | None = None,
     observe: Observer | None = None,
     workers: int = 0,
 ) -> RunResult:
@@ -192,6 +228,7 @@ def run(
     keep_partial : if an error ends the run after some sweeps, return what was computed until
         then, with ``error`` set, instead of raising
     extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
+    loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
     observe : e.g. :func:`loam_gtsam.recording.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
@@ -209,7 +246,7 @@ def run(
     """
     config = effective_config(config or Config(), dataset)
     imu = imu_buffer(dataset, config)
-    pipeline = Pipeline(config, imu=imu, extra_factors=extra_factors)
+    pipeline = Pipeline(config, imu=imu, extra_factors=extra_factors, loop_closer=loop_closer)
     updates: list[MapUpdate] = []
     interrupted = False
     error: Exception | None = None
@@ -230,7 +267,7 @@ def run(
             raise
         error = caught
     mapper = pipeline.mapper
-    edges, planes = mapper.map_points()
+    edges, planes = pipeline.map_points()
     return RunResult(
         config=config,
         updates=tuple(updates),
@@ -243,6 +280,7 @@ def run(
         interrupted=interrupted,
         error=error,
         imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+        loops=pipeline.loops,
     )
 
 

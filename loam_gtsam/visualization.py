@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.export import replacing, stage_seconds
-from loam_gtsam.types import FloatArray, IntArray, MapUpdate, OutputError, Trajectory
+from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, OutputError, Trajectory
 
 _INK, _FAINT, _PATH, _TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
 _STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d")
@@ -36,7 +36,10 @@ def available() -> bool:
 
 
 def plot_trajectory(
-    path: str | Path, trajectory: Trajectory, truth: Trajectory | None = None
+    path: str | Path,
+    trajectory: Trajectory,
+    truth: Trajectory | None = None,
+    loops: tuple[FloatArray, BoolArray] | None = None,
 ) -> None:
     """Draw the path from above, and its height.
 
@@ -45,6 +48,7 @@ def plot_trajectory(
     path : of the PNG file
     trajectory : ``map_T_lidar``
     truth : reference poses in the map frame (align them first), or None
+    loops : (L, 2, 3) ends of loops in the map and (L,) which are used; the others are dotted
 
     Raises
     ------
@@ -61,6 +65,13 @@ def plot_trajectory(
     top.plot(xyz[:, 0], xyz[:, 1], color=_PATH, lw=1.4, label="estimate")
     top.plot(xyz[:1, 0], xyz[:1, 1], "o", color=_INK, ms=6, label="start")
     side.plot(_travelled(xyz), xyz[:, 2], color=_PATH, lw=1.4)
+    if loops is not None:
+        for name, on, style in (("loops", loops[1], "-o"), ("loops, not used", ~loops[1], ":o")):
+            ends = loops[0][on]
+            if not len(ends):
+                continue
+            label = [f"{len(ends)} {name}", *[""] * (len(ends) - 1)]
+            top.plot(ends[:, :, 0].T, ends[:, :, 1].T, style, color=_INK, lw=0.8, ms=2, label=label)
     top.set_aspect("equal", adjustable="datalim")
     top.set(xlabel="x [m]", ylabel="y [m]", title=f"{trajectory.length:.1f} m travelled")
     top.legend(frameon=False)

@@ -37,6 +37,7 @@ LAYERS = (
         "loop_closure",
     ),
     ("mapper", "ahead"),
+    ("loop_mapping",),
     ("pipeline", "estimators", "graph_files"),
     ("comparison", "recording"),
     (

@@ -532,7 +532,7 @@ class ImuConfig(_Section):
         source="LOAM blends",
     )
     weight: float = _param(
-        0.03,
+        0.01,
         "share of the IMU's roll and pitch (blend, equivalent)",
         source="LOAM uses 0.002; on slopes that is too little to be seen",
         low=0.0,
@@ -550,6 +550,14 @@ class ImuConfig(_Section):
     )
     still_seconds: float = _param(
         0.5, "window before the first sweep in which the platform may be at rest", unit="s", low=0.0
+    )
+    average_seconds: float = _param(
+        0.1,
+        "roll and pitch of a frame are the mean over this, brought to its moment by the gyro; 0: "
+        "those of the moment",
+        unit="s",
+        source="one sweep, so that no sample counts twice; LOAM: 0",
+        low=0.0,
     )
     max_gap: float = _param(0.1, "a longer gap between samples is not bridged", unit="s", low=1e-3)
     lidar_R_imu_deg: tuple[float, float, float] = _param(
@@ -780,7 +788,7 @@ PRESETS: dict[str, Config] = {
         map=MapConfig(insertion="centroid"),
         matching=_CLASSICAL_MATCHING,
         solver=SolverConfig(method="loam", step_sigmas=0.0, min_map_edges=11, min_map_planes=101),
-        imu=ImuConfig(prior="blend", weight=0.002),
+        imu=ImuConfig(prior="blend", weight=0.002, average_seconds=0.0),
         relocalization=RelocalizationConfig(enabled=False),
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings.

@@ -17,6 +17,7 @@ from loam_gtsam.imu_prior import (
     equivalent_prior,
     find_level,
     gravity_factor,
+    mean_orientation,
     roll_pitch_factor,
     tilt_information,
     too_steep,
@@ -202,7 +203,12 @@ class ImuAid:
 
     def _attitude(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar``, None if there is none or if up is not known in the map."""
-        return None if self.level is None else self.buffer.orientation(stamp)
+        if self.level is None:
+            return None
+        if self.gyro is None or not self.config.average_seconds:
+            return self.buffer.orientation(stamp)
+        found = mean_orientation(self.buffer, stamp, 0.5 * self.config.average_seconds)
+        return None if found is None else found[0]
 
     def _gravity(self, measured: gtsam.Rot3) -> gtsam.NonlinearFactor:
         assert self.level is not None

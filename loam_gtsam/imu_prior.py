@@ -59,8 +59,6 @@ def find_level(
 ) -> Level | None:
     """Find up from the samples of ``still_seconds`` before a moment and as long after it.
 
-    Every sample is brought to that moment by the gyro, so the platform may be turning.
-
     Parameters
     ----------
     stamp : nanoseconds
@@ -73,20 +71,10 @@ def find_level(
     Level or None
         None if there is no orientation at that moment.
     """
-    here = buffer.orientation(stamp)
-    if here is None:
+    found = mean_orientation(buffer, stamp, config.still_seconds)
+    if found is None:
         return None
-    reach = round(config.still_seconds * 1e9)
-    samples = buffer.window(stamp - reach, stamp + reach)
-    assert samples.orientation is not None  # there is one at this moment
-    known = np.isfinite(samples.orientation[:, 0])
-    seconds: FloatArray = (samples.stamps[known] - stamp).astype(np.float64) * 1e-9
-    turns = buffer.turn(stamp, seconds)
-    count = 1
-    if turns is not None and len(turns):
-        brought = Rotation.from_quat(samples.orientation[known]) * Rotation.from_rotvec(turns).inv()
-        here = gtsam.Rot3(brought.mean().as_matrix())
-        count = len(turns)
+    here, count = found
     roll, pitch = roll_pitch(here)
     level_R_lidar = gtsam.Rot3.RzRyRx(roll, pitch, 0.0)
     return Level(
@@ -96,6 +84,36 @@ def find_level(
         count,
         "moving" if buffer.still(stamp) is None else "still",
     )
+
+
+def mean_orientation(buffer: ImuBuffer, stamp: int, reach: float) -> tuple[gtsam.Rot3, int] | None:
+    """``world_R_lidar`` of a moment from all samples around it, and how many they are.
+
+    Every sample is brought to that moment by the gyro, so the platform may be turning. If it has
+    turned too far, or the gyro has a gap, it is the orientation of the moment alone.
+
+    Parameters
+    ----------
+    stamp : nanoseconds
+    reach : seconds before and after it
+
+    Returns
+    -------
+    None if there is no orientation at that moment.
+    """
+    here = buffer.orientation(stamp)
+    if here is None:
+        return None
+    far = round(reach * 1e9)
+    samples = buffer.window(stamp - far, stamp + far)
+    assert samples.orientation is not None  # there is one at this moment
+    known = np.isfinite(samples.orientation[:, 0])
+    seconds: FloatArray = (samples.stamps[known] - stamp).astype(np.float64) * 1e-9
+    turns = buffer.turn(stamp, seconds)
+    if turns is None or not len(turns):
+        return here, 1
+    brought = Rotation.from_quat(samples.orientation[known]) * Rotation.from_rotvec(turns).inv()
+    return gtsam.Rot3(brought.mean().as_matrix()), len(turns)
 
 
 def roll_pitch(rotation: gtsam.Rot3) -> FloatArray:

@@ -654,6 +654,9 @@ class PoseGraphConfig(_Section):
         source="far above sqrt(6), the norm of a right one",
         low=0.1,
     )
+    believed_loops: int = _param(
+        6, "so many loops that agree pairwise are used although the odometry contradicts", low=2
+    )
     follow_distance: float = _param(
         0.05,
         "map points follow their keyframe once a loop has moved it by more than this, seen from "

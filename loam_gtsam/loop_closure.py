@@ -31,7 +31,7 @@ from loam_gtsam.types import FloatArray, IntArray
 
 _ALIKE = 10
 """Keyframes with the most similar heading-free descriptors that are compared in full."""
-_NEAR = (0.1, 0.5)
+_NEAR = (0.03, 0.2)
 """Metres and degrees: a step of a trial that is smaller ends it."""
 _STARTS = 3
 """Poses from the search around a candidate from which a few matches are tried."""
@@ -169,16 +169,18 @@ class ScanLoopCloser:
             offered = min(len(features[0]), most[0]) + min(len(features[1]), most[1])
             return standing_fit(found.matches, int(offered)) if found.solved else Fit(0.0, 0.0)
 
-        # The ground is where it was: height zero, and the tilt that the graph says.
-        rotation = history.pose(candidate).between(history.pose(keyframe.index)).rotation()
-        heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
-        start = gtsam.Pose3(heading, np.zeros(3))
         matching = trial(whole.matching)
-        best = self._rough_solver.solve(matches_at, start)
+        known = history.pose(candidate).between(history.pose(keyframe.index))
+        best = self._rough_solver.solve(matches_at, known)
         if self._judged(fit(best)) is not None:
+            # The ground is where it was: height zero, and the tilt that the graph says.
+            rotation = known.rotation()
+            heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
+            start = gtsam.Pose3(heading, np.zeros(3))
             held = np.concatenate([cubes.points() for cubes in maps])
             around = places(some(*features), held, [start], config.search, _STARTS)
-            trials = [best, *(self._rough_solver.solve(matches_at, pose) for pose in around)]
+            starts = start, *around
+            trials = [best, *(self._rough_solver.solve(matches_at, pose) for pose in starts)]
             best = max(trials, key=lambda tried: fit(tried).total)
         matching = whole.matching
         solution = self._solver.solve(matches_at, best.map_T_lidar)

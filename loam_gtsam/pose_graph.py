@@ -204,12 +204,13 @@ class PoseGraph:
         self.loops.append(loop)
         self._slots.append(None)
         on = {other for other, slot in enumerate(self._slots) if slot is not None}
-        if on <= self._consistency.agreeing[number]:
-            if self.chi_squared(number) <= self.config.max_chi2:
-                self._switch(number, True)
+        agrees = on <= self._consistency.agreeing[number]
+        if agrees and self.chi_squared(number) <= self.config.max_chi2:
+            self._switch(number, True)
         else:
             most = self._consistency.clique(number)
-            if len(most) > len(on):  # the others were the wrong ones
+            # The others were the wrong ones, or the odometry is worse than it knows.
+            if len(most) > max(len(on), self.config.believed_loops - 1 if agrees else 0):
                 for other in sorted(on - most):
                     self._switch(other, False)
                 for other in sorted(most - on):

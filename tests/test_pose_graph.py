@@ -480,3 +480,23 @@ def test_the_largest_group_that_agrees_is_found():
     assert consistency.clique(2) == {0, 1, 2}
     assert consistency.clique(4) == {0, 4}
     assert consistency.clique(3) == {3}
+
+
+@pytest.mark.parametrize(("count", "believed"), [(4, False), (10, True)])
+def test_loops_that_agree_are_believed_against_an_odometry_worse_than_it_knows(count, believed):
+    rng = np.random.default_rng(0)
+    truth = square(20, 2)
+    bend = gtsam.Pose3(gtsam.Rot3.Yaw(0.003), np.array([0.01, 0.03, 0.0]))  # 3 % of the way
+    odometry = [truth[0]]
+    for one, two in pairwise(truth):
+        odometry.append(odometry[-1].compose(one.between(two)).compose(bend))
+    graph = filled(odometry, walk=0.02, turn_walk_deg=0.02, believed_loops=6)
+    for loop in right_loops(truth, rng, count):
+        graph.add_loop(loop)
+    assert sum(graph.active) == (count if believed else 0)
+    wrong = wrong_loops(30, len(truth), rng)
+    for loop in wrong:
+        graph.add_loop(loop)
+    assert sum(graph.active[count:]) == 0
+    if believed:
+        assert off(graph, truth) < 0.5 * off(filled(odometry), truth)

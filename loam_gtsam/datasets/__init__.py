@@ -20,6 +20,7 @@ from loam_gtsam.types import DatasetError
 if TYPE_CHECKING:
     from loam_gtsam.datasets.arrays import ArrayDataset as ArrayDataset
     from loam_gtsam.datasets.bag import BagDataset as BagDataset
+    from loam_gtsam.datasets.city import build_city as build_city
     from loam_gtsam.datasets.kitti import KittiDataset as KittiDataset
     from loam_gtsam.datasets.loam_topics import LoamTopicsDataset as LoamTopicsDataset
     from loam_gtsam.datasets.pointcloud2 import decode_pointcloud2 as decode_pointcloud2
@@ -31,6 +32,7 @@ _LAZY = {
     "KittiDataset": "kitti",
     "LoamTopicsDataset": "loam_topics",
     "SimulatedWorld": "simulation",
+    "build_city": "city",
     "decode_pointcloud2": "pointcloud2",
 }
 __all__ = ["Dataset", "DatasetInfo", "Sweep", "open_dataset", *_LAZY]

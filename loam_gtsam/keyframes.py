@@ -28,6 +28,7 @@ class Keyframe:
     way : metres gone along the keyframes until here
     edges, planes : (E, 3) and (P, 3) metres, de-skewed to the stamp, lidar frame, voxel-filtered
     distinct : (E,) whether an edge stands out of its ring by more than noise makes it
+    session : of how many the run is that the frame is of; no odometry leads from one to another
     """
 
     index: int
@@ -36,6 +37,7 @@ class Keyframe:
     edges: FloatArray
     planes: FloatArray
     distinct: BoolArray
+    session: int = 0
 
     @property
     def stamp(self) -> int:

@@ -59,7 +59,13 @@ class LoopConsistency:
 def consistent(
     one: LoopClosure, two: LoopClosure, keyframes: Sequence[Keyframe], config: PoseGraphConfig
 ) -> bool:
-    """Whether two loops and the odometry between their ends make a cycle that closes."""
+    """Whether two loops and the odometry between their ends make a cycle that closes.
+
+    If there is no odometry between two ends, which are then of two sessions, nothing contradicts.
+    """
+    ends = (one.earlier, two.earlier), (one.later, two.later)
+    if any(keyframes[a].session != keyframes[b].session for a, b in ends):
+        return True
 
     def odometry(first: int, second: int) -> tuple[gtsam.Pose3, FloatArray]:
         return odometry_between(keyframes[first], keyframes[second], config)

@@ -17,6 +17,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.deskew import MovingSweep
+from loam_gtsam.geometry import transform
 from loam_gtsam.graph_optimize import (
     OptimizedGraph,
     SavedGraph,
@@ -47,6 +48,8 @@ _RELINEARIZE = 1e-3
 """rad or m by which a pose moves before iSAM2 linearises anew: what is missed is its square."""
 _ROUNDS = 20
 """Updates of iSAM2 at most until the poses stay; one is enough without loops."""
+_ANYWHERE = np.repeat([np.pi, 100.0], 3)
+"""rad and m: standard deviations of where another run began."""
 _STILL = 1e-5
 """rad and m; poses that move less in an update stay."""
 _SWITCHES = 50
@@ -73,6 +76,7 @@ class PoseGraph:
         self._imu = imu
         self.keyframes: list[Keyframe] = []
         self.loops: list[LoopClosure] = []
+        self._session = 0
         self._slots: list[int | None] = []  # of the loops in iSAM2; None: switched off
         self._consistency = LoopConsistency(self.config)
         self._fixed = gtsam.NonlinearFactorGraph()  # all factors but loops
@@ -104,8 +108,9 @@ class PoseGraph:
         if update.uncertainty is None or not update.status.solved:
             return None
         last = self.keyframes[-1] if self.keyframes else None
+        starts = last is None or last.session != self._session
         motion = gtsam.Pose3()
-        if last is not None:
+        if last is not None and not starts:
             if update.stamp <= last.stamp:
                 raise InputError(
                     f"PoseGraph.add: expected a stamp after {last.stamp}, that of the last "
@@ -119,9 +124,10 @@ class PoseGraph:
                 return None
         keyframe = self._keyframe(update, motion, features)
         factor: gtsam.NonlinearFactor
-        if last is None:
+        if last is None or starts:
             pose = update.map_T_lidar
-            factor = gtsam.PriorFactorPose3(0, pose, noise_model(update.covariance))
+            covariance = update.covariance if last is None else np.diag(_ANYWHERE**2)
+            factor = gtsam.PriorFactorPose3(keyframe.index, pose, noise_model(covariance))
         else:
             pose = self.pose(last.index).compose(motion)
             _, covariance = odometry_between(last, keyframe, self.config)
@@ -131,6 +137,14 @@ class PoseGraph:
         self.keyframes.append(keyframe)
         self._add_factor(factor, pose)
         return keyframe
+
+    def new_session(self) -> None:
+        """The frames to come are of another run: nothing but loops ties it to those before.
+
+        Its first keyframe is put where its own run has it, within a hundred metres and any heading.
+        """
+        if self.keyframes and self.keyframes[-1].session == self._session:
+            self._session += 1
 
     def add_position(self, index: int, position: FloatArray, covariance: FloatArray) -> None:
         """Take a measured position of a keyframe, as from GPS.
@@ -264,20 +278,33 @@ class PoseGraph:
         on = self._slots[number] is not None
         return chi_squared(loop.earlier_T_later, loop.covariance, between, covariance, included=on)
 
-    def trajectory(self, updates: Sequence[MapUpdate]) -> Trajectory:
+    def trajectory(self, updates: Sequence[MapUpdate], session: int = 0) -> Trajectory:
         """The frames of a run, corrected: between two keyframes, by both in proportion of time.
 
         Parameters
         ----------
         updates : frames of the run that the keyframes are of; those with a bad stamp are left out
+        session : which run that was, see :meth:`new_session`
         """
+        keyframes = [keyframe for keyframe in self.keyframes if keyframe.session == session]
         good = [update for update in updates if update.status is not FrameStatus.BAD_STAMP]
         stamps = np.array([update.stamp for update in good], np.int64)
-        starts = np.array([keyframe.stamp for keyframe in self.keyframes], np.int64)
+        starts = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
         nexts = np.searchsorted(starts, stamps, side="right").tolist()
-        poses = [self._corrected(*pair) for pair in zip(good, nexts, strict=True)]
+        poses = [
+            self._corrected(update, after, keyframes)
+            for update, after in zip(good, nexts, strict=True)
+        ]
         matrices = np.array([pose.matrix() for pose in poses], np.float64)
         return Trajectory(stamps, matrices.reshape(-1, 4, 4))
+
+    def map_points(self) -> tuple[FloatArray, FloatArray]:
+        """Edge and plane features of all keyframes in the map, (E, 3) and (P, 3) metres."""
+        edges, planes = [np.empty((0, 3))], [np.empty((0, 3))]
+        for keyframe, pose in zip(self.keyframes, self.poses(), strict=True):
+            edges.append(transform(pose, keyframe.edges))
+            planes.append(transform(pose, keyframe.planes))
+        return np.concatenate(edges), np.concatenate(planes)
 
     def saved(self) -> SavedGraph:
         """The graph as it is written to files: all loops, those switched off too, no kernels."""
@@ -316,11 +343,10 @@ class PoseGraph:
                 )
             sweep = MovingSweep(features, self._whole, self._imu)
             sweep.deskew(update.twist)
-            to_reference = sweep.middle_T_reference(update.twist).inverse()
-            edges = to_reference.transformFrom(sweep.edges.T).T
-            planes = to_reference.transformFrom(sweep.planes.T).T
+            to_reference = sweep.middle_T_reference(update.twist).inverse().matrix()
+            edges, planes = (transform(to_reference, part) for part in (sweep.edges, sweep.planes))
             distinct = sweep.distinct
-        return Keyframe(len(self), update, way, edges, planes, distinct)
+        return Keyframe(len(self), update, way, edges, planes, distinct, self._session)
 
     def _add_factor(self, factor: gtsam.NonlinearFactor, pose: gtsam.Pose3 | None = None) -> None:
         """A factor that is no loop, and the first estimate of the newest pose if that is new."""
@@ -375,9 +401,11 @@ class PoseGraph:
             else:
                 break
 
-    def _corrected(self, update: MapUpdate, after: int) -> gtsam.Pose3:
-        """A frame's pose in the map; ``after`` is the number of the first later keyframe."""
-        around = self.keyframes[max(after - 1, 0) : after + 1]
+    def _corrected(
+        self, update: MapUpdate, after: int, keyframes: Sequence[Keyframe]
+    ) -> gtsam.Pose3:
+        """A frame's pose in the map; ``after`` is the place of the first later keyframe."""
+        around = keyframes[max(after - 1, 0) : after + 1]
         poses = [
             self.pose(keyframe.index).compose(keyframe.odom_T_lidar.between(update.map_T_lidar))
             for keyframe in around
@@ -400,4 +428,6 @@ def _new_isam() -> gtsam.ISAM2:
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
     params.setRelinearizeThreshold(_RELINEARIZE)
+    # Cholesky calls the chain of a second session, which hangs on a wide prior, indeterminate.
+    params.setFactorization("QR")
     return gtsam.ISAM2(params)

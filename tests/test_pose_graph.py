@@ -500,3 +500,43 @@ def test_loops_that_agree_are_believed_against_an_odometry_worse_than_it_knows(c
     assert sum(graph.active[count:]) == 0
     if believed:
         assert off(graph, truth) < 0.5 * off(filled(odometry), truth)
+
+
+def test_a_second_session_is_tied_by_loops_alone():
+    """Two drives along the same way, the second one with another start of its own."""
+    rng = np.random.default_rng(3)
+    truth = square(10, 1)
+    offset = gtsam.Pose3(gtsam.Rot3.Yaw(2.0), np.array([30.0, -12.0, 1.0]))
+    first = drifted(truth, rng)
+    second = [offset.compose(pose) for pose in drifted(truth, rng)]
+    graph = PoseGraph(settings())
+    for update in frames(first):
+        graph.add(update)
+    graph.new_session()
+    graph.new_session()  # nothing came in between
+    for update in frames(second):  # their stamps begin again
+        graph.add(update)
+    count = len(truth)
+    assert [keyframe.session for keyframe in graph.keyframes] == [0] * count + [1] * count
+    assert graph.pose(count).range(second[0]) < 1e-6
+    for k in range(2, count, 5):
+        there = truth[k].retract(SIGMAS * rng.normal(size=6))
+        assert graph.add_loop(
+            LoopClosure(k, k + count, truth[k].between(there), np.diag(SIGMAS**2))
+        )
+    wrong = gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([5.0, 5.0, 0.0]))
+    assert not graph.add_loop(LoopClosure(4, count + 20, wrong, np.diag(SIGMAS**2)))
+    assert off(graph, truth + truth) < 0.2
+    frames_of_second = graph.trajectory(frames(second), session=1)
+    np.testing.assert_allclose(frames_of_second.map_T_lidar, graph.poses()[count:], atol=1e-9)
+
+
+def test_the_map_of_a_graph_is_that_of_its_keyframes():
+    graph = PoseGraph(settings())
+    assert graph.map_points()[0].shape == (0, 3)
+    points = np.array([[5.0, 0.0, 0.0], [0.0, 4.0, 1.0]])
+    for update in frames([gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.ones(3))]):
+        graph.add(update, Features.from_points(update.stamp, points[:1], points))
+    edges, planes = graph.map_points()
+    np.testing.assert_allclose(edges, [[5, 0, 0], [1, 6, 1]], atol=1e-6)
+    assert planes.shape == (4, 3)

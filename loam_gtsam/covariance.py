@@ -95,6 +95,7 @@ class PoseErrors:
     def __init__(self, config: Config) -> None:
         self.config = config.covariance
         graph = config.solver.method == "gtsam"
+        self._kernel = config.solver.kernel
         self._kernel_width = config.solver.kernel_width if graph else np.inf
         # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
         self._with_priors = graph
@@ -115,7 +116,12 @@ class PoseErrors:
         """
         first = self._seen.is_empty
         scan = scan_error(
-            solution, self._kernel_width, self._seen, self.config, with_priors=self._with_priors
+            solution,
+            self._kernel_width,
+            self._seen,
+            self.config,
+            kernel=self._kernel,
+            with_priors=self._with_priors,
         )
         if scan is None:
             self._last = None

@@ -285,9 +285,9 @@ class ScanLoopCloser:
         seen = localizability(solution.matches, solution.map_T_lidar)
         if seen.aligned[0] < self.config.min_aligned:
             return None
-        config = self._whole.covariance
+        config, solver = self._whole.covariance, self._whole.solver
         ground = SeenGround(config.ground_cell)
-        error = scan_error(solution, self._whole.solver.kernel_width, ground, config)
+        error = scan_error(solution, solver.kernel_width, ground, config, kernel=solver.kernel)
         if error is None:
             return None
         covariance = error.covariance

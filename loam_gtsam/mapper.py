@@ -6,7 +6,6 @@ is handed out at the reference time of the features.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -18,6 +17,7 @@ from loam_gtsam.config import Config, MatchingConfig, SolverConfig
 from loam_gtsam.covariance import PoseErrors
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.deskew import MovingSweep
+from loam_gtsam.frame_report import Clock, named, report, way
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.imu_aid import ImuAid
@@ -154,7 +154,7 @@ class Mapper:
         MapUpdate
             Never raises for what a sweep contains: see its ``status``.
         """
-        clock = _Clock()
+        clock = Clock()
         last = self.last
         if last is not None and features.stamp <= last.stamp:
             return self.skip(features.stamp, "")
@@ -235,7 +235,7 @@ class Mapper:
         sweep: MovingSweep,
         guess: Guess,
         priors: Sequence[gtsam.NonlinearFactor],
-        clock: _Clock,
+        clock: Clock,
     ) -> MapUpdate:
         """Match the sweep with the map around the guess, solve, insert."""
         guess, motion = self._expected(sweep, guess)
@@ -265,14 +265,14 @@ class Mapper:
             if isinstance(found, str):
                 self._last_middle = sweep.stamp, middle
                 nothing = Solution.unsolved(middle, solution.matches, solution.iterations, 0)
-                return _report(sweep, guess, FrameStatus.LOST, found, clock, nothing)
+                return report(sweep, guess, FrameStatus.LOST, found, clock, nothing)
             solution, twist, relocalized = found
         if not solution.solved:
             # Once may be chance; a sweep that has plenty to match is searched for the next time.
             self.watch.lost += matches_at.offered >= 2 * config.min_matches
             message = f"{len(solution.matches)} matches; {config.min_matches} are needed"
             self._last_middle = sweep.stamp, middle
-            return _report(sweep, guess, FrameStatus.FEW_MATCHES, message, clock, solution)
+            return report(sweep, guess, FrameStatus.FEW_MATCHES, message, clock, solution)
         if not relocalized:
             twist = self._twist(sweep, solution.map_T_lidar, guess.twist)
         if self._first is not None:
@@ -287,7 +287,7 @@ class Mapper:
             message = f"the pose still moved after {solution.iterations} associations"
         if solution.weak is not None:
             status = FrameStatus.DEGENERATE
-            message = f"the scan does not tell {_named(solution)}; the expected motion was kept"
+            message = f"the scan does not tell {named(solution)}; the expected motion was kept"
         if relocalized and message is not relocalized:
             message = f"{relocalized}; {message}"
         update = self._insert(sweep, result, status, message, clock, solution, tilt)
@@ -320,7 +320,7 @@ class Mapper:
         matches_at: _Association,
         priors: Sequence[gtsam.NonlinearFactor],
         motion: MotionPrior,
-        clock: _Clock,
+        clock: Clock,
     ) -> tuple[Solution, FloatArray, str] | str:
         """The solution that fits best, its twist and what happened; or why the sweep is lost.
 
@@ -352,7 +352,7 @@ class Mapper:
                 best = fit, found, twist
         clock.lap("relocalize")
         if best is not None and best[2] is not moving:
-            moved = f"moved by {_way(middle, best[1].map_T_lidar)}"
+            moved = f"moved by {way(middle, best[1].map_T_lidar)}"
             after = f" after {watch.lost} lost sweeps" if watch.lost else ""
             return best[1], best[2], f"relocalised{after}, {moved}" if lost else moved
         if not lost:
@@ -371,7 +371,7 @@ class Mapper:
         solution: Solution,
         matches_at: _Association,
         priors: Sequence[gtsam.NonlinearFactor],
-        clock: _Clock,
+        clock: Clock,
     ) -> gtsam.Pose3 | None:
         """Where around the prediction a few matches fit best; None if nowhere."""
         around = self.watch.around(predicted)
@@ -478,7 +478,7 @@ class Mapper:
         result: Guess,
         status: FrameStatus,
         message: str,
-        clock: _Clock,
+        clock: Clock,
         solution: Solution | None = None,
         tilt: TiltPrior = TiltPrior.NONE,
     ) -> MapUpdate:
@@ -487,7 +487,7 @@ class Mapper:
         sweep.deskew(result.twist)
         self._add_to_map(sweep, _to_middle(sweep, result))
         clock.lap("insert")
-        return _report(sweep, result, status, message, clock, solution, tilt)
+        return report(sweep, result, status, message, clock, solution, tilt)
 
     def _new_map(self) -> None:
         self.edge_map = CubeMap(self.config.map, self.config.map.edge_voxel)
@@ -503,7 +503,7 @@ class Mapper:
 class _Association:
     """The matches of a sweep at a pose, as a solver asks for them."""
 
-    def __init__(self, mapper: Mapper, sweep: MovingSweep, guess: Guess, clock: _Clock) -> None:
+    def __init__(self, mapper: Mapper, sweep: MovingSweep, guess: Guess, clock: Clock) -> None:
         self._mapper, self._sweep, self._guess, self._clock = mapper, sweep, guess, clock
         self._calls = 0
         self.wide = False
@@ -594,87 +594,7 @@ def _checked(factors: object) -> Sequence[gtsam.NonlinearFactor]:
     return factors
 
 
-def _named(solution: Solution) -> str:
-    """The weak directions in words: metres and rad in lidar axes."""
-    assert solution.localizability is not None
-    names = []
-    for direction in solution.localizability.directions[: solution.n_weak]:
-        unit = direction / direction[np.abs(direction).argmax()]  # its sign means nothing
-        parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
-        names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
-    return " or ".join(names)
-
-
-def _way(first: gtsam.Pose3, second: gtsam.Pose3) -> str:
-    """How far it is from one pose to another, in words."""
-    turn = gtsam.Rot3.Logmap(first.rotation().between(second.rotation()))
-    return f"{first.range(second):.2f} m and {np.degrees(np.linalg.norm(turn)):.1f} degrees"
-
-
-class _Clock:
-    """Adds up seconds per stage."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-        self._since = time.perf_counter()
-
-    def lap(self, stage: str) -> None:
-        """Book the time since the last lap on a stage."""
-        now = time.perf_counter()
-        self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
-        self._since = now
-
-
 def _to_middle(sweep: MovingSweep, result: Guess) -> gtsam.Pose3:
     """The pose at the middle of a sweep, from that at its reference time."""
     back = sweep.middle_T_reference(result.twist).inverse()
     return result.map_T_lidar.compose(back)
-
-
-def _report(
-    sweep: MovingSweep,
-    result: Guess,
-    status: FrameStatus,
-    message: str,
-    clock: _Clock,
-    solution: Solution | None,
-    tilt: TiltPrior = TiltPrior.NONE,
-) -> MapUpdate:
-    update = MapUpdate(
-        stamp=sweep.reference_stamp,
-        map_T_lidar=result.map_T_lidar,
-        status=status,
-        message=message,
-        n_edges=len(sweep.edges),
-        n_planes=len(sweep.planes),
-        twist=result.twist,
-        sweep_motion=sweep.motion,
-        tilt_prior=tilt,
-        timings=clock.seconds,
-    )
-    if solution is None:
-        return update
-    # The solve is about the middle of the sweep; a right perturbation there is, at the reference
-    # time, the same one seen through the motion between the two.
-    to_middle = sweep.middle_T_reference(result.twist).AdjointMap()
-    update = replace(
-        update,
-        n_edge_matches=len(solution.matches.edges),
-        n_plane_matches=len(solution.matches.planes),
-        iterations=solution.iterations,
-        solver_iterations=solution.solver_iterations,
-        error_before=solution.error_before,
-        error_after=solution.error_after,
-        information=to_middle.T @ solution.information @ to_middle,
-    )
-    seen = solution.localizability
-    if seen is None:
-        return update
-    seen = seen.seen_from(sweep.middle_T_reference(result.twist).inverse())
-    return replace(
-        update,
-        localizability=seen.aligned,
-        directions=seen.directions,
-        direction_information=seen.information,
-        axis_localizability=seen.axes(),
-    )

@@ -95,6 +95,7 @@ def scan_error(
     seen: SeenGround,
     config: CovarianceConfig,
     *,
+    kernel: str = "huber",
     with_priors: bool = True,
 ) -> ScanError | None:
     """The error of one solve from its residuals; None if its information is singular.
@@ -107,12 +108,12 @@ def scan_error(
     Parameters
     ----------
     solution : solved
-    kernel_width : of the solver, for the weights of the matches
+    kernel_width, kernel : of the solver, for the weights of the matches
     seen : ground matched so far; this frame's is added
     with_priors : whether the solution's information counts priors beside the matches
     """
     pose = solution.map_T_lidar
-    rows = match_rows(solution.matches, kernel_width)
+    rows = match_rows(solution.matches, kernel_width, kernel)
     residuals, jacobian = rows.residuals(pose)
     if solution.unseen is not None:
         assert solution.beacons is not None

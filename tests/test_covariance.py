@@ -302,7 +302,7 @@ def calibrated(errors, number):
 
 
 def test_ground_that_replaces_none_counts_half(monkeypatch):
-    def error(solution, width, seen, config, *, with_priors):
+    def error(solution, width, seen, config, **_):
         seen.cells(np.zeros((1, 3)))
         return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), np.zeros((6, 6)), 1.0, 10.0)
 

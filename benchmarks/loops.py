@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in city(options.city):
             print(line, flush=True)
         return 0
-    metres, columns = (700.0, 400) if options.quick else (1000.0, 900)
+    metres, columns = (700.0, 400) if options.quick else (1000.0, 600)
     seeds = range(1 if options.quick else options.seeds)
     with ProcessPoolExecutor(None, get_context("spawn")) as pool:
         job = partial(drive, metres=metres, columns=columns)

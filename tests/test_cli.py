@@ -20,6 +20,7 @@ from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.export import RUN_FILES, read_tum
+from loam_gtsam.graph_files import read_graph
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
 
 FRAMES = 4
@@ -475,6 +476,25 @@ def test_run_without_an_imu_says_nothing_of_it():
     assert result.exit_code == 0
     assert "IMU" not in result.output
     assert json.loads(Path("out/summary.json").read_text())["imu"] is None
+
+
+def test_run_closes_loops_and_writes_the_graph():
+    small = ["--set", "pose_graph.keyframe_distance=0.5", "--set", "loops.min_way=8"]
+    world = "sim:room?columns=400&speed=2"
+    result = loam("run", world, "--frames", 100, "--loops", *small, "--set", "loops.neighbours=3")
+    assert result.exit_code == 0, result.output
+    found = int(re.search(r"(\d+) of (\d+) found are used", one_line(result))[1])
+    assert found >= 2
+    folder = Path("loam_gtsam_output/room_vlp16")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["loops"]["on"] == found
+    graph = read_graph(folder / "pose_graph.g2o")
+    assert len(graph.loops) == summary["loops"]["loops"]
+    odometry, corrected = (read_tum(folder / f"{n}.tum") for n in ("odometry", "trajectory"))
+    assert len(odometry) == len(corrected) == 100
+    assert (odometry.map_T_lidar != corrected.map_T_lidar).any()
+    again = loam("optimize", folder / "pose_graph.g2o")
+    assert again.exit_code == 0, again.output
 
 
 def test_run_says_that_the_imu_is_mounted_otherwise():

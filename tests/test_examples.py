@@ -113,6 +113,14 @@ def saved_graph(names: Names, output: str) -> None:
     assert "city.g2o city_optimized.graph" in output
 
 
+def two_sessions(names: Names, output: str) -> None:
+    assert len(names["between"]) >= 5
+    assert all(names["graph"].active)
+    assert np.linalg.norm(names["true"].translation()) > 3.0
+    assert names["true"].range(names["found"]) < 0.02
+    assert Path("both.ply").stat().st_size > 100_000
+
+
 CHECKS: dict[str, Callable[[Names, str], None]] = {
     "01_map_a_built_in_scene.py": built_in_scene,
     "02_numpy_arrays.py": numpy_arrays,
@@ -125,6 +133,7 @@ CHECKS: dict[str, Callable[[Names, str], None]] = {
     "09_imu_in_a_corridor.py": imu_in_a_corridor,
     "10_own_loop_closer.py": own_loop_closer,
     "11_optimise_a_saved_graph.py": saved_graph,
+    "12_merge_two_sessions.py": two_sessions,
 }
 
 

@@ -247,6 +247,25 @@ def test_blend_is_done_after_the_solve():
 # -- steep -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize(("seconds", "least", "most"), [(0.0, 6.0, 15.0), (0.1, 1.0, 4.0)])
+def test_the_tilt_of_a_frame_is_the_mean_over_its_sweep(seconds, least, most):
+    """Samples of 10 mrad of noise, on a platform that turns: the gyro brings them together."""
+    rng = np.random.default_rng(4)
+    samples = seen_by_imu(rot(3.0, -2.0, 40.0), rate=(0.3, -0.2, 0.8))
+    noise = Rotation.from_rotvec(0.01 * rng.normal(size=(len(samples.stamps), 3)))
+    noisy = (Rotation.from_quat(samples.orientation) * noise).as_quat()
+    noisy = dataclasses.replace(samples, orientation=noisy)
+    errors = []
+    for step in range(-8, 9):
+        stamp = NOW + step * 20_000_000
+        aid = aid_for(noisy, prior="blend", weight=0.999, average_seconds=seconds)
+        exact = aid_for(samples, prior="blend", weight=0.999, average_seconds=0.0)
+        found, true = (one.blended(stamp, gtsam.Pose3())[0].rotation() for one in (aid, exact))
+        errors.append(1e3 * (roll_pitch(found) - roll_pitch(true)))
+    spread = float(np.sqrt(np.mean(np.square(errors))))  # mrad
+    assert least < spread < most
+
+
 @pytest.mark.parametrize("pitch", [90.0, -90.0, 85.01, -85.01])
 @pytest.mark.parametrize("prior", ["equivalent", "blend"])
 def test_near_a_pitch_of_90_degrees_the_gravity_direction_takes_over(pitch, prior):

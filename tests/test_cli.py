@@ -480,8 +480,8 @@ def test_run_without_an_imu_says_nothing_of_it():
 
 def test_run_closes_loops_and_writes_the_graph():
     small = ["--set", "pose_graph.keyframe_distance=0.5", "--set", "loops.min_way=8"]
-    world = "sim:room?columns=400&speed=2"
-    result = loam("run", world, "--frames", 100, "--loops", *small, "--set", "loops.neighbours=3")
+    world = "sim:room?frames=110&columns=400&speed=2"
+    result = loam("run", world, "--loops", *small, "--set", "loops.neighbours=3")
     assert result.exit_code == 0, result.output
     found = int(re.search(r"(\d+) of (\d+) found are used", one_line(result))[1])
     assert found >= 2
@@ -491,7 +491,7 @@ def test_run_closes_loops_and_writes_the_graph():
     graph = read_graph(folder / "pose_graph.g2o")
     assert len(graph.loops) == summary["loops"]["loops"]
     odometry, corrected = (read_tum(folder / f"{n}.tum") for n in ("odometry", "trajectory"))
-    assert len(odometry) == len(corrected) == 100
+    assert len(odometry) == len(corrected) == 110
     assert (odometry.map_T_lidar != corrected.map_T_lidar).any()
     again = loam("optimize", folder / "pose_graph.g2o")
     assert again.exit_code == 0, again.output

@@ -202,7 +202,7 @@ _EXPLANATION = (
     "share of its caches and clock does, and shows in the time of making the sweeps, which is the "
     "same work all along and no part of the pipeline. The target is for the growth of the pipeline "
     "over the growth of that, the last but one column.",
-    "The window counts both maps; a point there takes 32 bytes, in the archive 24. The archive may "
+    "The window counts both maps; a point there takes 36 bytes, in the archive 28. The archive may "
     "grow to `map.archive_megabytes` for each of the two; beyond it cubes go to `map.archive_dir`, "
     "or are lost and counted. A run also keeps the report of every frame (`MapUpdate`).",
     "Beside the recorded C++ systems: their milliseconds are those on the wall that they wrote "

@@ -169,10 +169,10 @@ class ScanLoopCloser:
             offered = min(len(features[0]), most[0]) + min(len(features[1]), most[1])
             return standing_fit(found.matches, int(offered)) if found.solved else Fit(0.0, 0.0)
 
-        matching = trial(whole.matching)
         known = history.pose(candidate).between(history.pose(keyframe.index))
-        best = self._rough_solver.solve(matches_at, known)
-        if self._judged(fit(best)) is not None:
+        solution = self._solver.solve(matches_at, known)
+        if self._judged(fit(solution)) is not None:
+            matching = trial(whole.matching)
             # The ground is where it was: height zero, and the tilt that the graph says.
             rotation = known.rotation()
             heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
@@ -180,10 +180,10 @@ class ScanLoopCloser:
             held = np.concatenate([cubes.points() for cubes in maps])
             around = places(some(*features), held, [start], config.search, _STARTS)
             starts = start, *around
-            trials = [best, *(self._rough_solver.solve(matches_at, pose) for pose in starts)]
+            trials = [self._rough_solver.solve(matches_at, pose) for pose in starts]
             best = max(trials, key=lambda tried: fit(tried).total)
-        matching = whole.matching
-        solution = self._solver.solve(matches_at, best.map_T_lidar)
+            matching = whole.matching
+            solution = self._solver.solve(matches_at, best.map_T_lidar)
         if not solution.solved:
             return Rejection.FEW_MATCHES
         final = fit(solution)

@@ -23,37 +23,36 @@ class LoopConsistency:
     ----------
     config : ``max_chi2``, ``walk`` and ``turn_walk_deg``
 
-    Attributes
-    ----------
-    agreeing : for each loop the numbers of the others
+    loops, keyframes : of the graph, which grow with it
     """
 
-    def __init__(self, config: PoseGraphConfig) -> None:
+    def __init__(
+        self, config: PoseGraphConfig, loops: Sequence[LoopClosure], keyframes: Sequence[Keyframe]
+    ) -> None:
         self.config = config
-        self.agreeing: list[set[int]] = []
-        self._loops: list[LoopClosure] = []
+        self._loops = loops
+        self._keyframes = keyframes
+        self._known: dict[tuple[int, int], bool] = {}
 
-    def add(self, loop: LoopClosure, keyframes: Sequence[Keyframe]) -> int:
-        """Compare a loop with all others; returns its number."""
-        others = {
-            number
-            for number, other in enumerate(self._loops)
-            if consistent(loop, other, keyframes, self.config)
-        }
-        number = len(self._loops)
-        for other in others:
-            self.agreeing[other].add(number)
-        self.agreeing.append(others)
-        self._loops.append(loop)
-        return number
+    def agreeing(self, number: int) -> set[int]:
+        """The numbers of the other loops that one agrees with; pairs are compared once."""
+        return {n for n in range(len(self._loops)) if n != number and self._agree(n, number)}
 
     def clique(self, number: int) -> set[int]:
         """Loops that agree pairwise, this one among them; as many as are found greedily."""
+        agreeing = {other: self.agreeing(other) for other in self.agreeing(number)}
         chosen = {number}
-        for other in sorted(self.agreeing[number], key=lambda n: (-len(self.agreeing[n]), n)):
-            if chosen <= self.agreeing[other]:
+        for other in sorted(agreeing, key=lambda n: (-len(agreeing[n]), n)):
+            if chosen <= agreeing[other]:
                 chosen.add(other)
         return chosen
+
+    def _agree(self, one: int, two: int) -> bool:
+        pair = min(one, two), max(one, two)
+        if pair not in self._known:
+            first, second = self._loops[pair[0]], self._loops[pair[1]]
+            self._known[pair] = consistent(second, first, self._keyframes, self.config)
+        return self._known[pair]
 
 
 def consistent(

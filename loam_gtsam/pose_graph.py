@@ -52,6 +52,8 @@ _ANYWHERE = np.repeat([np.pi, 100.0], 3)
 """rad and m: standard deviations of where another run began."""
 _STILL = 1e-5
 """rad and m; poses that move less in an update stay."""
+_LIKELY = 12.6
+"""Squared Mahalanobis distance that 95 % of right loops do not exceed."""
 _SWITCHES = 50
 """Loops switched on or off at most after a new one."""
 
@@ -78,7 +80,7 @@ class PoseGraph:
         self.loops: list[LoopClosure] = []
         self._session = 0
         self._slots: list[int | None] = []  # of the loops in iSAM2; None: switched off
-        self._consistency = LoopConsistency(self.config)
+        self._consistency = LoopConsistency(self.config, self.loops, self.keyframes)
         self._fixed = gtsam.NonlinearFactorGraph()  # all factors but loops
         self._poses = gtsam.Values()
         self._isam = _new_isam()
@@ -214,12 +216,18 @@ class PoseGraph:
                 f"{loop.earlier} and {loop.later}; if they are swapped, invert the motion"
             )
         noise_model(loop.covariance)
-        number = self._consistency.add(loop, self.keyframes)
+        number = len(self.loops)
         self.loops.append(loop)
         self._slots.append(None)
         on = {other for other, slot in enumerate(self._slots) if slot is not None}
-        agrees = on <= self._consistency.agreeing[number]
-        if agrees and self.chi_squared(number) <= self.config.max_chi2:
+        distance = self.chi_squared(number)
+        if distance <= min(_LIKELY, self.config.max_chi2):
+            # It changes little, so of the others only those that are off are tested anew.
+            self._switch(number, True)
+            self._settle(sorted(set(range(number)) - on))
+            return self._slots[number] is not None
+        agrees = on <= self._consistency.agreeing(number)
+        if agrees and distance <= self.config.max_chi2:
             self._switch(number, True)
         else:
             most = self._consistency.clique(number)
@@ -230,7 +238,7 @@ class PoseGraph:
                 for other in sorted(most - on):
                     self._switch(other, True)
         if any((slot is not None) != (other in on) for other, slot in enumerate(self._slots)):
-            self._settle()
+            self._settle(range(len(self.loops)))
         return self._slots[number] is not None
 
     # -- what comes out ------------------------------------------------------------------------
@@ -386,18 +394,20 @@ class PoseGraph:
                 break
             before = self._poses
 
-    def _settle(self) -> None:
-        """Switch off the loop that contradicts most, or on the one that fits best, until none."""
+    def _settle(self, numbers: Sequence[int]) -> None:
+        """Of some loops switch off that which contradicts most, or on that which fits best; until
+        none is left to switch.
+        """
         limit = self.config.max_chi2
-        for _ in range(_SWITCHES):
-            tested = np.array([self.chi_squared(number) for number in range(len(self.loops))])
-            on = np.array(self.active)
+        for _ in range(_SWITCHES if numbers else 0):
+            tested = np.array([self.chi_squared(number) for number in numbers])
+            on = np.array([self._slots[number] is not None for number in numbers])
             worst = int(np.where(on, tested, -1.0).argmax())
             best = int(np.where(on, np.inf, tested).argmin())
             if on[worst] and tested[worst] > limit:
-                self._switch(worst, False)
+                self._switch(numbers[worst], False)
             elif not on[best] and tested[best] <= limit:
-                self._switch(best, True)
+                self._switch(numbers[best], True)
             else:
                 break
 

@@ -475,8 +475,9 @@ def test_the_covariance_of_a_cycle_is_that_of_monte_carlo():
 
 
 def test_the_largest_group_that_agrees_is_found():
-    consistency = LoopConsistency(settings().pose_graph)
-    consistency.agreeing = [{1, 2, 4}, {0, 2}, {0, 1}, set(), {0}]
+    consistency = LoopConsistency(settings().pose_graph, [], [])
+    groups = [{1, 2, 4}, {0, 2}, {0, 1}, set(), {0}]
+    consistency.agreeing = lambda number: groups[number]
     assert consistency.clique(2) == {0, 1, 2}
     assert consistency.clique(4) == {0, 4}
     assert consistency.clique(3) == {3}

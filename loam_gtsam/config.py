@@ -628,7 +628,7 @@ class PoseGraphConfig(_Section):
     """Keyframes and the graph of their poses."""
 
     keyframe_distance: float = _param(
-        2.0, "a frame is a keyframe if it is as far as this from the last one", unit="m", low=0.0
+        4.0, "a frame is a keyframe if it is as far as this from the last one", unit="m", low=0.0
     )
     keyframe_angle_deg: float = _param(
         30.0, "or has turned as much as this", unit="degrees", low=0.0
@@ -660,11 +660,11 @@ class PoseGraphConfig(_Section):
     follow_distance: float = _param(
         0.05,
         "map points follow their keyframe once a loop has moved it by more than this, seen from "
-        "the newest one",
+        "the newest one, from which it may be off by the angle below as well",
         unit="m",
         low=0.0,
     )
-    follow_angle_deg: float = _param(0.1, "or turned it by more than this", unit="degrees", low=0.0)
+    follow_angle_deg: float = _param(0.2, "or turned it by more than this", unit="degrees", low=0.0)
 
 
 @dataclass(frozen=True, slots=True)

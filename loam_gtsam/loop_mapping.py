@@ -84,14 +84,22 @@ class LoopMapping:
         return True
 
     def follow(self, metres: float = 0.0, degrees: float = 0.0) -> None:
-        """Move the map points of the keyframes that lie elsewhere by more than this."""
+        """Move the map points of the keyframes that lie elsewhere by more than this.
+
+        Seen from the newest keyframe: one that is far away may be off by the angle's share more,
+        as it is not matched with now.
+        """
+        if not self._placed:
+            return
+        here = self._placed[-1]
         to_odom = self.map_T_odom.inverse()
         moves: dict[int, FloatArray] = {}
         for index, placed in enumerate(self._placed):
             there = to_odom.compose(self.graph.pose(index))
             step = placed.localCoordinates(there)
             turned, shifted = np.degrees(np.linalg.norm(step[:3])), np.linalg.norm(step[3:])
-            if turned > degrees or shifted > metres:
+            allowed = metres + np.radians(degrees) * here.range(placed)
+            if turned > degrees or shifted > allowed:
                 moves[index] = there.compose(placed.inverse()).matrix()
                 self._placed[index] = there
         if moves:

@@ -325,7 +325,7 @@ class Mapper:
         """The solution that fits best, its twist and what happened; or why the sweep is lost.
 
         A lidar that was moved between two sweeps did not move like that within them: its velocity
-        is that from before, or none.
+        is that from before, or none, or, if it was turned on its vehicle, that of the vehicle.
         """
         watch, middle = self.watch, _to_middle(sweep, guess)
         usual, before = watch.usual, Fit.of(solution.matches, matches_at.offered)
@@ -337,6 +337,8 @@ class Mapper:
         if lost:
             sweep.deskew(guess.twist)
             start = self._place(sweep, middle, solution, matches_at, priors, clock)
+            if start is not None:
+                twists.append(_turned(guess.twist, start.rotation().between(middle.rotation())))
         best: tuple[Fit, Solution, FloatArray] | None = None
         for twist in twists:
             if start is None:
@@ -592,6 +594,11 @@ def _checked(factors: object) -> Sequence[gtsam.NonlinearFactor]:
                 f"{POSE_KEY}; got {type(factor).__name__} on the keys {keys}"
             )
     return factors
+
+
+def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
+    """A (6,) body velocity in the axes of ``a``, if it is given in those of ``b``."""
+    return (a_R_b.matrix() @ twist.reshape(2, 3).T).T.reshape(6)
 
 
 def _to_middle(sweep: MovingSweep, result: Guess) -> gtsam.Pose3:

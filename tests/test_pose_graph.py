@@ -97,7 +97,7 @@ def test_a_frame_is_a_keyframe_when_it_is_far_or_has_turned():
     yaw = gtsam.Rot3.Yaw
     way = ((0, 0), (1.9, 0), (2.1, 0), (2.1, 0.5), (2.1, 0.53), (4.0, 0.53))
     poses = [gtsam.Pose3(yaw(turn), np.array([x, 0.0, 0.0])) for x, turn in way]
-    graph = PoseGraph(Config())
+    graph = PoseGraph(settings(keyframe_distance=2.0))
     taken = [graph.add(update) is not None for update in frames(poses)]
     assert taken == [True, False, True, False, True, False]
     assert [keyframe.stamp for keyframe in graph.keyframes] == [0, 2 * FRAME, 4 * FRAME]

@@ -218,7 +218,8 @@ class ScanLoopCloser:
         if len(old) == 0:
             return Rejection.TOO_RECENT
         spreads = np.array(self._spreads)[old] + self._spreads[keyframe.index]
-        gate = config.gate + config.gate_sigmas * spreads + config.gate_drift * ways[old]
+        gate = config.gate + config.gate_sigmas * spreads
+        gate += config.gate_drift * _untied(keyframe, history)[old]
         positions = history.poses()[:, :3, 3]
         away = np.linalg.norm(positions[old] - positions[keyframe.index], axis=1)
         near = old[away <= gate]
@@ -317,6 +318,17 @@ def standing_fit(matches: ScanMatches, offered: int) -> Fit:
     count = len(agree) + len(matches.edges)
     others = offered - (len(planes) - len(agree))
     return Fit(count / max(others, 1), float(agrees) / max(count, 1))
+
+
+def _untied(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
+    """(N,) metres along which the odometry alone leads to each keyframe: straight, or by a loop."""
+    ways = np.array([other.way for other in history.keyframes])
+    gone = keyframe.way - ways
+    for loop, on in zip(history.loops, history.active, strict=True):
+        if on:
+            since = keyframe.way - ways[loop.later]
+            gone = np.minimum(gone, since + np.abs(ways - ways[loop.earlier]))
+    return gone
 
 
 def _heading(rotation: gtsam.Rot3) -> float:

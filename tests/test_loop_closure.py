@@ -11,7 +11,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets._scenes import BUILDERS
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.keyframes import LoopClosure
-from loam_gtsam.loop_closure import Rejection, ScanLoopCloser
+from loam_gtsam.loop_closure import Rejection, ScanLoopCloser, _untied
 from loam_gtsam.pose_graph import PoseGraph
 from loam_gtsam.types import Features, FrameStatus, MapUpdate, Uncertainty
 
@@ -275,3 +275,20 @@ def test_where_not_to_look():
     assert reasons(settings(**tight), made=unsure)[Rejection.OUT_OF_REACH] == 0
     assert reasons(settings(**tight | {"gate": 30.0}))[Rejection.OUT_OF_REACH] == 0
     assert reasons(settings(**tight | {"gate_drift": 1.0}))[Rejection.OUT_OF_REACH] == 0
+
+
+def test_what_loops_have_tied_is_looked_for_less_far():
+    """The drift that nobody knows grows with the way from the last loop, not from the start."""
+    graph = PoseGraph(settings())
+    for update in updates(
+        [gtsam.Pose3(gtsam.Rot3(), np.array([2.0 * k, 0, 0])) for k in range(40)]
+    ):
+        graph.add(update)
+    last = graph.keyframes[-1]
+    np.testing.assert_allclose(_untied(last, graph), 78.0 - 2.0 * np.arange(40), atol=1e-6)
+    loop = LoopClosure(3, 35, graph.pose(3).between(graph.pose(35)), OWN)
+    assert graph.add_loop(loop)
+    tied = _untied(last, graph)
+    assert tied[3] == pytest.approx(8.0)  # from the end of the loop to the last
+    assert tied[0] == pytest.approx(8.0 + 6.0)
+    assert tied[37] == pytest.approx(4.0)

@@ -13,7 +13,6 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.geometry import transform
-from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.loop_closure import LoopCloser, LoopStatistics, ScanLoopCloser
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pose_graph import PoseGraph
@@ -29,7 +28,6 @@ class LoopMapping:
     config : ``pose_graph`` and ``loops``, and what :class:`PoseGraph` and
         :class:`ScanLoopCloser` use
     closer : finds the loops; a :class:`ScanLoopCloser` if None
-    imu : as the mapper's
 
     Attributes
     ----------
@@ -43,12 +41,10 @@ class LoopMapping:
         mapper: Mapper,
         config: Config | None = None,
         closer: LoopCloser | None = None,
-        *,
-        imu: ImuBuffer | None = None,
     ) -> None:
         self._config = config or Config()
         self._mapper = mapper
-        self.graph = PoseGraph(self._config, imu=imu)
+        self.graph = PoseGraph(self._config)
         self.closer: LoopCloser = closer or ScanLoopCloser(self._config)
         self.moved = 0
         self._placed: list[gtsam.Pose3] = []
@@ -71,6 +67,8 @@ class LoopMapping:
         -------
         Whether a loop was closed.
         """
+        aid = self._mapper.imu_aid
+        self.graph.imu = None if aid is None else aid.gyro  # which the mapper may give up
         keyframe = self.graph.add(update, features)
         if keyframe is None:
             return False

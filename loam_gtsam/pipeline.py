@@ -134,7 +134,7 @@ class Pipeline:
         self._last_odom: gtsam.Pose3 | None = None
         self.loops: LoopMapping | None = None
         if self.config.loops.enabled or loop_closer is not None:
-            self.loops = LoopMapping(self.mapper, self.config, loop_closer, imu=imu)
+            self.loops = LoopMapping(self.mapper, self.config, loop_closer)
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Register one sweep; what it contains never raises, see the status of the result.

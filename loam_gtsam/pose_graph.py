@@ -68,6 +68,7 @@ class PoseGraph:
 
     Attributes
     ----------
+    imu : as given
     keyframes : in the order of time
     loops : all that were added
     """
@@ -75,7 +76,7 @@ class PoseGraph:
     def __init__(self, config: Config | None = None, *, imu: ImuBuffer | None = None) -> None:
         self._whole = config or Config()
         self.config = self._whole.pose_graph
-        self._imu = imu
+        self.imu = imu
         self.keyframes: list[Keyframe] = []
         self.loops: list[LoopClosure] = []
         self._session = 0
@@ -349,7 +350,7 @@ class PoseGraph:
                 raise InputError(
                     f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
                 )
-            sweep = MovingSweep(features, self._whole, self._imu)
+            sweep = MovingSweep(features, self._whole, self.imu)
             sweep.deskew(update.twist)
             to_reference = sweep.middle_T_reference(update.twist).inverse().matrix()
             edges, planes = (transform(to_reference, part) for part in (sweep.edges, sweep.planes))

@@ -22,7 +22,7 @@ GROWTH = 1.1
 and an empty map)."""
 _ROWS = 500
 """Of a CSV at most, and points of a curve."""
-_POINT, _KEYED = 24e-6, 32e-6
+_POINT, _KEYED = 28e-6, 36e-6
 """MB of a point in the archive (three doubles), and in the window, where it has a voxel key."""
 
 

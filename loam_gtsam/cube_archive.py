@@ -54,6 +54,9 @@ class Archive:
     def __len__(self) -> int:
         return len(self._memory) + len(self._disk)
 
+    def __contains__(self, index: CubeIndex) -> bool:
+        return index in self._memory or index in self._disk
+
     def indices(self) -> list[CubeIndex]:
         """Of its cubes, oldest first, those in memory before those on disk."""
         return [*self._memory, *self._disk]

@@ -229,9 +229,9 @@ class CubeMap:
         owners = np.array(sorted(moves), np.int32)
         taken = [cube.take_out(owners) for cube in self._cubes.values()]
         for index in self._archive.indices():
-            content = self._archive.take(index)
-            if content is not None:
-                cube = _Cube(self._by_voxel(content))
+            content = self._archive.read(index)
+            if content is not None and np.isin(content.owners, owners).any():
+                cube = self._unarchived(index)
                 taken.append(cube.take_out(owners))
                 self._archive.store(index, cube.content)
         self._searches = []
@@ -289,12 +289,16 @@ class CubeMap:
         found, numbers = np.unique(cells, axis=0, return_inverse=True)
         for number, cell in enumerate(found):
             here = numbers.ravel() == number
-            content = self._archive.take(_index(cell))
-            cube = _Cube() if content is None else _Cube(self._by_voxel(content))
+            cube = self._unarchived(_index(cell))
             new = self._by_voxel(CubePoints(points[here], owners[here]))
             first = _starts(new.keys[1:] != new.keys[:-1])
             cube.settle(new.at(first))
             self._archive.store(_index(cell), cube.content)
+
+    def _unarchived(self, index: CubeIndex) -> _Cube:
+        """A cube out of the archive; an empty one if it is not there or cannot be read."""
+        content = self._archive.take(index) if index in self._archive else None
+        return _Cube() if content is None else _Cube(self._by_voxel(content))
 
     def _by_voxel(self, content: CubePoints) -> _Content:
         keys = voxel_keys(content.points, self._voxel_size)

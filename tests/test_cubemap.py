@@ -640,3 +640,16 @@ def test_a_moved_point_gives_way_to_one_that_was_there():
     after = cubes.nearest(np.full((1, 3), 2.0), 1, np.inf, [(0, 0, 0)])[0]
     np.testing.assert_array_equal(after, before)  # its trees know that
     assert cubes.move({7: moved_by(1.0)}) == 0
+
+
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_a_point_may_move_to_where_no_cube_was_ever_kept(tmp_path, on_disk):
+    config = MapConfig(
+        cube_size=10.0, window=(3, 3, 3), archive_dir=str(tmp_path) if on_disk else None
+    )
+    cubes = CubeMap(config, 0.5)
+    cubes.insert(np.array([[0.1, 0.1, 0.1]]))
+    assert cubes.move({0: moved_by(200.0)}) == 1
+    assert cubes.count() == 0
+    assert cubes.stats.archived_points == 1
+    np.testing.assert_allclose(cubes.points(archived=True), [[200.1, 0.1, 0.1]])

@@ -7,7 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from loam_gtsam.datasets._scenes import CAR, Kerb, Scene, rolling, streets
+from loam_gtsam.datasets._scenes import CAR, Kerb, Scene, points_at, rolling, streets
 from loam_gtsam.types import ConfigError, FloatArray
 
 _STREAM = 8
@@ -89,7 +89,4 @@ def _way(corners: FloatArray, metres: float) -> FloatArray:
     for corner, before, after in zip(corners[1:-1], along, along[1:], strict=False):
         centre = corner + _RADIUS * (after - before)
         pieces.append(centre + _RADIUS * (np.sin(angle) * before - np.cos(angle) * after))
-    rough = np.vstack(pieces)
-    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rough, axis=0), axis=1))])
-    at = np.linspace(0.0, metres, int(metres / _SPACING) + 1)
-    return np.stack([np.interp(at, chord, rough[:, k]) for k in (0, 1)], axis=1)
+    return points_at(np.vstack(pieces), np.linspace(0.0, metres, int(metres / _SPACING) + 1))

@@ -295,6 +295,16 @@ def streets(
         boxes += cars
         cylinders += posts
         crowns += trees
+    return grown(boxes, cylinders, crowns, ground)
+
+
+def grown(
+    boxes: list[list[float]],
+    cylinders: list[list[float]],
+    crowns: list[list[float]],
+    ground: Ground,
+) -> Solids:
+    """Solids of which all the crowns are foliage."""
     foliage = np.ones(len(crowns), np.bool_)
     return Solids(np.array(boxes), np.array(cylinders), np.array(crowns), foliage, ground)
 
@@ -384,6 +394,19 @@ def rolling(
     )
 
 
+def chord(way: FloatArray) -> FloatArray:
+    """(N,) metres from the first of (N, 2) points to each, along straight lines between them."""
+    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
+    distances: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
+    return distances
+
+
+def points_at(way: FloatArray, metres: FloatArray) -> FloatArray:
+    """(M, 2) points so far along a way of (N, 2) points, of which no two in a row are the same."""
+    distances = chord(way)
+    return np.stack([np.interp(metres, distances, way[:, k]) for k in (0, 1)], axis=1)
+
+
 def _rounded_rectangle(half_x: float, half_y: float, radius: float, wander: float) -> FloatArray:
     """Counter-clockwise way points about 8 m apart, from the middle of the lower side."""
     corners = np.array([[1, -1], [1, 1], [-1, 1], [-1, -1]]) * (half_x - radius, half_y - radius)
@@ -394,10 +417,10 @@ def _rounded_rectangle(half_x: float, half_y: float, radius: float, wander: floa
         pieces.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     rough = np.vstack([*pieces, pieces[0]])
     # Fill the straights, then let the driver wander a little within the lane.
-    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rough, axis=0), axis=1))])
-    step = np.linspace(0.0, chord[-1], int(chord[-1] / 8.0), endpoint=False)
-    way = np.stack([np.interp(step, chord, rough[:, k]) for k in (0, 1)], axis=1)
-    swing = wander * np.sin(2.0 * np.pi * 7.0 * step / chord[-1])
+    length = chord(rough)[-1]
+    step = np.linspace(0.0, length, int(length / 8.0), endpoint=False)
+    way = points_at(rough, step)
+    swing = wander * np.sin(2.0 * np.pi * 7.0 * step / length)
     tangent = np.roll(way, -1, axis=0) - np.roll(way, 1, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
     shifted: FloatArray = way + swing[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)

@@ -5,8 +5,16 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.datasets._raycast import Solids
-from loam_gtsam.datasets._scenes import CAR, DEEP, Kerb, Scene, rolling
+from loam_gtsam.datasets._scenes import (
+    CAR,
+    DEEP,
+    Kerb,
+    Scene,
+    chord,
+    grown,
+    points_at,
+    rolling,
+)
 from loam_gtsam.types import FloatArray, InputError
 
 _STREAM = 9
@@ -39,14 +47,14 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
     way = np.asarray(way, np.float64)
     if way.ndim != 2 or way.shape[1] != 2 or not np.isfinite(way).all():
         raise InputError(f"way: expected (N, 2) finite metres, got shape {way.shape}")
-    chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(way, axis=0), axis=1))])
-    if not len(way) or chord[-1] < 100.0:
+    distances = chord(way)
+    length = float(distances[-1])
+    if not len(way) or length < 100.0:
         raise InputError("way: expected one of 100 m or more; give more points of it")
-    keep = np.concatenate([[True], np.diff(chord) > 0.0])
+    way = way[np.concatenate([[True], np.diff(distances) > 0.0])]  # without stops
 
     def along(spacing: float) -> FloatArray:
-        at = np.linspace(0.0, chord[-1], int(chord[-1] / spacing) + 1)
-        return np.stack([np.interp(at, chord[keep], way[keep, k]) for k in (0, 1)], axis=1)
+        return points_at(way, np.linspace(0.0, length, int(length / spacing) + 1))
 
     path = along(_STEP)
     taken = cKDTree(path)
@@ -69,7 +77,7 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
         return not houses or float(np.linalg.norm(np.array(houses) - place, axis=1).min()) > metres
 
     s = 6.0
-    while s < chord[-1] - 6.0:
+    while s < length - 6.0:
         a, b = path[int((s - 4.0) / _STEP)], path[min(int((s + 4.0) / _STEP), len(path) - 1)]
         for left in (True, False):
             kerb = Kerb(a, b, left, ground)
@@ -103,13 +111,7 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
         s += float(rng.uniform(9.0, 13.0))
     return Scene(
         name="city",
-        solids=Solids(
-            np.array(boxes),
-            np.array(cylinders),
-            np.array(crowns),
-            np.ones(len(crowns), np.bool_),
-            ground,
-        ),
+        solids=grown(boxes, cylinders, crowns, ground),
         waypoints=along(_SPACING),
         closed=False,
         speed=10.0,

@@ -10,7 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
@@ -28,11 +28,11 @@ from rich.progress import (
 from loam_gtsam import visualization
 from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
 from loam_gtsam.evaluation import absolute_error, align, align_rotations, interpolate
 from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
 from loam_gtsam.graph_files import write_graph
-from loam_gtsam.pipeline import Observer, OnFrame, RunResult, run
+from loam_gtsam.pipeline import Observer, OnFrame, Pipeline, RunResult, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
 
 PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
@@ -57,6 +57,8 @@ class RunOptions:
     quiet: bool
     bag: Path | None = None
     workers: int | None = None
+    view: bool = False
+    rrd: Path | None = None
 
 
 def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
@@ -74,7 +76,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     folder = make_folder(free_folder(wanted, options.overwrite))
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
-    with stop_requests() as stop, _bag(options, config) as observe:
+    with stop_requests() as stop, _observers(options, config) as observe:
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             result = run(
@@ -102,6 +104,9 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         say_written(console, stop, len(result.updates), total, folder, files)
         if options.bag is not None and options.bag.exists():
             console.print(f"Bag written to {options.bag}", markup=False, soft_wrap=True)
+        if options.rrd is not None and options.rrd.exists():
+            text = f"Recording written to {options.rrd}; look at it with: rerun {options.rrd}"
+            console.print(text, markup=False, soft_wrap=True)
     if result.error is not None:
         raise result.error
     if stop.signum is not None:
@@ -122,16 +127,28 @@ def _workers(options: RunOptions, sweeps: int) -> int:
 
 
 @contextmanager
-def _bag(options: RunOptions, config: Config) -> Iterator[Observer | None]:
-    """What writes every frame into the bag that was asked for, if one was."""
-    if options.bag is None:
-        yield None
-        return
-    from loam_gtsam.export_bag import BagWriter
-    from loam_gtsam.recording import record
+def _observers(options: RunOptions, config: Config) -> Iterator[Observer | None]:
+    """What takes every frame: the bag and the viewer, if they were asked for."""
+    with ExitStack() as stack:
+        observers: list[Observer] = []
+        if options.view or options.rrd is not None:
+            from loam_gtsam.viewer import RerunViewer
+            from loam_gtsam.watching import watch
 
-    with BagWriter(options.bag, config.bag, overwrite=options.overwrite) as bag:
-        yield record(bag)
+            viewer = RerunViewer(options.rrd, window=options.view, overwrite=options.overwrite)
+            observers.append(watch(stack.enter_context(viewer)))
+        if options.bag is not None:
+            from loam_gtsam.export_bag import BagWriter
+            from loam_gtsam.recording import record
+
+            bag = BagWriter(options.bag, config.bag, overwrite=options.overwrite)
+            observers.append(record(stack.enter_context(bag)))
+
+        def observe(sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+            for observer in observers:
+                observer(sweep, update, pipeline)
+
+        yield observe if observers else None
 
 
 def free_folder(wanted: Path, overwrite: bool, known: Sequence[str] = RUN_OUTPUTS) -> Path:

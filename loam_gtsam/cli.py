@@ -180,6 +180,17 @@ def run(
             "folder if FILE has no suffix).",
         ),
     ] = None,
+    view: Annotated[
+        bool,
+        typer.Option("--view", help="Watch the run live, in the Rerun viewer (viewer extra)."),
+    ] = False,
+    rrd: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.rrd",
+            help="Save what --view shows, to be opened later with: rerun FILE.rrd.",
+        ),
+    ] = None,
     loops: Annotated[
         bool,
         typer.Option(
@@ -215,7 +226,7 @@ def run(
     if bag is not None and bag.resolve() in (Path(path).resolve(), *Path(path).resolve().parents):
         raise OutputError(f"--bag {bag}: the input must not be replaced; choose another name")
     dataset = _open(path, topic, imu_topic, loader_options)
-    options = RunOptions(frames, output, overwrite, plot, profile, quiet, bag, workers)
+    options = RunOptions(frames, output, overwrite, plot, profile, quiet, bag, workers, view, rrd)
     raise typer.Exit(execute(dataset, settings, options))
 
 

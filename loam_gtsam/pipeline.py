@@ -33,8 +33,6 @@ from loam_gtsam.types import (
 
 OnFrame = Callable[[int, MapUpdate], None]
 """Called after each frame with its number and result."""
-Observer = Callable[[Sweep, MapUpdate, Mapper], None]
-"""Called after each frame with the sweep, its result and the mapper, to look and not to change."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +184,11 @@ class Pipeline:
         return (self.mapper if self.loops is None else self.loops).map_points()
 
 
+Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
+"""Called after each frame with the sweep, its result and the pipeline (its mapper, its loops), to
+look and not to change."""
+
+
 def effective_config(config: Config, dataset: Dataset) -> Config:
     """The configuration with what the data set's layout says about the sensor.
 
@@ -257,7 +260,7 @@ def run(
             update = replace(update, timings={"read": seconds} | dict(update.timings))
             updates.append(update)
             if observe is not None:
-                observe(sweep, update, pipeline.mapper)
+                observe(sweep, update, pipeline)
             if on_frame is not None:
                 on_frame(number, update)
     except KeyboardInterrupt:

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1] / "loam_gtsam"
 THIS = "tests/test_layers.py"
 
 LAYERS = (
-    ("types", "config", "geometry", "rotations"),
+    ("types", "config", "geometry", "rotations", "frame_view"),
     (
         "rings",
         "place",
@@ -40,7 +40,7 @@ LAYERS = (
     ("mapper", "ahead"),
     ("loop_mapping",),
     ("pipeline", "estimators", "graph_files"),
-    ("comparison", "recording"),
+    ("comparison", "recording", "watching"),
     (
         "_cli_report",
         "_report_html",
@@ -57,6 +57,7 @@ SAME_LAYER = {
     "config": {"types"},
     "geometry": {"types"},
     "rotations": {"types"},
+    "frame_view": {"types"},
     "sweep": {"rings"},
     "features": {"sweep", "posts"},
     "cubemap": {"cube_archive"},
@@ -73,6 +74,7 @@ SAME_LAYER = {
     "loop_consistency": {"keyframes"},
     "pose_graph": {"keyframes", "loop_consistency"},
     "loop_closure": {"keyframes", "pose_graph", "relocalization", "scan_error"},
+    "watching": {"recording"},
     "_cli_run": {"_cli_report"},
     "_compare_files": {"_report_html"},
     "_cli_compare": {"_cli_report", "_cli_run", "_compare_files"},
@@ -87,6 +89,8 @@ LEAVES = {
     "export_bag": {"bag_messages"},
     "peers": set(),
     "visualization": {"export"},
+    "_rrd_file": set(),
+    "viewer": {"_rrd_file"},
 }
 """Leaves see layer 0 and these; of the layers, only the command line and LEAF_USERS see them."""
 
@@ -96,6 +100,7 @@ LEAF_USERS = {
     "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
+    "watching": {"datasets.base"},
     "graph_files": {"export"},
 }
 

@@ -21,7 +21,7 @@ from loam_gtsam.export import read_tum
 from loam_gtsam.export_bag import ODOMETRY, REGISTERED, SURROUND, BagWriter
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.pipeline import run
+from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.recording import record, registered_cloud, surrounding_cloud
 from loam_gtsam.types import (
     BadSweep,
@@ -121,9 +121,9 @@ def test_the_whole_of_a_run_is_recorded(tmp_path: Path) -> None:
     sweeps = [*(world[n] for n in range(5)), BadSweep(world[5].stamp, "broken")]
     mappers = []
 
-    def observe(sweep: Any, update: MapUpdate, mapper: Mapper) -> None:
-        mappers.append(mapper)
-        recorded(sweep, update, mapper)
+    def observe(sweep: Any, update: MapUpdate, pipeline: Pipeline) -> None:
+        mappers.append(pipeline.mapper)
+        recorded(sweep, update, pipeline)
 
     with BagWriter(tmp_path / "run.bag") as bag:
         recorded = record(bag)

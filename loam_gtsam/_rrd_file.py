@@ -39,13 +39,13 @@ class RrdFile:
         self._path = path
         if path.suffix != ".rrd":
             raise OutputError(f"{path}: expected a name that ends in .rrd")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            file = open(path, "wb" if overwrite else "xb")  # noqa: SIM115 - the thread closes it
-        except FileExistsError as error:
+        if path.exists() and not overwrite:
             raise OutputError(
                 f"{path}: the file exists; add overwrite=True (--overwrite) or choose another name"
-            ) from error
+            )
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = open(path, "wb", buffering=0)  # noqa: SIM115 - the thread closes it
         except OSError as error:
             raise self._unwritable(error) from error
         self._problem: OSError | None = None
@@ -56,12 +56,11 @@ class RrdFile:
             with open(source, "rb", buffering=0) as pipe, file:
                 while data := pipe.read(_CHUNK):
                     # After an error the rest is read all the same: the pipe must not fill up.
-                    if self._problem is None:
-                        try:
-                            file.write(data)
-                            file.flush()
-                        except OSError as error:
-                            self._problem = error
+                    try:
+                        while data and self._problem is None:
+                            data = data[file.write(data) :]
+                    except OSError as error:
+                        self._problem = error
 
         self._thread = threading.Thread(target=copy, name="rrd file", daemon=True)
         self._thread.start()

@@ -35,13 +35,12 @@ from loam_gtsam._rrd_file import RrdFile
 from loam_gtsam.frame_view import FrameView, MapView, residual_colours
 from loam_gtsam.types import FloatArray, FrameStatus, OutputError
 
+_NAME = "loam_gtsam"
 _MEMORY = "2GB"
 """What the viewer may take; it then forgets the oldest frames."""
-_PORT = 9876
-"""Rerun's own. A viewer that listens there already is used."""
 _FLUSH_SECONDS = 10.0
 _SIGMAS = 3.0
-_GREY, _DARK, _PALE = (150, 160, 170), (70, 84, 98), (205, 212, 218)
+_SWEEP, _MAP_EDGE, _MAP_PLANE = (220, 226, 232), (150, 160, 172), (96, 106, 118)
 _EDGE, _PLANE, _PATH = (228, 87, 46), (63, 143, 166), (228, 87, 46)
 _LOOP_ON, _LOOP_OFF, _ELLIPSOID = (46, 158, 107), (194, 34, 47), (238, 202, 59)
 _MOST_PATH = 2_000
@@ -78,7 +77,7 @@ class RerunViewer:
         window: bool = False,
         overwrite: bool = False,
         every: int = 10,
-        exaggerate: float = 20.0,
+        exaggerate: float = 10.0,
         most_sweep: int = 20_000,
         most_map: int = 60_000,
     ) -> None:
@@ -92,8 +91,12 @@ class RerunViewer:
         if window:
             _check_screen()
         self._file = None if self.path is None else RrdFile(self.path, overwrite)
-        self._stream: Any = self._rr.RecordingStream("loam_gtsam")
-        self._open(window)
+        # One each: a window that is closed must not cost the file anything.
+        self._streams: list[Any] = []
+        if self._file is not None:
+            self._streams.append(self._saved(self._file))
+        if window:
+            self._streams.append(self._shown())
         self._log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._log("map/lidar", self._rr.TransformAxes3D(2.0), static=True)
 
@@ -110,12 +113,13 @@ class RerunViewer:
         OutputError
             If the viewer is closed, or the file cannot be written.
         """
-        if self._stream is None:
+        if not self._streams:
             raise OutputError("the viewer is closed; nothing can be shown in it")
         if self._file is not None:
             self._file.check()
-        self._stream.set_time("frame", sequence=frame.number)
-        self._stream.set_time("stamp", timestamp=np.datetime64(frame.update.stamp, "ns"))
+        for stream in self._streams:
+            stream.set_time("frame", sequence=frame.number)
+            stream.set_time("stamp", timestamp=np.datetime64(frame.update.stamp, "ns"))
         self._draw_frame(frame)
         self._draw_matches(frame)
         self._plot(frame)
@@ -132,13 +136,14 @@ class RerunViewer:
         OutputError
             If the file could not be written.
         """
-        if self._stream is None:
+        if not self._streams:
             return
         self._draw_map()
-        stream, self._stream = self._stream, None
-        with suppress(RuntimeError):  # the window was closed before
-            stream.flush(timeout_sec=_FLUSH_SECONDS)
-        stream.disconnect()
+        streams, self._streams = self._streams, []
+        for stream in streams:
+            with suppress(RuntimeError):  # the window was closed before
+                stream.flush(timeout_sec=_FLUSH_SECONDS)
+            stream.disconnect()
         if self._file is None or self.path is None:
             return
         self._file.wait()
@@ -166,7 +171,7 @@ class RerunViewer:
         rr, pose = self._rr, frame.map_T_lidar
         self._log("map/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         self._log("map/covariance", self._ellipsoid(pose[:3, 3], frame.position_covariance))
-        self._log("map/sweep", self._points(_thinned(frame.sweep, self._most_sweep), _GREY, 1.0))
+        self._log("map/sweep", self._points(_thinned(frame.sweep, self._most_sweep), _SWEEP, 1.5))
         self._log("map/features/edges", self._points(frame.edges, _EDGE, 2.0))
         self._log("map/features/planes", self._points(frame.planes, _PLANE, 2.0))
 
@@ -187,7 +192,10 @@ class RerunViewer:
         view, self._around = self._around(), None
         rr = self._rr
         total = max(len(view.edges) + len(view.planes), 1)
-        for name, points, colour in (("edges", view.edges, _DARK), ("planes", view.planes, _PALE)):
+        for name, points, colour in (
+            ("edges", view.edges, _MAP_EDGE),
+            ("planes", view.planes, _MAP_PLANE),
+        ):
             most = self._most_map * len(points) // total
             entity = f"map/surroundings/{name}"
             self._log(entity, self._points(_thinned(points, most), colour, 1.0))
@@ -244,30 +252,31 @@ class RerunViewer:
         return self._rr.Points3D(points, colors=colours, radii=radii)
 
     def _log(self, entity: str, what: Any, *, static: bool = False) -> None:
-        self._stream.log(entity, what, static=static)
+        for stream in self._streams:
+            stream.log(entity, what, static=static)
 
     # -- where it goes -------------------------------------------------------------------------
 
-    def _open(self, window: bool) -> None:
-        """Connect the stream to the file, the window, or both."""
-        rr, sinks = self._rr, []
-        if self._file is not None:
-            sinks.append(rr.FileSink(self._file.sink))
-        if window:
-            # The program beside this Python, whose folder need not be on the path.
-            here = shutil.which("rerun", path=str(Path(sys.executable).parent))
-            rr.spawn(
-                port=_PORT,
-                connect=False,
-                memory_limit=_MEMORY,
-                hide_welcome_screen=True,
-                executable_path=here,
-                recording=self._stream,
-            )
-            sinks.append(rr.GrpcSink(f"rerun+http://127.0.0.1:{_PORT}/proxy"))
-        self._stream.set_sinks(*sinks, default_blueprint=_blueprint())
-        if self._file is not None:
-            self._file.opened()
+    def _saved(self, file: RrdFile) -> Any:
+        """A stream into a file."""
+        stream = self._rr.RecordingStream(_NAME)
+        stream.save(file.sink, default_blueprint=_blueprint())
+        file.opened()
+        return stream
+
+    def _shown(self) -> Any:
+        """A stream into a window."""
+        # The program beside this Python, whose folder need not be on the path.
+        here = shutil.which("rerun", path=str(Path(sys.executable).parent))
+        stream = self._rr.RecordingStream(_NAME)
+        self._rr.spawn(
+            memory_limit=_MEMORY,
+            hide_welcome_screen=True,
+            executable_path=here,
+            default_blueprint=_blueprint(),
+            recording=stream,
+        )
+        return stream
 
 
 def _thinned(points: FloatArray, most: int) -> FloatArray:
@@ -310,9 +319,10 @@ def _blueprint() -> Any:
             ("milliseconds", "Time of the frame [ms]"),
         )
     ]
+    eye = blueprint.EyeControls3D(tracking_entity="map/lidar")
     return blueprint.Blueprint(
         blueprint.Horizontal(
-            blueprint.Spatial3DView(origin="map", name="Map"),
+            blueprint.Spatial3DView(origin="map", name="Map", eye_controls=eye),
             blueprint.Vertical(*plots, blueprint.TextLogView(origin="frame/messages")),
             column_shares=[3, 1],
         ),

@@ -25,7 +25,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from loam_gtsam import visualization
+from loam_gtsam import frame_plot, visualization
 from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
@@ -34,11 +34,13 @@ from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
 from loam_gtsam.graph_files import write_graph
 from loam_gtsam.pipeline import Observer, OnFrame, Pipeline, RunResult, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
+from loam_gtsam.watching import LastFrame, watch
 
-PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
+PLOT_FILES = ("trajectory.png", "map.png", "frame.png", "timings.png")
+ERROR_PLOT = "errors.png"
 TRUTH_FILE = "truth.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
-RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, *LOOP_FILES, TRUTH_FILE)
+RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE)
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _WORTH_A_PROCESS = 200
 """Sweeps by which a process has saved the second that it takes to start."""
@@ -76,7 +78,8 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     folder = make_folder(free_folder(wanted, options.overwrite))
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
-    with stop_requests() as stop, _observers(options, config) as observe:
+    last = LastFrame()
+    with stop_requests() as stop, _observers(options, config, last) as observe:
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             result = run(
@@ -95,7 +98,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             )
         accuracy, truth = compare(result.trajectory, dataset.truth)
         info = _input_info(dataset)
-        files = _write(result, dataset, info, folder, plot, accuracy, truth)
+        files = _write(result, dataset, info, folder, last if plot else None, accuracy, truth)
     if not options.quiet:
         console = Console()
         if options.profile:
@@ -127,13 +130,12 @@ def _workers(options: RunOptions, sweeps: int) -> int:
 
 
 @contextmanager
-def _observers(options: RunOptions, config: Config) -> Iterator[Observer | None]:
-    """What takes every frame: the bag and the viewer, if they were asked for."""
+def _observers(options: RunOptions, config: Config, last: LastFrame) -> Iterator[Observer]:
+    """What takes every frame: the bag and the viewer, if they were asked for, and ``last``."""
     with ExitStack() as stack:
-        observers: list[Observer] = []
+        observers: list[Observer] = [last.observe]
         if options.view or options.rrd is not None:
             from loam_gtsam.viewer import RerunViewer
-            from loam_gtsam.watching import watch
 
             viewer = RerunViewer(options.rrd, window=options.view, overwrite=options.overwrite)
             observers.append(watch(stack.enter_context(viewer)))
@@ -148,7 +150,7 @@ def _observers(options: RunOptions, config: Config) -> Iterator[Observer | None]
             for observer in observers:
                 observer(sweep, update, pipeline)
 
-        yield observe if observers else None
+        yield observe
 
 
 def free_folder(wanted: Path, overwrite: bool, known: Sequence[str] = RUN_OUTPUTS) -> Path:
@@ -197,13 +199,13 @@ def _write(
     dataset: Dataset,
     info: DatasetInfo,
     folder: Path,
-    plot: bool,
+    drawn: LastFrame | None,
     accuracy: dict[str, Any],
     truth: Trajectory | None,
 ) -> list[str]:
-    """Write all files; names of what was written."""
+    """Write all files, with pictures if there is a frame to draw; names of what was written."""
     # A picture or a truth of the run that is being replaced would not belong to this one.
-    for name in (*PLOT_FILES, *LOOP_FILES, TRUTH_FILE):
+    for name in (*PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE):
         (folder / name).unlink(missing_ok=True)
     extra = {"accuracy": accuracy or None, "input": asdict(info)}
     write_run(result, folder, dataset=f"{info.kind} {info.path}", extra=extra)
@@ -215,15 +217,26 @@ def _write(
         write_tum(folder / LOOP_FILES[0], result.odometry, comments={"frame": "odom"})
         write_graph(folder / LOOP_FILES[1], result.loops.graph.saved())
         files.extend(LOOP_FILES)
-    if plot:
-        trajectory = result.trajectory
-        loops = None if result.loops is None else result.loops.ends()
-        visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
-        visualization.plot_map(
-            folder / "map.png", result.edge_points, result.plane_points, trajectory
-        )
-        visualization.plot_timings(folder / "timings.png", result.updates)
-        files.extend(PLOT_FILES)
+    if drawn is not None:
+        files.extend(_draw(result, dataset, folder, drawn, truth))
+    return files
+
+
+def _draw(
+    result: RunResult, dataset: Dataset, folder: Path, last: LastFrame, truth: Trajectory | None
+) -> list[str]:
+    """Draw all pictures; their names."""
+    files = list(PLOT_FILES)
+    trajectory = result.trajectory
+    loops = None if result.loops is None else result.loops.ends()
+    visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
+    visualization.plot_map(folder / "map.png", result.edge_points, result.plane_points, trajectory)
+    frame_plot.plot_frame(folder / "frame.png", last.frame(), last.around())
+    visualization.plot_timings(folder / "timings.png", result.updates)
+    if truth is not None and dataset.truth is not None:
+        error = absolute_error(trajectory, dataset.truth)
+        visualization.plot_errors(folder / ERROR_PLOT, error.stamps, error.translations)
+        files.append(ERROR_PLOT)
     return files
 
 

@@ -13,7 +13,7 @@ from loam_gtsam.types import BoolArray, FloatArray, MapUpdate
 
 LARGE_RESIDUAL = 3.0
 """Standard deviations that have the last colour: 99.7 % of normal noise is below."""
-_RESIDUAL_COLOURS = ("#2166ac", "#4fb3a9", "#f2cf4a", "#ee8a34", "#c2222f")
+RESIDUAL_COLOURS = ("#2166ac", "#4fb3a9", "#f2cf4a", "#ee8a34", "#c2222f")
 """From a residual of zero to a large one, evenly spaced."""
 
 
@@ -76,7 +76,7 @@ class FrameWatcher(Protocol):
 
 def residual_colours(residuals: NDArray[np.floating]) -> NDArray[np.uint8]:
     """(M, 3) red, green and blue of residuals, in standard deviations, from blue to red."""
-    stops = [[int(name[i : i + 2], 16) for i in (1, 3, 5)] for name in _RESIDUAL_COLOURS]
+    stops = [[int(name[i : i + 2], 16) for i in (1, 3, 5)] for name in RESIDUAL_COLOURS]
     places = np.linspace(0.0, LARGE_RESIDUAL, len(stops))
     columns = [np.interp(np.abs(residuals), places, column) for column in zip(*stops, strict=True)]
     return np.stack(columns, axis=-1).round().astype(np.uint8)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
@@ -28,20 +27,41 @@ def watch(*watchers: FrameWatcher) -> Observer:
     >>> with RerunViewer("run.rrd") as viewer:  # doctest: +SKIP
     ...     run(dataset, config, observe=watch(viewer))
     """
-    path: list[FloatArray] = []
-    number = -1
+    last = LastFrame()
 
     def observe(sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
-        nonlocal number
-        number += 1
-        if update.status is not FrameStatus.BAD_STAMP:
-            path.append(np.asarray(update.map_T_lidar.translation()))
-        frame = frame_view(number, sweep, update, pipeline)
-        around = partial(map_view, update, pipeline, path)
+        last.observe(sweep, update, pipeline)
+        frame = last.frame()
         for watcher in watchers:
-            watcher.show(frame, around)
+            watcher.show(frame, last.around)
 
     return observe
+
+
+class LastFrame:
+    """Remembers the last frame of a run, to be looked at when that is wanted."""
+
+    def __init__(self) -> None:
+        self._number = -1
+        self._path: list[FloatArray] = []
+        self._last: tuple[Sweep, MapUpdate, Pipeline] | None = None
+
+    def observe(self, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+        """An ``observe`` of :func:`loam_gtsam.pipeline.run` that takes no time."""
+        self._number += 1
+        self._last = sweep, update, pipeline
+        if update.status is not FrameStatus.BAD_STAMP:
+            self._path.append(np.asarray(update.map_T_lidar.translation()))
+
+    def frame(self) -> FrameView:
+        """See :func:`frame_view`; there must have been a frame."""
+        assert self._last is not None
+        return frame_view(self._number, *self._last)
+
+    def around(self) -> MapView:
+        """See :func:`map_view`; there must have been a frame."""
+        assert self._last is not None
+        return map_view(*self._last[1:], self._path)
 
 
 def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> FrameView:

@@ -76,7 +76,7 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
     result = loam("demo", "--scene", "room", "--frames", FRAMES, "--profile")
     assert result.exit_code == 0, result.output
     folder = Path("loam_gtsam_output/room_vlp16")
-    plots = set(_cli_run.PLOT_FILES) if PLOTS else set()
+    plots = {*_cli_run.PLOT_FILES, _cli_run.ERROR_PLOT} if PLOTS else set()
     assert files_in(folder) == {*RUN_FILES, "truth.tum"} | plots
     accuracy = json.loads((folder / "summary.json").read_text())["accuracy"]
     assert accuracy["compared_poses"] == FRAMES

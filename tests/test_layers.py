@@ -89,6 +89,7 @@ LEAVES = {
     "export_bag": {"bag_messages"},
     "peers": set(),
     "visualization": {"export"},
+    "frame_plot": {"visualization"},
     "_rrd_file": set(),
     "viewer": {"_rrd_file"},
 }

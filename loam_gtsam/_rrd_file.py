@@ -83,6 +83,8 @@ class RrdFile:
     def wait(self) -> None:
         """Wait until all is in the file. The other side must have closed :attr:`sink`."""
         self._thread.join(_PATIENCE)
+        if self._thread.is_alive():
+            self._problem = TimeoutError("the disk does not keep up")
 
     def _unwritable(self, error: OSError) -> OutputError:
         return OutputError(

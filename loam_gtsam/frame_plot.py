@@ -38,7 +38,7 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
 
-    figure = empty_figure(9.0, 7.0)
+    figure = empty_figure(9.0, 6.0)
     axes = figure.subplots()
     camera = _Camera(frame.map_T_lidar)
     known = camera.near(np.concatenate([around.edges, around.planes]))
@@ -67,7 +67,7 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     bar.set_label("residual [standard deviations]", color=INK)
     bar.ax.tick_params(colors=INK, length=0, labelsize=9)
     bar.outline.set_visible(False)
-    axes.set_aspect("equal")
+    axes.set(xlim=(-_REACH, _REACH), ylim=(-0.62 * _REACH, 0.72 * _REACH), aspect="equal")
     axes.axis("off")
     save_figure(figure, path)
 

@@ -64,6 +64,11 @@ class RerunViewer:
     most_sweep, most_map : points of a sweep, and of the map around it, that are drawn at most; of
         more, so many evenly spread ones
 
+    Attributes
+    ----------
+    path : as given
+    frames : shown so far
+
     Raises
     ------
     OutputError
@@ -92,11 +97,9 @@ class RerunViewer:
             _check_screen()
         self._file = None if self.path is None else RrdFile(self.path, overwrite)
         # One each: a window that is closed must not cost the file anything.
-        self._streams: list[Any] = []
+        self._streams: list[Any] = [self._shown()] if window else []
         if self._file is not None:
             self._streams.append(self._saved(self._file))
-        if window:
-            self._streams.append(self._shown())
         self._log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._log("map/lidar", self._rr.TransformAxes3D(2.0), static=True)
 
@@ -217,9 +220,7 @@ class RerunViewer:
         numbers = {
             "matches/edges": update.n_edge_matches,
             "matches/planes": update.n_plane_matches,
-            "residual/median": float(np.median(frame.residuals))
-            if len(frame.residuals)
-            else np.nan,
+            "residual/median": np.median(frame.residuals) if len(frame.residuals) else np.nan,
             "milliseconds/frame": 1e3 * sum(update.timings.values()),
         }
         sigmas = 1e3 * np.sqrt(np.diag(frame.position_covariance))
@@ -269,13 +270,16 @@ class RerunViewer:
         # The program beside this Python, whose folder need not be on the path.
         here = shutil.which("rerun", path=str(Path(sys.executable).parent))
         stream = self._rr.RecordingStream(_NAME)
-        self._rr.spawn(
-            memory_limit=_MEMORY,
-            hide_welcome_screen=True,
-            executable_path=here,
-            default_blueprint=_blueprint(),
-            recording=stream,
-        )
+        try:
+            self._rr.spawn(
+                memory_limit=_MEMORY,
+                hide_welcome_screen=True,
+                executable_path=here,
+                default_blueprint=_blueprint(),
+                recording=stream,
+            )
+        except RuntimeError as error:
+            raise OutputError(f"the viewer did not start: {error}") from error
         return stream
 
 

@@ -23,7 +23,7 @@ _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 _MAX_BYTES = 300_000
 """Larger pictures are reduced to ``_PALETTE`` colours: they are for READMEs and reports."""
-_PALETTE = 128
+_PALETTE = 255
 _MAP_CELLS = 700
 """Cells along the longer side of the top view; a picture has about as many pixels."""
 _MIN_CELL = 0.1

@@ -67,6 +67,7 @@ def town_loops(path: Path, frames: int) -> None:
     world = SimulatedWorld(build_city(streets()), columns=600, speed=20.0, frames=frames)
     pipeline, graph, closer = Pipeline(config), PoseGraph(config), ScanLoopCloser(config)
     last = odometry = gtsam.Pose3()
+    updates = []
     for sweep in world:
         extraction = extract(sweep, config)
         update = pipeline.process(sweep, extraction)
@@ -74,24 +75,28 @@ def town_loops(path: Path, frames: int) -> None:
         turn = gtsam.Rot3.Yaw(DRIFT * np.linalg.norm(step.translation()))
         odometry = odometry.compose(step).compose(gtsam.Pose3(turn, np.zeros(3)))
         last = update.map_T_lidar
-        keyframe = graph.add(replace(update, map_T_lidar=odometry), extraction.features)
+        updates.append(replace(update, map_T_lidar=odometry))
+        keyframe = graph.add(updates[-1], extraction.features)
         loop = None if keyframe is None else closer.detect(keyframe, graph)
         if loop is not None:
             graph.add_loop(loop)
-    before = np.array([keyframe.odom_T_lidar.matrix() for keyframe in graph.keyframes])
-    after = graph.poses()
-    stamps = np.array([keyframe.stamp for keyframe in graph.keyframes])
-    used = [loop for loop, on in zip(graph.loops, graph.active, strict=True) if on]
+    after = graph.trajectory(updates)
+    drifting = np.array([update.map_T_lidar.matrix() for update in updates])
+    keyframes = np.array([keyframe.odom_T_lidar.matrix() for keyframe in graph.keyframes])
+    ends = [graph.poses()[[loop.earlier, loop.later], :3, 3] for loop in graph.loops]
     panels = {}
-    for name, poses in (("Odometry with a drift", before), (f"After {len(used)} loops", after)):
-        error = absolute_error(Trajectory(stamps, poses), world.truth).rmse
+    for name, trajectory, poses in (
+        ("Odometry with a drift", Trajectory(after.stamps, drifting), keyframes),
+        (f"After {sum(graph.active)} loops", after, graph.poses()),
+    ):
+        error = absolute_error(trajectory, world.truth).rmse
         parts = [
             transform(pose, np.concatenate([keyframe.edges, keyframe.planes]))
             for pose, keyframe in zip(poses, graph.keyframes, strict=True)
         ]
-        panels[f"{name}: {error:.2f} m off"] = np.concatenate(parts), poses[:, :3, 3]
-    ends = [after[[loop.earlier, loop.later], :3, 3] for loop in used]
-    plot_loops(path, panels, np.array(ends).reshape(-1, 2, 3))
+        way = trajectory.map_T_lidar[:, :3, 3]
+        panels[f"{name}: {error:.2f} m off"] = np.concatenate(parts), way
+    plot_loops(path, panels, np.array(ends).reshape(-1, 2, 3)[list(graph.active)])
 
 
 def streets() -> FloatArray:

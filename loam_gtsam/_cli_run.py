@@ -203,7 +203,7 @@ def _write(
     accuracy: dict[str, Any],
     truth: Trajectory | None,
 ) -> list[str]:
-    """Write all files, with pictures if there is a frame to draw; names of what was written."""
+    """Write all files, with pictures if ``drawn`` is given; names of what was written."""
     # A picture or a truth of the run that is being replaced would not belong to this one.
     for name in (*PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE):
         (folder / name).unlink(missing_ok=True)

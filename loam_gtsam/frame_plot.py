@@ -11,8 +11,10 @@ from loam_gtsam.frame_view import LARGE_RESIDUAL, RESIDUAL_COLOURS, FrameView, M
 from loam_gtsam.types import BoolArray, FloatArray
 from loam_gtsam.visualization import INK, PATH, empty_figure, save_figure
 
-_REACH = 27.0
-"""Metres around the sensor that are drawn."""
+_REACH = (6.0, 50.0)
+"""Metres around the sensor that are drawn, at least and at most; between, so far as ..."""
+_SHARE = 0.88
+"""... this share of the sweep is."""
 _ASIDE_DEG, _ABOVE_DEG = 28.0, 33.0
 """From where it is looked at: aside of the sensor's back, and above the ground."""
 _MAP, _SWEEP = "#b9c3cc", "#6b7a88"
@@ -35,12 +37,12 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
+    figure = empty_figure(9.0, 6.0)
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
 
-    figure = empty_figure(9.0, 6.0)
     axes = figure.subplots()
-    camera = _Camera(frame.map_T_lidar)
+    camera = _Camera(frame)
     known = camera.near(np.concatenate([around.edges, around.planes]))
     axes.scatter(*camera(known).T, s=0.7, c=_MAP, lw=0)
     axes.scatter(*camera(camera.near(frame.sweep)).T, s=1.0, c=_SWEEP, lw=0)
@@ -67,7 +69,8 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     bar.set_label("residual [standard deviations]", color=INK)
     bar.ax.tick_params(colors=INK, length=0, labelsize=9)
     bar.outline.set_visible(False)
-    axes.set(xlim=(-_REACH, _REACH), ylim=(-0.62 * _REACH, 0.72 * _REACH), aspect="equal")
+    reach = camera.reach
+    axes.set(xlim=(-reach, reach), ylim=(-0.62 * reach, 0.72 * reach), aspect="equal")
     axes.axis("off")
     save_figure(figure, path)
 
@@ -75,8 +78,11 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
 class _Camera:
     """A parallel projection; the sensor's heading points up and to the right."""
 
-    def __init__(self, map_T_lidar: FloatArray) -> None:
+    def __init__(self, frame: FrameView) -> None:
+        map_T_lidar = frame.map_T_lidar
         self._centre = map_T_lidar[:3, 3]
+        far = self._distances(frame.sweep)
+        self.reach = float(np.clip(np.quantile(far, _SHARE) if len(far) else 0.0, *_REACH))
         heading = np.arctan2(map_T_lidar[1, 0], map_T_lidar[0, 0]) + np.radians(_ASIDE_DEG)
         above = np.radians(_ABOVE_DEG)
         forward = np.array([np.cos(heading), np.sin(heading), 0.0])
@@ -105,9 +111,13 @@ class _Camera:
 
     def is_near(self, points: FloatArray) -> BoolArray:
         """Which of (N, 3) points are to be drawn."""
-        near: BoolArray = np.linalg.norm((points - self._centre)[:, :2], axis=1) < _REACH
-        return near
+        return self._distances(points) < self.reach
 
     def near(self, points: FloatArray) -> FloatArray:
         """Those of (N, 3) points."""
         return points[self.is_near(points)]
+
+    def _distances(self, points: FloatArray) -> FloatArray:
+        """(N,) metres, seen from above."""
+        distances: FloatArray = np.linalg.norm((points - self._centre)[:, :2], axis=1)
+        return distances

@@ -110,19 +110,22 @@ def frame_view(residuals: np.ndarray, **changes) -> FrameView:
     return FrameView(**(values | changes))
 
 
-def test_a_frame_shows_its_matches_by_their_residuals(tmp_path):
+def around() -> MapView:
     nothing = np.zeros((0, 3))
-    around = MapView(nothing, nothing, nothing, np.zeros((0, 2, 3)), np.zeros(0, np.bool_))
+    return MapView(nothing, nothing, nothing, np.zeros((0, 2, 3)), np.zeros(0, np.bool_))
+
+
+def test_a_frame_shows_its_matches_by_their_residuals(tmp_path):
     colours = RESIDUAL_COLOURS[0], RESIDUAL_COLOURS[-1]
     shown = {}
     for name, residuals in (("good", np.zeros(300)), ("bad", np.full(300, 9.0))):
-        plot_frame(tmp_path / f"{name}.png", frame_view(residuals), around)
+        plot_frame(tmp_path / f"{name}.png", frame_view(residuals), around())
         shown[name] = [has_colour(tmp_path / f"{name}.png", colour, 600) for colour in colours]
     assert shown == {"good": [True, False], "bad": [False, True]}
     assert has_colour(tmp_path / "bad.png", visualization.INK, 300)  # the ellipse
     unknown = np.full((3, 3), np.nan)
-    bare = frame_view(np.zeros(0), sweep=nothing, position_covariance=unknown)
-    plot_frame(tmp_path / "bare.png", bare, around)
+    bare = frame_view(np.zeros(0), sweep=np.zeros((0, 3)), position_covariance=unknown)
+    plot_frame(tmp_path / "bare.png", bare, around())
     assert not has_colour(tmp_path / "bare.png", visualization.INK, 300)
 
 
@@ -145,4 +148,6 @@ def test_without_matplotlib_the_error_says_what_to_install(tmp_path, monkeypatch
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(OutputError, match=r'pip install "loam_gtsam\[plot\]"'):
         visualization.plot_trajectory(tmp_path / "t.png", circle())
+    with pytest.raises(OutputError, match=r'pip install "loam_gtsam\[plot\]"'):
+        plot_frame(tmp_path / "f.png", frame_view(np.zeros(0)), around())
     assert list(tmp_path.iterdir()) == []

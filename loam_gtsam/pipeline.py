@@ -7,12 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.ahead import Extraction, extract, extract_ahead
-from loam_gtsam.config import Config, SensorConfig
+from loam_gtsam.config import Config, ImuConfig, SensorConfig
 from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_aid import ImuAid
@@ -35,6 +36,7 @@ OnFrame = Callable[[int, MapUpdate], None]
 """Called after each frame with its number and result."""
 Observer = Callable[[Sweep, MapUpdate, Mapper], None]
 """Called after each frame with the sweep, its result and the mapper, to look and not to change."""
+_Section = TypeVar("_Section", SensorConfig, ImuConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,17 +189,24 @@ class Pipeline:
 
 
 def effective_config(config: Config, dataset: Dataset) -> Config:
-    """The configuration with what the data set's layout says about the sensor.
+    """The configuration with what the data set's layout says about the sensor and its IMU.
 
     A field the user changed from its default wins.
     """
-    default = SensorConfig()
-    implied = {
-        name: value
+    prefix = "imu."
+    imu = {
+        name.removeprefix(prefix): value
         for name, value in dataset.sensor.items()
-        if getattr(config.sensor, name) == getattr(default, name)
+        if name.startswith(prefix)
     }
-    return replace(config, sensor=replace(config.sensor, **implied))
+    sensor = {name: value for name, value in dataset.sensor.items() if not name.startswith(prefix)}
+    return replace(config, sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
+
+
+def _filled(section: _Section, implied: Mapping[str, Any]) -> _Section:
+    default = type(section)()
+    unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}
+    return replace(section, **unset)
 
 
 def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:

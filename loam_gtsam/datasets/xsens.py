@@ -13,6 +13,8 @@ from loam_gtsam.types import FloatArray, ImuSamples, IntArray
 _COLUMNS = "ns qx qy qz qw ex ey ez ax ay az bx by bz cx cy cz"
 _TRIPLES = {"columns 9 to 11": slice(7, 10), "columns 15 to 17": slice(13, 16)}
 _ACCELERATION = slice(10, 13)
+_WINDOW = 0.3
+"""Seconds over which the gyro is compared with the orientation."""
 _CLEARLY = 0.5
 """The gyro's distance from the rates of the orientation is below this share of the other's."""
 
@@ -56,16 +58,25 @@ def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
 
 
 def _gyro_columns(stamps: IntArray, values: FloatArray) -> str | None:
-    """Which three columns are the gyro: those nearest to the rates of the orientation."""
-    seconds = np.diff(stamps) * 1e-9
-    good = np.flatnonzero((seconds > 0.0) & (seconds < 0.1))
-    if len(good) == 0:
+    """Which three columns are the gyro: those whose mean is nearest to how the orientation turns.
+
+    Over a window, for the noise of the orientation counts less the longer it is.
+    """
+    order = np.argsort(stamps, kind="stable")
+    seconds = (stamps[order] - stamps[order[0]]) * 1e-9 if len(order) else np.zeros(0)
+    last = np.searchsorted(seconds, seconds + _WINDOW)
+    first = np.flatnonzero(last < len(seconds))
+    last = last[first]
+    if len(first) == 0:
         return None
+    values = values[order]
     q = values[:, :4].T / np.maximum(np.linalg.norm(values[:, :4], axis=1), 1e-12)
-    turned = quaternion_product(inverse(q[:, good]), q[:, good + 1])
-    rates = (logarithm(turned) / seconds[good]).T
+    turned = quaternion_product(inverse(q[:, first]), q[:, last])
+    rates = (logarithm(turned) / (seconds[last] - seconds[first])).T
+    total = np.vstack([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    means = (total[last] - total[first]) / (last - first)[:, None]
     distance = {
-        name: float(np.median(np.linalg.norm(values[good][:, columns] - rates, axis=1)))
+        name: float(np.median(np.linalg.norm(means[:, columns] - rates, axis=1)))
         for name, columns in _TRIPLES.items()
     }
     nearest, other = sorted(distance, key=distance.__getitem__)

@@ -193,13 +193,14 @@ def effective_config(config: Config, dataset: Dataset) -> Config:
 
     A field the user changed from its default wins.
     """
+    return with_implied(config, dataset.sensor)
+
+
+def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
+    """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset."""
     prefix = "imu."
-    imu = {
-        name.removeprefix(prefix): value
-        for name, value in dataset.sensor.items()
-        if name.startswith(prefix)
-    }
-    sensor = {name: value for name, value in dataset.sensor.items() if not name.startswith(prefix)}
+    imu = {k.removeprefix(prefix): v for k, v in implied.items() if k.startswith(prefix)}
+    sensor = {k: v for k, v in implied.items() if not k.startswith(prefix)}
     return replace(config, sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
 
 

@@ -40,7 +40,7 @@ LAYERS = (
     ("mapper", "ahead"),
     ("loop_mapping",),
     ("pipeline", "estimators", "graph_files"),
-    ("comparison", "recording"),
+    ("comparison", "recording", "evalio_pipeline"),
     (
         "_cli_report",
         "_report_html",

@@ -170,7 +170,7 @@ class KittiDataset:
         if self._has_times:
             return sensor
         if self._camera_T_lidar is not None:
-            sensor = {"times": "none"}
+            sensor = dict(KITTI_SENSOR) | {"times": "none"}
             self._problems.append(
                 "a sequence of KITTI's odometry benchmark: its sweeps are already freed of the "
                 "motion, so they are not de-skewed (sensor.times=azimuth would)"

@@ -20,19 +20,12 @@ from loam_gtsam.datasets.kitti_poses import (
     oxts_truth,
     read_oxts,
 )
-from loam_gtsam.datasets.point_times import (
-    SWEEP_SECONDS,
-    TimeDecision,
-    apply_times,
-    decide_times,
-)
+from loam_gtsam.datasets.kitti_times import sweep_stamps, turn_seconds
+from loam_gtsam.datasets.point_times import TimeDecision, apply_times, decide_times
 from loam_gtsam.datasets.tables import (
-    DEFAULT_PERIOD_NS,
     clean_imu,
     describe_imu,
     describe_stamps,
-    read_dates,
-    read_stamps,
     read_table,
     read_tum,
 )
@@ -40,7 +33,6 @@ from loam_gtsam.types import (
     BadSweep,
     DatasetError,
     ImuSamples,
-    IntArray,
     Scan,
     Trajectory,
 )
@@ -101,7 +93,7 @@ class KittiDataset:
         self._times_folder = self._root / "t_ns"
         self._has_times = self._times_folder.is_dir()
         self._problems: list[str] = []
-        self.stamps = self._read_stamps()
+        self.stamps = sweep_stamps(self._root, self._files, self._problems)
         self._camera_T_lidar = camera_T_lidar_of(self._root)
         self._oxts = read_oxts(self._root)
         self._lidar_T_imu = None if self._oxts is None else lidar_T_imu_of(self._root)
@@ -168,49 +160,19 @@ class KittiDataset:
     def _implied(self, folder: Path) -> Mapping[str, Any]:
         sensor: dict[str, Any] = {}
         if self._has_times:
-            return sensor
-        if self._camera_T_lidar is not None:
+            pass  # they say it all
+        elif self._camera_T_lidar is not None:
             sensor = dict(KITTI_SENSOR) | {"times": "none"}
             self._problems.append(
                 "a sequence of KITTI's odometry benchmark: its sweeps are already freed of the "
                 "motion, so they are not de-skewed (sensor.times=azimuth would)"
             )
         elif folder.name == "velodyne" or folder.parent.name == "velodyne_points":
-            sensor = dict(KITTI_SENSOR)
-        period = self._turn_seconds()
-        if period is not None:
-            sensor["period"] = period
+            period = turn_seconds(self._root, self._files, self.stamps, self._problems)
+            sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
         if self._lidar_T_imu is not None and not (self._root / "imu.csv").is_file():
             sensor.update(implied_by(self._lidar_T_imu))
         return sensor
-
-    def _of_sweeps(self, stamps: IntArray) -> IntArray:
-        """Of the stamps of a drive those of its files: some drives lack a few sweeps."""
-        numbers = [int(file.stem) if file.stem.isdecimal() else -1 for file in self._files]
-        if len(stamps) > len(numbers) and min(numbers) >= 0 and max(numbers) < len(stamps):
-            return stamps[numbers]
-        return stamps
-
-    def _turn_seconds(self) -> float | None:
-        """Median duration of a sweep, where KITTI's raw data tells it."""
-        paths = [
-            self._root / "velodyne_points" / f"timestamps_{end}.txt" for end in ("start", "end")
-        ]
-        if not all(path.is_file() for path in paths):
-            return None
-        first, last = (self._of_sweeps(read_dates(path)) for path in paths)
-        if not len(first) == len(last) == len(self._files):
-            raise DatasetError(
-                f"{paths[0]}, {paths[1].name}: {len(first)} and {len(last)} stamps for "
-                f"{len(self._files)} sweeps"
-            )
-        seconds = float(np.median(last - first)) * 1e-9
-        if not SWEEP_SECONDS[0] <= seconds <= SWEEP_SECONDS[1]:
-            raise DatasetError(f"{paths[1]}: sweeps of {seconds:g} s (median), expected about 0.1")
-        outside = int(np.count_nonzero((self.stamps < first) | (self.stamps > last)))
-        if outside:
-            self._problems.append(f"{outside} stamps lie outside their sweep's start and end")
-        return round(seconds, 6)
 
     def _read(self, file: Path, stamp: int) -> Scan:
         points = _read_points(file)
@@ -244,27 +206,6 @@ class KittiDataset:
             except DatasetError as error:
                 message = message or str(error)
         raise DatasetError(f"{self._times_folder}: no usable point times; {message}")
-
-    def _read_stamps(self) -> IntArray:
-        path = self._root / "times.txt"
-        kitti_path = self._root / "velodyne_points" / "timestamps.txt"
-        if path.is_file():
-            stamps = read_stamps(path)
-        elif kitti_path.is_file():
-            path = kitti_path
-            listed = read_dates(path)
-            stamps = self._of_sweeps(listed)
-            if missing := len(listed) - len(stamps):
-                self._problems.append(f"{missing} sweeps of {path.name} have no file")
-        else:
-            self._problems.append("no times.txt: 10 Hz assumed")
-            return np.arange(len(self._files), dtype=np.int64) * DEFAULT_PERIOD_NS
-        if len(stamps) != len(self._files):
-            raise DatasetError(
-                f"{path}: {len(stamps)} stamps for {len(self._files)} sweeps; expected one line "
-                "for each .bin file"
-            )
-        return stamps
 
 
 def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.floating]:

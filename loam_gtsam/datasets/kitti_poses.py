@@ -14,8 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.extrinsics import at_lidar, invert
+from loam_gtsam.datasets.kitti_times import read_dates
 from loam_gtsam.datasets.layouts import first_existing
-from loam_gtsam.datasets.tables import clean_imu, describe_rate, in_order, read_dates, read_lines
+from loam_gtsam.datasets.tables import clean_imu, describe_rate, in_order, read_lines
 from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
 _EARTH_RADIUS = 6378137.0

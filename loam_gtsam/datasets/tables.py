@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
@@ -51,21 +50,6 @@ def read_stamps(path: Path) -> IntArray:
         except ValueError as error:
             raise DatasetError(
                 f"{path}:{number}: expected a time in seconds, got {line.strip()!r}"
-            ) from error
-    return np.array(stamps, dtype=np.int64)
-
-
-def read_dates(path: Path) -> IntArray:
-    """KITTI raw: ``2011-09-26 13:02:25.594360375`` per line, as nanoseconds since 1970 UTC."""
-    stamps = []
-    for number, line in enumerate(read_lines(path), start=1):
-        date, _, fraction = line.strip().partition(".")
-        try:
-            moment = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            stamps.append(int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9]))
-        except ValueError as error:
-            raise DatasetError(
-                f"{path}:{number}: expected a date and time, got {line.strip()!r}"
             ) from error
     return np.array(stamps, dtype=np.int64)
 

@@ -22,10 +22,10 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from loam_gtsam.ahead import extract
 from loam_gtsam.config import Config, config_from_dict, config_to_dict
+from loam_gtsam.datasets.extrinsics import implied_by
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.pipeline import Pipeline, with_implied
 from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, InputError, Scan
@@ -132,16 +132,12 @@ class LoamGtsam(EvalioPipeline):
     def set_imu_T_lidar(self, T: SE3) -> None:
         """Extrinsics."""
         self._lidar_T_imu = gtsam.Pose3(T.to_mat()).inverse()
-        rotation = Rotation.from_matrix(self._lidar_T_imu.rotation().matrix())
-        self._implied |= {
-            "imu.lidar_R_imu_deg": tuple(rotation.as_euler("xyz", degrees=True).tolist()),
-            "imu.lidar_t_imu": tuple(self._lidar_T_imu.translation().tolist()),
-        }
+        self._implied |= implied_by(self._lidar_T_imu.matrix())
 
     def set_visualizing(self, visualize: Set[Any] | None) -> None:
         """Only then are features handed out."""
         super().set_visualizing(visualize)
-        self._shows = visualize is not None
+        self._shows = bool(visualize)
 
     def initialize(self) -> None:
         """Build the pipeline from what was set."""

@@ -96,6 +96,7 @@ LEAF_USERS = {
     "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
+    "evalio_pipeline": {"datasets.extrinsics"},
     "graph_files": {"export"},
 }
 

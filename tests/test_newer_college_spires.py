@@ -274,6 +274,11 @@ def test_oxford_spires_as_bags_in_either_layout(tmp_path: Path, kind: str) -> No
         assert (dataset.topic, dataset.imu_topic) == topics
         expect_truth(dataset)
         assert "absolute" in dataset.info().facts["point times"]
+    if kind != "ros1":  # one bag whose own folder holds the reference poses
+        alone = write_bag(tmp_path / "alone", kind, entries)
+        assert type(open_dataset(alone)) is BagDataset
+        write_truth(alone / "gt-tum.txt", BASE_T_QT64, tum=True)
+        expect_truth(open_dataset(alone))
 
 
 @pytest.mark.parametrize(

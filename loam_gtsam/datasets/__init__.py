@@ -74,8 +74,8 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
         College, MulRan, HeLiPR or Oxford Spires, or the name of a built-in world
         (``sim:room?frames=50&seed=3``)
     options : for the loader, e.g. ``topic``, ``imu_topic``, ``time_field``, ``time_unit``,
-        ``stamp_is`` (bags), ``axes`` (LOAM's topics), ``vertical_angle_offset_deg`` (KITTI).
-        Those that are None count as not given.
+        ``stamp_is`` (bags), ``axes`` (LOAM's topics), ``vertical_angle_offset_deg`` (KITTI),
+        ``sequence`` (Newer College), ``lidar`` (HeLiPR). Those that are None count as not given.
 
     Notes
     -----

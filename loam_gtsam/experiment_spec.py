@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -66,7 +67,7 @@ def load_spec(path: str | Path) -> Spec:
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     name = str(path)
     entries = _mapping(name, data, _SPEC)
-    folder = path.resolve().parent
+    folder = path.parent
     frames = _count(f"{name}: frames", entries.get("frames"))
     sequences = {
         key: _sequence(f"{name}: sequences.{key}", value, folder, frames)
@@ -102,8 +103,9 @@ def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequ
     if not isinstance(path, str) or not path:
         raise ConfigError(f"{where}: expected a path, or a mapping with the key 'path'")
     if not _is_world(path):
-        # Absolute, for the same relative path under another folder is other data.
-        path = str((folder / Path(path).expanduser()).resolve())
+        # Absolute, for the same relative path under another folder is other data. Links stay, for
+        # a worker on another machine may have them lead elsewhere.
+        path = os.path.abspath(folder / Path(path).expanduser())
     return _Sequence(
         path=path,
         options=_mapping(f"{where}.options", entries.get("options", {})),

@@ -13,6 +13,7 @@ from concurrent.futures import CancelledError
 from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
+from uuid import uuid4
 
 import dask
 from distributed import Client, Future, LocalCluster, WorkerPlugin, wait
@@ -25,8 +26,6 @@ from loam_gtsam.types import LoamError, MapUpdate
 _POLL = 0.2
 """Seconds between two looks at whether the sweep is to stop."""
 _CONNECT_SECONDS = 10
-_NO_WORKERS = 1
-"""Trials handed over while a cluster has no workers (yet)."""
 
 Stopped = Callable[[], bool]
 """Whether the user has asked to stop."""
@@ -51,6 +50,8 @@ def run_here(trials: Sequence[Trial], stopped: Stopped) -> Iterator[Row]:
             raise KeyboardInterrupt
 
     for trial in trials:
+        if stopped():
+            raise KeyboardInterrupt
         row: Row = dask.delayed(partial(run_trial, trial, on_frame))().compute(scheduler="sync")
         yield row
 
@@ -81,10 +82,12 @@ def run_on(
         while waiting or running:
             if stopped():
                 raise KeyboardInterrupt
-            slots = sum(client.nthreads().values()) or _NO_WORKERS
+            slots = max(1, sum(client.nthreads().values()))  # one waits for the first worker
             while waiting and len(running) < slots:
                 trial = waiting.popleft()
-                running[client.submit(task, trial, pure=False)] = trial
+                # Not the id alone: a scheduler that still holds an old result would hand it out.
+                key = f"trial-{trial.id}-{uuid4()}"
+                running[client.submit(task, trial, key=key, pure=False)] = trial
             with suppress(TimeoutError), client.as_current():
                 wait(list(running), timeout=_POLL, return_when="FIRST_COMPLETED")
             for future in [future for future in running if future.done()]:

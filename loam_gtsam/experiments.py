@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import socket
 import time
 import traceback
@@ -19,7 +20,6 @@ from itertools import islice
 from typing import Any
 
 import gtsam
-import numpy as np
 
 from loam_gtsam import datasets
 from loam_gtsam.comparison import score
@@ -217,9 +217,9 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
         "frames": len(finished.updates),
         **{f"frames_{status}": counts[status] for status in FrameStatus},
         **{name: getattr(scores, name) for name in METRICS if name != "drift_percent"},
-        "drift_percent": np.nan,
+        "drift_percent": math.nan,
         "path_m": scores.path_m,
-        "rpe_shortest_m": min(scores.lengths, default=np.nan),
+        "rpe_shortest_m": min(scores.lengths, default=math.nan),
         "map_points": scores.map_points,
         "problem": scores.problem or (None if truth is not None else "no truth"),
         "peer_version": None if finished.config is not None else finished.version,
@@ -228,7 +228,10 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
         _, metres, _ = pose_differences(finished.trajectory, truth)
         row["drift_percent"] = 100.0 * float(metres[-1]) / scores.path_m
     # NaN is no value, and would not equal itself when two tables are compared.
-    return {key: None if value != value else value for key, value in row.items()}
+    return {
+        key: None if isinstance(value, float) and not math.isfinite(value) else value
+        for key, value in row.items()
+    }
 
 
 def _unusable(name: str, finished: SolverRun) -> str | None:

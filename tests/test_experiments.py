@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import re
 import signal
 import subprocess
@@ -84,7 +85,9 @@ def _in_an_empty_folder(tmp_path, monkeypatch):
 
 
 def test_trials_are_sequences_times_configs_times_seeds_in_this_order(tmp_path):
-    (tmp_path / "mine.yaml").write_text("preset: aloam\nsolver: {iterations: 7}\n")
+    (tmp_path / "mine.yaml").write_text(
+        "preset: aloam\nsolver: {iterations: 7}\nmap: {cube_size: 2.5e1}\n"
+    )
     spec = load_spec(
         write_spec(
             tmp_path,
@@ -113,9 +116,11 @@ def test_trials_are_sequences_times_configs_times_seeds_in_this_order(tmp_path):
     assert spec.metrics == ("rpe_percent", "ms_median")
     config = spec.trials[0].config
     assert (config.solver.method, config.solver.iterations) == ("aloam", 7)
-    assert config.map.window == (11, 11, 5)
+    assert (config.map.window, config.map.cube_size) == ((11, 11, 5), 25.0)
+    sent = pickle.loads(pickle.dumps(spec.trials[0]))  # as Dask sends it to a worker
+    assert (sent, sent.id) == (spec.trials[0], spec.trials[0].id)
     drive = spec.trials[-1]
-    assert drive.path == str(tmp_path.resolve() / "data/drive")
+    assert drive.path == str(tmp_path / "data/drive")
     assert drive.dataset_options == {"topic": "/points"}
     assert spec.trials[0].dataset_options == {"seed": 3}
 
@@ -475,9 +480,15 @@ def test_a_signal_keeps_what_is_finished_and_the_next_call_goes_on(tmp_path, mon
     assert len(read_table(Path("out") / TABLE_FILE)[0]) == 4
 
 
+def test_a_stop_between_two_trials_starts_no_other(quick):
+    with pytest.raises(KeyboardInterrupt):
+        list(experiment_workers.run_here([trial_of()], lambda: True))
+    assert quick == []
+
+
 def test_the_page_explains_every_column_and_its_example_can_be_read(tmp_path):
     text = PAGE.read_text("utf-8")
-    assert [name for name in COLUMNS if f"`{name}`" not in re.sub("<[^>]*>", "", text)] == []
+    assert [name for name in COLUMNS if f"`{name}`" not in text] == []
     spec = re.search(r"^```yaml\n(.*?)^```", text, re.M | re.S)
     (tmp_path / "robot.yaml").write_text("preset: loam\n")
     trials = load_spec(write_spec(tmp_path, spec[1])).trials

@@ -9,6 +9,7 @@ A title after the path narrows it down to the first line there that has those wo
 from __future__ import annotations
 
 import ast
+import html
 import logging
 import posixpath
 import re
@@ -18,7 +19,12 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {"README.md": "overview.md", "CHANGELOG.md": "changelog.md"}
 """Pages of the repository that stand in the navigation."""
-LINK = re.compile(r'(\[(?:`(?P<name>[\w.]+)`)?[^\]]*\]\()(?P<path>[^)\s#]+)(?P<rest>[^)]*\))')
+LINK = re.compile(r"(?P<text>\[[^\]]*\]\()(?P<path>[^)\s#]+)(?P<rest>[^)]*\))")
+SYMBOL = re.compile(
+    r'<a href="[./]*/source/(?P<path>[^"#]+\.py)/"(?: title="(?P<words>[^"]*)")?>'
+    r"<code>(?P<name>\w+(?:\.(?!py<)\w+)+)</code></a>"
+)
+NOTEBOOK_LINK = re.compile(r'href="([\w./]+\.(?:md|ipynb))')
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.M | re.S)
 _LANGUAGES = {".py": "python", ".yml": "yaml", ".cff": "yaml", ".toml": "toml"}
 
@@ -111,28 +117,41 @@ def on_files(files: Any, *, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:
-    """Point the links of a page at the site."""
+    """Point the links that leave docs/ at the pages of the files."""
     uri = page.file.src_uri
     if uri.startswith("source/"):
         return markdown
     path = next((file for file, own in PAGES.items() if own == uri), f"docs/{uri}")
 
     def moved(match: re.Match[str]) -> str:
-        if not _local(match["path"]):
-            return match[0]
         target = _joined(path, match["path"])
-        if path.startswith("docs/") and target.startswith("docs/"):
+        if not _local(match["path"]) or (path.startswith("docs/") and target.startswith("docs/")):
             return match[0]
         link = posixpath.relpath(page_of(target), posixpath.dirname(uri) or ".")
-        rest = match["rest"]
-        if match["name"] and target.endswith(".py") and not target.endswith(match["name"]):
-            words = (re.findall(r'"([^"]*)"', rest) or [""])[0]
-            try:
-                line = line_of((ROOT / target).read_text("utf-8"), match["name"], words)
-            except (LookupError, OSError) as error:
-                log.warning("%s: link to %s: %s", path, target, error)
-            else:
-                rest = f"#__codelineno-0-{line}{rest}"
-        return f"{match[1]}{link}{rest}"
+        return f"{match['text']}{link}{match['rest']}"
 
     return LINK.sub(moved, markdown)
+
+
+def on_page_content(content: str, *, page: Any, config: Any, files: Any) -> str:
+    """Add the lines, and point the links of notebooks at pages, which MkDocs does not do."""
+    uri = page.file.src_uri
+
+    def with_line(match: re.Match[str]) -> str:
+        path, words = match["path"], html.unescape(match["words"] or "")
+        try:
+            line = line_of((ROOT / path).read_text("utf-8"), match["name"], words)
+        except LookupError as error:
+            log.warning("%s: link to %s: %s", uri, path, error)
+            return match[0]
+        return match[0].replace(f'{path}/"', f'{path}/#__codelineno-0-{line}"')
+
+    def of_notebook(match: re.Match[str]) -> str:
+        file = files.get_file_from_path(_joined(uri, match[1]))
+        if file is None:
+            log.warning("%s: no page %s", uri, match[1])
+            return match[0]
+        return f'href="{file.url_relative_to(page.file)}'
+
+    content = SYMBOL.sub(with_line, content)
+    return NOTEBOOK_LINK.sub(of_notebook, content) if uri.endswith(".ipynb") else content

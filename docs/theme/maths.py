@@ -14,7 +14,10 @@ _FUNCTION = "<mi>(?:sin|cos|tan|log|min|max)</mi>"
 # The converter leaves the spaces around these to the browser, which takes bars and slashes for
 # relations, a sign after an equals sign for a difference, and names of functions for variables.
 _SPACES = (
-    (re.compile(r"<mo([^>]*)>(&#x0007C;|\||&#x0002F;)</mo>"), r'<mo lspace="0" rspace="0"\1>\2</mo>'),
+    (
+        re.compile(r"<mo([^>]*)>(&#x0007C;|\||&#x0002F;)</mo>"),
+        r'<mo lspace="0" rspace="0"\1>\2</mo>',
+    ),
     (re.compile("(<mo>&#x0003D;</mo>)<mo>&#x02212;</mo>"), r'\1<mo form="prefix">&#x02212;</mo>'),
     (re.compile(f"(?<=</mi>|</mo>)({_FUNCTION})"), r'<mspace width="0.17em"/>\1'),
     (re.compile(f"({_FUNCTION})(?=<m[in]>)"), r'\1<mspace width="0.17em"/>'),

@@ -78,6 +78,15 @@ def test_every_public_name_has_an_anchor(site: Path) -> None:
     assert [n for n in loam_gtsam.__all__ if f'id="loam_gtsam.{n}"' not in pages] == []
 
 
+def test_docstrings_are_read_as_they_are_meant(site: Path) -> None:
+    page = (site / "api/types/index.html").read_text("utf-8")
+    row = page[page.index(">plane_times</span></code></td>") :].partition("</tr>")[0]
+    assert "FloatArray" in row  # the annotation is the type
+    assert "seconds from" in row  # and what stands behind the colon says what it is
+    for path in (site / "api").rglob("*.html"):
+        assert re.search(r":(func|class|meth|attr|mod):|``", path.read_text("utf-8")) is None, path
+
+
 def test_formulas_are_drawn_without_scripts(site: Path) -> None:
     for source in sorted((ROOT / "docs/maths").glob("*.md")):
         page = (site / "maths" / source.stem / "index.html").read_text("utf-8")

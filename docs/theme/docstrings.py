@@ -14,7 +14,7 @@ import griffe
 import loam_gtsam
 
 _HEADING = re.compile(r"^(\w[\w ]*)\n-{3,}$", re.M)
-_ITEM = re.compile(r"^(\*{0,2}\w+(?:, \*{0,2}\w+)*) : (.*)$", re.M)
+_ITEM = re.compile(r"^(?P<names>\*{0,2}\w+(?:, \*{0,2}\w+)*) : (?P<text>.*(?:\n    .*)*)", re.M)
 _ROLE = re.compile(r":(?:func|class|meth|mod|data|attr|exc):`~?([\w.]+)`")
 
 
@@ -33,11 +33,16 @@ def rewritten(text: str) -> str:
     start, *sections = _HEADING.split(text)
     for heading, body in zip(sections[::2], sections[1::2], strict=True):
         if heading in ("Parameters", "Attributes"):
-            body = _ITEM.sub(r"\1\n    \2", body)
+            body = _ITEM.sub(_items, body)
         elif heading == "Returns" and not re.search(r"^    ", body, re.M):
             body = "\n:\n" + re.sub(r"^(?=\S)", "    ", body.lstrip("\n"), flags=re.M)
         start += f"{heading}\n{'-' * len(heading)}{body}"
     return start
+
+
+def _items(match: re.Match[str]) -> str:
+    """What is said of several names, for each of them."""
+    return "\n".join(f"{name}\n    {match['text']}" for name in match["names"].split(", "))
 
 
 def _reference(target: str) -> str:

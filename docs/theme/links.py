@@ -19,13 +19,15 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = {"README.md": "overview.md", "CHANGELOG.md": "changelog.md"}
 """Pages of the repository that stand in the navigation."""
+WIDE = ("from_loam.md", "maths/deviations.md", "parameters.md")
+"""Pages of wide tables, which get the room of the table of contents."""
 LINK = re.compile(r"(?P<text>\[[^\]]*\]\()(?P<path>[^)\s#]+)(?P<rest>[^)]*\))")
 SYMBOL = re.compile(
     r'<a href="[./]*/source/(?P<path>[^"#]+\.py)/"(?: title="(?P<words>[^"]*)")?>'
     r"<code>(?P<name>\w+(?:\.(?!py<)\w+)+)</code></a>"
 )
 NOTEBOOK_LINK = re.compile(r'href="([\w./]+\.(?:md|ipynb))')
-CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.M | re.S)
+BLOCK = re.compile(r"(^```.*?^```)", re.M | re.S)
 _LANGUAGES = {".py": "python", ".yml": "yaml", ".cff": "yaml", ".toml": "toml"}
 
 log = logging.getLogger("mkdocs.hooks.links")
@@ -83,7 +85,7 @@ def page_of(path: str) -> str:
 
 def _targets(path: str) -> set[str]:
     """Files of the repository, outside docs/, that a page links to."""
-    text = CODE.sub("", (ROOT / path).read_text("utf-8"))
+    text = BLOCK.sub("", (ROOT / path).read_text("utf-8"))
     found = {_joined(path, match["path"]) for match in LINK.finditer(text) if _local(match["path"])}
     return {target for target in found if not target.startswith("docs/")}
 
@@ -110,7 +112,7 @@ def on_files(files: Any, *, config: Any) -> Any:
             language = _LANGUAGES.get(Path(path).suffix, "text")
             text = (
                 f"---\ntitle: {path}\nsearch:\n  exclude: true\n---\n"
-                f"# {path}\n\n````{{.{language} linenums=1}}\n{text}````\n"
+                f"# {path}\n\n````{{.{language} linenums=1}}\n{text.rstrip()}\n````\n"
             )
         files.append(File.generated(config, page_of(path), content=text))
     return files
@@ -119,6 +121,8 @@ def on_files(files: Any, *, config: Any) -> Any:
 def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> str:
     """Point the links that leave docs/ at the pages of the files."""
     uri = page.file.src_uri
+    if uri in WIDE:
+        page.meta["hide"] = ["toc"]
     if uri.startswith("source/"):
         return markdown
     path = next((file for file, own in PAGES.items() if own == uri), f"docs/{uri}")
@@ -130,7 +134,9 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> st
         link = posixpath.relpath(page_of(target), posixpath.dirname(uri) or ".")
         return f"{match['text']}{link}{match['rest']}"
 
-    return LINK.sub(moved, markdown)
+    parts = BLOCK.split(markdown)
+    parts[::2] = [LINK.sub(moved, part) for part in parts[::2]]
+    return "".join(parts)
 
 
 def on_page_content(content: str, *, page: Any, config: Any, files: Any) -> str:

@@ -197,6 +197,22 @@ def run(
             "than 200 sweeps. The result is the same.",
         ),
     ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on from the last checkpoint in the output folder, if a run of the same data "
+            "and configuration was stopped or killed; the result is the same.",
+        ),
+    ] = False,
+    checkpoint: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="Time from one checkpoint to the next; 0 writes none.",
+        ),
+    ] = 60.0,
     overwrite: Overwrite = False,
     plot: Plot = None,
     profile: Profile = False,
@@ -206,16 +222,23 @@ def run(
     """Map a data set and write trajectory, map, report and pictures.
 
     Ctrl-C stops after the current sweep and writes what was computed; a second one stops at once.
+    Either way, --resume goes on.
     """
     from loam_gtsam._cli_run import RunOptions, execute
 
     settings = _settings(preset, config, sensor, overrides)
     if loops:
         settings = replace(settings, loops=replace(settings.loops, enabled=True))
+    if resume and bag is not None:
+        raise typer.BadParameter("--resume: the frames before would not be in --bag; give one only")
+    if resume and overwrite:
+        raise typer.BadParameter("--resume and --overwrite contradict each other; give one only")
     if bag is not None and bag.resolve() in (Path(path).resolve(), *Path(path).resolve().parents):
         raise OutputError(f"--bag {bag}: the input must not be replaced; choose another name")
     dataset = _open(path, topic, imu_topic, loader_options)
-    options = RunOptions(frames, output, overwrite, plot, profile, quiet, bag, workers)
+    options = RunOptions(
+        frames, output, overwrite, plot, profile, quiet, bag, workers, resume, checkpoint
+    )
     raise typer.Exit(execute(dataset, settings, options))
 
 

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1] / "loam_gtsam"
 THIS = "tests/test_layers.py"
 
 LAYERS = (
-    ("types", "config", "geometry", "rotations"),
+    ("freezing", "types", "config", "geometry", "rotations"),
     (
         "rings",
         "place",
@@ -38,7 +38,7 @@ LAYERS = (
         "loop_closure",
     ),
     ("mapper", "ahead"),
-    ("loop_mapping",),
+    ("loop_mapping", "checkpoint"),
     ("pipeline", "estimators", "graph_files"),
     ("comparison", "recording"),
     (
@@ -54,6 +54,7 @@ LAYERS = (
 """From the bottom up; a module imports from lower layers, or as SAME_LAYER says."""
 
 SAME_LAYER = {
+    "types": {"freezing"},
     "config": {"types"},
     "geometry": {"types"},
     "rotations": {"types"},
@@ -97,6 +98,7 @@ LEAF_USERS = {
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
     "graph_files": {"export"},
+    "checkpoint": {"export"},
 }
 
 PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -138,6 +139,10 @@ class Mapper:
         self.extra_factors = extra_factors
         self.keyframe = 0
         self.reset()
+
+    def __getstate__(self) -> dict[str, Any]:
+        # For checkpoints: no frame depends on what is only there to be looked at.
+        return vars(self) | {"registered": None}
 
     def reset(self) -> None:
         """Forget the map: the next sweep is the first of a new one."""

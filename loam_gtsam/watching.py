@@ -53,6 +53,11 @@ class LastFrame:
         if update.status is not FrameStatus.BAD_STAMP:
             self._path.append(np.asarray(update.map_T_lidar.translation()))
 
+    @property
+    def seen(self) -> bool:
+        """Whether there was a frame; a run that was resumed may have none left to compute."""
+        return self._last is not None
+
     def frame(self) -> FrameView:
         """See :func:`frame_view`; there must have been a frame."""
         assert self._last is not None

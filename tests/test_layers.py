@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1] / "loam_gtsam"
 THIS = "tests/test_layers.py"
 
 LAYERS = (
-    ("types", "config", "geometry", "rotations", "frame_view"),
+    ("freezing", "types", "config", "geometry", "rotations", "frame_view"),
     (
         "rings",
         "place",
@@ -38,9 +38,10 @@ LAYERS = (
         "loop_closure",
     ),
     ("mapper", "ahead"),
-    ("loop_mapping",),
+    ("loop_mapping", "checkpoint"),
     ("pipeline", "estimators", "graph_files"),
-    ("comparison", "recording", "watching"),
+    ("comparison", "recording", "watching", "evalio_pipeline"),
+    ("experiments", "experiment_spec", "experiment_table", "experiment_workers"),
     (
         "_cli_report",
         "_report_html",
@@ -48,12 +49,14 @@ LAYERS = (
         "_cli_run",
         "_cli_compare",
         "_cli_optimize",
+        "_cli_sweep",
         "cli",
     ),
 )
 """From the bottom up; a module imports from lower layers, or as SAME_LAYER says."""
 
 SAME_LAYER = {
+    "types": {"freezing"},
     "config": {"types"},
     "geometry": {"types"},
     "rotations": {"types"},
@@ -75,10 +78,14 @@ SAME_LAYER = {
     "pose_graph": {"keyframes", "loop_consistency"},
     "loop_closure": {"keyframes", "pose_graph", "relocalization", "scan_error"},
     "watching": {"recording"},
+    "experiment_spec": {"experiments"},
+    "experiment_table": {"experiments", "experiment_spec"},
+    "experiment_workers": {"experiments"},
     "_cli_run": {"_cli_report"},
     "_compare_files": {"_report_html"},
     "_cli_compare": {"_cli_report", "_cli_run", "_compare_files"},
-    "cli": {"_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"},
+    "_cli_sweep": {"_cli_run"},
+    "cli": {"_cli_run", "_cli_report", "_cli_compare", "_cli_optimize", "_cli_sweep"},
 }
 
 LEAVES = {
@@ -102,10 +109,14 @@ LEAF_USERS = {
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
     "watching": {"datasets.base"},
+    "evalio_pipeline": {"datasets.extrinsics"},
+    "experiments": {"datasets", "datasets.base", "evaluation", "peers"},
+    "experiment_table": {"export"},
     "graph_files": {"export"},
+    "checkpoint": {"export"},
 }
 
-PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"}
+PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare", "_cli_optimize", "_cli_sweep"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

@@ -17,7 +17,7 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.keyframes import LoopClosure
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.types import BadSweep, FrameStatus
-from loam_gtsam.watching import watch
+from loam_gtsam.watching import LastFrame, watch
 
 FRAMES = 6
 
@@ -169,6 +169,17 @@ def test_with_loops_all_is_where_they_put_it(sweeps):
     for name in ("sweep", "planes"):
         here, there = getattr(frame, name), getattr(plain.frames[-1], name)
         np.testing.assert_allclose(transform(back, here), transform(before, there), atol=0.02)
+
+
+def test_of_a_run_only_the_last_frame_is_remembered(sweeps):
+    last, kept = LastFrame(), Kept()
+    assert not last.seen
+    run(ListDataset(sweeps), observe=last.observe)
+    run(ListDataset(sweeps), observe=watch(kept))
+    assert last.seen
+    assert last.frame().number == FRAMES - 1
+    np.testing.assert_array_equal(last.frame().feet, kept.frames[-1].feet)
+    np.testing.assert_array_equal(last.around().path, kept.maps[-1].path)
 
 
 def test_residuals_go_from_blue_to_red_and_large_ones_are_alike():

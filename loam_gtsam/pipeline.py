@@ -185,6 +185,31 @@ class Pipeline:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
         return (self.mapper if self.loops is None else self.loops).map_points()
 
+    def result(
+        self,
+        updates: Sequence[MapUpdate],
+        *,
+        interrupted: bool = False,
+        error: Exception | None = None,
+    ) -> RunResult:
+        """A whole run, from what :meth:`process` said about each of its sweeps."""
+        mapper = self.mapper
+        edges, planes = self.map_points()
+        return RunResult(
+            config=self.config,
+            updates=tuple(updates),
+            edge_points=edges,
+            plane_points=planes,
+            map_stats={
+                name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
+                for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
+            },
+            interrupted=interrupted,
+            error=error,
+            imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+            loops=self.loops,
+        )
+
 
 def effective_config(config: Config, dataset: Dataset) -> Config:
     """The configuration with what the data set's layout says about the sensor.
@@ -266,22 +291,7 @@ def run(
         if not (keep_partial and updates):
             raise
         error = caught
-    mapper = pipeline.mapper
-    edges, planes = pipeline.map_points()
-    return RunResult(
-        config=config,
-        updates=tuple(updates),
-        edge_points=edges,
-        plane_points=planes,
-        map_stats={
-            name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
-            for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
-        },
-        interrupted=interrupted,
-        error=error,
-        imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
-        loops=pipeline.loops,
-    )
+    return pipeline.result(updates, interrupted=interrupted, error=error)
 
 
 def _imu_summary(aid: ImuAid, updates: Sequence[MapUpdate]) -> ImuSummary:

@@ -84,7 +84,8 @@ LEAVES = {
     "evaluation": set(),
     "export": set(),
     "bag_messages": set(),
-    "export_bag": {"bag_messages"},
+    "frame_messages": {"bag_messages"},
+    "export_bag": {"frame_messages"},
     "peers": set(),
     "visualization": {"export"},
 }

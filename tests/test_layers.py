@@ -39,9 +39,12 @@ LAYERS = (
     ),
     ("mapper", "ahead"),
     ("loop_mapping",),
-    ("pipeline", "estimators", "graph_files"),
-    ("comparison", "recording"),
+    ("pipeline", "estimators", "graph_files", "live_imu", "live_report", "live_sweeps"),
+    ("comparison", "recording", "live"),
+    ("ros_topics",),
     (
+        "ros",
+        "ros1",
         "_cli_report",
         "_report_html",
         "_compare_files",
@@ -97,6 +100,26 @@ LEAF_USERS = {
     "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
+    "live": {
+        "datasets.base",
+        "datasets.cloud_stream",
+        "datasets.imu_messages",
+        "datasets.loam_messages",
+    },
+    "live_imu": {"datasets.tables"},
+    "live_sweeps": {
+        "datasets.base",
+        "datasets.cloud_stream",
+        "datasets.loam_messages",
+        "datasets.pointcloud2",
+    },
+    "ros_topics": {
+        "datasets.base",
+        "datasets.cloud_stream",
+        "datasets.loam_messages",
+        "export",
+        "frame_messages",
+    },
     "graph_files": {"export"},
 }
 

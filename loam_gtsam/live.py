@@ -25,6 +25,8 @@ from loam_gtsam.imu import STILL_AHEAD
 from loam_gtsam.live_imu import LiveImu
 from loam_gtsam.live_report import LiveLog, LiveReport
 from loam_gtsam.live_sweeps import ReadySweep, SweepDecoder, checked_stamp
+from loam_gtsam.loop_closure import LoopCloser
+from loam_gtsam.mapper import ExtraFactors
 from loam_gtsam.pipeline import Observer, Pipeline
 from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate
 
@@ -73,6 +75,7 @@ class LiveMapper:
     axes : of those, see :class:`loam_gtsam.datasets.loam_topics.LoamTopicsDataset`
     clouds : decodes the clouds; None takes a new one without options
     observe : called after each sweep, e.g. to publish it; its time counts as such
+    extra_factors, loop_closer : see :func:`loam_gtsam.pipeline.run`
     clock : nanoseconds, never going back
 
     Attributes
@@ -94,6 +97,8 @@ class LiveMapper:
         axes: Literal["auto", "lidar", "loam"] = "auto",
         clouds: CloudStream | None = None,
         observe: Observer | None = None,
+        extra_factors: ExtraFactors | None = None,
+        loop_closer: LoopCloser | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._config = config = config or Config()
@@ -105,7 +110,9 @@ class LiveMapper:
         if imu and config.imu.enabled:
             self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
         buffer = None if self._imu is None else self._imu.buffer
-        self.pipeline = Pipeline(config, imu=buffer)
+        self.pipeline = Pipeline(
+            config, imu=buffer, extra_factors=extra_factors, loop_closer=loop_closer
+        )
         self._matcher = StampMatcher(features)
         self._features = frozenset(features)
         self._observe, self._clock = observe, clock

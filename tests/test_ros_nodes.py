@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 import os
 import shutil
@@ -23,10 +24,12 @@ from rosbags.typesys import Stores, get_typestore
 from test_datasets import loam_recording, write_bag
 
 from loam_gtsam.bag_messages import Messages
+from loam_gtsam.config import LiveConfig
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.export import read_tum
 from loam_gtsam.frame_messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, TYPES
+from loam_gtsam.live_report import LiveReport
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.ros_topics import PARAMETERS, RosRun, config_of
 from loam_gtsam.types import ConfigError, DatasetError, OutputError
@@ -190,6 +193,14 @@ def test_parameters_make_the_configuration(tmp_path: Path) -> None:
     ):
         with pytest.raises(error):
             RosRun(values(**wrong), print, ros1=True)
+
+
+def test_the_page_on_live_runs_lists_every_parameter_and_field() -> None:
+    page = Path(__file__).resolve().parents[1] / "docs" / "live.md"
+    text = page.read_text("utf-8")
+    fields = [item.name for item in dataclasses.fields(LiveReport)]
+    keys = [f"live.{item.name}" for item in dataclasses.fields(LiveConfig)]
+    assert [name for name in (*PARAMETERS, *fields, *keys) if f"`{name}`" not in text] == []
 
 
 # --- ROS 2, as far as the node calls it -----------------------------------------------------

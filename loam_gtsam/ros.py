@@ -52,7 +52,8 @@ def connect(node: Any) -> RosRun:
     }
 
     def publish(topic: str, message: bytes) -> None:
-        publishers[topic].publish(message)
+        # RTPS pads to words of four bytes, which not every middleware does for serialised messages.
+        publishers[topic].publish(message + bytes(-len(message) % 4))
 
     run = RosRun(values, publish, ros1=False, on_error=rclpy.try_shutdown)
     for topic, kind in run.subscriptions.items():

@@ -11,8 +11,8 @@ try:
     import rospy
 except ImportError as error:
     raise ImportError(
-        "loam_gtsam.ros1 needs rospy of ROS 1: source /opt/ros/noetic/setup.bash first or, on "
-        "Debian and Ubuntu, install python3-rospy; and use a Python that finds it"
+        "loam_gtsam.ros1 needs rospy of ROS 1 in a Python of 3.11 or newer: on Debian 12, install "
+        "python3-rospy, and use a virtual environment made with --system-site-packages"
     ) from error
 
 from loam_gtsam.frame_messages import TYPES

@@ -230,6 +230,7 @@ class FakeRos2:
 
         def publish(message: object) -> None:
             assert type(message) is bytes
+            assert len(message) % 4 == 0
             self.published.append((topic, message))
 
         return SimpleNamespace(publish=publish)
@@ -330,7 +331,7 @@ def test_a_wrong_parameter_ends_the_ros_2_node(monkeypatch: pytest.MonkeyPatch) 
     ("name", "missing", "advice"),
     [
         ("loam_gtsam.ros", "rclpy", "source /opt/ros/DISTRO/setup.bash"),
-        ("loam_gtsam.ros1", "rospy", "install python3-rospy"),
+        ("loam_gtsam.ros1", "rospy", "python3-rospy, and use a virtual environment"),
     ],
 )
 def test_without_ros_the_error_says_what_to_do(

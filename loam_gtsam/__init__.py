@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from loam_gtsam import datasets
+from loam_gtsam.checkpoint import Checkpoint as Checkpoint
 from loam_gtsam.classical import ALoamSolver as ALoamSolver
 from loam_gtsam.classical import ClassicalSolver as ClassicalSolver
 from loam_gtsam.config import Config as Config
@@ -41,6 +42,7 @@ from loam_gtsam.factors import point_to_line_factor as point_to_line_factor
 from loam_gtsam.factors import point_to_plane_factor as point_to_plane_factor
 from loam_gtsam.factors import scan_match_factor as scan_match_factor
 from loam_gtsam.features import extract_features as extract_features
+from loam_gtsam.freezing import checkpointed as checkpointed
 from loam_gtsam.graph_files import read_graph as read_graph
 from loam_gtsam.graph_files import write_graph as write_graph
 from loam_gtsam.graph_optimize import SavedGraph as SavedGraph
@@ -48,6 +50,9 @@ from loam_gtsam.graph_optimize import optimize_graph as optimize_graph
 from loam_gtsam.imu import ImuBuffer as ImuBuffer
 from loam_gtsam.keyframes import Keyframe as Keyframe
 from loam_gtsam.keyframes import LoopClosure as LoopClosure
+from loam_gtsam.live import LiveMapper as LiveMapper
+from loam_gtsam.live import LiveResult as LiveResult
+from loam_gtsam.live_report import LiveReport as LiveReport
 from loam_gtsam.loop_closure import LoopCloser as LoopCloser
 from loam_gtsam.loop_closure import ScanLoopCloser as ScanLoopCloser
 from loam_gtsam.loop_mapping import LoopMapping as LoopMapping
@@ -109,6 +114,7 @@ __all__ = [
     "ALoamSolver",
     "AbsoluteError",
     "BadSweep",
+    "Checkpoint",
     "ClassicalSolver",
     "Config",
     "ConfigError",
@@ -125,6 +131,9 @@ __all__ = [
     "ImuSamples",
     "InputError",
     "Keyframe",
+    "LiveMapper",
+    "LiveReport",
+    "LiveResult",
     "LoamError",
     "LoopCloser",
     "LoopClosure",
@@ -151,6 +160,7 @@ __all__ = [
     "absolute_error",
     "associate",
     "checked_factor",
+    "checkpointed",
     "concatenate_rows",
     "dump_config",
     "extract_features",

@@ -6,9 +6,11 @@ import math
 import sys
 import threading
 import time
+from array import array
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -210,6 +212,34 @@ def test_units_of_g_and_missing_orientations_are_read_as_those_of_a_bag(tmp_path
     assert aid is not None
     assert aid.level is not None
     assert "gravity_filter" in aid.buffer.report.orientation
+
+
+def as_rclpy(message: Any) -> Any:
+    """Bytes as ``array.array``."""
+    if not hasattr(message, "data"):
+        return message
+    return replace(message, data=array("B", message.data.tobytes()))
+
+
+def as_rospy(message: Any) -> Any:
+    """Bytes as such, other names in the stamp, tuples for arrays."""
+    stamp = message.header.stamp
+    moment = SimpleNamespace(secs=stamp.sec, nsecs=stamp.nanosec)
+    message = replace(message, header=replace(message.header, stamp=moment))
+    if hasattr(message, "data"):
+        return replace(message, data=message.data.tobytes())
+    return replace(message, orientation_covariance=tuple(message.orientation_covariance))
+
+
+@pytest.mark.parametrize("converted", [as_rclpy, as_rospy])
+def test_messages_of_rclpy_and_rospy_are_read_as_those_of_rosbags(
+    bag: Path, offline: RunResult, converted: Any
+) -> None:
+    clock = Clock()
+    live = LiveMapper(imu=True, clock=clock)
+    messages = [replace(m, content=converted(m.content)) for m in messages_of(bag)]
+    results = replay(live, clock, messages)
+    np.testing.assert_array_equal(poses(r.update for r in results), poses(offline.updates))
 
 
 # --- waiting for the IMU --------------------------------------------------------------------

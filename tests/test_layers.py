@@ -40,7 +40,7 @@ LAYERS = (
     ("mapper", "ahead"),
     ("loop_mapping", "checkpoint"),
     ("pipeline", "estimators", "graph_files", "live_imu", "live_report", "live_sweeps"),
-    ("comparison", "recording", "live"),
+    ("comparison", "recording", "evalio_pipeline", "live"),
     ("ros_topics",),
     ("experiments", "experiment_spec", "experiment_table", "experiment_workers"),
     (
@@ -127,6 +127,7 @@ LEAF_USERS = {
         "export",
         "frame_messages",
     },
+    "evalio_pipeline": {"datasets.extrinsics"},
     "experiments": {"datasets", "datasets.base", "evaluation", "peers"},
     "experiment_table": {"export"},
     "graph_files": {"export"},

@@ -201,6 +201,31 @@ class Pipeline:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
         return (self.mapper if self.loops is None else self.loops).map_points()
 
+    def result(
+        self,
+        updates: Sequence[MapUpdate],
+        *,
+        interrupted: bool = False,
+        error: Exception | None = None,
+    ) -> RunResult:
+        """A whole run, from what :meth:`process` said about each of its sweeps."""
+        mapper = self.mapper
+        edges, planes = self.map_points()
+        return RunResult(
+            config=self.config,
+            updates=tuple(updates),
+            edge_points=edges,
+            plane_points=planes,
+            map_stats={
+                name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
+                for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
+            },
+            interrupted=interrupted,
+            error=error,
+            imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+            loops=self.loops,
+        )
+
 
 Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
 """Called after each frame with the sweep, its result and the pipeline (its mapper, its loops), to
@@ -316,22 +341,7 @@ def run(
             raise
         error = caught
         progress.save()
-    mapper = pipeline.mapper
-    edges, planes = pipeline.map_points()
-    return RunResult(
-        config=config,
-        updates=tuple(updates),
-        edge_points=edges,
-        plane_points=planes,
-        map_stats={
-            name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
-            for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
-        },
-        interrupted=interrupted,
-        error=error,
-        imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
-        loops=pipeline.loops,
-    )
+    return pipeline.result(updates, interrupted=interrupted, error=error)
 
 
 class _Progress:

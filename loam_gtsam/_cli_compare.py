@@ -18,6 +18,7 @@ from loam_gtsam._cli_run import (
     file_name,
     frame_progress,
     free_folder,
+    no_empty_folder,
     say_written,
     stop_requests,
 )
@@ -56,9 +57,11 @@ def execute(
         raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
     wanted = options.output or Path("loam_gtsam_output") / f"{file_name(dataset.name)}_compare"
     known = (*TABLE_FILES, *PICTURES, REPORT_FILE, TRUTH_FILE)
-    folder = make_folder(free_folder(wanted, options.overwrite, known))
+    wanted = free_folder(wanted, options.overwrite, known)
+    is_new = not wanted.exists()
+    folder = make_folder(wanted)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
-    with stop_requests() as stop:
+    with no_empty_folder(folder, is_new), stop_requests() as stop:
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             comparison = compare(

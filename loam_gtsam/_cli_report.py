@@ -80,7 +80,7 @@ def imu_facts(imu: ImuSummary) -> dict[str, str]:
     return {
         "IMU, level": up,
         "IMU, orientation": _ORIENTATIONS[imu.report.orientation],
-        "IMU, tilt": _counts(imu.tilt_priors),
+        "IMU, roll and pitch": f"priors: {_counts(imu.tilt_priors)}",
         "IMU, de-skew": _counts(imu.sweep_motions),
         "IMU, gyro": f"bias {rates} mrad/s",
     }

@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
@@ -87,6 +87,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
     if options.resume:
+        new_folder = not wanted.exists()
         folder = make_folder(wanted)
         if _complete(folder, config, dataset, total):
             Console(quiet=options.quiet).print(
@@ -94,13 +95,19 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             )
             return 0
     else:
-        folder = make_folder(free_folder(wanted, options.overwrite, (*RUN_OUTPUTS, CHECKPOINT)))
+        wanted = free_folder(wanted, options.overwrite, (*RUN_OUTPUTS, CHECKPOINT))
+        new_folder = not wanted.exists()
+        folder = make_folder(wanted)
     checkpoint = None
     if options.checkpoint_seconds > 0.0:
         place = folder / CHECKPOINT
         checkpoint = Checkpoint(place, seconds=options.checkpoint_seconds, resume=options.resume)
     last = LastFrame()
-    with stop_requests() as stop, _observers(options, config, last) as observe:
+    with (
+        no_empty_folder(folder, new_folder),
+        stop_requests() as stop,
+        _observers(options, config, last) as observe,
+    ):
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             result = run(
@@ -134,6 +141,9 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             console.print(profile_table(result.updates))
         console.print(summary(result, dataset.name, seconds, accuracy, info.problems))
         say_written(console, stop, len(result.updates), total, folder, files)
+        if stop.signum is not None and checkpoint is not None and not (options.bag or options.rrd):
+            text = f"To go on: the same command with --output {folder} --resume"
+            console.print(text, markup=False, soft_wrap=True)
         if options.bag is not None and options.bag.exists():
             console.print(f"Bag written to {options.bag}", markup=False, soft_wrap=True)
         if options.rrd is not None and options.rrd.exists():
@@ -238,6 +248,18 @@ def _observers(options: RunOptions, config: Config, last: LastFrame) -> Iterator
                 observer(sweep, update, pipeline)
 
         yield observe
+
+
+@contextmanager
+def no_empty_folder(folder: Path, is_new: bool) -> Iterator[None]:
+    """Remove a folder made for a run that ends with an error before it wrote anything."""
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
+        raise
 
 
 def free_folder(wanted: Path, overwrite: bool, known: Sequence[str] = RUN_OUTPUTS) -> Path:

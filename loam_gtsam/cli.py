@@ -7,7 +7,7 @@ The only place that catches :class:`~loam_gtsam.types.LoamError`. Exit codes: 0 
 from __future__ import annotations
 
 import platform
-from dataclasses import replace
+from dataclasses import fields, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,24 +76,36 @@ DataPath = Annotated[
     str,
     typer.Argument(
         metavar="PATH",
-        help="A folder of .bin sweeps (KITTI), a ROS 1 or ROS 2 bag, an .mcap or .db3 file, "
-        "or a built-in world such as sim:street_loop.",
+        help="A folder of .bin sweeps (KITTI), a ROS 1 or ROS 2 bag, an .mcap or .db3 file, a "
+        "sequence of a known data set (docs/inputs.md), or a built-in world such as "
+        "sim:street_loop.",
     ),
 ]
-Topic = Annotated[str | None, typer.Option(help="Topic of the sweeps; guessed if there is one.")]
-ImuTopic = Annotated[str | None, typer.Option(help="Topic of the IMU; guessed if there is one.")]
+Topic = Annotated[
+    str | None, typer.Option(help="Topic of the sweeps [default: the one with most messages].")
+]
+ImuTopic = Annotated[
+    str | None, typer.Option(help="Topic of the IMU [default: the one with most messages].")
+]
 LoaderOptions = Annotated[
     list[str] | None,
     typer.Option(
         "--option",
         metavar="KEY=VALUE",
-        help="Option of the loader, e.g. time_unit=ns; may be given repeatedly.",
+        help="Option of the loader, e.g. time_unit=ns; may be given repeatedly. Those of each "
+        "loader: docs/inputs.md.",
     ),
 ]
 Sensor = Annotated[
-    str | None, typer.Option(help="Sensor model (sensor.model), e.g. vlp16, hdl64, os1-128.")
+    str | None,
+    typer.Option(
+        help="Sensor model (sensor.model): vlp16, hdl32, hdl64, os1-16, os1-32, os1-64 or os1-128."
+    ),
 ]
-Preset = Annotated[str | None, typer.Option(help="Named configuration to start from.")]
+Preset = Annotated[
+    str | None,
+    typer.Option(help="Named configuration to start from: default, loam or aloam."),
+]
 ConfigFile = Annotated[
     Path | None, typer.Option("--config", metavar="FILE", help="YAML configuration.")
 ]
@@ -133,9 +145,11 @@ def _root(
     pass
 
 
-@app.command()
+@app.command(short_help="Map a built-in world and compare with its exact truth.")
 def demo(
-    scene: Annotated[str, typer.Option(help="Built-in scene.")] = "street_loop",
+    scene: Annotated[
+        str, typer.Option(help="Built-in scene; a wrong name lists them.")
+    ] = "street_loop",
     frames: Annotated[int, typer.Option(min=1, help="Number of sweeps.")] = 150,
     output: Output = None,
     overwrite: Overwrite = False,
@@ -266,7 +280,7 @@ def run(
     raise typer.Exit(execute(dataset, settings, options))
 
 
-@app.command()
+@app.command(short_help="Run several solvers on the same sweeps, and report.")
 def compare(
     path: DataPath,
     solvers: Annotated[
@@ -326,7 +340,7 @@ def compare(
     raise typer.Exit(execute(dataset, contenders, shared_guess, options))
 
 
-@app.command()
+@app.command(short_help="Run sequences x configurations x seeds into one table.")
 def sweep(
     spec: Annotated[
         Path,
@@ -375,7 +389,7 @@ def sweep(
     raise typer.Exit(execute(spec, options))
 
 
-@app.command()
+@app.command(short_help="Show what is understood of a data set, and problems.")
 def inspect(
     path: DataPath,
     topic: Topic = None,
@@ -501,7 +515,9 @@ def _changed(config: Config, sensor: str | None, overrides: list[str] | None) ->
     for entry in overrides or []:
         key, value = _key_value("--set", entry)
         if "." not in key:
-            raise typer.BadParameter(f"--set {entry}: expected SECTION.KEY=VALUE")
+            owners = [s.name for s in fields(config) if hasattr(getattr(config, s.name), key)]
+            meant = f", for example {owners[0]}.{entry}" if owners else ""
+            raise typer.BadParameter(f"--set {entry}: expected SECTION.KEY=VALUE{meant}")
         config = with_value(config, key, value, f"--set {entry}")
     return config
 

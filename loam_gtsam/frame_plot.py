@@ -66,7 +66,10 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     bar = figure.colorbar(
         dots, cax=axes.inset_axes((0.02, 0.09, 0.24, 0.022)), orientation="horizontal", extend="max"
     )
-    bar.set_label("residual [standard deviations]", color=INK)
+    bar.set_label(
+        f"residual [standard deviations]\nlines and {_SIGMAS:g}-sigma ellipse: {_ENLARGED:g} x",
+        color=INK,
+    )
     bar.ax.tick_params(colors=INK, length=0, labelsize=9)
     bar.outline.set_visible(False)
     reach = camera.reach

@@ -30,7 +30,9 @@ from loam_gtsam.types import (
     FeatureSweep,
     FloatArray,
     FrameStatus,
+    InputError,
     MapUpdate,
+    Scan,
     Trajectory,
 )
 
@@ -88,6 +90,12 @@ class RunResult:
     error: Exception | None = None
     imu: ImuSummary | None = None
     loops: LoopMapping | None = None
+
+    def __repr__(self) -> str:
+        """A line: all that is in it would fill the screen for minutes."""
+        statuses = ", ".join(f"{count} {status}" for status, count in self.status_counts.items())
+        points = f"{len(self.edge_points)} edge and {len(self.plane_points)} plane points"
+        return f"RunResult({len(self.updates)} updates: {statuses or 'none'}; {points})"
 
     @property
     def trajectory(self) -> Trajectory:
@@ -149,6 +157,11 @@ class Pipeline:
             return self.mapper.skip(sweep.stamp, sweep.message)
         if isinstance(sweep, FeatureSweep):
             return self._process_features(sweep)
+        if not isinstance(sweep, Scan):
+            raise InputError(
+                f"sweep: expected a Scan, got {type(sweep).__name__}; Scan(points=..., stamp=...) "
+                "makes one of an array"
+            )
         if extraction is None:
             extraction = extract(sweep, self.config)
         features, last = extraction.features, self.mapper.last
@@ -309,11 +322,18 @@ def run(
 
     Raises
     ------
+    InputError
+        If ``dataset`` is none.
     DatasetError
         If the data set cannot be read.
     OutputError
         If the checkpoint is of another run.
     """
+    if not hasattr(dataset, "sensor"):
+        raise InputError(
+            f"dataset: expected a Dataset, got {type(dataset).__name__} without 'sensor'; "
+            "open_dataset makes one of a path, ArrayDataset of arrays or Scan objects"
+        )
     config = effective_config(config or Config(), dataset)
     imu = imu_buffer(dataset, config)
     pipeline = Pipeline(config, imu=imu, extra_factors=extra_factors, loop_closer=loop_closer)

@@ -138,11 +138,16 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
         keep &= _plausible_times(times, keep)
     count = int(np.count_nonzero(keep))
     if count < MIN_POINTS:
-        finite = int(np.count_nonzero(np.isfinite(scan.points).all(axis=1)))
+        there = scan.points[np.isfinite(scan.points).all(axis=1)]
+        finite = len(there)
+        # hypot, for squares may overflow
+        ranges = np.hypot(np.hypot(there[:, 0], there[:, 1]), there[:, 2])
+        median = float(np.median(ranges)) if finite else 0.0
+        unit = f"; half are farther than {median:.4g}: metres?" if median > sensor.max_range else ""
         raise SweepError(
             f"sweep of {len(scan.points)} points, {finite} finite, {count} of them within "
             f"{sensor.min_range:g} to {sensor.max_range:g} m: at least {MIN_POINTS} are needed; "
-            "check the source, or sensor.min_range and sensor.max_range"
+            f"check the source, or sensor.min_range and sensor.max_range{unit}"
         )
     row_of = None
     if scan.rows and sensor.rings != "field":

@@ -16,7 +16,8 @@ from loam_gtsam.export import replacing, stage_seconds
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, OutputError, Trajectory
 
 INK, FAINT, PATH, TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
-_STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d")
+_STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d",
+                  "#54a24b", "#bab0ac", "#ff9da6")  # fmt: skip
 _RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8", "#7a5230")
 """Of the solvers of a comparison, in the order they were named."""
 _DPI = 110

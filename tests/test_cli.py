@@ -191,7 +191,7 @@ def test_an_empty_data_set_fails(opens):
     result = loam("run", "x", "--output", "out")
     assert result.exit_code == 1
     assert "no sweeps" in result.output
-    assert files_in("out") == set()
+    assert not Path("out").exists()
 
 
 def test_a_truth_that_cannot_be_compared_is_told_and_costs_nothing(opens, scans, monkeypatch):
@@ -416,6 +416,7 @@ def test_a_signal_stops_after_the_frame_and_everything_is_written(number, worker
     frames = len(read_tum("out/trajectory.tum"))
     assert frames >= (1 if workers else 4)  # the fourth sweep may have been read ahead
     assert f"Stopped by {number.name} after frame {frames} of 1000" in output
+    assert "To go on: the same command with --output out --resume" in output
     assert files_in("out") >= set(RUN_FILES)
     assert not [name for name in files_in("out") if name.endswith(".tmp")]
     with np.load("out/run.npz") as data:
@@ -464,7 +465,7 @@ def test_run_says_what_was_made_of_the_imu():
     assert "IMU, level roll -" in said.replace("roll 0", "roll -0")
     assert "samples, at rest" in said
     assert "IMU, orientation its own" in said
-    assert "IMU, tilt 1 none, 2 equivalent" in said
+    assert "IMU, roll and pitch priors: 1 none, 2 equivalent" in said
     assert "IMU, de-skew 3 gyro" in said
     assert "mrad/s" in said
     assert "given up" not in said
@@ -564,3 +565,24 @@ def test_resume_tells_what_it_cannot_go_together_with(other):
     result = loam("run", "sim:room", "--resume", *other)
     assert result.exit_code == 2
     assert "give one only" in one_line(result)
+
+
+def test_a_run_that_cannot_start_leaves_no_folder(opens, scans):
+    opens(scans)
+    Path("there.bag").write_text("x")
+    assert loam("run", "x", "--bag", "there.bag").exit_code == 1
+    assert not list(Path().glob("loam_gtsam_output/*"))
+    Path("mine").mkdir()
+    assert loam("run", "x", "--bag", "there.bag", "--output", "mine").exit_code == 1
+    assert Path("mine").is_dir()
+
+
+def test_set_without_a_section_names_one():
+    result = loam("run", "sim:room", "--set", "min_range=2")
+    assert result.exit_code == 2
+    assert "expected SECTION.KEY=VALUE, for example sensor.min_range=2" in result.output
+
+
+def test_no_help_of_a_command_is_cut_off(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "..." not in loam("--help").output.partition("Commands:")[2]

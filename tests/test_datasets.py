@@ -19,6 +19,8 @@ from loam_gtsam.datasets import (
     LoamTopicsDataset,
     open_dataset,
 )
+from loam_gtsam.datasets.bag import POINT_CLOUD
+from loam_gtsam.datasets.bag_reader import choose_topic
 from loam_gtsam.datasets.kitti import raise_elevation
 from loam_gtsam.datasets.loam_messages import StampMatcher
 from loam_gtsam.datasets.tables import clean_imu, read_tum, seconds_to_ns
@@ -573,6 +575,7 @@ def test_stamps_keep_every_nanosecond() -> None:
         ("0\n0.1\n0.1\n0.2\n", "1 stamps equal the one before, first at sweep 2"),
         ("0\n0.1\n0.05\n0.2\n", "1 stamps are earlier than the one before, first at sweep 2"),
         ("0\n0.1\n0.2\n0.4\n", "1 stamps come after a gap, first at sweep 3"),
+        ("0\n0\n0\n0\n", "all stamps are 0 s: nothing says when the sweeps were measured"),
         ("0\n0.1\n0.21\n0.3\n", None),
     ],
 )
@@ -582,7 +585,9 @@ def test_disorder_is_reported_and_still_read(
     folder = write_sweeps(tmp_path / "a", 4)
     (folder / "times.txt").write_text(text)
     dataset = KittiDataset(folder)
-    assert dataset.info().problems == ([problem] if problem else [])
+    said = dataset.info().problems
+    assert len(said) == (problem is not None)
+    assert all(text.startswith(problem or "") for text in said)
     assert [type(sweep) for sweep in dataset] == [Scan] * 4
 
 
@@ -783,6 +788,7 @@ def test_array_disorder_is_reported() -> None:
         (([np.zeros((3, 3))], [0]), {"rings": [np.zeros(3)]}, r"scans\[0\]: Scan.rings"),
         (([Scan(np.zeros((3, 3)), 0)], [0]), {}, "carry their own"),
         (([Scan(np.zeros((3, 3)), 0), np.zeros((3, 3))],), {}, "only Scan objects"),
+        (([np.zeros((3, 3))] * 3, [0, 10**5, 2 * 10**5]), {}, "100000 ns apart; expected nano"),
     ],
 )
 def test_bad_arrays(arguments: tuple[Any, ...], options: dict[str, Any], match: str) -> None:
@@ -793,10 +799,37 @@ def test_bad_arrays(arguments: tuple[Any, ...], options: dict[str, Any], match: 
 # --- open_dataset ---------------------------------------------------------------------------
 
 
+def test_a_folder_above_the_sweeps_says_where_they_are(tmp_path: Path) -> None:
+    write_sweeps(tmp_path / "sequences" / "07" / "velodyne", 1)
+    with pytest.raises(DatasetError, match=r"There may be sweeps in .*sequences/07/velodyne$"):
+        open_dataset(tmp_path)
+    file = next((tmp_path / "sequences" / "07" / "velodyne").rglob("*.bin"))
+    with pytest.raises(DatasetError, match="one sweep; give the folder that holds them"):
+        open_dataset(file)
+
+
+def test_a_world_is_not_made_of_words() -> None:
+    with pytest.raises(DatasetError, match="frames: expected a number, got 'few'"):
+        open_dataset("sim:room?frames=few")
+
+
+def test_a_bag_of_packets_says_what_they_need(tmp_path: Path) -> None:
+    recording = [("/imu", START, imu(ROS1, START))]
+    path = write_bag(tmp_path / "run", "ros1", recording)
+    with pytest.raises(DatasetError, match=r"no topic of type .*PointCloud2; .*Imu, 1\)$"):
+        BagDataset(path)
+    topics = {"/packets": ("velodyne_msgs/msg/VelodyneScan", 3)}
+    with pytest.raises(DatasetError, match="raw packets become PointCloud2 with the driver"):
+        choose_topic(path, topics, POINT_CLOUD, None, [])
+
+
 def test_nothing_to_open(tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match=r"no such file or folder; expected a folder with"):
         open_dataset(tmp_path / "none")
     with pytest.raises(DatasetError, match=r"no .bin sweeps; looked in the folder itself"):
+        open_dataset(tmp_path)
+    (tmp_path / "cloud.pcd").write_text("x")
+    with pytest.raises(DatasetError, match=r"it has files .pcd; .*docs/own_sensor.md"):
         open_dataset(tmp_path)
     (tmp_path / "cloud.las").write_text("x")
     with pytest.raises(DatasetError, match=r"unknown kind of file '.las'; expected"):

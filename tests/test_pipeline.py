@@ -146,6 +146,19 @@ def test_what_the_data_set_implies_yields_to_the_user():
     assert (sensor.stamp, sensor.spin) == ("end", "clockwise")
 
 
+def test_what_is_no_data_set_and_no_sweep_is_told():
+    with pytest.raises(InputError, match="got str without 'sensor'; open_dataset makes one"):
+        run("somewhere")
+    with pytest.raises(InputError, match="expected a Scan, got ndarray"):
+        Pipeline().process(np.zeros((5, 3)))
+
+
+def test_a_result_is_shown_in_a_line():
+    result = run(SimulatedWorld("room", frames=2))
+    assert repr(result).startswith("RunResult(2 updates: 1 first, 1 ok; ")
+    assert len(repr(result)) < 100
+
+
 def test_an_empty_data_set_is_an_empty_result():
     result = run(ListDataset([]))
     assert result.updates == ()

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import os
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -55,8 +57,11 @@ _ACCEPTED = (
     "a folder with .bin sweeps (also in velodyne/, scans/ or velodyne_points/data/), a ROS 1 .bag, "
     "a ROS 2 bag folder (with metadata.yaml), an .mcap or .db3 file, a sequence of Newer College, "
     "MulRan, HeLiPR or Oxford Spires, or a built-in world such as sim:street_loop or "
-    "sim:room?frames=50&seed=3"
+    "'sim:room?frames=50&seed=3'"
 )
+_OTHERS = "sweeps of any other format: docs/own_sensor.md"
+_LOOKED_AT = 500
+"""Folders searched for a better path to suggest."""
 
 
 def __getattr__(name: str) -> Any:
@@ -96,22 +101,46 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder; expected {_ACCEPTED}")
     if path.is_file() and path.suffix not in _BAG_FILES:
-        raise DatasetError(f"{path}: unknown kind of file {path.suffix!r}; expected {_ACCEPTED}")
+        if path.suffix == ".bin":
+            raise DatasetError(f"{path}: one sweep; give the folder that holds them: {path.parent}")
+        raise DatasetError(
+            f"{path}: unknown kind of file {path.suffix!r}; expected {_ACCEPTED}; {_OTHERS}"
+        )
     known = known_loader(path)
     if known is not None:
         return _construct(__getattr__(known), path, options)
     if path.is_file() or (path / "metadata.yaml").is_file():
         return _open_bag(path, options)
-    bags = [file for file in sorted(path.iterdir()) if file.suffix in _BAG_FILES]
-    from loam_gtsam.datasets.kitti import KittiDataset
+    from loam_gtsam.datasets.kitti import KittiDataset, find_sweeps
 
     try:
         return _construct(KittiDataset, path, options)
     except DatasetError as error:
+        if find_sweeps(path) is not None:
+            raise
+        bags = [file for file in sorted(path.iterdir()) if file.suffix in _BAG_FILES]
         if bags:
             names = ", ".join(file.name for file in bags[:5])
             raise DatasetError(f"{path}: open one of its bags instead: {names}") from error
-        raise
+        raise DatasetError(f"{error}. {_suggestion(path)}") from error
+
+
+def _suggestion(path: Path) -> str:
+    """What to open instead of a folder without sweeps."""
+    inside: list[str] = []
+    for folder, names, files in islice(os.walk(path), _LOOKED_AT):
+        names.sort()
+        found = Path(folder)
+        if "metadata.yaml" in files or any(name.endswith(".bin") for name in files):
+            inside.append(str(found))
+            names.clear()
+        inside += [str(found / name) for name in sorted(files) if name.endswith(_BAG_FILES)]
+    if inside:
+        more = ", ..." if len(inside) > 3 else ""
+        return f"There may be sweeps in {', '.join(inside[:3])}{more}"
+    kinds = sorted({file.suffix for file in path.iterdir() if file.is_file()})
+    there = f"it has files {', '.join(kinds[:5])}" if kinds else "it has no files"
+    return f"Expected {_ACCEPTED}; {there}; {_OTHERS}"
 
 
 def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
@@ -143,7 +172,12 @@ def _open_world(text: str, options: dict[str, Any]) -> Dataset:
         ) from error
     from loam_gtsam.datasets.simulation import SimulatedWorld
 
-    return _construct(SimulatedWorld, scene, {**settings, **options})
+    settings |= options
+    numbers = set(inspect.signature(SimulatedWorld).parameters) - {"sensor"}
+    for key, value in settings.items():
+        if key in numbers and isinstance(value, str):
+            raise DatasetError(f"{text}: {key}: expected a number, got {value!r}")
+    return _construct(SimulatedWorld, scene, settings)
 
 
 def _number_or_text(value: str) -> int | float | str:

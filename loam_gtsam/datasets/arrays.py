@@ -12,6 +12,9 @@ from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.tables import describe_imu, describe_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
 
+_SHORTEST = 1_000_000
+"""Nanoseconds between sweeps; no spinning lidar turns a thousand times a second."""
+
 
 class ArrayDataset:
     """Sweeps from numpy arrays, or ready :class:`Scan` objects.
@@ -126,6 +129,12 @@ def _stamps(stamps: Any, stamps_s: Any) -> IntArray:
             raise InputError(
                 f"stamps: expected 1-D integer nanoseconds, got {values.ndim}-D {values.dtype}; "
                 "use stamps_s for seconds"
+            )
+        step = float(np.median(np.diff(values.astype(np.int64)))) if len(values) > 2 else 0.0
+        if 0.0 < step < _SHORTEST:
+            raise InputError(
+                f"stamps: the sweeps are {step:g} ns apart; expected nanoseconds, stamps_s takes "
+                "seconds"
             )
         return values.astype(np.int64)
     seconds = np.asarray(stamps_s)

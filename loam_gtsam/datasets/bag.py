@@ -169,7 +169,7 @@ class BagDataset:
         facts["stamps"] = f"from {stamps[0] * 1e-9:.6f} s"
         facts["fields"] = fields
         facts["points"] = f"{len(decoded[0].scan.points)} in the first sweep"
-        facts["point times"] = str(self._decision or "none")
+        facts["point times"] = str(self._decision or "none recorded")
         facts["rings"] = _describe_rings(decoded[0].scan)
         if self._decision is None and self._options["time_field"] != NO_TIMES:
             self._problems.append("no per-point time field: times can only come from the azimuth")

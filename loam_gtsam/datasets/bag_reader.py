@@ -84,13 +84,20 @@ def choose_topic(
         return asked
     candidates = [name for name, (what, _) in topics.items() if what == kind]
     if not candidates:
-        raise DatasetError(f"{path}: no topic of type {kind}; the bag has: {listing or 'none'}")
+        packets = any(
+            "packet" in what.lower() or "scan" in what.lower() for what, _ in topics.values()
+        )
+        hint = "; raw packets become PointCloud2 with the driver of the sensor" if packets else ""
+        raise DatasetError(
+            f"{path}: no topic of type {kind}; the bag has: {listing or 'no messages'}{hint}"
+        )
+    option = "--imu-topic" if kind.endswith("Imu") else "--topic"
     chosen = max(candidates, key=lambda name: topics[name][1])  # the first of equals
     if len(candidates) > 1:
         problems.append(
             f"{len(candidates)} {kind.rsplit('/', 1)[-1]} topics ("
             + ", ".join(f"{name}: {topics[name][1]}" for name in candidates)
-            + f"); took {chosen}"
+            + f"); took {chosen}, {option} chooses another"
         )
     return chosen
 

@@ -80,7 +80,7 @@ class KittiDataset:
 
     def __init__(self, path: str | Path, *, vertical_angle_offset_deg: float = 0.0) -> None:
         given = Path(path)
-        folder = _find_sweeps(given)
+        folder = _sweep_folder(given)
         self._root = _root_of(folder, given)
         self.name = given.resolve().name or "sweeps"
         self._path = given
@@ -144,7 +144,7 @@ class KittiDataset:
         info = DatasetInfo("KITTI folder", str(self._path), {"sweeps": str(len(self))})
         describe_stamps(self.stamps, info.facts, info.problems)
         info.facts["fields"] = "x, y, z, intensity (float32)"
-        info.facts["point times"] = str(self._decision) if self._decision else "none"
+        info.facts["point times"] = str(self._decision or "none recorded")
         sensor = {key: value for key, value in self.sensor.items() if not key.startswith("imu.")}
         if sensor:
             info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in sensor.items())
@@ -236,14 +236,22 @@ def _read_points(file: Path) -> NDArray[np.float32]:
     return np.ascontiguousarray(values[:, :3], dtype=np.float32)
 
 
-def _find_sweeps(path: Path) -> Path:
-    if not path.is_dir():
-        what = "not a folder" if path.exists() else "no such folder"
-        raise DatasetError(f"{path}: {what}; expected a folder with .bin sweeps")
+def find_sweeps(path: Path) -> Path | None:
+    """The folder in or below ``path`` that holds ``.bin`` sweeps, None if there is none."""
     for name in _FOLDERS:
         folder = path / name
         if folder.is_dir() and next(folder.glob("*.bin"), None) is not None:
             return folder
+    return None
+
+
+def _sweep_folder(path: Path) -> Path:
+    if not path.is_dir():
+        what = "not a folder" if path.exists() else "no such folder"
+        raise DatasetError(f"{path}: {what}; expected a folder with .bin sweeps")
+    folder = find_sweeps(path)
+    if folder is not None:
+        return folder
     raise DatasetError(
         f"{path}: no .bin sweeps; looked in the folder itself, "
         f"{', '.join(name + '/' for name in _FOLDERS if name)}"

@@ -172,7 +172,7 @@ def _fitting_unit(low: float, high: float, span: float, field: str) -> str:
         f"point-time field {field!r}: values {low:.9g} .. {high:.9g} (span {span:.6g}) fit no "
         f"unit; tried {', '.join(_NANOSECONDS)} for a sweep of {SWEEP_SECONDS[0]:g} to "
         f"{SWEEP_SECONDS[1]:g} s. Give time_unit if you know it, another time_field, or "
-        "time_field='none' to ignore the field"
+        "time_field=none to ignore the field (on the command line --option time_field=none)"
     )
 
 

@@ -181,7 +181,7 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     norms = np.linalg.norm(orientation, axis=1, keepdims=True)
     unknown = bool((np.abs(norms - 1.0) > UNIT_TOLERANCE).any())
     if unknown:
-        problems.append("IMU: no orientation (quaternions are not of unit length)")
+        problems.append("IMU: no orientation in it (not given, or not of unit length)")
     if is_in_g(acceleration):
         median = float(np.median(np.linalg.norm(acceleration, axis=1)))
         problems.append(f"IMU: acceleration of {median:.2f} at rest is in g, converted to m/s^2")
@@ -216,6 +216,12 @@ def describe_stamps(stamps: IntArray, facts: dict[str, str], problems: list[str]
     facts["stamps"] = f"{stamps[0] * 1e-9:.6f} .. {stamps[-1] * 1e-9:.6f} s"
     facts["rate"] = describe_rate(stamps)
     steps = np.diff(stamps)
+    if len(steps) and not steps.any():
+        problems.append(
+            f"all stamps are {stamps[0] * 1e-9:g} s: nothing says when the sweeps were measured, "
+            "and only the first can be mapped; write their times into the headers"
+        )
+        return
     for what, which in (
         ("equal the one before", np.flatnonzero(steps == 0)),
         ("are earlier than the one before", np.flatnonzero(steps < 0)),

@@ -141,6 +141,9 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             console.print(profile_table(result.updates))
         console.print(summary(result, dataset.name, seconds, accuracy, info.problems))
         say_written(console, stop, len(result.updates), total, folder, files)
+        if not plot and options.plot is None:
+            text = 'No pictures without matplotlib: pip install "loam_gtsam[plot]"'
+            console.print(text, markup=False, soft_wrap=True)
         if stop.signum is not None and checkpoint is not None and not (options.bag or options.rrd):
             text = f"To go on: the same command with --output {folder} --resume"
             console.print(text, markup=False, soft_wrap=True)

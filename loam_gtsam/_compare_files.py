@@ -310,7 +310,7 @@ def _draw(results: Results, folder: Path) -> list[str]:
         )
     if results.differences:
         panels = {
-            f"{label} [{unit}]": {
+            f"{label} from {comparison.runs[0].name} [{unit}]": {
                 # The first-named solver has no curve, but keeps its colour.
                 comparison.runs[0].name: (np.zeros(0), np.zeros(0))
             }
@@ -318,7 +318,7 @@ def _draw(results: Results, folder: Path) -> list[str]:
                 name: (difference.frames, getattr(difference, key))
                 for name, difference in results.differences.items()
             }
-            for label, unit, key in (("position", "m", "metres"), ("rotation", "deg", "degrees"))
+            for label, unit, key in (("distance", "m", "metres"), ("angle", "deg", "degrees"))
         }
         pictures["differences.png"] = lambda path: visualization.plot_curves(
             path, panels, "frame", log=True

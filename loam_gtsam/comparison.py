@@ -361,6 +361,9 @@ def _common_configs(
         shared["deskew"] = replace(common.deskew, refine=own.refine, rotation=own.rotation)
         for section, value in shared.items():
             if getattr(config, section) != value:
-                notes.append(f"{entry.name}: section {section} is that of {name}")
+                notes.append(
+                    f"{entry.name}: section {section} is that of {name}, so that all get the same "
+                    "features at the same moments"
+                )
         configs.append(replace(config, **shared))
     return configs, notes

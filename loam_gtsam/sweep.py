@@ -143,7 +143,8 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
         # hypot, for squares may overflow
         ranges = np.hypot(np.hypot(there[:, 0], there[:, 1]), there[:, 2])
         median = float(np.median(ranges)) if finite else 0.0
-        unit = f"; half are farther than {median:.4g}: metres?" if median > sensor.max_range else ""
+        far = median > sensor.max_range
+        unit = f"; half are farther than {median:.0f} m: are they in metres?" if far else ""
         raise SweepError(
             f"sweep of {len(scan.points)} points, {finite} finite, {count} of them within "
             f"{sensor.min_range:g} to {sensor.max_range:g} m: at least {MIN_POINTS} are needed; "

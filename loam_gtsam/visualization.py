@@ -262,7 +262,8 @@ def plot_curves(
     path : of the PNG file
     panels : label of the vertical axis -> solver -> (N,) x and (N,) y; a solver has the colour of
         its place in the first panel
-    log : logarithmic vertical axes; values of zero are left out
+    log : logarithmic vertical axes; values below a millionth of the panel's largest, which are
+        rounding, are left out
 
     Raises
     ------
@@ -272,17 +273,18 @@ def plot_curves(
     figure = empty_figure(9.0, 1.0 + 2.8 * len(panels))
     rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (ylabel, curves) in zip(rows, panels.items(), strict=True):
+        largest = max((float(np.nanmax(y)) for _, y in curves.values() if len(y)), default=0.0)
         for (name, (x, y)), colour in zip(
             curves.items(), itertools.cycle(_RUN_COLOURS), strict=False
         ):
-            axes.plot(x, np.where(y > 0.0, y, np.nan) if log else y, color=colour, lw=1.4,
-                      label=name)  # fmt: skip
+            axes.plot(x, np.where(y > 1e-6 * largest, y, np.nan) if log else y, color=colour,
+                      lw=1.4, label=name if len(x) else None)  # fmt: skip
         if log:
             axes.set_yscale("log")
         else:
             axes.set_ylim(bottom=0.0)
         axes.set_ylabel(ylabel)
-        if curves:
+        if axes.get_legend_handles_labels()[0]:
             axes.legend(frameon=False)
     rows[-1].set_xlabel(xlabel)
     save_figure(figure, path)

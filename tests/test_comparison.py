@@ -333,8 +333,8 @@ def test_what_decides_the_features_is_that_of_the_first(dataset):
     assert used.features == Config().features
     assert used.deskew == replace(other.deskew, reference="start")
     assert result.notes == (
-        "b: section features is that of a",
-        "b: section deskew is that of a",
+        "b: section features is that of a, so that all get the same features at the same moments",
+        "b: section deskew is that of a, so that all get the same features at the same moments",
     )
     assert compare(dataset, [Contender("a", Config())], max_frames=2).notes == ()
 

@@ -26,6 +26,7 @@ from loam_gtsam.datasets.loam_messages import StampMatcher
 from loam_gtsam.datasets.tables import clean_imu, read_tum, seconds_to_ns
 from loam_gtsam.types import (
     BadSweep,
+    ConfigError,
     DatasetError,
     FeatureSweep,
     InputError,
@@ -811,6 +812,8 @@ def test_a_folder_above_the_sweeps_says_where_they_are(tmp_path: Path) -> None:
 def test_a_world_is_not_made_of_words() -> None:
     with pytest.raises(DatasetError, match="frames: expected a number, got 'few'"):
         open_dataset("sim:room?frames=few")
+    with pytest.raises(ConfigError, match=r"frames: expected a whole number, got 2.5"):
+        open_dataset("sim:room?frames=2.5")
 
 
 def test_a_bag_of_packets_says_what_they_need(tmp_path: Path) -> None:

@@ -141,6 +141,9 @@ class SimulatedWorld:
             raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
+        for label, number in (("seed", seed), ("frames", frames), ("columns", columns)):
+            if number is not None and number != int(number):
+                raise ConfigError(f"{label}: expected a whole number, got {number!r}")
         _at_least("seed", seed, 0)
         self.scene = _BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]

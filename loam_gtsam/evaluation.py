@@ -183,8 +183,8 @@ def path_lengths(path: float) -> FloatArray:
     fitting = [unit for unit in _LENGTH_UNITS if 2 * _LENGTHS * unit <= path]
     if not fitting:
         raise InputError(
-            f"relative_error: expected a path of {2 * _LENGTHS * _LENGTH_UNITS[0]:g} m or more, "
-            f"got {path:.3g} m; give the lengths"
+            f"no relative error: a path of {2 * _LENGTHS * _LENGTH_UNITS[0]:g} m or more is needed "
+            f"for the usual lengths, this one has {path:.3g} m"
         )
     return fitting[-1] * np.arange(1.0, _LENGTHS + 1.0)
 

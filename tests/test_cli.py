@@ -261,8 +261,11 @@ def test_an_output_folder_that_cannot_be_made_is_found_before_the_run(opens):
 def test_plots_without_matplotlib(opens, scans, monkeypatch):
     monkeypatch.setattr(visualization, "available", lambda: False)
     opens(scans[:1])
-    assert loam("run", "x", "--output", "a").exit_code == 0
+    result = loam("run", "x", "--output", "a")
+    assert result.exit_code == 0
+    assert "No pictures without matplotlib" in result.output
     assert files_in("a") == set(RUN_FILES)
+    assert "No pictures" not in loam("run", "x", "--output", "c", "--no-plot").output
     result = loam("run", "x", "--output", "b", "--plot")
     assert result.exit_code == 1
     assert 'pip install "loam_gtsam[plot]"' in result.output

@@ -816,6 +816,14 @@ def test_a_world_is_not_made_of_words() -> None:
         open_dataset("sim:room?frames=2.5")
 
 
+def test_clouds_in_the_map_are_no_sweeps_while_there_are_others(tmp_path: Path) -> None:
+    mapped = sweeps("ros1", 3, "/velodyne_cloud_registered")
+    both = write_bag(tmp_path / "both", "ros1", [*mapped, *sweeps("ros1", 2, "/velodyne_points")])
+    assert BagDataset(both).topic == "/velodyne_points"
+    alone = BagDataset(write_bag(tmp_path / "alone", "ros1", mapped))
+    assert any("do not map them again" in text for text in alone.info().problems)
+
+
 def test_a_bag_of_packets_says_what_they_need(tmp_path: Path) -> None:
     recording = [("/imu", START, imu(ROS1, START))]
     path = write_bag(tmp_path / "run", "ros1", recording)

@@ -36,6 +36,17 @@ def has_colour(path, colour: str, pixels_at_least: int = 50) -> bool:
     return bool((np.abs(pixels - rgb).max(axis=2) < 0.02).sum() >= pixels_at_least)
 
 
+def test_rounding_does_not_stretch_a_logarithmic_axis(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(visualization, "save_figure", lambda figure, path: figures.append(figure))
+    curve = np.arange(3.0), np.array([1e-38, 0.1, 0.2])
+    nothing = np.zeros(0), np.zeros(0)
+    visualization.plot_curves("x.png", {"y": {"first": nothing, "b": curve}}, "x", log=True)
+    (axes,) = figures[0].axes
+    assert axes.get_ylim()[0] > 0.01
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["b"]
+
+
 def test_trajectory_with_and_without_truth(tmp_path):
     visualization.plot_trajectory(tmp_path / "a.png", circle())
     visualization.plot_trajectory(tmp_path / "b.png", circle(), circle(50))

@@ -15,6 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 from loam_gtsam.datasets.tables import DEFAULT_PERIOD_NS
 from loam_gtsam.types import BadSweep, DatasetError
 
+MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_registered")
+"""Topics on which LOAM and A-LOAM publish clouds in the map."""
+
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -92,7 +95,12 @@ def choose_topic(
             f"{path}: no topic of type {kind}; the bag has: {listing or 'no messages'}{hint}"
         )
     option = "--imu-topic" if kind.endswith("Imu") else "--topic"
-    chosen = max(candidates, key=lambda name: topics[name][1])  # the first of equals
+    measured = [name for name in candidates if name not in MAPPED] or candidates
+    chosen = max(measured, key=lambda name: topics[name][1])  # the first of equals
+    if chosen in MAPPED:
+        problems.append(
+            f"{chosen}: its sweeps are de-skewed and lie in a map; do not map them again"
+        )
     if len(candidates) > 1:
         problems.append(
             f"{len(candidates)} {kind.rsplit('/', 1)[-1]} topics ("

@@ -14,7 +14,7 @@ import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -25,6 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.types import (
+    MAX_STAMP,
     DatasetError,
     FloatArray,
     FrameStatus,
@@ -159,9 +160,12 @@ def read_tum(path: str | Path) -> Trajectory:
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp = int((Decimal(words[0]) * _NS).to_integral_value())
+            nanoseconds = Decimal(words[0]) * _NS
+            if not abs(nanoseconds) <= MAX_STAMP:
+                raise ValueError("out of range")
+            stamp = int(nanoseconds.to_integral_value())
             row = [float(word) for word in words[1:]]
-        except (InvalidOperation, ValueError, OverflowError) as error:
+        except (ArithmeticError, ValueError) as error:
             raise DatasetError(f"{path}:{number}: not numbers: {line[:80]!r}") from error
         if len(row) != 7 or not np.isfinite(row).all() or not any(row[3:]):
             raise DatasetError(

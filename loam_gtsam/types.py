@@ -24,6 +24,12 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
+MAX_STAMP = 1 << 62
+"""Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
+_FARTHEST = 1e5
+"""Metres, of a feature; far beyond any lidar, and within the grid of voxels."""
+
+
 class LoamError(Exception):
     """Base of every error this package raises on purpose."""
 
@@ -87,6 +93,10 @@ class Scan:
                 f"Scan.stamp: expected integer nanoseconds, got {self.stamp!r}; "
                 "round(seconds * 1e9) makes them of seconds"
             )
+        if abs(int(self.stamp)) > MAX_STAMP:
+            raise InputError(
+                f"Scan.stamp: expected nanoseconds up to 2^62 (the year 2116), got {self.stamp}"
+            )
         for name, kinds in (("times", "f"), ("rings", "iu")):
             column = getattr(self, name)
             if column is None:
@@ -147,13 +157,19 @@ class Features:
         Raises
         ------
         InputError
-            If a shape or a dtype is wrong.
+            If a shape or a dtype is wrong, or a point is not finite or farther than any lidar sees.
         """
         for name, points in (("edges", edges), ("planes", planes)):
             if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
                 raise InputError(f"{name}: expected an (N, 3) array, got {_describe(points)}")
             if points.dtype.kind != "f":
                 raise InputError(f"{name}: expected a float dtype, got {points.dtype}")
+            wild = int(np.count_nonzero(~(np.abs(points) < _FARTHEST).all(axis=1)))
+            if wild:
+                raise InputError(
+                    f"{name}: expected metres below {_FARTHEST:g}, got {wild} points of "
+                    f"{len(points)} that are NaN, infinite or farther; remove them first"
+                )
         n_edges, n_planes = len(edges), len(planes)
         return cls(
             stamp=stamp,
@@ -262,7 +278,8 @@ class FrameStatus(StrEnum):
     UNUSABLE_SCAN = "unusable_scan"
     """The sweep has no usable points or features; the pose is predicted."""
     BAD_STAMP = "bad_stamp"
-    """The stamp is not later than the one before; the sweep is skipped, the pose repeated."""
+    """The stamp is not later than the one before, or, unlike the one after it, more than ten
+    minutes later; the sweep is skipped, the pose repeated."""
 
     @property
     def solved(self) -> bool:

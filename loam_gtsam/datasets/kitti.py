@@ -24,6 +24,7 @@ from loam_gtsam.datasets.tables import (
     read_tum,
 )
 from loam_gtsam.types import (
+    MAX_STAMP,
     BadSweep,
     DatasetError,
     ImuSamples,
@@ -248,7 +249,10 @@ def _read_dates(path: Path) -> IntArray:
         date, _, fraction = line.strip().partition(".")
         try:
             moment = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            stamps.append(int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9]))
+            stamp = int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9])
+            if abs(stamp) > MAX_STAMP:
+                raise ValueError("out of range")
+            stamps.append(stamp)
         except ValueError as error:
             raise DatasetError(
                 f"{path}:{number}: expected a date and time, got {line.strip()!r}"

@@ -15,6 +15,9 @@ from rosbags.typesys import Stores, get_typestore
 from loam_gtsam.datasets.tables import DEFAULT_PERIOD_NS
 from loam_gtsam.types import BadSweep, DatasetError
 
+_MOST = 2**63 - 1
+"""Neither a length nor nanoseconds are larger; a bag without messages starts there."""
+
 
 @dataclass(frozen=True, slots=True)
 class Message:
@@ -39,6 +42,11 @@ def open_bag(path: Path) -> AnyReader:
     try:
         reader = AnyReader([path], default_typestore=get_typestore(store))
         reader.open()
+        try:
+            _check_metadata(reader)
+        except BaseException:
+            reader.close()
+            raise
     # Damage surfaces as whatever its parser stumbles over (struct, sqlite3, yaml, assertions ...).
     except Exception as error:
         hint = (
@@ -47,6 +55,18 @@ def open_bag(path: Path) -> AnyReader:
         )
         raise DatasetError(f"{path}: cannot open the bag: {_reason(error)}{hint}") from error
     return reader
+
+
+def _check_metadata(reader: AnyReader) -> None:
+    """Raise ValueError unless names and numbers of messages, which a bag may state, make sense."""
+    for connection in reader.connections:
+        name, count = connection.topic, connection.msgcount
+        if not isinstance(name, str):
+            raise ValueError(f"expected a topic's name, its metadata have {name!r}")
+        if not isinstance(count, int) or not 0 <= count < _MOST:
+            raise ValueError(f"topic {name}: expected a number of messages, got {count!r}")
+    if not isinstance(reader.start_time, int) or abs(reader.start_time) > _MOST:
+        raise ValueError(f"expected a start in nanoseconds, got {reader.start_time!r}")
 
 
 def topic_types(reader: AnyReader) -> dict[str, tuple[str, int]]:

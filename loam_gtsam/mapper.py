@@ -48,6 +48,9 @@ _PLACES = 6
 """Places tried at most when a sweep does not fit where it was solved."""
 _CLEARLY = 1.02
 """By how much another motion within a sweep must fit better than the one before."""
+_LEAP = 600 * 10**9
+"""Nanoseconds. A stamp that is later by more is believed when the next sweep confirms it: a single
+wrong one in the far future would otherwise make all that follow come too late."""
 _SHORTEST = 1e-3
 """Seconds between the middles of two sweeps at least; those of unlike length may even coincide."""
 
@@ -129,6 +132,7 @@ class Mapper:
         self._new_map()
         self._first: tuple[MovingSweep, gtsam.Pose3] | None = None
         self._last_middle: tuple[int, gtsam.Pose3] | None = None
+        self._leap: int | None = None
 
     def register(
         self,
@@ -156,7 +160,7 @@ class Mapper:
         """
         clock = Clock()
         last = self.last
-        if last is not None and features.stamp <= last.stamp:
+        if last is not None and (features.stamp <= last.stamp or self._leaps(features.stamp)):
             return self.skip(features.stamp, "")
         aid = self.imu_aid
         if last is None and aid is not None:
@@ -178,7 +182,7 @@ class Mapper:
             update = self._insert(sweep, start, FrameStatus.FIRST, "the map starts here", clock)
         else:
             update = self._solve(sweep, start, priors, clock)
-        self.last = update
+        self.last, self._leap = update, None
         return update
 
     def skip(self, stamp: int, message: str) -> MapUpdate:
@@ -193,21 +197,31 @@ class Mapper:
         -------
         MapUpdate
             With status ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp is not later than the last
-            one.
+            one, or so much later that only the next one can confirm it.
         """
         last = self.last
         if last is None:
             return MapUpdate(stamp, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN, message)
-        if stamp <= last.stamp:
+        if stamp <= last.stamp or self._leaps(stamp):
             message = f"stamp {stamp} ns is not later than the last one, {last.stamp} ns"
+            if stamp > last.stamp:
+                self._leap = stamp
+                message = f"stamp {stamp} ns is {(stamp - last.stamp) * 1e-9:.0f} s after the last"
             return MapUpdate(
                 stamp, last.map_T_lidar, FrameStatus.BAD_STAMP, message, twist=last.twist
             )
+        self._leap = None
         guess = ConstantVelocity(self.imu_aid).at(stamp, last)
         self.last = MapUpdate(
             stamp, guess.map_T_lidar, FrameStatus.UNUSABLE_SCAN, message, twist=guess.twist
         )
         return self.last
+
+    def _leaps(self, stamp: int) -> bool:
+        """Whether a stamp lies far after the last one, and the one before it did not."""
+        if self.last is None or stamp - self.last.stamp <= _LEAP:
+            return False
+        return self._leap is None or not 0 < stamp - self._leap <= _LEAP
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
@@ -241,8 +255,11 @@ class Mapper:
         guess, motion = self._expected(sweep, guess)
         middle = _to_middle(sweep, guess)
         maps = self.edge_map, self.plane_map
-        for cubes in maps:
-            cubes.recenter(middle.translation())
+        try:
+            for cubes in maps:
+                cubes.recenter(middle.translation())
+        except InputError as error:  # a guess that is not finite, or beyond the voxel grid
+            return self.skip(sweep.reference_stamp, str(error))
         around = [cubes.neighbourhood(middle.matrix()) for cubes in maps]
         sizes = [cubes.count(near) for cubes, near in zip(maps, around, strict=True)]
         config = self.config.solver

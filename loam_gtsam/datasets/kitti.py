@@ -255,6 +255,6 @@ def _read_dates(path: Path) -> IntArray:
             stamps.append(stamp)
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected a date and time, got {line.strip()!r}"
+                f"{path}:{number}: expected a date and time, got {line.strip()[:80]!r}"
             ) from error
     return np.array(stamps, dtype=np.int64)

@@ -58,7 +58,7 @@ def read_stamps(path: Path) -> IntArray:
             stamps.append(seconds_to_ns(line))
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected a time in seconds, got {line.strip()!r}"
+                f"{path}:{number}: expected a time in seconds, got {line.strip()[:80]!r}"
             ) from error
     return np.array(stamps, dtype=np.int64)
 
@@ -95,7 +95,7 @@ def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArra
             rows.append([float(cell) for cell in cells[1:]])
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected {count} numbers ({columns}), got {line.strip()!r}"
+                f"{path}:{number}: expected {count} numbers ({columns}), got {line.strip()[:80]!r}"
             ) from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), count - 1)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))

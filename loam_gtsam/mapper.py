@@ -177,6 +177,10 @@ class Mapper:
         clock.lap("prepare")
 
         if last is None:
+            try:
+                self._recenter(_to_middle(sweep, start))
+            except InputError as error:
+                return self.skip(features.stamp, str(error))
             if self.config.deskew.refine:
                 self._first = sweep, start.map_T_lidar
             update = self._insert(sweep, start, FrameStatus.FIRST, "the map starts here", clock)
@@ -256,9 +260,8 @@ class Mapper:
         middle = _to_middle(sweep, guess)
         maps = self.edge_map, self.plane_map
         try:
-            for cubes in maps:
-                cubes.recenter(middle.translation())
-        except InputError as error:  # a guess that is not finite, or beyond the voxel grid
+            self._recenter(middle)
+        except InputError as error:
             return self.skip(sweep.reference_stamp, str(error))
         around = [cubes.neighbourhood(middle.matrix()) for cubes in maps]
         sizes = [cubes.count(near) for cubes, near in zip(maps, around, strict=True)]
@@ -483,6 +486,7 @@ class Mapper:
             first.deskew(twist)
             sweep.deskew(twist)
             self._new_map()
+            self._recenter(_to_middle(first, Guess(pose, twist)))
             self._add_to_map(first, _to_middle(first, Guess(pose, twist)))
             again = self.solver.solve(matches_at, solution.map_T_lidar, priors, motion)
             if not again.solved:
@@ -511,6 +515,11 @@ class Mapper:
     def _new_map(self) -> None:
         self.edge_map = CubeMap(self.config.map, self.config.map.edge_voxel)
         self.plane_map = CubeMap(self.config.map, self.config.map.plane_voxel)
+
+    def _recenter(self, middle: gtsam.Pose3) -> None:
+        """Let the windows follow; InputError if a pose is not finite or beyond the voxel grid."""
+        for cubes in (self.edge_map, self.plane_map):
+            cubes.recenter(middle.translation())
 
     def _add_to_map(self, sweep: MovingSweep, middle: gtsam.Pose3) -> None:
         self.edge_map.owner = self.plane_map.owner = self.keyframe

@@ -340,6 +340,28 @@ def test_a_guess_outside_the_grid_is_a_status_and_the_map_stays(metres: float) -
     assert mapper.register(features[2]).status.solved
 
 
+@pytest.mark.parametrize("metres", [400.0, -5000.0, 150_000.0])
+def test_a_map_may_start_far_from_its_origin(metres: float) -> None:
+    mapper = Pipeline(Config()).mapper
+    start = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, metres]))
+    for number, sweep in enumerate(SWEEPS[:3]):
+        features = extract_features(sweep, Config())
+        update = mapper.register(features, start if number == 0 else None)
+        assert update.status.solved == (number > 0), update.message
+    assert mapper.edge_map.stats.outside == 0
+    assert abs(mapper.map_points()[1][:, 2].mean() - metres) < 10.0
+
+
+def test_a_first_guess_outside_the_grid_is_a_status_and_the_next_sweep_the_first() -> None:
+    mapper = Pipeline(Config()).mapper
+    features = [extract_features(sweep, Config()) for sweep in SWEEPS[:2]]
+    nowhere = gtsam.Pose3(gtsam.Rot3(), np.array([4e6, 0.0, 0.0]))
+    refused = mapper.register(features[0], nowhere)
+    assert refused.status is FrameStatus.UNUSABLE_SCAN
+    assert "start the map nearer" in refused.message
+    assert mapper.register(features[1]).status is FrameStatus.FIRST
+
+
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e30])
 def test_features_without_a_place_are_refused(value: float) -> None:
     points = np.ones((5, 3))

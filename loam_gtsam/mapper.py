@@ -486,7 +486,7 @@ class Mapper:
             first.deskew(twist)
             sweep.deskew(twist)
             self._new_map()
-            self._recenter(_to_middle(first, Guess(pose, twist)))
+            self._recenter(pose)
             self._add_to_map(first, _to_middle(first, Guess(pose, twist)))
             again = self.solver.solve(matches_at, solution.map_T_lidar, priors, motion)
             if not again.solved:

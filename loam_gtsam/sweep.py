@@ -30,6 +30,9 @@ MIN_POINTS = 11
 _MAX_SPAN = 2.0
 """Seconds. No spinning sensor in use turns slower than 0.5 Hz; more means wrong units."""
 
+_MAX_OFFSET = 10.0
+"""Seconds between a stamp and its sweep: a pose that far from its sweep would be extrapolated."""
+
 _MAX_OUTLIERS = 0.01
 """Fraction of points that may carry a nonsense time and be dropped."""
 
@@ -255,6 +258,12 @@ def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -
             "(and spin, start_azimuth_deg, period, stamp), or to none to run without de-skew"
         )
     span = columns.span or (float(columns.times.min()), float(columns.times.max()))
+    # NaN compares false
+    if not (abs(span[1] - span[0]) <= _MAX_SPAN and max(map(abs, span)) <= _MAX_OFFSET):
+        raise SweepError(
+            f"the sweep lies {span[0]:.6g} to {span[1]:.6g} s from its stamp; expected at most "
+            f"{_MAX_SPAN:g} s, within {_MAX_OFFSET:g} s: times count from the stamp, in seconds"
+        )
     note = f"per-point times from {span[0]:.4f} to {span[1]:.4f} s after the stamp"
     return TimeAssignment(columns.times, span, "field", note)
 

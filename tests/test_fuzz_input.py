@@ -36,6 +36,8 @@ from loam_gtsam.config import (
     parse_config,
 )
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
+from loam_gtsam.datasets.packed_points import read_pcd
+from loam_gtsam.datasets.pointcloud2 import decode_pointcloud2
 from loam_gtsam.export import read_tum
 from loam_gtsam.features import extract_features
 from loam_gtsam.graph_files import read_graph
@@ -235,6 +237,58 @@ def test_a_damaged_graph_is_read_or_refused(content: bytes) -> None:
             return
 
 
+def pcd(kind: str) -> str:
+    """A small PCD file; bytes as latin-1."""
+    points = np.random.default_rng(0).uniform(-9, 9, (30, 4)).astype("<f4")
+    text = (
+        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z t\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+        f"WIDTH 30\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS 30\nDATA {kind}\n"
+    )
+    if kind == "ascii":
+        return text + "".join(" ".join(map(str, row)) + "\n" for row in points.tolist())
+    return text + points.tobytes().decode("latin1")
+
+
+PCDS = {kind: pcd(kind) for kind in ("ascii", "binary")}
+HUGE = ["2147483648", "99999999999999999999", "-7", "0"]
+
+
+def read_pcd_points(content: bytes) -> int:
+    """Points of a file; -1 if it is refused."""
+    with folder() as place:
+        (place / "a.pcd").write_bytes(content)
+        try:
+            return len(
+                decode_pointcloud2(read_pcd(place / "a.pcd", START), time_field="none").points
+            )
+        except LoamError:
+            return -1
+
+
+@pytest.mark.parametrize("kind", PCDS)
+@given(data=st.data())
+def test_a_damaged_pcd_file_is_read_or_refused(kind: str, data: st.DataObject) -> None:
+    read_pcd_points(data.draw(texts(PCDS[kind])))
+
+
+@pytest.mark.parametrize("kind", PCDS)
+@pytest.mark.parametrize("number", HUGE)
+@pytest.mark.parametrize("line", ["WIDTH 30", "HEIGHT 1", "SIZE 4", "COUNT 1"])
+def test_a_pcd_file_cannot_claim_more_than_it_holds(kind: str, line: str, number: str) -> None:
+    assert read_pcd_points(PCDS[kind].encode("latin1")) == 30
+    claim = PCDS[kind].replace(line, f"{line.split()[0]} {number}")
+    assert read_pcd_points(claim.encode("latin1")) in (-1, 0)
+
+
+@pytest.mark.parametrize("stamp", ["9" * 40, "-" + "9" * 40, str(2**62 + 1)])
+def test_a_sweep_named_by_an_absurd_stamp_is_refused(stamp: str) -> None:
+    with folder() as place:
+        (place / "LiDAR" / "Velodyne").mkdir(parents=True)
+        (place / "LiDAR" / "Velodyne" / f"{stamp}.bin").write_bytes(bytes(22))
+        with pytest.raises(LoamError, match="stamp of the sweep"):
+            open_dataset(place)
+
+
 # -- configurations --------------------------------------------------------------------------------
 
 
@@ -375,6 +429,16 @@ def test_a_sweep_from_beyond_the_year_2116_is_refused(stamp: int) -> None:
     with pytest.raises(LoamError, match=r"Scan\.stamp: expected nanoseconds up to 2\^62"):
         Scan(points=np.zeros((0, 3)), stamp=stamp)
     assert Scan(points=np.zeros((0, 3)), stamp=2**62).stamp == 2**62
+
+
+@pytest.mark.parametrize("span", [(-1e9, 1e9), (1.7e9, 1.7e9 + 0.1), (0.0, np.nan), (0.0, 3.0)])
+def test_a_sweep_far_from_its_stamp_is_a_status(span: tuple[float, float]) -> None:
+    pipeline = Pipeline(Config())
+    pipeline.process(SWEEPS[0])
+    update = pipeline.process(replace(SWEEPS[1], span=span))
+    assert update.status is FrameStatus.UNUSABLE_SCAN
+    assert "s from its stamp" in update.message
+    assert pipeline.process(SWEEPS[2]).status.solved
 
 
 @pytest.mark.parametrize("code", ["u1", "i1", "u2", "i4", "u4", "i8", "u8"])

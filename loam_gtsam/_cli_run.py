@@ -12,7 +12,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
@@ -28,21 +28,24 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from loam_gtsam import visualization
+from loam_gtsam import frame_plot, visualization
 from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.checkpoint import Checkpoint
 from loam_gtsam.config import Config, dump_config
-from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
 from loam_gtsam.evaluation import absolute_error, align, align_rotations, interpolate
 from loam_gtsam.export import RUN_FILES, make_folder, replacing_all, write_run, write_tum
 from loam_gtsam.graph_files import write_graph
-from loam_gtsam.pipeline import Observer, OnFrame, RunResult, effective_config, run
+from loam_gtsam.pipeline import Observer, OnFrame, Pipeline, RunResult, effective_config, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
+from loam_gtsam.watching import LastFrame, watch
 
-PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
+FRAME_PLOT = "frame.png"
+PLOT_FILES = ("trajectory.png", "map.png", FRAME_PLOT, "timings.png")
+ERROR_PLOT = "errors.png"
 TRUTH_FILE = "truth.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
-RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, *LOOP_FILES, TRUTH_FILE)
+RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE)
 CHECKPOINT = "checkpoint"
 """Folder among the results, until they are complete."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -65,6 +68,8 @@ class RunOptions:
     workers: int | None = None
     resume: bool = False
     checkpoint_seconds: float = 60.0
+    view: bool = False
+    rrd: Path | None = None
 
 
 def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
@@ -94,7 +99,8 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     if options.checkpoint_seconds > 0.0:
         place = folder / CHECKPOINT
         checkpoint = Checkpoint(place, seconds=options.checkpoint_seconds, resume=options.resume)
-    with stop_requests() as stop, _bag(options, config) as observe:
+    last = LastFrame()
+    with stop_requests() as stop, _observers(options, config, last) as observe:
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
             result = run(
@@ -115,7 +121,10 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         accuracy, truth = compare(result.trajectory, dataset.truth)
         info = _input_info(dataset)
         folder, files = _write_somewhere(
-            folder, lambda there: _write(result, dataset, info, there, plot, accuracy, truth)
+            folder,
+            lambda there: _write(
+                result, dataset, info, there, last if plot else None, accuracy, truth
+            ),
         )
         if checkpoint is not None and not result.interrupted and result.error is None:
             checkpoint.remove()
@@ -127,6 +136,9 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         say_written(console, stop, len(result.updates), total, folder, files)
         if options.bag is not None and options.bag.exists():
             console.print(f"Bag written to {options.bag}", markup=False, soft_wrap=True)
+        if options.rrd is not None and options.rrd.exists():
+            text = f"Recording written to {options.rrd}; look at it with: rerun {options.rrd}"
+            console.print(text, markup=False, soft_wrap=True)
     if result.error is not None:
         raise result.error
     if stop.signum is not None:
@@ -205,16 +217,27 @@ def _workers(options: RunOptions, sweeps: int) -> int:
 
 
 @contextmanager
-def _bag(options: RunOptions, config: Config) -> Iterator[Observer | None]:
-    """What writes every frame into the bag that was asked for, if one was."""
-    if options.bag is None:
-        yield None
-        return
-    from loam_gtsam.export_bag import BagWriter
-    from loam_gtsam.recording import record
+def _observers(options: RunOptions, config: Config, last: LastFrame) -> Iterator[Observer]:
+    """What takes every frame: the bag and the viewer, if they were asked for, and ``last``."""
+    with ExitStack() as stack:
+        observers: list[Observer] = [last.observe]
+        if options.view or options.rrd is not None:
+            from loam_gtsam.viewer import RerunViewer
 
-    with BagWriter(options.bag, config.bag, overwrite=options.overwrite) as bag:
-        yield record(bag)
+            viewer = RerunViewer(options.rrd, window=options.view, overwrite=options.overwrite)
+            observers.append(watch(stack.enter_context(viewer)))
+        if options.bag is not None:
+            from loam_gtsam.export_bag import BagWriter
+            from loam_gtsam.recording import record
+
+            bag = BagWriter(options.bag, config.bag, overwrite=options.overwrite)
+            observers.append(record(stack.enter_context(bag)))
+
+        def observe(sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+            for observer in observers:
+                observer(sweep, update, pipeline)
+
+        yield observe
 
 
 def free_folder(wanted: Path, overwrite: bool, known: Sequence[str] = RUN_OUTPUTS) -> Path:
@@ -267,11 +290,11 @@ def _write(
     dataset: Dataset,
     info: DatasetInfo,
     folder: Path,
-    plot: bool,
+    drawn: LastFrame | None,
     accuracy: dict[str, Any],
     truth: Trajectory | None,
 ) -> list[str]:
-    """Write all files; names of what was written."""
+    """Write all files, with pictures if ``drawn`` is given; names of what was written."""
     extra = {"accuracy": accuracy or None, "input": asdict(info)}
     files = list(RUN_FILES)
     with replacing_all(folder, RUN_OUTPUTS, last="summary.json") as new:
@@ -283,15 +306,27 @@ def _write(
             write_tum(new / LOOP_FILES[0], result.odometry, comments={"frame": "odom"})
             write_graph(new / LOOP_FILES[1], result.loops.graph.saved())
             files.extend(LOOP_FILES)
-        if plot:
-            trajectory = result.trajectory
-            loops = None if result.loops is None else result.loops.ends()
-            visualization.plot_trajectory(new / "trajectory.png", trajectory, truth, loops)
-            visualization.plot_map(
-                new / "map.png", result.edge_points, result.plane_points, trajectory
-            )
-            visualization.plot_timings(new / "timings.png", result.updates)
-            files.extend(PLOT_FILES)
+        if drawn is not None:
+            files.extend(_draw(result, dataset, new, drawn, truth))
+    return files
+
+
+def _draw(
+    result: RunResult, dataset: Dataset, folder: Path, last: LastFrame, truth: Trajectory | None
+) -> list[str]:
+    """Draw all pictures; their names."""
+    files = [name for name in PLOT_FILES if name != FRAME_PLOT or last.seen]
+    trajectory = result.trajectory
+    loops = None if result.loops is None else result.loops.ends()
+    visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
+    visualization.plot_map(folder / "map.png", result.edge_points, result.plane_points, trajectory)
+    if last.seen:
+        frame_plot.plot_frame(folder / FRAME_PLOT, last.frame(), last.around())
+    visualization.plot_timings(folder / "timings.png", result.updates)
+    if truth is not None and dataset.truth is not None:
+        error = absolute_error(trajectory, dataset.truth)
+        visualization.plot_errors(folder / ERROR_PLOT, error.stamps, error.translations)
+        files.append(ERROR_PLOT)
     return files
 
 

@@ -178,6 +178,17 @@ def run(
             "folder if FILE has no suffix).",
         ),
     ] = None,
+    view: Annotated[
+        bool,
+        typer.Option("--view", help="Watch the run live, in the Rerun viewer (viewer extra)."),
+    ] = False,
+    rrd: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.rrd",
+            help="Save what --view shows, to be opened later with: rerun FILE.rrd.",
+        ),
+    ] = None,
     loops: Annotated[
         bool,
         typer.Option(
@@ -227,15 +238,29 @@ def run(
     settings = _settings(preset, config, sensor, overrides)
     if loops:
         settings = replace(settings, loops=replace(settings.loops, enabled=True))
-    if resume and bag is not None:
-        raise typer.BadParameter("--resume: the frames before would not be in --bag; give one only")
+    if resume and (bag is not None or rrd is not None):
+        recording = "--bag" if bag is not None else "--rrd"
+        raise typer.BadParameter(
+            f"--resume: the frames before would not be in {recording}; give one only"
+        )
     if resume and overwrite:
         raise typer.BadParameter("--resume and --overwrite contradict each other; give one only")
     if bag is not None and bag.resolve() in (Path(path).resolve(), *Path(path).resolve().parents):
         raise OutputError(f"--bag {bag}: the input must not be replaced; choose another name")
     dataset = _open(path, topic, imu_topic, loader_options)
     options = RunOptions(
-        frames, output, overwrite, plot, profile, quiet, bag, workers, resume, checkpoint
+        frames,
+        output,
+        overwrite,
+        plot,
+        profile,
+        quiet,
+        bag=bag,
+        workers=workers,
+        resume=resume,
+        checkpoint_seconds=checkpoint,
+        view=view,
+        rrd=rrd,
     )
     raise typer.Exit(execute(dataset, settings, options))
 

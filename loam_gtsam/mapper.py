@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -77,6 +78,23 @@ ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
 """Called once for every sweep that is solved; returns factors on ``context.key``."""
 
 
+@dataclass(frozen=True, slots=True)
+class Registered:
+    """A sweep as it went into the map, to be looked at.
+
+    Attributes
+    ----------
+    edges, planes : (E, 3) and (P, 3) metres, de-skewed, seen from the middle of the sweep
+    map_T_middle : pose of that moment
+    matches : that the pose was solved with; None if it was not solved
+    """
+
+    edges: FloatArray
+    planes: FloatArray
+    map_T_middle: gtsam.Pose3
+    matches: ScanMatches | None
+
+
 class Mapper:
     """LOAM's mapping stage.
 
@@ -92,6 +110,7 @@ class Mapper:
     Attributes
     ----------
     last : the last update
+    registered : the last sweep as it went into the map; None if it did not
     imu_aid : what the mapper makes of the IMU; None without one
     watch : tells whether sweeps fit the map
     edge_map, plane_map : the map
@@ -124,9 +143,14 @@ class Mapper:
         self.keyframe = 0
         self.reset()
 
+    def __getstate__(self) -> dict[str, Any]:
+        # For checkpoints: no frame depends on what is only there to be looked at.
+        return vars(self) | {"registered": None}
+
     def reset(self) -> None:
         """Forget the map: the next sweep is the first of a new one."""
         self.last: MapUpdate | None = None
+        self.registered: Registered | None = None
         self.watch = Watch(self.config.relocalization)
         self._errors = PoseErrors(self.config)
         self._new_map()
@@ -159,6 +183,7 @@ class Mapper:
             Never raises for what a sweep contains: see its ``status``.
         """
         clock = Clock()
+        self.registered = None
         last = self.last
         if last is not None and (features.stamp <= last.stamp or self._leaps(features.stamp)):
             return self.skip(features.stamp, "")
@@ -203,6 +228,7 @@ class Mapper:
             With status ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp is not later than the last
             one, or so much later that only the next one can confirm it.
         """
+        self.registered = None
         last = self.last
         if last is None:
             return MapUpdate(stamp, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN, message)
@@ -508,7 +534,10 @@ class Mapper:
         """De-skew with the final motion, add to the map, report."""
         clock.lap("solve")
         sweep.deskew(result.twist)
-        self._add_to_map(sweep, _to_middle(sweep, result))
+        middle = _to_middle(sweep, result)
+        self._add_to_map(sweep, middle)
+        matches = None if solution is None else solution.matches
+        self.registered = Registered(sweep.edges, sweep.planes, middle, matches)
         clock.lap("insert")
         return report(sweep, result, status, message, clock, solution, tilt)
 

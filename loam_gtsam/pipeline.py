@@ -36,8 +36,6 @@ from loam_gtsam.types import (
 
 OnFrame = Callable[[int, MapUpdate], None]
 """Called after each frame with its number and result."""
-Observer = Callable[[Sweep, MapUpdate, Mapper], None]
-"""Called after each frame with the sweep, its result and the mapper, to look and not to change."""
 _Section = TypeVar("_Section", SensorConfig, ImuConfig)
 
 
@@ -203,6 +201,36 @@ class Pipeline:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
         return (self.mapper if self.loops is None else self.loops).map_points()
 
+    def result(
+        self,
+        updates: Sequence[MapUpdate],
+        *,
+        interrupted: bool = False,
+        error: Exception | None = None,
+    ) -> RunResult:
+        """A whole run, from what :meth:`process` said about each of its sweeps."""
+        mapper = self.mapper
+        edges, planes = self.map_points()
+        return RunResult(
+            config=self.config,
+            updates=tuple(updates),
+            edge_points=edges,
+            plane_points=planes,
+            map_stats={
+                name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
+                for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
+            },
+            interrupted=interrupted,
+            error=error,
+            imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+            loops=self.loops,
+        )
+
+
+Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
+"""Called after each frame with the sweep, its result and the pipeline (its mapper, its loops), to
+look and not to change."""
+
 
 def _sections(name: str, config: Any) -> dict[str, Any]:
     """A section of the configuration and those in it, by name."""
@@ -301,7 +329,7 @@ def run(
             update = replace(update, timings={"read": seconds} | dict(update.timings))
             progress.add(sweep, update)
             if observe is not None:
-                observe(sweep, update, pipeline.mapper)
+                observe(sweep, update, pipeline)
             if on_frame is not None:
                 on_frame(len(updates) - 1, update)
             progress.save_if_due()
@@ -313,22 +341,7 @@ def run(
             raise
         error = caught
         progress.save()
-    mapper = pipeline.mapper
-    edges, planes = pipeline.map_points()
-    return RunResult(
-        config=config,
-        updates=tuple(updates),
-        edge_points=edges,
-        plane_points=planes,
-        map_stats={
-            name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
-            for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
-        },
-        interrupted=interrupted,
-        error=error,
-        imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
-        loops=pipeline.loops,
-    )
+    return pipeline.result(updates, interrupted=interrupted, error=error)
 
 
 class _Progress:

@@ -12,7 +12,7 @@ from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.deskew import MovingSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.pipeline import Observer
+from loam_gtsam.pipeline import Observer, Pipeline
 from loam_gtsam.sweep import OrganisedSweep, organise
 from loam_gtsam.types import (
     BadSweep,
@@ -50,9 +50,9 @@ def record(recording: Recording) -> Observer:
     ...     run(dataset, config, observe=record(bag))
     """
 
-    def observe(sweep: Sweep, update: MapUpdate, mapper: Mapper) -> None:
-        cloud = registered_cloud(sweep, update, mapper)
-        recording.write(update, cloud, lambda: surrounding_cloud(update, mapper))
+    def observe(sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+        cloud = registered_cloud(sweep, update, pipeline.mapper)
+        recording.write(update, cloud, lambda: surrounding_cloud(update, pipeline.mapper))
 
     return observe
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from loam_gtsam.export import replacing, stage_seconds
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, OutputError, Trajectory
 
-_INK, _FAINT, _PATH, _TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
+INK, FAINT, PATH, TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
 _STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d")
 _RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8", "#7a5230")
 """Of the solvers of a comparison, in the order they were named."""
@@ -23,7 +23,7 @@ _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 _MAX_BYTES = 300_000
 """Larger pictures are reduced to ``_PALETTE`` colours: they are for READMEs and reports."""
-_PALETTE = 128
+_PALETTE = 255
 _MAP_CELLS = 700
 """Cells along the longer side of the top view; a picture has about as many pixels."""
 _MIN_CELL = 0.1
@@ -55,28 +55,28 @@ def plot_trajectory(
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
-    figure = _figure(9.0, 7.0)
+    figure = empty_figure(9.0, 7.0)
     top, side = figure.subplots(2, 1, height_ratios=(4, 1))
     if truth is not None:
         xyz = truth.map_T_lidar[:, :3, 3]
-        top.plot(xyz[:, 0], xyz[:, 1], color=_TRUTH, lw=3.0, label="truth")
-        side.plot(_travelled(xyz), xyz[:, 2], color=_TRUTH, lw=3.0)
+        top.plot(xyz[:, 0], xyz[:, 1], color=TRUTH, lw=3.0, label="truth")
+        side.plot(_travelled(xyz), xyz[:, 2], color=TRUTH, lw=3.0)
     xyz = trajectory.map_T_lidar[:, :3, 3]
-    top.plot(xyz[:, 0], xyz[:, 1], color=_PATH, lw=1.4, label="estimate")
-    top.plot(xyz[:1, 0], xyz[:1, 1], "o", color=_INK, ms=6, label="start")
-    side.plot(_travelled(xyz), xyz[:, 2], color=_PATH, lw=1.4)
+    top.plot(xyz[:, 0], xyz[:, 1], color=PATH, lw=1.4, label="estimate")
+    top.plot(xyz[:1, 0], xyz[:1, 1], "o", color=INK, ms=6, label="start")
+    side.plot(_travelled(xyz), xyz[:, 2], color=PATH, lw=1.4)
     if loops is not None:
         for name, on, style in (("loops", loops[1], "-o"), ("loops, not used", ~loops[1], ":o")):
             ends = loops[0][on]
             if not len(ends):
                 continue
             label = [f"{len(ends)} {name}", *[""] * (len(ends) - 1)]
-            top.plot(ends[:, :, 0].T, ends[:, :, 1].T, style, color=_INK, lw=0.8, ms=2, label=label)
+            top.plot(ends[:, :, 0].T, ends[:, :, 1].T, style, color=INK, lw=0.8, ms=2, label=label)
     top.set_aspect("equal", adjustable="datalim")
     top.set(xlabel="x [m]", ylabel="y [m]", title=f"{trajectory.length:.1f} m travelled")
     top.legend(frameon=False)
     side.set(xlabel="distance travelled [m]", ylabel="z [m]")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_map(
@@ -98,7 +98,7 @@ def plot_map(
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
-    figure = _figure(9.0, 7.0)
+    figure = empty_figure(9.0, 7.0)
     axes = figure.subplots()
     points = np.concatenate((edges, planes)).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
@@ -110,12 +110,73 @@ def plot_map(
     if trajectory is not None and len(trajectory):
         xyz = trajectory.map_T_lidar[:, :3, 3]
         axes.plot(xyz[:, 0], xyz[:, 1], color="white", lw=3.0)
-        axes.plot(xyz[:, 0], xyz[:, 1], color=_PATH, lw=1.6)
-        axes.plot(xyz[:1, 0], xyz[:1, 1], "o", color=_PATH, mec="white", ms=7)
+        axes.plot(xyz[:, 0], xyz[:, 1], color=PATH, lw=1.6)
+        axes.plot(xyz[:1, 0], xyz[:1, 1], "o", color=PATH, mec="white", ms=7)
     axes.set_aspect("equal")
     axes.margins(0.02)
     axes.set(xlabel="x [m]", ylabel="y [m]")
-    _save(figure, path)
+    save_figure(figure, path)
+
+
+def plot_errors(path: str | Path, stamps: IntArray, errors: FloatArray) -> None:
+    """Draw how far the positions are off the truth, over time.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    stamps : (N,) nanoseconds
+    errors : (N,) metres, see :class:`loam_gtsam.evaluation.AbsoluteError`
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = empty_figure(9.0, 3.2)
+    axes = figure.subplots()
+    seconds = (stamps - stamps[0]) * 1e-9 if len(stamps) else stamps
+    axes.fill_between(seconds, errors, color=PATH, alpha=0.15, lw=0)
+    axes.plot(seconds, errors, color=PATH, lw=1.4)
+    rmse = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
+    axes.axhline(rmse, color=INK, lw=0.8, ls=":", label=f"{rmse:.3f} m (RMSE)")
+    axes.set_ylim(bottom=0.0)
+    axes.legend(frameon=False)
+    axes.set(xlabel="time [s]", ylabel="position error [m]")
+    save_figure(figure, path)
+
+
+def plot_loops(
+    path: str | Path,
+    panels: Mapping[str, tuple[FloatArray, FloatArray]],
+    loops: FloatArray,
+) -> None:
+    """Draw maps of one run beside each other from above, e.g. without loops and with them.
+
+    Parameters
+    ----------
+    path : of the PNG file
+    panels : title -> (N, 3) points of the map and (K, 3) the way, metres
+    loops : (L, 2, 3) their ends in the last of the maps
+
+    Raises
+    ------
+    OutputError
+        If matplotlib is missing or the file cannot be written.
+    """
+    figure = empty_figure(4.6 * len(panels), 3.6)
+    row = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, (title, (points, way)) in zip(row, panels.items(), strict=True):
+        if len(points):
+            _top_view(axes, points)
+        axes.plot(way[:, 0], way[:, 1], color="white", lw=2.6)
+        axes.plot(way[:, 0], way[:, 1], color=PATH, lw=1.4)
+        axes.plot(way[:1, 0], way[:1, 1], "o", color=PATH, mec="white", ms=6)
+        axes.set_title(title, loc="left", fontsize=10)
+        axes.set_aspect("equal")
+        axes.set_xlabel("x [m]")
+    row[0].set_ylabel("y [m]")
+    row[-1].plot(loops[:, :, 0].T, loops[:, :, 1].T, "-o", color=INK, lw=0.8, ms=1.8)
+    save_figure(figure, path)
 
 
 def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
@@ -131,7 +192,7 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
-    figure = _figure(9.0, 4.0)
+    figure = empty_figure(9.0, 4.0)
     axes = figure.subplots()
     names, seconds = stage_seconds(updates)
     if names:
@@ -151,7 +212,7 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
             loc="center left", bbox_to_anchor=(1.0, 0.5),
         )  # fmt: skip
     axes.set(xlabel="frame", ylabel="time [ms]")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_trajectories(
@@ -170,9 +231,9 @@ def plot_trajectories(
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
-    figure = _figure(9.0, 7.5)
+    figure = empty_figure(9.0, 7.5)
     top, side = figure.subplots(2, 1, height_ratios=(4, 1))
-    lines = [] if truth is None else [("truth", truth, _TRUTH, 4.0)]
+    lines = [] if truth is None else [("truth", truth, TRUTH, 4.0)]
     named = zip(trajectories.items(), itertools.cycle(_RUN_COLOURS), strict=False)
     lines += [(name, trajectory, colour, 1.3) for (name, trajectory), colour in named]
     for name, trajectory, colour, width in lines:
@@ -183,7 +244,7 @@ def plot_trajectories(
     top.set(xlabel="x [m]", ylabel="y [m]")
     top.legend(frameon=False)
     side.set(xlabel="distance travelled [m]", ylabel="z [m]")
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_curves(
@@ -207,7 +268,7 @@ def plot_curves(
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
-    figure = _figure(9.0, 1.0 + 2.8 * len(panels))
+    figure = empty_figure(9.0, 1.0 + 2.8 * len(panels))
     rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (ylabel, curves) in zip(rows, panels.items(), strict=True):
         for (name, (x, y)), colour in zip(
@@ -223,7 +284,7 @@ def plot_curves(
         if curves:
             axes.legend(frameon=False)
     rows[-1].set_xlabel(xlabel)
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> None:
@@ -239,7 +300,7 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
     OutputError
         If matplotlib is missing or the file cannot be written.
     """
-    figure = _figure(9.0, 1.4 + 0.5 * len(stages))
+    figure = empty_figure(9.0, 1.4 + 0.5 * len(stages))
     axes = figure.subplots()
     names = list(dict.fromkeys(stage for row in stages.values() for stage in row))
     left = np.zeros(len(stages))
@@ -250,7 +311,7 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
     axes.invert_yaxis()
     axes.set_xlabel("median time per stage [ms]")
     axes.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    _save(figure, path)
+    save_figure(figure, path)
 
 
 def _top_view(axes: Any, points: FloatArray) -> Any:
@@ -293,7 +354,7 @@ def _travelled(xyz: FloatArray) -> FloatArray:
     return travelled
 
 
-def _figure(width: float, height: float) -> Any:
+def empty_figure(width: float, height: float) -> Any:
     """An empty figure, free of matplotlib's global state and of any display."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -307,17 +368,17 @@ def _figure(width: float, height: float) -> Any:
     return figure
 
 
-def _save(figure: Any, path: str | Path) -> None:
+def save_figure(figure: Any, path: str | Path) -> None:
     """Common style, then the PNG."""
     for axes in figure.axes:
-        axes.tick_params(colors=_INK, length=0, labelsize=9)
-        axes.xaxis.label.set_color(_INK)
-        axes.yaxis.label.set_color(_INK)
-        axes.title.set_color(_INK)
+        axes.tick_params(colors=INK, length=0, labelsize=9)
+        axes.xaxis.label.set_color(INK)
+        axes.yaxis.label.set_color(INK)
+        axes.title.set_color(INK)
         for spine in axes.spines.values():
-            spine.set_color(_FAINT)
+            spine.set_color(FAINT)
         if axes.get_label() != "<colorbar>":
-            axes.grid(True, color=_FAINT, lw=0.5)
+            axes.grid(True, color=FAINT, lw=0.5)
             axes.set_axisbelow(True)
     png = io.BytesIO()
     figure.savefig(png, format="png", bbox_inches="tight", pad_inches=0.12)

@@ -76,7 +76,7 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
     result = loam("demo", "--scene", "room", "--frames", FRAMES, "--profile")
     assert result.exit_code == 0, result.output
     folder = Path("loam_gtsam_output/room_vlp16")
-    plots = set(_cli_run.PLOT_FILES) if PLOTS else set()
+    plots = {*_cli_run.PLOT_FILES, _cli_run.ERROR_PLOT} if PLOTS else set()
     assert files_in(folder) == {*RUN_FILES, "truth.tum"} | plots
     accuracy = json.loads((folder / "summary.json").read_text())["accuracy"]
     assert accuracy["compared_poses"] == FRAMES
@@ -560,7 +560,7 @@ def test_a_checkpoint_is_not_run_over(opens, scans):
     assert files_in("out") == set(RUN_FILES)
 
 
-@pytest.mark.parametrize("other", [["--bag", "x.mcap"], ["--overwrite"]])
+@pytest.mark.parametrize("other", [["--bag", "x.mcap"], ["--rrd", "x.rrd"], ["--overwrite"]])
 def test_resume_tells_what_it_cannot_go_together_with(other):
     result = loam("run", "sim:room", "--resume", *other)
     assert result.exit_code == 2

@@ -674,7 +674,7 @@ def test_pictures_show_every_solver(tmp_path):
     visualization.plot_trajectories(tmp_path / "one.png", {"a": winding()})
     assert shows("two.png", first)
     assert shows("two.png", second)
-    assert shows("two.png", visualization._TRUTH)
+    assert shows("two.png", visualization.TRUTH)
     assert shows("one.png", first)
     assert not shows("one.png", second)
     x = np.arange(50)

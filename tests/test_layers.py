@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1] / "loam_gtsam"
 THIS = "tests/test_layers.py"
 
 LAYERS = (
-    ("freezing", "types", "config", "geometry", "rotations"),
+    ("freezing", "types", "config", "geometry", "rotations", "frame_view"),
     (
         "rings",
         "place",
@@ -39,10 +39,13 @@ LAYERS = (
     ),
     ("mapper", "ahead"),
     ("loop_mapping", "checkpoint"),
-    ("pipeline", "estimators", "graph_files"),
-    ("comparison", "recording", "evalio_pipeline"),
+    ("pipeline", "estimators", "graph_files", "live_imu", "live_report", "live_sweeps"),
+    ("comparison", "recording", "watching", "evalio_pipeline", "live"),
+    ("ros_topics",),
     ("experiments", "experiment_spec", "experiment_table", "experiment_workers"),
     (
+        "ros",
+        "ros1",
         "_cli_report",
         "_report_html",
         "_compare_files",
@@ -60,6 +63,7 @@ SAME_LAYER = {
     "config": {"types"},
     "geometry": {"types"},
     "rotations": {"types"},
+    "frame_view": {"types"},
     "sweep": {"rings"},
     "features": {"sweep", "posts"},
     "cubemap": {"cube_archive"},
@@ -76,6 +80,7 @@ SAME_LAYER = {
     "loop_consistency": {"keyframes"},
     "pose_graph": {"keyframes", "loop_consistency"},
     "loop_closure": {"keyframes", "pose_graph", "relocalization", "scan_error"},
+    "watching": {"recording"},
     "experiment_spec": {"experiments"},
     "experiment_table": {"experiments", "experiment_spec"},
     "experiment_workers": {"experiments"},
@@ -91,9 +96,13 @@ LEAVES = {
     "evaluation": set(),
     "export": set(),
     "bag_messages": set(),
-    "export_bag": {"bag_messages"},
+    "frame_messages": {"bag_messages"},
+    "export_bag": {"frame_messages"},
     "peers": set(),
     "visualization": {"export"},
+    "frame_plot": {"visualization"},
+    "_rrd_file": set(),
+    "viewer": {"_rrd_file"},
 }
 """Leaves see layer 0 and these; of the layers, only the command line and LEAF_USERS see them."""
 
@@ -103,6 +112,27 @@ LEAF_USERS = {
     "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
+    "watching": {"datasets.base"},
+    "live": {
+        "datasets.base",
+        "datasets.cloud_stream",
+        "datasets.imu_messages",
+        "datasets.loam_messages",
+    },
+    "live_imu": {"datasets.tables"},
+    "live_sweeps": {
+        "datasets.base",
+        "datasets.cloud_stream",
+        "datasets.loam_messages",
+        "datasets.pointcloud2",
+    },
+    "ros_topics": {
+        "datasets.base",
+        "datasets.cloud_stream",
+        "datasets.loam_messages",
+        "export",
+        "frame_messages",
+    },
     "evalio_pipeline": {"datasets.extrinsics"},
     "experiments": {"datasets", "datasets.base", "evaluation", "peers"},
     "experiment_table": {"export"},

@@ -18,10 +18,11 @@ from loam_gtsam.config import Config, DeskewConfig
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.export import read_tum
-from loam_gtsam.export_bag import ODOMETRY, REGISTERED, SURROUND, BagWriter
+from loam_gtsam.export_bag import BagWriter
+from loam_gtsam.frame_messages import ODOMETRY, REGISTERED, SURROUND
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.pipeline import run
+from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.recording import record, registered_cloud, surrounding_cloud
 from loam_gtsam.types import (
     BadSweep,
@@ -121,9 +122,9 @@ def test_the_whole_of_a_run_is_recorded(tmp_path: Path) -> None:
     sweeps = [*(world[n] for n in range(5)), BadSweep(world[5].stamp, "broken")]
     mappers = []
 
-    def observe(sweep: Any, update: MapUpdate, mapper: Mapper) -> None:
-        mappers.append(mapper)
-        recorded(sweep, update, mapper)
+    def observe(sweep: Any, update: MapUpdate, pipeline: Pipeline) -> None:
+        mappers.append(pipeline.mapper)
+        recorded(sweep, update, pipeline)
 
     with BagWriter(tmp_path / "run.bag") as bag:
         recorded = record(bag)

@@ -119,7 +119,8 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
 
     from loam_gtsam.datasets.bag import BagDataset
     from loam_gtsam.datasets.bag_reader import open_bag
-    from loam_gtsam.datasets.loam_topics import REQUIRED, LoamTopicsDataset
+    from loam_gtsam.datasets.loam_messages import REQUIRED
+    from loam_gtsam.datasets.loam_topics import LoamTopicsDataset
 
     with closing(open_bag(path)) as reader:
         topics = set(reader.topics)

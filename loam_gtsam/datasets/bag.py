@@ -20,13 +20,13 @@ from loam_gtsam.datasets.bag_reader import (
     topic_types,
 )
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.imu_messages import decode_imu
 from loam_gtsam.datasets.point_times import TimeDecision, check_time_options
 from loam_gtsam.datasets.pointcloud2 import (
     NO_TIMES,
     Decoded,
     decode_with_times,
     describe_fields,
-    message_stamp,
 )
 from loam_gtsam.datasets.tables import (
     clean_imu,
@@ -189,13 +189,9 @@ def read_imu(
         if isinstance(message, BadSweep):
             lost += 1
             continue
-        sample = message.content
-        q, w, a = sample.orientation, sample.angular_velocity, sample.linear_acceleration
-        # sensor_msgs/Imu: a first covariance element of -1 says there is no orientation
-        unknown = sample.orientation_covariance[0] == -1.0
-        orientation = (0.0, 0.0, 0.0, 0.0) if unknown else (q.x, q.y, q.z, q.w)
-        stamps.append(message_stamp(sample))
-        rows.append((*orientation, w.x, w.y, w.z, a.x, a.y, a.z))
+        stamp, row = decode_imu(message.content)
+        stamps.append(stamp)
+        rows.append(row)
     if lost:
         problems.append(f"IMU: {lost} messages cannot be read")
     values = np.array(rows, dtype=np.float64).reshape(-1, 10)

@@ -22,6 +22,8 @@ STANDARD_GRAVITY = 9.80665
 """m/s^2, CGPM 1901."""
 _ABSURD = 1e6
 """rad/s and m/s^2 that no IMU measures."""
+UNIT_TOLERANCE = 0.1
+"""By which the length of a quaternion may differ from one for it to be an orientation."""
 
 
 def seconds_to_ns(text: str) -> int:
@@ -189,14 +191,19 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     stamps, values = stamps[order], values[order]
     orientation, gyro, acceleration = values[:, :4].copy(), values[:, 4:7], values[:, 7:]
     norms = np.linalg.norm(orientation, axis=1, keepdims=True)
-    unknown = bool((np.abs(norms - 1.0) > 0.1).any())
+    unknown = bool((np.abs(norms - 1.0) > UNIT_TOLERANCE).any())
     if unknown:
         problems.append("IMU: no orientation (quaternions are not of unit length)")
-    median = float(np.median(np.linalg.norm(acceleration, axis=1)))
-    if 0.8 < median < 1.2:
+    if is_in_g(acceleration):
+        median = float(np.median(np.linalg.norm(acceleration, axis=1)))
         problems.append(f"IMU: acceleration of {median:.2f} at rest is in g, converted to m/s^2")
         acceleration = acceleration * STANDARD_GRAVITY
     return ImuSamples(stamps, None if unknown else orientation / norms, gyro, acceleration)
+
+
+def is_in_g(acceleration: FloatArray) -> bool:
+    """Whether (N, 3) accelerations, most of them near rest, are in g instead of m/s^2."""
+    return bool(0.8 < np.median(np.linalg.norm(acceleration, axis=1)) < 1.2)
 
 
 def describe_imu(samples: ImuSamples) -> str:

@@ -1,0 +1,93 @@
+"""An ``.rrd`` file that Rerun fills through a pipe.
+
+Rerun's own file sink waits for ever once a disk is full (seen in 0.41). Behind a pipe it never
+fails, and what goes wrong with the file is an error like any other.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+from loam_gtsam.types import OutputError
+
+_CHUNK = 1 << 20
+_PATIENCE = 60.0
+"""Seconds to wait for the last bytes."""
+
+
+class RrdFile:
+    """Copies what is written to :attr:`sink` into a file, in a thread.
+
+    Parameters
+    ----------
+    path : of the file
+    overwrite : replace an earlier file
+
+    Attributes
+    ----------
+    sink : the path to write to; whoever opens it must have done so before :meth:`opened`
+
+    Raises
+    ------
+    OutputError
+        If the name does not end in ``.rrd``, the file exists or cannot be written.
+    """
+
+    def __init__(self, path: Path, overwrite: bool) -> None:
+        self._path = path
+        if path.suffix != ".rrd":
+            raise OutputError(f"{path}: expected a name that ends in .rrd")
+        if path.exists() and not overwrite:
+            raise OutputError(
+                f"{path}: the file exists; add overwrite=True (--overwrite) or choose another name"
+            )
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            file = open(path, "wb", buffering=0)  # noqa: SIM115 - the thread closes it
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self._problem: OSError | None = None
+        source, self._write_end = os.pipe()
+        self.sink = f"/dev/fd/{self._write_end}"
+
+        def copy() -> None:
+            with open(source, "rb", buffering=0) as pipe, file:
+                while data := pipe.read(_CHUNK):
+                    # After an error the rest is read all the same: the pipe must not fill up.
+                    try:
+                        while data and self._problem is None:
+                            data = data[file.write(data) :]
+                    except OSError as error:
+                        self._problem = error
+
+        self._thread = threading.Thread(target=copy, name="rrd file", daemon=True)
+        self._thread.start()
+
+    def opened(self) -> None:
+        """The other side has opened :attr:`sink`: when it closes that, the file ends."""
+        os.close(self._write_end)
+
+    def check(self) -> None:
+        """Raise if something could not be written.
+
+        Raises
+        ------
+        OutputError
+            Which ends with what to do.
+        """
+        if self._problem is not None:
+            raise self._unwritable(self._problem) from self._problem
+
+    def wait(self) -> None:
+        """Wait until all is in the file. The other side must have closed :attr:`sink`."""
+        self._thread.join(_PATIENCE)
+        if self._thread.is_alive():
+            self._problem = TimeoutError("the disk does not keep up")
+
+    def _unwritable(self, error: OSError) -> OutputError:
+        return OutputError(
+            f"{self._path}: cannot write the file: {error.strerror or error}; choose another "
+            "folder or free some space"
+        )

@@ -31,6 +31,7 @@ from loam_gtsam.types import (
     FloatArray,
     FrameStatus,
     InputError,
+    IntArray,
     MapUpdate,
     OutputError,
     Trajectory,
@@ -89,6 +90,8 @@ class Run(Protocol):
     def trajectory(self) -> Trajectory: ...
     @property
     def status_counts(self) -> dict[str, int]: ...
+    @property
+    def faults(self) -> dict[str, int]: ...
 
 
 @contextmanager
@@ -399,6 +402,12 @@ def summarise(result: Run) -> dict[str, Any]:
         "interrupted": result.interrupted,
         "error": None if result.error is None else f"{type(result.error).__name__}: {result.error}",
         "status_counts": result.status_counts,
+        "faults": result.faults,
+        "sweep_gaps": _gaps(trajectory.stamps),
+        "not_finite_points": {
+            "sweeps": sum(u.n_not_finite > 0 for u in result.updates),
+            "points": sum(u.n_not_finite for u in result.updates),
+        },
         "messages": messages[:_MAX_MESSAGES],
         "path_length_m": trajectory.length,
         "duration_s": float(np.ptp(trajectory.stamps)) / _NS if len(trajectory) else 0.0,
@@ -410,6 +419,12 @@ def summarise(result: Run) -> dict[str, Any]:
         "imu": None if result.imu is None else _imu_part(result.imu),
         "loops": None if result.loops is None else result.loops.counts(),
     }
+
+
+def _gaps(stamps: IntArray) -> int:
+    """From how many sweeps to the next it took more than half as long again as usual."""
+    steps = np.diff(stamps)
+    return int(np.count_nonzero(steps > 1.5 * np.median(steps))) if len(steps) else 0
 
 
 def _axes_part(result: Run) -> dict[str, Any] | None:
@@ -436,6 +451,9 @@ def _imu_part(imu: Any) -> dict[str, Any]:
         "samples": report.samples,
         "rate_hz": report.rate,
         "gaps": report.gaps,
+        "duplicates": report.duplicates,
+        "out_of_order": report.out_of_order,
+        "not_finite": report.not_finite,
         "orientation": report.orientation,
         "level": None
         if level is None

@@ -52,8 +52,49 @@ class OutputError(LoamError):
     """A file or a picture could not be written."""
 
 
+@checkpointed
+class SweepFault(StrEnum):
+    """What was wrong with a sweep that was not used."""
+
+    UNREADABLE = "unreadable"
+    """Its loader could not read it."""
+    EMPTY = "empty"
+    """It has no points at all."""
+    NOT_FINITE = "not_finite"
+    """Too few of its points, or not all of its features, are finite numbers."""
+    TOO_FEW_POINTS = "too_few_points"
+    """Too few points, or too few that are within range."""
+    BAD_TIMES = "bad_times"
+    """The times of its points cannot be had, or be seconds of one sweep."""
+    BAD_RINGS = "bad_rings"
+    """Its beams cannot be told apart."""
+    NO_FEATURES = "no_features"
+    DUPLICATE_STAMP = "duplicate_stamp"
+    """That of the sweep before; see :mod:`loam_gtsam.stamps` for the other stamps."""
+    LATE = "late"
+    """A later sweep has come already."""
+    STAMP_BACK = "stamp_back"
+    """So much earlier that it is no late sweep: its stamp is wrong."""
+    STAMP_AHEAD = "stamp_ahead"
+    """So much later that its stamp is doubted."""
+    CLOCK_SET_BACK = "clock_set_back"
+    """Sweep after sweep is earlier than the last one used: nothing can be used until a reset."""
+    CLOCK_SET_AHEAD = "clock_set_ahead"
+    """Sweep after sweep is far ahead; from the next one on that is the clock."""
+
+
 class SweepError(LoamError):
-    """One sweep cannot be used; the mapper turns it into a frame status and goes on."""
+    """One sweep cannot be used; the mapper turns it into a frame status and goes on.
+
+    Parameters
+    ----------
+    message : a sentence
+    fault : what is wrong, where the sweep itself is
+    """
+
+    def __init__(self, message: str, fault: SweepFault | None = None) -> None:
+        super().__init__(message)
+        self.fault = fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,6 +173,7 @@ class Features:
     edge_kinks : (E,) metres by which each edge stands out of its ring, in the unit in which range
         noise has its own standard deviation (:func:`loam_gtsam.features.kinks`); None if unknown:
         all edges then count as real ones.
+    not_finite : points of the sweep that were NaN or infinite
     """
 
     stamp: int
@@ -145,6 +187,7 @@ class Features:
     flat: IntArray
     span: tuple[float, float] = (0.0, 0.0)
     edge_kinks: FloatArray | None = None
+    not_finite: int = 0
 
     @classmethod
     def from_points(
@@ -283,8 +326,8 @@ class FrameStatus(StrEnum):
     UNUSABLE_SCAN = "unusable_scan"
     """The sweep has no usable points or features; the pose is predicted."""
     BAD_STAMP = "bad_stamp"
-    """The stamp is not later than the one before, or, unlike the one after it, more than ten
-    minutes later; the sweep is skipped, the pose repeated."""
+    """The stamp is not later than the one before, or far too late; the sweep is skipped, the pose
+    repeated."""
 
     @property
     def solved(self) -> bool:
@@ -378,6 +421,8 @@ class MapUpdate:
         the other five are left free; at least 1; below ``solver.min_aligned`` do not rely on it.
         NaN likewise
     timings : seconds per stage
+    fault : what was wrong with the sweep, if the status is ``UNUSABLE_SCAN`` or ``BAD_STAMP``
+    n_not_finite : points of the sweep that were NaN or infinite, if it was used
     """
 
     stamp: int
@@ -403,6 +448,8 @@ class MapUpdate:
     direction_information: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     axis_localizability: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     timings: Mapping[str, float] = field(default_factory=dict)
+    fault: SweepFault | None = None
+    n_not_finite: int = 0
 
     @property
     def raw_covariance(self) -> FloatArray:

@@ -303,7 +303,7 @@ def match_planes(
     if config.plane_fit == "unit_offset":
         normals, offsets = _unit_offset_planes(group)
     across = _dot(group.transpose(2, 1, 0), normals[:, None, :]) + offsets
-    is_plane = np.abs(across).max(axis=0, initial=0.0) <= config.plane_tolerance
+    is_plane = np.abs(across).max(axis=0) <= config.plane_tolerance
     is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
     away = points_map[near].T - centres
     distances = _dot(points_map[near].T, normals) + offsets

@@ -354,8 +354,9 @@ def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]
     scale = determinant + _dot(means, across)
     length = _norm(across)
     proper = (length > 0.0) & (scale != 0.0)
-    normals = -np.sign(scale) * across / np.where(proper, length, 1.0)
-    offsets = np.where(proper, np.abs(scale) / np.where(proper, length, 1.0), np.inf)
+    length = np.where(proper, length, 1.0)
+    normals = -np.sign(scale) * across / length
+    offsets = np.where(proper, np.abs(scale) / length, np.inf)
     return normals, offsets
 
 

@@ -346,3 +346,30 @@ def test_checked_factor_takes_several_variables():
     values.insert(other, np.array([1.0, 2.0, 3.0]))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     np.testing.assert_allclose(result.atVector(other), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("variable", "dimension"),
+    [(gtsam.Rot3(), 3), (gtsam.Point3(1.0, 2.0, 3.0), 3), (np.arange(4.0), 4), (gtsam.Pose3(), 6)],
+)
+def test_checked_factor_knows_the_dimension_of_a_variable(variable, dimension):
+    def factor(columns):
+        return factors.checked_factor(
+            gtsam.noiseModel.Unit.Create(1), [KEY], lambda v: (np.ones(1), [np.ones((1, columns))])
+        )
+
+    values = gtsam.Values()
+    values.insert(KEY, variable)
+    assert factor(dimension).linearize(values).jacobian()[0].shape == (1, dimension)
+    with pytest.raises(InputError, match=rf"^factor Jacobian 0: .*\(1, {dimension}\)"):
+        factor(dimension + 1).linearize(values)
+
+
+def test_a_variable_of_an_unsupported_type_is_a_python_error():
+    factor = factors.checked_factor(
+        gtsam.noiseModel.Unit.Create(1), [KEY], lambda v: (np.ones(1), [np.ones((1, 3))])
+    )
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose2())
+    with pytest.raises(InputError, match="variable x0 has an unsupported type"):
+        factor.linearize(values)

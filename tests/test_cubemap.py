@@ -678,9 +678,9 @@ def test_moved_points_join_those_of_a_cube_in_the_archive(tmp_path, megabytes):
     cubes.insert(there)
     cubes.recenter(np.zeros(3))
     cubes.owner = 1
-    here = np.array([[0.6, 0.6, 0.6], [0.6, 0.6, 0.1], [0.6, 0.6, 1.1], [0.1, 0.1, 0.1]])
+    here = np.array([[0.1, 0.1, 0.1], [0.6, 0.6, 0.6], [1.6, 0.6, 0.4], [1.6, 0.6, 0.6]])
     cubes.insert(here)
-    # Two of the four come to lie in one voxel, another on a point that was there.
+    # The last two come to lie in one voxel, the second in that of a point that was there.
     turned = moved_by(100.0)
     turned[2, 2], turned[1, 1] = -1.0, -1.0
     turned[1:3, 3] = 0.7, 0.65
@@ -689,12 +689,12 @@ def test_moved_points_join_those_of_a_cube_in_the_archive(tmp_path, megabytes):
     assert cubes.count() == 0
     union = np.concatenate([there, arrived])
     _, first = np.unique(voxel_keys(union, 0.5), return_index=True)
-    assert len(first) == 6
+    assert sorted(first) == [0, 1, 2, 3, 5]
     np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=1e-12)
     cubes.recenter(np.array([100.0, 0.0, 0.0]))
-    assert cubes.count() == 6
-    # All of them can move on, each with its owner.
-    assert cubes.move({1: moved_by(-100.0)}) == 3
+    assert cubes.count() == 5
+    # They can move on, each with its owner.
+    assert cubes.move({1: moved_by(-100.0)}) == 2
     np.testing.assert_allclose(cubes.points(), there, atol=1e-12)
 
 
@@ -732,11 +732,11 @@ def test_a_thinned_map_is_that_of_the_window_in_larger_voxels(tmp_path):
     cubes = CubeMap(config, 0.5)
     cubes.insert(np.zeros((1, 3)))
     cubes.recenter(np.array([100.0, 0.0, 0.0]))
-    points = np.array([[100.1, 0.1, 0.1], [101.7, 0.1, 0.1], [103.9, 0.1, 0.1]])
+    points = np.array([[98.1, 0.1, 0.1], [100.1, 0.1, 0.1], [101.7, 0.1, 0.1]])
     cubes.insert(points)
     folders = list(tmp_path.iterdir())
-    thin = cubes.thinned(4.0)  # voxels from 100 to 102 and from 102 to 104
-    np.testing.assert_allclose(thin.points(archived=True), [[100.9, 0.1, 0.1], points[2]])
+    thin = cubes.thinned(4.0)  # voxels of 2 m: from 98 to 100 and from 100 to 102
+    np.testing.assert_allclose(thin.points(archived=True), [points[0], [100.9, 0.1, 0.1]])
     assert thin.window == cubes.window
     assert list(tmp_path.iterdir()) == folders
     np.testing.assert_array_equal(cubes.points(), points)

@@ -15,6 +15,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from loam_gtsam import datasets
+from loam_gtsam.checkpoint import Checkpoint as Checkpoint
 from loam_gtsam.classical import ALoamSolver as ALoamSolver
 from loam_gtsam.classical import ClassicalSolver as ClassicalSolver
 from loam_gtsam.config import Config as Config
@@ -41,6 +42,7 @@ from loam_gtsam.factors import point_to_line_factor as point_to_line_factor
 from loam_gtsam.factors import point_to_plane_factor as point_to_plane_factor
 from loam_gtsam.factors import scan_match_factor as scan_match_factor
 from loam_gtsam.features import extract_features as extract_features
+from loam_gtsam.freezing import checkpointed as checkpointed
 from loam_gtsam.graph_files import read_graph as read_graph
 from loam_gtsam.graph_files import write_graph as write_graph
 from loam_gtsam.graph_optimize import SavedGraph as SavedGraph
@@ -109,6 +111,7 @@ __all__ = [
     "ALoamSolver",
     "AbsoluteError",
     "BadSweep",
+    "Checkpoint",
     "ClassicalSolver",
     "Config",
     "ConfigError",
@@ -151,6 +154,7 @@ __all__ = [
     "absolute_error",
     "associate",
     "checked_factor",
+    "checkpointed",
     "concatenate_rows",
     "dump_config",
     "extract_features",

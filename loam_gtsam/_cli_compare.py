@@ -36,7 +36,7 @@ from loam_gtsam._compare_files import (
 )
 from loam_gtsam.comparison import Contender, compare
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.export import make_folder
+from loam_gtsam.export import make_folder, replacing_all
 from loam_gtsam.types import DatasetError, OutputError
 
 
@@ -69,11 +69,11 @@ def execute(
                 on_frame=on_frame,
             )
         seconds = time.perf_counter() - started
-        # What an earlier comparison left would not belong to this one.
-        for file in (*(folder / name for name in known), *folder.glob("trajectory_*.tum")):
-            file.unlink(missing_ok=True)
         results = Results.of(comparison, shared_guess)
-        files = write(results, folder, plot)
+        # What an earlier comparison left would not belong to this one.
+        left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
+        with replacing_all(folder, left, last=REPORT_FILE) as new:
+            files = write(results, new, plot)
     if not options.quiet:
         console = Console()
         console.print(_summary(results, seconds))

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import json
 import os
 import re
 import signal
 import sys
+import tempfile
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
+import typer
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -27,18 +30,21 @@ from rich.progress import (
 
 from loam_gtsam import visualization
 from loam_gtsam._cli_report import NOT_MAPPED, profile_table, summary
-from loam_gtsam.config import Config
+from loam_gtsam.checkpoint import Checkpoint
+from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.evaluation import absolute_error, align, align_rotations, interpolate
-from loam_gtsam.export import RUN_FILES, make_folder, write_run, write_tum
+from loam_gtsam.export import RUN_FILES, make_folder, replacing_all, write_run, write_tum
 from loam_gtsam.graph_files import write_graph
-from loam_gtsam.pipeline import Observer, OnFrame, RunResult, run
+from loam_gtsam.pipeline import Observer, OnFrame, RunResult, effective_config, run
 from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
 
 PLOT_FILES = ("trajectory.png", "map.png", "timings.png")
 TRUTH_FILE = "truth.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
 RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, *LOOP_FILES, TRUTH_FILE)
+CHECKPOINT = "checkpoint"
+"""Folder among the results, until they are complete."""
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _WORTH_A_PROCESS = 200
 """Sweeps by which a process has saved the second that it takes to start."""
@@ -57,6 +63,8 @@ class RunOptions:
     quiet: bool
     bag: Path | None = None
     workers: int | None = None
+    resume: bool = False
+    checkpoint_seconds: float = 60.0
 
 
 def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
@@ -72,8 +80,20 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     if plot and not visualization.available():
         raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
-    folder = make_folder(free_folder(wanted, options.overwrite))
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
+    if options.resume:
+        folder = make_folder(wanted)
+        if _complete(folder, config, dataset, total):
+            Console(quiet=options.quiet).print(
+                f"{folder}: complete, {total} sweeps", markup=False, soft_wrap=True
+            )
+            return 0
+    else:
+        folder = make_folder(free_folder(wanted, options.overwrite, (*RUN_OUTPUTS, CHECKPOINT)))
+    checkpoint = None
+    if options.checkpoint_seconds > 0.0:
+        place = folder / CHECKPOINT
+        checkpoint = Checkpoint(place, seconds=options.checkpoint_seconds, resume=options.resume)
     with stop_requests() as stop, _bag(options, config) as observe:
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
@@ -85,6 +105,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
                 keep_partial=True,
                 observe=observe,
                 workers=_workers(options, total),
+                checkpoint=checkpoint,
             )
         seconds = time.perf_counter() - started
         if not result.updates:
@@ -93,7 +114,11 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             )
         accuracy, truth = compare(result.trajectory, dataset.truth)
         info = _input_info(dataset)
-        files = _write(result, dataset, info, folder, plot, accuracy, truth)
+        folder, files = _write_somewhere(
+            folder, lambda there: _write(result, dataset, info, there, plot, accuracy, truth)
+        )
+        if checkpoint is not None and not result.interrupted and result.error is None:
+            checkpoint.remove()
     if not options.quiet:
         console = Console()
         if options.profile:
@@ -112,6 +137,64 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             f"{result.updates[0].message}; see also: loam-gtsam inspect"
         )
     return 0
+
+
+def _complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:
+    """Whether the run is done, and its results are in the folder.
+
+    Raises
+    ------
+    OutputError
+        If those of another run are.
+    """
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        written = (folder / "config.yaml").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return False
+    if summary.get("interrupted") or summary.get("error"):
+        return False
+    now = total, _described(_input_info(dataset)), dump_config(effective_config(config, dataset))
+    if (summary.get("frames"), summary.get("dataset"), written) != now:
+        raise OutputError(
+            f"{folder}: holds the results of another run (data, configuration or number of "
+            "sweeps); choose another folder, or --overwrite without --resume"
+        )
+    return True
+
+
+def _write_somewhere(folder: Path, write: Callable[[Path], list[str]]) -> tuple[Path, list[str]]:
+    """Write the results; if it cannot be done there, elsewhere, for they took long to compute.
+
+    Returns
+    -------
+    Where they are, and their names.
+
+    Raises
+    ------
+    OutputError
+        If they could not be written where they were wanted, saying where they are instead.
+    """
+    try:
+        return folder, write(folder)
+    except OutputError as error:
+        problem = error
+    while sys.stdin.isatty() and sys.stderr.isatty():
+        typer.echo(f"{problem}", err=True)
+        answer = typer.prompt("Another folder for the results (empty: none)", "", err=True)
+        if not answer:
+            break
+        try:
+            there = make_folder(free_folder(Path(answer), False))
+            return there, write(there)
+        except OutputError as error:
+            problem = error
+    try:
+        there = Path(tempfile.mkdtemp(prefix=f"loam_gtsam_{folder.name}_"))
+        write(there)
+    except (OSError, OutputError):
+        raise problem from None
+    raise OutputError(f"{problem}. The results were written to {there} instead")
 
 
 def _workers(options: RunOptions, sweeps: int) -> int:
@@ -175,6 +258,10 @@ def _input_info(dataset: Dataset) -> DatasetInfo:
         return DatasetInfo("data set", dataset.name, problems=[str(error)])
 
 
+def _described(info: DatasetInfo) -> str:
+    return f"{info.kind} {info.path}"
+
+
 def _write(
     result: RunResult,
     dataset: Dataset,
@@ -185,28 +272,26 @@ def _write(
     truth: Trajectory | None,
 ) -> list[str]:
     """Write all files; names of what was written."""
-    # A picture or a truth of the run that is being replaced would not belong to this one.
-    for name in (*PLOT_FILES, *LOOP_FILES, TRUTH_FILE):
-        (folder / name).unlink(missing_ok=True)
     extra = {"accuracy": accuracy or None, "input": asdict(info)}
-    write_run(result, folder, dataset=f"{info.kind} {info.path}", extra=extra)
     files = list(RUN_FILES)
-    if dataset.truth is not None:
-        write_tum(folder / TRUTH_FILE, dataset.truth)
-        files.append(TRUTH_FILE)
-    if result.loops is not None:
-        write_tum(folder / LOOP_FILES[0], result.odometry, comments={"frame": "odom"})
-        write_graph(folder / LOOP_FILES[1], result.loops.graph.saved())
-        files.extend(LOOP_FILES)
-    if plot:
-        trajectory = result.trajectory
-        loops = None if result.loops is None else result.loops.ends()
-        visualization.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
-        visualization.plot_map(
-            folder / "map.png", result.edge_points, result.plane_points, trajectory
-        )
-        visualization.plot_timings(folder / "timings.png", result.updates)
-        files.extend(PLOT_FILES)
+    with replacing_all(folder, RUN_OUTPUTS, last="summary.json") as new:
+        write_run(result, new, dataset=_described(info), extra=extra)
+        if dataset.truth is not None:
+            write_tum(new / TRUTH_FILE, dataset.truth)
+            files.append(TRUTH_FILE)
+        if result.loops is not None:
+            write_tum(new / LOOP_FILES[0], result.odometry, comments={"frame": "odom"})
+            write_graph(new / LOOP_FILES[1], result.loops.graph.saved())
+            files.extend(LOOP_FILES)
+        if plot:
+            trajectory = result.trajectory
+            loops = None if result.loops is None else result.loops.ends()
+            visualization.plot_trajectory(new / "trajectory.png", trajectory, truth, loops)
+            visualization.plot_map(
+                new / "map.png", result.edge_points, result.plane_points, trajectory
+            )
+            visualization.plot_timings(new / "timings.png", result.updates)
+            files.extend(PLOT_FILES)
     return files
 
 

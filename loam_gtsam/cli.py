@@ -1,4 +1,4 @@
-"""The command line: ``loam-gtsam demo | run | compare | inspect | optimize | config``.
+"""The command line: ``loam-gtsam demo | run | compare | sweep | inspect | optimize | config``.
 
 The only place that catches :class:`~loam_gtsam.types.LoamError`. Exit codes: 0 done, 1 an error
 (one message on stderr), 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM.
@@ -20,11 +20,10 @@ from typer.core import TyperGroup
 
 from loam_gtsam.config import (
     Config,
-    config_from_dict,
-    config_to_dict,
     dump_config,
     load_config,
     preset,
+    with_value,
 )
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.export import replacing
@@ -197,6 +196,22 @@ def run(
             "than 200 sweeps. The result is the same.",
         ),
     ] = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Go on from the last checkpoint in the output folder, if a run of the same data "
+            "and configuration was stopped or killed; the result is the same.",
+        ),
+    ] = False,
+    checkpoint: Annotated[
+        float,
+        typer.Option(
+            min=0.0,
+            metavar="SECONDS",
+            help="Time from one checkpoint to the next; 0 writes none.",
+        ),
+    ] = 60.0,
     overwrite: Overwrite = False,
     plot: Plot = None,
     profile: Profile = False,
@@ -206,16 +221,23 @@ def run(
     """Map a data set and write trajectory, map, report and pictures.
 
     Ctrl-C stops after the current sweep and writes what was computed; a second one stops at once.
+    Either way, --resume goes on.
     """
     from loam_gtsam._cli_run import RunOptions, execute
 
     settings = _settings(preset, config, sensor, overrides)
     if loops:
         settings = replace(settings, loops=replace(settings.loops, enabled=True))
+    if resume and bag is not None:
+        raise typer.BadParameter("--resume: the frames before would not be in --bag; give one only")
+    if resume and overwrite:
+        raise typer.BadParameter("--resume and --overwrite contradict each other; give one only")
     if bag is not None and bag.resolve() in (Path(path).resolve(), *Path(path).resolve().parents):
         raise OutputError(f"--bag {bag}: the input must not be replaced; choose another name")
     dataset = _open(path, topic, imu_topic, loader_options)
-    options = RunOptions(frames, output, overwrite, plot, profile, quiet, bag, workers)
+    options = RunOptions(
+        frames, output, overwrite, plot, profile, quiet, bag, workers, resume, checkpoint
+    )
     raise typer.Exit(execute(dataset, settings, options))
 
 
@@ -277,6 +299,55 @@ def compare(
     dataset = _open(path, topic, imu_topic, loader_options)
     options = RunOptions(frames, output, overwrite, plot, False, quiet)
     raise typer.Exit(execute(dataset, contenders, shared_guess, options))
+
+
+@app.command()
+def sweep(
+    spec: Annotated[
+        Path,
+        typer.Argument(
+            metavar="SPEC", help="What to run: sequences, configs, seeds (YAML; see docs/sweep.md)."
+        ),
+    ],
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Processes on this machine [default: none, in this process]."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ADDRESS",
+            help="Run on a Dask cluster, e.g. tcp://HOST:8786; paths must exist on its workers.",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="Folder for the results [default: loam_gtsam_output/NAME_sweep]. Trials that are "
+            "finished there are not run again.",
+        ),
+    ] = None,
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Run failed trials again.")
+    ] = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Run all trials again, finished ones as well.")
+    ] = False,
+    quiet: Quiet = False,
+    debug: Debug = False,
+) -> None:
+    """Run sequences x configs x seeds; one table (Parquet) of all results.
+
+    Ctrl-C keeps the trials that are finished; the same command goes on from there. Exits with 1 if
+    a trial failed.
+    """
+    from loam_gtsam._cli_sweep import SweepOptions, execute
+
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("give --workers or --scheduler, not both")
+    options = SweepOptions(workers, scheduler, output, retry_failed, overwrite, quiet)
+    raise typer.Exit(execute(spec, options))
 
 
 @app.command()
@@ -401,27 +472,13 @@ def _settings(
 def _changed(config: Config, sensor: str | None, overrides: list[str] | None) -> Config:
     """``config`` with --sensor, then each --set in turn."""
     if sensor is not None:
-        config = _override(config, "sensor.model", sensor, f"--sensor {sensor}")
+        config = with_value(config, "sensor.model", sensor, f"--sensor {sensor}")
     for entry in overrides or []:
         key, value = _key_value("--set", entry)
         if "." not in key:
             raise typer.BadParameter(f"--set {entry}: expected SECTION.KEY=VALUE")
-        config = _override(config, key, value, f"--set {entry}")
+        config = with_value(config, key, value, f"--set {entry}")
     return config
-
-
-def _override(config: Config, key: str, value: Any, source: str) -> Config:
-    """``config`` with one value changed; the error names ``source``."""
-    tree = config_to_dict(config)
-    *sections, last = key.split(".")
-    branch = tree
-    for section in sections:
-        below = branch.get(section)
-        if not isinstance(below, dict):
-            below = branch[section] = {}
-        branch = below
-    branch[last] = value
-    return config_from_dict(tree, source)
 
 
 def main() -> None:

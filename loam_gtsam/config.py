@@ -860,6 +860,32 @@ def config_to_dict(config: Config) -> dict[str, Any]:
     return dataclasses.asdict(config)
 
 
+def with_value(config: Config, key: str, value: Any, source: str) -> Config:
+    """``config`` with one value changed.
+
+    Parameters
+    ----------
+    key : as ``solver.iterations``
+    value : as YAML gives it
+    source : what to call the input in error messages
+
+    Raises
+    ------
+    ConfigError
+        If there is no such key, or the value does not fit.
+    """
+    tree = config_to_dict(config)
+    *sections, last = key.split(".")
+    branch = tree
+    for section in sections:
+        below = branch.get(section)
+        if not isinstance(below, dict):
+            below = branch[section] = {}
+        branch = below
+    branch[last] = value
+    return config_from_dict(tree, source)
+
+
 def load_config(path: str | Path) -> Config:
     """Read a YAML file.
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.deskew import MovingSweep
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.scan_error import SeenGround, scan_error
 from loam_gtsam.solvers import Solution
@@ -64,6 +65,7 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     return symmetric(covariance)
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class _Middle:
     """A solved frame at the middle of its sweep.
@@ -84,6 +86,7 @@ class _Middle:
     reference_stamp: int
 
 
+@checkpointed
 class PoseErrors:
     """Calibrates the covariances of a run, frame by frame.
 
@@ -192,6 +195,7 @@ class PoseErrors:
         return symmetric(own), shared, now
 
 
+@checkpointed
 class _Acceleration:
     """Mean square of the body acceleration, from the poses at the middles of three sweeps."""
 

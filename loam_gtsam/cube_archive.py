@@ -6,11 +6,12 @@ import logging
 import os
 import tempfile
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.types import ConfigError, FloatArray
 
 CubeIndex = tuple[int, int, int]
@@ -19,6 +20,7 @@ Owners = NDArray[np.int32]
 _log = logging.getLogger(__name__)
 
 
+@checkpointed
 class CubePoints(NamedTuple):
     """Points of a cube, (N, 3) metres, and who owns them, (N,): see :meth:`CubeMap.move`."""
 
@@ -31,10 +33,12 @@ class CubePoints(NamedTuple):
         return self.points.nbytes + self.owners.nbytes
 
 
+@checkpointed
 class Archive:
     """Points of cubes outside the window: the newest in memory, older ones on disk or dropped."""
 
     def __init__(self, megabytes: float, folder: str | None) -> None:
+        self._megabytes, self._root = megabytes, folder
         self._budget = megabytes * 1e6
         self._bytes = 0
         self._memory: dict[CubeIndex, CubePoints] = {}  # oldest first
@@ -50,6 +54,25 @@ class Archive:
                     f"map.archive_dir: cannot make a folder in {folder!r} ({error}); name one that "
                     "can be written to, or null to keep the archive in memory"
                 ) from error
+
+    def __getstate__(self) -> dict[str, Any]:
+        held = [(index, self.read(index)) for index in self.indices()]
+        return {
+            "given": (self._megabytes, self._root),
+            "cubes": [(index, content) for index, content in held if content is not None],
+            "in_memory": len(self._memory),
+            "dropped": (self.dropped_cubes, self.dropped_points),
+        }
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(*state["given"])  # type: ignore[misc]
+        in_memory = state["in_memory"]
+        for index, content in state["cubes"][in_memory:]:
+            self._bytes += content.nbytes
+            self._spill(index, content)
+        for index, content in state["cubes"][:in_memory]:
+            self.store(index, content)
+        self.dropped_cubes, self.dropped_points = state["dropped"]
 
     def __len__(self) -> int:
         return len(self._memory) + len(self._disk)

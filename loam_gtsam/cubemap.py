@@ -23,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cube_archive import Archive, CubeIndex, CubePoints, Owners
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import find, transform, voxel_keys
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
 
@@ -63,6 +64,7 @@ class CubeMapStats:
     outside: int
 
 
+@checkpointed
 class CubeMap:
     """Map points of one feature class, at most one per voxel, searchable around the sensor.
 
@@ -437,6 +439,7 @@ class _Voxels(NamedTuple):
         return _Voxels(*[column[which] for column in self])  # type: ignore[arg-type]
 
 
+@checkpointed
 class _Search:
     """kd-trees over the points of a set of cubes, while the points in them do not change.
 
@@ -448,6 +451,14 @@ class _Search:
         self._tree = cKDTree(points, **_TREE)
         self._recent: list[FloatArray] = []
         self._recent_tree: Any = None
+
+    def __getstate__(self) -> tuple[set[CubeIndex], FloatArray, list[FloatArray]]:
+        return self.cubes, self._tree.data, self._recent
+
+    def __setstate__(self, state: tuple[set[CubeIndex], FloatArray, list[FloatArray]]) -> None:
+        # A tree is a function of its points in their order.
+        self.__init__(*state[:2])  # type: ignore[misc]
+        self._recent = state[2]
 
     def add(self, points: Mapping[CubeIndex, FloatArray]) -> None:
         """Points that were added to cubes; other cubes than those searched do not matter."""
@@ -478,6 +489,7 @@ class _Search:
         return points, squared
 
 
+@checkpointed
 class _Content(NamedTuple):
     """Points in ascending order of their voxel keys, and who owns them."""
 
@@ -504,6 +516,7 @@ class _Content(NamedTuple):
 _EMPTY = _Content(_NO_KEYS, _NO_POINTS, np.empty(0, np.int32))
 
 
+@checkpointed
 class _Cube:
     """Points, at most one a voxel.
 

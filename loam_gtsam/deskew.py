@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import cross, move_points, voxel_filter
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.types import Features, FloatArray, SweepMotion
@@ -19,6 +20,7 @@ _DISTINCT = 4.5
 """Standard deviations of range noise by which a distinct edge stands out of its ring."""
 
 
+@checkpointed
 class MovingSweep:
     """The voxel-filtered features of a sweep.
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from decimal import Decimal, InvalidOperation
@@ -38,6 +39,10 @@ from loam_gtsam.types import (
 _NS = 10**9
 _MAX_MESSAGES = 20
 """Messages of frames kept in ``summary.json``; ``run.npz`` has them all."""
+
+_NEW, _COMPLETE = ".loam_gtsam_new", ".loam_gtsam_complete"
+"""Folders of new files: while they are being written, and when all are."""
+_PLAN = ".plan"
 
 EDGE_COLOUR, PLANE_COLOUR = (214, 96, 32), (110, 125, 140)
 """Red, green, blue of the two kinds of map points in the PLY file."""
@@ -445,8 +450,71 @@ def _imu_part(imu: Any) -> dict[str, Any]:
     }
 
 
+@contextmanager
+def replacing_all(folder: Path, known: Sequence[str], last: str) -> Iterator[Path]:
+    """A folder for new files, which take the places of the old ones together.
+
+    If the block ends with an error, or the process in it, the old files are as they were. After the
+    block the files are moved, one rename each, ``last`` at the end: where it is, all are of one
+    run. What a process that dies in between leaves to do, :func:`make_folder` does.
+
+    Parameters
+    ----------
+    folder : where they are to be; other files in it stay
+    known : names that an earlier run may have left; those that are not written anew are removed
+    last : the name that says that all are there
+
+    Raises
+    ------
+    OutputError
+        If that cannot be done.
+    """
+    new, complete = folder / _NEW, folder / _COMPLETE
+    try:
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir()
+        yield new
+        names = sorted((path.name for path in new.iterdir()), key=lambda name: name == last)
+        plan = {"new": names, "gone": sorted({*known, last} - set(names[:-1]))}
+        _write_text(new / _PLAN, json.dumps(plan))
+        os.replace(new, complete)
+    except OSError as error:
+        raise OutputError(
+            f"{folder}: cannot write there: {error.strerror or error}; choose another folder or "
+            "free some space"
+        ) from error
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    _move_all(folder)
+
+
+def _move_all(folder: Path) -> None:
+    """Move new files, all of which are written, to their places; go on where that was cut off."""
+    complete = folder / _COMPLETE
+    if not complete.is_dir():
+        return
+    try:
+        plan = json.loads((complete / _PLAN).read_text(encoding="utf-8"))
+        # Names of files only: whatever the plan says, nothing outside is touched.
+        new, gone = ([Path(name).name for name in plan[key]] for key in ("new", "gone"))
+        if (complete / new[-1]).exists():
+            for name in gone:
+                (folder / name).unlink(missing_ok=True)
+        for name in new:
+            if (complete / name).exists():
+                os.replace(complete / name, folder / name)
+        shutil.rmtree(complete)
+    except (OSError, ValueError, KeyError, IndexError) as error:
+        raise OutputError(
+            f"{complete}: cannot move these files to {folder}: {error}; they are whole: move them "
+            "by hand, or choose another folder"
+        ) from error
+
+
 def make_folder(directory: str | Path) -> Path:
     """Make a folder and check that files can be written there.
+
+    New files whose move was cut off, see :func:`replacing_all`, are moved to their places.
 
     Raises
     ------
@@ -460,6 +528,7 @@ def make_folder(directory: str | Path) -> Path:
         raise OutputError(
             f"{folder}: cannot make this output folder: {error.strerror or error}"
         ) from error
+    _move_all(folder)
     probe = folder / ".loam_gtsam_probe"
     with replacing(probe):
         pass

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -58,6 +59,14 @@ class ImuAid:
         self._disagreements = 0
         self._inertial: InertialOdometry | None = None
         self._predicted: int | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        learnt = {"gyro_bias": self.buffer.gyro_bias}
+        return learnt | {k: v for k, v in vars(self).items() if k not in ("buffer", "config")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.buffer.gyro_bias = state.pop("gyro_bias")
+        vars(self).update(state)
 
     @property
     def gyro(self) -> ImuBuffer | None:

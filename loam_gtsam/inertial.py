@@ -13,12 +13,14 @@ angular acceleration.)
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, G, V, X
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.inertial_factors import (
     BIASES,
     GRAVITY,
@@ -47,6 +49,8 @@ _POSE_SIGMA = (1e-3, 0.01)
 """rad and m of a pose from which a window begins: that of one scan match."""
 _VELOCITY_SIGMA = 0.5
 """m/s: two poses 0.1 s apart, known to 0.03 m."""
+_Scan = tuple[gtsam.Pose3, FloatArray, FloatArray | None]
+"""Pose, information and gradient of a scan, as :meth:`InertialOdometry.update` takes them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +71,7 @@ class Prediction:
     covariance: FloatArray
 
 
+@checkpointed
 class InertialOdometry:
     """Predicts the pose of every frame from the IMU, and learns from what the scan then said.
 
@@ -104,6 +109,8 @@ class InertialOdometry:
     state: InertialState
     restarts: int
     _pending: tuple[InertialState, gtsam.NonlinearFactor] | None
+    _asked: tuple[int, ImuSamples] | None
+    """Stamp and samples of the last prediction."""
 
     def __init__(
         self,
@@ -156,6 +163,25 @@ class InertialOdometry:
             velocity_sigma**2 * np.eye(3),
         )
 
+    def __getstate__(self) -> dict[str, Any]:
+        # GTSAM's factors are made again by going the same way.
+        gone = "_window", "_pending", "state"
+        return {name: value for name, value in vars(self).items() if name not in gone}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        asked, journal, restarts = self._asked, self._journal, self.restarts
+        self._start(self._base)
+        for stamp, samples, scan in journal:
+            self.predict(stamp, samples)
+            if scan is None:
+                self.skip()
+            else:
+                self.update(*scan)
+        if asked is not None:
+            self.predict(*asked)
+        self.restarts = restarts
+
     def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
         """Pose at ``stamp``, from the newest frame and the samples since.
 
@@ -196,6 +222,7 @@ class InertialOdometry:
         values.insert(predicted.values(n + 1))
         covariance = propagate(factor.linearize(values), last.covariance)
         self._pending = replace(predicted, covariance=covariance), factor
+        self._asked = stamp, samples
         # The IMU goes round the lidar as the platform turns.
         lever = np.cross(rate - last.gyro_bias, self._lidar_T_imu.translation())
         return Prediction(
@@ -230,7 +257,7 @@ class InertialOdometry:
         root, offset = square_root(
             _array("information", information, (6, 6)), _array("gradient", gradient, (6,))
         )
-        predicted, imu_factor = self._take_pending()
+        predicted, imu_factor = self._take_pending((measured, information, gradient))
         if not len(root):
             self._take_in(predicted, imu_factor)
             return
@@ -261,7 +288,7 @@ class InertialOdometry:
         InputError
             If nothing has been predicted.
         """
-        predicted, imu_factor = self._take_pending()
+        predicted, imu_factor = self._take_pending(None)
         self._take_in(predicted, imu_factor)
 
     def restart(
@@ -321,14 +348,16 @@ class InertialOdometry:
         self._start(replace(state, map_T_imu=map_T_imu, velocity=velocity, covariance=covariance))
 
     def _start(self, state: InertialState) -> None:
-        self.state = state
+        self.state = self._base = state
         self._window = Window(state)
-        self._pending = None
+        self._pending = self._asked = None
+        self._journal: list[tuple[int, ImuSamples, _Scan | None]] = []
 
-    def _take_pending(self) -> tuple[InertialState, gtsam.NonlinearFactor]:
-        if self._pending is None:
+    def _take_pending(self, scan: _Scan | None) -> tuple[InertialState, gtsam.NonlinearFactor]:
+        if self._pending is None or self._asked is None:
             raise InputError("nothing has been predicted: call predict() once for every frame")
-        pending, self._pending = self._pending, None
+        self._journal.append((*self._asked, scan))
+        pending, self._pending, self._asked = self._pending, None, None
         return pending
 
     def _take_in(self, predicted: InertialState, *factors: gtsam.NonlinearFactor) -> None:

@@ -14,6 +14,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, G, V, X
 
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.inertial_factors import POSE, REST, VELOCITY
 from loam_gtsam.types import FloatArray
 
@@ -23,6 +24,7 @@ _SMALL_STEP = 1e-2
 next frame takes that away."""
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class InertialState:
     """The newest frame of the window.

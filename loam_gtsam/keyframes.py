@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from loam_gtsam.config import PoseGraphConfig
 from loam_gtsam.covariance import relative_covariance
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.types import BoolArray, FloatArray, InputError, MapUpdate
 
@@ -17,6 +18,7 @@ _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
 """rad and m added to every standard deviation: a factor must not be infinitely sure."""
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class Keyframe:
     """A frame that is a pose of the graph.
@@ -50,6 +52,7 @@ class Keyframe:
         return self.update.map_T_lidar
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class LoopClosure:
     """The motion between two keyframes, found by looking at the same place.

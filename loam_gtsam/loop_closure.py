@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import astuple, dataclass, field, replace
 from enum import StrEnum
-from typing import Protocol
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -19,6 +19,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.degeneracy import localizability
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import transform
 from loam_gtsam.keyframes import Keyframe, LoopClosure
 from loam_gtsam.matching import ScanMatches, associate, trial
@@ -60,6 +61,7 @@ class LoopCloser(Protocol):
         ...
 
 
+@checkpointed
 class Rejection(StrEnum):
     """Why there is no loop."""
 
@@ -81,6 +83,7 @@ class Rejection(StrEnum):
     """Verification: the features do not fix the motion in some direction, as along a corridor."""
 
 
+@checkpointed
 @dataclass(slots=True)
 class LoopStatistics:
     """What became of the keyframes and candidates.
@@ -126,6 +129,10 @@ class ScanLoopCloser:
         )
         self._descriptors: list[FloatArray] = []
         self._spreads: list[float] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        names = "statistics", "_descriptors", "_spreads"
+        return {name: getattr(self, name) for name in names}
 
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
         """See :meth:`LoopCloser.detect`."""

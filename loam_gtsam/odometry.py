@@ -10,6 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import OdometryConfig
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import move_points
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
@@ -55,6 +56,7 @@ class Turns(Protocol):
         ...
 
 
+@checkpointed
 class ConstantVelocity:
     """The motion of the last sweep goes on; an IMU tells how the lidar turned meanwhile."""
 

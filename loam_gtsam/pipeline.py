@@ -5,14 +5,16 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import islice
+from typing import Any
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.ahead import Extraction, extract, extract_ahead
-from loam_gtsam.config import Config, SensorConfig
+from loam_gtsam.checkpoint import Checkpoint
+from loam_gtsam.config import Config, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_aid import ImuAid
@@ -23,6 +25,7 @@ from loam_gtsam.mapper import ExtraFactors, Mapper
 from loam_gtsam.odometry import Odometry, make_odometry
 from loam_gtsam.types import (
     BadSweep,
+    DatasetError,
     Features,
     FeatureSweep,
     FloatArray,
@@ -181,9 +184,33 @@ class Pipeline:
         seconds = time.perf_counter() - started
         return replace(update, timings=dict(update.timings) | {"loops": seconds})
 
+    def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """What changes from frame to frame, and what does not, for :mod:`loam_gtsam.freezing`."""
+        mapper, loops = self.mapper, self.loops
+        roots = {"pipeline": self, "mapper": mapper, "odometry": self.odometry}
+        shared = {"solver": mapper.solver, **_sections("config", self.config)}
+        if mapper.extra_factors is not None:
+            shared["extra_factors"] = mapper.extra_factors
+        if mapper.imu_aid is not None:
+            roots["imu"] = mapper.imu_aid
+            shared["samples"] = mapper.imu_aid.buffer
+        if loops is not None:
+            roots |= {"loops": loops, "graph": loops.graph, "closer": loops.closer}
+        return roots, shared
+
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
         return (self.mapper if self.loops is None else self.loops).map_points()
+
+
+def _sections(name: str, config: Any) -> dict[str, Any]:
+    """A section of the configuration and those in it, by name."""
+    found = {name: config}
+    for item in fields(config):
+        value = getattr(config, item.name)
+        if is_dataclass(value):
+            found |= _sections(f"{name}.{item.name}", value)
+    return found
 
 
 def effective_config(config: Config, dataset: Dataset) -> Config:
@@ -217,6 +244,7 @@ def run(
     loop_closer: LoopCloser | None = None,
     observe: Observer | None = None,
     workers: int = 0,
+    checkpoint: Checkpoint | None = None,
 ) -> RunResult:
     """Map a data set.
 
@@ -233,6 +261,9 @@ def run(
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
         needs the usual ``if __name__ == "__main__":``.
+    checkpoint : keeps the state of the run, and may begin with that of one that was stopped;
+        ``on_frame`` and ``observe`` are then called for the frames that follow. With factors or a
+        loop closer of your own, give the same ones again.
 
     Returns
     -------
@@ -243,29 +274,36 @@ def run(
     ------
     DatasetError
         If the data set cannot be read.
+    OutputError
+        If the checkpoint is of another run.
     """
     config = effective_config(config or Config(), dataset)
     imu = imu_buffer(dataset, config)
     pipeline = Pipeline(config, imu=imu, extra_factors=extra_factors, loop_closer=loop_closer)
-    updates: list[MapUpdate] = []
+    progress = _Progress(pipeline, dataset, checkpoint)
+    updates = progress.updates
     interrupted = False
     error: Exception | None = None
+    source = progress.rest(islice(_timed(dataset), max_frames))
     try:
-        sweeps = extract_ahead(islice(_timed(dataset), max_frames), config, workers)
-        for number, (sweep, seconds, extraction) in enumerate(sweeps):
+        for sweep, seconds, extraction in extract_ahead(source, config, workers):
+            progress.whole = False
             update = pipeline.process(sweep, extraction)
             update = replace(update, timings={"read": seconds} | dict(update.timings))
-            updates.append(update)
+            progress.add(sweep, update)
             if observe is not None:
                 observe(sweep, update, pipeline.mapper)
             if on_frame is not None:
-                on_frame(number, update)
+                on_frame(len(updates) - 1, update)
+            progress.save_if_due()
     except KeyboardInterrupt:
         interrupted = True
+        progress.save()
     except Exception as caught:
         if not (keep_partial and updates):
             raise
         error = caught
+        progress.save()
     mapper = pipeline.mapper
     edges, planes = pipeline.map_points()
     return RunResult(
@@ -282,6 +320,52 @@ def run(
         imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
         loops=pipeline.loops,
     )
+
+
+class _Progress:
+    """The frames of a run so far, and its checkpoints."""
+
+    def __init__(self, pipeline: Pipeline, dataset: Dataset, checkpoint: Checkpoint | None) -> None:
+        self._pipeline, self._checkpoint = pipeline, checkpoint
+        self.whole = True  # not in the middle of a frame
+        self.stamps: list[int] = []
+        self.updates: list[MapUpdate] = []
+        if checkpoint is not None:
+            about = {"data set": dataset.name, "configuration": dump_config(pipeline.config)}
+            self.stamps, self.updates = checkpoint.begin(about, *pipeline.state())
+
+    def rest(self, sweeps: Iterator[tuple[Sweep, float]]) -> Iterator[tuple[Sweep, float]]:
+        """The sweeps after those that are done."""
+        for number, done in enumerate(self.stamps):
+            sweep = next(sweeps, None)
+            stamp = None if sweep is None else _stamp(sweep[0])
+            if stamp != done:
+                raise DatasetError(
+                    f"sweep {number}: expected the stamp {done} ns of the run to go on with, got "
+                    f"{'no more sweeps' if stamp is None else stamp}; resume with the same data "
+                    "and options, or start again"
+                )
+        return sweeps
+
+    def add(self, sweep: Sweep, update: MapUpdate) -> None:
+        """A frame is done."""
+        self.stamps.append(_stamp(sweep))
+        self.updates.append(update)
+        self.whole = True
+
+    def save_if_due(self) -> None:
+        """Write a checkpoint, if it is time."""
+        if self._checkpoint is not None and self._checkpoint.due:
+            self.save()
+
+    def save(self) -> None:
+        """Write a checkpoint, unless a frame was cut off in the middle."""
+        if self._checkpoint is not None and self.whole:
+            self._checkpoint.save(self.stamps, self.updates, *self._pipeline.state())
+
+
+def _stamp(sweep: Sweep) -> int:
+    return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
 
 
 def _imu_summary(aid: ImuAid, updates: Sequence[MapUpdate]) -> ImuSummary:

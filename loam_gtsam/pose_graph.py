@@ -10,7 +10,8 @@ here: continuous, and drifting; ``map`` is the corrected one (ROS REP-105).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -80,11 +81,29 @@ class PoseGraph:
         self.keyframes: list[Keyframe] = []
         self.loops: list[LoopClosure] = []
         self._session = 0
+        self._journal: list[tuple[Any, ...]] = []  # what went into iSAM2, to go the same way again
         self._slots: list[int | None] = []  # of the loops in iSAM2; None: switched off
         self._consistency = LoopConsistency(self.config, self.loops, self.keyframes)
         self._fixed = gtsam.NonlinearFactorGraph()  # all factors but loops
         self._poses = gtsam.Values()
         self._isam = _new_isam()
+
+    def __getstate__(self) -> tuple[int, list[tuple[Any, ...]]]:
+        return self._session, self._journal
+
+    def __setstate__(self, state: tuple[int, list[tuple[Any, ...]]]) -> None:
+        session, journal = state
+        again: dict[str, Callable[..., object]] = {
+            "keyframe": self._append,
+            "position": self.add_position,
+            "gravity": self.add_gravity,
+            "loop": self._note,
+            "switch": self._switch,
+            "optimize": self.optimize,
+        }
+        for step, *given in journal:
+            again[step](*given)
+        self._session = session
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -126,19 +145,7 @@ class PoseGraph:
             if moved < config.keyframe_distance and turned < config.keyframe_angle_deg:
                 return None
         keyframe = self._keyframe(update, motion, features)
-        factor: gtsam.NonlinearFactor
-        if last is None or starts:
-            pose = update.map_T_lidar
-            covariance = update.covariance if last is None else np.diag(_ANYWHERE**2)
-            factor = gtsam.PriorFactorPose3(keyframe.index, pose, noise_model(covariance))
-        else:
-            pose = self.pose(last.index).compose(motion)
-            _, covariance = odometry_between(last, keyframe, self.config)
-            factor = gtsam.BetweenFactorPose3(
-                last.index, keyframe.index, motion, noise_model(covariance)
-            )
-        self.keyframes.append(keyframe)
-        self._add_factor(factor, pose)
+        self._append(keyframe)
         return keyframe
 
     def new_session(self) -> None:
@@ -166,6 +173,7 @@ class PoseGraph:
         self._known(index)
         where = checked("position", position, (3,))
         self._add_factor(gtsam.GPSFactor(index, where, noise_model(covariance, 3)))
+        self._journal.append(("position", index, position, covariance))
 
     def add_gravity(
         self, index: int, up_lidar: FloatArray, sigma: float, up_map: Sequence[float] = (0, 0, 1)
@@ -190,6 +198,7 @@ class PoseGraph:
             raise InputError(f"sigma: expected rad above 0, got {sigma!r}")
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
         self._add_factor(gtsam.AttitudeFactorPose3(index, there, noise, here))
+        self._journal.append(("gravity", index, up_lidar, sigma, up_map))
 
     def add_loop(self, loop: LoopClosure) -> bool:
         """Take a loop; those that contradict the rest of the graph are switched off.
@@ -217,9 +226,7 @@ class PoseGraph:
                 f"{loop.earlier} and {loop.later}; if they are swapped, invert the motion"
             )
         noise_model(loop.covariance)
-        number = len(self.loops)
-        self.loops.append(loop)
-        self._slots.append(None)
+        number = self._note(loop)
         on = {other for other, slot in enumerate(self._slots) if slot is not None}
         distance = self.chi_squared(number)
         if distance <= min(_LIKELY, self.config.max_chi2):
@@ -325,6 +332,7 @@ class PoseGraph:
 
     def optimize(self) -> OptimizedGraph:
         """Solve the whole graph at once, loops tested from scratch, and go on from there."""
+        self._journal.append(("optimize",))
         result = optimize_graph(self.saved(), max_chi2=self.config.max_chi2)
         on = [report.on for report in result.loops]
         self._isam = _new_isam()
@@ -357,6 +365,30 @@ class PoseGraph:
             distinct = sweep.distinct
         return Keyframe(len(self), update, way, edges, planes, distinct, self._session)
 
+    def _append(self, keyframe: Keyframe) -> None:
+        """A new pose, tied to the last one of its session."""
+        last = self.keyframes[-1] if self.keyframes else None
+        factor: gtsam.NonlinearFactor
+        if last is None or last.session != keyframe.session:
+            pose = keyframe.odom_T_lidar
+            covariance = keyframe.update.covariance if last is None else np.diag(_ANYWHERE**2)
+            factor = gtsam.PriorFactorPose3(keyframe.index, pose, noise_model(covariance))
+        else:
+            motion, covariance = odometry_between(last, keyframe, self.config)
+            pose = self.pose(last.index).compose(motion)
+            noise = noise_model(covariance)
+            factor = gtsam.BetweenFactorPose3(last.index, keyframe.index, motion, noise)
+        self.keyframes.append(keyframe)
+        self._journal.append(("keyframe", keyframe))
+        self._add_factor(factor, pose)
+
+    def _note(self, loop: LoopClosure) -> int:
+        """A new loop, switched off; its number."""
+        self.loops.append(loop)
+        self._slots.append(None)
+        self._journal.append(("loop", loop))
+        return len(self.loops) - 1
+
     def _add_factor(self, factor: gtsam.NonlinearFactor, pose: gtsam.Pose3 | None = None) -> None:
         """A factor that is no loop, and the first estimate of the newest pose if that is new."""
         values = gtsam.Values()
@@ -374,6 +406,7 @@ class PoseGraph:
 
     def _switch(self, number: int, on: bool) -> None:
         """Put a loop into iSAM2, or take it out."""
+        self._journal.append(("switch", number, on))
         graph, removed = gtsam.NonlinearFactorGraph(), []
         slot = self._slots[number]
         if on:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from loam_gtsam.config import RelocalizationConfig
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.matching import ScanMatches, spread
 from loam_gtsam.types import FloatArray, IntArray
 
@@ -37,6 +38,7 @@ _APART = (1.5, np.radians(12.0))
 """Metres and rad; nearer trials lead to the same solution."""
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class Fit:
     """How well a sweep fits the map at a pose.
@@ -66,6 +68,7 @@ class Fit:
         return self.share * self.agreement
 
 
+@checkpointed
 class Watch:
     """Tells from the fits of a run whether the next sweep is out of the usual.
 

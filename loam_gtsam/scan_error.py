@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loam_gtsam.config import CovarianceConfig
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import find, symmetric, transform, voxel_keys
 from loam_gtsam.solvers import Solution, match_rows
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
@@ -46,6 +47,7 @@ class ScanError:
     effective_matches: float
 
 
+@checkpointed
 class SeenGround:
     """Which cells of the map have been matched; those not matched for long are forgotten.
 

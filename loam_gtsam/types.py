@@ -19,6 +19,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.freezing import checkpointed
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -103,6 +105,7 @@ class Scan:
             raise InputError(f"Scan.rows: {len(points)} points do not divide into {self.rows} rows")
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class Features:
     """Edge and plane points of one sweep, at the positions they were measured (not de-skewed).
@@ -192,6 +195,7 @@ class BadSweep:
     message: str
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
     """A stretch of IMU data.
@@ -241,6 +245,7 @@ class Trajectory:
         return float(np.linalg.norm(steps, axis=1).sum())
 
 
+@checkpointed
 class FrameStatus(StrEnum):
     """What happened to one frame; see :attr:`solved` for which poses come from a solve."""
 
@@ -270,6 +275,7 @@ class FrameStatus(StrEnum):
         return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED, FrameStatus.DEGENERATE)
 
 
+@checkpointed
 class SweepMotion(StrEnum):
     """Where the rotation within a sweep came from; its translation is a constant velocity."""
 
@@ -280,6 +286,7 @@ class SweepMotion(StrEnum):
     ORIENTATION = "orientation"
 
 
+@checkpointed
 class TiltPrior(StrEnum):
     """How the IMU's roll and pitch acted on a pose (``imu.prior``)."""
 
@@ -294,6 +301,7 @@ class TiltPrior(StrEnum):
     """Asked for, but there is no orientation of that moment (a gap, or the end of the stream)."""
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
     """The parts of a solved pose's error (:mod:`loam_gtsam.covariance`).
@@ -318,6 +326,7 @@ class Uncertainty:
     effective_matches: float
 
 
+@checkpointed
 @dataclass(frozen=True, slots=True)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.

@@ -516,3 +516,51 @@ def test_inspect_says_what_is_understood_of_the_imu(opens, scans, monkeypatch):
     broken = ImuSamples(imu.stamps, 3.0 * imu.orientation, imu.gyro, imu.acceleration)
     monkeypatch.setattr(FakeDataset, "imu", broken)
     assert "not of unit length" in one_line(loam("inspect", "x"))
+
+
+# -- going on ------------------------------------------------------------------------------------
+
+
+def test_resume_starts_goes_on_and_says_when_all_is_done(opens, scans):
+    opens([*scans[:2], DatasetError("the disk was pulled out")])
+    arguments = ["run", "x", "--no-plot", "--output", "out", "--resume"]
+    assert loam(*arguments).exit_code == 1
+    assert (Path("out") / _cli_run.CHECKPOINT).is_dir()
+    opens(scans[:3])
+    assert loam(*arguments).exit_code == 0
+    assert files_in("out") == set(RUN_FILES)
+    assert len(read_tum("out/trajectory.tum")) == 3
+    result = loam(*arguments)
+    assert result.exit_code == 0
+    assert "out: complete, 3 sweeps" in result.output
+    assert not Path("out-2").exists()
+
+
+@pytest.mark.parametrize("change", [["--frames", 2], ["--set", "solver.iterations=7"]])
+def test_resume_does_not_take_another_run_for_its_own(opens, scans, change):
+    opens(scans[:3])
+    arguments = ["run", "x", "--no-plot", "--output", "out"]
+    assert loam(*arguments).exit_code == 0
+    result = loam(*arguments, "--resume", *change)
+    assert result.exit_code == 1
+    assert "out: holds the results of another run" in one_line(result)
+
+
+def test_a_checkpoint_is_not_run_over(opens, scans):
+    opens([*scans[:2], DatasetError("the disk was pulled out")])
+    arguments = ["run", "x", "--no-plot", "--output", "out"]
+    assert loam(*arguments).exit_code == 1
+    for name in RUN_FILES:
+        (Path("out") / name).unlink()
+    opens(scans[:3])
+    assert loam(*arguments).exit_code == 0
+    assert files_in("out-2") == set(RUN_FILES)
+    assert loam(*arguments, "--overwrite").exit_code == 0
+    assert files_in("out") == set(RUN_FILES)
+
+
+@pytest.mark.parametrize("other", [["--bag", "x.mcap"], ["--overwrite"]])
+def test_resume_tells_what_it_cannot_go_together_with(other):
+    result = loam("run", "sim:room", "--resume", *other)
+    assert result.exit_code == 2
+    assert "give one only" in one_line(result)

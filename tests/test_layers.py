@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1] / "loam_gtsam"
 THIS = "tests/test_layers.py"
 
 LAYERS = (
-    ("types", "config", "geometry", "rotations"),
+    ("freezing", "types", "config", "geometry", "rotations"),
     (
         "rings",
         "place",
@@ -38,9 +38,10 @@ LAYERS = (
         "loop_closure",
     ),
     ("mapper", "ahead"),
-    ("loop_mapping",),
+    ("loop_mapping", "checkpoint"),
     ("pipeline", "estimators", "graph_files"),
     ("comparison", "recording"),
+    ("experiments", "experiment_spec", "experiment_table", "experiment_workers"),
     (
         "_cli_report",
         "_report_html",
@@ -48,12 +49,14 @@ LAYERS = (
         "_cli_run",
         "_cli_compare",
         "_cli_optimize",
+        "_cli_sweep",
         "cli",
     ),
 )
 """From the bottom up; a module imports from lower layers, or as SAME_LAYER says."""
 
 SAME_LAYER = {
+    "types": {"freezing"},
     "config": {"types"},
     "geometry": {"types"},
     "rotations": {"types"},
@@ -73,10 +76,14 @@ SAME_LAYER = {
     "loop_consistency": {"keyframes"},
     "pose_graph": {"keyframes", "loop_consistency"},
     "loop_closure": {"keyframes", "pose_graph", "relocalization", "scan_error"},
+    "experiment_spec": {"experiments"},
+    "experiment_table": {"experiments", "experiment_spec"},
+    "experiment_workers": {"experiments"},
     "_cli_run": {"_cli_report"},
     "_compare_files": {"_report_html"},
     "_cli_compare": {"_cli_report", "_cli_run", "_compare_files"},
-    "cli": {"_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"},
+    "_cli_sweep": {"_cli_run"},
+    "cli": {"_cli_run", "_cli_report", "_cli_compare", "_cli_optimize", "_cli_sweep"},
 }
 
 LEAVES = {
@@ -96,10 +103,13 @@ LEAF_USERS = {
     "estimators": {"datasets.base", "peers"},
     "comparison": {"datasets.base", "evaluation", "peers"},
     "recording": {"datasets.base"},
+    "experiments": {"datasets", "datasets.base", "evaluation", "peers"},
+    "experiment_table": {"export"},
     "graph_files": {"export"},
+    "checkpoint": {"export"},
 }
 
-PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare", "_cli_optimize"}
+PRINTERS = {"cli", "_cli_run", "_cli_report", "_cli_compare", "_cli_optimize", "_cli_sweep"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LEVEL = {name: level for level, names in enumerate(LAYERS) for name in names}
 

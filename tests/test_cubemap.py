@@ -11,6 +11,7 @@ import pytest
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeIndex, CubeMap
+from loam_gtsam.freezing import freeze, thaw
 from loam_gtsam.geometry import voxel_filter, voxel_keys
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 
@@ -469,6 +470,28 @@ def test_points_that_wait_to_be_merged_in_are_there_all_the_same() -> None:
     keys = voxel_keys(waiting.points(), 0.2)
     assert np.all(np.diff(keys) > 0)
     np.testing.assert_array_equal(waiting.points(), merged.points())
+
+
+def test_a_restored_map_goes_on_with_the_trees_it_had() -> None:
+    """Also with the points that were added since: at which insert a tree is due stays the same."""
+    rng = np.random.default_rng(6)
+    cube_map, again = CubeMap(SMALL, 0.2), CubeMap(SMALL, 0.2)
+    cubes = [(0, 0, 0), (1, 0, 0)]
+    queries = rng.uniform(-2.0, 6.0, (200, 3))
+    cube_map.insert(rng.uniform((-2, -2, -2), (6, 2, 2), (2000, 3)))
+    cube_map.nearest(queries, 5, 1.0, cubes)
+    cube_map.insert(rng.uniform((-2, -2, -2), (6, 2, 2), (100, 3)))
+    thaw(freeze({"map": cube_map}, {"config": SMALL}), {"map": again}, {"config": SMALL})
+    (search,), (restored,) = cube_map._searches, again._searches
+    assert restored.cubes == search.cubes == set(cubes)
+    assert len(search._recent) > 0
+    for one, other in zip(search._recent, restored._recent, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(
+        cube_map.nearest(queries, 5, 1.0, cubes), again.nearest(queries, 5, 1.0, cubes), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert again._searches == [restored]
 
 
 def test_centroid_drops_only_the_trees_it_changed() -> None:

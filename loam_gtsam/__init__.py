@@ -50,6 +50,9 @@ from loam_gtsam.graph_optimize import optimize_graph as optimize_graph
 from loam_gtsam.imu import ImuBuffer as ImuBuffer
 from loam_gtsam.keyframes import Keyframe as Keyframe
 from loam_gtsam.keyframes import LoopClosure as LoopClosure
+from loam_gtsam.live import LiveMapper as LiveMapper
+from loam_gtsam.live import LiveResult as LiveResult
+from loam_gtsam.live_report import LiveReport as LiveReport
 from loam_gtsam.loop_closure import LoopCloser as LoopCloser
 from loam_gtsam.loop_closure import ScanLoopCloser as ScanLoopCloser
 from loam_gtsam.loop_mapping import LoopMapping as LoopMapping
@@ -128,6 +131,9 @@ __all__ = [
     "ImuSamples",
     "InputError",
     "Keyframe",
+    "LiveMapper",
+    "LiveReport",
+    "LiveResult",
     "LoamError",
     "LoopCloser",
     "LoopClosure",

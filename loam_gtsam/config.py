@@ -746,6 +746,30 @@ class BagConfig(_Section):
 
 
 @dataclass(frozen=True, slots=True)
+class LiveConfig(_Section):
+    """How sweeps wait, and which are dropped, when they come as they are measured."""
+
+    queue: int = _param(
+        20, "sweeps that may wait while another one is mapped; see when_full", low=1
+    )
+    when_full: Literal["drop_oldest", "keep_newest", "never"] = _param(
+        "drop_oldest",
+        "what makes room for a new sweep: the one that has waited longest is dropped, or all that "
+        "wait are, or nothing is and the queue grows",
+    )
+    imu_queue: int = _param(
+        20_000, "IMU samples that may wait for the next sweep; the oldest are dropped", low=1
+    )
+    imu_wait: float = _param(
+        0.2,
+        "a sweep waits for the IMU samples up to its end, but not longer than this after it was "
+        "received; until the map is levelled, imu.still_seconds more",
+        unit="s",
+        low=0.0,
+    )
+
+
+@dataclass(frozen=True, slots=True)
 class Config(_Section):
     """The whole configuration."""
 
@@ -763,7 +787,8 @@ class Config(_Section):
     covariance: CovarianceConfig = _param(CovarianceConfig(), "calibrated covariances")
     pose_graph: PoseGraphConfig = _param(PoseGraphConfig(), "keyframes and their graph")
     loops: LoopConfig = _param(LoopConfig(), "how loops are found and verified")
-    bag: BagConfig = _param(BagConfig(), "what is written into a bag")
+    bag: BagConfig = _param(BagConfig(), "what is written into a bag, or published")
+    live: LiveConfig = _param(LiveConfig(), "queues of a live run")
 
 
 _CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0, post_depth=0.0)

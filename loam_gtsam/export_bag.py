@@ -1,14 +1,6 @@
 """A run as a ROS bag with LOAM's topics, written frame by frame; ROS itself is not needed.
 
-| topic | type | when |
-|---|---|---|
-| ``/tf`` | ``tf2_msgs/TFMessage`` | every frame |
-| ``/aft_mapped_to_init`` | ``nav_msgs/Odometry`` | every frame |
-| ``/velodyne_cloud_registered`` | ``sensor_msgs/PointCloud2`` | every frame with a sweep |
-| ``/laser_cloud_surround`` | ``sensor_msgs/PointCloud2`` | every fifth frame |
-| ``/aft_mapped_path`` | ``nav_msgs/Path`` | whenever it has grown by a tenth, and at the end |
-
-Names, types and frames are those of LOAM (J. Zhang and S. Singh) and A-LOAM; the path is A-LOAM's.
+What it holds is said in :mod:`loam_gtsam.frame_messages`.
 """
 
 from __future__ import annotations
@@ -17,40 +9,18 @@ import os
 import shutil
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from rosbags import rosbag1, rosbag2
 
-from loam_gtsam.bag_messages import (
-    CLOUD_TYPE,
-    ODOMETRY_TYPE,
-    PATH_TYPE,
-    TF_TYPE,
-    Messages,
-    StampedPose,
-)
 from loam_gtsam.config import BagConfig
-from loam_gtsam.types import ConfigError, FrameStatus, MapUpdate, OutputError
+from loam_gtsam.frame_messages import TYPES, FrameMessages, Points
+from loam_gtsam.types import FrameStatus, MapUpdate, OutputError
 
-TF = "/tf"
-ODOMETRY = "/aft_mapped_to_init"
-REGISTERED = "/velodyne_cloud_registered"
-SURROUND = "/laser_cloud_surround"
-PATH = "/aft_mapped_path"
-
-_TYPES = {
-    TF: TF_TYPE,
-    ODOMETRY: ODOMETRY_TYPE,
-    REGISTERED: CLOUD_TYPE,
-    SURROUND: CLOUD_TYPE,
-    PATH: PATH_TYPE,
-}
 _ROS2_VERSION: Literal[8] = 8
 """Of ``metadata.yaml``. Humble cannot parse version 9, and later releases read both
 (github.com/ros2/rosbag2, issue 1895)."""
@@ -59,12 +29,6 @@ _COMMIT_EVERY = 50
 _HEADER_RECORD = 4096
 """Bytes of the first record of a ROS 1 bag, as ``rosbag`` has it: without its two lengths. rosbags
 counts them in, and ``rosbag reindex`` would then write over the first 8 bytes of the messages."""
-_PATH_STEP = 10
-"""Poses by which the path grows at least before it is written again; later a tenth of its length,
-so that all of its messages together are eleven times the last one, not its square."""
-
-Points = NDArray[np.floating]
-"""(N, 4) metres in the map frame, and the intensity."""
 
 
 class BagWriter:
@@ -97,26 +61,19 @@ class BagWriter:
     ) -> None:
         self.path = Path(path)
         self.frames = 0
-        self._config = config = config or BagConfig()
         self._kind = self.path.suffix
         if self._kind not in (".bag", ".mcap", "") or not self.path.name:
             raise OutputError(
                 f"{self.path}: expected a name that ends in .bag (ROS 1) or .mcap, or has no "
                 "suffix (ROS 2 folder)"
             )
-        if config.map_frame == config.lidar_frame or not (config.map_frame and config.lidar_frame):
-            raise ConfigError(
-                "bag.map_frame, bag.lidar_frame: expected two different names, got "
-                f"{config.map_frame!r} and {config.lidar_frame!r}"
-            )
+        self._frames = FrameMessages(config or BagConfig(), ros1=self._kind == ".bag")
         self._active = self.path.with_name(f"{self.path.name}.active")
         with self._failing():
             self._make_room(overwrite)
             self._writer: Any = self._open()
-        self._messages = Messages(self._kind == ".bag", config.map_frame, config.lidar_frame)
         self._connections: dict[str, Any] = {}
-        self._poses: list[StampedPose] = []
-        self._path_length = 0
+        self._last_stamp = 0
 
     def write(
         self,
@@ -144,19 +101,11 @@ class BagWriter:
             raise OutputError(f"{self.path}: the bag is closed; nothing can be added to it")
         if update.status is FrameStatus.BAD_STAMP:
             return
-        stamp, messages, config = update.stamp, self._messages, self._config
-        frame = [(TF, messages.transform(update)), (ODOMETRY, messages.odometry(update))]
-        if cloud is not None and config.registered:
-            frame.append((REGISTERED, messages.cloud(stamp, cloud)))
-        every = config.surround_every
-        if surround is not None and every and self.frames % every == 0:
-            frame.append((SURROUND, messages.cloud(stamp, surround())))
-        for topic, message in frame:  # all of a frame or, if a message cannot be made, none
-            self._append(topic, stamp, message)
-        self._poses.append((stamp, update.map_T_lidar))
+        # All of a frame or, if a message cannot be made, none.
+        frame = list(self._frames.frame(update, lambda: cloud, surround))
+        self._last_stamp = update.stamp
+        self._append(update.stamp, frame)
         self.frames += 1
-        if self.frames - self._path_length >= max(_PATH_STEP, self._path_length // 10):
-            self._write_path()
         if self._kind == "" and self.frames % _COMMIT_EVERY == 0:
             with self._failing():
                 self._writer.storage.conn.commit()  # rosbags would only at the end
@@ -174,8 +123,7 @@ class BagWriter:
         if self._writer is None:
             return
         with self._failing():
-            if self.frames > self._path_length:
-                self._write_path()
+            self._append(self._last_stamp, self._frames.path())
             writer, self._writer = self._writer, None
             writer.close()
             if self.frames:
@@ -195,17 +143,14 @@ class BagWriter:
         with nullcontext() if kind is None else suppress(OutputError):
             self.close()
 
-    def _append(self, topic: str, stamp: int, message: bytes) -> None:
+    def _append(self, stamp: int, messages: Iterable[tuple[str, bytes]]) -> None:
         with self._failing():
-            if topic not in self._connections:
-                self._connections[topic] = self._writer.add_connection(
-                    topic, _TYPES[topic], typestore=self._messages.store
-                )
-            self._writer.write(self._connections[topic], stamp, message)
-
-    def _write_path(self) -> None:
-        self._append(PATH, self._poses[-1][0], self._messages.path(self._poses))
-        self._path_length = self.frames
+            for topic, message in messages:
+                if topic not in self._connections:
+                    self._connections[topic] = self._writer.add_connection(
+                        topic, TYPES[topic], typestore=self._frames.store
+                    )
+                self._writer.write(self._connections[topic], stamp, message)
 
     def _make_room(self, overwrite: bool) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)

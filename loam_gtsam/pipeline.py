@@ -7,14 +7,14 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import islice
-from typing import Any
+from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.ahead import Extraction, extract, extract_ahead
 from loam_gtsam.checkpoint import Checkpoint
-from loam_gtsam.config import Config, SensorConfig, dump_config
+from loam_gtsam.config import Config, ImuConfig, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset, Sweep
 from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_aid import ImuAid
@@ -38,6 +38,7 @@ OnFrame = Callable[[int, MapUpdate], None]
 """Called after each frame with its number and result."""
 Observer = Callable[[Sweep, MapUpdate, Mapper], None]
 """Called after each frame with the sweep, its result and the mapper, to look and not to change."""
+_Section = TypeVar("_Section", SensorConfig, ImuConfig)
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +203,31 @@ class Pipeline:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
         return (self.mapper if self.loops is None else self.loops).map_points()
 
+    def result(
+        self,
+        updates: Sequence[MapUpdate],
+        *,
+        interrupted: bool = False,
+        error: Exception | None = None,
+    ) -> RunResult:
+        """A whole run, from what :meth:`process` said about each of its sweeps."""
+        mapper = self.mapper
+        edges, planes = self.map_points()
+        return RunResult(
+            config=self.config,
+            updates=tuple(updates),
+            edge_points=edges,
+            plane_points=planes,
+            map_stats={
+                name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
+                for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
+            },
+            interrupted=interrupted,
+            error=error,
+            imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+            loops=self.loops,
+        )
+
 
 def _sections(name: str, config: Any) -> dict[str, Any]:
     """A section of the configuration and those in it, by name."""
@@ -214,17 +240,25 @@ def _sections(name: str, config: Any) -> dict[str, Any]:
 
 
 def effective_config(config: Config, dataset: Dataset) -> Config:
-    """The configuration with what the data set's layout says about the sensor.
+    """The configuration with what the data set's layout says about the sensor and its IMU.
 
     A field the user changed from its default wins.
     """
-    default = SensorConfig()
-    implied = {
-        name: value
-        for name, value in dataset.sensor.items()
-        if getattr(config.sensor, name) == getattr(default, name)
-    }
-    return replace(config, sensor=replace(config.sensor, **implied))
+    return with_implied(config, dataset.sensor)
+
+
+def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
+    """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset."""
+    prefix = "imu."
+    imu = {k.removeprefix(prefix): v for k, v in implied.items() if k.startswith(prefix)}
+    sensor = {k: v for k, v in implied.items() if not k.startswith(prefix)}
+    return replace(config, sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
+
+
+def _filled(section: _Section, implied: Mapping[str, Any]) -> _Section:
+    default = type(section)()
+    unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}
+    return replace(section, **unset)
 
 
 def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
@@ -304,22 +338,7 @@ def run(
             raise
         error = caught
         progress.save()
-    mapper = pipeline.mapper
-    edges, planes = pipeline.map_points()
-    return RunResult(
-        config=config,
-        updates=tuple(updates),
-        edge_points=edges,
-        plane_points=planes,
-        map_stats={
-            name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
-            for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
-        },
-        interrupted=interrupted,
-        error=error,
-        imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
-        loops=pipeline.loops,
-    )
+    return pipeline.result(updates, interrupted=interrupted, error=error)
 
 
 class _Progress:

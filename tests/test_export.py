@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam import export
 from loam_gtsam.config import Config, load_config
+from loam_gtsam.evaluation import absolute_error
 from loam_gtsam.pipeline import RunResult
 from loam_gtsam.types import (
     DatasetError,
@@ -127,6 +128,38 @@ def test_evo_reads_both_formats(tmp_path):
     kitti = file_interface.read_kitti_poses_file(str(tmp_path / "t.txt"))
     np.testing.assert_allclose(np.array(tum.poses_se3), trajectory.map_T_lidar, atol=1e-8)
     np.testing.assert_allclose(np.array(kitti.poses_se3), trajectory.map_T_lidar, atol=1e-8)
+
+
+def test_evo_finds_the_same_ate_in_the_files_of_a_run(tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    metrics = pytest.importorskip("evo.core.metrics")
+    sync = pytest.importorskip("evo.core.sync")
+    result = make_result(20)
+    export.write_run(result, tmp_path)
+    moved = Rotation.random(random_state=3).as_matrix()
+    truth = result.trajectory.map_T_lidar.copy()
+    truth[:, :3, 3] += np.random.default_rng(4).normal(0.0, 2.0, (20, 3))
+    truth[:, :3] = moved @ truth[:, :3]
+    reference = Trajectory(result.trajectory.stamps, truth)
+    export.write_tum(tmp_path / "truth.tum", reference)
+    export.write_kitti(tmp_path / "truth.txt", reference)
+    expected = absolute_error(result.trajectory, reference).rmse
+    assert 1.0 < expected < 5.0
+    tum = file_interface.read_tum_trajectory_file
+    kitti = file_interface.read_kitti_poses_file
+    pairs = (
+        sync.associate_trajectories(
+            tum(str(tmp_path / "truth.tum")), tum(str(tmp_path / "trajectory.tum")), max_diff=1e-6
+        ),
+        (kitti(str(tmp_path / "truth.txt")), kitti(str(tmp_path / "trajectory_kitti.txt"))),
+    )
+    for theirs, ours in pairs:
+        assert ours.num_poses == 20
+        ours.align(theirs)
+        metric = metrics.APE(metrics.PoseRelation.translation_part)
+        metric.process_data((theirs, ours))
+        rmse = metric.get_statistic(metrics.StatisticsType.rmse)
+        assert rmse == pytest.approx(expected, rel=1e-6)
 
 
 def test_kitti_has_twelve_numbers_a_line(tmp_path):

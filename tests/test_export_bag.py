@@ -18,7 +18,8 @@ from rosbags.typesys import Stores, get_typestore
 from loam_gtsam.bag_messages import ros_covariance
 from loam_gtsam.config import BagConfig
 from loam_gtsam.datasets import open_dataset
-from loam_gtsam.export_bag import ODOMETRY, PATH, REGISTERED, SURROUND, TF, BagWriter
+from loam_gtsam.export_bag import BagWriter
+from loam_gtsam.frame_messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF
 from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, OutputError
 
 START = 1_700_000_000_123_456_789

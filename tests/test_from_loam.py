@@ -41,7 +41,7 @@ def value_of(name: str, config: Config) -> Any:
     module, _, key = name.partition(".")
     if module in SECTIONS and hasattr(getattr(config, module), key):
         return getattr(getattr(config, module), key)
-    folder = "datasets." if module == "loam_topics" else ""
+    folder = "datasets." if module == "loam_messages" else ""
     return getattr(importlib.import_module(f"loam_gtsam.{folder}{module}"), key)
 
 

@@ -18,7 +18,8 @@ from loam_gtsam.config import Config, DeskewConfig
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.simulation import SimulatedWorld
 from loam_gtsam.export import read_tum
-from loam_gtsam.export_bag import ODOMETRY, REGISTERED, SURROUND, BagWriter
+from loam_gtsam.export_bag import BagWriter
+from loam_gtsam.frame_messages import ODOMETRY, REGISTERED, SURROUND
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run

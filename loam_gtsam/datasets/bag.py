@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
@@ -20,13 +20,13 @@ from loam_gtsam.datasets.bag_reader import (
     topic_types,
 )
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.imu_messages import decode_imu
 from loam_gtsam.datasets.point_times import TimeDecision, check_time_options
 from loam_gtsam.datasets.pointcloud2 import (
     NO_TIMES,
     Decoded,
     decode_with_times,
     describe_fields,
-    message_stamp,
 )
 from loam_gtsam.datasets.tables import (
     clean_imu,
@@ -51,6 +51,7 @@ class BagDataset:
     imu_topic : None takes the Imu topic with the most messages, if there is one
     time_field, time_unit, stamp_is : see
         :func:`loam_gtsam.datasets.pointcloud2.decode_pointcloud2`
+    parts : the bags of a recording that was split; ``path`` then only names them
 
     Raises
     ------
@@ -68,14 +69,16 @@ class BagDataset:
         time_field: str | None = None,
         time_unit: str | None = None,
         stamp_is: str | None = None,
+        parts: Sequence[Path] = (),
     ) -> None:
         check_time_options(time_unit, stamp_is)
         self._path = Path(path)
+        self._parts = tuple(parts)
         self.name = self._path.stem
         self.sensor: Mapping[str, Any] = {}
         self._options = {"time_field": time_field, "time_unit": time_unit, "stamp_is": stamp_is}
         self._problems: list[str] = []
-        with closing(open_bag(self._path)) as reader:
+        with closing(open_bag(self._path, self._parts)) as reader:
             topics = topic_types(reader)
             self.topic = choose_topic(self._path, topics, POINT_CLOUD, topic, self._problems)
             self.imu_topic = (
@@ -93,7 +96,7 @@ class BagDataset:
 
     def __iter__(self) -> Iterator[Scan | BadSweep]:
         offset = self._clock_offset
-        for message in read_messages(self._path, [self.topic], self._problems):
+        for message in read_messages(self._path, [self.topic], self._problems, self._parts):
             if isinstance(message, BadSweep):
                 yield replace(message, stamp=message.stamp + offset)
                 continue
@@ -110,7 +113,7 @@ class BagDataset:
         """All samples of the IMU topic, or None; reads them at the first access."""
         if self.imu_topic is None:
             return None
-        return read_imu(self._path, self.imu_topic, self._problems)
+        return read_imu(self._path, self.imu_topic, self._problems, self._parts)
 
     @property
     def truth(self) -> Trajectory | None:
@@ -124,7 +127,8 @@ class BagDataset:
         if self.imu_topic is not None:
             facts["IMU topic"] = self.imu_topic
         facts["IMU"] = describe_imu(imu) if imu is not None else "none"
-        return DatasetInfo(bag_kind(self._path), str(self._path), facts, list(self._problems))
+        kind = bag_kind(self._parts[0] if self._parts else self._path)
+        return DatasetInfo(kind, str(self._path), facts, list(self._problems))
 
     def _decode(self, message: Message) -> Decoded:
         return decode_with_times(message.content, decision=self._decision, **self._options)
@@ -136,7 +140,7 @@ class BagDataset:
         offsets: list[int] = []
         failure: LoamError | None = None
         fields = ""
-        for number, message in enumerate(read_messages(self._path, [self.topic], [])):
+        for number, message in enumerate(read_messages(self._path, [self.topic], [], self._parts)):
             if number == _PEEK:
                 break
             if isinstance(message, BadSweep):
@@ -176,20 +180,18 @@ class BagDataset:
             )
 
 
-def read_imu(path: Path, topic: str, problems: list[str]) -> ImuSamples | None:
-    """All samples of a ``sensor_msgs/Imu`` topic."""
+def read_imu(
+    path: Path, topic: str, problems: list[str], parts: Sequence[Path] = ()
+) -> ImuSamples | None:
+    """All samples of a ``sensor_msgs/Imu`` topic; ``parts`` as for ``open_bag``."""
     stamps, rows, lost = [], [], 0
-    for message in read_messages(path, [topic], problems):
+    for message in read_messages(path, [topic], problems, parts):
         if isinstance(message, BadSweep):
             lost += 1
             continue
-        sample = message.content
-        q, w, a = sample.orientation, sample.angular_velocity, sample.linear_acceleration
-        # sensor_msgs/Imu: a first covariance element of -1 says there is no orientation
-        unknown = sample.orientation_covariance[0] == -1.0
-        orientation = (0.0, 0.0, 0.0, 0.0) if unknown else (q.x, q.y, q.z, q.w)
-        stamps.append(message_stamp(sample))
-        rows.append((*orientation, w.x, w.y, w.z, a.x, a.y, a.z))
+        stamp, row = decode_imu(message.content)
+        stamps.append(stamp)
+        rows.append(row)
     if lost:
         problems.append(f"IMU: {lost} messages cannot be read")
     values = np.array(rows, dtype=np.float64).reshape(-1, 10)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,19 +25,26 @@ class Message:
     content: Any
 
 
-def open_bag(path: Path) -> AnyReader:
+def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
     """An opened reader.
+
+    Parameters
+    ----------
+    parts : the bags of a recording that was split, all ROS 1 or all ROS 2; ``path`` then only
+        names them
 
     Raises
     ------
     DatasetError
         If there is no bag, or it is damaged.
     """
-    if not path.exists():
-        raise DatasetError(f"{path}: no such bag")
-    store = Stores.ROS1_NOETIC if path.suffix == ".bag" else Stores.LATEST
+    bags = list(parts or [path])
+    for bag in bags:
+        if not bag.exists():
+            raise DatasetError(f"{bag}: no such bag")
+    store = Stores.ROS1_NOETIC if bags[0].suffix == ".bag" else Stores.LATEST
     try:
-        reader = AnyReader([path], default_typestore=get_typestore(store))
+        reader = AnyReader(bags, default_typestore=get_typestore(store))
         reader.open()
     # Damage surfaces as whatever its parser stumbles over (struct, sqlite3, yaml, assertions ...).
     except Exception as error:
@@ -89,14 +96,14 @@ def choose_topic(
 
 
 def read_messages(
-    path: Path, topics: list[str], problems: list[str]
+    path: Path, topics: list[str], problems: list[str], parts: Sequence[Path] = ()
 ) -> Iterator[Message | BadSweep]:
-    """Messages in the order they were received.
+    """Messages in the order they were received; ``parts`` as for :func:`open_bag`.
 
     A message that cannot be deserialised gives a :class:`BadSweep`. Where the file itself is
     damaged the stream ends with one, after everything that came before.
     """
-    with closing(open_bag(path)) as reader:
+    with closing(open_bag(path, parts)) as reader:
         connections: list[Connection] = [c for c in reader.connections if c.topic in topics]
         stream = reader.messages(connections)
         last, interval = reader.start_time, DEFAULT_PERIOD_NS

@@ -35,7 +35,8 @@ class Dataset(Protocol):
 
     name: str
     sensor: Mapping[str, Any]
-    """Fields of ``SensorConfig`` that the layout of the data implies; the user's own win."""
+    """Fields of ``SensorConfig``, and of ``ImuConfig`` as ``imu.NAME``, that the layout of the data
+    implies; the user's own win."""
 
     def __len__(self) -> int: ...
 

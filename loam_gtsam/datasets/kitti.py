@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,14 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.extrinsics import describe_extrinsics, implied_by
+from loam_gtsam.datasets.kitti_poses import (
+    camera_T_lidar_of,
+    lidar_T_imu_of,
+    odometry_truth,
+    oxts_imu,
+    oxts_truth,
+    read_oxts,
+)
+from loam_gtsam.datasets.kitti_times import sweep_stamps, turn_seconds
 from loam_gtsam.datasets.point_times import TimeDecision, apply_times, decide_times
 from loam_gtsam.datasets.tables import (
-    DEFAULT_PERIOD_NS,
     clean_imu,
     describe_imu,
     describe_stamps,
-    read_lines,
-    read_stamps,
     read_table,
     read_tum,
 )
@@ -27,7 +33,6 @@ from loam_gtsam.types import (
     BadSweep,
     DatasetError,
     ImuSamples,
-    IntArray,
     Scan,
     Trajectory,
 )
@@ -62,6 +67,11 @@ class KittiDataset:
     ``velodyne_points/timestamps.txt``; ``t_ns/*.u64`` (uint64 nanoseconds per point);
     ``gt.tum`` (reference poses); ``imu.csv`` (s, quaternion x y z w, rad/s, m/s^2).
 
+    Of KITTI's raw drives also ``timestamps_start.txt`` and ``timestamps_end.txt`` (the duration of
+    a turn), and ``oxts/`` with ``calib_imu_to_velo.txt`` as IMU and as reference poses. A sequence
+    of its odometry benchmark, known by ``Tr`` in ``calib.txt``, has sweeps that are already freed
+    of the motion; its reference poses are ``../../poses/NN.txt``.
+
     Raises
     ------
     DatasetError
@@ -82,12 +92,17 @@ class KittiDataset:
             )
         self._times_folder = self._root / "t_ns"
         self._has_times = self._times_folder.is_dir()
-        is_kitti = folder.name == "velodyne" or folder.parent.name == "velodyne_points"
-        self.sensor: Mapping[str, Any] = (
-            dict(KITTI_SENSOR) if is_kitti and not self._has_times else {}
-        )
         self._problems: list[str] = []
-        self.stamps = self._read_stamps()
+        self.stamps = sweep_stamps(self._root, self._files, self._problems)
+        self._camera_T_lidar = camera_T_lidar_of(self._root)
+        self._oxts = read_oxts(self._root)
+        self._lidar_T_imu = None if self._oxts is None else lidar_T_imu_of(self._root)
+        if self._oxts is not None and self._lidar_T_imu is None:
+            self._problems.append(
+                "oxts left out: no calib_imu_to_velo.txt in the drive or above it says where the "
+                "scanner is (it comes with the calibration of the day)"
+            )
+        self.sensor: Mapping[str, Any] = self._implied(folder)
         self._decision = self._decide_times() if self._has_times else None
 
     def __len__(self) -> int:
@@ -102,17 +117,26 @@ class KittiDataset:
 
     @cached_property
     def imu(self) -> ImuSamples | None:
-        """From ``imu.csv``, or None."""
+        """From ``imu.csv`` or ``oxts/``, or None."""
         path = self._root / "imu.csv"
-        if not path.is_file():
+        if path.is_file():
+            table = read_table(path, "t qx qy qz qw wx wy wz ax ay az", ",")
+            return clean_imu(*table, self._problems)
+        if self._oxts is None or self._lidar_T_imu is None:
             return None
-        return clean_imu(*read_table(path, "t qx qy qz qw wx wy wz ax ay az", ","), self._problems)
+        return oxts_imu(*self._oxts, self._problems)
 
     @cached_property
     def truth(self) -> Trajectory | None:
-        """From ``gt.tum``, or None."""
+        """From ``gt.tum``, the odometry benchmark's poses or ``oxts/``, or None."""
         path = self._root / "gt.tum"
-        return read_tum(path) if path.is_file() else None
+        if path.is_file():
+            return read_tum(path)
+        if self._camera_T_lidar is not None:
+            return odometry_truth(self._root, self.stamps, self._camera_T_lidar)
+        if self._oxts is None or self._lidar_T_imu is None:
+            return None
+        return oxts_truth(*self._oxts, self._lidar_T_imu, self._problems)
 
     def info(self) -> DatasetInfo:
         """What was understood; reads no sweep."""
@@ -121,14 +145,34 @@ class KittiDataset:
         describe_stamps(self.stamps, info.facts, info.problems)
         info.facts["fields"] = "x, y, z, intensity (float32)"
         info.facts["point times"] = str(self._decision) if self._decision else "none"
-        if self.sensor:
-            info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in self.sensor.items())
+        sensor = {key: value for key, value in self.sensor.items() if not key.startswith("imu.")}
+        if sensor:
+            info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in sensor.items())
         if self._offset:
             info.facts["elevation raised by"] = f"{np.degrees(self._offset):g} degrees"
         info.facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        if "imu.lidar_t_imu" in self.sensor:
+            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, "calib_imu_to_velo.txt")
         info.facts["reference poses"] = str(len(self.truth)) if self.truth is not None else "none"
         info.problems.extend(self._problems)
         return info
+
+    def _implied(self, folder: Path) -> Mapping[str, Any]:
+        sensor: dict[str, Any] = {}
+        if self._has_times:
+            pass  # they say it all
+        elif self._camera_T_lidar is not None:
+            sensor = dict(KITTI_SENSOR) | {"times": "none"}
+            self._problems.append(
+                "a sequence of KITTI's odometry benchmark: its sweeps are already freed of the "
+                "motion, so they are not de-skewed (sensor.times=azimuth would)"
+            )
+        elif folder.name == "velodyne" or folder.parent.name == "velodyne_points":
+            period = turn_seconds(self._root, self._files, self.stamps, self._problems)
+            sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
+        if self._lidar_T_imu is not None and not (self._root / "imu.csv").is_file():
+            sensor.update(implied_by(self._lidar_T_imu))
+        return sensor
 
     def _read(self, file: Path, stamp: int) -> Scan:
         points = _read_points(file)
@@ -162,24 +206,6 @@ class KittiDataset:
             except DatasetError as error:
                 message = message or str(error)
         raise DatasetError(f"{self._times_folder}: no usable point times; {message}")
-
-    def _read_stamps(self) -> IntArray:
-        path = self._root / "times.txt"
-        kitti_path = self._root / "velodyne_points" / "timestamps.txt"
-        if path.is_file():
-            stamps = read_stamps(path)
-        elif kitti_path.is_file():
-            path = kitti_path
-            stamps = _read_dates(path)
-        else:
-            self._problems.append("no times.txt: 10 Hz assumed")
-            return np.arange(len(self._files), dtype=np.int64) * DEFAULT_PERIOD_NS
-        if len(stamps) != len(self._files):
-            raise DatasetError(
-                f"{path}: {len(stamps)} stamps for {len(self._files)} sweeps; expected one line "
-                "for each .bin file"
-            )
-        return stamps
 
 
 def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.floating]:
@@ -239,18 +265,3 @@ def _root_of(folder: Path, given: Path) -> Path:
 def _natural_order(file: Path) -> tuple[int, str]:
     """2.bin before 10.bin."""
     return (int(file.stem) if file.stem.isdecimal() else -1, file.name)
-
-
-def _read_dates(path: Path) -> IntArray:
-    """KITTI raw: ``2011-09-26 13:02:25.594360375`` per line, as nanoseconds since 1970 UTC."""
-    stamps = []
-    for number, line in enumerate(read_lines(path), start=1):
-        date, _, fraction = line.strip().partition(".")
-        try:
-            moment = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            stamps.append(int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9]))
-        except ValueError as error:
-            raise DatasetError(
-                f"{path}:{number}: expected a date and time, got {line.strip()!r}"
-            ) from error
-    return np.array(stamps, dtype=np.int64)

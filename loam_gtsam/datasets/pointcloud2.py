@@ -129,13 +129,19 @@ def decode_with_times(
 
 
 def message_stamp(msg: Any) -> int:
-    """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message."""
+    """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message.
+
+    Raises
+    ------
+    DatasetError
+        If there is none, or it is no number.
+    """
     try:
         stamp = msg.header.stamp
         if hasattr(stamp, "secs"):  # rospy
             return int(stamp.secs) * 10**9 + int(stamp.nsecs)
         return int(stamp.sec) * 10**9 + int(stamp.nanosec)
-    except AttributeError as error:
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
         raise DatasetError(
             f"expected a message with header.stamp, got {type(msg).__name__}: {error}"
         ) from error

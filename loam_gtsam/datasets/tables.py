@@ -13,6 +13,8 @@ DEFAULT_PERIOD_NS = 100_000_000
 """10 Hz, the usual rate of a spinning lidar."""
 STANDARD_GRAVITY = 9.80665
 """m/s^2, CGPM 1901."""
+UNIT_TOLERANCE = 0.1
+"""By which the length of a quaternion may differ from one for it to be an orientation."""
 
 
 def seconds_to_ns(text: str) -> int:
@@ -55,44 +57,69 @@ def read_stamps(path: Path) -> IntArray:
 
 
 def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
-    """Rows of a time in seconds and numbers; ``#`` starts a comment line.
+    """Rows of a time and numbers; ``#`` starts a comment line.
 
     Parameters
     ----------
     path : file
-    columns : names of the columns, the first being the time
+    columns : their names. The time is ``t`` (seconds), ``ns`` (whole nanoseconds), or the two
+        columns ``secs nsecs``. A first line of just these names is skipped.
     separator : as for ``str.split``
 
     Returns
     -------
     stamps : (N,) nanoseconds
-    values : (N, len(columns) - 1)
+    values : (N, C), the other columns
 
     Raises
     ------
     DatasetError
         Naming the line that does not fit.
     """
-    count = len(columns.split())
+    names = columns.split()
+    times = 2 if names[0] == "secs" else 1
     stamps, rows = [], []
     for number, line in enumerate(read_lines(path), start=1):
         if line.lstrip().startswith("#"):
             continue
         cells = line.split(separator)
+        if number == 1 and [cell.strip() for cell in cells] == names:
+            continue
         try:
-            if len(cells) != count:
+            if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} columns")
-            stamps.append(seconds_to_ns(cells[0]))
-            rows.append([float(cell) for cell in cells[1:]])
+            stamps.append(_stamp(names[0], cells))
+            rows.append([float(cell) for cell in cells[times:]])
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected {count} numbers ({columns}), got {line.strip()!r}"
+                f"{path}:{number}: expected {len(names)} numbers ({columns}), got {line.strip()!r}"
             ) from error
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), count - 1)
+    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(names) - times)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
     if len(bad):
         raise DatasetError(f"{path}: row {bad[0] + 1} of {len(rows)} holds NaN or infinity")
     return np.array(stamps, dtype=np.int64), values
+
+
+def _stamp(clock: str, cells: list[str]) -> int:
+    """Nanoseconds of a row, from its first cell or first two."""
+    if clock == "t":
+        return seconds_to_ns(cells[0])
+    nanoseconds = int(cells[0]) if clock == "ns" else int(cells[0]) * 10**9 + int(cells[1])
+    if abs(nanoseconds) >= 2**63:
+        raise ValueError(f"out of range: {cells[0].strip()!r}")
+    return nanoseconds
+
+
+def in_order(stamps: IntArray, poses: FloatArray, source: str, problems: list[str]) -> Trajectory:
+    """Reference poses by time, each time once; what had to be put right goes to ``problems``."""
+    order = np.argsort(stamps, kind="stable")
+    if (np.diff(stamps) < 0).any():
+        problems.append(f"{source}: poses out of order, sorted")
+    first = np.diff(stamps[order], prepend=np.iinfo(np.int64).min // 2) > 0
+    if dropped := len(stamps) - int(first.sum()):
+        problems.append(f"{source}: {dropped} poses with a repeated stamp left out")
+    return Trajectory(stamps[order[first]], poses[order[first]])
 
 
 def read_tum(path: Path) -> Trajectory:
@@ -152,14 +179,19 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     stamps, values = stamps[order], values[order]
     orientation, gyro, acceleration = values[:, :4].copy(), values[:, 4:7], values[:, 7:]
     norms = np.linalg.norm(orientation, axis=1, keepdims=True)
-    unknown = bool((np.abs(norms - 1.0) > 0.1).any())
+    unknown = bool((np.abs(norms - 1.0) > UNIT_TOLERANCE).any())
     if unknown:
         problems.append("IMU: no orientation (quaternions are not of unit length)")
-    median = float(np.median(np.linalg.norm(acceleration, axis=1)))
-    if 0.8 < median < 1.2:
+    if is_in_g(acceleration):
+        median = float(np.median(np.linalg.norm(acceleration, axis=1)))
         problems.append(f"IMU: acceleration of {median:.2f} at rest is in g, converted to m/s^2")
         acceleration = acceleration * STANDARD_GRAVITY
     return ImuSamples(stamps, None if unknown else orientation / norms, gyro, acceleration)
+
+
+def is_in_g(acceleration: FloatArray) -> bool:
+    """Whether (N, 3) accelerations, most of them near rest, are in g instead of m/s^2."""
+    return bool(0.8 < np.median(np.linalg.norm(acceleration, axis=1)) < 1.2)
 
 
 def describe_imu(samples: ImuSamples) -> str:

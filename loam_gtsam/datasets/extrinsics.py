@@ -1,0 +1,57 @@
+"""Where the sensors of a data set sit relative to each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.types import FloatArray, Trajectory
+
+
+def rigid(rotation: Rotation, translation: Sequence[float] | FloatArray) -> FloatArray:
+    """(4, 4) transform."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = rotation.as_matrix()
+    matrix[:3, 3] = translation
+    return matrix
+
+
+def pose(numbers: Sequence[float]) -> FloatArray:
+    """(4, 4) transform of ``x y z qx qy qz qw``."""
+    return rigid(Rotation.from_quat(numbers[3:]), numbers[:3])
+
+
+def invert(a_T_b: FloatArray) -> FloatArray:
+    """``b_T_a`` of a rigid (4, 4) transform."""
+    rotation = a_T_b[:3, :3].T
+    inverse = np.eye(4)
+    inverse[:3, :3] = rotation
+    inverse[:3, 3] = -rotation @ a_T_b[:3, 3]
+    return inverse
+
+
+def at_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
+    """Poses of the lidar where those of another frame of the same body are given."""
+    return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
+
+
+def implied_by(lidar_T_imu: FloatArray) -> Mapping[str, Any]:
+    """The extrinsics as entries of :attr:`loam_gtsam.Dataset.sensor`."""
+    angles = Rotation.from_matrix(lidar_T_imu[:3, :3]).as_euler("xyz", degrees=True)
+    return {
+        "imu.lidar_R_imu_deg": tuple(round(float(angle), 6) for angle in angles),
+        "imu.lidar_t_imu": tuple(round(float(value), 6) for value in lidar_T_imu[:3, 3]),
+    }
+
+
+def describe_extrinsics(sensor: Mapping[str, Any], source: str) -> str:
+    """For people."""
+    roll, pitch, yaw = sensor["imu.lidar_R_imu_deg"]
+    x, y, z = sensor["imu.lidar_t_imu"]
+    return (
+        f"roll, pitch, yaw {roll:.2f}, {pitch:.2f}, {yaw:.2f} degrees, position {x:.3f}, {y:.3f}, "
+        f"{z:.3f} m ({source})"
+    )

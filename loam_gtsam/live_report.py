@@ -1,0 +1,129 @@
+"""What became of the messages of a live run, and how long its sweeps took."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+STAGES = ("waiting", "mapping", "publishing", "total")
+_LATEST = 1000
+"""Sweeps of which the latencies are kept."""
+_REASONS = 30
+"""Different reasons that are counted one by one: they may quote numbers of the message."""
+OTHER_REASONS = "other reasons"
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Seconds that sweeps took: measured ones, none interpolated."""
+
+    median: float
+    p95: float
+    worst: float
+
+
+@dataclass(frozen=True, slots=True)
+class LiveReport:
+    """The state of a live run.
+
+    Attributes
+    ----------
+    received : messages by kind: ``cloud``, ``imu``, or a topic of LOAM
+    dropped : because a queue was full: ``sweep``, ``imu``
+    unmatched : messages of LOAM's topics given up without partners within 5 ms, by topic
+    faults : messages and sweeps that could not be used, by reason
+    late : ``sweep``: stamp not after that of one mapped before; ``imu``: sample of a time that has
+        been mapped
+    without_imu : sweeps mapped although their IMU samples had not all come
+    statuses : sweeps mapped, by status
+    waiting : sweeps in the queue now
+    deepest : most there were
+    latency : of the last 1000 sweeps, by stage: ``waiting`` from its reception to the start,
+        ``mapping``, ``publishing``, and ``total``. Empty before the first one.
+    """
+
+    received: Mapping[str, int]
+    dropped: Mapping[str, int]
+    unmatched: Mapping[str, int]
+    faults: Mapping[str, int]
+    late: Mapping[str, int]
+    without_imu: int
+    statuses: Mapping[str, int]
+    waiting: int
+    deepest: int
+    latency: Mapping[str, Latency]
+
+    def __str__(self) -> str:
+        """One line for a log."""
+        parts = [f"{sum(self.statuses.values())} sweeps mapped ({_listed(self.statuses)})"]
+        for what, counts in (
+            ("dropped", self.dropped),
+            ("late", self.late),
+            ("unmatched", self.unmatched),
+            ("not used", self.faults),
+        ):
+            if sum(counts.values()):
+                parts.append(f"{what}: {_listed(counts)}")
+        if self.without_imu:
+            parts.append(f"{self.without_imu} mapped before their IMU samples came")
+        parts.append(f"{self.waiting} waiting (most: {self.deepest})")
+        parts += [
+            f"{stage} {1e3 * took.median:.0f} ms (95 %: {1e3 * took.p95:.0f}, worst: "
+            f"{1e3 * took.worst:.0f})"
+            for stage, took in self.latency.items()
+        ]
+        return "; ".join(parts)
+
+
+@dataclass(slots=True)
+class LiveLog:
+    """Counts while the run goes on; not locked."""
+
+    received: Counter[str] = field(default_factory=Counter)
+    dropped: Counter[str] = field(default_factory=Counter)
+    faults: Counter[str] = field(default_factory=Counter)
+    late: Counter[str] = field(default_factory=Counter)
+    statuses: Counter[str] = field(default_factory=Counter)
+    without_imu: int = 0
+    deepest: int = 0
+    _seconds: deque[tuple[float, ...]] = field(default_factory=lambda: deque(maxlen=_LATEST))
+
+    def fault(self, reason: str) -> None:
+        """Count a message that cannot be used."""
+        new = reason not in self.faults and len(self.faults) >= _REASONS
+        self.faults[OTHER_REASONS if new else reason] += 1
+
+    def took(self, *seconds: float) -> None:
+        """Note how long a sweep took, by stage."""
+        self._seconds.append(seconds)
+
+    def report(self, waiting: int, unmatched: Mapping[str, int]) -> LiveReport:
+        """As it is now, to keep."""
+        latency = {}
+        if self._seconds:
+            columns = np.percentile(
+                np.array(self._seconds), [50, 95, 100], axis=0, method="inverted_cdf"
+            ).T
+            latency = {
+                stage: Latency(*column)
+                for stage, column in zip(STAGES, columns.tolist(), strict=True)
+            }
+        return LiveReport(
+            received=dict(self.received),
+            dropped=dict(self.dropped),
+            unmatched=dict(unmatched),
+            faults=dict(self.faults),
+            late=dict(self.late),
+            without_imu=self.without_imu,
+            statuses=dict(self.statuses),
+            waiting=waiting,
+            deepest=self.deepest,
+            latency=latency,
+        )
+
+
+def _listed(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count}" for name, count in counts.items() if count)

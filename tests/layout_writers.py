@@ -1,0 +1,127 @@
+"""Small data sets in the layouts of known ones, from a simulated room."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.types import Scan, Trajectory
+
+FIRST, COUNT = 22, 6
+"""Sweeps of the room that are used: by then the sensor moves and turns."""
+WORLD_T_MAP = np.eye(4)
+WORLD_T_MAP[:3, :3] = Rotation.from_euler("z", 40.0, degrees=True).as_matrix()
+WORLD_T_MAP[:3, 3] = (1000.0, -500.0, 30.0)
+"""Reference poses of real data sets do not start at the identity."""
+
+
+@cache
+def room(sensor: str = "os1-64", columns: int | None = None) -> SimulatedWorld:
+    return SimulatedWorld("shaken", sensor=sensor, columns=columns, frames=FIRST + COUNT, seed=4)
+
+
+@cache
+def sweeps(sensor: str = "os1-64", columns: int | None = None) -> list[Scan]:
+    return [room(sensor, columns).sweep(FIRST + i) for i in range(COUNT)]
+
+
+def stamps(sensor: str = "os1-64", columns: int | None = None) -> np.ndarray:
+    return np.array([sweep.stamp for sweep in sweeps(sensor, columns)], np.int64)
+
+
+def lidar_truth(sensor: str = "os1-64", columns: int | None = None) -> Trajectory:
+    """Poses at 50 Hz, from before the first sweep to after the last."""
+    at = stamps(sensor, columns)
+    times = np.arange(at[0] - 60_000_000, at[-1] + 160_000_000, 20_000_000)
+    return Trajectory(times, WORLD_T_MAP @ room(sensor, columns).truth_at(times).map_T_lidar)
+
+
+def body_truth(body_T_lidar: np.ndarray, **world: object) -> Trajectory:
+    truth = lidar_truth(**world)  # type: ignore[arg-type]
+    return Trajectory(truth.stamps, truth.map_T_lidar @ np.linalg.inv(body_T_lidar))
+
+
+def imu_rows(lidar_R_imu: np.ndarray) -> tuple[np.ndarray, ...]:
+    """Stamps, quaternions, gyro and acceleration of an IMU turned like this, while sweeps last."""
+    samples = room().imu
+    at = stamps()
+    use = (samples.stamps >= at[0] - 100_000_000) & (samples.stamps <= at[-1] + 150_000_000)
+    assert samples.orientation is not None
+    world_R_imu = Rotation.from_quat(samples.orientation[use]) * Rotation.from_matrix(lidar_R_imu)
+    turn = np.asarray(lidar_R_imu)  # rows times R is R^T times columns
+    return (
+        samples.stamps[use],
+        world_R_imu.as_quat(),
+        samples.gyro[use] @ turn,
+        samples.acceleration[use] @ turn,
+    )
+
+
+def firings(sweep: Scan, beams: int, columns: int) -> np.ndarray:
+    """(beams * columns, 4) float32, firing by firing, zero where nothing came back."""
+    assert sweep.times is not None
+    assert sweep.rings is not None
+    column = np.rint(sweep.times * 10.0 * columns).astype(np.int64)
+    values = np.zeros((beams * columns, 4), "<f4")
+    # Ouster's beams are numbered from the top.
+    values[column * beams + (beams - 1 - sweep.rings), :3] = sweep.points
+    return values
+
+
+def quaternion_rows(trajectory: Trajectory) -> np.ndarray:
+    """(N, 7): x y z qx qy qz qw."""
+    poses = trajectory.map_T_lidar
+    return np.hstack([poses[:, :3, 3], Rotation.from_matrix(poses[:, :3, :3]).as_quat()])
+
+
+def write_rows(
+    path: Path, stamps: object, rows: np.ndarray, separator: str = ",", header: str = ""
+) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    lines = [header] if header else []
+    for stamp, row in zip(stamps, rows, strict=True):  # type: ignore[call-overload]
+        lines.append(separator.join([str(stamp), *(repr(float(value)) for value in row)]))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def write_xsens(path: Path, lidar_R_imu: np.ndarray, gyro_last: bool = False) -> None:
+    at, quaternions, gyro, acceleration = imu_rows(lidar_R_imu)
+    angles = Rotation.from_quat(quaternions).as_euler("xyz", degrees=True)
+    magnetic = np.tile([0.3, 0.1, -0.4], (len(at), 1))
+    first, last = (magnetic, gyro) if gyro_last else (gyro, magnetic)
+    write_rows(path, at, np.hstack([quaternions, angles, first, acceleration, last]))
+
+
+def write_pcd(path: Path, columns: dict[str, np.ndarray], data: str = "binary") -> None:
+    """Fields in the given order, with four bytes of padding after the first three."""
+    names = list(columns)
+    record = np.dtype(
+        [
+            *((name, columns[name].dtype) for name in names[:3]),
+            ("_", "u1", (4,)),
+            *((name, columns[name].dtype) for name in names[3:]),
+        ]
+    )
+    points = np.zeros(len(columns[names[0]]), record)
+    for name in names:
+        points[name] = columns[name]
+    kinds = [record[name].base for name in record.names or ()]
+    header = [
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(record.names or ()),
+        "SIZE " + " ".join(str(kind.itemsize) for kind in kinds),
+        "TYPE " + " ".join(kind.kind.upper() for kind in kinds),
+        "COUNT " + " ".join("4" if name == "_" else "1" for name in record.names or ()),
+        f"WIDTH {len(points)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(points)}",
+        f"DATA {data}",
+    ]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes("\n".join(header).encode() + b"\n" + points.tobytes())

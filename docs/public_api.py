@@ -48,6 +48,8 @@ MODULES = (
     "export_bag",
     "recording",
     "visualization",
+    "viewer",
+    "watching",
     "comparison",
 )
 """Whose public names are public besides those of the package itself."""

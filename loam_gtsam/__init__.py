@@ -84,6 +84,7 @@ from loam_gtsam.types import MapUpdate as MapUpdate
 from loam_gtsam.types import OutputError as OutputError
 from loam_gtsam.types import Scan as Scan
 from loam_gtsam.types import SweepError as SweepError
+from loam_gtsam.types import SweepFault as SweepFault
 from loam_gtsam.types import SweepMotion as SweepMotion
 from loam_gtsam.types import TiltPrior as TiltPrior
 from loam_gtsam.types import Trajectory as Trajectory
@@ -153,6 +154,7 @@ __all__ = [
     "ScanToScan",
     "Solution",
     "SweepError",
+    "SweepFault",
     "SweepMotion",
     "TiltPrior",
     "Trajectory",

@@ -40,6 +40,9 @@ def summary(
     table.add_row("frames", f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)")
     statuses = ", ".join(f"{count} {status}" for status, count in result.status_counts.items())
     table.add_row("status", statuses)
+    if result.faults:
+        faults = ", ".join(f"{count} {fault}" for fault, count in result.faults.items())
+        table.add_row("not used", faults)
     table.add_row("path", f"{result.trajectory.length:.1f} m")
     table.add_row(
         "map", f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points"

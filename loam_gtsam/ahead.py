@@ -16,7 +16,7 @@ from multiprocessing import get_context
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.features import extract_features
-from loam_gtsam.types import Features, Scan, SweepError
+from loam_gtsam.types import Features, Scan, SweepError, SweepFault
 
 _AHEAD = 2
 """Sweeps read ahead of the current one, a process: one at work and one that waits for it."""
@@ -31,17 +31,18 @@ class Extraction:
     features: Features | None
     problem: str
     seconds: float
+    fault: SweepFault | None = None
 
 
 def extract(scan: Scan, config: Config) -> Extraction:
     """Extract features here and now; what a sweep contains never raises."""
     started = time.perf_counter()
-    features, problem = None, ""
+    features, problem, fault = None, "", None
     try:
         features = extract_features(scan, config)
     except SweepError as error:
-        problem = str(error)
-    return Extraction(features, problem, time.perf_counter() - started)
+        problem, fault = str(error), error.fault
+    return Extraction(features, problem, time.perf_counter() - started, fault)
 
 
 def extract_ahead(

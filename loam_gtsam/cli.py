@@ -15,7 +15,6 @@ from typing import Annotated, Any
 import typer
 from rich.console import Console
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 from typer.core import TyperGroup
 
 from loam_gtsam.config import (
@@ -492,7 +491,7 @@ def _key_value(option: str, entry: str) -> tuple[str, Any]:
         raise typer.BadParameter(f"{option} {entry}: expected KEY=VALUE")
     try:
         return key.strip(), YAML(typ="safe", pure=True).load(text)
-    except YAMLError as error:
+    except Exception as error:  # a day 32 is a ValueError, deep nesting a RecursionError
         raise typer.BadParameter(f"{option} {entry}: {text!r} is not a YAML value") from error
 
 

@@ -19,9 +19,12 @@ from typing import Any, Literal
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
-from ruamel.yaml.error import YAMLError
+from ruamel.yaml.scalarbool import ScalarBoolean
 
 from loam_gtsam.types import ConfigError
+
+_LONGEST = 200
+"""Characters of a value in an error message."""
 
 
 def _param(
@@ -46,8 +49,8 @@ def _check(where: str, value: Any, hint: Any, meta: Mapping[str, Any]) -> None:
     if origin is Literal:
         if value not in args:
             raise ConfigError(
-                f"{where}: expected one of {', '.join(args)}; got {value!r}"
-                f"{_nearest(str(value), args, listing=False)}"
+                f"{where}: expected one of {', '.join(args)}; got {_shown(value)}"
+                f"{_nearest(value, args, listing=False)}"
             )
         return
     if origin in (types.UnionType, typing.Union):
@@ -56,13 +59,15 @@ def _check(where: str, value: Any, hint: Any, meta: Mapping[str, Any]) -> None:
         hint = next(arg for arg in args if arg is not type(None))
     if origin is tuple:
         if not isinstance(value, tuple) or len(value) != len(args):
-            raise ConfigError(f"{where}: expected {len(args)} values, got {value!r}")
+            raise ConfigError(f"{where}: expected {len(args)} values, got {_shown(value)}")
         for entry in value:
             _check(where, entry, args[0], meta)
         return
     wanted: Any = (int, float) if hint is float else hint
     if not isinstance(value, wanted) or (isinstance(value, bool) and hint is not bool):
-        raise ConfigError(f"{where}: expected {hint.__name__}, got {value!r}")
+        raise ConfigError(f"{where}: expected {hint.__name__}, got {_shown(value)}")
+    if hint is int and abs(value) >= 1 << 63:
+        raise ConfigError(f"{where}: the number is too large")
     if isinstance(value, (int, float)) and not isinstance(value, bool):
         low, high = meta.get("low"), meta.get("high")
         if (
@@ -74,8 +79,39 @@ def _check(where: str, value: Any, hint: Any, meta: Mapping[str, Any]) -> None:
                 high is not None
             )
             raise ConfigError(
-                f"{where}: expected {' and '.join(bounds) or 'a number'}, got {value!r}"
+                f"{where}: expected {' and '.join(bounds) or 'a number'}, got {_shown(value)}"
             )
+
+
+def _shown(value: Any) -> str:
+    """A value in an error message: short, for aliases in YAML can make one of any length."""
+    if isinstance(value, Mapping):
+        return f"a mapping of {len(value)} keys"
+    if isinstance(value, (list, tuple)) and any(
+        isinstance(entry, (list, tuple, Mapping)) for entry in value
+    ):
+        return f"a list of {len(value)} lists or mappings"
+    try:
+        text = repr(value)
+    except ValueError:  # Python refuses to write integers of thousands of digits
+        return "a number that is too long"
+    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
+
+
+def _plain(value: Any) -> Any:
+    """A number or text without what the parser keeps of its looks (quotes, base, anchor)."""
+    if isinstance(value, list):
+        return [_plain_scalar(entry) for entry in value]
+    return _plain_scalar(value)
+
+
+def _plain_scalar(value: Any) -> Any:
+    if isinstance(value, bool):
+        return value
+    for kind, plain in ((ScalarBoolean, bool), (int, int), (float, float), (str, str)):
+        if isinstance(value, kind):
+            return plain(value)
+    return value
 
 
 def _where(source: str, located: Any, key: str) -> str:
@@ -86,8 +122,9 @@ def _where(source: str, located: Any, key: str) -> str:
         return source
 
 
-def _nearest(name: str, known: Any, listing: bool = True) -> str:
-    close = difflib.get_close_matches(name, [str(entry) for entry in known], n=1)
+def _nearest(name: object, known: Any, listing: bool = True) -> str:
+    asked = name[:_LONGEST] if isinstance(name, str) else ""
+    close = difflib.get_close_matches(asked, [str(entry) for entry in known], n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return hint + (f" (known: {', '.join(sorted(map(str, known)))})" if listing else "")
 
@@ -872,8 +909,8 @@ def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
     name = data.get("preset", "default")
     if not isinstance(name, str) or name not in PRESETS:
         raise ConfigError(
-            f"{_where(source, data, 'preset')}: unknown preset {name!r}"
-            f"{_nearest(str(name), PRESETS)}"
+            f"{_where(source, data, 'preset')}: unknown preset {_shown(name)}"
+            f"{_nearest(name, PRESETS)}"
         )
     rest = {key: value for key, value in data.items() if key != "preset"}
     config: Config = _override(PRESETS[name], rest, data, source, "")
@@ -930,7 +967,8 @@ def parse_config(text: str, source: str = "config") -> Config:
     """As :func:`load_config`, from text."""
     try:
         data = YAML(typ="rt").load(text)
-    except YAMLError as error:
+    # A day 32, an endless number and deep nesting surface as whatever the parser stumbles over.
+    except Exception as error:
         raise ConfigError(f"{source}: not valid YAML: {error}") from error
     return config_from_dict({} if data is None else data, source)
 
@@ -974,19 +1012,19 @@ def _override(section: Any, data: Mapping[str, Any], located: Any, source: str, 
     hints = _hints(type(section))
     changes: dict[str, Any] = {}
     for key, value in data.items():
-        full = f"{prefix}{key}"
+        full = f"{prefix}{key}" if isinstance(key, str) else _shown(key)
         where = _where(source, located, key)
         if key not in names:
-            raise ConfigError(f"{where}: unknown key {full!r}{_nearest(str(key), names)}")
+            raise ConfigError(f"{where}: unknown key {_shown(full)}{_nearest(key, names)}")
         current = getattr(section, key)
         if dataclasses.is_dataclass(current):
             if not isinstance(value, Mapping):
                 raise ConfigError(
-                    f"{where}: {full} is a section, expected a mapping, got {value!r}"
+                    f"{where}: {full} is a section, expected a mapping, got {_shown(value)}"
                 )
             changes[key] = _override(current, value, value, source, f"{full}.")
             continue
-        hint = hints[key]
+        hint, value = hints[key], _plain(value)
         if hint is float and isinstance(value, int) and not isinstance(value, bool):
             try:
                 value = float(value)

@@ -151,6 +151,10 @@ class PoseErrors:
         covariance = symmetric(own + drifted @ self._drift @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
+    def cut(self) -> None:
+        """The frames to come do not follow those before: their clock is another."""
+        self._last = None
+
     def _own(
         self,
         reference_stamp: int,

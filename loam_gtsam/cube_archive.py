@@ -101,7 +101,8 @@ class Archive:
         if index in self._memory:
             return self._memory[index]
         try:
-            rows = np.load(self._path(index), allow_pickle=False)
+            # Mapped, so that a damaged header cannot claim more memory than the file has bytes.
+            rows = np.load(self._path(index), mmap_mode="r", allow_pickle=False)
             if rows.shape != (self._disk[index], 4) or rows.dtype != np.float64:
                 raise ValueError(
                     f"expected ({self._disk[index]}, 4) float64, got {rows.shape} {rows.dtype}"
@@ -109,7 +110,7 @@ class Archive:
         except (OSError, ValueError) as error:
             self._drop(self._disk.pop(index), f"cannot read {self._path(index)}: {error}")
             return None
-        return CubePoints(np.ascontiguousarray(rows[:, :3]), rows[:, 3].astype(np.int32))
+        return CubePoints(np.array(rows[:, :3], order="C"), rows[:, 3].astype(np.int32))
 
     def take(self, index: CubeIndex) -> CubePoints | None:
         """The same, and forget it."""

@@ -43,6 +43,7 @@ class MovingSweep:
     edges, planes : (E, 3) and (P, 3) metres, seen from the middle of the sweep
     distinct : (E,) whether an edge stands out of its ring by more than range noise makes it
     motion : what the rotation comes from
+    not_finite : points of the sweep that were NaN or infinite
     """
 
     def __init__(
@@ -58,6 +59,7 @@ class MovingSweep:
         self.middle = 0.5 * (first + end) if moving else 0.0
         self.duration = end - first if moving else 0.0
         self.reference_stamp = features.stamp
+        self.not_finite = features.not_finite
         self.stamp = features.stamp + round(self.middle * 1e9)
         kinks = features.edge_kinks
         if kinks is None:

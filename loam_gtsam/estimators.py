@@ -164,7 +164,7 @@ class Ours:
     def register(self, sweep: Prepared, given: Step | None) -> Step | None:
         """Register a sweep from a given guess or an own one; returns the step of the guess."""
         if sweep.features is None:
-            self.updates.append(self.mapper.skip(sweep.stamp, sweep.problem))
+            self.updates.append(self.mapper.skip(sweep.stamp, sweep.problem, None))
             return None
         started = time.perf_counter()
         last = self.mapper.last

@@ -10,7 +10,6 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from ruamel.yaml import YAML
-from ruamel.yaml.error import YAMLError
 
 from loam_gtsam.comparison import Contender, contender
 from loam_gtsam.config import Config, with_value
@@ -63,7 +62,7 @@ def load_spec(path: str | Path) -> Spec:
         data = YAML(typ="safe", pure=True).load(text)
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: cannot read the specification: {error}") from error
-    except YAMLError as error:
+    except Exception as error:  # not only YAMLError: see config.parse_config
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     name = str(path)
     entries = _mapping(name, data, _SPEC)

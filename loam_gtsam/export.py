@@ -15,7 +15,7 @@ import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol
@@ -26,10 +26,12 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.types import (
+    MAX_STAMP,
     DatasetError,
     FloatArray,
     FrameStatus,
     InputError,
+    IntArray,
     MapUpdate,
     OutputError,
     Trajectory,
@@ -88,6 +90,8 @@ class Run(Protocol):
     def trajectory(self) -> Trajectory: ...
     @property
     def status_counts(self) -> dict[str, int]: ...
+    @property
+    def faults(self) -> dict[str, int]: ...
 
 
 @contextmanager
@@ -164,9 +168,12 @@ def read_tum(path: str | Path) -> Trajectory:
         if not words or words[0].startswith("#"):
             continue
         try:
-            stamp = int((Decimal(words[0]) * _NS).to_integral_value())
+            nanoseconds = Decimal(words[0]) * _NS
+            if not abs(nanoseconds) <= MAX_STAMP:
+                raise ValueError("out of range")
+            stamp = int(nanoseconds.to_integral_value())
             row = [float(word) for word in words[1:]]
-        except (InvalidOperation, ValueError, OverflowError) as error:
+        except (ArithmeticError, ValueError) as error:
             raise DatasetError(f"{path}:{number}: not numbers: {line[:80]!r}") from error
         if len(row) != 7 or not np.isfinite(row).all() or not any(row[3:]):
             raise DatasetError(
@@ -395,6 +402,12 @@ def summarise(result: Run) -> dict[str, Any]:
         "interrupted": result.interrupted,
         "error": None if result.error is None else f"{type(result.error).__name__}: {result.error}",
         "status_counts": result.status_counts,
+        "faults": result.faults,
+        "sweep_gaps": _gaps(trajectory.stamps),
+        "not_finite_points": {
+            "sweeps": sum(u.n_not_finite > 0 for u in result.updates),
+            "points": sum(u.n_not_finite for u in result.updates),
+        },
         "messages": messages[:_MAX_MESSAGES],
         "path_length_m": trajectory.length,
         "duration_s": float(np.ptp(trajectory.stamps)) / _NS if len(trajectory) else 0.0,
@@ -406,6 +419,12 @@ def summarise(result: Run) -> dict[str, Any]:
         "imu": None if result.imu is None else _imu_part(result.imu),
         "loops": None if result.loops is None else result.loops.counts(),
     }
+
+
+def _gaps(stamps: IntArray) -> int:
+    """From how many sweeps to the next it took more than half as long again as usual."""
+    steps = np.diff(stamps)
+    return int(np.count_nonzero(steps > 1.5 * np.median(steps))) if len(steps) else 0
 
 
 def _axes_part(result: Run) -> dict[str, Any] | None:
@@ -432,6 +451,9 @@ def _imu_part(imu: Any) -> dict[str, Any]:
         "samples": report.samples,
         "rate_hz": report.rate,
         "gaps": report.gaps,
+        "duplicates": report.duplicates,
+        "out_of_order": report.out_of_order,
+        "not_finite": report.not_finite,
         "orientation": report.orientation,
         "level": None
         if level is None

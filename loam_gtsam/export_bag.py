@@ -166,6 +166,10 @@ class BagWriter:
                 f"{self._active}: a recording that was cut off, or is still going on; repair "
                 "it (rosbag reindex, ros2 bag reindex, mcap recover) or delete it"
             )
+        if self._active.is_dir() and not _is_cut_off(self._active):
+            raise OutputError(
+                f"{self._active}: not a bag, so it is not replaced; choose another name"
+            )
         _remove(self._active)
 
     def _open(self) -> Any:
@@ -223,6 +227,12 @@ def _is_ros2_bag(folder: Path) -> bool:
     return "metadata.yaml" in names and all(
         Path(name).suffix in (".yaml", ".db3", ".mcap") for name in names
     )
+
+
+def _is_cut_off(folder: Path) -> bool:
+    """Whether a folder holds what an unfinished recording leaves, and nothing else."""
+    files = (path for path in folder.rglob("*") if not path.is_dir())
+    return all(path.suffix.startswith((".yaml", ".db3", ".mcap")) for path in files)
 
 
 def _remove(path: Path) -> None:

@@ -166,7 +166,8 @@ def line_rows(
     InputError
         If a shape is wrong or a value not finite.
     """
-    p, c, u = _points("points", points), _points("centres", centres), _points("dirs", directions)
+    p, c = _points("points", points), _points("centres", centres)
+    u = _points("directions", directions)
     _same_length(points=p, centres=c, directions=u, weights=np.atleast_1d(weights))
     basis = complement_basis(u)
     offsets = -np.einsum("nij,nj->ni", basis, c)
@@ -174,7 +175,7 @@ def line_rows(
         np.repeat(p, 2, axis=0),
         basis.reshape(-1, 3),
         offsets.reshape(-1),
-        np.repeat(np.asarray(weights, np.float64) / np.asarray(sigmas, np.float64), 2),
+        np.repeat(np.divide(weights, sigmas, dtype=np.float64), 2),
     )
 
 
@@ -204,7 +205,7 @@ def plane_rows(
         _points("points", points),
         _points("normals", normals),
         np.asarray(offsets, np.float64),
-        np.asarray(weights, np.float64) / np.asarray(sigmas, np.float64),
+        np.divide(weights, sigmas, dtype=np.float64),
     )
 
 

@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 from loam_gtsam.config import Config, FeatureConfig
 from loam_gtsam.posts import Posts, find_posts
 from loam_gtsam.sweep import OrganisedSweep, organise
-from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError
+from loam_gtsam.types import (
+    BoolArray,
+    Features,
+    FloatArray,
+    IntArray,
+    Scan,
+    SweepError,
+    SweepFault,
+)
 
 _ROUGH = 4.0
 """Standard deviations of range noise: no smooth surface scatters by that much."""
@@ -66,7 +74,8 @@ def extract_features(scan: Scan, config: Config) -> Features:
         longest = int(np.diff(sweep.ring_starts).max())
         raise SweepError(
             f"no features: the longest of {sweep.rings.count} rings has {longest} points, at "
-            f"least {2 * window + 1} are needed (rings: {sweep.rings.note})"
+            f"least {2 * window + 1} are needed (rings: {sweep.rings.note})",
+            SweepFault.NO_FEATURES,
         )
     posts = None
     if settings.post_depth > 0.0:
@@ -391,6 +400,7 @@ def _assemble(
         flat=np.arange(len(flat)),
         span=(span[0] - reference, span[1] - reference),
         edge_kinks=stands_out,
+        not_finite=sweep.not_finite,
     )
 
 

@@ -36,6 +36,7 @@ def report(
         map_T_lidar=result.map_T_lidar,
         status=status,
         message=message,
+        n_not_finite=sweep.not_finite,
         n_edges=len(sweep.edges),
         n_planes=len(sweep.planes),
         twist=result.twist,

@@ -25,7 +25,7 @@ from loam_gtsam.rotations import (
     running_product,
 )
 from loam_gtsam.stillness import STILL_SAMPLES, StillWindow, find_rest, rest_at_start
-from loam_gtsam.types import FloatArray, ImuSamples, InputError, IntArray
+from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, InputError, IntArray
 
 STILL_AHEAD = 0.1
 """Seconds after the asked stamp that still count to its still window: one sweep."""
@@ -46,6 +46,8 @@ WRAP = 3.0
 _FINE = 1e-3
 """Seconds between the nodes of ``turn``: a linear interpolation is then off by 4e-7 rad at
 3 rad/s^2."""
+_ABSURD = 1e6
+"""rad/s and m/s^2 that no IMU measures, and a length that no quaternion has."""
 _UNIT = 1e-3
 """Deviation of a quaternion's length from one that is still rounding (float32 has 1e-7)."""
 
@@ -59,9 +61,9 @@ class ImuReport:
     samples : in the buffer
     duplicates : dropped because of their stamp; the first to come is kept
     out_of_order : older than one that came before them; sorted in
-    not_finite : dropped because of NaN or infinity in gyro or acceleration
+    not_finite : dropped because of NaN, infinity or an absurd value in stamp, gyro or acceleration
     unnormalised : quaternions brought to unit length
-    no_orientation : samples without a quaternion, or with a zero or NaN one
+    no_orientation : samples without a quaternion, or with a zero, NaN or absurd one
     gaps : between neighbours, longer than ``max_gap``
     rate : median, Hz; 0 if unknown
     orientation : from the quaternions ("ahrs"), from gyro and acceleration ("gravity_filter"), or
@@ -149,14 +151,15 @@ class ImuBuffer:
             If an array has the wrong shape or dtype.
         """
         stamps, values = _checked(samples)
-        finite = np.isfinite(values[:, 4:]).all(axis=1)
+        finite = (np.abs(values[:, 4:]) < _ABSURD).all(axis=1)  # NaN compares false
+        finite &= (stamps >= -MAX_STAMP) & (stamps <= MAX_STAMP)
         self._not_finite += len(stamps) - int(finite.sum())
         stamps, values = stamps[finite], values[finite]
         if len(stamps) == 0:
             return
-        norms = np.linalg.norm(values[:, :4], axis=1)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            known = norms > 1e-6
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            norms = np.linalg.norm(values[:, :4], axis=1)
+            known = (norms > 1.0 / _ABSURD) & (norms < _ABSURD)
             off = known & (np.abs(norms - 1.0) > _UNIT)
             imu = np.where(known, values[:, :4].T / norms, np.nan)
         self._unnormalised += int(off.sum())
@@ -188,7 +191,7 @@ class ImuBuffer:
         for number, what in (
             (self._duplicates, "repeat a stamp: the first of each is kept"),
             (self._out_of_order, "came late: sorted in"),
-            (self._not_finite, "hold NaN or infinity: left out"),
+            (self._not_finite, "hold NaN, infinity or absurd values: left out"),
             (self._unnormalised, "have a quaternion that is not of unit length: normalised"),
             (self._no_orientation if source == "ahrs" else 0, "have no orientation: interpolated"),
         ):

@@ -33,6 +33,7 @@ from loam_gtsam.solvers import (
     ScanSolver,
     Solution,
 )
+from loam_gtsam.stamps import StampCheck
 from loam_gtsam.types import (
     ConfigError,
     Features,
@@ -40,6 +41,7 @@ from loam_gtsam.types import (
     FrameStatus,
     InputError,
     MapUpdate,
+    SweepFault,
     TiltPrior,
 )
 
@@ -150,6 +152,7 @@ class Mapper:
         self.registered: Registered | None = None
         self.watch = Watch(self.config.relocalization)
         self._errors = PoseErrors(self.config)
+        self._stamps = StampCheck()
         self._new_map()
         self._first: tuple[MovingSweep, gtsam.Pose3] | None = None
         self._last_middle: tuple[int, gtsam.Pose3] | None = None
@@ -180,10 +183,14 @@ class Mapper:
         """
         clock = Clock()
         self.registered = None
-        last = self.last
-        if last is not None and features.stamp <= last.stamp:
-            return self.skip(features.stamp, "")
-        aid = self.imu_aid
+        refused = self._refused(features.stamp)
+        if refused is not None:
+            return refused
+        points = features.edges, features.planes, features.edge_times, features.plane_times
+        if not all(np.isfinite(part).all() for part in points):
+            message = "features of the sweep are NaN or infinite"
+            return self._unused(features.stamp, message, SweepFault.NOT_FINITE)
+        aid, last = self.imu_aid, self.last
         if last is None and aid is not None:
             guess = aid.start(features.stamp, guess)
         if guess is None or twist is None:
@@ -193,11 +200,16 @@ class Mapper:
         start = Guess(guess, np.asarray(twist, np.float64))
         sweep = MovingSweep(features, self.config, None if aid is None else aid.gyro)
         if sweep.is_empty:
-            return self.skip(features.stamp, "the sweep has no features")
+            message = "the sweep has no features"
+            return self._unused(features.stamp, message, SweepFault.NO_FEATURES)
         sweep.deskew(start.twist)
         clock.lap("prepare")
 
         if last is None:
+            try:
+                self._recenter(_to_middle(sweep, start))
+            except InputError as error:
+                return self._unused(features.stamp, str(error), None)
             if self.config.deskew.refine:
                 self._first = sweep, start.map_T_lidar
             update = self._insert(sweep, start, FrameStatus.FIRST, "the map starts here", clock)
@@ -206,34 +218,23 @@ class Mapper:
         self.last = update
         return update
 
-    def skip(self, stamp: int, message: str) -> MapUpdate:
+    def skip(
+        self, stamp: int, message: str, fault: SweepFault | None = SweepFault.UNREADABLE
+    ) -> MapUpdate:
         """Account for a sweep that cannot be used: the pose is predicted, the map unchanged.
 
         Parameters
         ----------
         stamp : nanoseconds
-        message : why
+        message, fault : why
 
         Returns
         -------
         MapUpdate
-            With status ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp is not later than the last
-            one.
+            With status ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp cannot be used either.
         """
         self.registered = None
-        last = self.last
-        if last is None:
-            return MapUpdate(stamp, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN, message)
-        if stamp <= last.stamp:
-            message = f"stamp {stamp} ns is not later than the last one, {last.stamp} ns"
-            return MapUpdate(
-                stamp, last.map_T_lidar, FrameStatus.BAD_STAMP, message, twist=last.twist
-            )
-        guess = ConstantVelocity(self.imu_aid).at(stamp, last)
-        self.last = MapUpdate(
-            stamp, guess.map_T_lidar, FrameStatus.UNUSABLE_SCAN, message, twist=guess.twist
-        )
-        return self.last
+        return self._refused(stamp) or self._unused(stamp, message, fault)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
@@ -256,6 +257,38 @@ class Mapper:
 
     # -- the steps of a frame ----------------------------------------------------------------
 
+    def _refused(self, stamp: int) -> MapUpdate | None:
+        """What is said about a sweep whose stamp cannot be used; None if it can."""
+        last = self.last
+        refusal = None if last is None else self._stamps.refuse(stamp, last.stamp)
+        if last is None or refusal is None:
+            return None
+        if refusal.clock_step:
+            self.last = replace(last, stamp=last.stamp + refusal.clock_step)
+            if self._last_middle is not None:
+                before, pose = self._last_middle
+                self._last_middle = before + refusal.clock_step, pose
+            self._errors.cut()
+        return MapUpdate(
+            stamp,
+            last.map_T_lidar,
+            FrameStatus.BAD_STAMP,
+            refusal.message,
+            twist=last.twist,
+            fault=refusal.fault,
+        )
+
+    def _unused(self, stamp: int, message: str, fault: SweepFault | None) -> MapUpdate:
+        """What is said about a sweep that says nothing: the pose is predicted."""
+        last, status = self.last, FrameStatus.UNUSABLE_SCAN
+        if last is None:
+            return MapUpdate(stamp, gtsam.Pose3(), status, message, fault=fault)
+        guess = ConstantVelocity(self.imu_aid).at(stamp, last)
+        self.last = MapUpdate(
+            stamp, guess.map_T_lidar, status, message, twist=guess.twist, fault=fault
+        )
+        return self.last
+
     def _solve(
         self,
         sweep: MovingSweep,
@@ -267,8 +300,10 @@ class Mapper:
         guess, motion = self._expected(sweep, guess)
         middle = _to_middle(sweep, guess)
         maps = self.edge_map, self.plane_map
-        for cubes in maps:
-            cubes.recenter(middle.translation())
+        try:
+            self._recenter(middle)
+        except InputError as error:
+            return self._unused(sweep.reference_stamp, str(error), None)
         around = [cubes.neighbourhood(middle.matrix()) for cubes in maps]
         sizes = [cubes.count(near) for cubes, near in zip(maps, around, strict=True)]
         config = self.config.solver
@@ -492,6 +527,7 @@ class Mapper:
             first.deskew(twist)
             sweep.deskew(twist)
             self._new_map()
+            self._recenter(pose)
             self._add_to_map(first, _to_middle(first, Guess(pose, twist)))
             again = self.solver.solve(matches_at, solution.map_T_lidar, priors, motion)
             if not again.solved:
@@ -523,6 +559,11 @@ class Mapper:
     def _new_map(self) -> None:
         self.edge_map = CubeMap(self.config.map, self.config.map.edge_voxel)
         self.plane_map = CubeMap(self.config.map, self.config.map.plane_voxel)
+
+    def _recenter(self, middle: gtsam.Pose3) -> None:
+        """Let the windows follow; InputError if a pose is not finite or beyond the voxel grid."""
+        for cubes in (self.edge_map, self.plane_map):
+            cubes.recenter(middle.translation())
 
     def _add_to_map(self, sweep: MovingSweep, middle: gtsam.Pose3) -> None:
         self.edge_map.owner = self.plane_map.owner = self.keyframe

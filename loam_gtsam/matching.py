@@ -303,7 +303,7 @@ def match_planes(
     if config.plane_fit == "unit_offset":
         normals, offsets = _unit_offset_planes(group)
     across = _dot(group.transpose(2, 1, 0), normals[:, None, :]) + offsets
-    is_plane = np.abs(across).max(axis=0, initial=0.0) <= config.plane_tolerance
+    is_plane = np.abs(across).max(axis=0) <= config.plane_tolerance
     is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
     away = points_map[near].T - centres
     distances = _dot(points_map[near].T, normals) + offsets
@@ -354,8 +354,9 @@ def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]
     scale = determinant + _dot(means, across)
     length = _norm(across)
     proper = (length > 0.0) & (scale != 0.0)
-    normals = -np.sign(scale) * across / np.where(proper, length, 1.0)
-    offsets = np.where(proper, np.abs(scale) / np.where(proper, length, 1.0), np.inf)
+    length = np.where(proper, length, 1.0)
+    normals = -np.sign(scale) * across / length
+    offsets = np.where(proper, np.abs(scale) / length, np.inf)
     return normals, offsets
 
 

@@ -43,6 +43,11 @@ class Odometry(Protocol):
         ...
 
 
+_LONGEST = 10.0
+"""Seconds for which a motion is taken to go on; where a lidar is after a longer gap, nothing says,
+and a wrong stamp must not take it to the end of the world."""
+
+
 def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsam.Pose3:
     """The pose after moving with a constant body velocity."""
     return map_T_lidar.compose(gtsam.Pose3.Expmap(twist * seconds))
@@ -71,7 +76,7 @@ class ConstantVelocity:
         """The guess for a moment, nanoseconds."""
         if last is None:
             return Guess(gtsam.Pose3(), np.zeros(6))
-        seconds = (stamp - last.stamp) * 1e-9
+        seconds = min((stamp - last.stamp) * 1e-9, _LONGEST)
         turned = None if self.imu is None else self.imu.between(last.stamp, stamp)
         if turned is None:
             return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)

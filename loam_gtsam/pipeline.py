@@ -114,6 +114,11 @@ class RunResult:
         """How many frames ended in which status."""
         return dict(Counter(str(u.status) for u in self.updates))
 
+    @property
+    def faults(self) -> dict[str, int]:
+        """How many sweeps were not used for which :class:`~loam_gtsam.types.SweepFault`."""
+        return dict(Counter(str(u.fault) for u in self.updates if u.fault is not None))
+
 
 class Pipeline:
     """Feature extraction, odometry guess and mapping, one sweep at a time.
@@ -142,6 +147,7 @@ class Pipeline:
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
         self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu_aid)
         self._last_odom: gtsam.Pose3 | None = None
+        self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.loops: LoopMapping | None = None
         if self.config.loops.enabled or loop_closer is not None:
             self.loops = LoopMapping(self.mapper, self.config, loop_closer)
@@ -154,7 +160,7 @@ class Pipeline:
         extraction : of its features; made here if None
         """
         if isinstance(sweep, BadSweep):
-            return self.mapper.skip(sweep.stamp, sweep.message)
+            return self.mapper.skip(sweep.stamp + self._to_reference, sweep.message)
         if isinstance(sweep, FeatureSweep):
             return self._process_features(sweep)
         if not isinstance(sweep, Scan):
@@ -166,7 +172,9 @@ class Pipeline:
             extraction = extract(sweep, self.config)
         features, last = extraction.features, self.mapper.last
         if features is None:
-            return self.mapper.skip(sweep.stamp, extraction.problem)
+            stamp = sweep.stamp + self._to_reference
+            return self.mapper.skip(stamp, extraction.problem, extraction.fault)
+        self._to_reference = features.stamp - sweep.stamp
         started = time.perf_counter()
         guess = self.odometry.guess(features, last)
         guessed = time.perf_counter() - started
@@ -179,12 +187,13 @@ class Pipeline:
     def _process_features(self, sweep: FeatureSweep) -> MapUpdate:
         """The guess is the last pose, moved by the increment of the recorded odometry (LOAM)."""
         last, last_odom = self.mapper.last, self._last_odom
-        self._last_odom = sweep.odom_T_lidar
         if last is None or last_odom is None:
             update = self.mapper.register(sweep.features)
         else:
             pose = last.map_T_lidar.compose(last_odom.between(sweep.odom_T_lidar))
             update = self.mapper.register(sweep.features, pose)
+        if update.status is not FrameStatus.BAD_STAMP:  # then the last pose is that of another
+            self._last_odom = sweep.odom_T_lidar
         return self._with_loops(update, sweep.features)
 
     def _with_loops(self, update: MapUpdate, features: Features) -> MapUpdate:

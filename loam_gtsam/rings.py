@@ -79,12 +79,15 @@ def rings_from_labels(labels: NDArray[np.integer], xyz: NDArray[np.float32]) -> 
     """
     low, high = int(labels.min()), int(labels.max())
     if high - low < 65536:
-        compact = (labels.astype(np.int64) - low).astype(np.uint16)
+        # modulo 2^64, for labels of 64 bits without sign
+        lowest = labels.min().astype(np.int64)
+        compact = (labels.astype(np.int64) - lowest).astype(np.uint16)
     else:
         compact = np.unique(labels, return_inverse=True)[1].astype(np.int64)
     counts = np.bincount(compact)
-    with np.errstate(divide="ignore"):
-        slope = np.minimum(np.abs(xyz[2]) / np.hypot(xyz[0], xyz[1]), 1e6) * np.sign(xyz[2])
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        # fmin: a point at the origin, where sensor.min_range lets it in, has the slope zero
+        slope = np.fmin(np.abs(xyz[2]) / np.hypot(xyz[0], xyz[1]), 1e6) * np.sign(xyz[2])
     mean = np.bincount(compact, weights=slope) / np.maximum(counts, 1)
     mean[counts == 0] = np.inf
     rank = np.argsort(np.argsort(mean, kind="stable"), kind="stable")

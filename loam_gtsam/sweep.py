@@ -22,13 +22,16 @@ from loam_gtsam.rings import (
     rings_from_labels,
     rings_from_rows,
 )
-from loam_gtsam.types import BoolArray, FloatArray, IntArray, Scan, SweepError
+from loam_gtsam.types import BoolArray, FloatArray, IntArray, Scan, SweepError, SweepFault
 
 MIN_POINTS = 11
 """One window of LOAM's curvature: a point and five neighbours on either side."""
 
 _MAX_SPAN = 2.0
 """Seconds. No spinning sensor in use turns slower than 0.5 Hz; more means wrong units."""
+
+_MAX_OFFSET = 10.0
+"""Seconds between a stamp and its sweep: a pose that far from its sweep would be extrapolated."""
 
 _MAX_OUTLIERS = 0.01
 """Fraction of points that may carry a nonsense time and be dropped."""
@@ -69,6 +72,7 @@ class SweepColumns:
     labels, row_of, times : (N,) of the same points, or None
     span : as in :class:`~loam_gtsam.types.Scan`
     dropped : number of points left out
+    not_finite : of them, those that are NaN or infinite
     """
 
     xyz: NDArray[np.float32]
@@ -78,6 +82,7 @@ class SweepColumns:
     times: FloatArray | None
     span: tuple[float, float] | None
     dropped: int
+    not_finite: int
 
     def __len__(self) -> int:
         return len(self.index)
@@ -103,6 +108,7 @@ class OrganisedSweep:
     span : (first, last) seconds from the stamp
     rings, timing : how both were decided; their arrays are in the order of ``columns``
     dropped : points left out (not finite, out of range, nonsense time)
+    not_finite : of them, those that are NaN or infinite
     """
 
     xyz: NDArray[np.float32]
@@ -114,6 +120,7 @@ class OrganisedSweep:
     rings: RingAssignment
     timing: TimeAssignment
     dropped: int
+    not_finite: int
 
 
 def usable_columns(scan: Scan, config: Config) -> SweepColumns:
@@ -137,24 +144,31 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
     if times is not None:
         keep &= _plausible_times(times, keep)
     count = int(np.count_nonzero(keep))
+    everything = count == len(keep)
+    not_finite = 0 if everything else int(np.count_nonzero(~np.isfinite(xyz).all(axis=0)))
+    finite = len(keep) - not_finite
     if count < MIN_POINTS:
-        there = scan.points[np.isfinite(scan.points).all(axis=1)]
-        finite = len(there)
-        # hypot, for squares may overflow
-        ranges = np.hypot(np.hypot(there[:, 0], there[:, 1]), there[:, 2])
-        median = float(np.median(ranges)) if finite else 0.0
+        fault = SweepFault.TOO_FEW_POINTS
+        if len(keep) == 0:
+            fault = SweepFault.EMPTY
+        elif finite < MIN_POINTS <= len(keep):
+            fault = SweepFault.NOT_FINITE
+        elif times is not None and np.count_nonzero(np.isfinite(times)) < MIN_POINTS <= finite:
+            fault = SweepFault.BAD_TIMES
+        ranges = np.sqrt(squared[np.isfinite(squared)].astype(np.float64))
+        median = float(np.median(ranges)) if len(ranges) else 0.0
         far = median > sensor.max_range
         unit = f"; half are farther than {median:.0f} m: are they in metres?" if far else ""
         raise SweepError(
             f"sweep of {len(scan.points)} points, {finite} finite, {count} of them within "
             f"{sensor.min_range:g} to {sensor.max_range:g} m: at least {MIN_POINTS} are needed; "
-            f"check the source, or sensor.min_range and sensor.max_range{unit}"
+            f"check the source, or sensor.min_range and sensor.max_range{unit}",
+            fault,
         )
     row_of = None
     if scan.rows and sensor.rings != "field":
         row_of = np.repeat(np.arange(scan.rows), len(scan.points) // scan.rows)
     index = np.flatnonzero(keep)
-    everything = count == len(keep)
     return SweepColumns(
         xyz=xyz if everything else xyz.take(index, axis=1),
         index=index,
@@ -163,6 +177,7 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
         times=None if times is None else times[index].astype(np.float64),
         span=scan.span,
         dropped=len(keep) - count,
+        not_finite=not_finite,
     )
 
 
@@ -180,7 +195,8 @@ def _plausible_times(times: NDArray[np.floating], keep: BoolArray) -> BoolArray:
         raise SweepError(
             f"point times span {float(used.max()) - float(used.min()):.6g} s in one sweep, "
             f"more than {_MAX_SPAN:g} s: they are probably not in seconds from the stamp; fix "
-            "their unit, or set sensor.times to azimuth or none"
+            "their unit, or set sensor.times to azimuth or none",
+            SweepFault.BAD_TIMES,
         )
     good &= near
     return good
@@ -216,13 +232,15 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
     if found is None:
         raise SweepError(
             f"no rings for a sweep of {len(columns)} points ({'; '.join(tried)}); give Scan.rings "
-            "or Scan.rows, or set sensor.rings and sensor.model"
+            "or Scan.rows, or set sensor.rings and sensor.model",
+            SweepFault.BAD_RINGS,
         )
     if found.count < 2 or found.count > MAX_RINGS:
         raise SweepError(
             f"{found.count} ring(s) from {found.method} in a sweep of {len(columns)} points: "
             f"expected 2 to {MAX_RINGS}; check the ring field, or set sensor.rings to another "
-            "source"
+            "source",
+            SweepFault.BAD_RINGS,
         )
     return found
 
@@ -258,9 +276,17 @@ def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -
     if columns.times is None:
         raise SweepError(
             "sensor.times is field, but the points have no times; set sensor.times to azimuth "
-            "(and spin, start_azimuth_deg, period, stamp), or to none to run without de-skew"
+            "(and spin, start_azimuth_deg, period, stamp), or to none to run without de-skew",
+            SweepFault.BAD_TIMES,
         )
     span = columns.span or (float(columns.times.min()), float(columns.times.max()))
+    # NaN compares false
+    if not (0.0 <= span[1] - span[0] <= _MAX_SPAN and max(map(abs, span)) <= _MAX_OFFSET):
+        raise SweepError(
+            f"the sweep lies {span[0]:.6g} to {span[1]:.6g} s from its stamp; expected at most "
+            f"{_MAX_SPAN:g} s, within {_MAX_OFFSET:g} s: times count from the stamp, in seconds",
+            SweepFault.BAD_TIMES,
+        )
     note = f"per-point times from {span[0]:.4f} to {span[1]:.4f} s after the stamp"
     return TimeAssignment(columns.times, span, "field", note)
 
@@ -310,7 +336,8 @@ def _sense(
         return True, False, "assumed, as Velodyne and Ouster turn; sensor.spin overrides"
     raise SweepError(
         f"cannot tell the sense of rotation: within rings {forth} azimuth steps go up and {back} "
-        "go down; set sensor.spin, give per-point times, or set sensor.times to none"
+        "go down; set sensor.spin, give per-point times, or set sensor.times to none",
+        SweepFault.BAD_TIMES,
     )
 
 
@@ -364,6 +391,7 @@ def organise(scan: Scan, config: Config) -> OrganisedSweep:
         rings=rings,
         timing=timing,
         dropped=columns.dropped,
+        not_finite=columns.not_finite,
     )
 
 

@@ -26,6 +26,12 @@ IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
 
 
+MAX_STAMP = 1 << 62
+"""Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
+_FARTHEST = 1e5
+"""Metres, of a feature; far beyond any lidar, and within the grid of voxels."""
+
+
 class LoamError(Exception):
     """Base of every error this package raises on purpose."""
 
@@ -46,8 +52,49 @@ class OutputError(LoamError):
     """A file or a picture could not be written."""
 
 
+@checkpointed
+class SweepFault(StrEnum):
+    """What was wrong with a sweep that was not used."""
+
+    UNREADABLE = "unreadable"
+    """Its loader could not read it."""
+    EMPTY = "empty"
+    """It has no points at all."""
+    NOT_FINITE = "not_finite"
+    """Too few of its points, or not all of its features, are finite numbers."""
+    TOO_FEW_POINTS = "too_few_points"
+    """Too few points, or too few that are within range."""
+    BAD_TIMES = "bad_times"
+    """The times of its points cannot be had, or be seconds of one sweep."""
+    BAD_RINGS = "bad_rings"
+    """Its beams cannot be told apart."""
+    NO_FEATURES = "no_features"
+    DUPLICATE_STAMP = "duplicate_stamp"
+    """That of the sweep before; see :mod:`loam_gtsam.stamps` for the other stamps."""
+    LATE = "late"
+    """A later sweep has come already."""
+    STAMP_BACK = "stamp_back"
+    """So much earlier that it is no late sweep: its stamp is wrong."""
+    STAMP_AHEAD = "stamp_ahead"
+    """So much later that its stamp is doubted."""
+    CLOCK_SET_BACK = "clock_set_back"
+    """Sweep after sweep is earlier than the last one used: nothing can be used until a reset."""
+    CLOCK_SET_AHEAD = "clock_set_ahead"
+    """Sweep after sweep is far ahead; from the next one on that is the clock."""
+
+
 class SweepError(LoamError):
-    """One sweep cannot be used; the mapper turns it into a frame status and goes on."""
+    """One sweep cannot be used; the mapper turns it into a frame status and goes on.
+
+    Parameters
+    ----------
+    message : a sentence
+    fault : what is wrong, where the sweep itself is
+    """
+
+    def __init__(self, message: str, fault: SweepFault | None = None) -> None:
+        super().__init__(message)
+        self.fault = fault
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,6 +136,10 @@ class Scan:
                 f"Scan.stamp: expected integer nanoseconds, got {self.stamp!r}; "
                 "round(seconds * 1e9) makes them of seconds"
             )
+        if abs(int(self.stamp)) > MAX_STAMP:
+            raise InputError(
+                f"Scan.stamp: expected nanoseconds up to 2^62 (the year 2116), got {self.stamp}"
+            )
         for name, kinds in (("times", "f"), ("rings", "iu")):
             column = getattr(self, name)
             if column is None:
@@ -122,6 +173,7 @@ class Features:
     edge_kinks : (E,) metres by which each edge stands out of its ring, in the unit in which range
         noise has its own standard deviation (:func:`loam_gtsam.features.kinks`); None if unknown:
         all edges then count as real ones.
+    not_finite : points of the sweep that were NaN or infinite
     """
 
     stamp: int
@@ -135,6 +187,7 @@ class Features:
     flat: IntArray
     span: tuple[float, float] = (0.0, 0.0)
     edge_kinks: FloatArray | None = None
+    not_finite: int = 0
 
     @classmethod
     def from_points(
@@ -150,13 +203,19 @@ class Features:
         Raises
         ------
         InputError
-            If a shape or a dtype is wrong.
+            If a shape or a dtype is wrong, or a point is not finite or farther than any lidar sees.
         """
         for name, points in (("edges", edges), ("planes", planes)):
             if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
                 raise InputError(f"{name}: expected an (N, 3) array, got {_describe(points)}")
             if points.dtype.kind != "f":
                 raise InputError(f"{name}: expected a float dtype, got {points.dtype}")
+            wild = int(np.count_nonzero(~(np.abs(points) < _FARTHEST).all(axis=1)))
+            if wild:
+                raise InputError(
+                    f"{name}: expected metres below {_FARTHEST:g}, got {wild} points of "
+                    f"{len(points)} that are NaN, infinite or farther; remove them first"
+                )
         n_edges, n_planes = len(edges), len(planes)
         return cls(
             stamp=stamp,
@@ -267,7 +326,8 @@ class FrameStatus(StrEnum):
     UNUSABLE_SCAN = "unusable_scan"
     """The sweep has no usable points or features; the pose is predicted."""
     BAD_STAMP = "bad_stamp"
-    """The stamp is not later than the one before; the sweep is skipped, the pose repeated."""
+    """The stamp is not later than the one before, or far too late; the sweep is skipped, the pose
+    repeated."""
 
     @property
     def solved(self) -> bool:
@@ -361,6 +421,8 @@ class MapUpdate:
         the other five are left free; at least 1; below ``solver.min_aligned`` do not rely on it.
         NaN likewise
     timings : seconds per stage
+    fault : what was wrong with the sweep, if the status is ``UNUSABLE_SCAN`` or ``BAD_STAMP``
+    n_not_finite : points of the sweep that were NaN or infinite, if it was used
     """
 
     stamp: int
@@ -386,6 +448,8 @@ class MapUpdate:
     direction_information: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     axis_localizability: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
     timings: Mapping[str, float] = field(default_factory=dict)
+    fault: SweepFault | None = None
+    n_not_finite: int = 0
 
     @property
     def raw_covariance(self) -> FloatArray:

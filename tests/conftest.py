@@ -6,6 +6,17 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# The same few examples every time; `pytest --hypothesis-profile=thorough` looks for new ones.
+_slow = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
+settings.register_profile(
+    "default", max_examples=25, derandomize=True, deadline=None, suppress_health_check=_slow
+)
+settings.register_profile(
+    "thorough", max_examples=2000, deadline=None, suppress_health_check=_slow, print_blob=True
+)
+settings.load_profile("default")
 
 
 @pytest.fixture(scope="session")

@@ -281,6 +281,7 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
         (["--set", "solver=1"], 2, "expected SECTION.KEY=VALUE"),
         (["--set", "solver.iterations"], 2, "expected KEY=VALUE"),
         (["--set", "solver.iterations={"], 2, "is not a YAML value"),
+        (["--set", "imu.gravity=2001-12-00"], 2, "is not a YAML value"),
         (["--option", "=1"], 2, "expected KEY=VALUE"),
         (["--option", "nonsense=1"], 1, "nonsense"),
         (["--sensor", "vlp17"], 1, "did you mean 'vlp16'"),

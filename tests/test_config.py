@@ -4,6 +4,7 @@ import dataclasses
 import typing
 
 import pytest
+from ruamel.yaml import YAML
 
 from loam_gtsam.config import (
     PRESETS,
@@ -142,6 +143,13 @@ def test_the_tree_is_frozen():
         ("solver: [unclosed", ("here.yaml", "not valid YAML")),
         ("solver: {}\nsolver: {}", ("here.yaml", "not valid YAML", "duplicate")),
         ("a: \0", ("here.yaml", "not valid YAML")),
+        ("imu: {gravity: 2001-12-00}", ("here.yaml", "not valid YAML", "day is out of range")),
+        (f"imu: {{lag: {'9' * 9000}}}", ("here.yaml", "not valid YAML")),
+        (f"imu: {{lag: 0x{'f' * 9000}}}", ("here.yaml:1", "imu.lag", "too large")),
+        ("imu: " + "[" * 3000, ("here.yaml", "not valid YAML")),
+        ("imu: &a [*a]", ("here.yaml:1", "imu is a section")),
+        ("? [a, b]\n: 3", ("here.yaml:1", "unknown key")),
+        ("1: 2", ("here.yaml:1", "unknown key")),
     ],
 )
 def test_a_wrong_file_is_refused_with_key_and_line(text, words):
@@ -149,6 +157,34 @@ def test_a_wrong_file_is_refused_with_key_and_line(text, words):
         parse_config(text, "here.yaml")
     for word in words:
         assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("place", ["map: {0}", "map: {{archive_dir: {0}}}", "preset: {0}"])
+def test_aliases_that_multiply_do_not_make_an_endless_message(place):
+    laughs = "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 60))
+    text = place.format("&z [*a59]") + "\nloops: {enabled: &b [1]}\n"
+    with pytest.raises(ConfigError) as caught:
+        config_from_dict(
+            {
+                key: value
+                for key, value in YAML().load(f"a0: &a0 [x, x]\n{laughs}{text}").items()
+                if key in ("map", "preset")
+            }
+        )
+    assert len(str(caught.value)) < 1000
+
+
+def test_anchors_and_other_looks_of_a_value_do_not_matter():
+    plain = parse_config("imu: {enabled: true, lag: 16, gravity: 10.0}\nbag: {map_frame: map}")
+    text = "imu: {enabled: &a true, lag: &b 0x10, gravity: &c 1.0e+1}\nbag: {map_frame: &d 'map'}"
+    dressed = parse_config(text)
+    assert dressed == plain
+    assert {type(value) for value in dataclasses.astuple(dressed.imu)} <= {
+        bool, int, float, str, tuple, type(None)
+    }  # fmt: skip
+    assert parse_config(dump_config(dressed)) == plain
+    with pytest.raises(ConfigError, match="expected int, got True"):
+        parse_config("imu: {lag: &a true}")
 
 
 @pytest.mark.parametrize(("owner", "item", "end"), BOUNDS, ids=name_of)

@@ -11,6 +11,7 @@ import pytest
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeIndex, CubeMap
+from loam_gtsam.freezing import freeze, thaw
 from loam_gtsam.geometry import voxel_filter, voxel_keys
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 
@@ -215,6 +216,13 @@ def test_jump_of_ten_kilometres_and_back() -> None:
     assert cube_map.stats.restored == n_cubes
 
 
+def test_a_window_that_holds_still_evicts_nothing() -> None:
+    cube_map = CubeMap(SMALL, 0.5)
+    cube_map.insert(np.zeros((1, 3)))
+    assert cube_map.recenter(np.array([3.9, 0.0, 0.0])) == 0
+    assert cube_map.stats.evicted == 0
+
+
 def test_margin_wider_than_the_window_is_cut() -> None:
     cube_map = CubeMap(small(window=(3, 3, 1), window_margin=3), 0.5)
     cube_map.recenter(np.array([40.0, 0.0, 8.0]))
@@ -386,9 +394,13 @@ def test_centroid_equals_the_voxel_filter_of_the_union() -> None:
     np.testing.assert_allclose(cube_map.points(), voxel_filter(union, 0.4), rtol=0, atol=1e-13)
 
 
-def test_rounding_cannot_move_a_centroid_out_of_its_voxel() -> None:
-    """The plain mean of six times 1.4 is one bit above 1.4, in the next voxel of 0.2 m."""
-    points = np.full((6, 3), 1.4)
+@pytest.mark.parametrize("x", [1.4, 1.6])
+def test_rounding_cannot_move_a_centroid_out_of_its_voxel(x: float) -> None:
+    """The plain mean of six times 1.4 is one bit above it, that of six times 1.6 one bit below.
+
+    Either is then in the next voxel of 0.2 m.
+    """
+    points = np.full((6, 3), x)
     plain = np.add.reduce(points, axis=0)[None] / 6.0
     assert voxel_keys(plain, 0.2) != voxel_keys(points[:1], 0.2)
     cube_map = CubeMap(CENTROID, 0.2)
@@ -460,6 +472,28 @@ def test_points_that_wait_to_be_merged_in_are_there_all_the_same() -> None:
     np.testing.assert_array_equal(waiting.points(), merged.points())
 
 
+def test_a_restored_map_goes_on_with_the_trees_it_had() -> None:
+    """Also with the points that were added since: at which insert a tree is due stays the same."""
+    rng = np.random.default_rng(6)
+    cube_map, again = CubeMap(SMALL, 0.2), CubeMap(SMALL, 0.2)
+    cubes = [(0, 0, 0), (1, 0, 0)]
+    queries = rng.uniform(-2.0, 6.0, (200, 3))
+    cube_map.insert(rng.uniform((-2, -2, -2), (6, 2, 2), (2000, 3)))
+    cube_map.nearest(queries, 5, 1.0, cubes)
+    cube_map.insert(rng.uniform((-2, -2, -2), (6, 2, 2), (100, 3)))
+    thaw(freeze({"map": cube_map}, {"config": SMALL}), {"map": again}, {"config": SMALL})
+    (search,), (restored,) = cube_map._searches, again._searches
+    assert restored.cubes == search.cubes == set(cubes)
+    assert len(search._recent) > 0
+    for one, other in zip(search._recent, restored._recent, strict=True):
+        np.testing.assert_array_equal(one, other)
+    for one, other in zip(
+        cube_map.nearest(queries, 5, 1.0, cubes), again.nearest(queries, 5, 1.0, cubes), strict=True
+    ):
+        np.testing.assert_array_equal(one, other)
+    assert again._searches == [restored]
+
+
 def test_centroid_drops_only_the_trees_it_changed() -> None:
     cube_map = CubeMap(small(insertion="centroid"), 0.5)
     cube_map.insert(np.array([[0.1, 0.1, 0.1], [4.1, 0.1, 0.1]]))
@@ -519,6 +553,8 @@ def test_points_outside_are_counted() -> None:
     far = np.array([[10.1, 0.0, 0.0], [0.0, 1e300, 0.0], [0.0, 0.0, -6.1], [9.9, 0.0, 0.0]])
     cube_map.insert(far)
     assert (cube_map.stats.outside, cube_map.count()) == (3, 1)
+    cube_map.insert(far)
+    assert (cube_map.stats.outside, cube_map.count()) == (6, 1)
     # A fine grid ends inside the window: 2^20 voxels of 1e-5 m are 10.5 m.
     fine = CubeMap(MapConfig(), 1e-5)
     fine.insert(np.array([[11.0, 0.0, 0.0], [10.0, 0.0, 0.0]]))
@@ -575,7 +611,7 @@ def test_bad_input(call: Callable[[CubeMap], object], message: str) -> None:
     cube_map = CubeMap(SMALL, 0.5)
     cube_map.insert(np.zeros((1, 3)))
     before = cube_map.stats
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="^" + message):
         call(cube_map)
     assert cube_map.stats == before
 
@@ -653,3 +689,77 @@ def test_a_point_may_move_to_where_no_cube_was_ever_kept(tmp_path, on_disk):
     assert cubes.count() == 0
     assert cubes.stats.archived_points == 1
     np.testing.assert_allclose(cubes.points(archived=True), [[200.1, 0.1, 0.1]])
+
+
+@pytest.mark.parametrize("megabytes", [100.0, 0.0])
+def test_moved_points_join_those_of_a_cube_in_the_archive(tmp_path, megabytes):
+    """Of the moved ones too a voxel keeps one, and those that were there stay."""
+    config = small(archive_dir=str(tmp_path), archive_megabytes=megabytes)
+    cubes = CubeMap(config, 0.5)
+    there = np.array([[100.1, 0.1, 0.1], [100.6, 0.1, 0.1], [101.1, 0.1, 0.1]])
+    cubes.recenter(there[0])
+    cubes.insert(there)
+    cubes.recenter(np.zeros(3))
+    cubes.owner = 1
+    here = np.array([[0.1, 0.1, 0.1], [0.6, 0.6, 0.6], [1.6, 0.6, 0.4], [1.6, 0.6, 0.6]])
+    cubes.insert(here)
+    # The last two come to lie in one voxel, the second in that of a point that was there.
+    turned = moved_by(100.0)
+    turned[2, 2], turned[1, 1] = -1.0, -1.0
+    turned[1:3, 3] = 0.7, 0.65
+    arrived = here @ turned[:3, :3].T + turned[:3, 3]
+    assert cubes.move({1: turned}) == 4
+    assert cubes.count() == 0
+    union = np.concatenate([there, arrived])
+    _, first = np.unique(voxel_keys(union, 0.5), return_index=True)
+    assert sorted(first) == [0, 1, 2, 3, 5]
+    np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=1e-12)
+    cubes.recenter(np.array([100.0, 0.0, 0.0]))
+    assert cubes.count() == 5
+    # They can move on, each with its owner.
+    assert cubes.move({1: moved_by(-100.0)}) == 2
+    np.testing.assert_allclose(cubes.points(), there, atol=1e-12)
+
+
+def test_points_moved_beyond_the_voxel_grid_are_counted():
+    """2^20 voxels of 1e-5 m end at 10.5 m, and the window of one cube at 1 m."""
+    cubes = CubeMap(small(cube_size=2.0, window=(1, 1, 1), window_margin=0), 1e-5)
+    for owner in range(3):
+        cubes.owner = owner
+        cubes.insert(np.array([[0.1 * owner, 0.0, 0.0], [0.1 * owner, 0.5, 0.0]]))
+    assert cubes.move({0: moved_by(10.0), 1: moved_by(11.0)}) == 4
+    assert (cubes.stats.outside, cubes.stats.archived_points, cubes.count()) == (2, 2, 2)
+    assert cubes.move({2: moved_by(1e6)}) == 2
+    assert (cubes.stats.outside, cubes.stats.archived_points, cubes.count()) == (4, 2, 0)
+
+
+def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path):
+    cubes = CubeMap(small(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+    for owner, x in enumerate((0.0, 100.0, 200.0, 300.0)):
+        cubes.recenter(np.array([x, 0.0, 0.0]))
+        cubes.owner = owner
+        cubes.insert(np.array([[x, 0.0, 0.0]]))
+    files = [next(tmp_path.glob(f"cubes_*/cube_{number}_0_0.npy")) for number in (0, 25, 50)]
+    before = [file.stat().st_ino for file in files]
+    damaged = files[2].read_bytes()[:-5]
+    files[2].write_bytes(damaged)
+    assert cubes.move({1: moved_by(0.7), 2: moved_by(0.7)}) == 1
+    assert files[0].stat().st_ino == before[0]
+    np.testing.assert_allclose(np.load(files[1])[:, 0], [100.7])
+    assert (cubes.stats.dropped_cubes, cubes.stats.dropped_points) == (1, 1)
+    np.testing.assert_allclose(cubes.points(archived=True)[:, 0], [0.0, 100.7, 300.0])
+
+
+def test_a_thinned_map_is_that_of_the_window_in_larger_voxels(tmp_path):
+    config = small(insertion="settled", archive_dir=str(tmp_path))
+    cubes = CubeMap(config, 0.5)
+    cubes.insert(np.zeros((1, 3)))
+    cubes.recenter(np.array([100.0, 0.0, 0.0]))
+    points = np.array([[98.1, 0.1, 0.1], [100.1, 0.1, 0.1], [101.7, 0.1, 0.1]])
+    cubes.insert(points)
+    folders = list(tmp_path.iterdir())
+    thin = cubes.thinned(4.0)  # voxels of 2 m: from 98 to 100 and from 100 to 102
+    np.testing.assert_allclose(thin.points(archived=True), [points[0], [100.9, 0.1, 0.1]])
+    assert thin.window == cubes.window
+    assert list(tmp_path.iterdir()) == folders
+    np.testing.assert_array_equal(cubes.points(), points)

@@ -450,6 +450,94 @@ def test_loam_bag_without_cloud_or_with_a_broken_pose(tmp_path: Path) -> None:
     assert any("no /velodyne_cloud_3" in text for text in dataset.info().problems)
 
 
+def without_x(stamp: int) -> Any:
+    message = cloud(ROS1, stamp, sweep_points(0))
+    message.fields = message.fields[1:]
+    return message
+
+
+GARBAGE = b"\x00\x01\x00\x00garbage" * 3
+
+
+def test_damaged_messages_of_loam_topics_are_bad_sweeps_and_the_rest_goes_on(
+    tmp_path: Path,
+) -> None:
+    recording = loam_recording(count=4)
+    for topic, sweep, damage in (
+        ("/laser_cloud_surf_last", 0, without_x(START)),
+        ("/laser_cloud_corner_last", 2, GARBAGE),
+    ):
+        stamp = START + sweep * 100_000_000
+        index = next(i for i, entry in enumerate(recording) if entry[:2] == (topic, stamp))
+        recording[index] = (topic, stamp, damage)
+    dataset = LoamTopicsDataset(write_bag(tmp_path / "topics", "ros1", recording))
+    got = list(dataset)
+    assert [type(sweep) for sweep in got] == [BadSweep, FeatureSweep, BadSweep, FeatureSweep]
+    assert isinstance(got[0], BadSweep)
+    assert isinstance(got[2], BadSweep)
+    assert "topic /laser_cloud_surf_last: " in got[0].message
+    assert "topic /laser_cloud_corner_last: cannot deserialise" in got[2].message
+    assert dataset.unmatched == {
+        "/laser_cloud_corner_last": 0,
+        "/laser_cloud_surf_last": 1,
+        "/laser_odom_to_init": 1,
+        "/velodyne_cloud_3": 1,
+    }
+
+
+def test_a_loam_topic_of_a_type_without_stamp_is_a_bad_sweep_each_time(tmp_path: Path) -> None:
+    vector = ROS1.types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
+    recording = [
+        (topic, stamp, vector if topic == "/laser_odom_to_init" else message)
+        for topic, stamp, message in loam_recording()
+    ]
+    got = list(LoamTopicsDataset(write_bag(tmp_path / "topics", "ros1", recording)))
+    assert [type(sweep) for sweep in got] == [BadSweep] * 3
+    assert all("header.stamp" in sweep.message for sweep in got if isinstance(sweep, BadSweep))
+
+
+def test_the_axes_are_those_of_the_first_cloud_that_can_be_read(tmp_path: Path) -> None:
+    few = cloud(ROS1, START + 2 * 100_000_000, np.random.default_rng(0).normal(size=(99, 3)))
+    faulty = [GARBAGE, without_x(START + 100_000_000), few]
+    recording = loam_recording(loam_axes=True, count=4)
+    for topic, stamp, _ in list(recording):
+        sweep = (stamp - START) // 100_000_000
+        if topic == "/velodyne_cloud_3" and sweep < 3:
+            index = next(i for i, entry in enumerate(recording) if entry[:2] == (topic, stamp))
+            recording[index] = (topic, stamp, faulty[sweep])
+    assert LoamTopicsDataset(write_bag(tmp_path / "all", "ros1", recording)).axes == "loam"
+    short = [entry for entry in recording if entry[1] < START + 300_000_000]
+    with pytest.raises(DatasetError, match=r"cannot tell the axes .*unknown"):
+        LoamTopicsDataset(write_bag(tmp_path / "short", "ros1", short))
+
+
+def test_recorded_poses_of_loam_are_optional_and_broken_ones_are_left_out(tmp_path: Path) -> None:
+    mapped = "/aft_mapped_to_init"
+    recording = loam_recording(count=4)
+    damages = (odometry(ROS1, START, (0, 0, 0), (0,) * 4), None, GARBAGE, None)
+    broken = []
+    for topic, stamp, message in recording:
+        damage = damages[(stamp - START) // 100_000_000] if topic == mapped else None
+        broken.append((topic, stamp, message if damage is None else damage))
+    broken.append(("/imu", START, imu(ROS1, START)))
+    dataset = LoamTopicsDataset(write_bag(tmp_path / "broken", "ros1", broken))
+    assert dataset.recorded is not None
+    np.testing.assert_array_equal(dataset.recorded.stamps - START, [100_000_000, 300_000_000])
+    info = dataset.info()
+    assert info.facts["recorded result"] == f"{mapped}, 2 poses"
+    assert info.facts["not used"] == "/imu"
+    assert sum("left out: " in text for text in info.problems) == 1
+    # A bag without them, in which one kind of feature is missing once.
+    recording = [entry for entry in recording if entry[0] != mapped]
+    lacking = [entry for entry in recording if entry[:2] != ("/laser_cloud_surf_last", START)]
+    dataset = LoamTopicsDataset(write_bag(tmp_path / "without", "ros1", lacking))
+    assert dataset.recorded is None
+    info = dataset.info()
+    assert "recorded result" not in info.facts
+    assert info.facts["sweeps"] == "up to 3"
+    assert any("different numbers of messages" in text for text in info.problems)
+
+
 # hardly flat along z; flat along x, which no front end's axes are
 @pytest.mark.parametrize("shape", [(1.0, 1.0, 0.9), (0.2, 1.0, 1.0)])
 def test_axes_that_cannot_be_told(tmp_path: Path, shape: tuple[float, ...]) -> None:

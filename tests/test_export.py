@@ -8,7 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -97,6 +97,7 @@ def read_ply(path: Path) -> tuple[list[str], np.ndarray]:
     return lines, np.frombuffer(body, np.dtype(fields))
 
 
+@settings(deadline=None)  # a busy machine is no fault
 @given(
     st.lists(st.integers(min_value=-(2**62), max_value=2**62), min_size=1, max_size=5, unique=True)
 )

@@ -148,6 +148,73 @@ def test_uncompressed_rows_agree_with_factor():
     assert error == pytest.approx(0.5 * residual @ residual, rel=1e-10)
 
 
+def test_a_basis_is_orthonormal_also_beside_a_nearly_vertical_line():
+    """A pole leans a little: nearly straight up, nearly straight down, and exactly so."""
+    for tilt in (0.0, 1e-9, 1e-6, 1e-3, 0.5, np.pi / 2):
+        up = np.array([np.sin(tilt) * 0.6, np.sin(tilt) * 0.8, np.cos(tilt)])
+        for direction in (up, -up):
+            frame = np.vstack([direction, factors.complement_basis(direction[None])[0]])
+            np.testing.assert_allclose(frame @ frame.T, np.eye(3), rtol=0, atol=1e-14)
+
+
+def test_a_scan_far_from_the_map_origin_loses_no_digits():
+    rng = np.random.default_rng(6)
+    pose = gtsam.Pose3(POSES[2].rotation(), np.array([90_000.0, -40_000.0, 300.0]))
+    _, _, _, _, planes, normals, offsets, weights = make_matches(rng, pose)
+    rows = factors.plane_rows(planes, normals, offsets, weights, 0.1)
+    values = gtsam.Values()
+    values.insert(KEY, pose)
+    residual, _ = rows.residuals(pose)
+    error = factors.scan_match_factor(KEY, rows).error(values)
+    assert error == pytest.approx(0.5 * residual @ residual, rel=1e-8)
+
+
+def test_nearly_parallel_planes_do_not_send_the_anchor_away():
+    """Where rough ground alone is seen, its planes meet at a point far off, if at all."""
+    rng = np.random.default_rng(7)
+    points = np.column_stack([rng.uniform(-10, 10, (200, 2)), np.full(200, -1.7)])
+    normals = np.column_stack([rng.normal(0, 1e-7, (200, 2)), np.ones(200)])
+    offsets = 1.7 + rng.normal(0, 0.05, 200)
+    rows = factors.plane_rows(points, normals, offsets, np.ones(200), 0.1)
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose3())
+    residual, _ = rows.residuals(gtsam.Pose3())
+    error = factors.scan_match_factor(KEY, rows).error(values)
+    assert error == pytest.approx(0.5 * residual @ residual, rel=1e-9)
+
+
+def test_a_scan_is_one_factor_of_13_rows_however_many_matches_it_has():
+    for count in (1, 5, 50):
+        lines, centres, directions, weights, *_ = make_matches(np.random.default_rng(8), POSES[2])
+        rows = factors.line_rows(
+            lines[:count], centres[:count], directions[:count], weights[:count], 0.1
+        )
+        assert factors.scan_match_factor(KEY, rows).dim() == 13
+
+
+def test_rows_are_chosen_by_a_mask():
+    lines, centres, directions, weights, *_ = make_matches(np.random.default_rng(9), POSES[2])
+    rows = factors.line_rows(lines, centres, directions, weights, 0.1)
+    chosen = np.arange(80) % 3 == 0
+    residual, jacobian = rows.where(chosen).residuals(POSES[4])
+    expected, expected_jacobian = rows.residuals(POSES[4])
+    np.testing.assert_array_equal(residual, expected[chosen])
+    np.testing.assert_array_equal(jacobian, expected_jacobian[chosen])
+
+
+@pytest.mark.parametrize("number", [int, np.float32])
+def test_rows_are_double_precision_whatever_is_given(number):
+    threes = np.eye(3).astype(number)
+    ones = np.ones(3, number)
+    for rows in (
+        factors.line_rows(threes, threes, threes, ones, ones),
+        factors.plane_rows(threes, threes, ones, ones, ones),
+        factors.plane_rows(threes.tolist(), threes.tolist(), [1, 1, 1], [1, 1, 1], 1),
+    ):
+        for name in ("points", "normals", "offsets", "scales"):
+            assert getattr(rows, name).dtype == np.float64
+
+
 def test_one_plane_leaves_three_directions_free():
     """A rank-deficient scan compresses without error and without inventing information."""
     rng = np.random.default_rng(5)
@@ -165,43 +232,66 @@ def test_one_plane_leaves_three_directions_free():
     assert (eigenvalues[3:] > 1e3).all()
 
 
+VECTOR, UP, ROWS = [1, 2, 3], [0, 0, 1], np.ones((4, 3))
+
+
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda n: factors.point_to_plane_factor(KEY, [1, 2], [0, 0, 1], 0.0, n(1)), "point"),
-        (lambda n: factors.point_to_plane_factor(KEY, [1, 2, 3], [0, 0, 2], 0.0, n(1)), "unit"),
-        (lambda n: factors.point_to_plane_factor(KEY, [1, 2, 3], [0, 0, 1], np.nan, n(1)), "off"),
-        (lambda n: factors.point_to_plane_factor(KEY, [1, 2, 3], [0, 0, 1], 0.0, n(2)), "noise"),
-        (lambda n: factors.point_to_line_factor(KEY, [1, 2, 3], [0, np.inf, 1], [0, 0, 1], n(2)),
-         "centre"),
-        (lambda n: factors.point_to_line_factor(KEY, [1, 2, 3], [0, 0, 1], [0, 0, 0], n(2)),
-         "unit"),
-        (lambda n: factors.plane_rows(np.ones((4, 3)), np.ones((3, 3)), np.ones(4), np.ones(4), 1),
-         "normals"),
-        (lambda n: factors.plane_rows(np.ones((4, 2)), np.ones((4, 3)), np.ones(4), np.ones(4), 1),
-         "points"),
-        (lambda n: factors.line_rows(np.ones((4, 3)), np.ones((4, 3)), np.ones((4, 3)), [1], 1),
-         "lengths"),
-        (lambda n: factors.plane_rows([[np.nan] * 3], [[0, 0, 1.0]], [0.0], [1.0], 1), "NaN"),
+        (lambda n: factors.point_to_plane_factor(KEY, [1, 2], UP, 0.0, n(1)), "point: .*shape"),
+        (lambda n: factors.point_to_plane_factor(KEY, VECTOR, [0, 0, 2], 0.0, n(1)),
+         "normal: .*unit"),
+        (lambda n: factors.point_to_plane_factor(KEY, VECTOR, [0, 1], 0.0, n(1)),
+         "normal: .*shape"),
+        (lambda n: factors.point_to_plane_factor(KEY, VECTOR, UP, np.nan, n(1)), "offset: "),
+        (lambda n: factors.point_to_plane_factor(KEY, VECTOR, UP, 0.0, n(2)), "noise: "),
+        (lambda n: factors.point_to_line_factor(KEY, [1], UP, UP, n(2)), "point: .*shape"),
+        (lambda n: factors.point_to_line_factor(KEY, VECTOR, [0, np.inf, 1], UP, n(2)),
+         "centre: .*infinite"),
+        (lambda n: factors.point_to_line_factor(KEY, VECTOR, UP, [0, 0, 0], n(2)),
+         "direction: .*unit"),
+        (lambda n: factors.plane_rows([1, 2, 3], ROWS, np.ones(4), np.ones(4), 1), "points: "),
+        (lambda n: factors.plane_rows(ROWS[:, :2], ROWS, np.ones(4), np.ones(4), 1), "points: "),
+        (lambda n: factors.plane_rows(ROWS, ROWS[:, :2], np.ones(4), np.ones(4), 1), "normals: "),
+        (lambda n: factors.plane_rows(ROWS, ROWS[:3], np.ones(4), np.ones(4), 1),
+         "MatchRows.normals: "),
+        (lambda n: factors.line_rows(ROWS[:, :2], ROWS, ROWS, np.ones(4), 1), "points: "),
+        (lambda n: factors.line_rows(ROWS, ROWS[:, :2], ROWS, np.ones(4), 1), "centres: "),
+        (lambda n: factors.line_rows(ROWS, ROWS, ROWS[:, :2], np.ones(4), 1), "directions: "),
+        (lambda n: factors.line_rows(ROWS[:3], ROWS, ROWS, np.ones(4), 1), "matches: .*lengths"),
+        (lambda n: factors.line_rows(ROWS, ROWS[:1], ROWS, np.ones(4), 1), "matches: .*lengths"),
+        (lambda n: factors.line_rows(ROWS, ROWS, ROWS[:1], np.ones(4), 1), "matches: .*lengths"),
+        (lambda n: factors.line_rows(ROWS, ROWS, ROWS, [1], 1), "matches: .*lengths"),
+        (lambda n: factors.plane_rows([[np.nan] * 3], [[0, 0, 1.0]], [0.0], [1.0], 1),
+         "MatchRows.points: .*NaN"),
         (lambda n: factors.scan_match_factor(KEY, factors.plane_rows(
-            np.empty((0, 3)), np.empty((0, 3)), [], [], 1)), "at least one"),
+            np.empty((0, 3)), np.empty((0, 3)), [], [], 1)), "scan_match_factor: .*at least one"),
     ],
 )  # fmt: skip
 def test_faulty_shapes_are_errors(call, message):
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="^" + message):
         call(lambda dim: gtsam.noiseModel.Isotropic.Sigma(dim, 1.0))
+
+
+def test_a_direction_may_be_off_unit_length_by_rounding_alone():
+    noise = gtsam.noiseModel.Unit.Create(1)
+    for length in (1.0 - 5e-7, 1.0 + 5e-7):
+        factors.point_to_plane_factor(KEY, VECTOR, [0, 0, length], 0.0, noise)
+    for length in (1.0 - 2e-6, 1.0 + 2e-6):
+        with pytest.raises(InputError, match=r"^normal: "):
+            factors.point_to_plane_factor(KEY, VECTOR, [0, 0, length], 0.0, noise)
 
 
 @pytest.mark.parametrize(
     ("residual", "message"),
     [
-        (lambda v: (np.zeros(3), [np.zeros((2, 6))]), "residual"),
+        (lambda v: (np.zeros(3), [np.zeros((2, 6))]), "residual: .*shape"),
         (lambda v: (np.ones(2), [np.zeros((6, 2))]), "Jacobian 0"),
         (lambda v: (np.ones(2), [np.zeros((2, 5))]), "Jacobian 0"),
-        (lambda v: (np.ones(2), []), "one per key"),
+        (lambda v: (np.ones(2), []), "expected 1 Jacobians, one per key"),
         (lambda v: (np.ones(2), [None]), "Jacobian 0"),
-        (lambda v: (np.array([0.0, np.nan]), [np.zeros((2, 6))]), "NaN"),
-        (lambda v: ("text", [np.zeros((2, 6))]), "residual"),
+        (lambda v: (np.array([0.0, np.nan]), [np.zeros((2, 6))]), "residual: .*NaN"),
+        (lambda v: (["one", "two"], [np.zeros((2, 6))]), "residual: .*could not convert"),
     ],
 )
 def test_a_users_faulty_factor_is_a_python_error(residual, message):
@@ -210,7 +300,7 @@ def test_a_users_faulty_factor_is_a_python_error(residual, message):
     graph.add(factor)
     values = gtsam.Values()
     values.insert(KEY, gtsam.Pose3())
-    with pytest.raises(InputError, match=message):
+    with pytest.raises(InputError, match="^factor:? " + message):
         gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
 
 
@@ -230,6 +320,18 @@ def test_a_users_sound_factor_solves():
     assert result.translation()[2] == pytest.approx(1.5, abs=1e-5)
 
 
+@pytest.mark.parametrize("number", [int, np.float32])
+def test_a_users_factor_may_return_other_numbers_than_doubles(number):
+    row = np.array([[0, 0, 0, 0, 0, 1]], number)
+    factor = factors.checked_factor(
+        gtsam.noiseModel.Unit.Create(1), [KEY], lambda values: (np.array([2], number), [row])
+    )
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose3())
+    assert factor.error(values) == 2.0
+    np.testing.assert_array_equal(factor.linearize(values).jacobian()[0], row)
+
+
 def test_checked_factor_takes_several_variables():
     other = gtsam.symbol("v", 0)
 
@@ -244,3 +346,30 @@ def test_checked_factor_takes_several_variables():
     values.insert(other, np.array([1.0, 2.0, 3.0]))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     np.testing.assert_allclose(result.atVector(other), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("variable", "dimension"),
+    [(gtsam.Rot3(), 3), (gtsam.Point3(1.0, 2.0, 3.0), 3), (np.arange(4.0), 4), (gtsam.Pose3(), 6)],
+)
+def test_checked_factor_knows_the_dimension_of_a_variable(variable, dimension):
+    def factor(columns):
+        return factors.checked_factor(
+            gtsam.noiseModel.Unit.Create(1), [KEY], lambda v: (np.ones(1), [np.ones((1, columns))])
+        )
+
+    values = gtsam.Values()
+    values.insert(KEY, variable)
+    assert factor(dimension).linearize(values).jacobian()[0].shape == (1, dimension)
+    with pytest.raises(InputError, match=rf"^factor Jacobian 0: .*\(1, {dimension}\)"):
+        factor(dimension + 1).linearize(values)
+
+
+def test_a_variable_of_an_unsupported_type_is_a_python_error():
+    factor = factors.checked_factor(
+        gtsam.noiseModel.Unit.Create(1), [KEY], lambda v: (np.ones(1), [np.ones((1, 3))])
+    )
+    values = gtsam.Values()
+    values.insert(KEY, gtsam.Pose2())
+    with pytest.raises(InputError, match="variable x0 has an unsupported type"):
+        factor.linearize(values)

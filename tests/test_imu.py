@@ -421,7 +421,7 @@ def test_samples_that_are_no_numbers_are_left_out():
     samples.gyro[3, 1], samples.acceleration[10, 0] = np.nan, np.inf
     buffer = ImuBuffer(CONFIG, samples)
     assert (len(buffer), buffer.report.not_finite) == (198, 2)
-    assert "2 samples hold NaN or infinity: left out" in buffer.report.problems[0]
+    assert "2 samples hold NaN, infinity or absurd values: left out" in buffer.report.problems[0]
     buffer = ImuBuffer(CONFIG, dataclasses.replace(samples, gyro=np.full((200, 3), np.nan)))
     assert (len(buffer), buffer.report.orientation, buffer.report.rate) == (0, "none", 0.0)
     assert buffer.report.problems

@@ -9,6 +9,7 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.imu_prior import (
     STEEPEST_PITCH,
+    RollPitchPrior,
     blend,
     blend_direction,
     blended_angles,
@@ -189,6 +190,19 @@ def test_roll_is_taken_the_short_way_round(own, imu, weight):
         assert abs((away + 180.0) % 360.0 - 180.0) < 1e-6
 
 
+@pytest.mark.parametrize("side", [1.0, -1.0])
+@pytest.mark.parametrize("half", [91.0, 120.0, 134.0])
+def test_roll_is_taken_the_short_way_round_from_far_off(half, side):
+    """Two rolls on either side of upside down, ``360 - 2 half`` degrees apart."""
+    own, imu = rot(side * half, 0, 0), rot(-side * half, 0, 0)
+    apart = side * (360.0 - 2.0 * half)
+    roll, _ = blended_angles(own, imu, 0.25)
+    assert np.degrees(roll) == pytest.approx(side * half + 0.25 * apart, abs=1e-9)
+    prior = RollPitchPrior(roll_pitch(imu), np.eye(2))
+    error = whitened(roll_pitch_factor(POSE_KEY, prior, FLAT), gtsam.Pose3(own, np.zeros(3)))
+    np.testing.assert_allclose(np.degrees(error), [-apart, 0.0], atol=1e-9)
+
+
 def test_the_blend_of_the_direction_turns_up_by_its_share_of_the_way():
     rng = np.random.default_rng(2)
     up = np.array([0.0, 0.0, 1.0])
@@ -307,11 +321,16 @@ def test_a_pull_too_far_for_the_correction_leaves_the_target_at_the_imu():
     information = scan_information(np.random.default_rng(7))
     near = equivalent_prior(FLAT, information, rot(0, 60, 0), 0.5)
     assert abs(near.roll_pitch[1] - np.radians(60.0)) > 1e-5
-    # No end in 20 rounds, and past 85 degrees.
-    for own, measured in ((rot(0, 0, 0), rot(12, 86, 0)), (rot(10, 84, 0), rot(12, 86, 0))):
-        far = equivalent_prior(own, information, measured, 0.99)
-        np.testing.assert_allclose(far.roll_pitch, np.radians([12, 86]), rtol=0, atol=1e-12)
-        assert np.linalg.eigvalsh(far.information).min() > 0.0
+    # Past 85 degrees, and no end in 20 rounds.
+    for own, measured in (
+        (rot(0, 0, 0), rot(12, 86, 0)),
+        (rot(10, 84, 0), rot(12, 86, 0)),
+        (rot(0, 30, 0), rot(160, 30, 0)),
+    ):
+        far = equivalent_prior(own, np.eye(6), measured, 0.99)
+        np.testing.assert_allclose(far.roll_pitch, roll_pitch(measured), rtol=0, atol=1e-12)
+        knows = tilt_information(np.eye(6), own)
+        np.testing.assert_allclose(far.information, 0.99 / 0.01 * knows, rtol=1e-12)
 
 
 def test_the_information_of_the_tilt_is_the_schur_complement():
@@ -333,6 +352,19 @@ def test_a_direction_without_information_is_free():
     information[1] = information[:, 1] = 0.0
     knows = tilt_information(information, FLAT)
     assert np.linalg.eigvalsh(knows)[0] < 1e-6 * np.linalg.eigvalsh(knows)[1]
+
+
+@pytest.mark.parametrize("largest", [1e-4, 1.0, 1e8])
+def test_no_information_is_a_share_of_the_largest_whatever_its_unit(largest):
+    information = largest * np.diag([0.0, 1e-3, 1e-4, 1e-5, 1e-6, 1.0])
+    expected = largest * np.diag([1e-12, 1e-3])
+    np.testing.assert_allclose(tilt_information(information, FLAT), expected, rtol=1e-9)
+
+
+def test_a_scan_that_says_nothing_at_all_is_no_error():
+    knows = tilt_information(np.zeros((6, 6)), FLAT)
+    assert np.isfinite(knows).all()
+    assert np.abs(knows).max() < 1e-300
 
 
 # -- steep -----------------------------------------------------------------------------------------
@@ -444,3 +476,34 @@ def test_no_orientation_at_that_moment_is_no_level():
     )
     assert level_of(late) is None
     assert level_of(samples) is not None
+
+
+def rows_of(samples, chosen):
+    return ImuSamples(
+        samples.stamps[chosen], samples.orientation[chosen], samples.gyro[chosen],
+        samples.acceleration[chosen],
+    )  # fmt: skip
+
+
+def test_where_the_gyro_cannot_bring_samples_together_one_orientation_counts():
+    noisy = samples_of(rot(12, -7, 130), noise=0.01)
+    at = ImuBuffer(ImuConfig(), noisy).orientation(START + 10**9)
+    # A gap of 0.4 s ends 0.1 s before that moment.
+    gap = rows_of(noisy, (noisy.stamps < START + 5e8) | (noisy.stamps > START + 9e8))
+    # 3 rad/s turn the lidar by more than 3 rad within a second of it.
+    wild = samples_of(rot(12, -7, 130), (0.0, 0.0, 7.0), noise=0.01)
+    spun = ImuBuffer(ImuConfig(), wild).orientation(START + 10**9)
+    for samples, alone in ((gap, at), (wild, spun)):
+        level = level_of(samples, ImuConfig(still_seconds=1.0))
+        assert level.samples == 1
+        assert [level.roll, level.pitch] == pytest.approx(roll_pitch(alone), abs=1e-12)
+
+
+def test_between_samples_one_orientation_counts_if_none_is_within_reach():
+    samples = samples_of(rot(12, -7, 130), (0.0, 0.4, 0.0))
+    level = find_level(
+        ImuBuffer(ImuConfig(), samples), ImuConfig(still_seconds=0.001),
+        START + 10**9 + 2_500_000, gtsam.Pose3(), levelled=False,
+    )  # fmt: skip
+    assert level.samples == 1
+    assert np.degrees(level.roll) == pytest.approx(12.0, abs=0.1)

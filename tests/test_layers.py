@@ -32,6 +32,7 @@ LAYERS = (
         "imu_aid",
         "relocalization",
         "frame_report",
+        "stamps",
         "keyframes",
         "loop_consistency",
         "pose_graph",

@@ -9,7 +9,16 @@ import pytest
 from loam_gtsam.config import MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
-from loam_gtsam.matching import ScanMatches, associate, match_lines, match_planes, renew, trial
+from loam_gtsam.matching import (
+    ScanMatches,
+    associate,
+    match_lines,
+    match_planes,
+    moved,
+    renew,
+    spread,
+    trial,
+)
 
 CONFIG = MatchingConfig()
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -108,6 +117,34 @@ def test_scatter_of_the_neighbours_raises_the_sigma():
     assert smooth == pytest.approx(0.03 * np.sqrt(1.2), rel=1e-6)
 
 
+def test_few_neighbours_leave_one_degree_of_freedom_at_least():
+    """Four points leave a plane one, three leave it none: then the scatter counts in full."""
+    square = plane_group(saddle=0.1 * X)[:4]
+    config = changed(neighbours=4)
+    assert one(match_planes, AHEAD, square, config).sigmas[0] == pytest.approx(
+        np.sqrt(0.01 * 4 / 1 * (1 + 1 / 4)), rel=1e-6
+    )
+    three = AHEAD + np.array([[0.1, 0, -0.5], [-0.2, 0, 0], [0.1, 0, 0.5]])
+    assert one(match_lines, AHEAD, three, changed(neighbours=3, line_ratio=2.0)).sigmas[
+        0
+    ] == pytest.approx(np.sqrt(0.02 * 3 / 1 * (1 + 1 / 3)), rel=1e-6)
+
+
+def test_the_distance_from_a_plane_is_no_distance_within_it():
+    above = one(match_planes, AHEAD - 0.4 * X, plane_group())
+    assert above.sigmas[0] == pytest.approx(0.03 * np.sqrt(1 + 1 / 5), rel=1e-6)
+
+
+def test_tilts_in_closed_form():
+    """Of a line by its own length, of a plane by the shorter side of the two."""
+    line = one(match_lines, AHEAD, line_group())
+    np.testing.assert_allclose(line.tilts, 0.03 / np.sqrt(5 * 0.32), rtol=1e-6)
+    rough = one(match_lines, AHEAD, line_group(aside=0.1 * Y))
+    np.testing.assert_allclose(rough.tilts, np.sqrt(0.012 * 5 / 3 / (5 * 0.32)), rtol=1e-6)
+    plane = one(match_planes, AHEAD, plane_group(0.5 * Y, 0.4 * Z))
+    np.testing.assert_allclose(plane.tilts, 0.03 / np.sqrt(5 * 0.128), rtol=1e-6)
+
+
 def test_without_fit_uncertainty_every_sigma_is_that_of_a_point():
     config = changed(fit_uncertainty=False)
     assert one(match_lines, AHEAD + 3 * Z, line_group(aside=0.1 * Y), config).sigmas[0] == 0.03
@@ -124,6 +161,10 @@ def test_the_farthest_neighbour_must_be_near(match, group):
     assert len(one(match, AHEAD, group, squared=1.0)) == 0
     assert len(one(match, AHEAD, group, squared=1.0001)) == 0
     assert len(one(match, AHEAD, group, changed(max_distance=1.1), squared=1.0001)) == 1
+    assert len(one(match, AHEAD, group, changed(max_distance=1.1), squared=1.2099)) == 1
+    assert len(one(match, AHEAD, group, changed(max_distance=1.1), squared=1.2101)) == 0
+    farthest = np.array([0.1, 0.2, 0.3, 0.4, 1.01])
+    assert len(one(match, AHEAD, group, squared=farthest)) == 0
     missing = group.copy()
     missing[-1] = np.nan
     assert len(one(match, AHEAD, missing, squared=np.inf)) == 0
@@ -150,6 +191,12 @@ def test_a_line_may_not_run_along_the_ring(seed):
 
     assert [count(a) for a in (0, 30, 59.9, 60.1, 90, 119.9, 120.1)] == [0, 0, 0, 1, 1, 1, 0]
     assert count(0, changed(max_ring_cosine=2.0)) == 1
+
+
+def test_a_limit_of_one_keeps_lines_along_the_ring_and_no_limit_is_needed_above_the_sensor():
+    assert len(one(match_lines, AHEAD, line_group(0.4 * Y), changed(max_ring_cosine=1.0))) == 1
+    # Straight above there is no ring.
+    assert len(one(match_lines, 5 * Z, line_group(0.4 * Y, centre=5 * Z))) == 1
 
 
 def test_it_is_the_ring_of_the_sensor_that_counts_not_the_horizon():
@@ -211,6 +258,86 @@ def test_a_far_plane_is_dropped_by_its_weight_sooner_when_near():
         assert count(0.999 * edge, reach) == count(-0.999 * edge, reach) == 1
         assert count(1.001 * edge, reach) == count(-1.001 * edge, reach) == 0
         assert count(1.001 * edge, reach, changed(weight_slope=0.0)) == 1
+
+
+def test_a_weight_at_the_limit_is_too_small():
+    """LOAM keeps s > 0.1; with halves the weight is exact."""
+    config = changed(weight_slope=0.5, min_weight=0.5)
+    edge, above = [5.0, 1.0, 0.0], [4.0, 0.0, 0.0]
+    assert len(one(match_lines, edge, line_group(), config)) == 0
+    assert (
+        len(one(match_planes, above, plane_group(), changed(weight_slope=1.0, min_weight=0.5))) == 0
+    )
+    kept = ScanMatches(
+        one(match_lines, edge, line_group(), changed(weight_slope=0.5)),
+        one(match_planes, above, plane_group(), changed(weight_slope=1.0)),
+    )
+    assert (len(kept.edges), len(kept.planes)) == (1, 1)
+    renewed = renew(kept, gtsam.Pose3(), config)
+    assert (len(renewed.edges), len(renewed.planes)) == (0, 1)
+    renewed = renew(kept, gtsam.Pose3(), changed(weight_slope=1.0, min_weight=0.5))
+    assert (len(renewed.edges), len(renewed.planes)) == (0, 0)
+
+
+# -- the published forms ---------------------------------------------------------------------------
+
+
+UNIT_OFFSET = changed(plane_fit="unit_offset", min_incidence_sine=0.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_unit_offset_planes_are_the_least_squares_of_loam(seed):
+    """A n = -1 over the five neighbours; rough ones, so that the two fits differ."""
+    rng = np.random.default_rng(seed)
+    turn = gtsam.Pose3.Expmap(3 * rng.normal(size=6)).matrix()
+    flat = plane_group(0.5 * Y, 0.4 * Z, centre=rng.uniform(2, 9) * X)
+    group = transform(turn, flat + rng.normal(0, 0.03, (5, 3)))
+    point = group.mean(axis=0) + 0.1 * rng.normal(size=3)
+    found = one(match_planes, point, group, UNIT_OFFSET)
+    n = np.linalg.lstsq(group, -np.ones(5), rcond=None)[0]
+    length = np.linalg.norm(n)
+    np.testing.assert_allclose(found.normals, [n / length], atol=1e-9)
+    np.testing.assert_allclose(found.offsets, [1.0 / length], rtol=1e-9)
+    np.testing.assert_allclose(found.distances, [(n @ point + 1.0) / length], atol=1e-9)
+    ours = one(match_planes, point, group, changed(min_incidence_sine=0.0))
+    assert np.abs(np.abs(ours.offsets) - found.offsets) > 1e-5
+
+
+def test_unit_offset_planes_lose_nothing_where_the_points_lie_in_the_plane_exactly():
+    found = one(match_planes, [4.8, 0.1, 0.3], plane_group(), UNIT_OFFSET)
+    np.testing.assert_array_equal(found.normals, [-X])
+    np.testing.assert_array_equal(found.offsets, [5.0])
+
+
+@pytest.mark.parametrize("group", [
+    plane_group(0.5 * Y, 0.5 * Z, centre=0.0 * X),  # through the map origin
+    plane_group(0.5 * Y, 0.5 * Z, saddle=0.1 * X, centre=0.0 * X),  # all around it
+    line_group(0.4 * X, centre=0.0 * X),
+])  # fmt: skip
+def test_unit_offset_cannot_represent_every_plane(group):
+    config = dataclasses.replace(UNIT_OFFSET, plane_ratio=0.0)
+    beside = np.eye(4)
+    beside[:3, 3] = 3.0, 2.0, 1.0
+    with np.errstate(all="raise"):
+        assert len(one(match_planes, [0.1, 0.2, 0.1], group, config, beside)) == 0
+    if np.linalg.matrix_rank(group) > 1:
+        centroid = changed(min_incidence_sine=0.0)
+        assert len(one(match_planes, [0.1, 0.2, 0.1], group, centroid, beside)) == 1
+
+
+def test_the_range_in_the_weight_is_from_the_sensor_or_from_the_map_origin():
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([-3.0, 0.0, 0.0]))
+    point = [4.8, 0.1, 0.3]
+    edges = one(match_lines, [5.0, 0.1, 0.3], line_group(), pose=pose.matrix())
+    for kind, origin in (("lidar", [-3.0, 0.0, 0.0]), ("map", [0.0, 0.0, 0.0])):
+        config = changed(weight_range=kind)
+        planes = one(match_planes, point, plane_group(), config, pose.matrix())
+        reach = np.linalg.norm(np.array(point) - origin)
+        expected = 1.0 - 0.9 * 0.2 / np.sqrt(reach)
+        np.testing.assert_allclose(planes.weights, [expected], atol=1e-9)
+        stripped = dataclasses.replace(planes, weights=np.zeros(1))
+        renewed = renew(ScanMatches(edges, stripped), pose, config)
+        np.testing.assert_allclose(renewed.planes.weights, [expected], atol=1e-9)
 
 
 # -- whole scenes ----------------------------------------------------------------------------------
@@ -405,6 +532,70 @@ def test_at_most_so_many_features_are_matched_at_even_distances(limit, rows):
         np.testing.assert_allclose(np.abs(kind.distances), away[list(rows)], atol=1e-9)
 
 
+@pytest.mark.parametrize(("limit", "rows"), [
+    (0, range(8)),
+    (1, [1]),
+    (2, [1, 4]),
+    (3, [1, 4, 6]),
+    (4, [0, 1, 4, 6]),
+    (6, [0, 1, 2, 4, 5, 6]),
+    (8, range(8)),
+])  # fmt: skip
+def test_those_that_stand_out_are_matched_before_others(limit, rows):
+    first = np.isin(np.arange(8), [1, 4, 6])
+    np.testing.assert_array_equal(spread(8, limit, first), list(rows))
+
+
+def poles(*places, spacing=0.2):
+    """Five points each, upright and around eye level."""
+    return np.concatenate([line_group(spacing * Z, centre=np.array([*at, 0.0])) for at in places])
+
+
+FAR_APART = 0.8  # m between the points of a pole: the fifth is 1.6 m off
+
+
+def test_a_distinct_edge_without_a_line_near_is_searched_for_more_widely():
+    held = map_of(np.concatenate([
+        poles((5.0, 0.0), (9.0, 0.0)),
+        poles((5.0, 8.0), (9.0, 8.0), spacing=FAR_APART),
+    ]))  # fmt: skip
+    features = np.array([[5, 8, 0.01], [5, 0, 0.02], [9, 8, 0.03], [9, 0, 0.04], [0, -20, 0]])
+    distinct = np.array([True, True, False, False, True])
+    none = np.empty((0, 3))
+
+    def match(config, distinct):
+        found = associate(features, none, gtsam.Pose3(), held, held, config, distinct)
+        return found.edges
+
+    for wide, rows in ((4.0, [0, 1, 3]), (2.0, [0, 1, 3]), (1.5, [1, 3]), (1.0, [1, 3])):
+        edges = match(changed(wide_search=wide), distinct)
+        np.testing.assert_array_equal(edges.indices, rows)  # in the order of the features
+        np.testing.assert_array_equal(edges.points, features[rows])
+        np.testing.assert_array_equal(edges.distinct, distinct[rows])
+        np.testing.assert_allclose(edges.centres[:, :2], features[rows, :2], atol=1e-9)
+        np.testing.assert_allclose(np.abs(edges.directions), [Z] * len(rows), atol=1e-9)
+        spacing = np.where(np.array(rows) == 0, FAR_APART, 0.2)
+        np.testing.assert_allclose(edges.tilts, 0.03 / np.sqrt(10.0 * spacing**2), rtol=1e-6)
+    # It multiplies the usual reach, whatever that is: 1.65 m, 1.52 m.
+    assert len(match(changed(wide_search=1.1, max_distance=1.5), distinct)) == 3
+    assert len(match(changed(wide_search=1.9, max_distance=0.8), distinct)) == 2
+    np.testing.assert_array_equal(match(CONFIG, None).indices, [1, 3])
+    assert match(CONFIG, None).distinct is None
+    np.testing.assert_array_equal(match(CONFIG, np.full(5, True)).indices, [1, 3])
+
+
+def test_of_too_many_edges_the_distinct_ones_are_matched_and_known_by_their_rows():
+    held = map_of(np.concatenate([poles((5.0, 0.0)), poles((5.0, 8.0), spacing=FAR_APART)]))
+    features = np.array([[5, 0, 0.01 * n] for n in range(6)] + [[5.0, 8, 0], [5, 0, 0.1]])
+    distinct = np.isin(np.arange(8), [3, 6, 7])
+    found = associate(
+        features, np.empty((0, 3)), gtsam.Pose3(), held, held, changed(max_edges=4), distinct
+    )
+    np.testing.assert_array_equal(found.edges.indices, [0, 3, 6, 7])
+    np.testing.assert_array_equal(found.edges.points, features[[0, 3, 6, 7]])
+    np.testing.assert_array_equal(found.edges.distinct, [False, True, True, True])
+
+
 @pytest.mark.parametrize(("most", "expected"), [(0, (20, 70)), (50, (20, 50)), (10, (10, 10))])
 def test_the_configuration_for_trials_never_matches_more(most, expected):
     config = changed(max_edges=most, max_planes=most, trial_edges=20, trial_planes=70)
@@ -466,3 +657,26 @@ def test_a_renewed_match_that_is_too_far_is_dropped():
     assert (len(after.edges), len(after.planes)) == (0, 1)
     away = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
     assert len(renew(both(), away, CONFIG)) == 0
+
+
+def test_matches_that_all_stay_are_not_copied():
+    near = gtsam.Pose3(gtsam.Rot3(), np.array([0.01, 0.0, 0.0]))
+    before = both()
+    after = renew(before, near, CONFIG)
+    assert after.edges.points is before.edges.points
+    assert after.planes.points is before.planes.points
+
+
+def test_features_that_were_de_skewed_anew_keep_their_lines_and_planes():
+    held_edges, held_planes = map_of(line_group()), map_of(plane_group())
+    edges = AHEAD + np.outer([9.0, 0.1, 0.2], Y)  # the first meets no line
+    planes = AHEAD + np.outer([0.1, 0.0, 9.0], Y)
+    matches = associate(edges, planes, gtsam.Pose3(), held_edges, held_planes, CONFIG)
+    np.testing.assert_array_equal(matches.edges.indices, [1, 2])
+    np.testing.assert_array_equal(matches.planes.indices, [0, 1])
+    after = moved(matches, edges + 0.5, planes - 0.25)
+    np.testing.assert_array_equal(after.edges.points, edges[1:] + 0.5)
+    np.testing.assert_array_equal(after.planes.points, planes[:2] - 0.25)
+    assert after.edges.centres is matches.edges.centres
+    assert after.planes.normals is matches.planes.normals
+    assert (len(after.edges), len(after.planes)) == (2, 2)

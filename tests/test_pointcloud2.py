@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import warnings
 from types import SimpleNamespace
 from typing import Any
 
@@ -319,6 +320,12 @@ def test_integer_coordinate() -> None:
         ({"point_step": 0}, "point_step is 0"),
         ({"point_step": 8, "row_step": 8 * N}, "do not fit into point_step 8"),
         ({"data": b""}, "got 0"),
+        ({"height": -3, "width": -3, "row_step": 0}, "expected sizes from 0 on, got -3 x -3"),
+        ({"row_step": -48, "height": 2}, "expected sizes from 0 on"),
+        ({"height": "two"}, "expected a PointCloud2 message"),
+        ({"fields": 7}, "expected a PointCloud2 message"),
+        ({"data": [1, 256]}, "expected a PointCloud2 message"),
+        ({"data": None}, "expected a PointCloud2 message"),
     ],
 )
 def test_damaged_layout(change: dict[str, Any], match: str) -> None:
@@ -350,6 +357,27 @@ def test_tolerated_oddities() -> None:
     np.testing.assert_array_equal(decode_pointcloud2(message).points, expected)
     message.header.stamp = SimpleNamespace(secs=3, nsecs=4)
     assert decode_pointcloud2(message).stamp == 3_000_000_004
+
+
+def test_values_that_no_cast_survives_warn_of_nothing() -> None:
+    signalling = np.frombuffer(b"\x01\x00\xa0\x7f", "<f4")[0]  # a NaN that is not the usual one
+    columns = {**xyz(), "ring": (np.arange(N) % 4).astype("f4"), "t": SWEEP.astype("f4")}
+    columns["y"] = columns["y"].astype("f8")
+    columns["x"][3] = columns["t"][4] = signalling
+    columns["ring"][5], columns["ring"][6] = np.inf, -1e30
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        scan = decode_pointcloud2(make_message(columns))
+    assert len(scan.points) == N - 2
+    assert scan.rings is not None
+    assert scan.rings.max() == 2**31 == -scan.rings.min()
+
+
+def test_a_stamp_that_is_no_number_is_refused() -> None:
+    message = make_message(xyz())
+    message.header.stamp = SimpleNamespace(sec="now", nanosec=0)
+    with pytest.raises(DatasetError, match=r"header\.stamp"):
+        decode_pointcloud2(message)
 
 
 def test_not_a_cloud() -> None:

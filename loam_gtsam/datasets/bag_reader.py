@@ -17,6 +17,8 @@ from loam_gtsam.types import BadSweep, DatasetError
 
 MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_registered")
 """Topics on which LOAM and A-LOAM publish clouds in the map."""
+_MOST = 2**63 - 1
+"""Neither a length nor nanoseconds are larger; a bag without messages starts there."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,11 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
     try:
         reader = AnyReader(bags, default_typestore=get_typestore(store))
         reader.open()
+        try:
+            _check_metadata(reader)
+        except BaseException:
+            reader.close()
+            raise
     # Damage surfaces as whatever its parser stumbles over (struct, sqlite3, yaml, assertions ...).
     except Exception as error:
         hint = (
@@ -57,6 +64,18 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
         )
         raise DatasetError(f"{path}: cannot open the bag: {_reason(error)}{hint}") from error
     return reader
+
+
+def _check_metadata(reader: AnyReader) -> None:
+    """Raise ValueError unless names and numbers of messages, which a bag may state, make sense."""
+    for connection in reader.connections:
+        name, count = connection.topic, connection.msgcount
+        if not isinstance(name, str):
+            raise ValueError(f"expected a topic's name, its metadata have {name!r}")
+        if not isinstance(count, int) or not 0 <= count < _MOST:
+            raise ValueError(f"topic {name}: expected a number of messages, got {count!r}")
+    if not isinstance(reader.start_time, int) or abs(reader.start_time) > _MOST:
+        raise ValueError(f"expected a start in nanoseconds, got {reader.start_time!r}")
 
 
 def topic_types(reader: AnyReader) -> dict[str, tuple[str, int]]:

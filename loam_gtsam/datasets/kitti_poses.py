@@ -134,7 +134,7 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
             poses[number - 1, :3] = np.reshape([float(word) for word in line.split()], (3, 4))
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected 12 numbers, got {line.strip()!r}"
+                f"{path}:{number}: expected 12 numbers, got {line.strip()[:80]!r}"
             ) from error
     if len(poses) != len(stamps):
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")

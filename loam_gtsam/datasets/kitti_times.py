@@ -10,7 +10,7 @@ import numpy as np
 
 from loam_gtsam.datasets.point_times import SWEEP_SECONDS
 from loam_gtsam.datasets.tables import DEFAULT_PERIOD_NS, read_lines, read_stamps
-from loam_gtsam.types import DatasetError, IntArray
+from loam_gtsam.types import MAX_STAMP, DatasetError, IntArray
 
 _RAW = "velodyne_points"
 
@@ -83,10 +83,13 @@ def read_dates(path: Path) -> IntArray:
         date, _, fraction = line.strip().partition(".")
         try:
             moment = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-            stamps.append(int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9]))
+            stamp = int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9])
+            if abs(stamp) > MAX_STAMP:
+                raise ValueError("out of range")
+            stamps.append(stamp)
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected a date and time, got {line.strip()!r}"
+                f"{path}:{number}: expected a date and time, got {line.strip()[:80]!r}"
             ) from error
     return np.array(stamps, dtype=np.int64)
 

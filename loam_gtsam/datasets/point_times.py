@@ -183,7 +183,8 @@ def _split(values: NDArray[Any]) -> tuple[FloatArray, int | float]:
         # Modulo 2**64, so a wild unsigned outlier cannot overflow; then read as signed.
         wide = values.astype(np.int64).view(np.uint64) - np.int64(base).view(np.uint64)
         return wide.view(np.int64).astype(np.float64), int(np.int64(base))
-    wide_values = values.astype(np.float64)
+    with np.errstate(invalid="ignore"):  # some bit patterns of NaN do not survive it
+        wide_values = values.astype(np.float64)
     finite = wide_values[np.isfinite(wide_values)]
     start = float(finite[0]) if len(finite) else 0.0
     with np.errstate(over="ignore", invalid="ignore"):

@@ -21,6 +21,9 @@ TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "stamps", "time_stamp", "
 NO_TIMES = "none"
 """Value of ``time_field`` that ignores a time field on purpose."""
 
+_WILD_RING = 2.0**31
+"""No beam number; larger ones, which no integer holds, count as this."""
+
 # sensor_msgs/PointField: INT8 = 1 ... FLOAT64 = 8
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -167,13 +170,18 @@ class _Layout:
             self.order = ">" if msg.is_bigendian else "<"
             self.fields = {field.name: field for field in msg.fields}
             data = msg.data
-        except AttributeError as error:
+            if isinstance(data, (list, tuple)):
+                data = np.asarray(data, dtype=np.uint8)
+            self.data = np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, np.uint8)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
             raise DatasetError(
                 f"expected a PointCloud2 message, got {type(msg).__name__}: {error}"
             ) from error
-        if isinstance(data, (list, tuple)):
-            data = np.asarray(data, dtype=np.uint8)
-        self.data = np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, np.uint8)
+        if min(self.height, self.width, self.point_step, row_step) < 0:
+            raise DatasetError(
+                f"PointCloud2: expected sizes from 0 on, got {self.height} x {self.width} points "
+                f"of {self.point_step} bytes in rows of {row_step}"
+            )
         tight = self.width * self.point_step
         # One row needs no row step, and some drivers leave it zero.
         self.row_step = tight if self.height <= 1 or row_step == 0 else row_step
@@ -234,7 +242,8 @@ def _points(layout: _Layout) -> NDArray[Any]:
             raise DatasetError(
                 f"PointCloud2 field {name!r}: expected float32 or float64, got {column.dtype}"
             )
-    return np.stack(columns, axis=1)
+    with np.errstate(invalid="ignore"):  # some bit patterns of NaN do not survive a change of width
+        return np.stack(columns, axis=1)
 
 
 def _rings(layout: _Layout) -> NDArray[Any] | None:
@@ -243,7 +252,8 @@ def _rings(layout: _Layout) -> NDArray[Any] | None:
         return None
     column = layout.column(name)
     if column.dtype.kind == "f":  # a missing return may carry NaN; its point is NaN as well
-        whole: NDArray[np.int64] = np.rint(np.nan_to_num(column)).astype(np.int64)
+        beams = np.clip(np.nan_to_num(column), -_WILD_RING, _WILD_RING)
+        whole: NDArray[np.int64] = np.rint(beams).astype(np.int64)
         return whole
     return column
 

@@ -16,7 +16,15 @@ from loam_gtsam.datasets.packed_points import PackedCloud
 from loam_gtsam.datasets.point_times import TimeDecision, check_time_options
 from loam_gtsam.datasets.pointcloud2 import decode_with_times, describe_fields
 from loam_gtsam.datasets.tables import describe_imu, describe_stamps, read_lines
-from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, IntArray, Scan, Trajectory
+from loam_gtsam.types import (
+    MAX_STAMP,
+    BadSweep,
+    DatasetError,
+    ImuSamples,
+    IntArray,
+    Scan,
+    Trajectory,
+)
 
 _TRIED = 10
 """Sweeps looked at, at most, to decide on times."""
@@ -50,7 +58,10 @@ class StampedFiles(ABC):
         found = []
         for file in folder.glob(pattern):
             try:
-                found.append((stamp_of(file.stem), file))
+                stamp = stamp_of(file.stem)
+                if abs(stamp) > MAX_STAMP:
+                    raise ValueError("out of range")
+                found.append((stamp, file))
             except ValueError as error:
                 raise DatasetError(
                     f"{file}: expected a name that is the stamp of the sweep: {error}"

@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from pathlib import Path
 
 import numpy as np
 
-from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
+from loam_gtsam.types import (
+    MAX_STAMP,
+    DatasetError,
+    FloatArray,
+    ImuSamples,
+    IntArray,
+    Trajectory,
+)
 
 DEFAULT_PERIOD_NS = 100_000_000
 """10 Hz, the usual rate of a spinning lidar."""
 STANDARD_GRAVITY = 9.80665
 """m/s^2, CGPM 1901."""
+_ABSURD = 1e6
+"""rad/s and m/s^2 that no IMU measures."""
 UNIT_TOLERANCE = 0.1
 """By which the length of a quaternion may differ from one for it to be an orientation."""
 
@@ -23,16 +32,16 @@ def seconds_to_ns(text: str) -> int:
     Raises
     ------
     ValueError
-        If the text is not a finite number that fits 64 bits.
+        If the text is not a number up to :data:`loam_gtsam.types.MAX_STAMP`.
     """
     try:
         nanoseconds = Decimal(text.strip()) * 10**9
-        value = int(nanoseconds.to_integral_value())
-    except (InvalidOperation, OverflowError) as error:
+        # before it becomes an integer, which may have a million digits
+        if not abs(nanoseconds) <= MAX_STAMP:
+            raise ValueError(f"out of range: {text.strip()!r}")
+        return int(nanoseconds.to_integral_value())
+    except ArithmeticError as error:
         raise ValueError(f"not a time in seconds: {text.strip()!r}") from error
-    if abs(value) >= 2**63:
-        raise ValueError(f"out of range: {text.strip()!r}")
-    return value
 
 
 def read_lines(path: Path) -> list[str]:
@@ -51,7 +60,7 @@ def read_stamps(path: Path) -> IntArray:
             stamps.append(seconds_to_ns(line))
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected a time in seconds, got {line.strip()!r}"
+                f"{path}:{number}: expected a time in seconds, got {line.strip()[:80]!r}"
             ) from error
     return np.array(stamps, dtype=np.int64)
 
@@ -92,7 +101,8 @@ def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArra
             rows.append([float(cell) for cell in cells[times:]])
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected {len(names)} numbers ({columns}), got {line.strip()!r}"
+                f"{path}:{number}: expected {len(names)} numbers ({columns}), "
+                f"got {line.strip()[:80]!r}"
             ) from error
     values = np.array(rows, dtype=np.float64).reshape(len(rows), len(names) - times)
     bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
@@ -106,7 +116,7 @@ def _stamp(clock: str, cells: list[str]) -> int:
     if clock == "t":
         return seconds_to_ns(cells[0])
     nanoseconds = int(cells[0]) if clock == "ns" else int(cells[0]) * 10**9 + int(cells[1])
-    if abs(nanoseconds) >= 2**63:
+    if abs(nanoseconds) > MAX_STAMP:
         raise ValueError(f"out of range: {cells[0].strip()!r}")
     return nanoseconds
 
@@ -165,11 +175,13 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     values : (N, 10) quaternion x y z w (zero where unknown), rad/s, m/s^2
     problems : is appended to
     """
-    keep = np.flatnonzero(np.isfinite(values).all(axis=1))
+    keep = np.flatnonzero((np.abs(values) < _ABSURD).all(axis=1))  # NaN compares false
     order = keep[np.argsort(stamps[keep], kind="stable")]
     later = np.diff(stamps[order], prepend=np.iinfo(np.int64).min // 2) > 0
     if dropped := len(stamps) - int(later.sum()):
-        problems.append(f"IMU: {dropped} samples with NaN or a repeated stamp left out")
+        problems.append(
+            f"IMU: {dropped} samples with NaN, absurd values or a repeated stamp left out"
+        )
     if (np.diff(stamps) < 0).any():
         problems.append("IMU: stamps out of order, sorted")
     order = order[later]

@@ -1,0 +1,294 @@
+"""Thousands of sweeps with every fault there is, again and again: ``python -m benchmarks.soak``.
+
+Drives round and round a room and a block of the built-in world, whose sweeps, stamps and IMU
+samples are spoilt as :mod:`benchmarks.soak_faults` says. No exception may leave the pipeline, its
+memory must not grow, the good frames must stay accurate, and the report of the run must count every
+fault that was injected, no more and no less; else the exit code is 1. ``soak.md`` has the tables,
+``soak_*.csv`` and ``.png`` the curves.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cases import ROOT, Verdict
+from benchmarks.process import memory
+from benchmarks.report import machine
+from benchmarks.soak_faults import Expected, FaultyDrive
+from benchmarks.tables import write_csv
+from loam_gtsam.config import Config
+from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.evaluation import absolute_error
+from loam_gtsam.export import summarise
+from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
+from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, Trajectory
+from loam_gtsam.visualization import available, plot_curves
+
+FRAMES, QUICK = 10_000, 300
+SCENES = {"room": 300, "street_loop": 450}
+"""Firings a sweep: a sixth and a quarter of the sensor's own."""
+_BOUNDED = "room"
+"""The map of the block gets denser all the time, as noise fills further voxels."""
+_ATE = 0.05
+"""Metres."""
+_GROWTH = 2.0
+"""MB per 1,000 sweeps over the last four fifths of a run; the poses kept here are half of it."""
+_JUDGED = 2_000
+"""Sweeps from which on growth is judged."""
+_ROWS = 500
+"""Of the CSV at most."""
+_POINT = 36e-6
+"""MB of a map point, three doubles and a voxel key."""
+_NOTHING = {"information": np.zeros((6, 6)), "covariance": np.zeros((6, 6)), "uncertainty": None,
+            "localizability": np.zeros(6), "directions": np.zeros((6, 6)),
+            "direction_information": np.zeros(6), "axis_localizability": np.zeros(6),
+            "twist": np.zeros(6), "timings": {}}  # fmt: skip
+"""Of a frame's report what is not kept, in order to see the memory of the pipeline alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class SoakResult:
+    """What came of a run.
+
+    Attributes
+    ----------
+    scene : where it was
+    expected, summary : what was injected, and ``summary.json``
+    exceptions : that left the pipeline, by what they say
+    columns : (N,) per sweep delivered: ``process_mb``, ``map_points``, ``error_m`` (NaN if the
+        pose was not solved) and ``faults`` so far
+    sound : sweeps in the right order that were used, and how many of them were solved
+    ate, largest : metres, of the solved frames
+    """
+
+    scene: str
+    expected: Expected
+    summary: Mapping[str, Any]
+    exceptions: Counter[str]
+    columns: Mapping[str, FloatArray]
+    sound: tuple[int, int]
+    ate: float
+    largest: float
+
+    @property
+    def growth(self) -> float:
+        """MB per 1,000 sweeps: a straight line through the last four fifths."""
+        return self.slope(0.2, 1.0)
+
+    def slope(self, first: float, last: float) -> float:
+        """The same of any part of the run, in shares of it."""
+        used = self.columns["process_mb"]
+        part = np.arange(int(first * len(used)), int(last * len(used)))
+        return 1e3 * float(np.polyfit(part, used[part], 1)[0])
+
+    def counts(self) -> Iterator[tuple[str, int, int]]:
+        """What is counted, how often it was injected, and how often the report has it."""
+        expected, summary = self.expected, self.summary
+        for name in sorted({*expected.faults, *summary["faults"]}):
+            yield name, expected.faults[name], summary["faults"].get(name, 0)
+        yield "gaps between sweeps", expected.gaps, summary["sweep_gaps"]
+        points = summary["not_finite_points"]
+        yield "usable sweeps with NaN", len(expected.not_finite), points["sweeps"]
+        yield "NaN points in them", sum(expected.not_finite), points["points"]
+        for name in ("gaps", "duplicates", "out_of_order", "not_finite"):
+            yield f"IMU: {name.replace('_', ' ')}", expected.imu[name], summary["imu"][name]
+
+    def verdicts(self) -> dict[str, tuple[str, Verdict]]:
+        """By label the value and whether it is as it must be."""
+        raised = sum(self.exceptions.values())
+        equal = sum(injected == counted for _, injected, counted in self.counts())
+        total = len(list(self.counts()))
+        judged = self.scene == _BOUNDED and len(self.columns["faults"]) >= _JUDGED
+        return {
+            "exceptions": (str(raised), Verdict("0", raised == 0)),
+            "counts that are exact": (f"{equal} of {total}", Verdict("all", equal == total)),
+            "sound sweeps solved": (
+                f"{self.sound[1]} of {self.sound[0]}",
+                Verdict("all", self.sound[0] == self.sound[1]),
+            ),
+            "ATE [m]": (f"{self.ate:.4f}", Verdict(f"<= {_ATE:g}", self.ate <= _ATE)),
+            "largest error [m]": (f"{self.largest:.3f}", Verdict("-", None)),
+            "memory [MB per 1,000 sweeps]": (
+                f"{self.growth:+.2f}",
+                Verdict(f"<= {_GROWTH:g}", self.growth <= _GROWTH if judged else None),
+            ),
+        }
+
+    @property
+    def met(self) -> bool:
+        """Whether nothing is as it must not be."""
+        return all(verdict.met is not False for _, verdict in self.verdicts().values())
+
+
+def soak(scene: str, frames: int, seed: int = 0) -> SoakResult:
+    """Drive so many sweeps of a scene, spoilt, through a pipeline."""
+    world = SimulatedWorld(scene, frames=frames, columns=SCENES[scene])
+    drive = FaultyDrive(world, seed)
+    config = effective_config(Config(), world)
+    pipeline = Pipeline(config, imu=imu_buffer(drive, config))
+    updates: list[MapUpdate] = []
+    numbers: list[int] = []
+    exceptions: Counter[str] = Counter()
+    rows: list[tuple[float, int, int]] = []
+    for sweep, number in drive.deliveries():
+        try:
+            update = pipeline.process(sweep)
+        except Exception as error:  # what must not happen is counted
+            exceptions[f"{type(error).__name__}: {error}"] += 1
+            continue
+        updates.append(replace(update, **_NOTHING))
+        numbers.append(number)
+        maps = pipeline.mapper.edge_map.stats, pipeline.mapper.plane_map.stats
+        points = sum(each.points + each.archived_points for each in maps)
+        rows.append((memory()[0], points, drive.expected.injected.total()))
+    solved = np.array([update.status.solved for update in updates])
+    used = np.array([update.fault is None for update in updates])
+    error, ate = _errors(updates, np.array(numbers), solved, world)
+    process, points, faults = np.array(rows, np.float64).T
+    return SoakResult(
+        scene=scene,
+        expected=drive.expected,
+        summary=summarise(pipeline.result(updates)),
+        exceptions=exceptions,
+        columns={"process_mb": process, "map_points": points, "error_m": error, "faults": faults},
+        sound=(int(used.sum()) - 1, int(solved.sum())),  # the first is not solved
+        ate=ate,
+        largest=float(np.nanmax(error)),
+    )
+
+
+def _errors(
+    updates: Sequence[MapUpdate], numbers: IntArray, solved: BoolArray, world: SimulatedWorld
+) -> tuple[FloatArray, float]:
+    """Metres each solved frame is off after alignment, NaN for the others; the ATE of all."""
+    found = np.array([update.map_T_lidar.matrix() for update in updates])[solved]
+    stamps = world.truth.stamps[numbers[solved]]  # whatever the sweeps said
+    absolute = absolute_error(Trajectory(stamps, found), world.truth)
+    errors = np.full(len(updates), np.nan)
+    errors[solved] = absolute.translations
+    return errors, absolute.rmse
+
+
+def write(folder: Path, results: Sequence[SoakResult]) -> list[Path]:
+    """``soak_SCENE.csv`` and, with matplotlib, ``.png`` of each run; ``soak.md``."""
+    paths = [path for result in results for path in _write_curves(folder, result)]
+    paths.append(folder / "soak.md")
+    paths[-1].write_text("\n".join(_markdown(results)) + "\n", encoding="utf-8")
+    return paths
+
+
+def _write_curves(folder: Path, result: SoakResult) -> list[Path]:
+    columns = result.columns
+    sweeps = len(columns["faults"])
+    ends = np.linspace(0, sweeps, min(sweeps, _ROWS) + 1).astype(np.int64)
+    rows = {"sweep": (ends[1:] - 1).astype(np.float64)}
+    for name, column in columns.items():
+        parts = [column[a:b] for a, b in pairwise(ends)]
+        worst = name == "error_m"
+        rows[name] = np.array(
+            [np.nanmax(p) if worst and np.isfinite(p).any() else p[-1] for p in parts]
+        )
+    path = folder / f"soak_{result.scene}.csv"
+    write_csv(path, list(rows), zip(*(values.tolist() for values in rows.values()), strict=True))
+    paths = [path]
+    if available():
+        paths.append(path.with_suffix(".png"))
+        x = rows["sweep"]
+        map_mb = _POINT * rows["map_points"]
+        panels = {
+            "memory [MB]": {"process": (x, rows["process_mb"]), "map": (x, map_mb)},
+            "error [m]": {"largest of twenty": (x, rows["error_m"])},
+            "faults": {"injected so far": (x, rows["faults"])},
+        }
+        plot_curves(paths[-1], panels, "sweep")
+    return paths
+
+
+def _markdown(results: Sequence[SoakResult]) -> Iterator[str]:
+    yield "# Soak\n\nMade by `python -m benchmarks.soak`.\n"
+    yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
+    yield (
+        "Laps of built-in scenes with every fault there is, again and again, and an IMU with "
+        "faults of its own, through one `Pipeline` each. Of each frame's report, which a run "
+        "keeps, only pose and status are kept here. Memory is judged in the room, where the map is "
+        "soon full. That of the block gets denser all the time, ever more slowly, as noise fills "
+        "further voxels ([long runs](growth.md)), and memory with it."
+    )
+    for result in results:
+        yield from _scene(result)
+
+
+def _scene(result: SoakResult) -> Iterator[str]:
+    injected, name = result.expected.injected, f"soak_{result.scene}"
+    points = result.columns["map_points"]
+    growth = ", ".join(f"{result.slope(k / 5, (k + 1) / 5):.1f}" for k in range(1, 5))
+    yield f"\n## {result.scene}\n"
+    yield (
+        f"{len(points)} sweeps of {SCENES[result.scene]} firings delivered, {injected.total()} "
+        f"faults. From the second to the last fifth of them memory grew by {growth} MB per 1,000 "
+        f"sweeps; map points: {points[len(points) // 5]:.0f} after a fifth, {points[-1]:.0f} in "
+        "the end.\n"
+    )
+    yield "| what | value | target |\n|---|---|---|"
+    for label, (value, verdict) in result.verdicts().items():
+        yield f"| {label} | {value} | {verdict if verdict.target != '-' else ''} |"
+    yield "\n**What was done to the sweeps**\n\n| fault | times |\n|---|---|"
+    yield from (f"| {kind} | {times} |" for kind, times in sorted(injected.items()))
+    yield "\n**What the report counts** (`faults`, `sweep_gaps`, `not_finite_points` and `imu` in"
+    yield "`summary.json`)\n\n| what | injected | counted |\n|---|---|---|"
+    yield from (f"| {' | '.join(map(str, row))} |" for row in result.counts())
+    statuses = ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
+    yield f"\nStatuses: {statuses}. ([CSV]({name}.csv))"
+    if available():
+        yield f"\n![Memory, error and faults over the sweeps of {result.scene}]({name}.png)"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Command line; 1 if anything is not as it must be."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.soak", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help=f"{QUICK} sweeps of the block")
+    parser.add_argument("--frames", type=int, help=f"sweeps of each scene; {FRAMES} by default")
+    parser.add_argument("--seed", type=int, default=0, help="of the faults")
+    parser.add_argument("--output", type=Path, help="folder for the results; docs/benchmarks, or "
+                        "benchmarks/results if only a part is run")  # fmt: skip
+    options = parser.parse_args(arguments)
+    part = options.quick or options.frames is not None
+    frames = QUICK if options.quick else options.frames or FRAMES
+    if frames < 2 * QUICK // 3:
+        parser.error(f"--frames: expected at least {2 * QUICK // 3}, got {frames}")
+    folder = options.output or ROOT / ("benchmarks/results" if part else "docs/benchmarks")
+    scenes = ["street_loop"] if options.quick else list(SCENES)
+    # Processes of their own, started afresh: the memory of one run is not that of the other.
+    with ProcessPoolExecutor(len(scenes), mp_context=get_context("spawn")) as pool:
+        runs = [pool.submit(soak, scene, frames, options.seed) for scene in scenes]
+        results = [run.result() for run in runs]
+    for result in results:
+        _show(result)
+    print(f"Written: {', '.join(map(str, write(folder, results)))}")
+    return int(not all(result.met for result in results))
+
+
+def _show(result: SoakResult) -> None:
+    print(result.scene)
+    for label, (value, verdict) in result.verdicts().items():
+        print(f"  {label}: {value} ({verdict})")
+    for name, injected, counted in result.counts():
+        if injected != counted:
+            print(f"  {name}: injected {injected}, counted {counted}")
+    for message, times in result.exceptions.items():
+        print(f"  {times} x {message}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,234 @@
+"""Laws of the geometry that hold for every input: rigid motions, fits, voxels, interpolation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from strategies import generators
+
+from loam_gtsam.evaluation import interpolate
+from loam_gtsam.geometry import (
+    fit_lines,
+    fit_planes,
+    move_points,
+    symmetric_eigenvalues,
+    transform,
+    voxel_filter,
+)
+from loam_gtsam.rotations import (
+    as_rot3,
+    exponential,
+    inverse,
+    logarithm,
+    quaternion_product,
+    rotate,
+    running_product,
+)
+from loam_gtsam.types import Trajectory
+
+SIZES = [0.0, 1e-12, 1e-9, 1e-7, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9]
+"""Angles: none, where series take over from sines, and near a half turn."""
+
+
+@st.composite
+def rotation_vectors(draw: st.DrawFn) -> Any:
+    axis = draw(generators()).normal(size=3)
+    return draw(st.sampled_from(SIZES)) * axis / np.linalg.norm(axis)
+
+
+@st.composite
+def twists(draw: st.DrawFn) -> Any:
+    metres = draw(st.sampled_from([0.0, 1e-9, 1.0, 30.0]))
+    return np.concatenate([draw(rotation_vectors()), draw(generators()).normal(0.0, metres, 3)])
+
+
+@st.composite
+def clouds(draw: st.DrawFn, most: int = 60) -> Any:
+    rng = draw(generators())
+    count = draw(st.integers(1, most))
+    return draw(st.sampled_from([0.01, 1.0, 100.0])) * rng.normal(size=(count, 3))
+
+
+def pose(twist: Any) -> gtsam.Pose3:
+    return gtsam.Pose3.Expmap(twist)
+
+
+# -- groups ----------------------------------------------------------------------------------------
+
+
+@given(a=twists(), b=twists(), points=clouds())
+def test_transforms_compose_and_invert(a: Any, b: Any, points: Any) -> None:
+    A, B = pose(a).matrix(), pose(b).matrix()
+    tolerance = {"rtol": 0, "atol": 1e-12 * (100.0 + np.abs(points).max())}
+    np.testing.assert_allclose(transform(A @ B, points), transform(A, transform(B, points)),
+                               **tolerance)  # fmt: skip
+    np.testing.assert_allclose(transform(np.linalg.inv(A), transform(A, points)), points,
+                               **tolerance)  # fmt: skip
+    np.testing.assert_array_equal(transform(np.eye(4), points), points)
+    moved = transform(A, points)
+    before, after = (np.linalg.norm(p[1:] - p[:-1], axis=1) for p in (points, moved))
+    np.testing.assert_allclose(after, before, **tolerance)
+
+
+@given(twist=twists(), points=clouds(), times=st.tuples(*[st.floats(-2.0, 2.0)] * 2))
+def test_moving_points_is_one_motion_after_the_other(
+    twist: Any, points: Any, times: tuple[float, float]
+) -> None:
+    first, second = (np.full(len(points), time) for time in times)
+    tolerance = {"rtol": 0, "atol": 1e-10 * (100.0 + np.abs(points).max())}
+    once = move_points(points, twist, first + second)
+    twice = move_points(move_points(points, twist, first), twist, second)
+    np.testing.assert_allclose(twice, once, **tolerance)
+    by_gtsam = transform(pose(twist * times[0]).matrix(), points)
+    np.testing.assert_allclose(move_points(points, twist, first), by_gtsam, **tolerance)
+    np.testing.assert_array_equal(move_points(points, twist, np.zeros(len(points))), points)
+
+
+@given(a=rotation_vectors(), b=rotation_vectors(), points=clouds(most=5))
+def test_quaternions_are_a_group_and_act_like_their_matrices(a: Any, b: Any, points: Any) -> None:
+    A, B = (exponential(v[:, None]) for v in (a, b))
+    product = quaternion_product(A, B)
+    np.testing.assert_allclose(np.linalg.norm(product), 1.0, atol=1e-15)
+    np.testing.assert_allclose(
+        quaternion_product(A, inverse(A))[:, 0], [0, 0, 0, 1.0], rtol=0, atol=1e-15
+    )
+    expected = as_rot3(A[:, 0]).compose(as_rot3(B[:, 0])).matrix()
+    np.testing.assert_allclose(as_rot3(product[:, 0]).matrix(), expected, rtol=0, atol=1e-14)
+    turned = rotate(np.repeat(A, len(points), axis=1), points.T).T
+    by_matrix = points @ gtsam.Rot3.Expmap(a).matrix().T
+    size = np.abs(points).max()
+    np.testing.assert_allclose(turned, by_matrix, rtol=0, atol=1e-14 * size + 1e-300)
+    steps = np.concatenate([A, B], axis=1)
+    np.testing.assert_allclose(running_product(steps)[:, -1:], product, rtol=0, atol=1e-15)
+
+
+@given(vector=rotation_vectors())
+def test_logarithm_undoes_exponential_near_and_far_from_identity(vector: Any) -> None:
+    found = logarithm(exponential(vector[:, None]))[:, 0]
+    # The last digits before a half turn, where the sine of the half angle is flat.
+    np.testing.assert_allclose(found, vector, rtol=1e-7, atol=1e-15)
+
+
+# -- interpolation ---------------------------------------------------------------------------------
+
+
+@given(twist=twists(), share=st.floats(0.0, 1.0), change=twists())
+def test_interpolation_hits_its_ends_and_moves_with_the_frame(
+    twist: Any, share: float, change: Any
+) -> None:
+    stamps = np.array([0, 10**9])
+    ends = np.array([np.eye(4), pose(twist).matrix()])
+    at = np.array([0, round(share * 1e9), 10**9])
+    found = interpolate(Trajectory(stamps, ends), at).map_T_lidar
+    np.testing.assert_allclose(found[[0, 2]], ends, rtol=0, atol=1e-12)
+    rotations = found[:, :3, :3]
+    identity = np.broadcast_to(np.eye(3), (3, 3, 3))
+    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), identity, atol=1e-12)
+    turn = gtsam.Rot3.Logmap(gtsam.Rot3(rotations[1]))
+    np.testing.assert_allclose(turn, at[1] * 1e-9 * twist[:3], rtol=0, atol=1e-6)
+    map_T_other = pose(change).matrix()
+    moved = interpolate(Trajectory(stamps, map_T_other @ ends), at).map_T_lidar
+    np.testing.assert_allclose(moved, map_T_other @ found, rtol=0, atol=1e-6)
+
+
+# -- fits ------------------------------------------------------------------------------------------
+
+
+@st.composite
+def groups(draw: st.DrawFn) -> Any:
+    """Five or more points each: scattered, on lines, in planes, at one place; near and far away."""
+    rng = draw(generators())
+    shapes = [(1, 1, 1), (1, 0.3, 0), (1, 0, 0), (1, 1, 0), (0, 0, 0)]
+    extent = np.array(draw(st.sampled_from(shapes)))
+    noise = draw(st.sampled_from([0.0, 1e-6, 0.02]))
+    points = rng.normal(size=(draw(st.integers(1, 20)), draw(st.integers(5, 8)), 3)) * extent
+    points += noise * rng.normal(size=points.shape)
+    turn = gtsam.Rot3.Expmap(rng.normal(size=3)).matrix()
+    away = draw(st.sampled_from([0.0, 10.0, 1e3])) * rng.normal(size=3)
+    return points @ turn.T + away
+
+
+@given(neighbours=groups())
+def test_fits_are_those_of_eigh(neighbours: Any) -> None:
+    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
+    values, vectors = np.linalg.eigh(centred.swapaxes(1, 2) @ centred / neighbours.shape[1])
+    rounding = 1e-15 * np.abs(neighbours).max() ** 2
+    tolerance = 3e-8 * values[:, 2:] + rounding
+    centres, directions, eigenvalues = fit_lines(neighbours)
+    np.testing.assert_allclose(centres.T, neighbours.mean(axis=1), rtol=1e-14, atol=1e-12)
+    assert (np.abs(eigenvalues.T - values) <= tolerance).all()
+    _, normals, wide, again = fit_planes(neighbours)
+    np.testing.assert_array_equal(again, eigenvalues)
+    np.testing.assert_array_equal(wide, directions)
+    for found, column, other in ((directions, 2, 1), (normals, 0, 1)):
+        np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1.0, atol=1e-12)
+        clear = np.abs(values[:, column] - values[:, other]) > 0.1 * values[:, 2] + 1e3 * rounding
+        cosine = np.abs((found.T * vectors[:, :, column]).sum(axis=1))
+        assert (cosine[clear] > 1.0 - 1e-10).all()
+
+
+@given(neighbours=groups(), twist=twists(), rng=generators())
+def test_fits_move_with_the_frame_and_forget_the_order(
+    neighbours: Any, twist: Any, rng: np.random.Generator
+) -> None:
+    T = pose(twist).matrix()
+    moved = transform(T, neighbours.reshape(-1, 3)).reshape(neighbours.shape)
+    shuffled = rng.permuted(np.arange(neighbours.shape[1]))
+    values = fit_planes(neighbours)[3]
+    size = np.abs(neighbours).max() + np.abs(moved).max()
+    tolerance = 1e-7 * values[2].max() + 1e-14 * size**2
+    for other in (moved, neighbours[:, shuffled]):
+        np.testing.assert_allclose(fit_planes(other)[3], values, rtol=0, atol=tolerance)
+    clear = (values[1] - values[0] > 0.1 * values[2]) & (values[2] > 1e-9 * size**2)
+    before, after = fit_planes(neighbours)[1], fit_planes(moved)[1]
+    cosine = np.abs((after * (T[:3, :3] @ before)).sum(axis=0))
+    assert (cosine[clear] > 1.0 - 1e-8).all()
+
+
+@given(rng=generators(), scale=st.sampled_from([1e-100, 1e-6, 1.0, 1e6, 1e50]))
+def test_eigenvalues_scale_and_shift_with_the_matrix(
+    rng: np.random.Generator, scale: float
+) -> None:
+    matrices = rng.normal(size=(6, 20))
+    values = symmetric_eigenvalues(matrices)
+    np.testing.assert_allclose(values.sum(axis=0), matrices[:3].sum(axis=0), atol=1e-12)
+    np.testing.assert_allclose(symmetric_eigenvalues(scale * matrices), scale * values,
+                               rtol=1e-9, atol=1e-9 * scale)  # fmt: skip
+    shifted = matrices + np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
+    np.testing.assert_allclose(symmetric_eigenvalues(shifted), values + 1.0, atol=1e-9)
+
+
+# -- voxels ----------------------------------------------------------------------------------------
+
+
+@given(points=clouds(most=200), size=st.sampled_from([0.05, 0.4, 7.0]), rng=generators())
+def test_voxel_filter_forgets_the_order_and_is_done_after_one_pass(
+    points: Any, size: float, rng: np.random.Generator
+) -> None:
+    once = voxel_filter(points, size)
+    np.testing.assert_allclose(voxel_filter(rng.permutation(points), size), once,
+                               rtol=0, atol=1e-12 * np.abs(points).max())  # fmt: skip
+    assert len(once) <= len(points)
+    cells = np.floor(points / size)
+    assert len(once) == len(np.unique(cells, axis=0))
+    # A mean may be rounded out of its voxel; else nothing is left to do.
+    inside = (np.floor(once / size) == np.unique(cells, axis=0)).all()
+    if inside:
+        np.testing.assert_array_equal(voxel_filter(once, size), once)
+    whole = np.round(rng.uniform(-50, 50, 3)) * size  # a shift by whole voxels shifts the result
+    shifted = voxel_filter(points + whole, size)
+    if len(shifted) == len(once):
+        np.testing.assert_allclose(shifted, once + whole, rtol=0, atol=1e-9 * (100 * size + 100))
+
+
+@pytest.mark.parametrize("size", [0.1, 0.4])
+def test_a_filtered_cloud_stays_inside_the_hull_of_each_voxel(size: float) -> None:
+    points = np.random.default_rng(1).uniform(-5, 5, (2000, 3))
+    found = voxel_filter(points, size)
+    cells = np.unique(np.floor(points / size), axis=0)
+    assert ((found >= cells * size - 1e-12) & (found <= (cells + 1) * size + 1e-12)).all()

@@ -17,7 +17,15 @@ from loam_gtsam.export import stage_seconds
 from loam_gtsam.features import extract_features
 from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buffer
 from loam_gtsam.sweep import assign_rings, assign_times, usable_columns
-from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Scan, SweepError
+from loam_gtsam.types import (
+    BadSweep,
+    FeatureSweep,
+    FrameStatus,
+    ImuSamples,
+    MapUpdate,
+    Scan,
+    SweepError,
+)
 
 NOT_MAPPED = (FrameStatus.UNUSABLE_SCAN, FrameStatus.BAD_STAMP)
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
@@ -74,7 +82,8 @@ def imu_facts(imu: ImuSummary) -> dict[str, str]:
     """Label -> value, of what was made of an IMU."""
     level = imu.level
     if level is None:
-        up = "unknown: no orientation"
+        known = imu.report.orientation != "none"
+        up = "unknown: no samples about the first sweep" if known else "unknown: no orientation"
     else:
         angles = f"roll {np.degrees(level.roll):.2f}, pitch {np.degrees(level.pitch):.2f} deg"
         state = "at rest" if level.source == "still" else "moving"
@@ -102,6 +111,12 @@ def _counts(counts: Mapping[str, int]) -> str:
 
 def _imu_problems(imu: ImuSummary) -> list[str]:
     problems = list(imu.report.problems)
+    dropped = imu.tilt_priors.get("dropped", 0)
+    if dropped and imu.report.orientation != "none":
+        problems.append(
+            f"IMU: no orientation at {dropped} of {sum(imu.tilt_priors.values())} sweeps: gaps "
+            "longer than imu.max_gap, or another clock than that of the sweeps"
+        )
     if not imu.gyro_trusted:
         problems.append(
             "IMU: its gyro turned unlike the scans and was given up; check imu.lidar_R_imu_deg, "
@@ -154,6 +169,7 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
             problems.append(f"sweep {number}: {error}")
             continue
         facts = {"shown": f"sweep {number}"} | facts
+        problems += _imu_beside(dataset.imu if config.imu.enabled else None, sweep)
         runnable = True
         break
     if len(dataset) == 0:
@@ -175,6 +191,20 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     verdict = "can be run" if runnable else "cannot be run: no usable sweep among the first few"
     parts.append(Text(verdict, style="green" if runnable else "red"))
     return Group(*parts), runnable
+
+
+def _imu_beside(imu: ImuSamples | None, sweep: Sweep) -> list[str]:
+    """A problem if the IMU has no samples at a sweep, as on another clock."""
+    if imu is None or len(imu.stamps) == 0:
+        return []
+    stamp = sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
+    first, last = int(imu.stamps.min()), int(imu.stamps.max())
+    if first <= stamp <= last:
+        return []
+    return [
+        f"IMU: its samples are from {first * 1e-9:.3f} to {last * 1e-9:.3f} s, the sweep shown is "
+        f"at {stamp * 1e-9:.3f} s; if they never meet, the clocks differ and the IMU is of no use"
+    ]
 
 
 def sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:

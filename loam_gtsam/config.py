@@ -959,7 +959,8 @@ def load_config(path: str | Path) -> Config:
     try:
         text = Path(path).read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot read the configuration: {error}") from error
+        reason = getattr(error, "strerror", None) or error  # without the path again
+        raise ConfigError(f"{path}: cannot read the configuration: {reason}") from error
     return parse_config(text, str(path))
 
 

@@ -61,7 +61,8 @@ def load_spec(path: str | Path) -> Spec:
         text = path.read_text(encoding="utf-8")
         data = YAML(typ="safe", pure=True).load(text)
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot read the specification: {error}") from error
+        reason = getattr(error, "strerror", None) or error  # without the path again
+        raise ConfigError(f"{path}: cannot read the specification: {reason}") from error
     except Exception as error:  # not only YAMLError: see config.parse_config
         raise ConfigError(f"{path}: not valid YAML: {error}") from error
     name = str(path)

@@ -209,7 +209,8 @@ def _text(path: Path) -> str:
     try:
         return path.read_text(encoding="ascii")
     except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot read the graph: {error}") from error
+        reason = getattr(error, "strerror", None) or error  # without the path again
+        raise DatasetError(f"{path}: cannot read the graph: {reason}") from error
 
 
 # -- GTSAM -----------------------------------------------------------------------------------------

@@ -523,6 +523,18 @@ def test_inspect_says_what_is_understood_of_the_imu(opens, scans, monkeypatch):
     assert "not of unit length" in one_line(loam("inspect", "x"))
 
 
+def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
+    opens(scans)
+    imu = SimulatedWorld("room", frames=FRAMES).imu
+    late = ImuSamples(imu.stamps + 3600 * 10**9, imu.orientation, imu.gyro, imu.acceleration)
+    for samples, told in ((imu, False), (late, True)):
+        monkeypatch.setattr(FakeDataset, "imu", samples)
+        assert ("the clocks differ" in one_line(loam("inspect", "x"))) == told
+        said = one_line(loam("run", "x", "--no-plot", "--overwrite"))
+        assert ("no orientation at 3 of 4 sweeps" in said) == told
+        assert ("IMU, level unknown: no samples about the first sweep" in said) == told
+
+
 # -- going on ------------------------------------------------------------------------------------
 
 

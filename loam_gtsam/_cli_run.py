@@ -86,25 +86,22 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
-    if options.resume:
-        new_folder = not wanted.exists()
-        folder = make_folder(wanted)
-        if _complete(folder, config, dataset, total):
-            Console(quiet=options.quiet).print(
-                f"{folder}: complete, {total} sweeps", markup=False, soft_wrap=True
-            )
-            return 0
-    else:
+    if not options.resume:
         wanted = free_folder(wanted, options.overwrite, (*RUN_OUTPUTS, CHECKPOINT))
-        new_folder = not wanted.exists()
-        folder = make_folder(wanted)
+    is_new = not wanted.exists()
+    folder = make_folder(wanted)
+    if options.resume and _complete(folder, config, dataset, total):
+        Console(quiet=options.quiet).print(
+            f"{folder}: complete, {total} sweeps", markup=False, soft_wrap=True
+        )
+        return 0
     checkpoint = None
     if options.checkpoint_seconds > 0.0:
         place = folder / CHECKPOINT
         checkpoint = Checkpoint(place, seconds=options.checkpoint_seconds, resume=options.resume)
     last = LastFrame()
     with (
-        no_empty_folder(folder, new_folder),
+        no_empty_folder(folder, is_new),
         stop_requests() as stop,
         _observers(options, config, last) as observe,
     ):

@@ -106,9 +106,8 @@ def choose_topic(
         return asked
     candidates = [name for name, (what, _) in topics.items() if what == kind]
     if not candidates:
-        packets = any(
-            "packet" in what.lower() or "scan" in what.lower() for what, _ in topics.values()
-        )
+        kinds = [what.lower() for what, _ in topics.values()]
+        packets = any("packet" in k or (k.endswith("scan") and "laser" not in k) for k in kinds)
         hint = "; raw packets become PointCloud2 with the driver of the sensor" if packets else ""
         raise DatasetError(
             f"{path}: no topic of type {kind}; the bag has: {listing or 'no messages'}{hint}"

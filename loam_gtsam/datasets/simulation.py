@@ -142,7 +142,7 @@ class SimulatedWorld:
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
         for label, number in (("seed", seed), ("frames", frames), ("columns", columns)):
-            if number is not None and number != int(number):
+            if number is not None and not isinstance(number, (int, np.integer)):
                 raise ConfigError(f"{label}: expected a whole number, got {number!r}")
         _at_least("seed", seed, 0)
         self.scene = _BUILDERS[scene](seed) if isinstance(scene, str) else scene

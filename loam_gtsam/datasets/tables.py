@@ -231,7 +231,7 @@ def describe_stamps(stamps: IntArray, facts: dict[str, str], problems: list[str]
     if len(steps) and not steps.any():
         problems.append(
             f"all stamps are {stamps[0] * 1e-9:g} s: nothing says when the sweeps were measured, "
-            "and only the first can be mapped; write their times into the headers"
+            "and only the first can be mapped; each needs a stamp of its own"
         )
         return
     for what, which in (

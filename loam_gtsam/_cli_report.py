@@ -203,7 +203,7 @@ def _imu_beside(imu: ImuSamples | None, sweep: Sweep) -> list[str]:
         return []
     return [
         f"IMU: its samples are from {first * 1e-9:.3f} to {last * 1e-9:.3f} s, the sweep shown is "
-        f"at {stamp * 1e-9:.3f} s; if they never meet, the clocks differ and the IMU is of no use"
+        f"at {stamp * 1e-9:.3f} s; if they never meet, the clocks differ, and the IMU is not used"
     ]
 
 

@@ -416,10 +416,12 @@ def frame_progress(name: str, total: int, stop: StopRequest, quiet: bool) -> Ite
     )
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(name, total=total, rate="", status="")
-        started = time.perf_counter()
+        started, done = time.perf_counter(), 0
 
         def on_frame(number: int, update: MapUpdate) -> None:
-            rate = (number + 1) / (time.perf_counter() - started)
+            nonlocal done
+            done += 1  # not number + 1: a run that goes on begins in the middle
+            rate = done / (time.perf_counter() - started)
             bar.update(
                 task, completed=number + 1, rate=f"{rate:.1f} frames/s", status=str(update.status)
             )

@@ -220,7 +220,7 @@ def test_a_run_that_breaks_off_leaves_a_whole_bag(monkeypatch: pytest.MonkeyPatc
 def test_a_run_without_sweeps_leaves_no_bag(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: Sweeps([]))
     assert loam("x", "--bag", "a.bag").exit_code == 1
-    assert [path.name for path in Path().iterdir()] == ["out"]
+    assert [path.name for path in Path().iterdir()] == []
 
 
 def test_a_bag_that_cannot_be_written_costs_no_results(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,13 +10,13 @@ import shutil
 import sqlite3
 import struct
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 from rosbags import rosbag1, rosbag2
 
+from loam_gtsam.closing import ClosedByBlock
 from loam_gtsam.config import BagConfig
 from loam_gtsam.frame_messages import TYPES, FrameMessages, Points
 from loam_gtsam.types import FrameStatus, MapUpdate, OutputError
@@ -31,7 +31,7 @@ _HEADER_RECORD = 4096
 counts them in, and ``rosbag reindex`` would then write over the first 8 bytes of the messages."""
 
 
-class BagWriter:
+class BagWriter(ClosedByBlock):
     """Writes a run into a new bag while it goes on.
 
     Until it is closed the bag is called ``PATH.active``, as ``rosbag record`` has it. Leaving the
@@ -129,19 +129,6 @@ class BagWriter:
             if self.frames:
                 self._give_name()
             _remove(self._active)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        # What ended the block matters more than what closing says on a full disk.
-        with nullcontext() if kind is None else suppress(OutputError):
-            self.close()
 
     def _append(self, stamp: int, messages: Iterable[tuple[str, bytes]]) -> None:
         with self._failing():

@@ -23,15 +23,15 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam._rrd_file import RrdFile
+from loam_gtsam.closing import ClosedByBlock
 from loam_gtsam.frame_view import FrameView, MapView, residual_colours
 from loam_gtsam.types import FloatArray, FrameStatus, OutputError
 
@@ -48,7 +48,7 @@ _MOST_PATH = 2_000
 _FINE = (FrameStatus.OK, FrameStatus.FIRST)
 
 
-class RerunViewer:
+class RerunViewer(ClosedByBlock):
     """Shows the frames of a run; :func:`loam_gtsam.watching.watch` makes them.
 
     Leaving the block closes the file, after an error or Ctrl-C too; what a killed process wrote
@@ -153,19 +153,6 @@ class RerunViewer:
         self._file.check()
         if not self.frames:
             self.path.unlink(missing_ok=True)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        # What ended the block matters more than what closing says on a full disk.
-        with nullcontext() if kind is None else suppress(OutputError):
-            self.close()
 
     # -- what is drawn -------------------------------------------------------------------------
 

@@ -9,7 +9,7 @@ ROOT = Path(__file__).resolve().parents[1] / "loam_gtsam"
 THIS = "tests/test_layers.py"
 
 LAYERS = (
-    ("freezing", "types", "config", "geometry", "rotations", "frame_view"),
+    ("freezing", "types", "config", "geometry", "rotations", "closing", "frame_view"),
     (
         "rings",
         "place",
@@ -61,6 +61,7 @@ LAYERS = (
 
 SAME_LAYER = {
     "types": {"freezing"},
+    "closing": {"types"},
     "config": {"types"},
     "geometry": {"types"},
     "rotations": {"types"},

@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from loam_gtsam.types import BadSweep, FeatureSweep, ImuSamples, Scan, Trajectory
+from loam_gtsam.types import (
+    BadSweep,
+    DatasetError,
+    FeatureSweep,
+    ImuSamples,
+    IntArray,
+    Scan,
+    Trajectory,
+)
 
 Sweep = Scan | FeatureSweep | BadSweep
 
@@ -55,3 +65,28 @@ class Dataset(Protocol):
     def truth(self) -> Trajectory | None:
         """Reference poses if the data comes with them."""
         ...
+
+
+class SweepFiles(ABC):
+    """The sweeps of a data set with one file each; one that cannot be read is a bad sweep.
+
+    Attributes
+    ----------
+    stamps : (N,) nanoseconds
+    """
+
+    stamps: IntArray
+    _files: list[Path]
+
+    def __len__(self) -> int:
+        return len(self._files)
+
+    def __iter__(self) -> Iterator[Scan | BadSweep]:
+        for file, stamp in zip(self._files, self.stamps.tolist(), strict=True):
+            try:
+                yield self._read(file, stamp)
+            except DatasetError as error:
+                yield BadSweep(stamp, str(error))
+
+    @abstractmethod
+    def _read(self, file: Path, stamp: int) -> Scan: ...

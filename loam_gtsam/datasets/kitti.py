@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
 from loam_gtsam.datasets.extrinsics import describe_extrinsics, implied_by
 from loam_gtsam.datasets.kitti_poses import (
     camera_T_lidar_of,
@@ -30,7 +30,6 @@ from loam_gtsam.datasets.tables import (
     read_tum,
 )
 from loam_gtsam.types import (
-    BadSweep,
     DatasetError,
     ImuSamples,
     Scan,
@@ -51,7 +50,7 @@ _FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
 _POINT_BYTES = 16
 
 
-class KittiDataset:
+class KittiDataset(SweepFiles):
     """Folder of ``.bin`` files, float32 ``x y z intensity`` little endian.
 
     Parameters
@@ -104,16 +103,6 @@ class KittiDataset:
             )
         self.sensor: Mapping[str, Any] = self._implied(folder)
         self._decision = self._decide_times() if self._has_times else None
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __iter__(self) -> Iterator[Scan | BadSweep]:
-        for file, stamp in zip(self._files, self.stamps.tolist(), strict=True):
-            try:
-                yield self._read(file, stamp)
-            except DatasetError as error:
-                yield BadSweep(stamp, str(error))
 
     @cached_property
     def imu(self) -> ImuSamples | None:

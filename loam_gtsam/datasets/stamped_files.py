@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Mapping
+from abc import abstractmethod
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
 from loam_gtsam.datasets.extrinsics import describe_extrinsics
 from loam_gtsam.datasets.packed_points import PackedCloud
 from loam_gtsam.datasets.point_times import TimeDecision, check_time_options
@@ -18,7 +18,6 @@ from loam_gtsam.datasets.pointcloud2 import decode_with_times, describe_fields
 from loam_gtsam.datasets.tables import describe_imu, describe_stamps, read_lines
 from loam_gtsam.types import (
     MAX_STAMP,
-    BadSweep,
     DatasetError,
     ImuSamples,
     IntArray,
@@ -30,7 +29,7 @@ _TRIED = 10
 """Sweeps looked at, at most, to decide on times."""
 
 
-class StampedFiles(ABC):
+class StampedFiles(SweepFiles):
     """A data set with one file per sweep.
 
     Parameters
@@ -70,17 +69,7 @@ class StampedFiles(ABC):
             raise DatasetError(f"{folder}: no sweeps ({pattern})")
         found.sort()
         self._files = [file for _, file in found]
-        self.stamps: IntArray = np.array([stamp for stamp, _ in found], dtype=np.int64)
-
-    def __len__(self) -> int:
-        return len(self._files)
-
-    def __iter__(self) -> Iterator[Scan | BadSweep]:
-        for file, stamp in zip(self._files, self.stamps.tolist(), strict=True):
-            try:
-                yield self._read(file, stamp)
-            except DatasetError as error:
-                yield BadSweep(stamp, str(error))
+        self.stamps = np.array([stamp for stamp, _ in found], dtype=np.int64)
 
     @property
     @abstractmethod
@@ -91,9 +80,6 @@ class StampedFiles(ABC):
     @abstractmethod
     def truth(self) -> Trajectory | None:
         """Poses of the lidar if the data comes with them."""
-
-    @abstractmethod
-    def _read(self, file: Path, stamp: int) -> Scan: ...
 
     @abstractmethod
     def _sweep_facts(self) -> dict[str, str]:

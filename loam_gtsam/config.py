@@ -348,6 +348,12 @@ class MatchingConfig(_Section):
         source="LOAM has none",
         low=1.0,
     )
+    wide_below: float = _param(
+        8.0,
+        "search for lines, too, by wide_search times max_distance, if fewer planes than this fix a "
+        "translation, counted as if they lay across it",
+        low=0.0,
+    )
     line_ratio: float = _param(
         10.0,
         "a line needs its largest eigenvalue above this times the second",

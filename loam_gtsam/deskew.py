@@ -14,7 +14,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import cross, move_points, voxel_filter
 from loam_gtsam.imu import ImuBuffer
-from loam_gtsam.types import Features, FloatArray, SweepMotion
+from loam_gtsam.types import Features, FloatArray, IntArray, SweepMotion
 
 _DISTINCT = 4.5
 """Standard deviations of range noise by which a distinct edge stands out of its ring."""
@@ -40,7 +40,7 @@ class MovingSweep:
     stamp : nanoseconds of the middle of the sweep
     middle : seconds from the one to the other; 0 if the features do not move
     duration : seconds of the sweep; 0 likewise
-    edges, planes : (E, 3) and (P, 3) metres, seen from the middle of the sweep
+    n_edges, n_planes : how many there are
     distinct : (E,) whether an edge stands out of its ring by more than range noise makes it
     motion : what the rotation comes from
     not_finite : points of the sweep that were NaN or infinite
@@ -73,7 +73,9 @@ class MovingSweep:
         self.distinct = filtered[0][:, 4] > _DISTINCT * config.features.range_noise
         self._points = [part[:, :3] for part in filtered]
         self._seconds = [part[:, 3] - self.middle for part in filtered]
-        self.edges, self.planes = self._points
+        self.n_edges, self.n_planes = map(len, self._points)
+        self._twist: FloatArray | None = None
+        self._all: tuple[FloatArray, FloatArray] | None = None
         self.motion = SweepMotion.CONSTANT_VELOCITY if moving else SweepMotion.NONE
         self._turned: list[FloatArray] | None = None
         span = np.array([first, 0.0, end]) - self.middle
@@ -90,30 +92,52 @@ class MovingSweep:
                 before, reference, after = turns[:3]
                 self._rate = (after - before) / (span[2] - span[0])
                 self._middle_R_reference: FloatArray = Rotation.from_rotvec(reference).as_matrix()
-                split = 3 + len(self.edges)
+                split = 3 + self.n_edges
                 parts = turns[3:split], turns[split:]
                 self._turned = [_rotated(*part) for part in zip(self._points, parts, strict=True)]
 
     @property
     def is_empty(self) -> bool:
         """Whether there is no feature at all."""
-        return len(self.edges) + len(self.planes) == 0
+        return self.n_edges + self.n_planes == 0
+
+    @property
+    def edges(self) -> FloatArray:
+        """(E, 3) metres, seen from the middle of the sweep."""
+        return self._deskewed()[0]
+
+    @property
+    def planes(self) -> FloatArray:
+        """(P, 3) metres, seen from the middle of the sweep."""
+        return self._deskewed()[1]
 
     def deskew(self, twist: FloatArray) -> None:
         """Set ``edges`` and ``planes`` for a (6,) body velocity at the reference time."""
-        if self.motion is SweepMotion.NONE:
-            return
+        if self.motion is not SweepMotion.NONE:
+            self._twist, self._all = twist, None
+
+    def some(self, edges: IntArray, planes: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Those of ``edges`` and ``planes`` in some rows."""
+        return self._part(0, edges), self._part(1, planes)
+
+    def _deskewed(self) -> tuple[FloatArray, FloatArray]:
+        if self._all is None:
+            self._all = self._part(0), self._part(1)
+        return self._all
+
+    def _part(self, which: int, rows: IntArray | None = None) -> FloatArray:
+        """Edges (0) or planes (1), de-skewed; all if there are no rows."""
+        twist = self._twist
+        points, seconds = self._points[which], self._seconds[which]
+        if twist is not None and self._turned is not None:
+            points = self._turned[which]
+        if rows is not None:
+            points, seconds = points.take(rows, axis=0), seconds.take(rows)
+        if twist is None:
+            return points
         if self._turned is None:
-            self.edges, self.planes = (
-                move_points(points, twist, seconds)
-                for points, seconds in zip(self._points, self._seconds, strict=True)
-            )
-            return
-        velocity = self._middle_R_reference @ twist[3:]
-        self.edges, self.planes = (
-            points + np.outer(seconds, velocity)
-            for points, seconds in zip(self._turned, self._seconds, strict=True)
-        )
+            return move_points(points, twist, seconds)
+        return points + np.outer(seconds, self._middle_R_reference @ twist[3:])
 
     def middle_T_reference(self, twist: FloatArray) -> gtsam.Pose3:
         """The lidar at the reference time seen from the middle of the sweep."""

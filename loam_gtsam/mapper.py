@@ -22,7 +22,7 @@ from loam_gtsam.frame_report import Clock, named, report, way
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.imu_aid import ImuAid
-from loam_gtsam.matching import ScanMatches, associate, moved, renew, trial
+from loam_gtsam.matching import ScanMatches, chosen_rows, match_features, moved, renew, trial
 from loam_gtsam.odometry import ConstantVelocity, Guess, advance
 from loam_gtsam.relocalization import Fit, Watch, places, some
 from loam_gtsam.solvers import (
@@ -584,9 +584,7 @@ class _Association:
     @property
     def offered(self) -> int:
         """Features to match."""
-        most = self._matching.max_edges or np.inf, self._matching.max_planes or np.inf
-        sweep = self._sweep
-        return int(min(len(sweep.edges), most[0]) + min(len(sweep.planes), most[1]))
+        return sum(map(len, self._rows))
 
     def stay(self) -> None:
         """Take the sweep as it is de-skewed now."""
@@ -594,7 +592,11 @@ class _Association:
 
     def use(self, matching: MatchingConfig) -> None:
         """Go on with another configuration, and without the matches found so far."""
+        sweep, distinct = self._sweep, self._sweep.distinct
+        known = None if distinct.all() else distinct
         self._matching = matching
+        self._rows = chosen_rows(sweep.n_edges, sweep.n_planes, matching, known)
+        self._distinct = None if known is None else known[self._rows[0]]
         self._found: tuple[CubeMap, gtsam.Pose3, ScanMatches] | None = None
 
     def __call__(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:
@@ -607,12 +609,13 @@ class _Association:
             sweep.deskew(mapper._twist(sweep, map_T_lidar, self._guess.twist))
             if self._found is not None:
                 cubes, searched, found = self._found
-                self._found = cubes, searched, moved(found, sweep.edges, sweep.planes)
+                points = sweep.some(found.edges.indices, found.planes.indices)
+                self._found = cubes, searched, moved(found, *points)
         matches = self._kept(map_T_lidar)
         if matches is None:
-            features = sweep.edges, sweep.planes, map_T_lidar
+            features = *sweep.some(*self._rows), map_T_lidar
             maps = mapper.edge_map, mapper.plane_map
-            matches = associate(*features, *maps, self._matching, sweep.distinct)
+            matches = match_features(*features, *maps, self._matching, self._distinct)
             wide = self._matching.wide_search
             self.wide = len(matches) < mapper.config.solver.min_matches and wide > 1.0
             if self.wide:
@@ -621,7 +624,8 @@ class _Association:
                 reach = wide * self._matching.max_distance
                 maps = mapper.edge_map.thinned(wide), mapper.plane_map.thinned(wide)
                 matching = replace(self._matching, max_distance=reach)
-                matches = associate(*features, *maps, matching, sweep.distinct)
+                matches = match_features(*features, *maps, matching, self._distinct)
+            matches = matches.at_rows(*self._rows)
             self._found = mapper.plane_map, map_T_lidar, matches
         self._clock.lap("match")
         return matches

@@ -88,6 +88,13 @@ class ScanMatches:
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
 
+    def at_rows(self, edge_rows: IntArray, plane_rows: IntArray) -> ScanMatches:
+        """The same with the rows (E,) and (P,) that the matched features have among others."""
+        e, p = self.edges, self.planes
+        return ScanMatches(
+            replace(e, indices=edge_rows[e.indices]), replace(p, indices=plane_rows[p.indices])
+        )
+
 
 def associate(
     edges: FloatArray,
@@ -109,33 +116,73 @@ def associate(
     map_T_lidar : pose at which to associate
     edge_map, plane_map : the maps
     distinct : (E,) see :class:`EdgeMatches`; all are if None. They are matched before others, and
-        searched for more widely (``wide_search``) where no line is near.
+        searched for more widely (``wide_search``) where no line is near and the planes leave a
+        translation open.
     """
+    if distinct is not None and distinct.all():
+        distinct = None
+    rows = chosen_rows(len(edges), len(planes), config, distinct)
+    found = match_features(
+        edges.take(rows[0], axis=0),
+        planes.take(rows[1], axis=0),
+        map_T_lidar,
+        edge_map,
+        plane_map,
+        config,
+        None if distinct is None else distinct[rows[0]],
+    )
+    return found.at_rows(*rows)
+
+
+def chosen_rows(
+    edges: int, planes: int, config: MatchingConfig, distinct: BoolArray | None = None
+) -> tuple[IntArray, IntArray]:
+    """Which of so many edges and planes are matched, see :func:`associate`."""
+    return spread(edges, config.max_edges, distinct), spread(planes, config.max_planes)
+
+
+def match_features(
+    edges: FloatArray,
+    planes: FloatArray,
+    map_T_lidar: gtsam.Pose3,
+    edge_map: CubeMap,
+    plane_map: CubeMap,
+    config: MatchingConfig,
+    distinct: BoolArray | None = None,
+) -> ScanMatches:
+    """Match all of the features; parameters are those of :func:`associate`."""
     pose = map_T_lidar.matrix()
-    edge_rows = spread(len(edges), config.max_edges, distinct)
-    plane_rows = spread(len(planes), config.max_planes)
-    edges, planes = edges.take(edge_rows, axis=0), planes.take(plane_rows, axis=0)
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
     k, limit = config.neighbours, config.max_distance
     around = edge_map.neighbourhood(pose)
     near_edges = edge_map.nearest(edges_map, k, limit, around)
     near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
     lines = match_lines(edges, edges_map, *near_edges, pose, config)
-    if distinct is not None and config.wide_search > 1.0 and not distinct.all():
+    surfaces = match_planes(planes, planes_map, *near_planes, pose, config)
+    if distinct is None:
+        return ScanMatches(lines, surfaces)
+    alone = distinct.copy()
+    alone[lines.indices] = False
+    rows = np.flatnonzero(alone)
+    if config.wide_search > 1.0 and len(rows) and _fixed_by(surfaces) < config.wide_below:
         # A pole that few beams met has no five points within max_distance.
-        alone = distinct[edge_rows]
-        alone[lines.indices] = False
-        rows, reach = np.flatnonzero(alone), config.wide_search * limit
+        reach = config.wide_search * limit
         near_edges = edge_map.nearest(edges_map[rows], k, reach, around)
         wide = replace(config, max_distance=reach)
         more = match_lines(edges[rows], edges_map[rows], *near_edges, pose, wide)
         lines = _joined(lines, replace(more, indices=rows[more.indices]))
-    surfaces = match_planes(planes, planes_map, *near_planes, pose, config)
-    chosen = edge_rows[lines.indices]
-    return ScanMatches(
-        replace(lines, indices=chosen, distinct=None if distinct is None else distinct[chosen]),
-        replace(surfaces, indices=plane_rows[surfaces.indices]),
-    )
+    return ScanMatches(replace(lines, distinct=distinct[lines.indices]), surfaces)
+
+
+def _fixed_by(planes: PlaneMatches) -> float:
+    """Planes across the translation that they fix least, less what noise makes of their normals.
+
+    The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviations of the normals.
+    Planes that fix three translations face three ways, and with that they fix the turns.
+    """
+    tilts = np.zeros(len(planes)) if planes.tilts is None else planes.tilts
+    across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
+    return float(np.linalg.eigvalsh(across)[0])
 
 
 def spread(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
@@ -164,9 +211,10 @@ def trial(config: MatchingConfig) -> MatchingConfig:
 
 
 def moved(matches: ScanMatches, edges: FloatArray, planes: FloatArray) -> ScanMatches:
-    """The same lines and planes for features that were de-skewed anew, (E, 3) and (P, 3) metres."""
-    e, p = matches.edges, matches.planes
-    return ScanMatches(replace(e, points=edges[e.indices]), replace(p, points=planes[p.indices]))
+    """The same lines and planes for their features de-skewed anew, (M, 3) metres each."""
+    return ScanMatches(
+        replace(matches.edges, points=edges), replace(matches.planes, points=planes)
+    )
 
 
 def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig) -> ScanMatches:

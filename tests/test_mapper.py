@@ -280,8 +280,9 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     for i in range(3):
         mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
     calls = []
-    real = mapper_module.associate
-    monkeypatch.setattr(mapper_module, "associate", lambda *args: calls.append(1) or real(*args))
+    real = mapper_module.match_features
+    count = lambda *args: calls.append(1) or real(*args)  # noqa: E731
+    monkeypatch.setattr(mapper_module, "match_features", count)
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
     update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
     assert (update.iterations, len(calls)) == (2, searches)

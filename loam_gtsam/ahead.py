@@ -15,7 +15,7 @@ from multiprocessing import get_context
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Sweep
-from loam_gtsam.features import extract_features
+from loam_gtsam.features import extract_features, thinned
 from loam_gtsam.types import Features, Scan, SweepError, SweepFault
 
 _AHEAD = 2
@@ -40,6 +40,9 @@ def extract(scan: Scan, config: Config) -> Extraction:
     features, problem, fault = None, "", None
     try:
         features = extract_features(scan, config)
+        if config.odometry.method == "constant_velocity":
+            # The mapper would do it, and nobody else needs them all.
+            features = thinned(features, config.map)
     except SweepError as error:
         problem, fault = str(error), error.fault
     return Extraction(features, problem, time.perf_counter() - started, fault)

@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-from scipy.linalg import eigh
 
 from loam_gtsam.factors import complement_basis
 from loam_gtsam.geometry import cross
@@ -113,7 +112,7 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     noise = _displacements(points, (weights * tilts) ** 2)
     unit = _displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
     floor = np.finfo(np.float64).eps * (np.trace(noise) + 1.0)
-    _, columns = eigh(information, noise + floor * (unit + np.eye(6)))
+    columns = _eigenvectors(information, noise + floor * (unit + np.eye(6)))
     scale = np.sqrt(np.einsum("ik,ij,jk->k", columns, unit, columns))
     directions = columns.T / np.maximum(scale, floor)[:, None]
 
@@ -183,10 +182,17 @@ def _sight(
     seen = cross(points.T, normals.T).T @ turn.T + normals @ shift.T
     # |shift + turn x p|^2 for all points and directions, as products of small matrices
     moved = np.outer((points**2).sum(axis=1), (turn**2).sum(axis=1)) - (points @ turn.T) ** 2
-    moved += 2.0 * points @ np.cross(shift, turn).T + (shift**2).sum(axis=1)
+    moved += 2.0 * points @ cross(shift.T, turn.T) + (shift**2).sum(axis=1)
     moved = np.maximum(moved, _MOVED**2)
     squared = seen**2 / moved
     return np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0)
+
+
+def _eigenvectors(form: FloatArray, noise: FloatArray) -> FloatArray:
+    """(6, 6) generalised eigenvectors of two forms, as columns; a third of scipy's time."""
+    inverse = np.linalg.inv(np.linalg.cholesky(noise))
+    columns: FloatArray = inverse.T @ np.linalg.eigh(inverse @ form @ inverse.T)[1]
+    return columns
 
 
 def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:

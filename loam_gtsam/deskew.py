@@ -12,9 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config
 from loam_gtsam.freezing import checkpointed
-from loam_gtsam.geometry import cross, move_points, voxel_filter
+from loam_gtsam.features import thinned
+from loam_gtsam.geometry import cross, move_points
 from loam_gtsam.imu import ImuBuffer
-from loam_gtsam.types import Features, FloatArray, IntArray, SweepMotion
+from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, SweepMotion
 
 _DISTINCT = 4.5
 """Standard deviations of range noise by which a distinct edge stands out of its ring."""
@@ -61,18 +62,15 @@ class MovingSweep:
         self.reference_stamp = features.stamp
         self.not_finite = features.not_finite
         self.stamp = features.stamp + round(self.middle * 1e9)
-        kinks = features.edge_kinks
-        if kinks is None:
-            kinks = np.full(len(features.edges), np.inf)
-        edges = np.column_stack([features.edges, features.edge_times, kinks])
-        planes = np.column_stack([features.planes, features.plane_times])
-        filtered = [
-            voxel_filter(edges, config.map.edge_voxel if thin else 0.0),
-            voxel_filter(planes, config.map.plane_voxel if thin else 0.0),
-        ]
-        self.distinct = filtered[0][:, 4] > _DISTINCT * config.features.range_noise
-        self._points = [part[:, :3] for part in filtered]
-        self._seconds = [part[:, 3] - self.middle for part in filtered]
+        if thin:
+            features = thinned(features, config.map)
+        kinks, least = features.edge_kinks, _DISTINCT * config.features.range_noise
+        self.distinct: BoolArray = (
+            np.ones(len(features.edges), np.bool_) if kinks is None else kinks > least
+        )
+        self._points = [features.edges, features.planes]
+        times = features.edge_times, features.plane_times
+        self._seconds = [part - self.middle for part in times]
         self.n_edges, self.n_planes = map(len, self._points)
         self._twist: FloatArray | None = None
         self._all: tuple[FloatArray, FloatArray] | None = None

@@ -27,7 +27,11 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
+from loam_gtsam.geometry import cross
 from loam_gtsam.types import BoolArray, FloatArray, InputError
+
+_RIDGE = 1e-9
+"""Share of the planes that holds the anchor of :func:`scan_match_factor` where they do not."""
 
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Sequence[FloatArray]]]
 """Maps values to (residual (m,), one Jacobian (m, dim) per key)."""
@@ -350,25 +354,19 @@ def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:
     Map coordinates are taken from the anchor, a point on the planes, so that the entries of L stay
     of the size of a scan however far the map extends, and the squared form loses no digits.
     """
-    normals = rows.scales[:, None] * rows.normals
-    offsets = rows.scales * rows.offsets
-    solved, *_ = np.linalg.lstsq(normals.T @ normals, -normals.T @ offsets, rcond=1e-9)
-    anchor: FloatArray = solved.astype(np.float64, copy=False)
-    matrix = np.empty((len(offsets), 13))
-    np.multiply(normals[:, :, None], rows.points[:, None, :], out=_as_3x3(matrix))
-    matrix[:, 9:12] = normals
-    matrix[:, 12] = offsets + normals @ anchor
-    values, vectors = np.linalg.eigh(matrix.T @ matrix)
+    normals = np.ascontiguousarray(rows.normals.T) * rows.scales
+    offsets = rows.offsets * rows.scales
+    across = normals @ normals.T
+    # Where no plane fixes it the anchor stays near the origin.
+    held = across + (_RIDGE * np.trace(across)) * np.eye(3)
+    anchor: FloatArray = np.linalg.solve(held, -normals @ offsets).astype(np.float64, copy=False)
+    matrix = np.empty((13, len(offsets)))
+    np.multiply(normals[:, None], rows.points.T, out=matrix[:9].reshape(3, 3, -1))
+    matrix[9:12] = normals
+    matrix[12] = offsets + anchor @ normals
+    values, vectors = np.linalg.eigh(matrix @ matrix.T)
     root: FloatArray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
     return anchor, root
-
-
-def _as_3x3(matrix: FloatArray) -> FloatArray:
-    """View of the first nine columns as (M, 3, 3)."""
-    view: FloatArray = np.lib.stride_tricks.as_strided(
-        matrix, (len(matrix), 3, 3), (matrix.strides[0], 3 * matrix.strides[1], matrix.strides[1])
-    )
-    return view
 
 
 _GENERATORS = np.zeros((3, 3, 3))
@@ -398,7 +396,7 @@ def _row_residuals(
     rotation = map_T_lidar.rotation().matrix()
     local = normals @ rotation
     residual = np.einsum("ij,ij->i", local, points) + normals @ map_T_lidar.translation() + offsets
-    return residual, np.hstack([np.cross(points, local), local])
+    return residual, np.hstack([cross(points.T, local.T).T, local])
 
 
 def _pose_factor(

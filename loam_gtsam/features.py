@@ -18,10 +18,13 @@ the published code:
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, FeatureConfig
+from loam_gtsam.config import Config, FeatureConfig, MapConfig
+from loam_gtsam.geometry import voxel_filter
 from loam_gtsam.posts import Posts, find_posts
 from loam_gtsam.sweep import OrganisedSweep, organise
 from loam_gtsam.types import (
@@ -106,6 +109,39 @@ def extract_features(scan: Scan, config: Config) -> Features:
     rest[edges] = False
     rest[flat] = False
     return _assemble(scan, config, sweep, edges, rank, flat, np.flatnonzero(rest), posts)
+
+
+def thinned(features: Features, config: MapConfig) -> Features:
+    """The centroids of the features in each voxel, at their mean times: what the mapper matches.
+
+    Thinned features stay as they are. Beams are not kept (``edge_rings`` and ``plane_rings`` are
+    0), nor which features are the most pronounced (``sharp`` and ``flat`` are empty).
+
+    Parameters
+    ----------
+    features : of a sweep
+    config : ``edge_voxel`` and ``plane_voxel`` are used
+    """
+    kinks = features.edge_kinks
+    if kinks is None:
+        kinks = np.full(len(features.edges), np.inf)
+    edges = np.column_stack([features.edges, features.edge_times, kinks])
+    planes = np.column_stack([features.planes, features.plane_times])
+    edges = voxel_filter(edges, config.edge_voxel)
+    planes = voxel_filter(planes, config.plane_voxel)
+    none: IntArray = np.empty(0, np.int64)
+    return replace(
+        features,
+        edges=edges[:, :3].copy(),
+        planes=planes[:, :3].copy(),
+        edge_times=edges[:, 3].copy(),
+        plane_times=planes[:, 3].copy(),
+        edge_rings=np.zeros(len(edges), np.int64),
+        plane_rings=np.zeros(len(planes), np.int64),
+        sharp=none,
+        flat=none,
+        edge_kinks=edges[:, 4].copy(),
+    )
 
 
 def _squared_norm(xyz: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -205,6 +205,8 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     if size <= 0.0 or len(points) == 0:
         return np.asarray(points, dtype=np.float64)
     keys = voxel_keys(points, size)
+    if (keys[1:] > keys[:-1]).all():  # filtered already
+        return np.asarray(points, dtype=np.float64)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
@@ -216,9 +218,10 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
 
 def find(held: IntArray, keys: IntArray) -> tuple[IntArray, BoolArray]:
     """Where (N,) keys are or belong among (M,) sorted ones, and which are there."""
-    at = np.searchsorted(held, keys)
-    taken: BoolArray = at < len(held)
-    taken[taken] = held[at[taken]] == keys[taken]
+    at: IntArray = held.searchsorted(keys)
+    if len(held) == 0:
+        return at, np.zeros(len(keys), np.bool_)
+    taken: BoolArray = held.take(at, mode="clip") == keys
     return at, taken
 
 

@@ -360,7 +360,8 @@ def match_rows(
     edge_units, plane_units = e.distances / e.sigmas, np.abs(p.distances) / p.sigmas
     edge_weights, plane_weights = e.weights, p.weights
     if len(matches) and np.isfinite(kernel_width):
-        scatter = _TO_SIGMA * float(np.median(np.concatenate([edge_units, plane_units])))
+        units, half = np.concatenate([edge_units, plane_units]), len(matches) // 2
+        scatter = _TO_SIGMA * float(np.partition(units, half)[half])
         width = kernel_width * max(1.0, scatter)
         edge_weights = edge_weights * _kept(edge_units, width, kernel)
         plane_weights = plane_weights * _kept(plane_units, width, kernel)

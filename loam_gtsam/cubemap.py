@@ -12,7 +12,7 @@ cubes that are searched together: a sweep touches a dozen, most of them with a h
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any, NamedTuple
@@ -362,9 +362,9 @@ class CubeMap:
                 search.add({index: self._cubes[index].points for index in sorted(new)})
                 break
         else:
-            search = _Search(held, self.points(held))
+            search = _Search(held, self._parts(held))
         if search.is_stale:
-            search = _Search(held, self.points(held))
+            search = _Search(held, self._parts(held))
         self._searches = [*self._searches[1 - _SEARCHES :], search]
         return search
 
@@ -379,8 +379,7 @@ class CubeMap:
         archived : with ``cubes=None``, include the archive: the whole map
         """
         if cubes is not None:
-            held = sorted({index for index in cubes if index in self._cubes})
-            parts = [self._cubes[index].points for index in held]
+            parts = self._parts({index for index in cubes if index in self._cubes})
         else:
             everywhere = {index: cube.points for index, cube in self._cubes.items()}
             if archived:
@@ -390,6 +389,10 @@ class CubeMap:
                         everywhere[index] = stored.points
             parts = [everywhere[index] for index in sorted(everywhere)]
         return np.concatenate([_NO_POINTS, *parts])
+
+    def _parts(self, held: set[CubeIndex]) -> list[FloatArray]:
+        """Points of cubes of the window, in the order of the cubes."""
+        return [self._cubes[index].points for index in sorted(held)]
 
     def thinned(self, factor: float) -> CubeMap:
         """The points of the window in a map of their own, with voxels this times as large."""
@@ -443,6 +446,35 @@ class _Voxels(NamedTuple):
         return _Voxels(*[column[which] for column in self])  # type: ignore[arg-type]
 
 
+class _Tree:
+    """A kd-tree, and a row of NaN behind its points, which stands for a neighbour that is missing.
+
+    Parameters
+    ----------
+    parts : (N, 3) each, metres
+    """
+
+    def __init__(self, parts: Sequence[FloatArray]) -> None:
+        self._points = np.concatenate([*parts, [[np.nan] * 3]])
+        self._tree: Any = cKDTree(self.points, **_TREE)
+
+    def __len__(self) -> int:
+        return len(self._points) - 1
+
+    @property
+    def points(self) -> FloatArray:
+        """(N, 3) metres."""
+        return self._points[:-1]
+
+    def query(
+        self, queries: FloatArray, k: int, max_distance: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Points (M, k, 3) and squared distances (M, k); NaN and infinite if missing."""
+        distances, found = self._tree.query(queries, k, distance_upper_bound=max_distance)
+        squared: FloatArray = (distances * distances).reshape(-1, k)
+        return self._points.take(found.reshape(-1, k), axis=0), squared
+
+
 @checkpointed
 class _Search:
     """kd-trees over the points of a set of cubes, while the points in them do not change.
@@ -450,19 +482,20 @@ class _Search:
     Points added later are searched in a small tree of their own until there are too many.
     """
 
-    def __init__(self, cubes: set[CubeIndex], points: FloatArray) -> None:
+    def __init__(self, cubes: set[CubeIndex], parts: Sequence[FloatArray]) -> None:
         self.cubes = cubes
-        self._tree = cKDTree(points, **_TREE)
+        self._tree = _Tree(parts)
         self._recent: list[FloatArray] = []
-        self._recent_tree: Any = None
+        self._recent_tree: _Tree | None = None
 
     def __getstate__(self) -> tuple[set[CubeIndex], FloatArray, list[FloatArray]]:
-        return self.cubes, self._tree.data, self._recent
+        return self.cubes, self._tree.points, self._recent
 
     def __setstate__(self, state: tuple[set[CubeIndex], FloatArray, list[FloatArray]]) -> None:
         # A tree is a function of its points in their order.
-        self.__init__(*state[:2])  # type: ignore[misc]
-        self._recent = state[2]
+        cubes, points, recent = state
+        self.__init__(cubes, [points])  # type: ignore[misc]
+        self._recent = recent
 
     def add(self, points: Mapping[CubeIndex, FloatArray]) -> None:
         """Points that were added to cubes; other cubes than those searched do not matter."""
@@ -474,18 +507,18 @@ class _Search:
     @property
     def is_stale(self) -> bool:
         """Whether a new tree of all the points is due."""
-        return sum(map(len, self._recent)) > _RECENT * len(self._tree.data)
+        return sum(map(len, self._recent)) > _RECENT * len(self._tree)
 
     def nearest(
         self, queries: FloatArray, k: int, max_distance: float
     ) -> tuple[FloatArray, FloatArray]:
         """As :meth:`CubeMap.nearest`, in these cubes."""
-        points, squared = _query(self._tree, queries, k, max_distance)
+        points, squared = self._tree.query(queries, k, max_distance)
         if self._recent:
             if self._recent_tree is None:
-                self._recent = [np.concatenate(self._recent)]
-                self._recent_tree = cKDTree(self._recent[0], **_TREE)
-            more_points, more_squared = _query(self._recent_tree, queries, k, max_distance)
+                self._recent_tree = _Tree(self._recent)
+                self._recent = [self._recent_tree.points]
+            more_points, more_squared = self._recent_tree.query(queries, k, max_distance)
             rows = np.flatnonzero(more_squared[:, 0] < squared[:, -1])
             points[rows], squared[rows] = _merge(
                 points[rows], squared[rows], more_points[rows], more_squared[rows]
@@ -507,6 +540,8 @@ class _Content(NamedTuple):
 
     def joined(self, new: _Content) -> _Content:
         """Both; no key is in both."""
+        if len(self.keys) == 0:
+            return new
         keys = np.concatenate((self.keys, new.keys))
         # merges two sorted runs; half of np.insert's time
         order = np.argsort(keys, kind="stable")
@@ -605,17 +640,6 @@ def _group(points: FloatArray, keys: IntArray, first: IntArray) -> _Voxels:
 def _starts(changes: BoolArray) -> IntArray:
     """Where the runs of a non-empty sequence begin, from ``sequence[1:] != sequence[:-1]``."""
     return np.flatnonzero(np.concatenate(([True], changes)))
-
-
-def _query(
-    tree: Any, queries: FloatArray, k: int, max_distance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Points (M, k, 3) and squared distances (M, k) from a tree; NaN and infinite if missing."""
-    distances, found = tree.query(queries, k, distance_upper_bound=max_distance)
-    squared = (distances * distances).reshape(-1, k)
-    points = tree.data.take(found.reshape(-1, k), axis=0, mode="clip")
-    points[np.isinf(squared)] = np.nan
-    return points, squared
 
 
 def _merge(

@@ -176,14 +176,14 @@ class CubeMap:
         """
         pose = _finite(map_T_lidar, "map_T_lidar", (4, 4))
         cell = self._cell_of(pose[:3, 3])
-        ranges = [
-            range(int(c) - n // 2, int(c) - n // 2 + n)
-            for c, n in zip(cell, self._config.neighbourhood, strict=True)
-        ]
-        x, y, z = ranges
+        shape = np.array(self._config.neighbourhood)
+        low = (cell - shape // 2).tolist()
+        high = (cell - shape // 2 + shape).tolist()
         around = tuple(
             sorted(
-                index for index in self._cubes if index[0] in x and index[1] in y and index[2] in z
+                (x, y, z)
+                for x, y, z in self._cubes
+                if low[0] <= x < high[0] and low[1] <= y < high[1] and low[2] <= z < high[2]
             )
         )
         if not around or not self._config.field_of_view:
@@ -248,9 +248,10 @@ class CubeMap:
     def _put(self, points: FloatArray, owners: Owners, *, archive: bool = False) -> None:
         """Insert points; with ``archive`` those outside the window go there."""
         # By component: numpy is several times slower along an axis of three.
-        places = self._cells(points).T - self._low[:, None]
+        axes = np.ascontiguousarray(points.T)
+        places = self._cells(axes) - self._low[:, None]
         inside = ((places >= 0) & (places < self._shape[:, None])).all(axis=0)
-        inside &= (np.abs(points.T) < _VOXEL_LIMIT * self._voxel_size).all(axis=0)
+        inside &= (np.abs(axes) < _VOXEL_LIMIT * self._voxel_size).all(axis=0)
         if not inside.all():
             if archive:
                 self._put_away(points[~inside], owners[~inside])

@@ -100,9 +100,8 @@ def complement_basis(directions: FloatArray) -> FloatArray:
     sign = np.where(z >= 0.0, 1.0, -1.0)
     a = -1.0 / (sign + z)
     b = x * y * a
-    first = np.stack([1.0 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    second = np.stack([b, sign + y * y * a, -y], axis=1)
-    return np.stack([first, second], axis=1)
+    rows = [[1.0 + sign * x * x * a, sign * b, -sign * x], [b, sign + y * y * a, -y]]
+    return np.ascontiguousarray(np.array(rows).transpose(2, 0, 1))
 
 
 @dataclass(frozen=True, slots=True)

@@ -57,7 +57,8 @@ def move_points(
         moved += velocity[:, None] * times
         return np.ascontiguousarray(moved.T)
     axis, angle = omega / rate, rate * times
-    across = np.cross(axis, np.eye(3)).T  # the matrix of k x
+    x, y, z = axis
+    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # k x
     around = across @ moved - (across @ across @ velocity / rate)[:, None]
     inward = across @ around
     around *= np.sin(angle)

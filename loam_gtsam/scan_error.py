@@ -110,12 +110,12 @@ def scan_error(
     Parameters
     ----------
     solution : solved
-    kernel_width, kernel : of the solver, for the weights of the matches
+    kernel_width, kernel : of the solver, for the weights of the matches if it gives no rows
     seen : ground matched so far; this frame's is added
     with_priors : whether the solution's information counts priors beside the matches
     """
     pose = solution.map_T_lidar
-    rows = match_rows(solution.matches, kernel_width, kernel)
+    rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
     residuals, jacobian = rows.residuals(pose)
     if solution.unseen is not None:
         assert solution.beacons is not None

@@ -66,6 +66,7 @@ class Solution:
     unseen : (6, 6) projector onto those that the planes say too little about, where nothing but
         ``beacons`` and the expected motion counts; None if there are none
     beacons : (R,) which rows of the matches count there
+    rows : the matches as the last association weighted them; None if a solver has no such rows
     """
 
     map_T_lidar: gtsam.Pose3
@@ -81,6 +82,7 @@ class Solution:
     weak: FloatArray | None = None
     unseen: FloatArray | None = None
     beacons: BoolArray | None = None
+    rows: MatchRows | None = None
 
     @classmethod
     def unsolved(
@@ -245,6 +247,7 @@ class GtsamSolver:
             weak,
             unseen,
             beacons,
+            rows,
         )
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config
-from loam_gtsam.freezing import checkpointed
 from loam_gtsam.features import thinned
+from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import cross, move_points
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, SweepMotion

@@ -22,7 +22,15 @@ from loam_gtsam.frame_report import Clock, named, report, way
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu import ImuBuffer
 from loam_gtsam.imu_aid import ImuAid
-from loam_gtsam.matching import ScanMatches, chosen_rows, match_features, moved, renew, trial
+from loam_gtsam.matching import (
+    ScanMatches,
+    at_rows,
+    chosen_rows,
+    match_features,
+    moved,
+    renew,
+    trial,
+)
 from loam_gtsam.odometry import ConstantVelocity, Guess, advance
 from loam_gtsam.relocalization import Fit, Watch, places, some
 from loam_gtsam.solvers import (
@@ -625,7 +633,7 @@ class _Association:
                 maps = mapper.edge_map.thinned(wide), mapper.plane_map.thinned(wide)
                 matching = replace(self._matching, max_distance=reach)
                 matches = match_features(*features, *maps, matching, self._distinct)
-            matches = matches.at_rows(*self._rows)
+            matches = at_rows(matches, *self._rows)
             self._found = mapper.plane_map, map_T_lidar, matches
         self._clock.lap("match")
         return matches

@@ -88,13 +88,6 @@ class ScanMatches:
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
 
-    def at_rows(self, edge_rows: IntArray, plane_rows: IntArray) -> ScanMatches:
-        """The same with the rows (E,) and (P,) that the matched features have among others."""
-        e, p = self.edges, self.planes
-        return ScanMatches(
-            replace(e, indices=edge_rows[e.indices]), replace(p, indices=plane_rows[p.indices])
-        )
-
 
 def associate(
     edges: FloatArray,
@@ -131,7 +124,7 @@ def associate(
         config,
         None if distinct is None else distinct[rows[0]],
     )
-    return found.at_rows(*rows)
+    return at_rows(found, *rows)
 
 
 def chosen_rows(
@@ -174,6 +167,14 @@ def match_features(
     return ScanMatches(replace(lines, distinct=distinct[lines.indices]), surfaces)
 
 
+def at_rows(matches: ScanMatches, edge_rows: IntArray, plane_rows: IntArray) -> ScanMatches:
+    """The same with the rows (E,) and (P,) that the features have among those of the sweep."""
+    e, p = matches.edges, matches.planes
+    return ScanMatches(
+        replace(e, indices=edge_rows[e.indices]), replace(p, indices=plane_rows[p.indices])
+    )
+
+
 def _fixed_by(planes: PlaneMatches) -> float:
     """Planes across the translation that they fix least, less what noise makes of their normals.
 
@@ -212,9 +213,7 @@ def trial(config: MatchingConfig) -> MatchingConfig:
 
 def moved(matches: ScanMatches, edges: FloatArray, planes: FloatArray) -> ScanMatches:
     """The same lines and planes for their features de-skewed anew, (M, 3) metres each."""
-    return ScanMatches(
-        replace(matches.edges, points=edges), replace(matches.planes, points=planes)
-    )
+    return ScanMatches(replace(matches.edges, points=edges), replace(matches.planes, points=planes))
 
 
 def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig) -> ScanMatches:

@@ -1,15 +1,13 @@
 """Features extracted ahead, in processes of their own."""
 
 import logging
-from concurrent.futures import Future
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import nullcontext
+import multiprocessing
 
 import numpy as np
 import pytest
 from list_dataset import ListDataset
 
-from loam_gtsam import Config, SimulatedWorld, ahead, run
+from loam_gtsam import Config, SimulatedWorld, run
 from loam_gtsam.ahead import extract, extract_ahead
 from loam_gtsam.types import BadSweep, DatasetError, FrameStatus, Scan
 
@@ -65,28 +63,37 @@ def test_an_error_of_the_data_comes_after_the_sweeps_before_it(sweeps):
         next(found)
 
 
-class DyingPool:
-    """A pool whose process dies over the first sweep."""
+def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog):
+    def kill(number, update):
+        for child in multiprocessing.active_children() if number == 1 else []:
+            child.kill()
+            child.join()
 
-    def __init__(self):
-        self.submitted = 0
-
-    def submit(self, function, sweep):
-        self.submitted += 1
-        if self.submitted > 2:
-            raise BrokenProcessPool
-        future = Future()
-        future.set_exception(BrokenProcessPool())
-        return future
-
-
-def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog, monkeypatch):
-    monkeypatch.setattr(ahead, "_processes", lambda config, workers: nullcontext(DyingPool()))
     with caplog.at_level(logging.WARNING, "loam_gtsam.ahead"):
-        found = list(extract_ahead(numbered(sweeps), Config(), 1))
-    assert [number for _, number, _ in found] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
-    assert {extraction for _, _, extraction in found} == {None}  # for the pipeline to extract
-    assert "died" in caplog.text
+        killed = run(ListDataset(sweeps), workers=1, on_frame=kill)
+    assert caplog.text.count("died") == 1
+    whole = run(ListDataset(sweeps))
+    assert np.array_equal(killed.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
+
+
+def test_the_sweeps_of_a_process_that_died_are_left_to_others(sweeps):
+    found = []
+    for _, number, extraction in extract_ahead(numbered(sweeps), Config(), 1):
+        found.append((number, extraction is None))
+        for child in multiprocessing.active_children():
+            child.kill()
+            child.join()
+    assert [number for number, _ in found] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
+    assert not found[0][1]
+    assert all(missing for _, missing in found[3:])
+
+
+def test_processes_end_with_a_run_that_is_given_up(sweeps):
+    found = extract_ahead(numbered(sweeps), Config(), 2)
+    assert next(found)[2] is not None
+    assert len(multiprocessing.active_children()) == 2
+    found.close()
+    assert multiprocessing.active_children() == []
 
 
 def test_without_processes_nothing_is_read_ahead(sweeps):

@@ -180,7 +180,7 @@ def test_renewed_matches_are_the_old_ones_seen_from_the_new_pose(rng: np.random.
         there = T[:3, :3] @ after.planes.points[match] + T[:3, 3]
         distance = after.planes.normals[match] @ there + after.planes.offsets[match]
         assert after.planes.distances[match] == pytest.approx(distance, abs=1e-12)
-    shifted = moved(found, edges + 1.0, planes + 1.0)
+    shifted = moved(found, found.edges.points + 1.0, found.planes.points + 1.0)
     np.testing.assert_array_equal(shifted.edges.points, found.edges.points + 1.0)
 
 

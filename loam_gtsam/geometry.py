@@ -84,13 +84,10 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def moments(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (3, N) and covariance (6, N: xx, yy, zz, xy, yz, xz) of (N, k, 3) groups of points."""
-    # Always a copy: what follows writes to it.
-    x, y, z = np.array(neighbours.transpose(2, 1, 0), dtype=np.float64, order="C")
+    axes = np.ascontiguousarray(neighbours.transpose(2, 1, 0), dtype=np.float64)
     count = neighbours.shape[1]
-    means = np.stack([x.sum(axis=0), y.sum(axis=0), z.sum(axis=0)]) / count
-    x -= means[0]
-    y -= means[1]
-    z -= means[2]
+    means: FloatArray = axes.sum(axis=1) / count
+    x, y, z = axes - means[:, None]
     pairs = ((x, x), (y, y), (z, z), (x, y), (y, z), (x, z))
     covariance = np.stack([(a * b).sum(axis=0) for a, b in pairs]) / count
     return means, covariance
@@ -123,17 +120,15 @@ def symmetric_eigenvector(matrices: FloatArray, eigenvalues: FloatArray) -> Floa
     """
     a, b, c, d, e, f = matrices
     a, b, c = a - eigenvalues, b - eigenvalues, c - eigenvalues
-    candidates = np.array(
-        [
-            [d * e - f * b, f * d - a * e, a * b - d * d],
-            [b * c - e * e, e * f - d * c, d * e - b * f],
-            [e * f - c * d, c * a - f * f, f * d - e * a],
-        ]
-    )
-    norms = (candidates * candidates).sum(axis=1)
-    best = norms.argmax(axis=0)[None, :]
-    vector: FloatArray = np.take_along_axis(candidates, best[None], axis=0)[0]
-    norm = np.sqrt(np.take_along_axis(norms, best, axis=0)[0])
+    p, q, r = d * e - f * b, e * f - c * d, f * d - a * e
+    vector: FloatArray = np.array([p, r, a * b - d * d])
+    norm = (vector * vector).sum(axis=0)
+    for other in (np.array([b * c - e * e, q, p]), np.array([q, c * a - f * f, r])):
+        squared = (other * other).sum(axis=0)
+        longer = squared > norm
+        np.copyto(vector, other, where=longer)
+        np.copyto(norm, squared, where=longer)
+    norm = np.sqrt(norm)
     degenerate = norm <= 0.0
     if degenerate.any():
         vector[:, degenerate] = [[0.0], [0.0], [1.0]]

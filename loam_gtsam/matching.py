@@ -344,20 +344,23 @@ def match_planes(
     and ``weight_range: map`` give the published forms.
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
-    group = neighbours[near]
+    # Axis by axis in memory, like all that follows.
+    axes = np.ascontiguousarray(neighbours[near].transpose(2, 1, 0))
+    here = np.ascontiguousarray(points_map[near].T)
+    group = axes.transpose(2, 1, 0)
     centres, normals, wide, eigenvalues = fit_planes(group)
     offsets = -_dot(normals, centres)
     if config.plane_fit == "unit_offset":
         normals, offsets = _unit_offset_planes(group)
-    across = _dot(group.transpose(2, 1, 0), normals[:, None, :]) + offsets
+    across = _dot(axes, normals[:, None, :]) + offsets
     is_plane = np.abs(across).max(axis=0) <= config.plane_tolerance
     is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
-    away = points_map[near].T - centres
-    distances = _dot(points_map[near].T, normals) + offsets
-    rays = points_map[near].T - map_T_lidar[:3, 3:]
+    away = here - centres
+    distances = _dot(here, normals) + offsets
+    rays = here - map_T_lidar[:3, 3:]
     ranges = _norm(rays)
     is_plane &= np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
-    reach = _norm(points_map[near].T) if config.weight_range == "map" else ranges
+    reach = _norm(here) if config.weight_range == "map" else ranges
     weights = _plane_weights(distances, reach, config)
     keep = is_plane & (weights > config.min_weight)
     along = _dot(away, wide)

@@ -263,7 +263,9 @@ class CubeMap:
         slots: IntArray = np.ravel_multi_index(tuple(places.astype(np.int64)), self._shape)
         keys = voxel_keys(points, self._voxel_size)
         order = np.lexsort((keys, slots))  # stable: points of a voxel stay in the order given
-        points, keys, slots, owners = points[order], keys[order], slots[order], owners[order]
+        # take is several times faster than an index on rows.
+        points = points.take(order, axis=0)
+        keys, slots, owners = keys[order], slots[order], owners[order]
         first = _starts((slots[1:] != slots[:-1]) | (keys[1:] != keys[:-1]))
         slots = slots[first]
         starts = _starts(slots[1:] != slots[:-1])
@@ -274,7 +276,7 @@ class CubeMap:
         parts = [slice(*ends) for ends in zip(starts.tolist(), stops, strict=True)]
         owners = owners[first]
         if self._config.insertion == "settled":
-            keys, points = keys[first], points[first]
+            keys, points = keys[first], points.take(first, axis=0)
             added = {
                 cell: cube.settle(_Content(keys[part], points[part], owners[part]))
                 for cell, cube, part in zip(found, cubes, parts, strict=True)
@@ -535,9 +537,11 @@ class _Content(NamedTuple):
     points: FloatArray
     owners: Owners
 
-    def at(self, chosen: BoolArray | IntArray) -> _Content:
-        """Some of them: a mask, or rows in ascending order."""
-        return _Content(self.keys[chosen], self.points[chosen], self.owners[chosen])
+    def at(self, rows: IntArray) -> _Content:
+        """Some of them, rows in ascending order."""
+        return _Content(
+            self.keys.take(rows), self.points.take(rows, axis=0), self.owners.take(rows)
+        )
 
     def joined(self, new: _Content) -> _Content:
         """Both; no key is in both."""
@@ -604,7 +608,7 @@ class _Cube:
         """Add the points whose voxels are free, and return them."""
         for held in (self._old.keys, self._new.keys):
             taken = find(held, new.keys)[1]
-            new = new.at(~taken) if taken.any() else new
+            new = new.at(np.flatnonzero(~taken)) if taken.any() else new
         if len(new.keys):
             self._new = self._new.joined(new)
             if len(self._new.keys) > _WAITING * len(self._old.keys):
@@ -617,8 +621,8 @@ class _Cube:
         out = np.isin(self._old.owners, owners)
         if not out.any():
             return CubePoints(_NO_POINTS, _EMPTY.owners)
-        gone = self._old.at(out)
-        self._old = self._old.at(~out)
+        gone = self._old.at(np.flatnonzero(out))
+        self._old = self._old.at(np.flatnonzero(~out))
         return CubePoints(gone.points, gone.owners)
 
     def _take_in(self) -> None:

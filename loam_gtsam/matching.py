@@ -292,7 +292,7 @@ def match_lines(
     map_T_lidar : (4, 4) the pose; the rings go round its z axis
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
-    centres, directions, eigenvalues = fit_lines(neighbours[near])
+    centres, directions, eigenvalues = fit_lines(neighbours.take(near, axis=0))
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
     ring = cross(map_T_lidar[:3, 2], points_map[near].T - map_T_lidar[:3, 3:])
     is_line &= np.abs(_dot(directions, ring)) <= (config.max_ring_cosine + _TINY) * _norm(ring)
@@ -345,8 +345,8 @@ def match_planes(
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
     # Axis by axis in memory, like all that follows.
-    axes = np.ascontiguousarray(neighbours[near].transpose(2, 1, 0))
-    here = np.ascontiguousarray(points_map[near].T)
+    axes = np.ascontiguousarray(neighbours.take(near, axis=0).transpose(2, 1, 0))
+    here = np.ascontiguousarray(points_map.take(near, axis=0).T)
     group = axes.transpose(2, 1, 0)
     centres, normals, wide, eigenvalues = fit_planes(group)
     offsets = -_dot(normals, centres)

@@ -440,7 +440,7 @@ class SolverConfig(_Section):
         low=0.0,
     )
     translation_tolerance: float = _param(
-        0.002, "and less than this", unit="m", source="LOAM uses 0.0005", low=0.0
+        0.0005, "and less than this", unit="m", source="LOAM", low=0.0
     )
     kernel: Literal["huber", "geman_mcclure"] = _param(
         "huber",
@@ -858,13 +858,7 @@ PRESETS: dict[str, Config] = {
         odometry=OdometryConfig(method="scan_to_scan"),
         map=MapConfig(insertion="centroid"),
         matching=_CLASSICAL_MATCHING,
-        solver=SolverConfig(
-            method="loam",
-            translation_tolerance=0.0005,
-            step_sigmas=0.0,
-            min_map_edges=11,
-            min_map_planes=101,
-        ),
+        solver=SolverConfig(method="loam", step_sigmas=0.0, min_map_edges=11, min_map_planes=101),
         imu=ImuConfig(prior="blend", weight=0.002, average_seconds=0.0),
         relocalization=RelocalizationConfig(enabled=False),
     ),
@@ -879,7 +873,6 @@ PRESETS: dict[str, Config] = {
             method="aloam",
             iterations=2,
             inner_iterations=4,
-            translation_tolerance=0.0005,
             step_sigmas=0.0,
             min_matches=6,  # A-LOAM has no minimum; fewer cannot fix a pose
             min_map_edges=11,

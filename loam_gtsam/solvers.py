@@ -315,8 +315,8 @@ def fuse(
 def within_tolerance(step: FloatArray, information: FloatArray, config: SolverConfig) -> bool:
     """Whether a (6,) step is small enough to stop: LOAM's rule, or small for what is known.
 
-    In a direction that the scan hardly fixes, re-association goes to and fro by more than the
-    tolerance for ever. Such steps are far below the standard deviation in that direction.
+    In a direction that the scan hardly fixes, re-association goes to and fro by more than LOAM's
+    half millimetre for ever. Such steps are far below the standard deviation in that direction.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ from loam_gtsam.geometry import find, transform, voxel_keys
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
 
 _COS_VIEW = np.sqrt(3.0) / 2.0  # cos 30 degrees: LOAM's field of view is 30 to 150 off the up axis
-_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3)))  # of a cube, from its centre
+_CORNERS = np.array(list(product((-0.5, 0.5), repeat=3))).T[:, None]  # of a cube, from its centre
 _VOXEL_LIMIT = (1 << 20) - 1  # voxels on either side of the origin that voxel_keys tells apart
 _RECENT = 0.1  # a tree is rebuilt when points added since exceed this share of those in it
 _WAITING = 0.1  # new points of a cube are merged in when they exceed this share of the others
@@ -188,9 +188,11 @@ class CubeMap:
         )
         if not around or not self._config.field_of_view:
             return around
-        rays = (np.array(around)[:, None, :] + _CORNERS) * self._config.cube_size - pose[:3, 3]
-        visible = np.abs(rays @ pose[:3, 2]) < _COS_VIEW * np.linalg.norm(rays, axis=2)
-        return tuple(index for index, seen in zip(around, visible.any(axis=1), strict=True) if seen)
+        corners = self._config.cube_size * (np.array(around).T[:, :, None] + _CORNERS)
+        rays = corners - pose[:3, 3, None, None]
+        up = np.tensordot(pose[:3, 2], rays, axes=1)
+        visible = (up**2 < _COS_VIEW**2 * (rays**2).sum(axis=0)).any(axis=1)
+        return tuple(index for index, seen in zip(around, visible.tolist(), strict=True) if seen)
 
     def insert(self, points_map: NDArray[np.floating]) -> None:
         """Add points; each voxel keeps one.

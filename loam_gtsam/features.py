@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, FeatureConfig, MapConfig
-from loam_gtsam.geometry import voxel_filter
+from loam_gtsam.geometry import one_per_voxel, voxel_filter
 from loam_gtsam.posts import Posts, find_posts
 from loam_gtsam.sweep import OrganisedSweep, organise
 from loam_gtsam.types import (
@@ -114,7 +114,7 @@ def extract_features(scan: Scan, config: Config) -> Features:
 def thinned(features: Features, config: MapConfig) -> Features:
     """The centroids of the features in each voxel, at their mean times: what the mapper matches.
 
-    Thinned features stay as they are. Beams are not kept (``edge_rings`` and ``plane_rings`` are
+    Those that are thinned already are returned as they are. Beams are not kept (``edge_rings`` and ``plane_rings`` are
     0), nor which features are the most pronounced (``sharp`` and ``flat`` are empty).
 
     Parameters
@@ -122,13 +122,15 @@ def thinned(features: Features, config: MapConfig) -> Features:
     features : of a sweep
     config : ``edge_voxel`` and ``plane_voxel`` are used
     """
+    sizes = config.edge_voxel, config.plane_voxel
+    if all(map(one_per_voxel, (features.edges, features.planes), sizes)):
+        return features
     kinks = features.edge_kinks
     if kinks is None:
         kinks = np.full(len(features.edges), np.inf)
     edges = np.column_stack([features.edges, features.edge_times, kinks])
     planes = np.column_stack([features.planes, features.plane_times])
-    edges = voxel_filter(edges, config.edge_voxel)
-    planes = voxel_filter(planes, config.plane_voxel)
+    edges, planes = map(voxel_filter, (edges, planes), sizes)
     none: IntArray = np.empty(0, np.int64)
     return replace(
         features,

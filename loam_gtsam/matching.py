@@ -292,11 +292,12 @@ def match_lines(
     map_T_lidar : (4, 4) the pose; the rings go round its z axis
     """
     near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
+    here = np.ascontiguousarray(points_map.take(near, axis=0).T)
     centres, directions, eigenvalues = fit_lines(neighbours.take(near, axis=0))
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
-    ring = cross(map_T_lidar[:3, 2], points_map[near].T - map_T_lidar[:3, 3:])
+    ring = cross(map_T_lidar[:3, 2], here - map_T_lidar[:3, 3:])
     is_line &= np.abs(_dot(directions, ring)) <= (config.max_ring_cosine + _TINY) * _norm(ring)
-    away = points_map[near].T - centres
+    away = here - centres
     along = _dot(away, directions)
     distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))
     weights = _line_weights(distances, config)

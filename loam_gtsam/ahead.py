@@ -7,7 +7,7 @@ import signal
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -158,13 +158,12 @@ def _serve(pipe: Connection, config: Config) -> None:
     """Extract features of what comes out of a pipe, until its other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the caller to handle
     scans: SimpleQueue[Scan | None] = SimpleQueue()
-    # Sweeps are taken in at once: who sends one must not wait for the work on another.
+    found: SimpleQueue[Extraction] = SimpleQueue()
+    # Neither the caller nor this process waits for the other to put down what it is at.
     Thread(target=_take_in, args=(pipe, scans), daemon=True).start()
+    Thread(target=_hand_out, args=(pipe, found), daemon=True).start()
     while (scan := scans.get()) is not None:
-        try:
-            pipe.send(extract(scan, config))
-        except OSError:
-            return
+        found.put(extract(scan, config))
 
 
 def _take_in(pipe: Connection, scans: SimpleQueue[Scan | None]) -> None:
@@ -174,3 +173,9 @@ def _take_in(pipe: Connection, scans: SimpleQueue[Scan | None]) -> None:
         except Exception:  # closed, or in the middle of a sweep
             scans.put(None)
             return
+
+
+def _hand_out(pipe: Connection, found: SimpleQueue[Extraction]) -> None:
+    with suppress(OSError):  # closed
+        while True:
+            pipe.send(found.get())

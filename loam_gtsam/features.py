@@ -114,8 +114,9 @@ def extract_features(scan: Scan, config: Config) -> Features:
 def thinned(features: Features, config: MapConfig) -> Features:
     """The centroids of the features in each voxel, at their mean times: what the mapper matches.
 
-    Those that are thinned already are returned as they are. Beams are not kept (``edge_rings`` and ``plane_rings`` are
-    0), nor which features are the most pronounced (``sharp`` and ``flat`` are empty).
+    Those that are thinned already are returned as they are. Of others, beams are not kept
+    (``edge_rings`` and ``plane_rings`` are 0), nor which are the most pronounced (``sharp`` and
+    ``flat`` are empty).
 
     Parameters
     ----------

@@ -76,6 +76,18 @@ def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog):
     assert np.array_equal(killed.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
 
 
+def test_a_sweep_too_large_for_shared_memory_goes_through_the_pipe(sweeps):
+    first = sweeps[0]
+    times = 1 + 200_000 // len(first.points)
+    large = Scan(np.tile(first.points, (times, 1)), first.stamp)
+    assert large.points.nbytes > 1 << 21
+    scans = [large, first, large]
+    here = [extract(scan, Config()) for scan in scans]
+    there = [found for *_, found in extract_ahead(numbered(scans), Config(), 1)]
+    assert [one.problem for one in here] == [one.problem for one in there]
+    assert np.array_equal(here[1].features.planes, there[1].features.planes)
+
+
 def test_the_sweeps_of_a_process_that_died_are_left_to_others(sweeps):
     found = []
     for _, number, extraction in extract_ahead(numbered(sweeps), Config(), 1):

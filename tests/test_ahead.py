@@ -3,12 +3,16 @@
 import logging
 import multiprocessing
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from list_dataset import ListDataset
 
 from loam_gtsam import Config, SimulatedWorld, run
 from loam_gtsam.ahead import extract, extract_ahead
+from loam_gtsam.config import OdometryConfig
+from loam_gtsam.features import extract_features, thinned
 from loam_gtsam.types import BadSweep, DatasetError, FrameStatus, Scan
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -114,6 +118,18 @@ def test_without_processes_nothing_is_read_ahead(sweeps):
     assert sweep is sweeps[0]
     assert extraction is None
     assert len(list(source)) == len(sweeps) - 1
+
+
+@pytest.mark.parametrize(("method", "thin"), [("constant_velocity", True), ("scan_to_scan", False)])
+def test_features_are_thinned_where_nobody_needs_them_all(sweeps, method, thin):
+    config = replace(Config(), odometry=OdometryConfig(method=method))
+    whole = extract_features(sweeps[0], config)
+    found = extract(sweeps[0], config).features
+    assert (len(found.planes) < len(whole.planes)) is thin
+    if thin:
+        assert np.array_equal(found.planes, thinned(whole, config.map).planes)
+    else:
+        assert np.array_equal(found.planes, whole.planes)
 
 
 def test_extraction_says_why_there_are_no_features(sweeps):

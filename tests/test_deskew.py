@@ -105,6 +105,19 @@ def test_a_known_motion_is_undone(rotation, reference):
 
 
 @pytest.mark.parametrize("rotation", MOTIONS)
+@pytest.mark.parametrize("moved", [False, True])
+def test_some_points_are_de_skewed_as_all_are(rotation, moved):
+    moving = MovingSweep(sweep()[0], config(rotation), buffer())
+    if moved:
+        moving.deskew(twist_at((moving.reference_stamp - START) * 1e-9))
+    rows = np.arange(moving.n_planes)[::7]
+    none = np.empty(0, np.int64)
+    edges, planes = moving.some(none, rows)
+    assert edges.shape == (0, 3)
+    np.testing.assert_allclose(planes, moving.planes[rows], atol=1e-12)
+
+
+@pytest.mark.parametrize("rotation", MOTIONS)
 @pytest.mark.parametrize("reference", [0.0, 0.5, 1.0])
 def test_poses_between_middle_and_reference_are_those_of_the_motion(rotation, reference):
     moving = MovingSweep(sweep(reference)[0], config(rotation), buffer())

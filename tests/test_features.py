@@ -19,6 +19,7 @@ from loam_gtsam.features import (
     roughness,
     sector_bounds,
     squared_gaps,
+    thinned,
     unreliable_points,
     window_fits,
 )
@@ -539,3 +540,34 @@ def test_kitti_and_ouster_sweeps(shared_data: Path) -> None:
         assert len(features.flat) > rings * 12
         assert len(features.edges) < rings * 120
         assert features.plane_rings.max() == rings - 1
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None:
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-2.0, 2.0, (500, 3))
+    times = rng.uniform(0.0, 0.1, 500)
+    raw = Features.from_points(7, points, points[:300])
+    raw = replace(raw, edge_times=times, plane_times=times[:300], span=(0.0, 0.1), not_finite=3)
+    if known:
+        raw = replace(raw, edge_kinks=times + 1.0)
+    config = replace(Config().map, edge_voxel=0.5, plane_voxel=1.0)
+    thin = thinned(raw, config)
+    for size, held, moments, all_points in (
+        (0.5, thin.edges, thin.edge_times, points),
+        (1.0, thin.planes, thin.plane_times, points[:300]),
+    ):
+        cells = [tuple(cell) for cell in np.floor(all_points / size).astype(int)]
+        assert len(held) == len(moments) == len(set(cells))
+        for point, moment in zip(held, moments, strict=True):
+            inside = [cell == tuple(np.floor(point / size).astype(int)) for cell in cells]
+            np.testing.assert_allclose(point, all_points[inside].mean(axis=0), atol=1e-12)
+            assert moment == pytest.approx(times[: len(inside)][inside].mean(), abs=1e-12)
+    assert (thin.stamp, thin.span, thin.not_finite) == (7, (0.0, 0.1), 3)
+    assert thin.edge_kinks is not None
+    expected = thin.edge_times + 1.0 if known else np.full(len(thin.edges), np.inf)
+    np.testing.assert_allclose(thin.edge_kinks, expected)
+    assert len(thin.edge_rings) == len(thin.edges)
+    assert len(thin.plane_rings) == len(thin.planes)
+    assert thinned(thin, config) is thin
+    assert thinned(thin, replace(config, plane_voxel=2.0)) is not thin

@@ -596,6 +596,44 @@ def test_of_too_many_edges_the_distinct_ones_are_matched_and_known_by_their_rows
     np.testing.assert_array_equal(found.edges.distinct, [False, True, True, True])
 
 
+def wall(across, count=169):
+    """Points every 0.5 m on a wall 10 m ahead of the sensor, and features on it."""
+    along, up = np.delete(np.eye(3), np.argmax(across), axis=0)
+    steps = np.arange(-3.0, 3.5, 0.5)
+    a, b = np.meshgrid(steps, steps)
+    points = 10.0 * across + np.outer(a.ravel(), along) + np.outer(b.ravel(), up)
+    return points, points[np.linspace(0, 168, count).astype(int)]
+
+
+@pytest.mark.parametrize(
+    ("walls", "count", "wide_below", "searched"),
+    [
+        ((X, Y, Z), 10, 8.0, False),
+        ((X, Y, Z), 7, 8.0, True),
+        ((X, Y, Z), 7, 5.0, False),
+        ((X, Z), 20, 8.0, True),
+        ((X, Z), 20, 0.0, True),
+    ],
+)
+def test_edges_are_searched_for_widely_where_planes_leave_a_translation_open(
+    walls, count, wide_below, searched
+):
+    held = map_of(poles((5.0, 8.0), spacing=FAR_APART))
+    points, features = zip(*(wall(across, count) for across in walls), strict=True)
+    edges, distinct = np.array([[5, 8, 0.01], [0, -20, 0]]), np.array([True, False])
+    found = associate(
+        edges,
+        np.concatenate(features),
+        gtsam.Pose3(),
+        held,
+        map_of(np.concatenate(points)),
+        changed(wide_below=wide_below),
+        distinct,
+    )
+    assert len(found.planes) == count * len(walls)
+    assert len(found.edges) == searched
+
+
 @pytest.mark.parametrize(("most", "expected"), [(0, (20, 70)), (50, (20, 50)), (10, (10, 10))])
 def test_the_configuration_for_trials_never_matches_more(most, expected):
     config = changed(max_edges=most, max_planes=most, trial_edges=20, trial_planes=70)

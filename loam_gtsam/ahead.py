@@ -52,7 +52,7 @@ def extract(scan: Scan, config: Config) -> Extraction:
     try:
         features = extract_features(scan, config)
         if config.odometry.method == "constant_velocity":
-            # The mapper would do it, and nobody else needs them all.
+            # The mapper would do it, and so less is handed over. Scan to scan needs them all.
             features = thinned(features, config.map)
     except SweepError as error:
         problem, fault = str(error), error.fault

@@ -2,7 +2,6 @@
 
 import logging
 import multiprocessing
-
 from dataclasses import replace
 
 import numpy as np

@@ -181,7 +181,8 @@ def _fixed_by(planes: PlaneMatches) -> float:
     The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviations of the normals.
     Planes that fix three translations face three ways, and with that they fix the turns.
     """
-    tilts = np.zeros(len(planes)) if planes.tilts is None else planes.tilts
+    tilts = planes.tilts
+    assert tilts is not None  # match_planes tells them
     across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
     return float(np.linalg.eigvalsh(across)[0])
 

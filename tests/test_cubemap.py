@@ -361,8 +361,8 @@ def test_field_of_view_against_the_angle(roll: float, pitch: float) -> None:
 def test_neighbourhood_is_as_wide_as_configured() -> None:
     cube_map = CubeMap(MapConfig(neighbourhood=(5, 5, 3), field_of_view=False), 0.4)
     cube_map.insert(50.0 * np.array(list(product(range(-4, 5), repeat=3)), dtype=np.float64))
-    cubes = cube_map.neighbourhood(pose(60.0, 0.0, -30.0))
-    expected = product(range(1 - 2, 1 + 3), range(-2, 3), range(-1 - 1, -1 + 2))
+    cubes = cube_map.neighbourhood(pose(60.0, 0.0, 30.0))
+    expected = product(range(1 - 2, 1 + 3), range(-2, 3), range(1 - 1, 1 + 2))
     assert cubes == tuple(expected)
 
 

@@ -14,7 +14,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.factors import complement_basis
-from loam_gtsam.geometry import cross
+from loam_gtsam.geometry import cross, cross_matrix
 from loam_gtsam.matching import EdgeMatches, ScanMatches, subset
 from loam_gtsam.types import FloatArray
 
@@ -201,8 +201,7 @@ def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:
     second = (points * weights[:, None]).T @ points
     form = np.zeros((6, 6))
     form[:3, :3] = np.trace(second) * np.eye(3) - second
-    x, y, z = first
-    form[:3, 3:] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    form[:3, 3:] = cross_matrix(first)
     form[3:, :3] = form[:3, 3:].T
     form[3:, 3:] = weights.sum() * np.eye(3)
     return form

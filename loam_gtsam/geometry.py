@@ -57,8 +57,7 @@ def move_points(
         moved += velocity[:, None] * times
         return np.ascontiguousarray(moved.T)
     axis, angle = omega / rate, rate * times
-    x, y, z = axis
-    across = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])  # k x
+    across = cross_matrix(axis)
     around = across @ moved - (across @ across @ velocity / rate)[:, None]
     inward = across @ around
     around *= np.sin(angle)
@@ -72,6 +71,12 @@ def move_points(
 
 # Fits work on component arrays, points last: one pass over contiguous memory per operation, several
 # times faster than (N, 3, 3) stacks. A symmetric 3 x 3 matrix is (6, N): xx, yy, zz, xy, yz, xz.
+
+
+def cross_matrix(vector: FloatArray) -> FloatArray:
+    """(3, 3) matrix that takes a vector to its cross product with (3,) ``vector``, on the left."""
+    x, y, z = vector
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:

@@ -600,11 +600,11 @@ class _Association:
 
     def use(self, matching: MatchingConfig) -> None:
         """Go on with another configuration, and without the matches found so far."""
-        sweep, distinct = self._sweep, self._sweep.distinct
-        known = None if distinct.all() else distinct
+        sweep = self._sweep
         self._matching = matching
-        self._rows = chosen_rows(sweep.n_edges, sweep.n_planes, matching, known)
-        self._distinct = None if known is None else known[self._rows[0]]
+        counts = sweep.n_edges, sweep.n_planes
+        edges, planes, self._distinct = chosen_rows(*counts, matching, sweep.distinct)
+        self._rows = edges, planes
         self._found: tuple[CubeMap, gtsam.Pose3, ScanMatches] | None = None
 
     def __call__(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:

@@ -112,26 +112,24 @@ def associate(
         searched for more widely (``wide_search``) where no line is near and the planes leave a
         translation open.
     """
-    if distinct is not None and distinct.all():
-        distinct = None
-    rows = chosen_rows(len(edges), len(planes), config, distinct)
-    found = match_features(
-        edges.take(rows[0], axis=0),
-        planes.take(rows[1], axis=0),
-        map_T_lidar,
-        edge_map,
-        plane_map,
-        config,
-        None if distinct is None else distinct[rows[0]],
-    )
-    return at_rows(found, *rows)
+    edge_rows, plane_rows, known = chosen_rows(len(edges), len(planes), config, distinct)
+    edges, planes = edges.take(edge_rows, axis=0), planes.take(plane_rows, axis=0)
+    found = match_features(edges, planes, map_T_lidar, edge_map, plane_map, config, known)
+    return at_rows(found, edge_rows, plane_rows)
 
 
 def chosen_rows(
     edges: int, planes: int, config: MatchingConfig, distinct: BoolArray | None = None
-) -> tuple[IntArray, IntArray]:
-    """Which of so many edges and planes are matched, see :func:`associate`."""
-    return spread(edges, config.max_edges, distinct), spread(planes, config.max_planes)
+) -> tuple[IntArray, IntArray, BoolArray | None]:
+    """Which of so many edges and planes are matched, and which of those edges are distinct.
+
+    Parameters are those of :func:`associate`. Where all are distinct it is not known which are.
+    """
+    if distinct is not None and distinct.all():
+        distinct = None
+    edge_rows = spread(edges, config.max_edges, distinct)
+    known = None if distinct is None else distinct[edge_rows]
+    return edge_rows, spread(planes, config.max_planes), known
 
 
 def match_features(

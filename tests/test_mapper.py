@@ -281,7 +281,11 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
         mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
     calls = []
     real = mapper_module.match_features
-    count = lambda *args: calls.append(1) or real(*args)  # noqa: E731
+
+    def count(*args):
+        calls.append(1)
+        return real(*args)
+
     monkeypatch.setattr(mapper_module, "match_features", count)
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
     update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from benchmarks import ouster, report
 from benchmarks.cases import CASES, QUICK, ROOT, Case, CaseResult, open_case, run_case
-from loam_gtsam.datasets.kitti import KittiDataset
+from loam_gtsam.datasets.kitti.folder import KittiDataset
 from loam_gtsam.pipeline import run
 from loam_gtsam.types import LoamError
 

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from benchmarks.peers import KissIcp, KissVariant, load, timed_points
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import Dataset, Sweep, open_dataset
-from loam_gtsam.datasets.loam_topics import LoamTopicsDataset
-from loam_gtsam.datasets.tables import read_tum
-from loam_gtsam.evaluation import absolute_error, interpolate
-from loam_gtsam.export import stage_seconds
+from loam_gtsam.datasets.bags.loam_topics import LoamTopicsDataset
+from loam_gtsam.datasets.decode.tables import read_tum
+from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import RunResult, effective_config, run
+from loam_gtsam.studies.evaluation import absolute_error, interpolate
 from loam_gtsam.types import DatasetError, FloatArray, MapUpdate, Scan, Trajectory
 
 ROOT = Path(__file__).resolve().parents[1]

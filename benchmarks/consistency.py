@@ -23,9 +23,9 @@ from scipy.stats import chi2
 
 from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
-from loam_gtsam.covariance import relative_covariance
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.pipeline import run
+from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import FloatArray, MapUpdate
 
 AXES = ("rx", "ry", "rz", "x", "y", "z")

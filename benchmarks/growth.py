@@ -27,9 +27,9 @@ from benchmarks.process import memory, processor_clock
 from loam_gtsam.config import Config, MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld
-from loam_gtsam.datasets.simulation import build_avenue
-from loam_gtsam.evaluation import absolute_error
+from loam_gtsam.datasets.sim.world import build_avenue
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, MapUpdate, Trajectory
 
 STAGES = ("features", "odometry", "prepare", "match", "solve", "insert", "covariance")

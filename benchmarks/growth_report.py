@@ -15,7 +15,7 @@ from benchmarks.recorded import RivalResult
 from benchmarks.report import machine
 from benchmarks.tables import write_csv
 from loam_gtsam.types import FloatArray, IntArray
-from loam_gtsam.visualization import available, plot_curves
+from loam_gtsam.view.plots import available, plot_curves
 
 GROWTH = 1.1
 """Target: time of the last tenth of a run over that of its second tenth (the first has a start-up

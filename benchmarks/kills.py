@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loam_gtsam.export import RUN_FILES, make_folder
+from loam_gtsam.io.run_files import RUN_FILES, make_folder
 
 _BYTES = ("trajectory.tum", "trajectory_kitti.txt", "trajectory_covariance.csv", "map.ply")
 """Files that hold no times."""

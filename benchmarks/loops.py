@@ -21,15 +21,15 @@ import gtsam
 import numpy as np
 
 from benchmarks.tables import write_csv
-from loam_gtsam.ahead import extract
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld, build_city
-from loam_gtsam.evaluation import absolute_error
-from loam_gtsam.keyframes import LoopClosure
-from loam_gtsam.loop_closure import ScanLoopCloser
+from loam_gtsam.frontend.workers import extract
+from loam_gtsam.loops.closure import ScanLoopCloser
+from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config, run
-from loam_gtsam.pose_graph import PoseGraph
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Features, FloatArray, MapUpdate, Scan, Trajectory
 
 DRIFTS = (0.0, 0.005, 0.01, 0.02)

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from benchmarks.cases import ROOT, CaseResult, EvidenceTable, Verdict, stage_times
 from benchmarks.peers import KissIcp, KissVariant, TimedPoints, gicp_step, load
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.kitti import KittiDataset
+from loam_gtsam.datasets.kitti.folder import KittiDataset
 from loam_gtsam.geometry import fit_planes, move_points, transform, voxel_filter
 from loam_gtsam.pipeline import run
 from loam_gtsam.types import FloatArray, Scan

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from loam_gtsam import peers
-from loam_gtsam.datasets.kitti import raise_elevation
-from loam_gtsam.estimators import timed_points as timed_points
-from loam_gtsam.peers import PeerPose, TimedPoints
-from loam_gtsam.peers import version as version
+from loam_gtsam.datasets.kitti.folder import raise_elevation
+from loam_gtsam.studies import peers
+from loam_gtsam.studies.contenders import timed_points as timed_points
+from loam_gtsam.studies.peers import PeerPose, TimedPoints
+from loam_gtsam.studies.peers import version as version
 from loam_gtsam.types import FloatArray
 
 
@@ -48,7 +48,7 @@ class KissIcp(peers.KissIcp):
         self.variant = variant
 
     def register(self, stamp: int, sweep: TimedPoints) -> PeerPose:
-        """See :meth:`loam_gtsam.peers.Peer.register`."""
+        """See :meth:`loam_gtsam.studies.peers.Peer.register`."""
         if self.variant.elevation_deg:
             angle = float(np.radians(self.variant.elevation_deg))
             points = raise_elevation(sweep.points, angle).astype(np.float64)

@@ -13,7 +13,7 @@ from benchmarks.cases import EvidenceTable, Verdict
 from benchmarks.process import processor_clock
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import open_dataset
-from loam_gtsam.export import stage_seconds
+from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import run
 
 MAPPING = ("prepare", "match", "solve", "insert")

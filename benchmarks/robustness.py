@@ -27,16 +27,16 @@ from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
-from loam_gtsam.datasets.disturbances import (
+from loam_gtsam.datasets.sim.disturbances import (
     Disturbed,
     MissingSweeps,
     MovingObjects,
     Outliers,
     SectorDropouts,
 )
-from loam_gtsam.datasets.kidnapping import Kidnapped, SkippedAhead
-from loam_gtsam.evaluation import absolute_error, interpolate
+from loam_gtsam.datasets.sim.kidnapping import Kidnapped, SkippedAhead
 from loam_gtsam.pipeline import effective_config, run
+from loam_gtsam.studies.evaluation import absolute_error, interpolate
 from loam_gtsam.types import FloatArray, Scan, Trajectory
 
 OURS, KISS = "loam_gtsam", "KISS-ICP"

@@ -26,9 +26,9 @@ from benchmarks.scene_tables import NONE, RECORDED, Row, along, drift, tilt, wri
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
-from loam_gtsam.estimators import Ours, Prepared, prepare
-from loam_gtsam.evaluation import absolute_error
 from loam_gtsam.pipeline import effective_config, imu_buffer
+from loam_gtsam.studies.contenders import Ours, Prepared, prepare
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, Scan, Trajectory
 
 SOLVERS = ("default", "loam", "aloam")

@@ -29,11 +29,11 @@ from benchmarks.soak_faults import Expected, FaultyDrive
 from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
-from loam_gtsam.evaluation import absolute_error
-from loam_gtsam.export import summarise
+from loam_gtsam.io.run_files import summarise
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, Trajectory
-from loam_gtsam.visualization import available, plot_curves
+from loam_gtsam.view.plots import available, plot_curves
 
 FRAMES, QUICK = 10_000, 300
 SCENES = {"room": 300, "street_loop": 450}

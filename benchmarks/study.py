@@ -28,12 +28,12 @@ from benchmarks.tables import write_csv
 from loam_gtsam.config import Config, FeatureConfig, MapConfig, preset
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld
-from loam_gtsam.deskew import MovingSweep
-from loam_gtsam.features import extract_features
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import make_solver
-from loam_gtsam.matching import ScanMatches, associate
-from loam_gtsam.solvers import MotionPrior, Solution, match_rows
+from loam_gtsam.registration.association import ScanMatches, associate
+from loam_gtsam.registration.solvers import MotionPrior, Solution, match_rows
 from loam_gtsam.types import BoolArray, FloatArray
 
 SCENES = ("street_loop", "room", "corridor", "trees")

@@ -26,8 +26,8 @@ import typer
 
 import loam_gtsam
 from loam_gtsam import config
-from loam_gtsam._cli_run import RUN_OUTPUTS, RunOptions, execute
-from loam_gtsam.cli import app
+from loam_gtsam.cli.app import app
+from loam_gtsam.cli.run import RUN_OUTPUTS, RunOptions, execute
 from loam_gtsam.datasets import SimulatedWorld
 
 DOCS = Path(__file__).resolve().parent

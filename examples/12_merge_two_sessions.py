@@ -17,7 +17,7 @@ from loam_gtsam import (
     SimulatedWorld,
     extract_features,
 )
-from loam_gtsam.export import write_ply
+from loam_gtsam.io.run_files import write_ply
 
 config = Config()
 config = replace(  # small steps for a small room

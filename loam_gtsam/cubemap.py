@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.cube_archive import Archive, CubeIndex, CubePoints, Owners
-from loam_gtsam.freezing import checkpointed
 from loam_gtsam.geometry import find, transform, voxel_keys
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
+from loam_gtsam.voxels.archive import Archive, CubeIndex, CubePoints, Owners
 
 _COS_VIEW = np.sqrt(3.0) / 2.0  # cos 30 degrees: LOAM's field of view is 30 to 150 off the up axis
 _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3))).T[:, None]  # of a cube, from its centre
@@ -64,7 +63,6 @@ class CubeMapStats:
     outside: int
 
 
-@checkpointed
 class CubeMap:
     """Map points of one feature class, at most one per voxel, searchable around the sensor.
 
@@ -480,7 +478,6 @@ class _Tree:
         return self._points.take(found.reshape(-1, k), axis=0), squared
 
 
-@checkpointed
 class _Search:
     """kd-trees over the points of a set of cubes, while the points in them do not change.
 
@@ -531,7 +528,6 @@ class _Search:
         return points, squared
 
 
-@checkpointed
 class _Content(NamedTuple):
     """Points in ascending order of their voxel keys, and who owns them."""
 
@@ -562,7 +558,6 @@ class _Content(NamedTuple):
 _EMPTY = _Content(_NO_KEYS, _NO_POINTS, np.empty(0, np.int32))
 
 
-@checkpointed
 class _Cube:
     """Points, at most one a voxel.
 

@@ -15,8 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.factors import checked_factor
-from loam_gtsam.freezing import checkpointed
-from loam_gtsam.imu import ImuBuffer
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import FloatArray
 
 STEEPEST_PITCH = np.radians(85.0)
@@ -31,7 +30,6 @@ _EXACT = 1e-12
 """Rad, by which the corrected mean may miss the blend's."""
 
 
-@checkpointed
 @dataclass(frozen=True, slots=True)
 class Level:
     """Which way is up in the map.

@@ -1,7 +1,7 @@
 """The mapper: registers one sweep after another with the cube map.
 
-Within a frame, poses belong to the middle of the sweep (see :mod:`loam_gtsam.deskew`); the result
-is handed out at the reference time of the features.
+Within a frame, poses belong to the middle of the sweep (see
+:mod:`loam_gtsam.frontend.deskew`); the result is handed out at the reference time of the features.
 """
 
 from __future__ import annotations
@@ -13,16 +13,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.classical import ALoamSolver, ClassicalSolver
 from loam_gtsam.config import Config, MatchingConfig, SolverConfig
-from loam_gtsam.covariance import PoseErrors
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.deskew import MovingSweep
-from loam_gtsam.frame_report import Clock, named, report, way
+from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import transform
-from loam_gtsam.imu import ImuBuffer
-from loam_gtsam.imu_aid import ImuAid
-from loam_gtsam.matching import (
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.registration.association import (
     ScanMatches,
     at_rows,
     chosen_rows,
@@ -31,9 +27,13 @@ from loam_gtsam.matching import (
     renew,
     trial,
 )
-from loam_gtsam.odometry import ConstantVelocity, Guess, advance
-from loam_gtsam.relocalization import Fit, Watch, places, some
-from loam_gtsam.solvers import (
+from loam_gtsam.registration.classical import ALoamSolver, ClassicalSolver
+from loam_gtsam.registration.imu_tracker import ImuAid
+from loam_gtsam.registration.odometry import ConstantVelocity, Guess, advance
+from loam_gtsam.registration.pose_errors import PoseErrors
+from loam_gtsam.registration.relocalization import Fit, Watch, places, some
+from loam_gtsam.registration.report import Clock, named, report, way
+from loam_gtsam.registration.solvers import (
     POSE_KEY,
     Associate,
     GtsamSolver,
@@ -41,7 +41,7 @@ from loam_gtsam.solvers import (
     ScanSolver,
     Solution,
 )
-from loam_gtsam.stamps import StampCheck
+from loam_gtsam.registration.stamp_check import StampCheck
 from loam_gtsam.types import (
     ConfigError,
     Features,
@@ -109,8 +109,8 @@ class Mapper:
     ----------
     config : the whole configuration; ``map``, ``matching``, ``solver``, ``deskew`` and ``imu``
         are used
-    solver : anything with :meth:`loam_gtsam.solvers.ScanSolver.solve`; :func:`make_solver` makes
-        it from the configuration if None
+    solver : anything with :meth:`loam_gtsam.registration.solvers.ScanSolver.solve`;
+        :func:`make_solver` makes it from the configuration if None
     imu : samples may be added to it while the mapper runs
     extra_factors : a user's own factors for every sweep: GPS, ground level, wheels, ...
 
@@ -181,8 +181,8 @@ class Mapper:
             the first sweep the origin, levelled by the IMU
         twist : (6,) predicted body velocity during the sweep, rad/s and m/s; that of the last
             sweep if None
-        priors : further factors on :data:`loam_gtsam.solvers.POSE_KEY`, the pose at the middle of
-            the sweep
+        priors : further factors on :data:`loam_gtsam.registration.solvers.POSE_KEY`, the
+            pose at the middle of the sweep
 
         Returns
         -------

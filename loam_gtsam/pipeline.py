@@ -12,17 +12,17 @@ from typing import Any, TypeVar
 import gtsam
 import numpy as np
 
-from loam_gtsam.ahead import Extraction, extract, extract_ahead
-from loam_gtsam.checkpoint import Checkpoint
 from loam_gtsam.config import Config, ImuConfig, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset, Sweep
-from loam_gtsam.imu import ImuBuffer, ImuReport, extrinsic_problem
-from loam_gtsam.imu_aid import ImuAid
+from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead
+from loam_gtsam.imu.buffer import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_prior import Level
-from loam_gtsam.loop_closure import LoopCloser
-from loam_gtsam.loop_mapping import LoopMapping
+from loam_gtsam.io.checkpoint import Checkpoint
+from loam_gtsam.loops.closure import LoopCloser
+from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import ExtraFactors, Mapper
-from loam_gtsam.odometry import Odometry, make_odometry
+from loam_gtsam.registration.imu_tracker import ImuAid
+from loam_gtsam.registration.odometry import Odometry, make_odometry
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
@@ -206,7 +206,7 @@ class Pipeline:
         return replace(update, timings=dict(update.timings) | {"loops": seconds})
 
     def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
-        """What changes from frame to frame, and what does not, for :mod:`loam_gtsam.freezing`."""
+        """What changes from frame to frame, and what does not, for :mod:`loam_gtsam.io.state`."""
         mapper, loops = self.mapper, self.loops
         roots = {"pipeline": self, "mapper": mapper, "odometry": self.odometry}
         shared = {"solver": mapper.solver, **_sections("config", self.config)}
@@ -316,7 +316,7 @@ def run(
         then, with ``error`` set, instead of raising
     extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
     loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
-    observe : e.g. :func:`loam_gtsam.recording.record`, for a bag
+    observe : e.g. :func:`loam_gtsam.view.clouds.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
         needs the usual ``if __name__ == "__main__":``.

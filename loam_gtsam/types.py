@@ -19,8 +19,6 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.freezing import checkpointed
-
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -52,7 +50,6 @@ class OutputError(LoamError):
     """A file or a picture could not be written."""
 
 
-@checkpointed
 class SweepFault(StrEnum):
     """What was wrong with a sweep that was not used."""
 
@@ -70,7 +67,7 @@ class SweepFault(StrEnum):
     """Its beams cannot be told apart."""
     NO_FEATURES = "no_features"
     DUPLICATE_STAMP = "duplicate_stamp"
-    """That of the sweep before; see :mod:`loam_gtsam.stamps` for the other stamps."""
+    """That of the sweep before;  The other stamps: :mod:`loam_gtsam.registration.stamp_check`."""
     LATE = "late"
     """A later sweep has come already."""
     STAMP_BACK = "stamp_back"
@@ -156,7 +153,6 @@ class Scan:
             raise InputError(f"Scan.rows: {len(points)} points do not divide into {self.rows} rows")
 
 
-@checkpointed
 @dataclass(frozen=True, slots=True)
 class Features:
     """Edge and plane points of one sweep, at the positions they were measured (not de-skewed).
@@ -171,8 +167,8 @@ class Features:
         (used by scan-to-scan odometry).
     span : (first, last) seconds from ``stamp`` covered by the sweep.
     edge_kinks : (E,) metres by which each edge stands out of its ring, in the unit in which range
-        noise has its own standard deviation (:func:`loam_gtsam.features.kinks`); None if unknown:
-        all edges then count as real ones.
+        noise has its own standard deviation (``kinks`` of the feature extraction); None if
+        unknown: all edges then count as real ones.
     not_finite : points of the sweep that were NaN or infinite
     """
 
@@ -254,7 +250,6 @@ class BadSweep:
     message: str
 
 
-@checkpointed
 @dataclass(frozen=True, slots=True)
 class ImuSamples:
     """A stretch of IMU data.
@@ -304,7 +299,6 @@ class Trajectory:
         return float(np.linalg.norm(steps, axis=1).sum())
 
 
-@checkpointed
 class FrameStatus(StrEnum):
     """What happened to one frame; see :attr:`solved` for which poses come from a solve."""
 
@@ -335,7 +329,6 @@ class FrameStatus(StrEnum):
         return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED, FrameStatus.DEGENERATE)
 
 
-@checkpointed
 class SweepMotion(StrEnum):
     """Where the rotation within a sweep came from; its translation is a constant velocity."""
 
@@ -346,7 +339,6 @@ class SweepMotion(StrEnum):
     ORIENTATION = "orientation"
 
 
-@checkpointed
 class TiltPrior(StrEnum):
     """How the IMU's roll and pitch acted on a pose (``imu.prior``)."""
 
@@ -361,10 +353,9 @@ class TiltPrior(StrEnum):
     """Asked for, but there is no orientation of that moment (a gap, or the end of the stream)."""
 
 
-@checkpointed
 @dataclass(frozen=True, slots=True)
 class Uncertainty:
-    """The parts of a solved pose's error (:mod:`loam_gtsam.covariance`).
+    """The parts of a solved pose's error (:mod:`loam_gtsam.registration.pose_errors`).
 
     Attributes
     ----------
@@ -386,7 +377,6 @@ class Uncertainty:
     effective_matches: float
 
 
-@checkpointed
 @dataclass(frozen=True, slots=True)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.
@@ -406,7 +396,7 @@ class MapUpdate:
         Zero when the frame was not solved.
     covariance : (6, 6) of the pose in the map, calibrated: the error of this frame and what the map
         has drifted since its start; tangent order of the package. For the motion between two frames
-        see :func:`loam_gtsam.covariance.relative_covariance`. NaN when the frame was not solved.
+        see :func:`loam_gtsam.relative_covariance`. NaN when the frame was not solved.
     uncertainty : the parts of it; None when the frame was not solved
     twist : (6,) body velocity at ``stamp`` (rad/s, m/s) used for the de-skew of the sweep; where
         an IMU gives the rotation within the sweep, its mean

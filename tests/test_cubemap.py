@@ -11,8 +11,8 @@ import pytest
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeIndex, CubeMap
-from loam_gtsam.freezing import freeze, thaw
 from loam_gtsam.geometry import voxel_filter, voxel_keys
+from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 
 ALL_AROUND = MapConfig(field_of_view=False)

@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.imu import ImuBuffer
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu_prior import (
     STEEPEST_PITCH,
     RollPitchPrior,
@@ -22,7 +22,7 @@ from loam_gtsam.imu_prior import (
     tilt_information,
     too_steep,
 )
-from loam_gtsam.solvers import POSE_KEY, fuse
+from loam_gtsam.registration.solvers import POSE_KEY, fuse
 from loam_gtsam.types import ImuSamples
 
 FLAT = gtsam.Rot3()

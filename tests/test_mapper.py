@@ -8,12 +8,12 @@ import pytest
 
 from loam_gtsam import mapper as mapper_module
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.simulation import SimulatedWorld
-from loam_gtsam.features import extract_features
-from loam_gtsam.imu import ImuBuffer
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import imu_buffer
-from loam_gtsam.solvers import POSE_KEY, GtsamSolver
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import Features, FrameStatus, ImuSamples, TiltPrior
 
 SECOND = 1_000_000_000

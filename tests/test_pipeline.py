@@ -6,19 +6,19 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
-from list_dataset import ListDataset
 from scipy.spatial.transform import Rotation
+from support.list_dataset import ListDataset
 
 from loam_gtsam.config import Config, ImuConfig, preset
 from loam_gtsam.datasets.arrays import ArrayDataset
-from loam_gtsam.datasets.simulation import SimulatedWorld
-from loam_gtsam.evaluation import absolute_error
+from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.factors import checked_factor
-from loam_gtsam.features import extract_features
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import move_points
 from loam_gtsam.imu_prior import roll_pitch
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
-from loam_gtsam.solvers import POSE_KEY
+from loam_gtsam.registration.solvers import POSE_KEY
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
     BadSweep,
     ConfigError,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import FEW, generators
+from support.strategies import FEW, generators
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap

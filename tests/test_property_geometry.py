@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from strategies import generators
+from support.strategies import generators
 
-from loam_gtsam.evaluation import interpolate
 from loam_gtsam.geometry import (
     fit_lines,
     fit_planes,
@@ -20,7 +19,7 @@ from loam_gtsam.geometry import (
     transform,
     voxel_filter,
 )
-from loam_gtsam.rotations import (
+from loam_gtsam.imu.quaternions import (
     as_rot3,
     exponential,
     inverse,
@@ -29,6 +28,7 @@ from loam_gtsam.rotations import (
     rotate,
     running_product,
 )
+from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.types import Trajectory
 
 SIZES = [0.0, 1e-12, 1e-9, 1e-7, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9]

@@ -6,10 +6,10 @@ import pytest
 
 from loam_gtsam.config import Config, ImuConfig, MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.datasets.simulation import SimulatedWorld
-from loam_gtsam.evaluation import absolute_error
-from loam_gtsam.matching import associate
+from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import run
+from loam_gtsam.registration.association import associate
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FrameStatus
 
 

@@ -27,13 +27,13 @@ from loam_gtsam import (
     absolute_error,
     run,
 )
-from loam_gtsam.ahead import extract
 from loam_gtsam.datasets import build_city
-from loam_gtsam.frame_plot import plot_frame
+from loam_gtsam.frontend.workers import extract
 from loam_gtsam.geometry import transform
 from loam_gtsam.types import FloatArray
-from loam_gtsam.visualization import plot_loops, plot_map
-from loam_gtsam.watching import frame_view, map_view
+from loam_gtsam.view.frame_plot import plot_frame
+from loam_gtsam.view.observers import frame_view, map_view
+from loam_gtsam.view.plots import plot_loops, plot_map
 
 IMAGES = Path(__file__).resolve().parents[1] / "images"
 CORNERS = ((0, 0), (220, 0), (220, 95), (0, 95), (0, 0), (110, 0), (110, 95), (0, 95), (0, 8))

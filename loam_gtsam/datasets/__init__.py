@@ -17,38 +17,38 @@ from urllib.parse import parse_qsl
 from loam_gtsam.datasets.base import Dataset as Dataset
 from loam_gtsam.datasets.base import DatasetInfo as DatasetInfo
 from loam_gtsam.datasets.base import Sweep as Sweep
-from loam_gtsam.datasets.layouts import known_loader
+from loam_gtsam.datasets.known.layouts import known_loader
 from loam_gtsam.types import DatasetError
 
 if TYPE_CHECKING:
     from loam_gtsam.datasets.arrays import ArrayDataset as ArrayDataset
-    from loam_gtsam.datasets.bag import BagDataset as BagDataset
-    from loam_gtsam.datasets.city import build_city as build_city
-    from loam_gtsam.datasets.helipr import HeLiPRDataset as HeLiPRDataset
-    from loam_gtsam.datasets.kitti import KittiDataset as KittiDataset
-    from loam_gtsam.datasets.loam_topics import LoamTopicsDataset as LoamTopicsDataset
-    from loam_gtsam.datasets.mulran import MulRanDataset as MulRanDataset
-    from loam_gtsam.datasets.newer_college import NewerCollegeBags as NewerCollegeBags
-    from loam_gtsam.datasets.newer_college import NewerCollegeClouds as NewerCollegeClouds
-    from loam_gtsam.datasets.oxford_spires import OxfordSpiresBags as OxfordSpiresBags
-    from loam_gtsam.datasets.oxford_spires import OxfordSpiresClouds as OxfordSpiresClouds
-    from loam_gtsam.datasets.pointcloud2 import decode_pointcloud2 as decode_pointcloud2
-    from loam_gtsam.datasets.simulation import SimulatedWorld as SimulatedWorld
+    from loam_gtsam.datasets.bags.bag import BagDataset as BagDataset
+    from loam_gtsam.datasets.bags.loam_topics import LoamTopicsDataset as LoamTopicsDataset
+    from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2 as decode_pointcloud2
+    from loam_gtsam.datasets.kitti.folder import KittiDataset as KittiDataset
+    from loam_gtsam.datasets.known.helipr import HeLiPRDataset as HeLiPRDataset
+    from loam_gtsam.datasets.known.mulran import MulRanDataset as MulRanDataset
+    from loam_gtsam.datasets.known.newer_college import NewerCollegeBags as NewerCollegeBags
+    from loam_gtsam.datasets.known.newer_college import NewerCollegeClouds as NewerCollegeClouds
+    from loam_gtsam.datasets.known.oxford_spires import OxfordSpiresBags as OxfordSpiresBags
+    from loam_gtsam.datasets.known.oxford_spires import OxfordSpiresClouds as OxfordSpiresClouds
+    from loam_gtsam.datasets.sim.city import build_city as build_city
+    from loam_gtsam.datasets.sim.world import SimulatedWorld as SimulatedWorld
 
 _LAZY = {
     "ArrayDataset": "arrays",
-    "BagDataset": "bag",
-    "HeLiPRDataset": "helipr",
-    "KittiDataset": "kitti",
-    "LoamTopicsDataset": "loam_topics",
-    "MulRanDataset": "mulran",
-    "NewerCollegeBags": "newer_college",
-    "NewerCollegeClouds": "newer_college",
-    "OxfordSpiresBags": "oxford_spires",
-    "OxfordSpiresClouds": "oxford_spires",
-    "SimulatedWorld": "simulation",
-    "build_city": "city",
-    "decode_pointcloud2": "pointcloud2",
+    "BagDataset": "bags.bag",
+    "HeLiPRDataset": "known.helipr",
+    "KittiDataset": "kitti.folder",
+    "LoamTopicsDataset": "bags.loam_topics",
+    "MulRanDataset": "known.mulran",
+    "NewerCollegeBags": "known.newer_college",
+    "NewerCollegeClouds": "known.newer_college",
+    "OxfordSpiresBags": "known.oxford_spires",
+    "OxfordSpiresClouds": "known.oxford_spires",
+    "SimulatedWorld": "sim.world",
+    "build_city": "sim.city",
+    "decode_pointcloud2": "decode.pointcloud2",
 }
 __all__ = ["Dataset", "DatasetInfo", "Sweep", "open_dataset", *_LAZY]
 
@@ -111,7 +111,7 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
         return _construct(__getattr__(known), path, options)
     if path.is_file() or (path / "metadata.yaml").is_file():
         return _open_bag(path, options)
-    from loam_gtsam.datasets.kitti import KittiDataset, find_sweeps
+    from loam_gtsam.datasets.kitti.folder import KittiDataset, find_sweeps
 
     try:
         return _construct(KittiDataset, path, options)
@@ -146,10 +146,10 @@ def _suggestion(path: Path) -> str:
 def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
     from contextlib import closing
 
-    from loam_gtsam.datasets.bag import BagDataset
-    from loam_gtsam.datasets.bag_reader import open_bag
-    from loam_gtsam.datasets.loam_messages import REQUIRED
-    from loam_gtsam.datasets.loam_topics import LoamTopicsDataset
+    from loam_gtsam.datasets.bags.bag import BagDataset
+    from loam_gtsam.datasets.bags.bag_reader import open_bag
+    from loam_gtsam.datasets.bags.loam_topics import LoamTopicsDataset
+    from loam_gtsam.datasets.decode.loam_messages import REQUIRED
 
     with closing(open_bag(path)) as reader:
         topics = set(reader.topics)
@@ -170,7 +170,7 @@ def _open_world(text: str, options: dict[str, Any]) -> Dataset:
         raise DatasetError(
             f"{text}: expected sim:SCENE?frames=NUMBER&seed=NUMBER&sensor=NAME: {error}"
         ) from error
-    from loam_gtsam.datasets.simulation import SimulatedWorld
+    from loam_gtsam.datasets.sim.world import SimulatedWorld
 
     settings |= options
     numbers = set(inspect.signature(SimulatedWorld).parameters) - {"sensor"}

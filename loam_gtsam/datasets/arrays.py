@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo
-from loam_gtsam.datasets.tables import describe_imu, describe_stamps
+from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
 
 _SHORTEST = 1_000_000

@@ -15,13 +15,13 @@ with atheris.instrument_imports(include=["loam_gtsam"]):
     from harness import fuzz
 
     from loam_gtsam.config import Config
-    from loam_gtsam.datasets.pointcloud2 import (
+    from loam_gtsam.datasets.decode.pointcloud2 import (
         RING_FIELDS,
         TIME_FIELDS,
         decode_with_times,
         describe_fields,
     )
-    from loam_gtsam.features import extract_features
+    from loam_gtsam.frontend.features import extract_features
     from loam_gtsam.types import DatasetError, LoamError
 
 import numpy as np

@@ -1,0 +1,10 @@
+"""The command line: the only place that prints, catches ``LoamError`` or exits."""
+
+from __future__ import annotations
+
+
+def main() -> None:
+    """Entry point of ``loam-gtsam``."""
+    from loam_gtsam.cli.app import main as run_app
+
+    run_app()

@@ -1,0 +1,129 @@
+"""One comparison from the command line: run, tables, files, pictures, report."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console, Group
+from rich.table import Table
+from rich.text import Text
+
+from loam_gtsam.cli.report import NOT_MAPPED
+from loam_gtsam.cli.run import (
+    RunOptions,
+    file_name,
+    frame_progress,
+    free_folder,
+    no_empty_folder,
+    say_written,
+    stop_requests,
+)
+from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.io.run_files import make_folder, replacing_all
+from loam_gtsam.studies.comparison import Contender, compare
+from loam_gtsam.studies.comparison_report import (
+    ACCURACY_COLUMNS,
+    COLUMNS,
+    PICTURES,
+    REPORT_FILE,
+    TABLE_FILES,
+    TRUTH_FILE,
+    Results,
+    best,
+    cell,
+    spread,
+    write,
+)
+from loam_gtsam.types import DatasetError, OutputError
+from loam_gtsam.view import plots as visualization
+
+
+def execute(
+    dataset: Dataset, contenders: Sequence[Contender], shared_guess: bool, options: RunOptions
+) -> int:
+    """Compare, write, report; returns the exit code.
+
+    Raises
+    ------
+    LoamError
+        If the comparison cannot start or its results cannot be written, or what ended it early
+        (after what was computed until then has been written).
+    """
+    plot = visualization.available() if options.plot is None else options.plot
+    if plot and not visualization.available():
+        raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
+    wanted = options.output or Path("loam_gtsam_output") / f"{file_name(dataset.name)}_compare"
+    known = (*TABLE_FILES, *PICTURES, REPORT_FILE, TRUTH_FILE)
+    wanted = free_folder(wanted, options.overwrite, known)
+    is_new = not wanted.exists()
+    folder = make_folder(wanted)
+    total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
+    with no_empty_folder(folder, is_new), stop_requests() as stop:
+        started = time.perf_counter()
+        with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
+            comparison = compare(
+                dataset,
+                contenders,
+                max_frames=options.frames,
+                shared_guess=shared_guess,
+                on_frame=on_frame,
+            )
+        seconds = time.perf_counter() - started
+        results = Results.of(comparison, shared_guess)
+        # What an earlier comparison left would not belong to this one.
+        left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
+        with replacing_all(folder, left, last=REPORT_FILE) as new:
+            files = write(results, new, plot)
+    if not options.quiet:
+        console = Console()
+        console.print(_summary(results, seconds))
+        say_written(console, stop, comparison.frames, total, folder, files)
+    if comparison.error is not None:
+        raise comparison.error
+    if stop.signum is not None:
+        return 128 + stop.signum
+    if all(u.status in NOT_MAPPED for run in comparison.runs for u in run.updates):
+        message = next((u.message for u in comparison.runs[0].updates if u.message), "")
+        raise DatasetError(
+            f"{dataset.name}: no solver could use any of the {comparison.frames} sweeps; the "
+            f"first: {message}; see also: loam-gtsam inspect"
+        )
+    return 0
+
+
+def _summary(results: Results, seconds: float) -> Group:
+    title = Text(f"{results.comparison.name}  ({seconds:.1f} s)", style="bold")
+    winners = best(results)
+    # Two tables, accuracy and cost, for together they do not fit a terminal of 80 columns.
+    parts: list[Any] = []
+    for heading, columns in (
+        (title, range(ACCURACY_COLUMNS)),
+        (None, range(ACCURACY_COLUMNS, len(COLUMNS))),
+    ):
+        table = Table("solver", title=heading, title_justify="left", box=None)
+        for index in columns:
+            table.add_column(Text(COLUMNS[index].title), justify="right")
+        for number, (run, scores) in enumerate(results.rows):
+            cells = [
+                Text(
+                    cell(scores, COLUMNS[index]),
+                    style="bold green" if (number, index + 1) in winners else "",
+                )
+                for index in columns
+            ]
+            table.add_row(Text(run.name), *cells)
+        parts.append(table)
+    if results.differences:
+        header = Text(f"Difference from {results.comparison.runs[0].name}", style="bold")
+        apart = Table("solver", title=header, title_justify="left", box=None)
+        for name in ("median [mm]", "95 %", "max", "median [deg]", "95 %", "max"):
+            apart.add_column(Text(name), justify="right")
+        for name, difference in results.differences.items():
+            numbers = [f"{1e3 * v:.2f}" for v in spread(difference.metres)]
+            numbers += [f"{v:.4f}" for v in spread(difference.degrees)]
+            apart.add_row(Text(name), *numbers)
+        parts.append(apart)
+    return Group(*parts, *(Text(f"  {note}", style="dim") for note in results.notes))

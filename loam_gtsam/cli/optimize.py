@@ -1,0 +1,86 @@
+"""One saved pose graph from the command line: read, optimise, write, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from loam_gtsam.io.run_files import write_tum
+from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
+from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
+from loam_gtsam.types import DatasetError, OutputError, Trajectory
+
+_LISTED = 10
+"""Loops that are switched off and listed."""
+
+
+def execute(
+    path: Path,
+    output: Path | None,
+    trajectory: Path | None,
+    *,
+    robust: bool,
+    max_chi2: float,
+    overwrite: bool,
+    quiet: bool,
+) -> int:
+    """Optimise a file; returns the exit code.
+
+    Raises
+    ------
+    LoamError
+        If a file cannot be read or written, or the graph cannot be solved.
+    """
+    target = output or path.with_name(f"{path.stem}_optimized{path.suffix}")
+    written = [target]
+    if target.suffix == GTSAM_SUFFIXES[0]:
+        written = [target.with_suffix(suffix) for suffix in GTSAM_SUFFIXES]
+    if trajectory is not None:
+        written.append(trajectory)
+    for file in written:
+        if file.resolve() == path.resolve():
+            raise OutputError(f"{file}: the input must not be replaced; choose another name")
+        if file.exists() and not overwrite:
+            raise OutputError(f"{file}: the file exists; add --overwrite or choose another name")
+    saved = read_graph(path)
+    keys = sorted(saved.poses.keys())
+    if trajectory is not None and set(keys) - set(saved.stamps):
+        raise DatasetError(
+            f"{path}: has no stamps for some poses, which --trajectory needs; leave it out"
+        )
+    result = optimize_graph(saved, robust=robust, max_chi2=max_chi2)
+    stamps = {key: saved.stamps[key] for key in keys if key in saved.stamps}
+    write_graph(target, SavedGraph(result.factors, result.poses, stamps))
+    if trajectory is not None:
+        poses = np.array([result.poses.atPose3(key).matrix() for key in keys])
+        times = np.array([stamps[key] for key in keys], np.int64)
+        write_tum(trajectory, Trajectory(times, poses), comments={"graph": path.name})
+    if not quiet:
+        console = Console()
+        console.print(_table(saved, result, keys))
+        names = ", ".join(str(file) for file in written)
+        console.print(f"Written to {names}", markup=False, soft_wrap=True)
+    return 0
+
+
+def _table(saved: SavedGraph, result: OptimizedGraph, keys: list[int]) -> Table:
+    before, after = (
+        np.array([poses.atPose3(key).translation() for key in keys])
+        for poses in (saved.poses, result.poses)
+    )
+    moved = np.linalg.norm(after - before, axis=1)
+    off = [loop for loop in result.loops if not loop.on]
+    table = Table(show_header=False, box=None)
+    table.add_row("poses, factors", f"{len(keys)}, {saved.factors.size()}")
+    table.add_row("loops", f"{len(result.loops)}, of which {len(off)} contradict the others")
+    table.add_row("cost", f"{result.error_before:.6g} -> {result.error_after:.6g}")
+    table.add_row("poses moved", f"{moved.mean():.3f} m on average, {moved.max():.3f} m at most")
+    for loop in off[:_LISTED]:
+        said = f"{loop.earlier} - {loop.later}, chi squared {loop.chi_squared:.4g}"
+        table.add_row("switched off", said)
+    if len(off) > _LISTED:
+        table.add_row("", f"and {len(off) - _LISTED} more")
+    return table

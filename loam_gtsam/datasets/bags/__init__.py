@@ -1,0 +1,1 @@
+"""Loaders of ROS 1 bags, ROS 2 bags and MCAP files."""

@@ -1,0 +1,206 @@
+"""ROS bags with ``PointCloud2`` sweeps: ROS 1, ROS 2 and MCAP, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loam_gtsam.datasets.bags.bag_reader import (
+    Message,
+    bag_kind,
+    choose_topic,
+    open_bag,
+    read_messages,
+    topic_types,
+)
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.decode.imu_messages import decode_imu
+from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
+from loam_gtsam.datasets.decode.pointcloud2 import (
+    NO_TIMES,
+    Decoded,
+    decode_with_times,
+    describe_fields,
+)
+from loam_gtsam.datasets.decode.tables import (
+    clean_imu,
+    describe_imu,
+    describe_stamps,
+)
+from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
+
+POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+IMU = "sensor_msgs/msg/Imu"
+_PEEK = 10
+"""Sweeps looked at before the run, to decide on times and to describe the bag."""
+
+
+class BagDataset:
+    """Sweeps and IMU of a bag, read message by message.
+
+    Parameters
+    ----------
+    path : ROS 1 ``.bag``, ROS 2 bag folder, or a single ``.mcap`` / ``.db3``
+    topic : of the sweeps; None takes the PointCloud2 topic with the most messages
+    imu_topic : None takes the Imu topic with the most messages, if there is one
+    time_field, time_unit, stamp_is : see
+        :func:`loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
+    parts : the bags of a recording that was split; ``path`` then only names them
+
+    Raises
+    ------
+    DatasetError
+        If the bag cannot be opened, a topic is not there, or no sweep of its beginning can be
+        decoded.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        topic: str | None = None,
+        imu_topic: str | None = None,
+        time_field: str | None = None,
+        time_unit: str | None = None,
+        stamp_is: str | None = None,
+        parts: Sequence[Path] = (),
+    ) -> None:
+        check_time_options(time_unit, stamp_is)
+        self._path = Path(path)
+        self._parts = tuple(parts)
+        self.name = self._path.stem
+        self.sensor: Mapping[str, Any] = {}
+        self._options = {"time_field": time_field, "time_unit": time_unit, "stamp_is": stamp_is}
+        self._problems: list[str] = []
+        with closing(open_bag(self._path, self._parts)) as reader:
+            topics = topic_types(reader)
+            self.topic = choose_topic(self._path, topics, POINT_CLOUD, topic, self._problems)
+            self.imu_topic = (
+                choose_topic(self._path, topics, IMU, imu_topic, self._problems)
+                if imu_topic is not None or any(kind == IMU for kind, _ in topics.values())
+                else None
+            )
+            self._count = topics[self.topic][1]
+        self._decision: TimeDecision | None = None
+        self._facts: dict[str, str] = {}
+        self._peek()
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __iter__(self) -> Iterator[Scan | BadSweep]:
+        offset = self._clock_offset
+        for message in read_messages(self._path, [self.topic], self._problems, self._parts):
+            if isinstance(message, BadSweep):
+                yield replace(message, stamp=message.stamp + offset)
+                continue
+            try:
+                scan = self._decode(message).scan
+                offset = scan.stamp - message.received
+                yield scan
+            except LoamError as error:
+                stamp = message.received + offset
+                yield BadSweep(stamp, f"{self._path}, topic {self.topic}: {error}")
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """All samples of the IMU topic, or None; reads them at the first access."""
+        if self.imu_topic is None:
+            return None
+        return read_imu(self._path, self.imu_topic, self._problems, self._parts)
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """A bag of sweeps carries no reference poses."""
+        return None
+
+    def info(self) -> DatasetInfo:
+        """What was understood; reads the first sweeps and the IMU topic."""
+        imu = self.imu  # first: it may find problems
+        facts = dict(self._facts)
+        if self.imu_topic is not None:
+            facts["IMU topic"] = self.imu_topic
+        facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        kind = bag_kind(self._parts[0] if self._parts else self._path)
+        return DatasetInfo(kind, str(self._path), facts, list(self._problems))
+
+    def _decode(self, message: Message) -> Decoded:
+        return decode_with_times(message.content, decision=self._decision, **self._options)
+
+    def _peek(self) -> None:
+        """Decide on the times, once for the whole run, and collect what there is to say."""
+        decoded: list[Decoded] = []
+        stamps: list[int] = []
+        offsets: list[int] = []
+        failure: LoamError | None = None
+        fields = ""
+        for number, message in enumerate(read_messages(self._path, [self.topic], [], self._parts)):
+            if number == _PEEK:
+                break
+            if isinstance(message, BadSweep):
+                failure = failure or DatasetError(message.message)
+                continue
+            try:
+                decoded.append(self._decode(message))
+                stamps.append(decoded[-1].scan.stamp)
+                offsets.append(stamps[-1] - message.received)
+                fields = fields or describe_fields(message.content)
+            except LoamError as error:
+                failure = failure or error
+        if not decoded:
+            raise DatasetError(
+                f"{self._path}, topic {self.topic}: no sweep can be decoded: "
+                f"{failure or 'it has no messages'}"
+            )
+        # The last one: near time zero an absolute time can still look like an offset.
+        self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)
+        # A sweep that cannot be read has only a receive time; this leads to the stamps' clock.
+        self._clock_offset = offsets[0]
+        facts = self._facts
+        facts["topic"] = self.topic
+        facts["sweeps"] = str(self._count)
+        describe_stamps(np.array(stamps, dtype=np.int64), facts, self._problems)
+        facts["stamps"] = f"from {stamps[0] * 1e-9:.6f} s"
+        facts["fields"] = fields
+        facts["points"] = f"{len(decoded[0].scan.points)} in the first sweep"
+        facts["point times"] = str(self._decision or "none recorded")
+        facts["rings"] = _describe_rings(decoded[0].scan)
+        if self._decision is None and self._options["time_field"] != NO_TIMES:
+            self._problems.append("no per-point time field: times can only come from the azimuth")
+        if outliers := sum(d.outliers for d in decoded):
+            self._problems.append(
+                f"{outliers} points of the first {len(decoded)} sweeps have a time far outside "
+                "their sweep and are left out"
+            )
+
+
+def read_imu(
+    path: Path, topic: str, problems: list[str], parts: Sequence[Path] = ()
+) -> ImuSamples | None:
+    """All samples of a ``sensor_msgs/Imu`` topic; ``parts`` as for ``open_bag``."""
+    stamps, rows, lost = [], [], 0
+    for message in read_messages(path, [topic], problems, parts):
+        if isinstance(message, BadSweep):
+            lost += 1
+            continue
+        stamp, row = decode_imu(message.content)
+        stamps.append(stamp)
+        rows.append(row)
+    if lost:
+        problems.append(f"IMU: {lost} messages cannot be read")
+    values = np.array(rows, dtype=np.float64).reshape(-1, 10)
+    return clean_imu(np.array(stamps, dtype=np.int64), values, problems)
+
+
+def _describe_rings(scan: Scan) -> str:
+    if scan.rows:
+        return f"{scan.rows} rows of a range image"
+    if scan.rings is None or len(scan.rings) == 0:
+        return "none"
+    return f"field, {len(np.unique(scan.rings))} beams ({scan.rings.min()} .. {scan.rings.max()})"

@@ -1,0 +1,172 @@
+"""Bags of every kind as a stream of messages; damage becomes a message of its own."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rosbags.highlevel import AnyReader
+from rosbags.interfaces import Connection
+from rosbags.typesys import Stores, get_typestore
+
+from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS
+from loam_gtsam.types import BadSweep, DatasetError
+
+MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_registered")
+"""Topics on which LOAM and A-LOAM publish clouds in the map."""
+_MOST = 2**63 - 1
+"""Neither a length nor nanoseconds are larger; a bag without messages starts there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A deserialised message with its topic and receive time (ns)."""
+
+    topic: str
+    received: int
+    content: Any
+
+
+def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
+    """An opened reader.
+
+    Parameters
+    ----------
+    parts : the bags of a recording that was split, all ROS 1 or all ROS 2; ``path`` then only
+        names them
+
+    Raises
+    ------
+    DatasetError
+        If there is no bag, or it is damaged.
+    """
+    bags = list(parts or [path])
+    for bag in bags:
+        if not bag.exists():
+            raise DatasetError(f"{bag}: no such bag")
+    store = Stores.ROS1_NOETIC if bags[0].suffix == ".bag" else Stores.LATEST
+    try:
+        reader = AnyReader(bags, default_typestore=get_typestore(store))
+        reader.open()
+        try:
+            _check_metadata(reader)
+        except BaseException:
+            reader.close()
+            raise
+    # Damage surfaces as whatever its parser stumbles over (struct, sqlite3, yaml, assertions ...).
+    except Exception as error:
+        hint = (
+            "; if the recording was cut off, `rosbag reindex` (ROS 1), `ros2 bag reindex` or "
+            "`mcap recover` may repair it"
+        )
+        raise DatasetError(f"{path}: cannot open the bag: {_reason(error)}{hint}") from error
+    return reader
+
+
+def _check_metadata(reader: AnyReader) -> None:
+    """Raise ValueError unless names and numbers of messages, which a bag may state, make sense."""
+    for connection in reader.connections:
+        name, count = connection.topic, connection.msgcount
+        if not isinstance(name, str):
+            raise ValueError(f"expected a topic's name, its metadata have {name!r}")
+        if not isinstance(count, int) or not 0 <= count < _MOST:
+            raise ValueError(f"topic {name}: expected a number of messages, got {count!r}")
+    if not isinstance(reader.start_time, int) or abs(reader.start_time) > _MOST:
+        raise ValueError(f"expected a start in nanoseconds, got {reader.start_time!r}")
+
+
+def topic_types(reader: AnyReader) -> dict[str, tuple[str, int]]:
+    """Topic -> (message type, number of messages)."""
+    return {
+        topic: (info.msgtype or "several types", info.msgcount)
+        for topic, info in sorted(reader.topics.items())
+    }
+
+
+def choose_topic(
+    path: Path,
+    topics: Mapping[str, tuple[str, int]],
+    kind: str,
+    asked: str | None,
+    problems: list[str],
+) -> str:
+    """The topic asked for, or the one of type ``kind`` with the most messages."""
+    listing = ", ".join(f"{name} ({what}, {count})" for name, (what, count) in topics.items())
+    if asked is not None:
+        if asked not in topics:
+            raise DatasetError(f"{path}: no topic {asked!r}; the bag has: {listing or 'none'}")
+        if topics[asked][0] != kind:
+            raise DatasetError(
+                f"{path}: topic {asked!r} is {topics[asked][0]}, expected {kind}; "
+                f"the bag has: {listing}"
+            )
+        return asked
+    candidates = [name for name, (what, _) in topics.items() if what == kind]
+    if not candidates:
+        kinds = [what.lower() for what, _ in topics.values()]
+        packets = any("packet" in k or (k.endswith("scan") and "laser" not in k) for k in kinds)
+        hint = "; raw packets become PointCloud2 with the driver of the sensor" if packets else ""
+        raise DatasetError(
+            f"{path}: no topic of type {kind}; the bag has: {listing or 'no messages'}{hint}"
+        )
+    option = "--imu-topic" if kind.endswith("Imu") else "--topic"
+    measured = [name for name in candidates if name not in MAPPED] or candidates
+    chosen = max(measured, key=lambda name: topics[name][1])  # the first of equals
+    if chosen in MAPPED:
+        problems.append(
+            f"{chosen}: its sweeps are de-skewed and lie in a map; do not map them again"
+        )
+    if len(candidates) > 1:
+        problems.append(
+            f"{len(candidates)} {kind.rsplit('/', 1)[-1]} topics ("
+            + ", ".join(f"{name}: {topics[name][1]}" for name in candidates)
+            + f"); took {chosen}, {option} chooses another"
+        )
+    return chosen
+
+
+def read_messages(
+    path: Path, topics: list[str], problems: list[str], parts: Sequence[Path] = ()
+) -> Iterator[Message | BadSweep]:
+    """Messages in the order they were received; ``parts`` as for :func:`open_bag`.
+
+    A message that cannot be deserialised gives a :class:`BadSweep`. Where the file itself is
+    damaged the stream ends with one, after everything that came before.
+    """
+    with closing(open_bag(path, parts)) as reader:
+        connections: list[Connection] = [c for c in reader.connections if c.topic in topics]
+        stream = reader.messages(connections)
+        last, interval = reader.start_time, DEFAULT_PERIOD_NS
+        while True:
+            try:
+                connection, received, raw = next(stream)
+            except StopIteration:
+                return
+            except Exception as error:  # as in open_bag
+                text = f"{path}: damaged after {last * 1e-9:.3f} s, the rest is lost: "
+                text += _reason(error)
+                if text not in problems:
+                    problems.append(text)
+                yield BadSweep(last + interval, text)  # when the next one was due
+                return
+            interval = received - last if received > last else interval
+            last = received
+            try:
+                content = reader.deserialize(raw, connection.msgtype)
+            except Exception as error:
+                text = f"{path}, topic {connection.topic}: cannot deserialise: {_reason(error)}"
+                yield BadSweep(received, text)
+                continue
+            yield Message(connection.topic, received, content)
+
+
+def bag_kind(path: Path) -> str:
+    """What to call the file for people."""
+    return {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(path.suffix, "ROS 2 bag")
+
+
+def _reason(error: Exception) -> str:
+    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__

@@ -1,0 +1,133 @@
+"""Bags of a known data set: their parts, topics, extrinsics and reference poses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from loam_gtsam.datasets.bags.bag import BagDataset
+from loam_gtsam.datasets.bags.bag_reader import open_bag
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.decode.extrinsics import at_lidar, describe_extrinsics, implied_by
+from loam_gtsam.datasets.decode.tables import (
+    in_order,
+    poses_from_quaternions,
+    read_lines,
+    read_table,
+)
+from loam_gtsam.types import DatasetError, FloatArray, Trajectory
+
+
+@dataclass(frozen=True)
+class Rig:
+    """What is known of the sensors of a data set.
+
+    Attributes
+    ----------
+    kind : for people
+    topic, imu_topic : in its bags
+    body_T_lidar : the frame of the reference poses
+    lidar_T_imu : extrinsics
+    source : of the extrinsics, for people
+    """
+
+    kind: str
+    topic: str
+    imu_topic: str
+    body_T_lidar: FloatArray
+    lidar_T_imu: FloatArray
+    source: str
+
+
+class BagSequence(BagDataset):
+    """Bags recorded by a known rig, with reference poses beside them.
+
+    Parameters
+    ----------
+    path : as the user gave it
+    parts : the bags
+    rig : of the data set
+    truth : file of the reference poses, or None
+    others : as for :class:`~loam_gtsam.datasets.BagDataset`; topics default to the rig's
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        parts: Sequence[Path],
+        rig: Rig,
+        truth: Path | None,
+        *,
+        topic: str | None,
+        imu_topic: str | None,
+        time_field: str | None,
+        time_unit: str | None,
+        stamp_is: str | None,
+    ) -> None:
+        with closing(open_bag(path, parts)) as reader:
+            known = set(reader.topics)
+        super().__init__(
+            path,
+            topic=topic or (rig.topic if rig.topic in known else None),
+            imu_topic=imu_topic or (rig.imu_topic if rig.imu_topic in known else None),
+            time_field=time_field,
+            time_unit=time_unit,
+            stamp_is=stamp_is,
+            parts=parts,
+        )
+        self._rig, self._truth_file = rig, truth
+        self.name = path.resolve().name if path.is_dir() else path.stem
+        if self.imu_topic == rig.imu_topic:
+            self.sensor: Mapping[str, Any] = implied_by(rig.lidar_T_imu)
+        elif self.imu_topic is not None:
+            self._problems.append(
+                f"IMU: not the {rig.imu_topic} of {rig.kind}, so its rotation to the lidar is "
+                "unknown: set imu.lidar_R_imu_deg"
+            )
+
+    @cached_property
+    def truth(self) -> Trajectory | None:
+        """The reference poses, moved to the lidar; None without their file."""
+        if self._truth_file is None:
+            return None
+        return read_poses(self._truth_file, self._rig.body_T_lidar, self._problems)
+
+    def info(self) -> DatasetInfo:
+        """As of a bag, with the parts, extrinsics and reference poses."""
+        truth = self.truth  # first: it may find problems
+        info = super().info()
+        info.kind = f"{self._rig.kind}, {info.kind}"
+        if len(self._parts) > 1:
+            info.facts["bags"] = f"{self._parts[0].name} and {len(self._parts) - 1} more"
+        if self.sensor:
+            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._rig.source)
+        info.facts["reference poses"] = describe_truth(truth, self._truth_file)
+        return info
+
+
+def describe_truth(truth: Trajectory | None, path: Path | None) -> str:
+    """For people."""
+    return "none" if truth is None or path is None else f"{len(truth)} ({path.name})"
+
+
+def read_poses(path: Path, body_T_lidar: FloatArray, problems: list[str]) -> Trajectory:
+    """Poses of the lidar from a file of poses of its carrier.
+
+    Parameters
+    ----------
+    path : ``secs,nsecs,x,y,z,qx,qy,qz,qw`` or TUM's ``t x y z qx qy qz qw``
+    problems : is appended to
+    """
+    first = next((line for line in read_lines(path) if not line.startswith("#")), "")
+    if "," in first:
+        stamps, values = read_table(path, "secs nsecs x y z qx qy qz qw", ",")
+    else:
+        stamps, values = read_table(path, "t x y z qx qy qz qw", None)
+    if len(stamps) == 0:
+        raise DatasetError(f"{path}: no poses")
+    poses = poses_from_quaternions(values[:, :3], values[:, 3:], str(path))
+    return at_lidar(in_order(stamps, poses, path.name, problems), body_T_lidar)

@@ -1,0 +1,195 @@
+"""A bag with the topics of LOAM's own front end: features and odometry, ready to map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import closing
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from loam_gtsam.datasets.bags.bag_reader import (
+    bag_kind,
+    open_bag,
+    read_messages,
+    topic_types,
+)
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.decode.loam_messages import (
+    CLOUD,
+    ODOMETRY,
+    PLANES,
+    REQUIRED,
+    STAMP_TOLERANCE_NS,
+    FeatureDecoder,
+    StampMatcher,
+    decide_axes,
+    directions_spread,
+    finite_points,
+)
+from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
+from loam_gtsam.datasets.decode.tables import describe_stamps
+from loam_gtsam.types import (
+    BadSweep,
+    DatasetError,
+    FeatureSweep,
+    ImuSamples,
+    LoamError,
+    Trajectory,
+)
+
+MAPPED = "/aft_mapped_to_init"
+
+
+class LoamTopicsDataset:
+    """De-skewed features and odometry poses of LOAM or A-LOAM, recorded in a bag.
+
+    Parameters
+    ----------
+    path : ROS 1 or ROS 2 bag with ``/laser_cloud_corner_last``, ``/laser_cloud_surf_last``,
+        ``/laser_odom_to_init`` and, optionally, ``/velodyne_cloud_3`` and ``/aft_mapped_to_init``
+    axes : ``lidar`` (A-LOAM), ``loam`` (the original's camera-like axes), or ``auto``: the
+        directions of a spinning lidar's points spread least along its vertical axis
+
+    Attributes
+    ----------
+    axes : what was decided
+    unmatched : topic -> messages without partners within 5 ms, of the last full iteration
+
+    Notes
+    -----
+    Everything that comes out is in lidar axes (x forward, y left, z up).
+
+    Raises
+    ------
+    DatasetError
+        If the bag cannot be opened, a topic is missing or the axes cannot be told.
+    """
+
+    def __init__(
+        self, path: str | Path, *, axes: Literal["auto", "lidar", "loam"] = "auto"
+    ) -> None:
+        if axes not in ("auto", "lidar", "loam"):
+            raise DatasetError(f"axes: expected one of auto, lidar, loam; got {axes!r}")
+        self._path = Path(path)
+        self.name = self._path.stem
+        self.sensor: Mapping[str, Any] = {}
+        self.unmatched: dict[str, int] = {}
+        self._problems: list[str] = []
+        with closing(open_bag(self._path)) as reader:
+            self._types = topic_types(reader)
+        missing = [topic for topic in REQUIRED if topic not in self._types]
+        if missing:
+            listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in self._types.items())
+            raise DatasetError(
+                f"{self._path}: no topic {', '.join(missing)}; the bag has: {listing or 'none'}"
+            )
+        self._topics = [*REQUIRED, CLOUD] if CLOUD in self._types else list(REQUIRED)
+        self.axes: Literal["lidar", "loam"] = axes if axes != "auto" else self._decide_axes()
+        self._decoder = FeatureDecoder(self.axes)
+
+    def __len__(self) -> int:
+        """Most sweeps there can be: the count of the rarest topic."""
+        return min(self._types[topic][1] for topic in self._topics)
+
+    def __iter__(self) -> Iterator[FeatureSweep | BadSweep]:
+        matcher = StampMatcher(self._topics)
+        for message in read_messages(self._path, self._topics, self._problems):
+            if isinstance(message, BadSweep):
+                yield message
+                continue
+            try:
+                group = matcher.add(message.topic, message_stamp(message.content), message.content)
+            except DatasetError as error:
+                yield BadSweep(message.received, f"{self._path}: {error}")
+                continue
+            if group is not None:
+                yield self._sweep(group)
+        self.unmatched = matcher.finish()
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """None: LOAM's front end has used the IMU already."""
+        return None
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """None: see ``recorded`` for LOAM's own result."""
+        return None
+
+    @cached_property
+    def recorded(self) -> Trajectory | None:
+        """LOAM's own mapped poses (``/aft_mapped_to_init``), for comparison, or None."""
+        if MAPPED not in self._types:
+            return None
+        stamps, poses = [], []
+        for message in read_messages(self._path, [MAPPED], self._problems):
+            if isinstance(message, BadSweep):
+                continue
+            try:
+                pose = self._decoder.pose(MAPPED, message.content)
+            except DatasetError as error:
+                self._problems.append(f"left out: {error}")
+                continue
+            stamps.append(message_stamp(message.content))
+            poses.append(pose)
+        return Trajectory(
+            np.array(stamps, dtype=np.int64), np.array(poses, dtype=float).reshape(-1, 4, 4)
+        )
+
+    def info(self) -> DatasetInfo:
+        """What was understood; reads LOAM's own poses if they are there."""
+        facts = {"sweeps": f"up to {len(self)}", "axes": self.axes}
+        facts["topics"] = ", ".join(f"{topic} ({self._types[topic][1]})" for topic in self._topics)
+        problems: list[str] = []
+        if self.recorded is not None:
+            facts["recorded result"] = f"{MAPPED}, {len(self.recorded)} poses"
+            describe_stamps(self.recorded.stamps, facts, problems)
+        others = [name for name in self._types if name not in (*self._topics, MAPPED)]
+        if others:
+            facts["not used"] = ", ".join(others)
+        counts = {self._types[topic][1] for topic in self._topics}
+        if len(counts) > 1:
+            problems.append(
+                "the topics have different numbers of messages; those without partners within "
+                f"{STAMP_TOLERANCE_NS * 1e-6:g} ms are left out"
+            )
+        if CLOUD not in self._topics:
+            problems.append(f"no {CLOUD}: no full-resolution cloud")
+        problems += [
+            f"{count} messages of {topic} without partners within "
+            f"{STAMP_TOLERANCE_NS * 1e-6:g} ms, left out"
+            for topic, count in self.unmatched.items()
+            if count
+        ]
+        return DatasetInfo(
+            f"{bag_kind(self._path)} with LOAM topics",
+            str(self._path),
+            facts,
+            problems + self._problems,
+        )
+
+    def _sweep(self, group: Mapping[str, Any]) -> FeatureSweep | BadSweep:
+        try:
+            return self._decoder.sweep(group)
+        except LoamError as error:
+            return BadSweep(message_stamp(group[ODOMETRY]), f"{self._path}: {error}")
+
+    def _decide_axes(self) -> Literal["lidar", "loam"]:
+        topic = CLOUD if CLOUD in self._types else PLANES
+        spread = None
+        for message in read_messages(self._path, [topic], []):
+            if isinstance(message, BadSweep):
+                continue
+            try:
+                spread = directions_spread(finite_points(topic, message.content))
+            except DatasetError:
+                continue  # it becomes a bad sweep of the run
+            if spread is not None:
+                break
+        try:
+            return decide_axes(topic, spread)
+        except DatasetError as error:
+            raise DatasetError(f"{self._path}: {error}") from error

@@ -1,0 +1,1 @@
+"""Decoders of messages, tables and point formats into arrays."""

@@ -1,0 +1,202 @@
+"""Files of points packed like a PointCloud2: records of fixed layout, and PCD."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.types import DatasetError
+
+# sensor_msgs/PointField, as PCD's TYPE and SIZE name the same
+_CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+_PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA")
+
+
+@dataclass(frozen=True, slots=True)
+class Stamp:
+    """As in a ROS 2 header."""
+
+    sec: int
+    nanosec: int
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """As in ROS 2."""
+
+    stamp: Stamp
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """As ``sensor_msgs/PointField``."""
+
+    name: str
+    offset: int
+    datatype: int
+    count: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class PackedCloud:
+    """What :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_with_times` needs of a message."""
+
+    header: Header
+    height: int
+    width: int
+    fields: tuple[Field, ...]
+    point_step: int
+    row_step: int
+    data: NDArray[np.uint8]
+    is_bigendian: bool = False
+
+
+def read_records(path: Path, stamp: int, record: np.dtype[Any]) -> PackedCloud:
+    """A file that is nothing but records.
+
+    Parameters
+    ----------
+    stamp : nanoseconds
+    record : of little-endian fields
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read or its size is no multiple of the record's.
+    """
+    data = _read_bytes(path)
+    step = record.itemsize
+    if len(data) % step:
+        raise DatasetError(
+            f"{path}: {len(data)} bytes is not a multiple of {step} "
+            f"({', '.join(record.names or ())}); the file is truncated or in another format"
+        )
+    return _packed(stamp, record, 1, len(data) // step, data)
+
+
+def read_pcd(path: Path, stamp: int) -> PackedCloud:
+    """A PCD file with ``DATA binary`` or ``DATA ascii``; fields named ``_`` are padding.
+
+    Parameters
+    ----------
+    stamp : nanoseconds
+
+    Raises
+    ------
+    DatasetError
+        If it is no such file, or cut off.
+
+    References
+    ----------
+    The PCD file format, https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
+    """
+    data = _read_bytes(path)
+    header, start = _pcd_header(path, data)
+    try:
+        record = _pcd_record(header)
+        width, height = int(header["WIDTH"][0]), int(header["HEIGHT"][0])
+        kind = header["DATA"][0]
+    except (KeyError, ValueError, TypeError, IndexError) as error:
+        raise DatasetError(f"{path}: the PCD header cannot be understood: {error!r}") from error
+    if kind == "ascii":
+        body = _from_text(path, data[start:], record)
+    elif kind == "binary":
+        body = data[start:]
+    else:
+        raise DatasetError(
+            f"{path}: PCD with DATA {kind}; expected binary or ascii. PCL's "
+            f"`pcl_convert_pcd_ascii_binary {path.name} out.pcd 1` converts it"
+        )
+    needed = width * height * record.itemsize
+    if len(body) < needed:
+        raise DatasetError(
+            f"{path}: {width} x {height} points of {record.itemsize} bytes need {needed} bytes, "
+            f"got {len(body)}; the file is cut off"
+        )
+    return _packed(stamp, record, height, width, body[:needed])
+
+
+def firing_by_firing(cloud: PackedCloud, beams: int, columns: int, source: str) -> PackedCloud:
+    """The same points as a range image, which they are in if the beams of a firing lie together.
+
+    Raises
+    ------
+    DatasetError
+        If there are not ``beams`` x ``columns`` of them.
+    """
+    count = cloud.width * cloud.height
+    if count != beams * columns:
+        raise DatasetError(
+            f"{source}: {count} points, expected {columns} firings of {beams} = {beams * columns}; "
+            "times and beams follow from the order of a complete sweep"
+        )
+    return replace(cloud, height=columns, width=beams, row_step=beams * cloud.point_step)
+
+
+def _read_bytes(path: Path) -> NDArray[np.uint8]:
+    try:
+        return np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise DatasetError(f"{path}: cannot read the sweep: {error}") from error
+
+
+def _packed(
+    stamp: int, record: np.dtype[Any], height: int, width: int, data: NDArray[np.uint8]
+) -> PackedCloud:
+    assert record.fields is not None
+    return PackedCloud(
+        header=Header(Stamp(stamp // 10**9, stamp % 10**9)),
+        height=height,
+        width=width,
+        fields=tuple(
+            Field(name, offset, _CODES[kind.str[1:]])
+            for name, (kind, offset, *_) in record.fields.items()
+            if kind.str[1:] in _CODES
+        ),
+        point_step=record.itemsize,
+        row_step=width * record.itemsize,
+        data=data,
+    )
+
+
+def _pcd_header(path: Path, data: NDArray[np.uint8]) -> tuple[dict[str, list[str]], int]:
+    """Its lines by their first word, and where the points begin."""
+    header: dict[str, list[str]] = {}
+    start = 0
+    text = data[:4096].tobytes()
+    while "DATA" not in header:
+        end = text.find(b"\n", start)
+        if end < 0:
+            raise DatasetError(f"{path}: no PCD file: expected a line DATA in its header")
+        words = text[start:end].decode("ascii", errors="replace").split()
+        start = end + 1
+        if words and words[0] in _PCD_KEYS:
+            header[words[0]] = words[1:]
+    return header, start
+
+
+def _pcd_record(header: dict[str, list[str]]) -> np.dtype[Any]:
+    names, kinds = header["FIELDS"], header["TYPE"]
+    counts = header.get("COUNT", ["1"] * len(names))
+    layout: list[tuple[Any, ...]] = []
+    for number, (name, kind, size, count) in enumerate(
+        zip(names, kinds, header["SIZE"], counts, strict=True)
+    ):
+        base = f"<{ {'F': 'f', 'I': 'i', 'U': 'u'}[kind] }{int(size)}"
+        if name == "_" or int(count) != 1:
+            layout.append((f"_{number}", base, (int(count),)))
+        else:
+            layout.append((name, base))
+    return np.dtype(layout)
+
+
+def _from_text(path: Path, data: NDArray[np.uint8], record: np.dtype[Any]) -> NDArray[np.uint8]:
+    try:
+        rows = np.loadtxt(data.tobytes().decode("ascii").splitlines(), dtype=record, ndmin=1)
+    except ValueError as error:
+        raise DatasetError(f"{path}: the points cannot be read: {error}") from error
+    return rows.view(np.uint8).reshape(-1)

@@ -1,0 +1,269 @@
+"""One decoder for every ``sensor_msgs/PointCloud2``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.datasets.decode.point_times import (
+    TimeDecision,
+    apply_times,
+    check_time_options,
+    decide_times,
+)
+from loam_gtsam.types import DatasetError, Scan
+
+RING_FIELDS = ("ring", "channel", "line")
+TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "stamps", "time_stamp", "offset_time")
+NO_TIMES = "none"
+"""Value of ``time_field`` that ignores a time field on purpose."""
+
+_WILD_RING = 2.0**31
+"""No beam number; larger ones, which no integer holds, count as this."""
+
+# sensor_msgs/PointField: INT8 = 1 ... FLOAT64 = 8
+_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def decode_pointcloud2(
+    msg: Any,
+    *,
+    time_field: str | None = None,
+    time_unit: str | None = None,
+    stamp_is: str | None = None,
+) -> Scan:
+    """Decode one PointCloud2 message.
+
+    Parameters
+    ----------
+    msg : a message as rosbags, rclpy or rospy hand it out, or any object with its attributes
+    time_field : name of the per-point time field; None looks for the usual names, ``"none"``
+        ignores it
+    time_unit : ``s``, ``ms``, ``us`` or ``ns``; None decides from the numbers
+    stamp_is : moment of the sweep the header stamp is (``start``, ``middle``, ``end``); None
+        decides from the numbers
+
+    Returns
+    -------
+    Scan
+        A copy. Points that are not finite are dropped, with their times and rings, unless the
+        cloud is a range image without ring field: then they stay, as NaN, and ``rows`` is set.
+
+    Raises
+    ------
+    DatasetError
+        If the layout, a field or the times cannot be understood.
+    """
+    return decode_with_times(
+        msg, time_field=time_field, time_unit=time_unit, stamp_is=stamp_is
+    ).scan
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """A decoded cloud, and what was found out about its times.
+
+    Attributes
+    ----------
+    scan : the sweep
+    decision : how its times were read, or None if it has none
+    outliers : number of points taken out because their time lies far outside the sweep
+    """
+
+    scan: Scan
+    decision: TimeDecision | None
+    outliers: int
+
+
+def decode_with_times(
+    msg: Any,
+    *,
+    time_field: str | None = None,
+    time_unit: str | None = None,
+    stamp_is: str | None = None,
+    decision: TimeDecision | None = None,
+) -> Decoded:
+    """As :func:`decode_pointcloud2`, with the account of the times.
+
+    ``decision`` is the one of an earlier sweep: a whole run then reads its times in one way, also
+    where a sweep has too few points to tell.
+    """
+    check_time_options(time_unit, stamp_is)
+    layout = _Layout(msg)
+    stamp = message_stamp(msg)
+    points = _points(layout)
+    rings = _rings(layout)
+    values = _time_values(layout, time_field)
+    rows = 0
+    if rings is None and layout.height > 1:
+        rows = min(layout.height, layout.width)
+        if layout.height > layout.width:  # one column of the image per row of the message
+            order = np.arange(len(points)).reshape(layout.height, layout.width).T.ravel()
+            points = points[order]
+            values = (values[0], values[1][order]) if values is not None else None
+    finite = np.isfinite(points).all(axis=1)
+    times = None
+    outliers = 0
+    if values is not None and finite.any():
+        name, column = values
+        # Only measured points: drivers leave anything in the time of a missing return.
+        measured = column[finite]
+        decision = decision or decide_times(
+            measured, stamp, field=name, unit=time_unit, stamp_is=stamp_is
+        )
+        measured_times, outlier = apply_times(measured, stamp, decision)
+        outliers = int(outlier.sum())
+        times = np.full(len(points), measured_times.min())
+        times[finite] = measured_times
+        if outliers:
+            points[np.flatnonzero(finite)[outlier]] = np.nan
+            finite = np.isfinite(points).all(axis=1)
+    elif values is not None:
+        times = np.zeros(len(points))
+    if rows == 0 and not finite.all():
+        points = points[finite]
+        times = times[finite] if times is not None else None
+        rings = rings[finite] if rings is not None else None
+    scan = Scan(points=points, stamp=stamp, times=times, rings=rings, rows=rows)
+    return Decoded(scan, decision if values is not None else None, outliers)
+
+
+def message_stamp(msg: Any) -> int:
+    """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message.
+
+    Raises
+    ------
+    DatasetError
+        If there is none, or it is no number.
+    """
+    try:
+        stamp = msg.header.stamp
+        if hasattr(stamp, "secs"):  # rospy
+            return int(stamp.secs) * 10**9 + int(stamp.nsecs)
+        return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+    except (AttributeError, TypeError, ValueError, OverflowError) as error:
+        raise DatasetError(
+            f"expected a message with header.stamp, got {type(msg).__name__}: {error}"
+        ) from error
+
+
+def describe_fields(msg: Any) -> str:
+    """Fields of a PointCloud2 for people: ``x float32, ..., t uint32``."""
+    return ", ".join(
+        f"{field.name} {np.dtype(_DATATYPES[field.datatype]).name}"
+        if field.datatype in _DATATYPES
+        else f"{field.name} datatype {field.datatype}"
+        for field in msg.fields
+    )
+
+
+class _Layout:
+    """Checked geometry of the byte buffer; hands out columns without copying."""
+
+    def __init__(self, msg: Any) -> None:
+        try:
+            self.height, self.width = int(msg.height), int(msg.width)
+            self.point_step, row_step = int(msg.point_step), int(msg.row_step)
+            self.order = ">" if msg.is_bigendian else "<"
+            self.fields = {field.name: field for field in msg.fields}
+            data = msg.data
+            if isinstance(data, (list, tuple)):
+                data = np.asarray(data, dtype=np.uint8)
+            self.data = np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, np.uint8)
+        except (AttributeError, TypeError, ValueError, OverflowError) as error:
+            raise DatasetError(
+                f"expected a PointCloud2 message, got {type(msg).__name__}: {error}"
+            ) from error
+        if min(self.height, self.width, self.point_step, row_step) < 0:
+            raise DatasetError(
+                f"PointCloud2: expected sizes from 0 on, got {self.height} x {self.width} points "
+                f"of {self.point_step} bytes in rows of {row_step}"
+            )
+        tight = self.width * self.point_step
+        # One row needs no row step, and some drivers leave it zero.
+        self.row_step = tight if self.height <= 1 or row_step == 0 else row_step
+        if self.size and self.point_step <= 0:
+            raise DatasetError(f"PointCloud2: point_step is {self.point_step}, expected above 0")
+        if self.row_step < tight:
+            raise DatasetError(
+                f"PointCloud2: row_step {self.row_step} is below width x point_step = {tight}"
+            )
+        needed = (self.height - 1) * self.row_step + tight if self.size else 0
+        if len(self.data) < needed:
+            raise DatasetError(
+                f"PointCloud2: {self.height} x {self.width} points of {self.point_step} bytes "
+                f"need {needed} bytes of data, got {len(self.data)}; the message is damaged"
+            )
+
+    @property
+    def size(self) -> int:
+        return self.height * self.width
+
+    def column(self, name: str) -> NDArray[Any]:
+        """(height * width,) values of a field, in native byte order."""
+        field = self.fields[name]
+        if field.datatype not in _DATATYPES:
+            raise DatasetError(
+                f"PointCloud2 field {name!r}: unknown datatype {field.datatype}, expected 1 to 8"
+            )
+        dtype = np.dtype(self.order + _DATATYPES[field.datatype])
+        if field.count > 1:  # 0 is what old PCL versions write for 1
+            raise DatasetError(f"PointCloud2 field {name!r}: expected count 1, got {field.count}")
+        if self.size == 0:
+            return np.zeros(0, dtype.newbyteorder("="))
+        if field.offset < 0 or field.offset + dtype.itemsize > self.point_step:
+            raise DatasetError(
+                f"PointCloud2 field {name!r}: {dtype.itemsize} bytes at offset {field.offset} "
+                f"do not fit into point_step {self.point_step}"
+            )
+        view: NDArray[Any] = np.ndarray(
+            (self.height, self.width),
+            dtype,
+            self.data,
+            field.offset,
+            (self.row_step, self.point_step),
+        )
+        return view.astype(dtype.newbyteorder("=")).reshape(-1)
+
+
+def _points(layout: _Layout) -> NDArray[Any]:
+    missing = [name for name in "xyz" if name not in layout.fields]
+    if missing:
+        raise DatasetError(
+            f"PointCloud2: no field {', '.join(missing)}; the message has: "
+            f"{', '.join(layout.fields) or 'no fields'}"
+        )
+    columns = [layout.column(name) for name in "xyz"]
+    for name, column in zip("xyz", columns, strict=True):
+        if column.dtype.kind != "f":
+            raise DatasetError(
+                f"PointCloud2 field {name!r}: expected float32 or float64, got {column.dtype}"
+            )
+    with np.errstate(invalid="ignore"):  # some bit patterns of NaN do not survive a change of width
+        return np.stack(columns, axis=1)
+
+
+def _rings(layout: _Layout) -> NDArray[Any] | None:
+    name = next((name for name in RING_FIELDS if name in layout.fields), None)
+    if name is None:
+        return None
+    column = layout.column(name)
+    if column.dtype.kind == "f":  # a missing return may carry NaN; its point is NaN as well
+        beams = np.clip(np.nan_to_num(column), -_WILD_RING, _WILD_RING)
+        whole: NDArray[np.int64] = np.rint(beams).astype(np.int64)
+        return whole
+    return column
+
+
+def _time_values(layout: _Layout, asked: str | None) -> tuple[str, NDArray[Any]] | None:
+    if asked == NO_TIMES:
+        return None
+    if asked is not None and asked not in layout.fields:
+        raise DatasetError(
+            f"PointCloud2: no time field {asked!r}; the message has: {', '.join(layout.fields)}"
+        )
+    name = asked or next((name for name in TIME_FIELDS if name in layout.fields), None)
+    return None if name is None else (name, layout.column(name))

@@ -1,0 +1,264 @@
+"""A folder of ``.bin`` sweeps: KITTI, and the many data sets that copy its format."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
+from loam_gtsam.datasets.decode.extrinsics import describe_extrinsics, implied_by
+from loam_gtsam.datasets.decode.point_times import TimeDecision, apply_times, decide_times
+from loam_gtsam.datasets.decode.tables import (
+    clean_imu,
+    describe_imu,
+    describe_stamps,
+    read_table,
+    read_tum,
+)
+from loam_gtsam.datasets.kitti.poses import (
+    camera_T_lidar_of,
+    lidar_T_imu_of,
+    odometry_truth,
+    oxts_imu,
+    oxts_truth,
+    read_oxts,
+)
+from loam_gtsam.datasets.kitti.times import sweep_stamps, turn_seconds
+from loam_gtsam.types import (
+    DatasetError,
+    ImuSamples,
+    Scan,
+    Trajectory,
+)
+
+KITTI_SENSOR: Mapping[str, Any] = {
+    "spin": "clockwise",
+    "start_azimuth_deg": 180.0,
+    "stamp": "middle",
+}
+"""KITTI's HDL-64E: the synced stamp is the moment the sensor faces forward (data set paper,
+Geiger et al. 2013), the cut between sweeps is behind. The sense of rotation was measured: on drive
+2011_09_26_0002, sweeps 8 to 12 frames apart match best (10 of 10 pairs) when de-skewed clockwise
+from behind by exactly the true motion; the order in the files, ring by ring, runs the other way."""
+
+_FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
+_POINT_BYTES = 16
+
+
+class KittiDataset(SweepFiles):
+    """Folder of ``.bin`` files, float32 ``x y z intensity`` little endian.
+
+    Parameters
+    ----------
+    path : the folder with the ``.bin`` files, or one that holds them in ``velodyne/``, ``scans/``
+        or ``velodyne_points/data/``
+    vertical_angle_offset_deg : raise every ray by this elevation. Some systems (CT-ICP, KISS-ICP)
+        correct the intrinsic calibration of KITTI's HDL-64E by 0.205 degrees.
+
+    Notes
+    -----
+    Next to the sweeps it reads, where present: ``times.txt`` (seconds, one per sweep) or KITTI's
+    ``velodyne_points/timestamps.txt``; ``t_ns/*.u64`` (uint64 nanoseconds per point);
+    ``gt.tum`` (reference poses); ``imu.csv`` (s, quaternion x y z w, rad/s, m/s^2).
+
+    Of KITTI's raw drives also ``timestamps_start.txt`` and ``timestamps_end.txt`` (the duration of
+    a turn), and ``oxts/`` with ``calib_imu_to_velo.txt`` as IMU and as reference poses. A sequence
+    of its odometry benchmark, known by ``Tr`` in ``calib.txt``, has sweeps that are already freed
+    of the motion; its reference poses are ``../../poses/NN.txt``.
+
+    Raises
+    ------
+    DatasetError
+        If there are no sweeps, or a file next to them cannot be understood.
+    """
+
+    def __init__(self, path: str | Path, *, vertical_angle_offset_deg: float = 0.0) -> None:
+        given = Path(path)
+        folder = _sweep_folder(given)
+        self._root = _root_of(folder, given)
+        self.name = given.resolve().name or "sweeps"
+        self._path = given
+        self._files = sorted(folder.glob("*.bin"), key=_natural_order)
+        self._offset = float(np.radians(vertical_angle_offset_deg))
+        if not np.isfinite(self._offset):
+            raise DatasetError(
+                f"vertical_angle_offset_deg: expected degrees, got {vertical_angle_offset_deg!r}"
+            )
+        self._times_folder = self._root / "t_ns"
+        self._has_times = self._times_folder.is_dir()
+        self._problems: list[str] = []
+        self.stamps = sweep_stamps(self._root, self._files, self._problems)
+        self._camera_T_lidar = camera_T_lidar_of(self._root)
+        self._oxts = read_oxts(self._root)
+        self._lidar_T_imu = None if self._oxts is None else lidar_T_imu_of(self._root)
+        if self._oxts is not None and self._lidar_T_imu is None:
+            self._problems.append(
+                "oxts left out: no calib_imu_to_velo.txt in the drive or above it says where the "
+                "scanner is (it comes with the calibration of the day)"
+            )
+        self.sensor: Mapping[str, Any] = self._implied(folder)
+        self._decision = self._decide_times() if self._has_times else None
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """From ``imu.csv`` or ``oxts/``, or None."""
+        path = self._root / "imu.csv"
+        if path.is_file():
+            table = read_table(path, "t qx qy qz qw wx wy wz ax ay az", ",")
+            return clean_imu(*table, self._problems)
+        if self._oxts is None or self._lidar_T_imu is None:
+            return None
+        return oxts_imu(*self._oxts, self._problems)
+
+    @cached_property
+    def truth(self) -> Trajectory | None:
+        """From ``gt.tum``, the odometry benchmark's poses or ``oxts/``, or None."""
+        path = self._root / "gt.tum"
+        if path.is_file():
+            return read_tum(path)
+        if self._camera_T_lidar is not None:
+            return odometry_truth(self._root, self.stamps, self._camera_T_lidar)
+        if self._oxts is None or self._lidar_T_imu is None:
+            return None
+        return oxts_truth(*self._oxts, self._lidar_T_imu, self._problems)
+
+    def info(self) -> DatasetInfo:
+        """What was understood; reads no sweep."""
+        imu = self.imu  # first: it may find problems
+        info = DatasetInfo("KITTI folder", str(self._path), {"sweeps": str(len(self))})
+        describe_stamps(self.stamps, info.facts, info.problems)
+        info.facts["fields"] = "x, y, z, intensity (float32)"
+        info.facts["point times"] = str(self._decision or "none recorded")
+        sensor = {key: value for key, value in self.sensor.items() if not key.startswith("imu.")}
+        if sensor:
+            info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in sensor.items())
+        if self._offset:
+            info.facts["elevation raised by"] = f"{np.degrees(self._offset):g} degrees"
+        info.facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        if "imu.lidar_t_imu" in self.sensor:
+            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, "calib_imu_to_velo.txt")
+        info.facts["reference poses"] = str(len(self.truth)) if self.truth is not None else "none"
+        info.problems.extend(self._problems)
+        return info
+
+    def _implied(self, folder: Path) -> Mapping[str, Any]:
+        sensor: dict[str, Any] = {}
+        if self._has_times:
+            pass  # they say it all
+        elif self._camera_T_lidar is not None:
+            sensor = dict(KITTI_SENSOR) | {"times": "none"}
+            self._problems.append(
+                "a sequence of KITTI's odometry benchmark: its sweeps are already freed of the "
+                "motion, so they are not de-skewed (sensor.times=azimuth would)"
+            )
+        elif folder.name == "velodyne" or folder.parent.name == "velodyne_points":
+            period = turn_seconds(self._root, self._files, self.stamps, self._problems)
+            sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
+        if self._lidar_T_imu is not None and not (self._root / "imu.csv").is_file():
+            sensor.update(implied_by(self._lidar_T_imu))
+        return sensor
+
+    def _read(self, file: Path, stamp: int) -> Scan:
+        points = _read_points(file)
+        if self._offset:
+            points = raise_elevation(points, self._offset)
+        if self._decision is None:
+            return Scan(points=points, stamp=stamp)
+        values = self._read_point_times(file, len(points))
+        times, outlier = apply_times(values, stamp, self._decision)
+        if outlier.any():
+            points[outlier] = np.nan
+        return Scan(points=points, stamp=stamp, times=times)
+
+    def _read_point_times(self, file: Path, count: int | None = None) -> NDArray[np.uint64]:
+        path = self._times_folder / f"{file.stem}.u64"
+        try:
+            values = np.fromfile(path, dtype="<u8")
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot read the point times: {error}") from error
+        if count is not None and len(values) != count:
+            raise DatasetError(f"{path}: expected {count} point times, got {len(values)}")
+        return values
+
+    def _decide_times(self) -> TimeDecision:
+        """From the first sweep that has times; a missing file is a bad sweep, not the end."""
+        message = ""
+        for file, stamp in zip(self._files, self.stamps.tolist(), strict=True):
+            try:
+                values = self._read_point_times(file)
+                return decide_times(values, stamp, field="t_ns", unit="ns")
+            except DatasetError as error:
+                message = message or str(error)
+        raise DatasetError(f"{self._times_folder}: no usable point times; {message}")
+
+
+def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.floating]:
+    """Turn every ray up by ``angle`` (rad), about the horizontal axis perpendicular to it."""
+    horizontal = np.hypot(points[:, 0], points[:, 1])
+    cosine, sine = np.cos(angle), np.sin(angle)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        scale = np.where(horizontal > 0.0, cosine - sine * points[:, 2] / horizontal, 1.0)
+    raised = np.empty_like(points)
+    raised[:, :2] = points[:, :2] * scale[:, None]
+    raised[:, 2] = np.where(
+        horizontal > 0.0, cosine * points[:, 2] + sine * horizontal, points[:, 2]
+    )
+    return raised
+
+
+def _read_points(file: Path) -> NDArray[np.float32]:
+    try:
+        size = file.stat().st_size
+        if size % _POINT_BYTES:
+            raise DatasetError(
+                f"{file}: {size} bytes is not a multiple of {_POINT_BYTES} (float32 x y z "
+                "intensity); the file is truncated or in another format"
+            )
+        values = np.fromfile(file, dtype="<f4").reshape(-1, 4)
+    except OSError as error:
+        raise DatasetError(f"{file}: cannot read the sweep: {error}") from error
+    return np.ascontiguousarray(values[:, :3], dtype=np.float32)
+
+
+def find_sweeps(path: Path) -> Path | None:
+    """The folder in or below ``path`` that holds ``.bin`` sweeps, None if there is none."""
+    for name in _FOLDERS:
+        folder = path / name
+        if folder.is_dir() and next(folder.glob("*.bin"), None) is not None:
+            return folder
+    return None
+
+
+def _sweep_folder(path: Path) -> Path:
+    if not path.is_dir():
+        what = "not a folder" if path.exists() else "no such folder"
+        raise DatasetError(f"{path}: {what}; expected a folder with .bin sweeps")
+    folder = find_sweeps(path)
+    if folder is not None:
+        return folder
+    raise DatasetError(
+        f"{path}: no .bin sweeps; looked in the folder itself, "
+        f"{', '.join(name + '/' for name in _FOLDERS if name)}"
+    )
+
+
+def _root_of(folder: Path, given: Path) -> Path:
+    """Folder of ``times.txt`` and the like, also when the sweep folder itself was given."""
+    if folder != given:
+        return given
+    folder = folder.resolve()
+    if folder.name in ("velodyne", "scans"):
+        return folder.parent
+    if folder.name == "data" and folder.parent.name == "velodyne_points":
+        return folder.parent.parent
+    return given
+
+
+def _natural_order(file: Path) -> tuple[int, str]:
+    """2.bin before 10.bin."""
+    return (int(file.stem) if file.stem.isdecimal() else -1, file.name)

@@ -1,0 +1,136 @@
+"""HeLiPR: several lidars on a car, one file of points per sweep."""
+
+from __future__ import annotations
+
+from functools import cached_property, partial
+from pathlib import Path
+
+import numpy as np
+
+from loam_gtsam.datasets.decode.extrinsics import implied_by, invert
+from loam_gtsam.datasets.decode.packed_points import read_records
+from loam_gtsam.datasets.decode.tables import in_order, poses_from_quaternions, read_table
+from loam_gtsam.datasets.known.layouts import HELIPR_OTHERS, first_existing, helipr_truth
+from loam_gtsam.datasets.known.stamped_files import PackedFiles, missing_files
+from loam_gtsam.datasets.known.xsens import read_xsens
+from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
+
+RECORDS = {
+    "Ouster": np.dtype(
+        [
+            *((name, "<f4") for name in ("x", "y", "z", "intensity")),
+            ("t", "<u4"),
+            *((name, "<u2") for name in ("reflectivity", "ring", "ambient")),
+        ]
+    ),
+    "Velodyne": np.dtype(
+        [
+            *((name, "<f4") for name in ("x", "y", "z", "intensity")),
+            ("ring", "<u2"),
+            ("time", "<f4"),
+        ]
+    ),
+}
+"""Fields of a point, without padding (the data set's file player)."""
+IMU_T_LIDAR = {
+    "Ouster": np.array(
+        [
+            [0.999715495593027, 0.0223448061210468, -0.00834490926264448, -0.417],
+            [-0.0224514077723064, 0.999664614804883, -0.0129070599303583, -0.003],
+            [0.00805370475188661, 0.0130907427756056, 0.999881878170293, 0.2996],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    ),
+    "Velodyne": np.array(
+        [
+            [0.999995760375673, 0.000773891425480788, -0.00280719125478291, -1.372],
+            [-0.000825966811080870, 0.999826715354752, -0.0185972320992637, 0.0668],
+            [0.00279231257318289, 0.0185994719007949, 0.999823115673720, 0.0297],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    ),
+}
+"""From the data set's Pointcloud-Toolbox (``transformINStoLiDAR.py``)."""
+
+
+class HeLiPRDataset(PackedFiles):
+    """A sequence of HeLiPR.
+
+    Parameters
+    ----------
+    path : holds ``LiDAR/Ouster/*.bin`` or ``LiDAR/Velodyne/*.bin`` (or these without ``LiDAR/``),
+        named by nanoseconds, and, where present, ``LiDAR_GT/Ouster_gt.txt`` (or
+        ``global_Ouster_gt.txt``), ``Inertial_data/xsens_imu.csv`` and ``stamp.csv``
+    lidar : ``Ouster`` (OS2-128) or ``Velodyne`` (VLP-16C); None takes the first that is there
+    time_unit, stamp_is : see :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
+
+    Raises
+    ------
+    DatasetError
+        If there are no sweeps, a table cannot be understood, or another lidar is asked for: those
+        do not sweep rings around themselves, which the features of LOAM need.
+
+    References
+    ----------
+    Jung, Yang, Lee, Gil, Kim and Kim, HeLiPR: Heterogeneous LiDAR dataset for inter-LiDAR place
+    recognition under spatiotemporal variations, IJRR 2024;
+    https://github.com/minwoo0611/HeLiPR-File-Player.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        lidar: str | None = None,
+        time_unit: str | None = None,
+        stamp_is: str | None = None,
+    ) -> None:
+        root = Path(path)
+        folder = _lidar_folder(root, lidar)
+        self._lidar = folder.name
+        super().__init__(
+            root,
+            f"HeLiPR sequence, {self._lidar}",
+            folder,
+            "*.bin",
+            int,
+            read=partial(read_records, record=RECORDS[self._lidar]),
+            time_unit=time_unit,
+            stamp_is=stamp_is,
+        )
+        self._root = root
+        self.sensor = implied_by(invert(IMU_T_LIDAR[self._lidar]))
+        self._extrinsics_source = "HeLiPR-Pointcloud-Toolbox"
+        listing = first_existing(root, ["stamp.csv"])
+        self._problems += missing_files(listing, self._lidar.lower(), self.stamps)
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """From ``xsens_imu.csv``, or None."""
+        path = first_existing(self._root, ["Inertial_data/xsens_imu.csv", "xsens_imu.csv"])
+        return None if path is None else read_xsens(path, self._problems)
+
+    @cached_property
+    def truth(self) -> Trajectory | None:
+        """Poses of the lidar itself, or None."""
+        path = helipr_truth(self._root, self._lidar)
+        if path is None:
+            return None
+        stamps, values = read_table(path, "ns x y z qx qy qz qw", None)
+        poses = poses_from_quaternions(values[:, :3], values[:, 3:], str(path))
+        return in_order(stamps, poses, path.name, self._problems)
+
+
+def _lidar_folder(root: Path, lidar: str | None) -> Path:
+    if lidar is not None and lidar not in RECORDS:
+        reason = "it does not sweep rings" if lidar in HELIPR_OTHERS else "unknown"
+        raise DatasetError(f"lidar: expected {' or '.join(RECORDS)}, got {lidar!r}: {reason}")
+    for name in [lidar] if lidar else RECORDS:
+        folder = first_existing(root, [f"LiDAR/{name}", name])
+        if folder is not None:
+            return folder
+    others = [name for name in HELIPR_OTHERS if first_existing(root, [f"LiDAR/{name}", name])]
+    hint = f"; {', '.join(others)} cannot be used: no rings" if others else ""
+    raise DatasetError(
+        f"{root}: no HeLiPR sequence: expected LiDAR/{lidar or ' or LiDAR/'.join(RECORDS)}{hint}"
+    )

@@ -1,0 +1,197 @@
+"""The Newer College data sets of 2020 (OS1-64) and 2021 (OS0-128), hand-held."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
+from loam_gtsam.datasets.decode.extrinsics import invert, pose, rigid
+from loam_gtsam.datasets.decode.packed_points import firing_by_firing, read_pcd
+from loam_gtsam.datasets.known.layouts import (
+    NEWER_COLLEGE_SCANS,
+    first_existing,
+    newer_college_sequence,
+    newer_college_sequences,
+)
+from loam_gtsam.datasets.known.stamped_files import PackedFiles
+from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
+
+_SENSOR_T_LIDAR = rigid(Rotation.from_euler("z", 180.0, degrees=True), [0.0, 0.0, 0.03618])
+_SENSOR_T_IMU = rigid(Rotation.identity(), [0.006253, -0.011775, 0.007645])
+"""Ouster's manual of the OS1, coordinate frames."""
+
+RIG_2020 = Rig(
+    kind="Newer College 2020",
+    topic="/os1_cloud_node/points",
+    imu_topic="/os1_cloud_node/imu",
+    body_T_lidar=pose([-0.084, -0.025, 0.050, 0.0, 0.0, 0.924, 0.383]),
+    lidar_T_imu=invert(_SENSOR_T_LIDAR) @ _SENSOR_T_IMU,
+    source="Ouster's manual",
+)
+"""Points are in the driver's lidar frame, half a turn from the case; reference poses are of the
+left camera's mount. ``body_T_lidar`` as pyLiDAR-SLAM and KISS-ICP quote it; it equals the
+data set's IMU extrinsics, as evalio quotes them, with Ouster's manual to a millimetre."""
+RIG_2021 = Rig(
+    kind="Newer College 2021",
+    topic="/os_cloud_node/points",
+    imu_topic="/os_cloud_node/imu",
+    body_T_lidar=pose([0.001, 0.0, 0.091, 0.0, 0.0, 0.0, 1.0]),
+    lidar_T_imu=invert(
+        pose([0.013801, -0.012207, -0.01514, 0.0032925, -0.004627, -0.0024302, 0.99998])
+    ),
+    source="the data set's calibration, as evalio quotes it",
+)
+"""``os_sensor_to_base`` of the data set's ``os_imu_lidar_transforms.yaml``, as ptudes and evalio
+quote it. Points are in the frame of the case."""
+
+_BEAMS, _COLUMNS, _PERIOD = 64, 1024, 0.1
+
+
+class NewerCollegeBags(BagSequence):
+    """A sequence of the Newer College data sets as bags.
+
+    Parameters
+    ----------
+    path : one bag, or a folder with the bags of a sequence (also in ``rosbag/``), which are read
+        one after the other. Reference poses are looked for there, in ``ground_truth/`` and
+        in ``ground_truth/tum_format/``, also one folder up.
+    sequence : which, if the folder holds several, e.g. ``quad-easy``
+    topic, imu_topic, time_field, time_unit, stamp_is : as for
+        :class:`~loam_gtsam.datasets.BagDataset`
+
+    Raises
+    ------
+    DatasetError
+        If there is none, or there are several sequences and none is named.
+
+    References
+    ----------
+    Ramezani et al., The Newer College dataset, IROS 2020; Zhang et al., Multi-camera LiDAR inertial
+    extension to the Newer College dataset, 2021, https://ori-drs.github.io/newer-college-dataset.
+    """
+
+    def __init__(
+        self,
+        path: str | Path,
+        *,
+        sequence: str | None = None,
+        topic: str | None = None,
+        imu_topic: str | None = None,
+        time_field: str | None = None,
+        time_unit: str | None = None,
+        stamp_is: str | None = None,
+    ) -> None:
+        root = Path(path)
+        name, parts = _choose(root, sequence)
+        super().__init__(
+            root,
+            parts,
+            RIG_2020 if name == "rooster" else RIG_2021,
+            _truth_file(parts[0].parent, name),
+            topic=topic,
+            imu_topic=imu_topic,
+            time_field=time_field,
+            time_unit=time_unit,
+            stamp_is=stamp_is,
+        )
+
+
+class NewerCollegeClouds(PackedFiles):
+    """A sequence of 2020 as PCD files.
+
+    Parameters
+    ----------
+    path : holds ``raw_format/ouster_scan/cloud_SECONDS_NANOSECONDS.pcd``, and
+        ``ground_truth/registered_poses.csv``
+    time_unit, stamp_is : as for :class:`~loam_gtsam.datasets.BagDataset`
+
+    Notes
+    -----
+    Files without times of points are taken to be 1024 firings of 64 beams in 0.1 s from the stamp,
+    as KISS-ICP reads them; a file of another size then becomes a bad sweep.
+    """
+
+    def __init__(
+        self, path: str | Path, *, time_unit: str | None = None, stamp_is: str | None = None
+    ) -> None:
+        root = Path(path)
+        super().__init__(
+            root,
+            f"{RIG_2020.kind}, PCD files",
+            root / NEWER_COLLEGE_SCANS,
+            "*.pcd",
+            _cloud_stamp,
+            read=read_pcd,
+            time_unit=time_unit,
+            stamp_is=stamp_is,
+        )
+        self._problems.append("IMU: not read from this layout; the bags have one")
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """None: the bags have one."""
+        return None
+
+    @cached_property
+    def truth(self) -> Trajectory | None:
+        """The reference poses, moved to the lidar; None without their file."""
+        path = _truth_file(self._path, "rooster")
+        return None if path is None else read_poses(path, RIG_2020.body_T_lidar, self._problems)
+
+    def _read(self, file: Path, stamp: int) -> Scan:
+        if self._first[0] is not None:
+            return super()._read(file, stamp)
+        cloud = firing_by_firing(self._unpack(file, stamp), _BEAMS, _COLUMNS, str(file))
+        column = np.arange(_BEAMS * _COLUMNS) % _COLUMNS
+        return replace(self._decode(cloud).scan, times=_PERIOD / _COLUMNS * column)
+
+
+def _cloud_stamp(stem: str) -> int:
+    """Of ``cloud_1583836591_182590976``."""
+    match = re.fullmatch(r"cloud_(\d+)_(\d{1,9})", stem)
+    if match is None:
+        raise ValueError(f"{stem} is not cloud_SECONDS_NANOSECONDS")
+    return int(match[1]) * 10**9 + int(match[2])
+
+
+def _choose(root: Path, sequence: str | None) -> tuple[str, list[Path]]:
+    if root.is_file():
+        known = newer_college_sequence(root)
+        if known is None:
+            raise DatasetError(f"{root}: not named as a bag of the Newer College data sets")
+        return known[0], [root]
+    found = newer_college_sequences(root)
+    names = ", ".join(found)
+    if not found:
+        raise DatasetError(f"{root}: no bags of the Newer College data sets")
+    if sequence is None and len(found) > 1:
+        raise DatasetError(f"{root}: several sequences ({names}); give sequence, or open one bag")
+    name = sequence or next(iter(found))
+    if name not in found:
+        raise DatasetError(f"{root}: no sequence {sequence!r}; there is {names}")
+    return name, found[name]
+
+
+def _truth_file(folder: Path, name: str) -> Path | None:
+    if name == "rooster":
+        files = ["registered_poses.csv"]
+    elif name.startswith("math-"):
+        difficulty = name.removeprefix("math-")
+        files = [f"gt_state_{difficulty}.csv", f"gt_math_{difficulty}.csv"]
+    else:
+        files = [f"gt-nc-{name}.csv"]
+    return first_existing(
+        folder,
+        [
+            f"{up}{inner}{file}"
+            for up in ("", "../")
+            for inner in ("", "ground_truth/", "ground_truth/tum_format/")
+            for file in files
+        ],
+    )

@@ -1,0 +1,1 @@
+"""Built-in simulated worlds, with exact truth."""

@@ -1,0 +1,120 @@
+"""A town laid out around a way of one's own, which may cross and repeat itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from loam_gtsam.datasets.sim.scenes import (
+    CAR,
+    DEEP,
+    Kerb,
+    Scene,
+    chord,
+    grown,
+    points_at,
+    rolling,
+)
+from loam_gtsam.types import FloatArray, InputError
+
+_STREAM = 9
+"""Of random numbers; other scenes have lower ones."""
+_STEP = 1.0
+"""Metres between the points at which the way is looked at."""
+_SPACING = 8.0
+"""Metres between way points."""
+_CLEAR = 5.0
+"""Metres that houses keep from the way at least."""
+_KERB = 2.8
+"""Metres that cars, posts and trees do."""
+
+
+def build_city(way: FloatArray, seed: int = 0) -> Scene:
+    """Houses, parked cars, lamp posts and trees on both sides of a way.
+
+    Nothing stands on the way, nor twice where it passes more than once.
+
+    Parameters
+    ----------
+    way : (N, 2) x y of the path, metres, in the order in which it is driven
+    seed : of the place
+
+    Raises
+    ------
+    InputError
+        If there are no two points 100 m apart along the way.
+    """
+    way = np.asarray(way, np.float64)
+    if way.ndim != 2 or way.shape[1] != 2 or not np.isfinite(way).all():
+        raise InputError(f"way: expected (N, 2) finite metres, got shape {way.shape}")
+    distances = chord(way)
+    length = float(distances[-1])
+    if not len(way) or length < 100.0:
+        raise InputError("way: expected one of 100 m or more; give more points of it")
+    way = way[np.concatenate([[True], np.diff(distances) > 0.0])]  # without stops
+
+    def along(spacing: float) -> FloatArray:
+        return points_at(way, np.linspace(0.0, length, int(length / spacing) + 1))
+
+    path = along(_STEP)
+    taken = cKDTree(path)
+    rng = np.random.default_rng([seed, 0, _STREAM])
+    ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
+    boxes: list[list[float]] = []
+    cylinders: list[list[float]] = []
+    crowns: list[list[float]] = []
+    houses: list[FloatArray] = []
+
+    def free(box: list[float], margin: float) -> bool:
+        """Whether a box keeps away from the way."""
+        x, y, _, half_x, half_y, _, yaw = box
+        u, v = np.meshgrid(np.linspace(-half_x, half_x, 7), np.linspace(-half_y, half_y, 7))
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        outline = np.stack([x + cosine * u - sine * v, y + sine * u + cosine * v], axis=-1)
+        return bool(taken.query(outline.reshape(-1, 2))[0].min() > margin)
+
+    def apart(place: FloatArray, metres: float) -> bool:
+        return not houses or float(np.linalg.norm(np.array(houses) - place, axis=1).min()) > metres
+
+    s = 6.0
+    while s < length - 6.0:
+        a, b = path[int((s - 4.0) / _STEP)], path[min(int((s + 4.0) / _STEP), len(path) - 1)]
+        for left in (True, False):
+            kerb = Kerb(a, b, left, ground)
+            middle = 0.5 * kerb.length
+            width, setback = float(rng.uniform(8.0, 13.0)), float(rng.uniform(8.0, 12.5))
+            top, chance = float(rng.uniform(5.0, 16.0)), float(rng.random())
+            house = kerb.box(
+                middle - 0.5 * width, middle + 0.5 * width, setback, setback + 10.0, -DEEP, top
+            )
+            place = np.array(house[:2])
+            if free(house, _CLEAR) and apart(place, 9.0):
+                houses.append(place)
+                boxes.append(house)
+                for _ in range(int(rng.integers(1, 4))):  # porches, bays and pilasters
+                    at, out = float(rng.uniform(-0.4, 0.35)) * width, float(rng.uniform(0.25, 0.9))
+                    wide = float(rng.uniform(0.6, 2.2))
+                    low, high = ((-DEEP, top), (-DEEP, 2.6), (1.0, 4.5))[rng.integers(3)]
+                    boxes.append(
+                        kerb.box(middle + at, middle + at + wide, setback - out, setback, low, high)
+                    )
+            x, y, z = kerb.place(middle, float(rng.uniform(5.8, 7.0)))
+            post = [x, y, 0.0, 0.3, 0.3, 1.0, 0.0]
+            if chance < 0.5 and free(post, _KERB):
+                cylinders.append([x, y, float(rng.uniform(0.1, 0.22)), z - DEEP, z + 5.0])
+                if chance < 0.25:
+                    size = float(rng.uniform(1.2, 1.9))
+                    crowns.append([x, y, z + 3.2 + size, size, size, size])
+            car = kerb.box(middle - 2.1, middle + 2.1, 4.2, 6.0, 0.25, 1.3)
+            if 0.3 < chance < 0.6 and free(car, _KERB):
+                boxes.append(car)
+        s += float(rng.uniform(9.0, 13.0))
+    return Scene(
+        name="city",
+        solids=grown(boxes, cylinders, crowns, ground),
+        waypoints=along(_SPACING),
+        closed=False,
+        speed=10.0,
+        height=1.8,
+        sway=CAR,
+    )

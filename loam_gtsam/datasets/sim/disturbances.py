@@ -1,0 +1,297 @@
+"""Sweeps as they should not be: passing objects, outliers, drop-outs, gaps.
+
+Any data set can be made harder, its truth and IMU are handed through:
+``Disturbed(dataset, [Outliers(0.2), MissingSweeps(at=(40, 80))])``. Everything random comes from a
+seed and the number of the sweep: iterating twice gives the same sweeps twice. For a lidar that is
+put somewhere else see :mod:`loam_gtsam.datasets.sim.kidnapping`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
+from loam_gtsam.types import (
+    BoolArray,
+    ConfigError,
+    FeatureSweep,
+    FloatArray,
+    ImuSamples,
+    InputError,
+    Scan,
+    Trajectory,
+)
+
+_REACH = 60.0
+"""Metres ahead and behind that hold moving objects."""
+_CALIBRATIONS = 16
+"""Moments at which the share of points on moving objects is averaged."""
+
+
+class Disturbance:
+    """What happens to the sweeps of a data set; this one does nothing."""
+
+    def keeps(self, number: int) -> bool:
+        """Whether the sweep of that number (from 0) arrives at all."""
+        return True
+
+    def apply(self, number: int, scan: Scan) -> Scan:
+        """The sweep as it arrives; rows stay in place, lost points become NaN."""
+        return scan
+
+
+@dataclass(frozen=True, slots=True)
+class Outliers(Disturbance):
+    """Points moved along their beams to a random range, uniform within bounds.
+
+    Parameters
+    ----------
+    share : of the points of each sweep
+    ranges : least and largest, metres
+    """
+
+    share: float = 0.2
+    ranges: tuple[float, float] = (1.0, 50.0)
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check_share(self.share)
+
+    def apply(self, number: int, scan: Scan) -> Scan:
+        """See :meth:`Disturbance.apply`."""
+        rng = np.random.default_rng([self.seed, number])
+        chosen = rng.permutation(len(scan.points))[: round(self.share * len(scan.points))]
+        points = scan.points.astype(np.float64)
+        ranges = rng.uniform(*self.ranges, len(chosen))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            points[chosen] *= (ranges / np.linalg.norm(points[chosen], axis=1))[:, None]
+        return replace(scan, points=points.astype(scan.points.dtype))
+
+
+@dataclass(frozen=True, slots=True)
+class SectorDropouts(Disturbance):
+    """Sectors of azimuth without a return, at other places every few sweeps.
+
+    Parameters
+    ----------
+    share : of the full circle
+    sectors : of equal width, evenly spread
+    seconds : after which they are somewhere else
+    """
+
+    share: float = 0.25
+    sectors: int = 2
+    seconds: float = 0.5
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        _check_share(self.share)
+        if self.sectors < 1 or not self.seconds > 0.0:
+            raise ConfigError(
+                "SectorDropouts: expected at least one sector and a time above 0 s, got "
+                f"{self.sectors} and {self.seconds!r}"
+            )
+
+    def apply(self, number: int, scan: Scan) -> Scan:
+        """See :meth:`Disturbance.apply`."""
+        period = int(scan.stamp) // max(round(self.seconds * 1e9), 1)
+        offset = np.random.default_rng([self.seed, period]).random()
+        turn = np.arctan2(scan.points[:, 1], scan.points[:, 0]) / (2.0 * np.pi)
+        lost = ((turn + offset) * self.sectors) % 1.0 < self.share
+        points = scan.points.copy()
+        points[lost] = np.nan
+        return replace(scan, points=points)
+
+
+@dataclass(frozen=True, slots=True)
+class MissingSweeps(Disturbance):
+    """Sweeps that never arrive.
+
+    Parameters
+    ----------
+    at : number of the first one missing, of each gap
+    count : sweeps in a row
+    """
+
+    at: tuple[int, ...]
+    count: int = 1
+
+    def keeps(self, number: int) -> bool:
+        """See :meth:`Disturbance.keeps`."""
+        return not any(first <= number < first + self.count for first in self.at)
+
+
+@dataclass(frozen=True, slots=True)
+class MovingObjects(Disturbance):
+    """Two columns of boxes that pass the lidar on either side and hide what is behind them.
+
+    They keep their speed in the frame of the lidar, as the traffic on the next lanes does: all
+    points on them agree with each other on a wrong motion. Beams without a return meet none.
+
+    Parameters
+    ----------
+    length, width, height : of a box, metres
+    spacing : from the start of one to that of the next, metres
+    lane : from the lidar to the near side of a box, metres
+    bottom : of a box, metres, lidar frame
+    speeds : of the left and of the right column along x, m/s, lidar frame
+    range_noise : standard deviation along the beam, metres
+    """
+
+    length: float = 8.0
+    width: float = 2.0
+    height: float = 3.0
+    spacing: float = 16.0
+    lane: float = 2.5
+    bottom: float = -1.5
+    speeds: tuple[float, float] = (4.0, -9.0)
+    range_noise: float = 0.02
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.length <= self.spacing or min(self.width, self.height, self.lane) <= 0.0:
+            raise ConfigError(
+                "MovingObjects: expected sizes and a lane above 0 m, and boxes no longer than "
+                f"their spacing; got {self}"
+            )
+
+    def covering(self, share: float, scan: Scan) -> MovingObjects:
+        """The same with boxes so long that they hide a share of a sweep's points, averaged in time.
+
+        Raises
+        ------
+        ConfigError
+            If boxes without a gap between them hide less.
+        """
+        _check_share(share)
+        # Once past the slower column: the other one is then seen at as many places.
+        period = self.spacing / min((abs(v) for v in self.speeds if v), default=self.spacing)
+        moments = np.arange(_CALIBRATIONS) * (period / _CALIBRATIONS)
+
+        def hidden(length: float) -> float:
+            boxes = replace(self, length=length)
+            return float(
+                np.mean([np.isfinite(boxes._ranges(scan, at)).mean() for at in moments.tolist()])
+            )
+
+        low, high = 0.0, self.spacing
+        if hidden(high) < share:
+            raise ConfigError(
+                f"MovingObjects: boxes in a row hide {hidden(high):.2f} of this sweep, not "
+                f"{share:g}; bring the lane nearer or make the boxes higher"
+            )
+        for _ in range(12):  # to a few millimetres
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if hidden(middle) < share else (low, middle)
+        return replace(self, length=high)
+
+    def hits(self, scan: Scan) -> BoolArray:
+        """(N,) which points of a sweep lie on a box instead."""
+        hit: BoolArray = np.isfinite(self._ranges(scan))
+        return hit
+
+    def apply(self, number: int, scan: Scan) -> Scan:
+        """See :meth:`Disturbance.apply`."""
+        ranges = self._ranges(scan)
+        hit = np.isfinite(ranges)
+        rng = np.random.default_rng([self.seed, number])
+        ranges[hit] += self.range_noise * rng.standard_normal(int(hit.sum()))
+        points = scan.points.astype(np.float64)
+        points[hit] *= (ranges[hit] / np.linalg.norm(points[hit], axis=1))[:, None]
+        return replace(scan, points=points.astype(scan.points.dtype))
+
+    def _ranges(self, scan: Scan, later: float = 0.0) -> FloatArray:
+        """(N,) metres to the nearest box where it is nearer than the point itself, else inf."""
+        points = scan.points.astype(np.float64)
+        times = np.zeros(len(points)) if scan.times is None else scan.times
+        seconds = scan.stamp * 1e-9 + later + times
+        measured = np.linalg.norm(points, axis=1)
+        x, y, z = points.T
+        count = math.ceil(_REACH / self.spacing)
+        starts: FloatArray = np.arange(-count, count, dtype=np.float64) * self.spacing
+        nearest = np.full(len(points), np.inf)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            # Along a beam, in shares of its measured range: where it is between two planes.
+            rise = _between(z, self.bottom, self.bottom + self.height)
+            for side, speed in zip((1.0, -1.0), self.speeds, strict=True):
+                across = _between(side * y, self.lane, self.lane + self.width)
+                low = starts[:, None] + np.remainder(speed * seconds, self.spacing)
+                along = _between(x, low, low + self.length)
+                enter = np.maximum(np.maximum(rise[0], across[0]), along[0])
+                leave = np.minimum(np.minimum(rise[1], across[1]), along[1])
+                enter = np.where((enter < leave) & (enter > 0.0) & (enter < 1.0), enter, np.inf)
+                nearest = np.minimum(nearest, enter.min(axis=0))
+        ranges: FloatArray = nearest * measured
+        return ranges
+
+
+def _between(
+    coordinate: FloatArray, low: float | FloatArray, high: float | FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where rays from the origin are between two planes, in shares of their length."""
+    first, second = low / coordinate, high / coordinate
+    return np.minimum(first, second), np.maximum(first, second)
+
+
+class Disturbed:
+    """A data set whose sweeps are disturbed, one disturbance after the other.
+
+    Parameters
+    ----------
+    dataset : of raw sweeps; its IMU and truth are handed through
+    disturbances : in the order in which they happen
+
+    Raises
+    ------
+    InputError
+        While iterating, if the data set holds features instead of sweeps.
+    """
+
+    def __init__(self, dataset: Dataset, disturbances: Sequence[Disturbance]) -> None:
+        self._dataset = dataset
+        self._disturbances = tuple(disturbances)
+        self.name = f"{dataset.name} disturbed"
+        self.sensor: Mapping[str, Any] = dataset.sensor
+
+    def __len__(self) -> int:
+        return sum(self._keeps(number) for number in range(len(self._dataset)))
+
+    def __iter__(self) -> Iterator[Sweep]:
+        for number, sweep in enumerate(self._dataset):
+            if not self._keeps(number):
+                continue
+            if isinstance(sweep, FeatureSweep):
+                raise InputError("Disturbed: expected raw sweeps, got features")
+            for disturbance in self._disturbances:
+                if isinstance(sweep, Scan):
+                    sweep = disturbance.apply(number, sweep)
+            yield sweep
+
+    def _keeps(self, number: int) -> bool:
+        return all(disturbance.keeps(number) for disturbance in self._disturbances)
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """That of the data set."""
+        return self._dataset.imu
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """That of the data set, missing sweeps included."""
+        return self._dataset.truth
+
+    def info(self) -> DatasetInfo:
+        """That of the data set, with what disturbs it."""
+        info = self._dataset.info()
+        facts = info.facts | {"disturbed by": ", ".join(map(str, self._disturbances)) or "nothing"}
+        return replace(info, facts=facts)
+
+
+def _check_share(share: float) -> None:
+    if not 0.0 <= share <= 1.0:
+        raise ConfigError(f"share: expected 0 to 1, got {share!r}")

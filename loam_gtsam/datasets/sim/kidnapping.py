@@ -1,0 +1,203 @@
+"""A lidar that is put somewhere else between two sweeps; the truth jumps with it.
+
+:class:`SkippedAhead` cuts a piece out of any drive, :class:`Kidnapped` moves the lidar of a
+simulated one to any place.
+"""
+
+from __future__ import annotations
+
+import copy
+import itertools
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
+from loam_gtsam.datasets.sim.motion import Motion
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.types import (
+    BadSweep,
+    BoolArray,
+    FeatureSweep,
+    FloatArray,
+    ImuSamples,
+    InputError,
+    IntArray,
+    Scan,
+    Trajectory,
+)
+
+
+class SkippedAhead:
+    """A drive out of which some sweeps were cut, and the gap in time closed: a kidnapped lidar.
+
+    Works on any data; the lidar jumps to where it really went, at the speed it had there.
+
+    Parameters
+    ----------
+    dataset : of raw sweeps; they are read up to the cut at once
+    first, count : the sweeps to cut out
+
+    Raises
+    ------
+    InputError
+        If there is nothing before or after the cut.
+    """
+
+    def __init__(self, dataset: Dataset, first: int, count: int) -> None:
+        if not (first > 0 and count > 0 and first + count < len(dataset)):
+            raise InputError(
+                f"SkippedAhead: expected sweeps within 1 to {len(dataset) - 2} to cut out, got "
+                f"{count} from {first}"
+            )
+        self._dataset, self._first, self._count = dataset, first, count
+        self.name = f"{dataset.name} skipped ahead"
+        self.sensor: Mapping[str, Any] = dataset.sensor
+        until = list(itertools.islice(dataset, first + count + 1))
+        self._begin, self._end = (_earlier(sweep, 0).stamp for sweep in (until[first], until[-1]))
+
+    def __len__(self) -> int:
+        return len(self._dataset) - self._count
+
+    def __iter__(self) -> Iterator[Sweep]:
+        for number, sweep in enumerate(self._dataset):
+            if number < self._first:
+                yield sweep
+            elif number >= self._first + self._count:
+                yield _earlier(sweep, self._end - self._begin)
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """With the same stretch cut out."""
+        imu = self._dataset.imu
+        if imu is None:
+            return None
+        keep, stamps = self._cut(imu.stamps)
+        turned = None if imu.orientation is None else imu.orientation[keep]
+        return ImuSamples(stamps, turned, imu.gyro[keep], imu.acceleration[keep])
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """With the same stretch cut out: it jumps."""
+        truth = self._dataset.truth
+        if truth is None:
+            return None
+        keep, stamps = self._cut(truth.stamps)
+        return Trajectory(stamps, truth.map_T_lidar[keep])
+
+    def _cut(self, stamps: IntArray) -> tuple[BoolArray, IntArray]:
+        keep = (stamps < self._begin) | (stamps >= self._end)
+        later = np.where(stamps[keep] >= self._end, self._end - self._begin, 0)
+        return keep, stamps[keep] - later
+
+    def info(self) -> DatasetInfo:
+        """That of the data set, with the cut."""
+        info = self._dataset.info()
+        cut = f"{self._count} sweeps from {self._first}"
+        return replace(info, facts=info.facts | {"cut out": cut})
+
+
+class Kidnapped:
+    """A simulated drive in which the lidar is put somewhere else between two sweeps.
+
+    From then on it rides along in its new place, seen from where it would have been.
+
+    Parameters
+    ----------
+    world : the drive
+    number : of the first sweep elsewhere
+    move : metres, lidar frame
+    turn_deg : about the lidar's z axis, after the move
+
+    Raises
+    ------
+    InputError
+        If the drive has no sweep before and at ``number``.
+    """
+
+    def __init__(
+        self,
+        world: SimulatedWorld,
+        number: int,
+        move: tuple[float, float, float] = (1.0, 0.0, 0.0),
+        turn_deg: float = 0.0,
+    ) -> None:
+        if not 0 < number < len(world):
+            raise InputError(f"Kidnapped: expected a sweep in 1 to {len(world) - 1}, got {number}")
+        self._world, self._number = world, number
+        self.name = f"{world.name} kidnapped"
+        self.sensor: Mapping[str, Any] = world.sensor
+        lidar_T_moved = np.eye(4)
+        lidar_T_moved[:3, :3] = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
+        lidar_T_moved[:3, 3] = move
+        self._moved = copy.copy(world)  # its cached truth and IMU are not touched below
+        vars(self._moved).pop("imu", None)
+        self._moved._motion = _Moved(world._motion, lidar_T_moved)
+        self._change = f"at sweep {number} by {move} m and {turn_deg:g} degrees"
+
+    def __len__(self) -> int:
+        return len(self._world)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Scan:
+        number += len(self) if number < 0 else 0
+        world = self._world if number < self._number else self._moved
+        return world.sweep(number)
+
+    @cached_property
+    def truth(self) -> Trajectory:
+        """Exact poses at the start of every sweep; they jump."""
+        stamps = self._world.truth.stamps
+        before = self._world.truth.map_T_lidar[: self._number]
+        after = self._moved.truth_at(stamps[self._number :]).map_T_lidar
+        return Trajectory(stamps, np.concatenate([before, after]))
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """What an IMU measures that is moved along with the lidar, but does not feel the jump."""
+        before, after = self._world.imu, self._moved.imu
+        assert before.orientation is not None
+        assert after.orientation is not None
+        here = before.stamps < self._world.truth.stamps[self._number]
+        pairs = (
+            (before.orientation, after.orientation),
+            (before.gyro, after.gyro),
+            (before.acceleration, after.acceleration),
+        )
+        columns = [np.where(here[:, None], first, second) for first, second in pairs]
+        return ImuSamples(before.stamps, *columns)
+
+    def info(self) -> DatasetInfo:
+        """That of the drive, with the change of place."""
+        info = self._world.info()
+        return replace(info, facts=info.facts | {"kidnapped": self._change})
+
+
+class _Moved(Motion):
+    """A motion seen from a place that rides along.
+
+    Parameters
+    ----------
+    lidar_T_moved : (4, 4) that place
+    """
+
+    def __init__(self, motion: Motion, lidar_T_moved: FloatArray) -> None:
+        vars(self).update(vars(motion))  # no need to fit the path again
+        self._lidar_T_moved = lidar_T_moved
+
+    def world_T_lidar(self, times: FloatArray) -> FloatArray:
+        """See :meth:`Motion.world_T_lidar`."""
+        poses: FloatArray = super().world_T_lidar(times) @ self._lidar_T_moved
+        return poses
+
+
+def _earlier(sweep: Sweep, nanoseconds: int) -> Scan | BadSweep:
+    if isinstance(sweep, FeatureSweep):
+        raise InputError("SkippedAhead: expected raw sweeps, got features")
+    return replace(sweep, stamp=sweep.stamp - nanoseconds)

@@ -1,0 +1,332 @@
+"""A built-in world with exact truth: several places, a spinning lidar that moves, an IMU.
+
+Every beam is cast from the sensor's exact pose at its own time, so the sweeps carry real motion
+distortion and :attr:`SimulatedWorld.truth` has no error. Sweeps are independent of each other:
+``world[i]`` is the same whether or not the sweeps before it were made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.sim import avenue as _avenue
+from loam_gtsam.datasets.sim import bare_scenes as _bare_scenes
+from loam_gtsam.datasets.sim import scenes as _scenes
+from loam_gtsam.datasets.sim.avenue import build_avenue
+from loam_gtsam.datasets.sim.motion import GRAVITY, Motion
+from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
+from loam_gtsam.datasets.sim.scenes import Scene
+from loam_gtsam.types import (
+    ConfigError,
+    FloatArray,
+    ImuSamples,
+    InputError,
+    IntArray,
+    Scan,
+    Trajectory,
+)
+
+__all__ = [
+    "GRAVITY",
+    "SCENES",
+    "SENSORS",
+    "Ground",
+    "Scene",
+    "SimulatedWorld",
+    "Solids",
+    "build_avenue",
+]
+
+_BUILDERS = _scenes.BUILDERS | _bare_scenes.BUILDERS | _avenue.BUILDERS
+
+SCENES: tuple[str, ...] = tuple(_BUILDERS)
+"""Names of the built-in places."""
+
+SENSORS: dict[str, tuple[FloatArray, int]] = {
+    "vlp16": (np.linspace(-15.0, 15.0, 16), 1800),
+    "hdl32": (np.linspace(-30.67, 10.67, 32), 1800),
+    # Two blocks of lasers: 1/2 degree apart below, 1/3 above.
+    "hdl64": (
+        np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)]),
+        2000,
+    ),
+    "os1-16": (np.linspace(-22.5, 22.5, 16), 1024),
+    "os1-32": (np.linspace(-22.5, 22.5, 32), 1024),
+    "os1-64": (np.linspace(-22.5, 22.5, 64), 1024),
+    "os1-128": (np.linspace(-22.5, 22.5, 128), 1024),
+}
+"""Elevations in degrees from the lowest beam up, and columns per sweep at 10 Hz (data sheets)."""
+
+_EPOCH = 1_700_000_000_000_000_000
+"""Nanoseconds of the first sweep: as large as real stamps are, which floats cannot hold."""
+_MIN_RANGE = 0.5
+"""Metres."""
+_IMU_PERIOD = 5_000_000
+"""Nanoseconds: 200 Hz."""
+_IMU_MARGIN = 200_000_000
+"""Nanoseconds of IMU data before the first and after the last sweep."""
+
+
+class SimulatedWorld:
+    """A data set made on the fly, the same for the same arguments on every run.
+
+    The sensor spins clockwise from straight behind; all beams of a column fire together, and
+    points come in firing order. It starts at rest and gathers speed within three seconds. The
+    IMU sits at the lidar's origin with the lidar's axes.
+
+    Parameters
+    ----------
+    scene : one of :data:`SCENES`, or a :class:`Scene` of your own
+    sensor : one of :data:`SENSORS`
+    frames : sweeps; None is the scene's own number: once round and two seconds more for
+        ``street_loop``, to the end for the corridors and the slopes. Closed paths (room, shaken,
+        street_loop, trees) are driven round and round, open ones have an end.
+    seed : of the place and of all noise
+    range_noise : standard deviation along the beam, metres
+    dropout : share of returns that are lost
+    foliage_noise : mean depth by which a beam enters a tree crown (exponential), metres
+    rate : sweeps per second
+    speed : m/s on a straight; None is the scene's own
+    columns : firings per sweep; None is the sensor's own
+    max_range : metres
+    imu_noise : orientation, rad per axis
+    gyro_noise, gyro_bias : rad/s per axis, white and constant
+    acceleration_noise, acceleration_bias : m/s^2 per axis, white and constant
+
+    Attributes
+    ----------
+    name : scene and sensor
+    sensor : what the layout implies for ``SensorConfig``
+    scene : the place
+    world_T_start : (4, 4) pose of the first sweep in the gravity-aligned world (z up)
+
+    Raises
+    ------
+    ConfigError
+        If a name is unknown, a number out of range, or an open path too short for ``frames``.
+
+    Examples
+    --------
+    >>> world = SimulatedWorld("room", frames=3, columns=360)
+    >>> [scan.points.shape[1] for scan in world]
+    [3, 3, 3]
+    """
+
+    def __init__(
+        self,
+        scene: str | Scene = "street_loop",
+        *,
+        sensor: str = "vlp16",
+        frames: int | None = None,
+        seed: int = 0,
+        range_noise: float = 0.02,
+        dropout: float = 0.02,
+        foliage_noise: float = 0.15,
+        rate: float = 10.0,
+        speed: float | None = None,
+        columns: int | None = None,
+        max_range: float = 100.0,
+        imu_noise: float = 0.003,
+        gyro_noise: float = 0.003,
+        gyro_bias: tuple[float, float, float] = (0.002, -0.001, 0.0015),
+        acceleration_noise: float = 0.03,
+        acceleration_bias: tuple[float, float, float] = (0.03, -0.02, 0.04),
+    ) -> None:
+        if isinstance(scene, str) and scene not in _BUILDERS:
+            raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
+        if sensor not in SENSORS:
+            raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
+        for label, number in (("seed", seed), ("frames", frames), ("columns", columns)):
+            if number is not None and not isinstance(number, (int, np.integer)):
+                raise ConfigError(f"{label}: expected a whole number, got {number!r}")
+        _at_least("seed", seed, 0)
+        self.scene = _BUILDERS[scene](seed) if isinstance(scene, str) else scene
+        elevations, default_columns = SENSORS[sensor]
+        self._columns = default_columns if columns is None else columns
+        speed = self.scene.speed if speed is None else float(speed)
+        for label, value, least in (
+            ("range_noise", range_noise, 0.0),
+            ("foliage_noise", foliage_noise, 0.0),
+            ("rate", rate, 0.1),
+            ("speed", speed, 0.01),
+            ("columns", self._columns, 8),
+            ("max_range", max_range, _MIN_RANGE),
+            ("imu_noise", imu_noise, 0.0),
+            ("gyro_noise", gyro_noise, 0.0),
+            ("acceleration_noise", acceleration_noise, 0.0),
+        ):
+            _at_least(label, value, least)
+        if not 0.0 <= dropout < 1.0:
+            raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
+        self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
+        self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
+        self._imu_noise = imu_noise
+        self._gyro = gyro_noise, gyro_bias
+        self._acceleration = acceleration_noise, acceleration_bias
+        self._motion = Motion(self.scene, speed)
+        self._frames = self._count(frames)
+        self.name = f"{self.scene.name} {sensor}"
+        self.sensor: Mapping[str, Any] = {
+            "model": sensor,
+            "rings": "field",
+            "times": "field",
+            "spin": "clockwise",
+            "start_azimuth_deg": 180.0,
+            "period": 1.0 / rate,
+        }
+        turn = np.arange(self._columns) / self._columns
+        azimuth = np.pi - 2.0 * np.pi * turn[:, None]
+        elevation = np.deg2rad(elevations)[None, :]
+        self._times = turn / rate
+        self._beams = np.stack(
+            [
+                np.cos(azimuth) * np.cos(elevation),
+                np.sin(azimuth) * np.cos(elevation),
+                np.broadcast_to(np.sin(elevation), (self._columns, len(elevations))),
+            ]
+        )
+        self.world_T_start: FloatArray = self._motion.world_T_lidar(np.zeros(1))[0]
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self.sweep(i) for i in range(self._frames))
+
+    def __getitem__(self, i: int) -> Scan:
+        return self.sweep(i + self._frames if i < 0 else i)
+
+    def sweep(self, i: int) -> Scan:
+        """Sweep ``i``: float32 points at their own times, ``times``, ``rings``, ``span``.
+
+        Independent of all others, so several processes can share the work.
+        """
+        if not 0 <= i < self._frames:
+            raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
+        stamp = self._stamp(i)
+        world_T_lidar = self._motion.world_T_lidar((stamp - _EPOCH) * 1e-9 + self._times)
+        rotation = world_T_lidar[:, :3, :3]
+        directions = np.einsum("cij,jcb->icb", rotation, self._beams)
+        ranges, soft = cast_rays(
+            self.scene.solids, world_T_lidar[:, :3, 3], directions, self._max_range
+        )
+        rng = np.random.default_rng([self._seed, i])
+        lost = rng.random(ranges.shape) < self._dropout
+        ranges += self._range_noise * rng.standard_normal(ranges.shape)
+        ranges[soft] += self._foliage * rng.standard_exponential(int(soft.sum()))
+        seen = np.isfinite(ranges) & ~lost & (ranges > _MIN_RANGE)
+        column, ring = np.nonzero(seen)
+        points = (self._beams[:, seen] * ranges[seen]).T
+        return Scan(
+            points=np.ascontiguousarray(points, dtype=np.float32),
+            stamp=stamp,
+            times=self._times[column],
+            rings=ring.astype(np.int32),
+            span=(0.0, 1.0 / self._rate),
+        )
+
+    @cached_property
+    def truth(self) -> Trajectory:
+        """Exact poses at the start of every sweep; the first is the identity."""
+        return self.truth_at(np.array([self._stamp(i) for i in range(self._frames)], np.int64))
+
+    def truth_at(self, stamps: IntArray) -> Trajectory:
+        """Exact poses at any ``stamps`` (N,) in nanoseconds, relative to the first sweep's.
+
+        Raises
+        ------
+        InputError
+            If the stamps are no row of integers, or later than the end of an open path.
+        """
+        stamps = np.asarray(stamps)
+        if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
+            raise InputError(
+                f"stamps: expected (N,) integer nanoseconds, got shape {stamps.shape} of "
+                f"{stamps.dtype}"
+            )
+        stamps = stamps.astype(np.int64)
+        end = _EPOCH + int(self._motion.duration * 1e9) + _IMU_MARGIN
+        if not self.scene.closed and np.any(stamps > end):
+            raise InputError(
+                f"stamps: the path of {self.scene.name!r} ends at {end}, got {stamps.max()}"
+            )
+        world_T_lidar = self._motion.world_T_lidar(_seconds(stamps))
+        poses = _inverse(self.world_T_start) @ world_T_lidar
+        if len(stamps) and stamps[0] == _EPOCH:
+            poses[0] = np.eye(4)  # not only up to rounding
+        return Trajectory(stamps=stamps, map_T_lidar=poses)
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """200 Hz, from 0.2 s before the first sweep to 0.2 s after the last."""
+        last = self._stamp(self._frames) + _IMU_MARGIN
+        stamps = np.arange(_EPOCH - _IMU_MARGIN, last + 1, _IMU_PERIOD, dtype=np.int64)
+        poses, gyro, acceleration = self._motion.inertial(_seconds(stamps))
+        # One number more than a sweep's seed, so that no sweep shares this stream.
+        rng = np.random.default_rng([self._seed, 0, 200])
+        shape = gyro.shape
+        wrong = Rotation.from_rotvec(self._imu_noise * rng.standard_normal(shape))
+        orientation = (Rotation.from_matrix(poses[:, :3, :3]) * wrong).as_quat()
+        noise, bias = self._gyro
+        gyro = gyro + bias + noise * rng.standard_normal(shape)
+        noise, bias = self._acceleration
+        acceleration = acceleration + bias + noise * rng.standard_normal(shape)
+        return ImuSamples(stamps, orientation, gyro, acceleration)
+
+    def info(self) -> DatasetInfo:
+        """Scene, sensor, frames and length of the way; reads nothing."""
+        beams, columns = self._beams.shape[2], self._columns
+        facts = {
+            "scene": self.scene.name,
+            "sensor": f"{self.sensor['model']}: {beams} beams x {columns} columns, clockwise",
+            "frames": f"{self._frames} at {self._rate:g} Hz",
+            "path": f"{self.truth.length:.1f} m"
+            + (f", {'closed' if self.scene.closed else 'open'}"),
+            "noise": f"{self._range_noise:g} m, {100.0 * self._dropout:g} % lost",
+            "times": "per point, seconds from the start of the sweep",
+            "imu": f"200 Hz, orientation within {self._imu_noise:g} rad",
+            "truth": "exact, at the start of each sweep",
+            "seed": str(self._seed),
+        }
+        return DatasetInfo(kind="simulated world", path=self.scene.name, facts=facts)
+
+    def _stamp(self, i: int) -> int:
+        return _EPOCH + round(i * 1e9 / self._rate)
+
+    def _count(self, frames: int | None) -> int:
+        """Number of sweeps, checked against the end of an open path."""
+        # A closed path is driven a little past its start, for the loop to be seen to close.
+        available = math.floor(self._motion.duration * self._rate)
+        once = available + round(2.0 * self._rate) if self.scene.closed else available
+        count = frames if frames is not None else self.scene.frames or once
+        _at_least("frames", count, 1)
+        if not self.scene.closed and count > available:
+            raise ConfigError(
+                f"frames: the path of {self.scene.name!r} ends after {available} sweeps at this "
+                f"speed and rate, got {count}; ask for fewer or lower the speed"
+            )
+        return count
+
+
+def _seconds(stamps: IntArray) -> FloatArray:
+    """Since the first sweep; the difference is taken in integers."""
+    return (stamps - _EPOCH).astype(np.float64) * 1e-9
+
+
+def _at_least(name: str, value: float, least: float) -> None:
+    if not (math.isfinite(value) and value >= least):
+        raise ConfigError(f"{name}: expected at least {least:g}, got {value!r}")
+
+
+def _inverse(a_T_b: FloatArray) -> FloatArray:
+    inverse = np.eye(4)
+    inverse[:3, :3] = a_T_b[:3, :3].T
+    inverse[:3, 3] = -a_T_b[:3, :3].T @ a_T_b[:3, 3]
+    return inverse

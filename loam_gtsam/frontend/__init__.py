@@ -1,0 +1,1 @@
+"""From a sweep to features: rings, edges, planes, poles, and the motion within the sweep."""

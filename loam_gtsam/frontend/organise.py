@@ -1,0 +1,432 @@
+"""What a sweep looks like: which ring and when each point was measured, in firing order.
+
+LOAM's features live on the order in which one beam met the world, so everything that follows
+works on an :class:`OrganisedSweep`: ring after ring, each in firing order. How rings and times
+were found is part of the result (``method``, ``note``), for people to check.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.config import Config, SensorConfig
+from loam_gtsam.frontend.rings import (
+    MAX_RINGS,
+    RingAssignment,
+    rings_from_elevation,
+    rings_from_file_order,
+    rings_from_labels,
+    rings_from_rows,
+)
+from loam_gtsam.types import BoolArray, FloatArray, IntArray, Scan, SweepError, SweepFault
+
+MIN_POINTS = 11
+"""One window of LOAM's curvature: a point and five neighbours on either side."""
+
+_MAX_SPAN = 2.0
+"""Seconds. No spinning sensor in use turns slower than 0.5 Hz; more means wrong units."""
+
+_MAX_OFFSET = 10.0
+"""Seconds between a stamp and its sweep: a pose that far from its sweep would be extrapolated."""
+
+_MAX_OUTLIERS = 0.01
+"""Fraction of points that may carry a nonsense time and be dropped."""
+
+_ONE_WAY = 0.8
+"""Fraction of azimuth steps of one sign from which the sense of rotation is taken as known."""
+
+_SEAM = 0.9
+"""Fraction of a turn: a step back this large, in firing order, passes the start of the sweep."""
+
+
+@dataclass(frozen=True, slots=True)
+class TimeAssignment:
+    """When each point was measured.
+
+    Attributes
+    ----------
+    times : (N,) seconds from the scan's stamp
+    span : (first, last) seconds from the stamp covered by the sweep
+    method : "field", "azimuth" or "none"
+    note : one sentence for people
+    """
+
+    times: FloatArray
+    span: tuple[float, float]
+    method: str
+    note: str
+
+
+@dataclass(frozen=True)
+class SweepColumns:
+    """The usable points of a scan, one row per coordinate, and what came with them.
+
+    Attributes
+    ----------
+    xyz : (3, N) float32, metres, lidar frame
+    index : (N,) position of each point in the scan
+    labels, row_of, times : (N,) of the same points, or None
+    span : as in :class:`~loam_gtsam.types.Scan`
+    dropped : number of points left out
+    not_finite : of them, those that are NaN or infinite
+    """
+
+    xyz: NDArray[np.float32]
+    index: IntArray
+    labels: NDArray[np.integer] | None
+    row_of: IntArray | None
+    times: FloatArray | None
+    span: tuple[float, float] | None
+    dropped: int
+    not_finite: int
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @cached_property
+    def azimuth(self) -> NDArray[np.float32]:
+        """(N,) radians from x towards y."""
+        azimuth: NDArray[np.float32] = np.arctan2(self.xyz[1], self.xyz[0])
+        return azimuth
+
+
+@dataclass(frozen=True, slots=True)
+class OrganisedSweep:
+    """A sweep, ring after ring, each ring in firing order.
+
+    Attributes
+    ----------
+    xyz : (3, N) float32, metres, lidar frame at each point's own time
+    index : (N,) position of each point in the scan
+    ring_starts : (R + 1,) where each ring begins; the last entry is N
+    ring_of_start : (R,) number of each of those rings
+    times : (N,) seconds from the scan's stamp
+    span : (first, last) seconds from the stamp
+    rings, timing : how both were decided; their arrays are in the order of ``columns``
+    dropped : points left out (not finite, out of range, nonsense time)
+    not_finite : of them, those that are NaN or infinite
+    """
+
+    xyz: NDArray[np.float32]
+    index: IntArray
+    ring_starts: IntArray
+    ring_of_start: IntArray
+    times: FloatArray
+    span: tuple[float, float]
+    rings: RingAssignment
+    timing: TimeAssignment
+    dropped: int
+    not_finite: int
+
+
+def usable_columns(scan: Scan, config: Config) -> SweepColumns:
+    """Drop points that are not finite, out of range, or (a few) far off in time.
+
+    Raises
+    ------
+    SweepError
+        If fewer than 11 points remain, or the times cannot be seconds.
+    """
+    sensor = config.sensor
+    # One mask for all columns: dropping points but not their times is a well-known bug.
+    # NaN compares false; the square of an infinity is above any finite bound.
+    with np.errstate(over="ignore", invalid="ignore"):
+        xyz = np.ascontiguousarray(scan.points.T, dtype=np.float32)
+        squared = xyz[0] * xyz[0] + xyz[1] * xyz[1] + xyz[2] * xyz[2]
+    keep: BoolArray = (squared >= np.float32(sensor.min_range) ** 2) & (
+        squared <= np.float32(min(sensor.max_range, 1e18)) ** 2
+    )
+    times = None if sensor.times in ("azimuth", "none") else scan.times
+    if times is not None:
+        keep &= _plausible_times(times, keep)
+    count = int(np.count_nonzero(keep))
+    everything = count == len(keep)
+    not_finite = 0 if everything else int(np.count_nonzero(~np.isfinite(xyz).all(axis=0)))
+    finite = len(keep) - not_finite
+    if count < MIN_POINTS:
+        fault = SweepFault.TOO_FEW_POINTS
+        if len(keep) == 0:
+            fault = SweepFault.EMPTY
+        elif finite < MIN_POINTS <= len(keep):
+            fault = SweepFault.NOT_FINITE
+        elif times is not None and np.count_nonzero(np.isfinite(times)) < MIN_POINTS <= finite:
+            fault = SweepFault.BAD_TIMES
+        ranges = np.sqrt(squared[np.isfinite(squared)].astype(np.float64))
+        median = float(np.median(ranges)) if len(ranges) else 0.0
+        far = median > sensor.max_range
+        unit = f"; half are farther than {median:.0f} m: are they in metres?" if far else ""
+        raise SweepError(
+            f"sweep of {len(scan.points)} points, {finite} finite, {count} of them within "
+            f"{sensor.min_range:g} to {sensor.max_range:g} m: at least {MIN_POINTS} are needed; "
+            f"check the source, or sensor.min_range and sensor.max_range{unit}",
+            fault,
+        )
+    row_of = None
+    if scan.rows and sensor.rings != "field":
+        row_of = np.repeat(np.arange(scan.rows), len(scan.points) // scan.rows)
+    index = np.flatnonzero(keep)
+    return SweepColumns(
+        xyz=xyz if everything else xyz.take(index, axis=1),
+        index=index,
+        labels=None if scan.rings is None else scan.rings[index],
+        row_of=None if row_of is None else row_of[index],
+        times=None if times is None else times[index].astype(np.float64),
+        span=scan.span,
+        dropped=len(keep) - count,
+        not_finite=not_finite,
+    )
+
+
+def _plausible_times(times: NDArray[np.floating], keep: BoolArray) -> BoolArray:
+    """Mask of times that can belong to this sweep; refuses times that are not seconds."""
+    good: BoolArray = np.isfinite(times)
+    used = times[good & keep]
+    if len(used) == 0 or float(used.max()) - float(used.min()) <= _MAX_SPAN:
+        return good
+    middle = float(np.median(used))
+    with np.errstate(invalid="ignore"):
+        near = np.abs(times - middle) <= _MAX_SPAN / 2
+    outside = int(np.count_nonzero(good & keep & ~near))
+    if outside > _MAX_OUTLIERS * len(used):
+        raise SweepError(
+            f"point times span {float(used.max()) - float(used.min()):.6g} s in one sweep, "
+            f"more than {_MAX_SPAN:g} s: they are probably not in seconds from the stamp; fix "
+            "their unit, or set sensor.times to azimuth or none",
+            SweepFault.BAD_TIMES,
+        )
+    good &= near
+    return good
+
+
+def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
+    """Find the beam of each point.
+
+    ``sensor.rings`` chooses the source; ``auto`` tries the ring field, row order (of a range
+    image, or of a file written ring after ring), and elevation.
+
+    Raises
+    ------
+    SweepError
+        If no source gives at least two rings; says what was tried.
+    """
+    tried: list[str] = []
+    found: RingAssignment | None = None
+    if sensor.rings in ("auto", "field"):
+        if columns.labels is None:
+            tried.append("ring field: the scan has none")
+        else:
+            found = rings_from_labels(columns.labels, columns.xyz)
+    if found is None and sensor.rings in ("auto", "rows"):
+        if columns.row_of is not None:
+            found = rings_from_rows(columns.row_of)
+        else:
+            found, reason = rings_from_file_order(columns.azimuth)
+            tried.append(f"row order: {reason}")
+    if found is None and sensor.rings in ("auto", "elevation"):
+        found, reason = rings_from_elevation(columns.xyz, sensor.model)
+        tried.append(f"elevation: {reason}")
+    if found is None:
+        raise SweepError(
+            f"no rings for a sweep of {len(columns)} points ({'; '.join(tried)}); give Scan.rings "
+            "or Scan.rows, or set sensor.rings and sensor.model",
+            SweepFault.BAD_RINGS,
+        )
+    if found.count < 2 or found.count > MAX_RINGS:
+        raise SweepError(
+            f"{found.count} ring(s) from {found.method} in a sweep of {len(columns)} points: "
+            f"expected 2 to {MAX_RINGS}; check the ring field, or set sensor.rings to another "
+            "source",
+            SweepFault.BAD_RINGS,
+        )
+    return found
+
+
+def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -> TimeAssignment:
+    """Find when each point was measured.
+
+    ``config.sensor.times`` chooses the source; ``auto`` takes the times of the points, else, if
+    they are needed for de-skew, the azimuth.
+
+    Parameters
+    ----------
+    columns : in the order of the scan, which tells the sense of rotation
+    rings : of the same points
+    config : ``sensor`` and ``deskew.enabled`` are used
+
+    Raises
+    ------
+    SweepError
+        If the source has no times; says what to set.
+    """
+    sensor = config.sensor
+    source: str = sensor.times
+    if source == "auto" and columns.times is not None:
+        source = "field"
+    elif source == "auto":
+        source = "azimuth" if config.deskew.enabled else "none"
+    if source == "none":
+        zeros = np.zeros(len(columns))
+        return TimeAssignment(zeros, (0.0, 0.0), "none", "no times: the sweep is not de-skewed")
+    if source == "azimuth":
+        return _times_from_azimuth(columns, rings, sensor)
+    if columns.times is None:
+        raise SweepError(
+            "sensor.times is field, but the points have no times; set sensor.times to azimuth "
+            "(and spin, start_azimuth_deg, period, stamp), or to none to run without de-skew",
+            SweepFault.BAD_TIMES,
+        )
+    span = columns.span or (float(columns.times.min()), float(columns.times.max()))
+    # NaN compares false
+    if not (0.0 <= span[1] - span[0] <= _MAX_SPAN and max(map(abs, span)) <= _MAX_OFFSET):
+        raise SweepError(
+            f"the sweep lies {span[0]:.6g} to {span[1]:.6g} s from its stamp; expected at most "
+            f"{_MAX_SPAN:g} s, within {_MAX_OFFSET:g} s: times count from the stamp, in seconds",
+            SweepFault.BAD_TIMES,
+        )
+    note = f"per-point times from {span[0]:.4f} to {span[1]:.4f} s after the stamp"
+    return TimeAssignment(columns.times, span, "field", note)
+
+
+def _times_from_azimuth(
+    columns: SweepColumns, rings: RingAssignment, sensor: SensorConfig
+) -> TimeAssignment:
+    """Times in proportion to the angle turned since the start of the sweep."""
+    order = slice(None) if rings.ring_major else np.argsort(rings.rings, kind="stable")
+    number = rings.rings[order]
+    same_ring = number[1:] == number[:-1]
+    clockwise, in_order, why = _sense(columns.azimuth[order], same_ring, rings, sensor)
+    sign = -1.0 if clockwise else 1.0
+    start = np.deg2rad(sensor.start_azimuth_deg)
+    turned = columns.azimuth * np.float32(sign / (2.0 * np.pi)) - sign * start / (2.0 * np.pi)
+    fraction = (turned - np.floor(turned)).astype(np.float64)
+    if in_order:
+        fraction[order] += _seam_turns(fraction[order], same_ring)
+    moment = "start" if sensor.stamp == "auto" else sensor.stamp
+    offset = {"start": 0.0, "middle": -0.5, "end": -1.0}[moment]
+    span = (offset * sensor.period, (offset + 1.0) * sensor.period)
+    note = (
+        f"times from azimuth: {'clockwise' if clockwise else 'counterclockwise'} ({why}) from "
+        f"{sensor.start_azimuth_deg:g} degrees, {sensor.period:g} s, stamp at sweep {moment}"
+    )
+    return TimeAssignment((fraction + offset) * sensor.period, span, "azimuth", note)
+
+
+def _sense(
+    azimuth: NDArray[np.float32], same_ring: BoolArray, rings: RingAssignment, sensor: SensorConfig
+) -> tuple[bool, bool, str]:
+    """(clockwise, the order of the points is that of firing, why)."""
+    step = np.diff(azimuth)[same_ring]
+    step -= np.float32(2.0 * np.pi) * np.rint(step * np.float32(0.5 / np.pi))
+    back, forth = int(np.count_nonzero(step < 0.0)), int(np.count_nonzero(step > 0.0))
+    one_way = max(back, forth) >= _ONE_WAY * max(back + forth, 1) and back + forth > 0
+    # A file written ring after ring tells the writer's order, not the sensor's: KITTI's raw
+    # sweeps ascend in azimuth although the scanner turned clockwise (de-skewing them clockwise
+    # brings sweeps closer together, counterclockwise drives them apart).
+    in_order = one_way and not rings.ring_major
+    if sensor.spin != "auto":
+        clockwise = sensor.spin == "clockwise"
+        return clockwise, in_order and clockwise == (back > forth), "as configured"
+    if in_order:
+        return back > forth, True, "from the order of the points"
+    if rings.ring_major:
+        return True, False, "assumed, as Velodyne and Ouster turn; sensor.spin overrides"
+    raise SweepError(
+        f"cannot tell the sense of rotation: within rings {forth} azimuth steps go up and {back} "
+        "go down; set sensor.spin, give per-point times, or set sensor.times to none",
+        SweepFault.BAD_TIMES,
+    )
+
+
+def _seam_turns(fraction: FloatArray, same_ring: BoolArray) -> FloatArray:
+    """Whole turns to add, so that a sweep that overlaps its own start keeps its order.
+
+    Drivers cut sweeps at packets: the first points may lie just before the start azimuth and
+    the last ones just behind it. In firing order such a seam is a step of almost a whole turn.
+    """
+    step = np.diff(fraction) * same_ring
+    wraps = (step < -_SEAM).astype(np.float64) - (step > _SEAM)
+    if not wraps.any():
+        return np.zeros(len(fraction))
+    turns = np.concatenate(([0.0], np.cumsum(wraps)))
+    first = np.flatnonzero(np.concatenate(([True], ~same_ring)))
+    counts = np.diff(np.append(first, len(fraction)))
+    ends = np.append(first[1:], len(fraction)) - 1
+    base = turns[first]
+    # A ring that begins just before the start azimuth and passes it began a turn early.
+    base = base + ((fraction[first] > _SEAM) & (turns[ends] > base))
+    turns -= np.repeat(base, counts)
+    return turns
+
+
+def organise(scan: Scan, config: Config) -> OrganisedSweep:
+    """Rings, times, and the points ring after ring in firing order.
+
+    Parameters
+    ----------
+    scan : not de-skewed
+    config : ``sensor`` and ``deskew.enabled`` are used
+
+    Raises
+    ------
+    SweepError
+        If too few points are usable, or rings or times cannot be had.
+    """
+    columns = usable_columns(scan, config)
+    rings = assign_rings(columns, config.sensor)
+    timing = assign_times(columns, rings, config)
+    order = _firing_order(columns, rings, timing)
+    number = rings.rings if order is None else rings.rings[order]
+    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    return OrganisedSweep(
+        xyz=columns.xyz if order is None else columns.xyz.take(order, axis=1),
+        index=columns.index if order is None else columns.index[order],
+        ring_starts=np.append(starts, len(number)),
+        ring_of_start=number[starts].astype(np.int64),
+        times=timing.times if order is None else timing.times[order],
+        span=timing.span,
+        rings=rings,
+        timing=timing,
+        dropped=columns.dropped,
+        not_finite=columns.not_finite,
+    )
+
+
+def _firing_order(
+    columns: SweepColumns, rings: RingAssignment, timing: TimeAssignment
+) -> IntArray | None:
+    """Order by ring and time, or None if the points are in that order.
+
+    A stable sort by 16-bit keys is a radix sort, far cheaper than sorting the times. The keys are
+    ring and a coarse time, which is exact for data that was stored in time order (or against it)
+    but cut elsewhere; what is still out of order is sorted in full.
+    """
+    number = rings.rings
+    clock = timing.times
+    if timing.method == "none":
+        # Without times the azimuth is the order along a ring.
+        clock = -columns.azimuth.astype(np.float64)
+    if _in_order(number, clock):
+        return None
+    first, last = float(clock.min()), float(clock.max())
+    bins = 65536 // rings.count
+    coarse = (clock - first).astype(np.float32)
+    coarse *= np.float32((bins - 1) / max(last - first, 1e-12))
+    key = number * np.uint16(bins) + coarse.astype(np.uint16)
+    against = np.count_nonzero(clock[1:] < clock[:-1]) > len(clock) // 2
+    if against:
+        order = len(key) - 1 - np.argsort(key[::-1], kind="stable")
+    else:
+        order = np.argsort(key, kind="stable")
+    if not _in_order(number[order], clock[order]):
+        order = np.lexsort((clock, number))
+    return order
+
+
+def _in_order(number: NDArray[np.uint16], clock: FloatArray) -> bool:
+    """True if rings ascend, and times ascend within each."""
+    up, same = number[1:] > number[:-1], number[1:] == number[:-1]
+    return bool(np.all(up | (same & (clock[1:] >= clock[:-1]))))

@@ -1,0 +1,1 @@
+"""Inertial samples: buffer, rest, attitude, level and pre-integration."""

@@ -1,0 +1,144 @@
+"""Whether a stretch of IMU samples is at rest, and what it then says about gyro and gravity."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.imu.quaternions import as_rot3
+from loam_gtsam.types import FloatArray, IntArray
+
+STILL_LEAST = 0.1
+"""Seconds a still window must span at least."""
+STILL_SAMPLES = 10
+"""Samples a still window must have at least."""
+STILL_GYRO = 0.02
+"""rad/s, scatter per axis at rest: several times the noise of consumer MEMS gyros at 200 Hz."""
+STILL_ACCELERATION = 0.15
+"""m/s^2, scatter per axis at rest: above an idling engine, below any driving (VINS-Mono takes
+0.25 for "enough excitation" of a hand-held start)."""
+STILL_DRIFT = 4.0
+"""Standard deviations by which the means of the two halves of a still window may differ. What the
+scatter does not show, this does: a platform that begins to move."""
+STILL_DRIFT_FLOOR = (5e-4, 0.01)
+"""rad/s and m/s^2, allowed on top: noise is not quite white."""
+STILL_TURN = 0.05
+"""rad/s, mean rate at rest: the largest bias of consumer MEMS gyros (3 deg/s). A platform that
+turns evenly at less than that cannot be told from a bias."""
+STILL_GRAVITY = 0.5
+"""m/s^2 by which the mean acceleration at rest may differ from gravity: 5 %, a scale and a bias."""
+
+
+@dataclass(frozen=True, slots=True)
+class StillWindow:
+    """A stretch of samples at rest, lidar axes.
+
+    Attributes
+    ----------
+    first, last : stamps, nanoseconds
+    samples : number
+    gyro : (3,) mean, rad/s: the bias of the gyro
+    acceleration : (3,) mean, m/s^2: points up
+    world_R_lidar : mean orientation, None if there is none
+    """
+
+    first: int
+    last: int
+    samples: int
+    gyro: FloatArray
+    acceleration: FloatArray
+    world_R_lidar: gtsam.Rot3 | None
+
+    @property
+    def disagreement(self) -> float:
+        """Angle between up by the orientation and by the accelerometer, rad; NaN if unknown."""
+        if self.world_R_lidar is None:
+            return float("nan")
+        up = self.world_R_lidar.matrix()[2]
+        away = np.linalg.norm(np.cross(up, self.acceleration))
+        return float(np.arctan2(away, up @ self.acceleration))
+
+
+def find_rest(
+    config: ImuConfig,
+    stamps: IntArray,
+    gyro: FloatArray,
+    acceleration: FloatArray,
+    quaternions: FloatArray | None = None,
+) -> StillWindow | None:
+    """These samples, if they are at rest.
+
+    At rest is: gyro and acceleration scatter little (:data:`STILL_GYRO`,
+    :data:`STILL_ACCELERATION`) and do not drift (:data:`STILL_DRIFT`), the mean rate is a possible
+    bias (:data:`STILL_TURN`), the mean acceleration is gravity (:data:`STILL_GRAVITY`), and there
+    are enough samples without a gap (:data:`STILL_LEAST`, :data:`STILL_SAMPLES`).
+
+    Parameters
+    ----------
+    config : section ``imu``
+    stamps : (N,) nanoseconds, ascending
+    gyro, acceleration : (N, 3) rad/s and m/s^2, lidar axes
+    quaternions : (N, 4) x y z w of ``world_R_lidar``, NaN where unknown
+    """
+    if len(stamps) < STILL_SAMPLES or stamps[-1] - stamps[0] < STILL_LEAST * 1e9:
+        return None
+    mean_gyro, mean_acceleration = gyro.mean(axis=0), acceleration.mean(axis=0)
+    weight = float(np.linalg.norm(mean_acceleration))
+    drift_gyro, drift_acceleration = STILL_DRIFT_FLOOR
+    if (
+        np.diff(stamps).max() > config.max_gap * 1e9
+        or gyro.std(axis=0).max() > STILL_GYRO
+        or acceleration.std(axis=0).max() > STILL_ACCELERATION
+        or _drifts(gyro, drift_gyro)
+        or _drifts(acceleration, drift_acceleration)
+        or np.linalg.norm(mean_gyro) > STILL_TURN
+        or abs(weight - config.gravity) > STILL_GRAVITY
+    ):
+        return None
+    world_R_lidar = None
+    if quaternions is not None:
+        known = quaternions[np.isfinite(quaternions[:, 0])]
+        if len(known):
+            # q and -q are one rotation: bring all to one side before they are averaged.
+            mean = np.where(known @ known[0] < 0.0, -1.0, 1.0) @ known
+            world_R_lidar = as_rot3(mean / np.linalg.norm(mean))
+    return StillWindow(
+        first=int(stamps[0]),
+        last=int(stamps[-1]),
+        samples=len(stamps),
+        gyro=mean_gyro,
+        acceleration=mean_acceleration,
+        world_R_lidar=world_R_lidar,
+    )
+
+
+def rest_at_start(
+    config: ImuConfig,
+    stamps: IntArray,
+    gyro: FloatArray,
+    acceleration: FloatArray,
+    quaternions: FloatArray | None = None,
+) -> StillWindow | None:
+    """The first ``still_seconds`` of a stream, or a half or a quarter of them, if at rest.
+
+    Parameters are those of :func:`find_rest`, at least one sample.
+    """
+    for share in (1.0, 0.5, 0.25):
+        end = int(stamps[0]) + round(share * config.still_seconds * 1e9)
+        part = slice(0, int(np.searchsorted(stamps, end, side="right")))
+        among = None if quaternions is None else quaternions[part]
+        window = find_rest(config, stamps[part], gyro[part], acceleration[part], among)
+        if window is not None:
+            return window
+    return None
+
+
+def _drifts(values: FloatArray, floor: float) -> bool:
+    """Whether the halves of (N, 3) values differ by more than chance on some axis."""
+    half = len(values) // 2
+    change = np.abs(values[half:].mean(axis=0) - values[:half].mean(axis=0))
+    chance = 2.0 * values.std(axis=0) / np.sqrt(len(values))
+    return bool((change > STILL_DRIFT * chance + floor).any())

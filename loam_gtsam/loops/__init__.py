@@ -1,0 +1,1 @@
+"""Keyframes, loop closures and the pose graph that ties them together."""

@@ -1,0 +1,265 @@
+"""Pose graphs as files: g2o, and GTSAM's own serialisation.
+
+g2o (Kuemmerle et al., g2o: A General Framework for Graph Optimization, ICRA 2011) knows poses and
+motions between them; GTSAM's text archives know every factor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.io.run_files import replacing
+from loam_gtsam.loops.batch import SavedGraph
+from loam_gtsam.types import DatasetError, FloatArray, InputError, OutputError
+
+G2O_SUFFIX, GTSAM_SUFFIXES = ".g2o", (".graph", ".values", ".stamps")
+"""Of the files that are read and written; the second format takes three side by side."""
+
+_POSE, _EDGE, _FIX, _STAMP = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX", "# stamp_ns"
+_NUMBERS = {_POSE: 8, _EDGE: 30, _FIX: 1}
+_UPPER = np.triu_indices(6)
+_SWAP = np.array([3, 4, 5, 0, 1, 2])
+"""g2o has translation first."""
+_FIXED_SIGMA = 1e-4
+
+
+def write_graph(path: str | Path, saved: SavedGraph) -> None:
+    """Write a graph: ``NAME.g2o``, or ``NAME.graph``, ``.values`` and ``.stamps`` for GTSAM.
+
+    g2o has no priors, positions and directions of gravity: they are left out, a comment tells how
+    many, and the first pose is marked as fixed. Stamps go into comments.
+
+    Raises
+    ------
+    InputError
+        If the suffix is neither.
+    OutputError
+        If a file cannot be written, or the graph holds a factor that GTSAM cannot serialise.
+    """
+    path = Path(path)
+    _by_suffix(path, _write_g2o, _write_gtsam)(path, saved)
+
+
+def read_graph(path: str | Path) -> SavedGraph:
+    """Read what :func:`write_graph` wrote, or another system's g2o file of 3D poses.
+
+    Raises
+    ------
+    InputError
+        If the suffix is neither ``.g2o`` nor ``.graph``.
+    DatasetError
+        If the file cannot be read, naming the line that does not fit.
+    """
+    path = Path(path)
+    saved: SavedGraph = _by_suffix(path, _read_g2o, _read_gtsam)(path)
+    return saved
+
+
+def _by_suffix(path: Path, g2o: Callable[..., Any], own: Callable[..., Any]) -> Callable[..., Any]:
+    if path.suffix == G2O_SUFFIX:
+        return g2o
+    if path.suffix == GTSAM_SUFFIXES[0]:
+        return own
+    raise InputError(
+        f"{path}: expected a name that ends in {G2O_SUFFIX}, or in {GTSAM_SUFFIXES[0]} for GTSAM's "
+        f"own format; got {path.suffix or 'none'}"
+    )
+
+
+# -- g2o -------------------------------------------------------------------------------------------
+
+
+def _write_g2o(path: Path, saved: SavedGraph) -> None:
+    lines = ["# made by loam_gtsam; information: translation first, then rotation (rad)"]
+    lines += [f"{_STAMP} {key} {stamp}" for key, stamp in sorted(saved.stamps.items())]
+    for key in sorted(saved.poses.keys()):
+        lines.append(f"{_POSE} {key} {_pose_text(saved.poses.atPose3(key))}")
+    if saved.poses.size():
+        lines.append(f"{_FIX} {min(saved.poses.keys())}")
+    left_out = 0
+    for place in range(saved.factors.size()):
+        factor = saved.factors.at(place)
+        if not isinstance(factor, gtsam.BetweenFactorPose3):
+            left_out += 1
+            continue
+        noise: Any = factor.noiseModel()
+        if isinstance(noise, gtsam.noiseModel.Robust):
+            noise = noise.noise()
+        information = noise.information()[np.ix_(_SWAP, _SWAP)][_UPPER]
+        first, second = factor.keys()
+        numbers = " ".join(f"{value:.17g}" for value in information.tolist())
+        lines.append(f"{_EDGE} {first} {second} {_pose_text(factor.measured())} {numbers}")
+    if left_out:
+        lines.insert(1, f"# {left_out} factors are left out, which g2o does not know")
+    with replacing(path) as file:
+        file.write(("\n".join(lines) + "\n").encode("ascii"))
+
+
+def _pose_text(pose: gtsam.Pose3) -> str:
+    q: Any = pose.rotation().toQuaternion()
+    numbers = [*pose.translation(), q.x(), q.y(), q.z(), q.w()]
+    return " ".join(f"{value:.17g}" for value in numbers)
+
+
+def _read_g2o(path: Path) -> SavedGraph:
+    graph, poses, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
+    fixed: list[tuple[int, str]] = []
+    edges: list[tuple[int, int, FloatArray, str]] = []
+    for number, line in enumerate(_text(path).splitlines(), 1):
+        where = f"{path}:{number}"
+        words = line.split()
+        if line.startswith(_STAMP) and len(words) == 4:
+            stamps[_key(words[2], where)] = _integer(words[3], where)
+        if not words or words[0].startswith("#"):
+            continue
+        tag, fields = words[0], words[1:]
+        if tag not in _NUMBERS:
+            raise DatasetError(
+                f"{where}: expected {', '.join(_NUMBERS)} (poses in 3D and motions between them), "
+                f"got {tag[:40]!r}"
+            )
+        if len(fields) != _NUMBERS[tag]:
+            raise DatasetError(
+                f"{where}: {tag} takes {_NUMBERS[tag]} numbers, this line has {len(fields)}"
+            )
+        if tag == _FIX:
+            fixed.append((_key(fields[0], where), where))
+        elif tag == _POSE:
+            key = _key(fields[0], where)
+            if poses.exists(key):
+                raise DatasetError(f"{where}: there already is a pose {key}")
+            poses.insert(key, _pose(_floats(fields[1:], where), where))
+        else:
+            first, second = (_key(word, where) for word in fields[:2])
+            edges.append((first, second, _floats(fields[2:], where), where))
+    if poses.size() == 0:
+        raise DatasetError(f"{path}: expected lines that begin with {_POSE}, found none")
+    for key, where in fixed:
+        _exists(poses, key, where)
+        held = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
+        graph.add(gtsam.PriorFactorPose3(key, poses.atPose3(key), held))
+    for first, second, numbers, where in edges:
+        _exists(poses, first, where)
+        _exists(poses, second, where)
+        if first == second:
+            raise DatasetError(f"{where}: expected a motion between two poses, got {first} twice")
+        noise = gtsam.noiseModel.Gaussian.Information(_information(numbers[7:], where))
+        graph.add(gtsam.BetweenFactorPose3(first, second, _pose(numbers[:7], where), noise))
+    return SavedGraph(graph, poses, {key: at for key, at in stamps.items() if poses.exists(key)})
+
+
+def _pose(numbers: FloatArray, where: str) -> gtsam.Pose3:
+    x, y, z, w = numbers[3:]
+    length = float(np.linalg.norm(numbers[3:]))
+    if not 0.99 < length < 1.01:
+        raise DatasetError(f"{where}: expected a quaternion of length 1, got {length:.4g}")
+    rotation = gtsam.Rot3.Quaternion(*(value / length for value in (w, x, y, z)))
+    return gtsam.Pose3(rotation, numbers[:3])
+
+
+def _information(upper: FloatArray, where: str) -> FloatArray:
+    matrix = np.zeros((6, 6))
+    matrix[_UPPER] = upper
+    matrix = np.triu(matrix) + np.triu(matrix, 1).T
+    least = float(np.linalg.eigvalsh(matrix)[0])
+    if not least > 0.0:
+        raise DatasetError(
+            f"{where}: expected a positive definite information matrix, its least eigenvalue is "
+            f"{least:.3g}"
+        )
+    swapped: FloatArray = matrix[np.ix_(_SWAP, _SWAP)]
+    return swapped
+
+
+def _exists(poses: gtsam.Values, key: int, where: str) -> None:
+    if not poses.exists(key):
+        raise DatasetError(f"{where}: there is no {_POSE} {key}")
+
+
+def _integer(word: str, where: str) -> int:
+    try:
+        return int(word)
+    except ValueError:
+        raise DatasetError(f"{where}: expected a whole number, got {word[:40]!r}") from None
+
+
+def _key(word: str, where: str) -> int:
+    key = _integer(word, where)
+    if not 0 <= key < 1 << 63:
+        raise DatasetError(f"{where}: expected a number of a pose from 0 on, got {key}")
+    return key
+
+
+def _floats(words: list[str], where: str) -> FloatArray:
+    try:
+        numbers = np.array([float(word) for word in words])
+    except ValueError as error:
+        raise DatasetError(f"{where}: {error}") from None
+    if not np.isfinite(numbers).all():
+        raise DatasetError(f"{where}: expected finite numbers")
+    return numbers
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="ascii")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error  # without the path again
+        raise DatasetError(f"{path}: cannot read the graph: {reason}") from error
+
+
+# -- GTSAM -----------------------------------------------------------------------------------------
+
+
+def _write_gtsam(path: Path, saved: SavedGraph) -> None:
+    try:
+        parts = [saved.factors.serialize(), saved.poses.serialize()]
+    except RuntimeError as error:
+        raise OutputError(
+            f"{path}: GTSAM cannot serialise this graph ({error}); factors written in Python "
+            "cannot be saved"
+        ) from error
+    stamps = sorted(saved.stamps.items())
+    parts.append("".join(f"{key} {stamp}\n" for key, stamp in stamps))
+    for suffix, text in zip(GTSAM_SUFFIXES, parts, strict=True):
+        with replacing(path.with_suffix(suffix)) as file:
+            file.write(text.encode("ascii"))
+
+
+def _read_gtsam(path: Path) -> SavedGraph:
+    graph, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    targets: tuple[gtsam.NonlinearFactorGraph | gtsam.Values, ...] = (graph, poses)
+    for suffix, target in zip(GTSAM_SUFFIXES[:2], targets, strict=True):
+        part = path.with_suffix(suffix)
+        text = _text(part)
+        try:
+            target.deserialize(text)
+        except (RuntimeError, MemoryError) as error:
+            raise DatasetError(
+                f"{part}: not the text of a gtsam {type(target).__name__}: {error}"
+            ) from error
+    for key in poses.keys():  # noqa: SIM118 (no mapping)
+        try:
+            poses.atPose3(key)
+        except RuntimeError as error:
+            raise DatasetError(f"{path}: expected poses only, key {key} has none") from error
+    # Some texts of other things are read without an error, as nothing.
+    known = set(poses.keys())
+    for place in range(graph.size()):
+        if not known.issuperset(graph.at(place).keys()):
+            part = path.with_suffix(GTSAM_SUFFIXES[1])
+            raise DatasetError(f"{part}: has no pose for factor {place} of {path}")
+    stamps: dict[int, int] = {}
+    part = path.with_suffix(GTSAM_SUFFIXES[2])
+    if part.exists():
+        for number, line in enumerate(_text(part).splitlines(), 1):
+            words, where = line.split(), f"{part}:{number}"
+            if len(words) != 2:
+                raise DatasetError(f"{where}: expected a key and a stamp, got {line[:80]!r}")
+            stamps[_key(words[0], where)] = _integer(words[1], where)
+    return SavedGraph(graph, poses, stamps)

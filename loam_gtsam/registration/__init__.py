@@ -1,0 +1,1 @@
+"""From features and a map to a pose: matches, solvers, degeneracy, covariance."""

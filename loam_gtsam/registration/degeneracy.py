@@ -1,0 +1,207 @@
+"""Which motions a scan says something about, and what to do about the others.
+
+The information of a scan is never singular: the normals of five noisy points are wrong by some
+degrees, and a thousand of them on the bare walls of a corridor seem to say how far along it one is.
+Since the map points that they come from are matched anew at every pose, they say nothing. What
+tells such information from real one is the noise that the normals themselves have.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.factors import complement_basis
+from loam_gtsam.geometry import cross, cross_matrix
+from loam_gtsam.registration.association import EdgeMatches, ScanMatches, subset
+from loam_gtsam.types import FloatArray
+
+_CLEAR = 3.0
+"""Standard deviations of a normal by which a displacement must be off its surface to be seen."""
+
+_MOVED = 0.1
+"""Part of the root mean square displacement that a match must have to count in full: the points of
+a pole say nothing about a turn about that pole, whatever the direction of their few millimetres."""
+_HELD = 0.5
+"""Part of the least number of matches that lines must be for planes to be left out beside them."""
+
+
+@dataclass(frozen=True, slots=True)
+class Localizability:
+    """How well a scan fixes its pose, by direction, the weakest first.
+
+    Attributes
+    ----------
+    directions : (6, 6) rows, tangent vectors at the pose (rad, m), each scaled to move the matched
+        points by 1 m (root mean square)
+    aligned : (6,) matches that fix each of them, counted as if the normals pointed that way: the
+        sum of squared cosines between normal and displacement, over the matches that see it at all
+    information : (6,) of the scan along each of them, 1 / m^2, what noise makes of it included
+    displacement : (6, 6) form whose value for a motion is the mean squared displacement of the
+        matched points, m^2
+    by_planes : (6,) those of ``aligned`` that are planes
+    """
+
+    directions: FloatArray
+    aligned: FloatArray
+    information: FloatArray
+    displacement: FloatArray
+    by_planes: FloatArray
+
+    def seen_from(self, a_T_b: gtsam.Pose3) -> Localizability:
+        """The same about frame ``a``, if this is about frame ``b``, which moves with it."""
+        to_a, to_b = a_T_b.AdjointMap(), a_T_b.inverse().AdjointMap()
+        form: FloatArray = to_b.T @ self.displacement @ to_b
+        return replace(self, directions=self.directions @ to_a.T, displacement=form)
+
+    def axes(self) -> FloatArray:
+        """(6,) aligned matches that fix rx, ry, rz, x, y, z, with the other five left free.
+
+        The directions and their counts a make the form ``(sum v v^T / a)^-1``. Of that the Schur
+        complement of an axis is taken, and scaled to a motion along the axis that displaces the
+        matched points by 1 m. A direction counts at least one match, or an axis that is off it by
+        a fraction of a degree would have none either.
+        """
+        spread = (self.directions**2 / np.maximum(self.aligned, 1.0)[:, None]).sum(axis=0)
+        counts: FloatArray = 1.0 / (spread * np.diagonal(self.displacement))
+        return counts
+
+    def weak(self, least: float) -> FloatArray:
+        """(W, 6) the directions with fewer aligned matches than ``least``."""
+        chosen: FloatArray = self.directions[self.aligned < least]
+        return chosen
+
+    def projector(self, least: float) -> FloatArray | None:
+        """(6, 6) projector onto the weak directions along the others, None if there are none."""
+        mask = self.aligned < least
+        if not mask.any():
+            return None
+        columns = self.directions.T
+        projector: FloatArray = columns @ (mask[:, None] * np.linalg.inv(columns))
+        return projector
+
+
+def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizability:
+    """Find the directions in which information stands out least from what noise makes of it.
+
+    With u the displacement of a point by a motion, n the normal and s its standard deviation in
+    rad, a match contributes ``(n . u)^2`` to the information, of which ``s^2 |u|^2`` is noise. The
+    directions are the generalised eigenvectors of the two sums. Matches with
+    ``|n . u| > 3 s |u|`` see the motion. A line counts as two planes, if it is distinct.
+
+    Parameters
+    ----------
+    matches : of the scan
+    map_T_lidar : the pose at which they were made
+    """
+    rotation = map_T_lidar.rotation().matrix()
+    e, p = matches.edges, matches.planes
+    own = np.ones(len(e), np.bool_) if e.distinct is None else e.distinct
+    line_tilts = np.zeros(len(e)) if e.tilts is None else e.tilts
+    plane_tilts = np.zeros(len(p)) if p.tilts is None else p.tilts
+    basis = complement_basis(e.directions[own]).reshape(-1, 3)
+    points = np.concatenate([np.repeat(e.points[own], 2, axis=0), p.points])
+    normals = np.concatenate([basis, p.normals]) @ rotation
+    tilts = np.concatenate([np.repeat(line_tilts[own], 2), plane_tilts])
+    weights = np.concatenate([np.repeat(e.weights[own] / e.sigmas[own], 2), p.weights / p.sigmas])
+
+    rows = np.hstack([cross(points.T, normals.T).T, normals])
+    information = rows.T @ (rows * (weights**2)[:, None])
+    noise = _displacements(points, (weights * tilts) ** 2)
+    unit = _displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
+    floor = np.finfo(np.float64).eps * (np.trace(noise) + 1.0)
+    columns = _eigenvectors(information, noise + floor * (unit + np.eye(6)))
+    scale = np.sqrt(np.einsum("ik,ij,jk->k", columns, unit, columns))
+    directions = columns.T / np.maximum(scale, floor)[:, None]
+
+    sight = _sight(points, normals, tilts, directions)
+    aligned, by_planes = sight.sum(axis=0), sight[len(sight) - len(p) :].sum(axis=0)
+    order = np.argsort(aligned, kind="stable")
+    along = np.einsum("ki,ij,kj->k", directions, information, directions)
+    return Localizability(directions[order], aligned[order], along[order], unit, by_planes[order])
+
+
+def unseen_by_planes(
+    matches: ScanMatches, map_T_lidar: gtsam.Pose3, seen: Localizability, least: float
+) -> Localizability | None:
+    """How well the planes alone fix the pose, if there are motions to be left to the lines.
+
+    The few lines of poles say truly how far the pose is off. A thousand planes of rough ground do
+    not, but noise makes them hold it where it was, and together they outweigh the poles.
+
+    Parameters
+    ----------
+    matches : of the scan
+    map_T_lidar : the pose at which they were made
+    seen : how well planes and lines together fix it
+    least : see :meth:`Localizability.weak`
+
+    Returns
+    -------
+    None if planes see all motions, or nothing sees a motion but they and they do so well enough.
+    """
+    if seen.by_planes.min() >= least:
+        return None
+    no_lines = subset(matches.edges, np.zeros(len(matches.edges), np.bool_))
+    planes = localizability(replace(matches, edges=no_lines), map_T_lidar)
+    directions = planes.weak(least)
+    if not len(directions):
+        return None
+    by_lines = line_sight(matches.edges, map_T_lidar, directions).sum(axis=0)
+    held = seen.aligned[0] < least or by_lines.min() >= _HELD * least
+    return planes if held else None
+
+
+def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatArray) -> FloatArray:
+    """(E, W) how far each line sees the motions: what it counts in ``Localizability.aligned``.
+
+    Parameters
+    ----------
+    edges : of the scan
+    map_T_lidar : the pose at which they were made
+    directions : (W, 6), see :class:`Localizability`
+    """
+    tilts = np.zeros(len(edges)) if edges.tilts is None else edges.tilts
+    rotation = map_T_lidar.rotation().matrix()
+    normals = complement_basis(edges.directions).reshape(-1, 3) @ rotation
+    points = np.repeat(edges.points, 2, axis=0)
+    sight = _sight(points, normals, np.repeat(tilts, 2), directions)
+    sight = sight[0::2] + sight[1::2]
+    if edges.distinct is not None:
+        sight[~edges.distinct] = 0.0
+    return sight
+
+
+def _sight(
+    points: FloatArray, normals: FloatArray, tilts: FloatArray, directions: FloatArray
+) -> FloatArray:
+    """(N, W) squared cosines between normals and displacements; 0 where noise may make them."""
+    turn, shift = directions[:, :3], directions[:, 3:]
+    seen = cross(points.T, normals.T).T @ turn.T + normals @ shift.T
+    # |shift + turn x p|^2 for all points and directions, as products of small matrices
+    moved = np.outer((points**2).sum(axis=1), (turn**2).sum(axis=1)) - (points @ turn.T) ** 2
+    moved += 2.0 * points @ cross(shift.T, turn.T) + (shift**2).sum(axis=1)
+    moved = np.maximum(moved, _MOVED**2)
+    squared = seen**2 / moved
+    return np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0)
+
+
+def _eigenvectors(form: FloatArray, noise: FloatArray) -> FloatArray:
+    """(6, 6) generalised eigenvectors of two forms, as columns; a third of scipy's time."""
+    inverse = np.linalg.inv(np.linalg.cholesky(noise))
+    columns: FloatArray = inverse.T @ np.linalg.eigh(inverse @ form @ inverse.T)[1]
+    return columns
+
+
+def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """(6, 6) form: the weighted sum of the points' squared displacements by a motion."""
+    first = weights @ points
+    second = (points * weights[:, None]).T @ points
+    form = np.zeros((6, 6))
+    form[:3, :3] = np.trace(second) * np.eye(3) - second
+    form[:3, 3:] = cross_matrix(first)
+    form[3:, :3] = form[:3, 3:].T
+    form[3:, 3:] = weights.sum() * np.eye(3)
+    return form

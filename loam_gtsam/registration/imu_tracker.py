@@ -1,0 +1,230 @@
+"""What an IMU does for the mapper: which way is up, the tilt of every pose, the gyro's bias."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.preintegration import InertialOdometry, Prediction
+from loam_gtsam.imu_prior import (
+    Level,
+    blend,
+    blend_direction,
+    equivalent_prior,
+    find_level,
+    gravity_factor,
+    mean_orientation,
+    roll_pitch_factor,
+    tilt_information,
+    too_steep,
+)
+from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
+from loam_gtsam.types import FloatArray, SweepError, TiltPrior
+
+_BIAS_GAIN = 0.02
+"""Share of a frame's difference between gyro and scan that goes into the gyro's bias: 50 frames."""
+_DISAGREEMENT = (np.radians(0.3), 0.5)
+"""Gyro and scan disagree about a frame if they differ by more than this angle plus this share of
+the turn: far above the noise of either, below what a wrong axis or sign makes."""
+_DISTRUST = 5
+"""Frames of disagreement, less those of agreement, after which the gyro is not used."""
+_SCAN_VARIANCE = 4.0
+"""By which the scan's information is divided before pre-integration believes it: errors of scans
+against one map last over frames (built-in scenes: mean squared errors of 1 to 4 times the
+information's over 10 to 50 frames)."""
+
+
+class ImuAid:
+    """Use of an IMU in mapping, as ``config`` says.
+
+    Parameters
+    ----------
+    buffer : samples may be added to it at any time
+
+    Attributes
+    ----------
+    level : which way is up in the map; None until there is an orientation
+    """
+
+    def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
+        self.config = config
+        self.buffer = buffer
+        self.level: Level | None = None
+        self._disagreements = 0
+        self._inertial: InertialOdometry | None = None
+        self._predicted: int | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        learnt = {"gyro_bias": self.buffer.gyro_bias}
+        return learnt | {k: v for k, v in vars(self).items() if k not in ("buffer", "config")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.buffer.gyro_bias = state.pop("gyro_bias")
+        vars(self).update(state)
+
+    @property
+    def gyro(self) -> ImuBuffer | None:
+        """The buffer, while its gyro agrees with the scans."""
+        return self.buffer if self._disagreements < _DISTRUST else None
+
+    def between(self, first: int, second: int) -> gtsam.Rot3 | None:
+        """``first_R_second`` of two stamps by the gyro; None while it is not to be trusted."""
+        gyro = self.gyro
+        return None if gyro is None else gyro.between(first, second)
+
+    def start(self, stamp: int, given: gtsam.Pose3 | None = None) -> gtsam.Pose3:
+        """Where the first sweep is: at the origin, of a map whose z axis points up if wanted.
+
+        Parameters
+        ----------
+        stamp : nanoseconds
+        given : where a user wants it, in a map of the user's own; up is then found in that map
+        """
+        still = self.buffer.still(stamp)
+        if still is not None:
+            self.buffer.gyro_bias = still.gyro
+        levelled = self.config.level and given is None
+        pose = gtsam.Pose3() if given is None else given
+        self.level = find_level(self.buffer, self.config, stamp, pose, levelled=levelled)
+        if self.level is None or not levelled:
+            return pose
+        tilted = gtsam.Rot3.RzRyRx(self.level.roll, self.level.pitch, 0.0)
+        return gtsam.Pose3(tilted, np.zeros(3))
+
+    def find_level(self, stamp: int, map_T_lidar: gtsam.Pose3) -> None:
+        """If there was no orientation at the start, find up in the map as soon as there is one."""
+        if self.level is None:
+            self.level = find_level(self.buffer, self.config, stamp, map_T_lidar, levelled=False)
+
+    def factors(self, stamp: int) -> Sequence[gtsam.NonlinearFactor]:
+        """Factors on the pose of a moment that are known before the solve: mode ``sigma``."""
+        measured = self._attitude(stamp)
+        if self.config.prior != "sigma" or measured is None:
+            return ()
+        return (self._gravity(measured),)
+
+    def tilted(self, stamp: int, solution: Solution) -> tuple[Solution, TiltPrior]:
+        """Bring roll and pitch into the solution for a moment, where they are a factor."""
+        config = self.config
+        if config.prior in ("off", "blend"):
+            return solution, TiltPrior.NONE
+        measured = self._attitude(stamp)
+        if measured is None:
+            return solution, TiltPrior.DROPPED
+        assert self.level is not None
+        if config.prior == "sigma":
+            return solution, TiltPrior.GRAVITY  # it was in the solve
+        pose, information = solution.map_T_lidar, solution.information
+        level_R_lidar = self.level.level_R_map.compose(pose.rotation())
+        if too_steep(level_R_lidar, measured) or self._tilt_is_unknown(solution, level_R_lidar):
+            factor, tilt = self._gravity(measured), TiltPrior.GRAVITY
+        else:
+            prior = equivalent_prior(level_R_lidar, information, measured, config.weight)
+            factor = roll_pitch_factor(POSE_KEY, prior, self.level.level_R_map)
+            tilt = TiltPrior.EQUIVALENT
+        pose, information = fuse(pose, information, [factor])
+        return replace(solution, map_T_lidar=pose, information=information), tilt
+
+    def blended(self, stamp: int, map_T_lidar: gtsam.Pose3) -> tuple[gtsam.Pose3, TiltPrior]:
+        """LOAM's blend of the pose of a moment, if that is the mode."""
+        if self.config.prior != "blend":
+            return map_T_lidar, TiltPrior.NONE
+        measured = self._attitude(stamp)
+        if measured is None:
+            return map_T_lidar, TiltPrior.DROPPED
+        assert self.level is not None
+        up = self.level.level_R_map
+        if too_steep(up.compose(map_T_lidar.rotation()), measured):
+            blended = blend_direction(map_T_lidar, measured, self.config.weight, self.level.map_up)
+            return blended, TiltPrior.GRAVITY
+        return blend(map_T_lidar, measured, self.config.weight, up), TiltPrior.BLEND
+
+    def compare_gyro(self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3]) -> None:
+        """Learn the gyro's bias from two solved poses; give up a gyro that turns otherwise.
+
+        Parameters
+        ----------
+        last, now : stamp and pose
+        """
+        turned = self.buffer.between(last[0], now[0])
+        if turned is None or now[0] <= last[0]:  # sweeps of unlike length
+            return
+        scan = last[1].rotation().between(now[1].rotation())
+        missing = gtsam.Rot3.Logmap(scan.between(turned))
+        limit, share = _DISAGREEMENT
+        allowed = limit + share * float(np.linalg.norm(gtsam.Rot3.Logmap(scan)))
+        if np.linalg.norm(missing) > allowed:
+            self._disagreements = min(self._disagreements + 1, 2 * _DISTRUST)
+            return
+        self._disagreements = max(self._disagreements - 1, 0)
+        rate = missing / ((now[0] - last[0]) * 1e-9)
+        self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
+
+    def predict(self, stamp: int) -> Prediction | None:
+        """Pose, velocity and covariance of a moment by pre-integration; None if not to be had.
+
+        To be called once a frame, before :meth:`observe` of the same stamp.
+        """
+        self._predicted = None
+        if self._inertial is None:
+            return None
+        margin = round(self.config.max_gap * 1e9)
+        samples = self.buffer.window(self._inertial.state.stamp - margin, stamp + margin)
+        try:
+            prediction = self._inertial.predict(stamp, samples)
+        except SweepError:
+            return None
+        self._predicted = stamp
+        return prediction
+
+    def observe(
+        self,
+        last: tuple[int, gtsam.Pose3],
+        now: tuple[int, gtsam.Pose3],
+        information: FloatArray,
+    ) -> None:
+        """What the scan alone said about a moment, for the predictions to come.
+
+        Parameters
+        ----------
+        last, now : stamp and pose, the middles of two sweeps
+        information : (6, 6) of the second, zero along directions in which the scan is not believed
+        """
+        if not self.config.preintegration or self.level is None:
+            return
+        stamp, pose = now
+        if self._inertial is not None and self._predicted == stamp:
+            self._inertial.update(pose, information / _SCAN_VARIANCE)
+            return
+        velocity = (pose.translation() - last[1].translation()) / ((stamp - last[0]) * 1e-9)
+        if self._inertial is None:
+            gravity = -self.config.gravity * self.level.map_up
+            bias = self.buffer.gyro_bias
+            self._inertial = InertialOdometry(self.config, gravity, stamp, pose, velocity, bias)
+        else:
+            self._inertial.restart(stamp, pose, velocity)
+
+    def _attitude(self, stamp: int) -> gtsam.Rot3 | None:
+        """``world_R_lidar``, None if there is none or if up is not known in the map."""
+        if self.level is None:
+            return None
+        if self.gyro is None or not self.config.average_seconds:
+            return self.buffer.orientation(stamp)
+        found = mean_orientation(self.buffer, stamp, 0.5 * self.config.average_seconds)
+        return None if found is None else found[0]
+
+    def _gravity(self, measured: gtsam.Rot3) -> gtsam.NonlinearFactor:
+        assert self.level is not None
+        sigma = float(np.radians(self.config.sigma_deg))
+        return gravity_factor(POSE_KEY, measured, sigma, self.level.map_up)
+
+    def _tilt_is_unknown(self, solution: Solution, level_R_lidar: gtsam.Rot3) -> bool:
+        """Whether the scan knows some direction of the tilt less well than the IMU."""
+        knows = tilt_information(solution.scan_information, level_R_lidar)
+        return bool(np.linalg.eigvalsh(knows)[0] < np.radians(self.config.sigma_deg) ** -2)

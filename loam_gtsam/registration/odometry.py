@@ -1,0 +1,247 @@
+"""The guess the mapper starts from: constant velocity, scan to scan, or recorded odometry."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import gtsam
+import numpy as np
+from scipy.spatial import cKDTree
+
+from loam_gtsam.config import OdometryConfig
+from loam_gtsam.geometry import move_points
+from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """A predicted pose at the reference time of a sweep, and the motion within that sweep.
+
+    Attributes
+    ----------
+    map_T_lidar : pose
+    twist : (6,) body velocity, rad/s and m/s
+    """
+
+    map_T_lidar: gtsam.Pose3
+    twist: FloatArray
+
+
+class Odometry(Protocol):
+    """Makes the guess for each sweep."""
+
+    def guess(self, features: Features, last: MapUpdate | None) -> Guess:
+        """Predict the pose of a sweep.
+
+        Parameters
+        ----------
+        features : of the new sweep
+        last : the mapper's result for the sweep before, None at the start
+        """
+        ...
+
+
+_LONGEST = 10.0
+"""Seconds for which a motion is taken to go on; where a lidar is after a longer gap, nothing says,
+and a wrong stamp must not take it to the end of the world."""
+
+
+def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsam.Pose3:
+    """The pose after moving with a constant body velocity."""
+    return map_T_lidar.compose(gtsam.Pose3.Expmap(twist * seconds))
+
+
+class Turns(Protocol):
+    """Tells how the lidar turned: an :class:`~loam_gtsam.imu.ImuBuffer` or the mapper's IMU."""
+
+    def between(self, first: int, second: int) -> gtsam.Rot3 | None:
+        """``first_R_second`` of two stamps, None if unknown."""
+        ...
+
+
+class ConstantVelocity:
+    """The motion of the last sweep goes on; an IMU tells how the lidar turned meanwhile."""
+
+    def __init__(self, imu: Turns | None = None) -> None:
+        self.imu = imu
+
+    def guess(self, features: Features, last: MapUpdate | None) -> Guess:
+        """See :meth:`Odometry.guess`."""
+        return self.at(features.stamp, last)
+
+    def at(self, stamp: int, last: MapUpdate | None) -> Guess:
+        """The guess for a moment, nanoseconds."""
+        if last is None:
+            return Guess(gtsam.Pose3(), np.zeros(6))
+        seconds = min((stamp - last.stamp) * 1e-9, _LONGEST)
+        turned = None if self.imu is None else self.imu.between(last.stamp, stamp)
+        if turned is None:
+            return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)
+        # With the rotation known it is the velocity in the map that stays, not that of the body.
+        moved = last.map_T_lidar.compose(gtsam.Pose3(turned, last.twist[3:] * seconds))
+        velocity = turned.matrix().T @ last.twist[3:]
+        return Guess(moved, np.concatenate([last.twist[:3], velocity]))
+
+
+_REASSOCIATE_EVERY = 5
+"""Gauss-Newton iterations per association of the scan-to-scan odometry (LOAM)."""
+_WEIGHT_SLOPE = 1.8
+"""Weight 1 - 1.8 |d| after the first association of the scan-to-scan odometry (LOAM)."""
+_MIN_MATCHES = 10
+"""Fewer matches leave the constant-velocity twist (LOAM)."""
+_CONVERGED = 1e-5
+"""Stop when the motion over the sweep changes less than this (rad and m)."""
+_RING_SPACING = 1e4
+"""Metres between rings in the four-dimensional search; more than any sweep is wide."""
+
+
+class ScanToScan:
+    """LOAM's odometry: the motion within a sweep from matches with the sweep before.
+
+    The sweep before, de-skewed with its solved motion, is moved to the start of the new one. Sharp
+    points of the new one are matched with lines through edge points of two neighbouring rings, flat
+    ones with planes through three plane points of two rings; the unknown is the constant body
+    velocity over the sweep (Zhang and Singh, LOAM, RSS 2014, Section V).
+    """
+
+    def __init__(self, config: OdometryConfig, imu: Turns | None = None) -> None:
+        self.config = config
+        self._start = ConstantVelocity(imu)
+        self._previous: Features | None = None
+
+    def guess(self, features: Features, last: MapUpdate | None) -> Guess:
+        """See :meth:`Odometry.guess`."""
+        guess = self._start.guess(features, last)
+        previous, self._previous = self._previous, features
+        first, end = features.span
+        if previous is None or last is None or end <= first:
+            return guess
+        gap = (features.stamp - previous.stamp) * 1e-9 + first
+        twist = self._solve(features, previous, last.twist, gap)
+        start = advance(guess.map_T_lidar, guess.twist, first)
+        return Guess(advance(start, twist, -first), twist)
+
+    def _solve(
+        self, features: Features, previous: Features, twist: FloatArray, gap: float
+    ) -> FloatArray:
+        """The twist that lays the sharp and flat points on the sweep before."""
+        limit, rings = self.config.max_distance, self.config.ring_gap
+        first, end = features.span
+        edges = _RingSearch(
+            move_points(previous.edges, twist, previous.edge_times - gap), previous.edge_rings
+        )
+        planes = _RingSearch(
+            move_points(previous.planes, twist, previous.plane_times - gap), previous.plane_rings
+        )
+        sharp, flat = features.sharp, features.flat
+        points = np.concatenate([features.edges[sharp], features.planes[flat]])
+        times = np.concatenate([features.edge_times[sharp], features.plane_times[flat]]) - first
+        for iteration in range(self.config.iterations):
+            moved = move_points(points, twist, times)
+            if iteration % _REASSOCIATE_EVERY == 0:
+                on_line, centres, directions = edges.lines(moved[: len(sharp)], limit, rings)
+                on_plane, normals, offsets = planes.planes(moved[len(sharp) :], limit, rings)
+                index = np.concatenate([on_line, len(sharp) + on_plane])
+                if len(index) < _MIN_MATCHES:
+                    break
+            away = moved[on_line] - centres
+            away -= np.einsum("ij,ij->i", away, directions)[:, None] * directions
+            distance = np.linalg.norm(away, axis=1)
+            rows = np.concatenate([away / np.maximum(distance, 1e-9)[:, None], normals])
+            height = np.einsum("ij,ij->i", normals, moved[len(sharp) + on_plane]) + offsets
+            residual = np.concatenate([distance, height])
+            weight = np.ones(len(residual))
+            if iteration >= _REASSOCIATE_EVERY:
+                weight = np.maximum(1.0 - _WEIGHT_SLOPE * np.abs(residual), 0.0)
+            # A small change d of the twist moves q = Exp(twist t) p by t (d_rot x q + d_trans).
+            scale = (weight * times[index])[:, None]
+            jacobian = scale * np.hstack([np.cross(moved[index], rows), rows])
+            step = np.linalg.lstsq(jacobian, -weight * residual, rcond=1e-6)[0]
+            twist = twist + step
+            if np.abs(step).max() * (end - first) < _CONVERGED:
+                break
+        return twist
+
+
+class _RingSearch:
+    """Nearest neighbours among the points of a sweep, in any ring or in given rings.
+
+    The second tree is four-dimensional: rings lie so far apart along the fourth axis that the
+    nearest neighbour of (x, y, z, ring) is the nearest point of exactly that ring.
+    """
+
+    def __init__(self, points: FloatArray, rings: IntArray) -> None:
+        self.points, self.rings = points, rings
+        self._tree = cKDTree(points)
+        self._ring_tree = cKDTree(np.column_stack([points, rings * _RING_SPACING]))
+
+    def lines(
+        self, queries: FloatArray, limit: float, gap: int
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Which queries have a line; a point on it and its unit direction."""
+        index, first = self._nearest(queries, limit)
+        second = self._in_other_rings(queries[index], self.rings[first], limit, gap)
+        found = second >= 0
+        centres = self.points[first[found]]
+        directions, proper = _normalised(self.points[second[found]] - centres)
+        return index[found][proper], centres[proper], directions[proper]
+
+    def planes(
+        self, queries: FloatArray, limit: float, gap: int
+    ) -> tuple[IntArray, FloatArray, FloatArray]:
+        """Which queries have a plane ``n . q + d = 0``; its unit normal and offset."""
+        index, first = self._nearest(queries, limit)
+        ring = self.rings[first]
+        other = self._in_other_rings(queries[index], ring, limit, gap)
+        pairs = self._in_ring(queries[index], ring, limit, 2)
+        same = np.where(pairs[:, 0] == first, pairs[:, 1], pairs[:, 0])
+        found = (other >= 0) & (same >= 0)
+        a, b, c = (self.points[ids[found]] for ids in (first, same, other))
+        normals, proper = _normalised(np.cross(b - a, c - a))
+        normals = normals[proper]
+        return index[found][proper], normals, -np.einsum("ij,ij->i", normals, a[proper])
+
+    def _nearest(self, queries: FloatArray, limit: float) -> tuple[IntArray, IntArray]:
+        """Indices of the queries with a neighbour, and of that neighbour."""
+        if not len(self.points) or not len(queries):
+            return np.zeros(0, np.int64), np.zeros(0, np.int64)
+        _, nearest = self._tree.query(queries, distance_upper_bound=limit)
+        index = np.flatnonzero(nearest < len(self.points))
+        return index, nearest[index]
+
+    def _in_ring(self, queries: FloatArray, rings: IntArray, limit: float, k: int) -> IntArray:
+        """(N, k) nearest points of the given rings, -1 where missing."""
+        if not len(self.points) or not len(queries):
+            return np.full((len(queries), k), -1)
+        query = np.column_stack([queries, rings * _RING_SPACING])
+        _, nearest = self._ring_tree.query(query, k=range(1, k + 1), distance_upper_bound=limit)
+        return np.where(nearest < len(self.points), nearest, -1)
+
+    def _in_other_rings(
+        self, queries: FloatArray, rings: IntArray, limit: float, gap: int
+    ) -> IntArray:
+        """(N,) nearest point of a ring up to ``gap`` away from the given one, -1 if none."""
+        steps = [step for step in range(-gap, gap + 1) if step]
+        candidates = np.column_stack(
+            [self._in_ring(queries, rings + step, limit, 1) for step in steps]
+        )
+        missing = candidates < 0
+        if not len(self.points):
+            return candidates[:, 0]
+        away = self.points[candidates] - queries[:, None, :]
+        squared = np.where(missing, np.inf, np.einsum("nki,nki->nk", away, away))
+        nearest: IntArray = candidates[np.arange(len(queries)), squared.argmin(axis=1)]
+        return nearest
+
+
+def _normalised(vectors: FloatArray) -> tuple[FloatArray, BoolArray]:
+    """Unit vectors, and which were long enough to have a direction."""
+    length = np.linalg.norm(vectors, axis=1)
+    proper = length > 1e-6
+    return vectors / np.where(proper, length, 1.0)[:, None], proper
+
+
+def make_odometry(config: OdometryConfig, imu: Turns | None = None) -> Odometry:
+    """The odometry named by the configuration."""
+    return ScanToScan(config, imu) if config.method == "scan_to_scan" else ConstantVelocity(imu)

@@ -1,0 +1,229 @@
+"""A run as a ROS bag with LOAM's topics, written frame by frame; ROS itself is not needed.
+
+What it holds is said in :mod:`loam_gtsam.ros.frame_messages`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Literal
+
+from rosbags import rosbag1, rosbag2
+
+from loam_gtsam.config import BagConfig
+from loam_gtsam.io.closing import ClosedByBlock
+from loam_gtsam.ros.frame_messages import TYPES, FrameMessages, Points
+from loam_gtsam.types import FrameStatus, MapUpdate, OutputError
+
+_ROS2_VERSION: Literal[8] = 8
+"""Of ``metadata.yaml``. Humble cannot parse version 9, and later releases read both
+(github.com/ros2/rosbag2, issue 1895)."""
+_COMMIT_EVERY = 50
+"""Frames between two commits of a database: what a killed process loses at most."""
+_HEADER_RECORD = 4096
+"""Bytes of the first record of a ROS 1 bag, as ``rosbag`` has it: without its two lengths. rosbags
+counts them in, and ``rosbag reindex`` would then write over the first 8 bytes of the messages."""
+
+
+class BagWriter(ClosedByBlock):
+    """Writes a run into a new bag while it goes on.
+
+    Until it is closed the bag is called ``PATH.active``, as ``rosbag record`` has it. Leaving the
+    block closes it, after an error or Ctrl-C too: it then holds what was written until there.
+
+    Parameters
+    ----------
+    path : ending in ``.bag``: a ROS 1 bag; in ``.mcap``: an MCAP file (ROS 2); without a suffix: a
+        ROS 2 folder with an SQLite database
+    config : names of the frames, and which clouds to write
+    overwrite : replace an earlier bag, once the new one is complete
+
+    Attributes
+    ----------
+    frames : written so far
+
+    Raises
+    ------
+    OutputError
+        If the name fits none of these, or there is such a bag already, or it cannot be written.
+    ConfigError
+        If the names of the frames are empty or equal.
+    """
+
+    def __init__(
+        self, path: str | Path, config: BagConfig | None = None, *, overwrite: bool = False
+    ) -> None:
+        self.path = Path(path)
+        self.frames = 0
+        self._kind = self.path.suffix
+        if self._kind not in (".bag", ".mcap", "") or not self.path.name:
+            raise OutputError(
+                f"{self.path}: expected a name that ends in .bag (ROS 1) or .mcap, or has no "
+                "suffix (ROS 2 folder)"
+            )
+        self._frames = FrameMessages(config or BagConfig(), ros1=self._kind == ".bag")
+        self._active = self.path.with_name(f"{self.path.name}.active")
+        with self._failing():
+            self._make_room(overwrite)
+            self._writer: Any = self._open()
+        self._connections: dict[str, Any] = {}
+        self._last_stamp = 0
+
+    def write(
+        self,
+        update: MapUpdate,
+        cloud: Points | None = None,
+        surround: Callable[[], Points] | None = None,
+    ) -> None:
+        """Append one frame; one with a bad stamp is left out, as in trajectories.
+
+        Parameters
+        ----------
+        update : of the frame
+        cloud : de-skewed points of the sweep, in the map frame
+        surround : gives the map points around the sensor; called when they are due
+
+        Raises
+        ------
+        OutputError
+            If the bag is closed or cannot be written (a full disk), or a message cannot say the
+            stamp.
+        InputError
+            If a cloud is not (N, 4).
+        """
+        if self._writer is None:
+            raise OutputError(f"{self.path}: the bag is closed; nothing can be added to it")
+        if update.status is FrameStatus.BAD_STAMP:
+            return
+        # All of a frame or, if a message cannot be made, none.
+        frame = list(self._frames.frame(update, lambda: cloud, surround))
+        self._last_stamp = update.stamp
+        self._append(update.stamp, frame)
+        self.frames += 1
+        if self._kind == "" and self.frames % _COMMIT_EVERY == 0:
+            with self._failing():
+                self._writer.storage.conn.commit()  # rosbags would only at the end
+
+    def close(self) -> None:
+        """Write the whole path and the index, and give the bag its name.
+
+        Without a frame there is no bag. Calling it again does nothing.
+
+        Raises
+        ------
+        OutputError
+            If that fails; ``PATH.active`` then holds what could be written.
+        """
+        if self._writer is None:
+            return
+        with self._failing():
+            self._append(self._last_stamp, self._frames.path())
+            writer, self._writer = self._writer, None
+            writer.close()
+            if self.frames:
+                self._give_name()
+            _remove(self._active)
+
+    def _append(self, stamp: int, messages: Iterable[tuple[str, bytes]]) -> None:
+        with self._failing():
+            for topic, message in messages:
+                if topic not in self._connections:
+                    self._connections[topic] = self._writer.add_connection(
+                        topic, TYPES[topic], typestore=self._frames.store
+                    )
+                self._writer.write(self._connections[topic], stamp, message)
+
+    def _make_room(self, overwrite: bool) -> None:
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        if self.path.exists() and not overwrite:
+            raise OutputError(
+                f"{self.path}: the bag exists; add overwrite=True (--overwrite) or choose another "
+                "name"
+            )
+        if self.path.is_dir() and not (self._kind == "" and _is_ros2_bag(self.path)):
+            raise OutputError(f"{self.path}: not a bag, so it is not replaced; choose another name")
+        if self._active.exists() and not overwrite:
+            raise OutputError(
+                f"{self._active}: a recording that was cut off, or is still going on; repair "
+                "it (rosbag reindex, ros2 bag reindex, mcap recover) or delete it"
+            )
+        if self._active.is_dir() and not _is_cut_off(self._active):
+            raise OutputError(
+                f"{self._active}: not a bag, so it is not replaced; choose another name"
+            )
+        _remove(self._active)
+
+    def _open(self) -> Any:
+        writer: Any
+        if self._kind == ".bag":
+            writer = rosbag1.Writer(self._active)
+        else:
+            storage = rosbag2.StoragePlugin.MCAP if self._kind else rosbag2.StoragePlugin.SQLITE3
+            self._active.mkdir()
+            # The file inside gets the name of this folder.
+            writer = rosbag2.Writer(
+                self._active / self.path.stem, version=_ROS2_VERSION, storage_plugin=storage
+            )
+        writer.open()
+        if self._kind == ".bag":
+            writer.bio.flush()
+            writer.bio.write(b" " * _pad_header(self._active))
+        return writer
+
+    def _give_name(self) -> None:
+        if self._kind == ".bag":
+            _pad_header(self._active)
+            os.replace(self._active, self.path)
+        elif self._kind == ".mcap":
+            os.replace(self._active / self.path.stem / self.path.name, self.path)
+        else:
+            _remove(self.path)
+            os.replace(self._active / self.path.stem, self.path)
+
+    @contextmanager
+    def _failing(self) -> Iterator[None]:
+        try:
+            yield
+        except (OSError, sqlite3.Error, rosbag1.WriterError, rosbag2.WriterError) as error:
+            raise OutputError(
+                f"{self.path}: cannot write the bag: {error}; choose another folder or free some "
+                "space"
+            ) from error
+
+
+def _pad_header(bag: Path) -> int:
+    """Tell the first record of a ROS 1 bag its full length; returns the bytes it was short of."""
+    with open(bag, "r+b") as file:
+        file.seek(len(b"#ROSBAG V2.0\n"))
+        (header,) = struct.unpack("<I", file.read(4))
+        place = file.seek(header, os.SEEK_CUR)
+        (padding,) = struct.unpack("<I", file.read(4))
+        file.seek(place)
+        file.write(struct.pack("<I", _HEADER_RECORD - header))
+    return int(_HEADER_RECORD - header - padding)
+
+
+def _is_ros2_bag(folder: Path) -> bool:
+    names = [entry.name for entry in folder.iterdir()]
+    return "metadata.yaml" in names and all(
+        Path(name).suffix in (".yaml", ".db3", ".mcap") for name in names
+    )
+
+
+def _is_cut_off(folder: Path) -> bool:
+    """Whether a folder holds what an unfinished recording leaves, and nothing else."""
+    files = (path for path in folder.rglob("*") if not path.is_dir())
+    return all(path.suffix.startswith((".yaml", ".db3", ".mcap")) for path in files)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -1,0 +1,289 @@
+"""A live run without ROS: messages come in as they are measured, poses come out.
+
+The queues, what waits for what, and what is dropped when the mapper is too slow are here; a node
+only hands messages over (:mod:`loam_gtsam.ros.node`).
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any, Literal
+
+import numpy as np
+
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.base import Sweep
+from loam_gtsam.datasets.decode.cloud_stream import CloudStream
+from loam_gtsam.datasets.decode.imu_messages import decode_imu
+from loam_gtsam.datasets.decode.loam_messages import StampMatcher
+from loam_gtsam.imu.buffer import STILL_AHEAD
+from loam_gtsam.loops.closure import LoopCloser
+from loam_gtsam.mapper import ExtraFactors
+from loam_gtsam.pipeline import Observer, Pipeline
+from loam_gtsam.ros.live_imu import LiveImu
+from loam_gtsam.ros.live_report import LiveLog, LiveReport
+from loam_gtsam.ros.live_sweeps import ReadySweep, SweepDecoder, checked_stamp
+from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate
+
+_POLL = 0.02
+"""Seconds after which a worker looks whether a sweep has waited for long enough."""
+
+
+@dataclass(frozen=True, slots=True)
+class LiveResult:
+    """One sweep, mapped.
+
+    Attributes
+    ----------
+    sweep, update : as :meth:`loam_gtsam.pipeline.Pipeline.process` took and gave them
+    received, started, mapped, published : nanoseconds of the clock
+    """
+
+    sweep: Sweep
+    update: MapUpdate
+    received: int
+    started: int
+    mapped: int
+    published: int
+
+    @property
+    def seconds(self) -> tuple[float, float, float, float]:
+        """Waiting, mapping, publishing, and all of it."""
+        moments = (self.received, self.started, self.mapped, self.published)
+        waiting, mapping, publishing = ((end - start) * 1e-9 for start, end in pairwise(moments))
+        return waiting, mapping, publishing, (self.published - self.received) * 1e-9
+
+
+class LiveMapper:
+    """Maps sweeps as they come, each as soon as its IMU samples are there.
+
+    Any thread may call the ``add`` methods, :meth:`report` and :meth:`wait`, which return at once
+    or when told; one thread at a time calls :meth:`step` or :meth:`work`, which owns the pipeline.
+    If nothing is dropped and no sweep waits in vain, poses and map are those of
+    :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
+
+    Parameters
+    ----------
+    config : section ``live`` says how long the queues are
+    imu : IMU samples will come
+    features : topics of LOAM's front end that will come, in place of clouds
+    axes : of those, see :class:`loam_gtsam.datasets.bags.loam_topics.LoamTopicsDataset`
+    clouds : decodes the clouds; None takes a new one without options
+    observe : called after each sweep, e.g. to publish it; its time counts as such
+    extra_factors, loop_closer : see :func:`loam_gtsam.pipeline.run`
+    clock : nanoseconds, never going back
+
+    Attributes
+    ----------
+    pipeline : the mapper and what is around it; not to be touched while ``step`` runs
+
+    Raises
+    ------
+    ConfigError
+        If features come without one of LOAM's three topics, or with an IMU, or ``axes`` is unknown.
+    """
+
+    def __init__(
+        self,
+        config: Config | None = None,
+        *,
+        imu: bool = False,
+        features: Collection[str] = (),
+        axes: Literal["auto", "lidar", "loam"] = "auto",
+        clouds: CloudStream | None = None,
+        observe: Observer | None = None,
+        extra_factors: ExtraFactors | None = None,
+        loop_closer: LoopCloser | None = None,
+        clock: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._config = config = config or Config()
+        if features and imu:
+            raise ConfigError("features, imu: LOAM's front end has used the IMU already")
+        self._decoder = SweepDecoder(config, features, axes, clouds or CloudStream())
+        bounded = config.live.when_full != "never"
+        self._imu: LiveImu | None = None
+        if imu and config.imu.enabled:
+            self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
+        buffer = None if self._imu is None else self._imu.buffer
+        self.pipeline = Pipeline(
+            config, imu=buffer, extra_factors=extra_factors, loop_closer=loop_closer
+        )
+        self._matcher = StampMatcher(features)
+        self._features = frozenset(features)
+        self._observe, self._clock = observe, clock
+        # Below: shared between threads, under the lock.
+        self._lock = threading.Lock()
+        self._news = threading.Event()
+        self._log = LiveLog()
+        self._queue: deque[tuple[int, Any]] = deque()
+        # Below: of the thread that maps.
+        self._current: ReadySweep | None = None
+        self._no_level = False
+
+    # -- from any thread ---------------------------------------------------------------------------
+
+    def add_cloud(self, message: Any, received: int | None = None) -> None:
+        """Queue a ``sensor_msgs/PointCloud2``; whatever is wrong with it is found when it is due.
+
+        Parameters
+        ----------
+        message : as rosbags, rclpy or rospy hand it out
+        received : nanoseconds of the clock; None is now
+
+        Raises
+        ------
+        InputError
+            If this run is one of LOAM's topics.
+        """
+        if self._features:
+            raise InputError("add_cloud: this run expects LOAM's topics, see add_features")
+        received = self._clock() if received is None else received
+        with self._lock:
+            self._log.received["cloud"] += 1
+            self._enqueue(received, message)
+
+    def add_features(self, topic: str, message: Any, received: int | None = None) -> None:
+        """Take a message of LOAM's front end; those whose stamps agree to 5 ms make a sweep.
+
+        Raises
+        ------
+        InputError
+            If it is none of this run's topics.
+        """
+        if topic not in self._features:
+            raise InputError(
+                f"add_features: expected one of {', '.join(sorted(self._features)) or 'none'}; "
+                f"got {topic!r}"
+            )
+        received = self._clock() if received is None else received
+        with self._lock:
+            self._log.received[topic] += 1
+            try:
+                stamp = checked_stamp(message)
+            except DatasetError as error:
+                self._log.fault(f"{topic}: {error}")
+                return
+            group = self._matcher.add(topic, stamp, message)
+            if group is not None:
+                self._enqueue(received, group)
+
+    def add_imu(self, message: Any) -> None:
+        """Take a ``sensor_msgs/Imu``; ignored if no IMU is used."""
+        if self._imu is None:
+            return
+        with self._lock:
+            self._log.received["imu"] += 1
+            try:
+                checked_stamp(message)
+                stamp, values = decode_imu(message)
+            except DatasetError as error:
+                self._log.fault(f"imu: {error}")
+                return
+            if not np.isfinite(values).all():
+                self._log.fault("imu: NaN or infinity")
+                return
+            self._imu.add((stamp, values))
+        self._news.set()
+
+    def fault(self, reason: str) -> None:
+        """Count a message that could not even be handed over."""
+        with self._lock:
+            self._log.fault(reason)
+
+    def report(self) -> LiveReport:
+        """What has become of all messages so far."""
+        with self._lock:
+            if self._imu is not None:
+                self._log.dropped["imu"] = self._imu.dropped
+                self._log.late["imu"] = self._imu.late
+            return self._log.report(len(self._queue), self._matcher.unmatched)
+
+    # -- from the one thread that maps -------------------------------------------------------------
+
+    def step(self) -> LiveResult | None:
+        """Map the next sweep.
+
+        Returns
+        -------
+        None if there is none, or if it waits for the IMU: see :meth:`wait`.
+        """
+        self._news.clear()
+        while self._current is None:
+            with self._lock:
+                if not self._queue:
+                    return None
+                received, content = self._queue.popleft()
+            try:
+                self._current = self._decoder.ready(received, content)
+            except DatasetError as error:
+                self.fault(str(error))
+        current = self._current
+        if self._must_wait(current):
+            return None
+        self._current = None
+        return self._map(current)
+
+    def wait(self, seconds: float) -> None:
+        """Until a message comes, but not longer than this."""
+        self._news.wait(seconds)
+
+    def work(self, stop: threading.Event) -> None:
+        """Map all sweeps that come, until told to stop."""
+        while not stop.is_set():
+            if self.step() is None:
+                self.wait(_POLL)
+
+    def _enqueue(self, received: int, content: Any) -> None:
+        live, queue = self._config.live, self._queue
+        if live.when_full != "never" and len(queue) >= live.queue:
+            gone = 1 if live.when_full == "drop_oldest" else len(queue)
+            self._log.dropped["sweep"] += gone
+            for _ in range(gone):
+                queue.popleft()
+        queue.append((received, content))
+        self._log.deepest = max(self._log.deepest, len(queue))
+        self._news.set()
+
+    def _must_wait(self, current: ReadySweep) -> bool:
+        """Whether samples of a sweep may still come."""
+        imu, config, aid = self._imu, self._config, self.pipeline.mapper.imu_aid
+        if imu is None or aid is None or current.needs is None:
+            return False
+        # Up is found from the samples before the first sweep and as long after it.
+        levelling = aid.level is None and not self._no_level
+        more = round(max(config.imu.still_seconds, STILL_AHEAD) * 1e9) if levelling else 0
+        if imu.covers(current.needs + more):
+            return False
+        patience = round(config.live.imu_wait * 1e9) + more
+        if self._clock() < current.received + patience:
+            return True
+        self._no_level = levelling or self._no_level
+        if not imu.covers(current.needs):
+            with self._lock:
+                self._log.without_imu += 1
+        return False
+
+    def _map(self, current: ReadySweep) -> LiveResult:
+        started = self._clock()
+        if self._imu is not None and current.needs is not None:
+            with self._lock:
+                rows = self._imu.take()
+            self._imu.hand_over(rows, current.needs)
+        update = self.pipeline.process(current.sweep)
+        mapped = self._clock()
+        if self._observe is not None:
+            self._observe(current.sweep, update, self.pipeline)
+        result = LiveResult(current.sweep, update, current.received, started, mapped, self._clock())
+        with self._lock:
+            self._log.statuses[str(update.status)] += 1
+            if update.status is FrameStatus.UNUSABLE_SCAN:
+                self._log.fault(update.message)
+            elif update.status is FrameStatus.BAD_STAMP:
+                self._log.late["sweep"] += 1
+            self._log.took(*result.seconds)
+        return result

@@ -1,0 +1,1 @@
+"""Evaluation against truth, other systems, comparisons and parameter studies."""

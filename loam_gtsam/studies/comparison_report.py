@@ -1,0 +1,350 @@
+"""What is written of a comparison: scores, tables, pictures and the report."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from loam_gtsam.config import Config, config_to_dict
+from loam_gtsam.io.run_files import replacing, stage_seconds, write_tum
+from loam_gtsam.studies.comparison import (
+    Comparison,
+    FrameDifferences,
+    Scores,
+    frame_differences,
+    score_all,
+)
+from loam_gtsam.studies.contenders import SolverRun
+from loam_gtsam.studies.evaluation import absolute_error, align, distance_travelled, interpolate
+from loam_gtsam.studies.report_html import write_report
+from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
+from loam_gtsam.view import plots as visualization
+
+TRUTH_FILE = "truth.tum"
+TABLE_FILES = ("comparison.csv", "comparison.json", "frames.csv")
+PICTURES = {
+    "trajectories.png": "Trajectories",
+    "errors.png": "Position error over the distance travelled",
+    "differences.png": "Differences from the first-named solver, frame by frame",
+    "stages.png": "Time per stage",
+}
+REPORT_FILE = "report.html"
+
+
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column of the tables.
+
+    Attributes
+    ----------
+    key : of :class:`loam_gtsam.studies.comparison.Scores`
+    digits : after the point
+    lower_wins : whether the smallest value is the best
+    """
+
+    key: str
+    title: str
+    meaning: str
+    digits: int = 3
+    lower_wins: bool = False
+
+
+COLUMNS = (
+    Column("ate_m", "ATE [m]", "root mean square distance between the positions of the solver "
+            "and the reference at the same moments, after the rigid motion (SE(3), no scale) that "
+            "brings them nearest", 4, True),
+    Column("ate_max_m", "max [m]", "largest of those distances", 3, True),
+    Column("rotation_deg", "rot. [deg]", "root mean square angle between the orientations, after "
+            "the rotation that fits them best", 3, True),
+    Column("rpe_percent", "RPE [%]", "error of the relative motion over each path length, in per "
+            "cent of it; mean over all starts and lengths", 3, True),
+    Column("rpe_deg_per_m", "RPE [deg/m]", "the same for the rotation", 4, True),
+    Column("iterations", "assoc.", "associations a frame, mean of the solved frames", 1),
+    Column("solver_iterations", "iter.", "solver steps a frame, over all associations, mean", 1),
+    Column("matches", "matches", "edge and plane matches of the last association, median", 0),
+    Column("ms_median", "ms/frame", "median time of a frame without reading it, features "
+            "included; the first frame is left out", 1, True),
+    Column("ms_95", "95 % [ms]", "95th percentile of it", 1, True),
+    Column("map_points", "map", "points of the whole map; of a peer, points or voxels it "
+            "still keeps", 0),
+)  # fmt: skip
+ACCURACY_COLUMNS = 5
+"""The first of them; the others say what it cost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """A comparison and what was worked out of it."""
+
+    comparison: Comparison
+    shared_guess: bool
+    scores: tuple[Scores, ...]
+    differences: dict[str, FrameDifferences]
+
+    @classmethod
+    def of(cls, comparison: Comparison, shared_guess: bool) -> Results:
+        """Score every run."""
+        scores = score_all(comparison)
+        return cls(comparison, shared_guess, scores, frame_differences(comparison))
+
+    @property
+    def rows(self) -> list[tuple[SolverRun, Scores]]:
+        """Every run with its scores."""
+        return list(zip(self.comparison.runs, self.scores, strict=True))
+
+    @property
+    def against(self) -> str:
+        """What errors are taken against."""
+        return "truth" if self.comparison.truth is not None else self.comparison.runs[0].name
+
+    @property
+    def notes(self) -> list[str]:
+        """What a reader of the tables must know."""
+        lengths = next((s.lengths for s in self.scores if s.lengths), ())
+        path = next((s.path_m for s in self.scores if s.path_m == s.path_m), math.nan)
+        about = f"{self.comparison.frames} sweeps; errors against {self.against}"
+        if lengths:
+            listed = ", ".join(f"{length:g}" for length in lengths)
+            about += f"; path {path:.1f} m, RPE over {listed} m"
+        guesses = (
+            "every solver of this package starts from the guess of the first of them"
+            if self.shared_guess
+            else "every solver predicts its guesses from its own motion"
+        )
+        problems = [f"{run.name}: {s.problem}" for run, s in self.rows if s.problem]
+        return [about, guesses, *self.comparison.notes, *problems]
+
+
+def cell(scores: Scores, column: Column) -> str:
+    """One score as text, a dash where there is none."""
+    value = getattr(scores, column.key)
+    return "-" if value != value else f"{value:.{column.digits}f}"
+
+
+def best(results: Results) -> set[tuple[int, int]]:
+    """(row, column) of the best values, counted with the name as column 0."""
+    winners = set()
+    for index, column in enumerate(COLUMNS, 1):
+        values = np.array([getattr(scores, column.key) for scores in results.scores], np.float64)
+        if column.lower_wins and np.isfinite(values).sum() > 1:
+            winners.add((int(np.nanargmin(values)), index))
+    return winners
+
+
+def spread(values: FloatArray) -> tuple[float, float, float]:
+    """Median, 95th percentile and maximum."""
+    median, high = np.percentile(values, (50.0, 95.0))
+    return float(median), float(high), float(values.max())
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+def write(results: Results, folder: Path, plot: bool) -> list[str]:
+    """Write all files; names of what was written."""
+    comparison = results.comparison
+    _write_csv(
+        folder / "comparison.csv",
+        ["solver", "version", *(column.key for column in COLUMNS), "path_m", "solved", "problem"],
+        (
+            [run.name, run.version]
+            + [getattr(scores, column.key) for column in COLUMNS]
+            + [scores.path_m, scores.solved, scores.problem]
+            for run, scores in results.rows
+        ),
+    )
+    _write_text(folder / "comparison.json", json.dumps(_summary_json(results), indent=2) + "\n")
+    _write_csv(folder / "frames.csv", _FRAME_COLUMNS, _frame_rows(results))
+    files = list(TABLE_FILES)
+    trajectories = [(f"trajectory_{run.name}.tum", run.trajectory) for run in comparison.runs]
+    if comparison.truth is not None:
+        trajectories.append((TRUTH_FILE, comparison.truth))
+    for name, trajectory in trajectories:
+        write_tum(folder / name, trajectory)
+        files.append(name)
+    drawn = _draw(results, folder) if plot else []
+    winners = best(results)
+    write_report(
+        folder / REPORT_FILE,
+        f"Comparison on {comparison.name}",
+        results.notes,
+        ["solver", *(column.title for column in COLUMNS)],
+        [[run.name, *(cell(s, column) for column in COLUMNS)] for run, s in results.rows],
+        winners,
+        {column.title: column.meaning for column in COLUMNS},
+        {PICTURES[name]: folder / name for name in drawn},
+        {run.name: _settings(run) for run in
+         comparison.runs},
+    )  # fmt: skip
+    return [*files, *drawn, REPORT_FILE]
+
+
+def _summary_json(results: Results) -> dict[str, Any]:
+    solvers = []
+    for run, scores in results.rows:
+        difference = results.differences.get(run.name)
+        solvers.append(
+            {
+                "name": run.name,
+                "version": run.version,
+                "config": None if run.config is None else config_to_dict(run.config),
+                "scores": {key: _plain(value) for key, value in asdict(scores).items()},
+                "stages_ms": _stages(run),
+                "difference_m": difference and spread(difference.metres),
+                "difference_deg": difference and spread(difference.degrees),
+            }
+        )
+    comparison = results.comparison
+    return {
+        "dataset": comparison.name,
+        "frames": comparison.frames,
+        "reference": results.against,
+        "shared_guess": results.shared_guess,
+        "interrupted": comparison.interrupted,
+        "error": comparison.error and f"{type(comparison.error).__name__}: {comparison.error}",
+        "notes": results.notes,
+        "solvers": solvers,
+    }
+
+
+_FRAME_COLUMNS = (
+    "solver", "frame", "stamp_ns", "status", "x", "y", "z", "ms", "associations", "iterations",
+    "edge_matches", "plane_matches", "difference_m", "difference_deg",
+)  # fmt: skip
+
+
+def _frame_rows(results: Results) -> Iterable[list[Any]]:
+    for run in results.comparison.runs:
+        apart = results.differences.get(run.name)
+        found = {}
+        if apart is not None:
+            pairs = zip(apart.metres.tolist(), apart.degrees.tolist(), strict=True)
+            found = dict(zip(apart.frames.tolist(), pairs, strict=True))
+        for number, update in enumerate(run.updates):
+            position = update.map_T_lidar.translation().tolist()
+            milliseconds = 1e3 * sum(update.timings.values())
+            yield [
+                run.name, number, update.stamp, str(update.status), *position, milliseconds,
+                update.iterations, update.solver_iterations, update.n_edge_matches,
+                update.n_plane_matches, *found.get(number, (math.nan, math.nan)),
+            ]  # fmt: skip
+
+
+def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
+    """Comma-separated; what is not known is empty."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(header)
+    for row in rows:
+        values = [_plain(value) for value in row]
+        writer.writerow([f"{v:.9g}" if isinstance(v, float) else v for v in values])
+    _write_text(path, text.getvalue())
+
+
+def _write_text(path: Path, text: str) -> None:
+    with replacing(path) as file:
+        file.write(text.encode("utf-8"))
+
+
+def _plain(value: Any) -> Any:
+    """NaN, which JSON cannot say, becomes None."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def _stages(run: SolverRun) -> dict[str, float]:
+    """Median milliseconds of each stage, over the frames after the first in which it ran."""
+    names, seconds = stage_seconds(run.updates[1:])
+    return {
+        name: 1e3 * float(np.nanmedian(column))
+        for name, column in zip(names, seconds.T, strict=True)
+    }
+
+
+def _settings(run: SolverRun) -> str:
+    """What a reader needs to repeat the run."""
+    if run.config is None:
+        about = "its own defaults; see docs/compare.md for its de-skew and the moment of its poses"
+        return f"{run.version}; {about}"
+    ours, default = (dict(_flat(config_to_dict(c))) for c in (run.config, Config()))
+    changed = [f"{key} = {value}" for key, value in ours.items() if value != default[key]]
+    return f"{run.version}; differs from the default in: {', '.join(changed) or 'nothing'}"
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
+    for key, value in tree.items():
+        if isinstance(value, dict):
+            yield from _flat(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+# -- pictures --------------------------------------------------------------------------------------
+
+
+def _draw(results: Results, folder: Path) -> list[str]:
+    """Draw what there is; names of the files."""
+    comparison = results.comparison
+    moved, errors = {}, {}
+    for run in comparison.runs:
+        try:
+            found = absolute_error(run.trajectory, comparison.reference)
+        except InputError:  # too few poses
+            continue
+        moved[run.name] = _aligned(run.trajectory, comparison.reference, found.stamps)
+        there = interpolate(comparison.reference, found.stamps).map_T_lidar[:, :3, 3]
+        errors[run.name] = distance_travelled(there), found.translations
+    pictures: dict[str, Callable[[Path], None]] = {}
+    if moved:
+        pictures["trajectories.png"] = lambda path: visualization.plot_trajectories(
+            path, moved, _part(comparison.truth, moved.values())
+        )
+    if errors and comparison.truth is not None:
+        pictures["errors.png"] = lambda path: visualization.plot_curves(
+            path, {"position error [m]": errors}, "distance travelled [m]"
+        )
+    if results.differences:
+        panels = {
+            f"{label} from {comparison.runs[0].name} [{unit}]": {
+                # The first-named solver has no curve, but keeps its colour.
+                comparison.runs[0].name: (np.zeros(0), np.zeros(0))
+            }
+            | {
+                name: (difference.frames, getattr(difference, key))
+                for name, difference in results.differences.items()
+            }
+            for label, unit, key in (("distance", "m", "metres"), ("angle", "deg", "degrees"))
+        }
+        pictures["differences.png"] = lambda path: visualization.plot_curves(
+            path, panels, "frame", log=True
+        )
+    stages = {run.name: _stages(run) for run in comparison.runs}
+    if any(stages.values()):
+        pictures["stages.png"] = lambda path: visualization.plot_stages(path, stages)
+    for name, draw in pictures.items():
+        draw(folder / name)
+    return list(pictures)
+
+
+def _aligned(trajectory: Trajectory, reference: Trajectory, stamps: IntArray) -> Trajectory:
+    """The trajectory in the frame of the reference, fitted over the poses at ``stamps``."""
+    inside = np.isin(trajectory.stamps, stamps)
+    there = interpolate(reference, stamps).map_T_lidar[:, :3, 3]
+    reference_T_map = align(trajectory.map_T_lidar[inside][:, :3, 3], there)
+    return Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
+
+
+def _part(truth: Trajectory | None, others: Iterable[Trajectory]) -> Trajectory | None:
+    """The truth over the time of the others."""
+    if truth is None:
+        return None
+    stamps = np.concatenate([other.stamps for other in others])
+    inside = (truth.stamps >= stamps.min()) & (truth.stamps <= stamps.max())
+    return Trajectory(truth.stamps[inside], truth.map_T_lidar[inside])

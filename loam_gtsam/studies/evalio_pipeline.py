@@ -1,0 +1,227 @@
+"""A pipeline of evalio, to run this package beside others on evalio's data sets.
+
+::
+
+    export EVALIO_CUSTOM=loam_gtsam.studies.evalio_pipeline
+    evalio run -p loam_gtsam -d newer_college_2021/quad_easy
+
+(evalio's own ``-M loam_gtsam.studies.evalio_pipeline`` does with a file of experiments; its 0.6.1
+checks the names after ``-p`` before it looks into the module.) Needs evalio, ``pip install
+"loam_gtsam[evalio]"``, and is therefore imported by nothing else here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import Config, config_from_dict, config_to_dict
+from loam_gtsam.datasets.decode.extrinsics import implied_by
+from loam_gtsam.frontend.workers import extract
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.pipeline import Pipeline, with_implied
+from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, InputError, Scan
+
+try:
+    from evalio.pipelines import Pipeline as EvalioPipeline
+    from evalio.types import (
+        SE3,
+        SO3,
+        ImuMeasurement,
+        ImuParams,
+        LidarMeasurement,
+        LidarParams,
+        Point,
+        Stamp,
+    )
+except ModuleNotFoundError as error:
+    raise ImportError(
+        f'this module needs evalio ({error}); install it with: pip install "loam_gtsam[evalio]"'
+    ) from error
+
+_PRESET = "preset"
+_PATIENCE = 2
+"""Sweeps that may wait for the IMU."""
+
+
+class LoamGtsam(EvalioPipeline):
+    """LOAM's scan-to-map estimator as a GTSAM factor graph.
+
+    Notes
+    -----
+    evalio stamps a sweep with its start and may hand it out before the IMU samples taken during it.
+    A sweep therefore waits for the first sample after its end, but no longer than for two more
+    sweeps. As evalio does not tell a pipeline that a sequence is over, the last two sweeps may
+    stay without a pose.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._params: dict[str, Any] = self.default_params()
+        self._implied: dict[str, Any] = {}
+        self._lidar_T_imu = gtsam.Pose3()
+        self._period = 0.1
+        self._samples: list[ImuMeasurement] = []
+        self._newest: int | None = None
+        self._waiting: list[LidarMeasurement] = []
+        self._shows = False
+        self._buffer: ImuBuffer | None = None
+        self._pipeline: Pipeline | None = None
+
+    @staticmethod
+    def name() -> str:
+        """Of the pipeline."""
+        return "loam_gtsam"
+
+    @staticmethod
+    def version() -> str:
+        """Of this package."""
+        try:
+            return version("loam_gtsam")
+        except PackageNotFoundError:  # a source tree on the path
+            return "unknown"
+
+    @staticmethod
+    def default_params() -> dict[str, bool | int | float | str]:
+        """Every scalar of the configuration as ``section.name``, and ``preset``.
+
+        What differs from these defaults is set on top of the preset.
+        """
+        params: dict[str, bool | int | float | str] = {_PRESET: "default"}
+        for section, values in config_to_dict(Config()).items():
+            for key, value in values.items():
+                if isinstance(value, (bool, int, float, str)):
+                    params[f"{section}.{key}"] = value
+        return params
+
+    def set_params(
+        self, params: Mapping[str, bool | int | float | str]
+    ) -> dict[str, bool | int | float | str]:
+        """Take parameters; returns those that are unknown."""
+        self._params |= {key: value for key, value in params.items() if key in self._params}
+        return {key: value for key, value in params.items() if key not in self._params}
+
+    def set_lidar_params(self, params: LidarParams) -> None:
+        """Range limits and the duration of a sweep."""
+        self._period = 1.0 / params.rate
+        self._implied |= {
+            "min_range": params.min_range,
+            "max_range": params.max_range,
+            "period": self._period,
+        }
+
+    def set_imu_params(self, params: ImuParams) -> None:
+        """Noise and gravity, which matter for pre-integration only."""
+        known = {
+            "imu.gravity": float(np.linalg.norm(params.gravity)),
+            "imu.gyro_noise": params.gyro,
+            "imu.acceleration_noise": params.accel,
+            "imu.gyro_bias_walk": params.gyro_bias,
+            "imu.acceleration_bias_walk": params.accel_bias,
+        }
+        self._implied |= {key: value for key, value in known.items() if value > 0.0}
+
+    def set_imu_T_lidar(self, T: SE3) -> None:
+        """Extrinsics."""
+        self._lidar_T_imu = gtsam.Pose3(T.to_mat()).inverse()
+        self._implied |= implied_by(self._lidar_T_imu.matrix())
+
+    def set_visualizing(self, visualize: Set[Any] | None) -> None:
+        """Only then are features handed out."""
+        super().set_visualizing(visualize)
+        self._shows = bool(visualize)
+
+    def initialize(self) -> None:
+        """Build the pipeline from what was set."""
+        default = self.default_params()
+        sections: dict[str, Any] = {_PRESET: self._params[_PRESET]}
+        for key, value in self._params.items():
+            section, _, name = key.partition(".")
+            if name and value != default[key]:
+                sections.setdefault(section, {})[name] = value
+        config = with_implied(config_from_dict(sections, "evalio parameters"), self._implied)
+        self._buffer = ImuBuffer(config.imu) if config.imu.enabled else None
+        self._pipeline = Pipeline(config, imu=self._buffer)
+
+    def add_imu(self, mm: ImuMeasurement) -> None:
+        """Keep a sample; sweeps that waited for it are mapped."""
+        if self._buffer is None:
+            return
+        self._samples.append(mm)
+        stamp = mm.stamp.to_nsec()
+        self._newest = stamp if self._newest is None else max(self._newest, stamp)
+        self._map_waiting()
+
+    def add_lidar(self, mm: LidarMeasurement) -> None:
+        """Map a sweep, now or when the IMU covers it."""
+        self._waiting.append(mm)
+        self._map_waiting()
+
+    def map(self) -> dict[str, list[Point]]:
+        """Edge and plane points of the whole map."""
+        if self._pipeline is None:
+            return {"edges": [], "planes": []}
+        edges, planes = self._pipeline.map_points()
+        return {"edges": _as_points(edges), "planes": _as_points(planes)}
+
+    def _covered(self, sweep: LidarMeasurement) -> bool:
+        """Whether there are samples up to the end of a sweep, or none at all."""
+        end = sweep.stamp.to_nsec() + round(self._period * 1e9)
+        return self._newest is None or self._newest >= end
+
+    def _map_waiting(self) -> None:
+        while self._waiting and (len(self._waiting) > _PATIENCE or self._covered(self._waiting[0])):
+            self._map(self._waiting.pop(0))
+
+    def _map(self, sweep: LidarMeasurement) -> None:
+        if self._pipeline is None:
+            raise InputError("add_lidar: initialize() must come first")
+        if self._buffer is not None and self._samples:
+            self._buffer.add(_as_samples(self._samples))
+            self._samples.clear()
+        scan = _as_scan(sweep)
+        extraction = extract(scan, self._pipeline.config)
+        update = self._pipeline.process(scan, extraction)
+        if update.status is FrameStatus.BAD_STAMP:
+            return
+        stamp = Stamp.from_nsec(update.stamp)
+        self.save(stamp, _as_se3(update.map_T_lidar.compose(self._lidar_T_imu)))
+        features = extraction.features
+        if self._shows and features is not None:
+            shown = {"edges": _as_points(features.edges), "planes": _as_points(features.planes)}
+            self.save(stamp, shown)
+
+
+def _as_scan(sweep: LidarMeasurement) -> Scan:
+    points = sweep.points
+    values = (value for point in points for value in (point.x, point.y, point.z, point.row))
+    table = np.fromiter(values, np.float64, 4 * len(points)).reshape(-1, 4)
+    rings = table[:, 3].astype(np.int64)
+    times = np.asarray(sweep.to_vec_stamps(), np.float64)
+    return Scan(
+        points=np.ascontiguousarray(table[:, :3], dtype=np.float32),
+        stamp=sweep.stamp.to_nsec(),
+        times=times if (times != times[:1]).any() else None,
+        rings=rings if rings.any() else None,
+    )
+
+
+def _as_samples(samples: list[ImuMeasurement]) -> ImuSamples:
+    return ImuSamples(
+        stamps=np.array([sample.stamp.to_nsec() for sample in samples], np.int64),
+        orientation=None,
+        gyro=np.array([sample.gyro for sample in samples]),
+        acceleration=np.array([sample.accel for sample in samples]),
+    )
+
+
+def _as_se3(pose: gtsam.Pose3) -> SE3:
+    return SE3(SO3.from_mat(pose.rotation().matrix()), pose.translation())
+
+
+def _as_points(points: FloatArray) -> list[Point]:
+    return [Point(x=x, y=y, z=z) for x, y, z in points.tolist()]

@@ -1,0 +1,222 @@
+"""What a sweep over parameters runs: sequences x configurations x seeds, read from YAML."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qsl
+
+from ruamel.yaml import YAML
+
+from loam_gtsam.config import Config, with_value
+from loam_gtsam.studies.comparison import Contender, contender
+from loam_gtsam.studies.trials import METRICS, Trial
+from loam_gtsam.types import ConfigError
+
+_SPEC = ("sequences", "configs", "seeds", "frames", "metrics")
+_SEQUENCE = ("path", "options", "frames", "set")
+_CONFIG = ("solver", "set")
+
+
+@dataclass(frozen=True, slots=True)
+class Spec:
+    """A specification that was read.
+
+    Attributes
+    ----------
+    name : of its file
+    text : of its file
+    trials : sequences x configurations x seeds, in this order
+    metrics : to be shown at the end
+    """
+
+    name: str
+    text: str
+    trials: tuple[Trial, ...]
+    metrics: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _Sequence:
+    path: str
+    options: Mapping[str, Any]
+    frames: int | None
+    changes: Mapping[str, Any]
+    where: str
+
+
+def load_spec(path: str | Path) -> Spec:
+    """Read a specification; paths in it are relative to its folder.
+
+    Raises
+    ------
+    ConfigError
+        If the file cannot be read, is not YAML, or does not fit, naming the key.
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+        data = YAML(typ="safe", pure=True).load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or error  # without the path again
+        raise ConfigError(f"{path}: cannot read the specification: {reason}") from error
+    except Exception as error:  # not only YAMLError: see config.parse_config
+        raise ConfigError(f"{path}: not valid YAML: {error}") from error
+    name = str(path)
+    entries = _mapping(name, data, _SPEC)
+    folder = path.parent
+    frames = _count(f"{name}: frames", entries.get("frames"))
+    sequences = {
+        key: _sequence(f"{name}: sequences.{key}", value, folder, frames)
+        for key, value in _named(f"{name}: sequences", entries.get("sequences")).items()
+    }
+    configs = {
+        key: _config(f"{name}: configs.{key}", value, folder)
+        for key, value in _named(f"{name}: configs", entries.get("configs")).items()
+    }
+    seeds = _seeds(f"{name}: seeds", entries.get("seeds"), sequences)
+    trials = tuple(
+        Trial(
+            sequence=label,
+            config_name=config_name,
+            path=sequence.path,
+            options=sequence.options,
+            frames=sequence.frames,
+            seed=seed,
+            config=_changed(entry.config or Config(), f"{sequence.where}.set", sequence.changes),
+            peer=entry.name if entry.config is None else None,
+        )
+        for label, sequence in sequences.items()
+        for config_name, entry in configs.items()
+        for seed in _seeds_of(sequence, seeds)
+    )
+    return Spec(path.stem, text, trials, _metrics(f"{name}: metrics", entries.get("metrics")))
+
+
+def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequence:
+    """A path, or a mapping with one."""
+    entries = {"path": value} if isinstance(value, str) else _mapping(where, value, _SEQUENCE)
+    path = entries.get("path")
+    if not isinstance(path, str) or not path:
+        raise ConfigError(f"{where}: expected a path, or a mapping with the key 'path'")
+    if not _is_world(path):
+        # Absolute, for the same relative path under another folder is other data. Links stay, for
+        # a worker on another machine may have them lead elsewhere.
+        path = os.path.abspath(folder / Path(path).expanduser())
+    return _Sequence(
+        path=path,
+        options=_mapping(f"{where}.options", entries.get("options", {})),
+        frames=_count(f"{where}.frames", entries.get("frames", frames)),
+        changes=_mapping(f"{where}.set", entries.get("set", {})),
+        where=where,
+    )
+
+
+def _config(where: str, value: Any, folder: Path) -> Contender:
+    """The name of a solver, or a mapping with one and with changes."""
+    entries = {"solver": value} if isinstance(value, str) else _mapping(where, value, _CONFIG)
+    solver = entries.get("solver", "gtsam")
+    if not isinstance(solver, str):
+        raise ConfigError(f"{where}.solver: expected a name or a .yaml file, got {solver!r}")
+    if Path(solver).suffix in (".yaml", ".yml"):
+        solver = str(folder / Path(solver).expanduser())
+    try:
+        entry = contender(solver)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
+    changes = _mapping(f"{where}.set", entries.get("set", {}))
+    if entry.config is None:
+        if changes:
+            raise ConfigError(f"{where}.set: {solver} is a peer and runs with its own defaults")
+        return entry
+    return Contender(entry.name, _changed(entry.config, f"{where}.set", changes))
+
+
+def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
+    """``config`` with each ``section.key`` set in turn."""
+    for key, value in changes.items():
+        if "." not in key:
+            raise ConfigError(f"{where}: expected SECTION.KEY: VALUE, got {key!r}")
+        config = with_value(config, key, value, where)
+    return config
+
+
+def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[int]:
+    """The seeds, once it is clear that they can be used."""
+    if value is None:
+        return []
+    if (
+        not isinstance(value, list)
+        or not value
+        or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in value)
+        or min(value) < 0
+        or len(set(value)) < len(value)
+    ):
+        raise ConfigError(f"{where}: expected a list of different integers from 0, got {value!r}")
+    worlds = [sequence for sequence in sequences.values() if _is_world(sequence.path)]
+    if not worlds:
+        raise ConfigError(
+            f"{where}: only built-in worlds (sim:NAME) have a seed, and none is among the "
+            "sequences; recorded data runs once per configuration"
+        )
+    for sequence in worlds:
+        if _own_seed(sequence) is not None:
+            raise ConfigError(f"{sequence.where}: has a seed of its own; take it or 'seeds' away")
+    return value
+
+
+def _seeds_of(sequence: _Sequence, seeds: list[int]) -> list[int | None]:
+    """Those of the specification, else its own one, else the loader's default."""
+    if not _is_world(sequence.path):
+        return [None]
+    own = _own_seed(sequence)
+    return [*seeds] or [0 if own is None else own]
+
+
+def _own_seed(sequence: _Sequence) -> int | None:
+    """The seed in the address or among the options of a built-in world, if there is one."""
+    query = dict(parse_qsl(sequence.path.partition("?")[2]))
+    seed = sequence.options.get("seed", query.get("seed"))
+    try:
+        return None if seed is None else int(seed)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"{sequence.where}: seed: expected an integer, got {seed!r}") from error
+
+
+def _metrics(where: str, value: Any) -> tuple[str, ...]:
+    if value is None:
+        return ("ate_m",)
+    if not isinstance(value, list) or not value or any(name not in METRICS for name in value):
+        raise ConfigError(f"{where}: expected a list of {', '.join(METRICS)}; got {value!r}")
+    return tuple(value)
+
+
+def _is_world(path: str) -> bool:
+    return path.startswith("sim:")
+
+
+def _count(where: str, value: Any) -> int | None:
+    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+        raise ConfigError(f"{where}: expected a number of sweeps, at least 1, got {value!r}")
+    return value
+
+
+def _named(where: str, value: Any) -> dict[str, Any]:
+    """A mapping that is not empty."""
+    if not value:
+        raise ConfigError(f"{where}: expected at least one, as NAME: VALUE")
+    return _mapping(where, value)
+
+
+def _mapping(where: str, value: Any, known: tuple[str, ...] = ()) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise ConfigError(f"{where}: expected a mapping, got {value!r}")
+    for key in value:
+        if not isinstance(key, str):
+            raise ConfigError(f"{where}: expected names as keys, got {key!r}; put it in quotes")
+        if known and key not in known:
+            raise ConfigError(f"{where}: unknown key {key!r} (known: {', '.join(known)})")
+    return value

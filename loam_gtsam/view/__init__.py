@@ -1,0 +1,1 @@
+"""What can be seen of a run: pictures, observers and the Rerun viewer."""

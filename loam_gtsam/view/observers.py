@@ -1,0 +1,159 @@
+"""A run as it is shown: views of its frames, made of what the mapper has just used."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from loam_gtsam.datasets.base import Sweep
+from loam_gtsam.geometry import transform
+from loam_gtsam.mapper import Registered
+from loam_gtsam.pipeline import Observer, Pipeline
+from loam_gtsam.types import FloatArray, FrameStatus, MapUpdate
+from loam_gtsam.view.clouds import registered_cloud, surrounding_cloud
+from loam_gtsam.view.frame_view import FrameView, FrameWatcher, MapView
+
+_NONE = np.zeros((0, 3))
+
+
+def watch(*watchers: FrameWatcher) -> Observer:
+    """The ``observe`` of :func:`loam_gtsam.pipeline.run` that shows every frame.
+
+    The run is the same with it: bit by bit, but for the time it takes.
+
+    Examples
+    --------
+    >>> with RerunViewer("run.rrd") as viewer:  # doctest: +SKIP
+    ...     run(dataset, config, observe=watch(viewer))
+    """
+    last = LastFrame()
+
+    def observe(sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+        last.observe(sweep, update, pipeline)
+        frame = last.frame()
+        for watcher in watchers:
+            watcher.show(frame, last.around)
+
+    return observe
+
+
+class LastFrame:
+    """Remembers the last frame of a run, to be looked at when that is wanted."""
+
+    def __init__(self) -> None:
+        self._number = -1
+        self._path: list[FloatArray] = []
+        self._last: tuple[Sweep, MapUpdate, Pipeline] | None = None
+
+    def observe(self, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+        """An ``observe`` of :func:`loam_gtsam.pipeline.run` that takes no time."""
+        self._number += 1
+        self._last = sweep, update, pipeline
+        if update.status is not FrameStatus.BAD_STAMP:
+            self._path.append(np.asarray(update.map_T_lidar.translation()))
+
+    @property
+    def seen(self) -> bool:
+        """Whether there was a frame; a run that was resumed may have none left to compute."""
+        return self._last is not None
+
+    def frame(self) -> FrameView:
+        """See :func:`frame_view`; there must have been a frame."""
+        assert self._last is not None
+        return frame_view(self._number, *self._last)
+
+    def around(self) -> MapView:
+        """See :func:`map_view`; there must have been a frame."""
+        assert self._last is not None
+        return map_view(*self._last[1:], self._path)
+
+
+def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> FrameView:
+    """A frame that a pipeline has just processed.
+
+    Parameters
+    ----------
+    number : of the frame
+    sweep : as it was processed
+    update : the result
+    pipeline : as it is right after that frame
+    """
+    map_T_odom = _correction(pipeline)
+    map_T_lidar = map_T_odom @ update.map_T_lidar.matrix()
+    cloud = registered_cloud(sweep, update, pipeline.mapper)
+    seen = pipeline.mapper.registered
+    edges = planes = points = feet = _NONE
+    residuals = np.zeros(0)
+    if seen is not None:
+        pose = seen.map_T_middle.matrix()
+        edges, planes = (transform(map_T_odom @ pose, part) for part in (seen.edges, seen.planes))
+        points, feet, residuals = matched(seen)
+        points, feet = transform(map_T_odom, points), transform(map_T_odom, feet)
+    # The perturbation of a pose is in the axes of the lidar.
+    rotation = map_T_lidar[:3, :3]
+    return FrameView(
+        number=number,
+        update=update,
+        map_T_lidar=map_T_lidar,
+        position_covariance=rotation @ update.covariance[3:, 3:] @ rotation.T,
+        sweep=_NONE if cloud is None else transform(map_T_odom, cloud[:, :3]),
+        edges=edges,
+        planes=planes,
+        points=points,
+        feet=feet,
+        residuals=residuals,
+    )
+
+
+def matched(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Matched features, the feet of their distances, and these over their standard deviations.
+
+    Returns
+    -------
+    (M, 3) and (M, 3) metres in the frame of the mapper, and (M,); edges first. Empty if the sweep
+    was not solved.
+    """
+    if seen.matches is None:
+        return _NONE, _NONE, np.zeros(0)
+    edges, planes = seen.matches.edges, seen.matches.planes
+    pose = seen.map_T_middle.matrix()
+    on_edges, on_planes = transform(pose, edges.points), transform(pose, planes.points)
+    along = ((on_edges - edges.centres) * edges.directions).sum(axis=1, keepdims=True)
+    above = (on_planes * planes.normals).sum(axis=1) + planes.offsets
+    points = np.concatenate([on_edges, on_planes])
+    feet = np.concatenate(
+        [edges.centres + along * edges.directions, on_planes - above[:, None] * planes.normals]
+    )
+    sigmas = np.concatenate([edges.sigmas, planes.sigmas])
+    return points, feet, np.linalg.norm(points - feet, axis=1) / sigmas
+
+
+def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) -> MapView:
+    """The map around the sensor, the way it came, and the loops.
+
+    Parameters
+    ----------
+    update : of the last frame
+    pipeline : as it is right after that frame
+    path : (3,) positions of all frames so far, in the frame of the mapper
+    """
+    map_T_odom = _correction(pipeline)
+    cloud = surrounding_cloud(update, pipeline.mapper)
+    points, is_plane = transform(map_T_odom, cloud[:, :3]), cloud[:, 3] > 0.0
+    way = np.array(path).reshape(-1, 3)
+    ends, on = np.zeros((0, 2, 3)), np.zeros(0, np.bool_)
+    if pipeline.loops is not None and len(pipeline.loops.graph):
+        way = np.concatenate(
+            [pipeline.loops.graph.poses()[:, :3, 3], transform(map_T_odom, way[-1:])]
+        )
+        ends, on = pipeline.loops.ends()
+    return MapView(points[~is_plane], points[is_plane], way, ends, on)
+
+
+def _correction(pipeline: Pipeline) -> FloatArray:
+    """(4, 4) ``map_T_odom``; without loops the two frames are one."""
+    if pipeline.loops is None:
+        return np.eye(4)
+    correction: FloatArray = pipeline.loops.map_T_odom.matrix()
+    return correction

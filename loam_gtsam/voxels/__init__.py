@@ -1,0 +1,1 @@
+"""Cubes of voxels, their search trees and their archive."""

@@ -1,0 +1,606 @@
+"""The command line: what it writes, says and returns, above all when something is wrong."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.list_dataset import ListDataset
+from typer.testing import CliRunner, Result
+
+from loam_gtsam.cli import app as cli
+from loam_gtsam.cli import run as _cli_run
+from loam_gtsam.config import Config, config_to_dict, load_config
+from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.io.run_files import RUN_FILES, read_tum
+from loam_gtsam.loops.files import read_graph
+from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
+from loam_gtsam.view import plots as visualization
+
+FRAMES = 4
+PLOTS = visualization.available()
+
+
+def loam(*arguments: object) -> Result:
+    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
+
+
+@pytest.fixture(autouse=True)
+def _wide_screen_in_an_empty_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "300")
+
+
+class FakeDataset(ListDataset):
+    """Its names look like markup."""
+
+    name = "fake [bold]data[/bold]"
+
+    def info(self):
+        return DatasetInfo("fake", "nowhere", {"fields": "x [y] z"}, ["a [red]small[/red] problem"])
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Scan]:
+    return list(SimulatedWorld("room", frames=FRAMES))
+
+
+@pytest.fixture
+def opens(monkeypatch):
+    """Make every path open as a list of sweeps."""
+
+    def patch(items):
+        monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: FakeDataset(items))
+
+    return patch
+
+
+def files_in(folder: Path | str) -> set[str]:
+    return {path.name for path in Path(folder).iterdir()}
+
+
+def one_line(result: Result) -> str:
+    return " ".join(result.output.split())
+
+
+# -- what a good run gives ---------------------------------------------------------------------
+
+
+def test_demo_writes_everything_and_says_how_accurate_it_is():
+    result = loam("demo", "--scene", "room", "--frames", FRAMES, "--profile")
+    assert result.exit_code == 0, result.output
+    folder = Path("loam_gtsam_output/room_vlp16")
+    plots = {*_cli_run.PLOT_FILES, _cli_run.ERROR_PLOT} if PLOTS else set()
+    assert files_in(folder) == {*RUN_FILES, "truth.tum"} | plots
+    accuracy = json.loads((folder / "summary.json").read_text())["accuracy"]
+    assert accuracy["compared_poses"] == FRAMES
+    assert accuracy["ate_rmse_m"] < 0.05
+    assert f"ATE {accuracy['ate_rmse_m']:.3f} m" in one_line(result)
+    assert str(folder) in one_line(result)
+    for word in ("features", "match", "median", "95 %", "share", "loam-gtsam run PATH"):
+        assert word in result.output
+
+
+def test_run_opens_built_in_worlds_and_uses_every_option():
+    result = loam(
+        "run", "sim:room?frames=9", "--frames", 3, "--output", "out", "--no-plot",
+        "--sensor", "vlp16", "--set", "solver.iterations=7", "--set", "map.window=[11, 11, 5]",
+        "--set", "deskew.enabled=false", "--option", "seed=3",
+    )  # fmt: skip
+    assert result.exit_code == 0, result.output
+    assert files_in("out") == {*RUN_FILES, "truth.tum"}
+    config = load_config("out/config.yaml")
+    assert config.sensor.model == "vlp16"
+    assert config.solver.iterations == 7
+    assert config.map.window == (11, 11, 5)
+    assert config.deskew.enabled is False
+    assert len(read_tum("out/trajectory.tum")) == 3
+    assert json.loads(Path("out/summary.json").read_text())["input"]["facts"]["seed"] == "3"
+
+
+@pytest.mark.parametrize(
+    ("asked", "sweeps", "cores", "expected"),
+    [(None, 200, 2, 0), (None, 201, 2, 1), (None, 201, 1, 0), (0, 900, 2, 0), (3, 2, 1, 3)],
+)
+def test_a_process_extracts_features_where_it_is_worth_its_start(
+    asked, sweeps, cores, expected, monkeypatch
+):
+    monkeypatch.setattr(_cli_run.os, "cpu_count", lambda: cores)
+    options = _cli_run.RunOptions(None, None, False, None, False, True, workers=asked)
+    assert _cli_run._workers(options, sweeps) == expected
+
+
+def test_a_configuration_file_is_used_and_set_wins_over_it():
+    Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
+    arguments = ["run", "sim:room", "--frames", 1, "--no-plot", "--output", "out"]
+    result = loam(*arguments, "--config", "mine.yaml", "--set", "solver.iterations=4")
+    assert result.exit_code == 0, result.output
+    solver = load_config("out/config.yaml").solver
+    assert (solver.iterations, solver.min_matches) == (4, 20)
+
+
+def test_an_earlier_run_is_kept_unless_overwrite_is_given(opens, scans):
+    opens(scans[:2])
+    for folder in ("out", "out-2", "out-3"):
+        result = loam("run", "x", "--no-plot", "--output", "out")
+        assert result.exit_code == 0
+        assert f"Written to {folder}: " in one_line(result)
+    Path("out/trajectory.png").write_text("of the earlier run")
+    opens(scans[:3])
+    assert loam("run", "x", "--no-plot", "--output", "out", "--overwrite").exit_code == 0
+    assert len(read_tum("out/trajectory.tum")) == 3
+    assert len(read_tum("out-2/trajectory.tum")) == 2
+    assert files_in("out") == set(RUN_FILES)
+    assert not Path("out-4").exists()
+
+
+def test_a_folder_with_other_files_is_used_as_it_is(opens, scans):
+    opens(scans[:1])
+    Path("out").mkdir()
+    Path("out/notes.md").write_text("mine")
+    assert loam("run", "x", "--no-plot", "--output", "out").exit_code == 0
+    assert files_in("out") == {*RUN_FILES, "notes.md"}
+
+
+def test_quiet_prints_nothing(opens, scans):
+    opens(scans[:2])
+    result = loam("run", "x", "--quiet", "--output", "out")
+    assert (result.exit_code, result.output) == (0, "")
+    assert "summary.json" in files_in("out")
+
+
+def test_text_of_the_data_is_never_taken_for_markup(opens, scans):
+    opens(scans[:2])
+    assert "fake [bold]data[/bold]" in loam("run", "x", "--no-plot").output
+    output = loam("inspect", "x").output
+    assert "x [y] z" in output
+    assert "a [red]small[/red] problem" in output
+
+
+# -- what is odd, and what is wrong ------------------------------------------------------------
+
+
+def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
+    bad = [BadSweep(scans[2].stamp + n, f"damaged {n}") for n in range(1, 7)]
+    opens([*scans[:3], *bad])
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 0
+    assert "1 first, 2 ok, 6 unusable_scan" in result.output
+    assert [n for n in range(1, 7) if f"damaged {n}" in result.output] == [1, 2, 3]
+    assert "and 3 more" in result.output
+    with np.load("out/run.npz") as data:
+        assert data["messages"][-1] == "damaged 6"
+
+
+def test_a_run_in_which_no_sweep_is_usable_fails(opens):
+    opens([BadSweep(n, f"damaged {n}") for n in range(3)])
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 1
+    assert "none of the 3 sweeps could be used; the first: damaged 0" in one_line(result)
+    assert "run.npz" in files_in("out")
+
+
+def test_an_empty_data_set_fails(opens):
+    opens([])
+    result = loam("run", "x", "--output", "out")
+    assert result.exit_code == 1
+    assert "no sweeps" in result.output
+    assert not Path("out").exists()
+
+
+def test_a_truth_that_cannot_be_compared_is_told_and_costs_nothing(opens, scans, monkeypatch):
+    opens(scans)
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    first, last = scans[0].stamp, scans[-1].stamp
+    for stamps, problem in (([1, 2, 3, 4], "3 or more poses"), ([first, first, last, last], "")):
+        truth = Trajectory(np.array(stamps, np.int64), poses)
+        monkeypatch.setattr(FakeDataset, "truth", truth)
+        result = loam("run", "x", "--no-plot", "--output", "out", "--overwrite")
+        assert result.exit_code == 0, result.output
+        assert problem in result.output
+        assert problem in json.loads(Path("out/summary.json").read_text())["accuracy"]["problem"]
+        assert len(read_tum("out/trajectory.tum")) == len(scans)
+
+
+def test_what_is_odd_about_the_input_is_told_after_a_run(opens, scans, monkeypatch):
+    opens(scans[:1])
+    assert "input: a [red]small[/red] problem" in loam("run", "x", "--no-plot").output
+
+    def damaged(self):
+        raise DatasetError("the index is gone")
+
+    monkeypatch.setattr(FakeDataset, "info", damaged)
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 0
+    assert "input: the index is gone" in result.output
+    assert files_in("out") == set(RUN_FILES)
+
+
+@pytest.mark.parametrize("error", [DatasetError("the bag breaks off"), RuntimeError("oops")])
+def test_an_error_in_the_middle_keeps_what_was_computed(opens, scans, error):
+    opens([*scans[:3], error, scans[3]])
+    result = loam("run", "x", "--no-plot", "--output", "out")
+    assert result.exit_code == 1
+    assert len(read_tum("out/trajectory.tum")) == 3
+    assert str(error) in json.loads(Path("out/summary.json").read_text())["error"]
+    if isinstance(error, DatasetError):
+        assert "error: the bag breaks off" in result.output
+    else:  # a mistake of ours keeps its traceback
+        assert result.exception is error
+
+
+def test_an_error_before_the_first_frame_is_told(opens):
+    opens([DatasetError("the bag is damaged")])
+    result = loam("run", "x", "--output", "out")
+    assert result.exit_code == 1
+    assert "error: the bag is damaged" in result.output
+
+
+def test_errors_are_one_message_and_debug_shows_the_traceback():
+    result = loam("run", "missing/folder")
+    assert result.exit_code == 1
+    assert result.output.startswith("error: missing/folder: ")
+    assert "Traceback" not in result.output
+    assert isinstance(loam("run", "missing/folder", "--debug").exception, DatasetError)
+
+
+def test_an_output_folder_that_cannot_be_made_is_found_before_the_run(opens):
+    opens([RuntimeError("the run has begun")])
+    Path("file").write_text("")
+    result = loam("run", "x", "--output", "file/out")
+    assert result.exit_code == 1
+    assert "file/out: cannot make this output folder" in one_line(result)
+
+
+def test_plots_without_matplotlib(opens, scans, monkeypatch):
+    monkeypatch.setattr(visualization, "available", lambda: False)
+    opens(scans[:1])
+    result = loam("run", "x", "--output", "a")
+    assert result.exit_code == 0
+    assert "No pictures without matplotlib" in result.output
+    assert files_in("a") == set(RUN_FILES)
+    assert "No pictures" not in loam("run", "x", "--output", "c", "--no-plot").output
+    result = loam("run", "x", "--output", "b", "--plot")
+    assert result.exit_code == 1
+    assert 'pip install "loam_gtsam[plot]"' in result.output
+    assert not Path("b").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (["--set", "solver.iteratons=3"], 1, "did you mean 'iterations'"),
+        (["--set", "solver.iterations=many"], 1, "--set solver.iterations=many"),
+        (["--set", "solver.iterations.x=1"], 1, "expected int"),
+        (["--set", "solver=1"], 2, "expected SECTION.KEY=VALUE"),
+        (["--set", "solver.iterations"], 2, "expected KEY=VALUE"),
+        (["--set", "solver.iterations={"], 2, "is not a YAML value"),
+        (["--set", "imu.gravity=2001-12-00"], 2, "is not a YAML value"),
+        (["--option", "=1"], 2, "expected KEY=VALUE"),
+        (["--option", "nonsense=1"], 1, "nonsense"),
+        (["--sensor", "vlp17"], 1, "did you mean 'vlp16'"),
+        (["--preset", "nothing"], 1, "unknown preset 'nothing'"),
+        (["--config", "absent.yaml"], 1, "absent.yaml: cannot read"),
+        (["--preset", "default", "--config", "x.yaml"], 2, "not both"),
+        (["--frames", "0"], 2, "--frames"),
+        (["--nonsense"], 2, "nonsense"),
+    ],
+)
+def test_wrong_options_say_what_was_expected(arguments, code, message):
+    result = loam("run", "sim:room", "--quiet", "--no-plot", *arguments)
+    assert result.exit_code == code, result.output
+    assert message in one_line(result)
+
+
+# -- the other commands ------------------------------------------------------------------------
+
+
+def test_inspect_shows_what_was_understood():
+    result = loam("inspect", "sim:room")
+    assert result.exit_code == 0, result.output
+    for text in (
+        "simulated world",
+        "16 rings from the ring field",
+        "per-point times",
+        "can be run",
+    ):
+        assert text in one_line(result)
+
+
+def test_inspect_looks_past_a_bad_first_sweep(opens, scans):
+    opens([BadSweep(0, "damaged"), scans[0]])
+    result = loam("inspect", "x")
+    assert result.exit_code == 0
+    assert "sweep 0: damaged" in result.output
+    assert "sweep 1" in result.output
+
+
+@pytest.mark.parametrize(
+    ("items", "problem"),
+    [
+        ([BadSweep(n, f"damaged {n}") for n in range(9)], "sweep 4: damaged 4"),
+        ([Scan(np.full((50, 3), np.nan), 0)], "sweep of 50 points, 0 finite"),
+        ([], "no sweeps"),
+    ],
+)
+def test_inspect_fails_on_what_cannot_be_run(opens, items, problem):
+    opens(items)
+    result = loam("inspect", "x")
+    assert result.exit_code == 1
+    assert problem in one_line(result)
+    assert "cannot be run" in result.output
+    assert "damaged 5" not in result.output
+
+
+def test_config_prints_and_writes_what_can_be_loaded():
+    result = loam("config")
+    assert result.exit_code == 0
+    assert "# edge length of a cube [m] (LOAM)" in result.output
+    assert loam("config", "--output", "c.yaml").exit_code == 0
+    assert Path("c.yaml").read_text() == result.output
+    assert config_to_dict(load_config("c.yaml")) == config_to_dict(Config())
+
+
+def test_config_does_not_replace_a_file_unasked():
+    Path("c.yaml").write_text("mine")
+    result = loam("config", "--output", "c.yaml")
+    assert result.exit_code == 1
+    assert "c.yaml: the file exists" in result.output
+    assert Path("c.yaml").read_text() == "mine"
+    assert loam("config", "--output", "c.yaml", "--overwrite").exit_code == 0
+    assert Path("c.yaml").read_text() != "mine"
+
+
+def test_version_names_what_matters_in_a_bug_report():
+    result = loam("--version")
+    assert result.exit_code == 0
+    assert [line.split()[0] for line in result.output.splitlines()] == [
+        "loam_gtsam", "gtsam", "numpy", "python",
+    ]  # fmt: skip
+
+
+# -- stopping ----------------------------------------------------------------------------------
+
+_ENDLESS = """
+import itertools, signal, sys, time
+signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal
+import loam_gtsam.datasets
+from loam_gtsam.cli.app import main
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+
+pause = float(sys.argv.pop())
+
+class Endless(SimulatedWorld):
+    def __iter__(self):
+        first = next(iter(super().__iter__()))
+        for number in itertools.count():
+            if number == 3:
+                print("ready", flush=True)
+                time.sleep(pause)
+            yield first.__class__(
+                first.points, first.stamp + number * 10**8, first.times, first.rings, first.span
+            )
+
+loam_gtsam.datasets.open_dataset = lambda *a, **k: Endless("room", frames=1000)
+main()
+"""
+
+
+def start_endless_run(pause: float, workers: int = 0) -> subprocess.Popen[str]:
+    """A run that goes on for ever; returns when it reads its fourth sweep, ``pause`` s long."""
+    workers_option = ["--workers", str(workers)]
+    command = ["run", "x", "--output", "out", "--no-plot", *workers_option, str(pause)]
+    process = subprocess.Popen(
+        [sys.executable, "-c", _ENDLESS, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"COLUMNS": "300"},
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize(
+    ("number", "workers"), [(signal.SIGINT, 0), (signal.SIGTERM, 0), (signal.SIGINT, 1)]
+)
+def test_a_signal_stops_after_the_frame_and_everything_is_written(number, workers):
+    process = start_endless_run(0.05, workers)
+    process.send_signal(number)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 128 + number, errors
+    assert errors == ""
+    frames = len(read_tum("out/trajectory.tum"))
+    assert frames >= (1 if workers else 4)  # the fourth sweep may have been read ahead
+    assert f"Stopped by {number.name} after frame {frames} of 1000" in output
+    assert "To go on: the same command with --output out --resume" in output
+    assert files_in("out") >= set(RUN_FILES)
+    assert not [name for name in files_in("out") if name.endswith(".tmp")]
+    with np.load("out/run.npz") as data:
+        assert len(data["stamps"]) == frames
+    summary = json.loads(Path("out/summary.json").read_text())
+    assert (summary["interrupted"], summary["frames"]) == (True, frames)
+
+
+def test_a_second_signal_ends_the_process_at_once():
+    process = start_endless_run(pause=600.0)
+    for _ in range(300):
+        process.send_signal(signal.SIGINT)
+        try:
+            process.communicate(timeout=0.1)
+            break
+        except subprocess.TimeoutExpired:
+            continue
+    assert process.returncode == -signal.SIGINT
+    assert files_in("out") == set()
+
+
+def test_handlers_are_put_back():
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    with _cli_run.stop_requests() as stop:
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.signum == signal.SIGTERM
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+def test_an_ignored_signal_stays_ignored(monkeypatch):
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with _cli_run.stop_requests() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert stop.signum is None
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+# -- the IMU in what is said -----------------------------------------------------------------------
+
+
+def test_run_says_what_was_made_of_the_imu():
+    result = loam("run", "sim:room", "--frames", 3, "--no-plot", "--output", "out")
+    said = one_line(result)
+    assert "IMU, level roll -" in said.replace("roll 0", "roll -0")
+    assert "samples, at rest" in said
+    assert "IMU, orientation its own" in said
+    assert "IMU, roll and pitch priors: 1 none, 2 equivalent" in said
+    assert "IMU, de-skew 3 gyro" in said
+    assert "mrad/s" in said
+    assert "given up" not in said
+
+
+def test_run_without_an_imu_says_nothing_of_it():
+    off = ["--set", "imu.enabled=false"]
+    result = loam("run", "sim:room", "--frames", 2, "--no-plot", "--output", "out", *off)
+    assert result.exit_code == 0
+    assert "IMU" not in result.output
+    assert json.loads(Path("out/summary.json").read_text())["imu"] is None
+
+
+def test_run_closes_loops_and_writes_the_graph():
+    small = ["--set", "pose_graph.keyframe_distance=0.5", "--set", "loops.min_way=8"]
+    world = "sim:room?frames=110&columns=400&speed=2"
+    result = loam("run", world, "--loops", *small, "--set", "loops.neighbours=3")
+    assert result.exit_code == 0, result.output
+    found = int(re.search(r"(\d+) of (\d+) found are used", one_line(result))[1])
+    assert found >= 2
+    folder = Path("loam_gtsam_output/room_vlp16")
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["loops"]["on"] == found
+    graph = read_graph(folder / "pose_graph.g2o")
+    assert len(graph.loops) == summary["loops"]["loops"]
+    odometry, corrected = (read_tum(folder / f"{n}.tum") for n in ("odometry", "trajectory"))
+    assert len(odometry) == len(corrected) == 110
+    assert (odometry.map_T_lidar != corrected.map_T_lidar).any()
+    again = loam("optimize", folder / "pose_graph.g2o")
+    assert again.exit_code == 0, again.output
+
+
+def test_run_says_that_the_imu_is_mounted_otherwise():
+    turned = ["--set", "imu.lidar_R_imu_deg=[180.0, 0.0, 0.0]"]
+    result = loam("run", "sim:shaken?columns=900", "--frames", 40, "--no-plot", *turned)
+    assert result.exit_code == 0
+    said = one_line(result)
+    assert "its gyro turned unlike the scans and was given up" in said
+    assert re.search(r"fit those of the scans better by (179|180) degrees", said)
+
+
+def test_inspect_says_what_is_understood_of_the_imu(opens, scans, monkeypatch):
+    said = one_line(loam("inspect", "sim:room"))
+    assert "samples at 200 Hz, orientation its own" in said
+    assert "IMU, used" not in loam("inspect", "sim:room", "--set", "imu.enabled=false").output
+    opens(scans[:1])
+    assert "IMU, used" not in loam("inspect", "x").output
+    imu = SimulatedWorld("room", frames=2).imu
+    broken = ImuSamples(imu.stamps, 3.0 * imu.orientation, imu.gyro, imu.acceleration)
+    monkeypatch.setattr(FakeDataset, "imu", broken)
+    assert "not of unit length" in one_line(loam("inspect", "x"))
+
+
+def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
+    opens(scans)
+    imu = SimulatedWorld("room", frames=FRAMES).imu
+    late = ImuSamples(imu.stamps + 3600 * 10**9, imu.orientation, imu.gyro, imu.acceleration)
+    for samples, told in ((imu, False), (late, True)):
+        monkeypatch.setattr(FakeDataset, "imu", samples)
+        assert ("the clocks differ" in one_line(loam("inspect", "x"))) == told
+        said = one_line(loam("run", "x", "--no-plot", "--overwrite"))
+        assert ("no orientation at 3 of 4 sweeps" in said) == told
+        assert ("IMU, level unknown: no samples about the first sweep" in said) == told
+
+
+# -- going on ------------------------------------------------------------------------------------
+
+
+def test_resume_starts_goes_on_and_says_when_all_is_done(opens, scans):
+    opens([*scans[:2], DatasetError("the disk was pulled out")])
+    arguments = ["run", "x", "--no-plot", "--output", "out", "--resume"]
+    assert loam(*arguments).exit_code == 1
+    assert (Path("out") / _cli_run.CHECKPOINT).is_dir()
+    opens(scans[:3])
+    assert loam(*arguments).exit_code == 0
+    assert files_in("out") == set(RUN_FILES)
+    assert len(read_tum("out/trajectory.tum")) == 3
+    result = loam(*arguments)
+    assert result.exit_code == 0
+    assert "out: complete, 3 sweeps" in result.output
+    assert not Path("out-2").exists()
+
+
+@pytest.mark.parametrize("change", [["--frames", 2], ["--set", "solver.iterations=7"]])
+def test_resume_does_not_take_another_run_for_its_own(opens, scans, change):
+    opens(scans[:3])
+    arguments = ["run", "x", "--no-plot", "--output", "out"]
+    assert loam(*arguments).exit_code == 0
+    result = loam(*arguments, "--resume", *change)
+    assert result.exit_code == 1
+    assert "out: holds the results of another run" in one_line(result)
+
+
+def test_a_checkpoint_is_not_run_over(opens, scans):
+    opens([*scans[:2], DatasetError("the disk was pulled out")])
+    arguments = ["run", "x", "--no-plot", "--output", "out"]
+    assert loam(*arguments).exit_code == 1
+    for name in RUN_FILES:
+        (Path("out") / name).unlink()
+    opens(scans[:3])
+    assert loam(*arguments).exit_code == 0
+    assert files_in("out-2") == set(RUN_FILES)
+    assert loam(*arguments, "--overwrite").exit_code == 0
+    assert files_in("out") == set(RUN_FILES)
+
+
+@pytest.mark.parametrize("other", [["--bag", "x.mcap"], ["--rrd", "x.rrd"], ["--overwrite"]])
+def test_resume_tells_what_it_cannot_go_together_with(other):
+    result = loam("run", "sim:room", "--resume", *other)
+    assert result.exit_code == 2
+    assert "give one only" in one_line(result)
+
+
+def test_a_run_that_cannot_start_leaves_no_folder(opens, scans):
+    opens(scans)
+    Path("there.bag").write_text("x")
+    assert loam("run", "x", "--bag", "there.bag").exit_code == 1
+    assert not list(Path().glob("loam_gtsam_output/*"))
+    Path("mine").mkdir()
+    assert loam("run", "x", "--bag", "there.bag", "--output", "mine").exit_code == 1
+    assert Path("mine").is_dir()
+
+
+def test_set_without_a_section_names_one():
+    result = loam("run", "sim:room", "--set", "min_range=2")
+    assert result.exit_code == 2
+    assert "expected SECTION.KEY=VALUE, for example sensor.min_range=2" in result.output
+
+
+def test_no_help_of_a_command_is_cut_off(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "..." not in loam("--help").output.partition("Commands:")[2]

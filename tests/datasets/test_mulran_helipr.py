@@ -1,0 +1,246 @@
+"""MulRan and HeLiPR, in files of their layout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support import layout_writers as write
+
+from loam_gtsam.config import Config, ImuConfig
+from loam_gtsam.datasets import HeLiPRDataset, MulRanDataset, open_dataset
+from loam_gtsam.pipeline import effective_config, run
+from loam_gtsam.studies.evaluation import absolute_error
+from loam_gtsam.types import BadSweep, DatasetError, Scan
+
+HALF_TURN = np.diag([-1.0, -1.0, 1.0])
+STAMPS = write.stamps()
+
+
+def base_T_lidar() -> np.ndarray:
+    """MulRan's calib_base2ouster.txt: 1.7042 -0.021 1.8047 0.0001 0.0003 179.6654."""
+    matrix = np.eye(4)
+    angles = np.radians([0.0001, 0.0003, 179.6654])
+    matrix[:3, :3] = Rotation.from_euler("xyz", angles).as_matrix()
+    matrix[:3, 3] = (1.7042, -0.021, 1.8047)
+    return matrix
+
+
+def write_mulran(root: Path, below: str = "", count: int = write.COUNT) -> Path:
+    folder = root / below / "Ouster"
+    folder.mkdir(parents=True)
+    for sweep in write.sweeps()[:count]:
+        write.firings(sweep, 64, 1024).tofile(folder / f"{sweep.stamp}.bin")
+    base = write.body_truth(base_T_lidar())
+    rows = base.map_T_lidar[:, :3].reshape(-1, 12)
+    write.write_rows(root / "global_pose.csv", base.stamps, rows)
+    write.write_xsens(root / below / "xsens_imu.csv", HALF_TURN)
+    listing = [f"{stamp},ouster" for stamp in STAMPS[:count]] + [f"{STAMPS[0]},imu"]
+    (root / below / "data_stamp.csv").write_text("\n".join(listing) + "\n")
+    return root
+
+
+def write_helipr(root: Path, lidar: str = "Ouster") -> Path:
+    """As the record of the file player: no padding between the fields."""
+    folder = root / "LiDAR" / lidar
+    folder.mkdir(parents=True)
+    kinds = {
+        "Ouster": (
+            "<f4 <f4 <f4 <f4 <u4 <u2 <u2 <u2",
+            "x y z intensity t reflectivity ring ambient",
+        ),
+        "Velodyne": ("<f4 <f4 <f4 <f4 <u2 <f4", "x y z intensity ring time"),
+    }[lidar]
+    record = np.dtype(list(zip(kinds[1].split(), kinds[0].split(), strict=True)))
+    assert record.itemsize == {"Ouster": 26, "Velodyne": 22}[lidar]
+    for sweep in write.sweeps("os1-128" if lidar == "Ouster" else "vlp16", 512):
+        points = np.zeros(len(sweep.points), record)
+        for axis, name in enumerate("xyz"):
+            points[name] = sweep.points[:, axis]
+        points["ring"] = sweep.rings
+        if lidar == "Ouster":
+            points["t"] = np.rint(sweep.times * 1e9)
+        else:
+            points["time"] = sweep.times
+        points.tofile(folder / f"{sweep.stamp}.bin")
+    truth = write.lidar_truth()
+    write.write_rows(
+        root / "LiDAR_GT" / f"{lidar}_gt.txt", truth.stamps, write.quaternion_rows(truth), " "
+    )
+    return root
+
+
+def test_a_mulran_sequence_is_recognised_and_mapped_in_the_lidar_s_frame(tmp_path: Path) -> None:
+    dataset = open_dataset(write_mulran(tmp_path))
+    assert isinstance(dataset, MulRanDataset)
+    assert dataset.stamps.tolist() == STAMPS.tolist()
+    truth, expected = dataset.truth, write.lidar_truth()
+    assert truth is not None
+    np.testing.assert_allclose(truth.map_T_lidar, expected.map_T_lidar, atol=1e-8)
+    result = run(dataset, Config())
+    assert sum(update.status.solved for update in result.updates) == write.COUNT - 1
+    assert absolute_error(result.trajectory, truth).rmse < 0.02
+    # The IMU is half a turn away from the lidar; its gyro agrees once that is known.
+    assert result.config.imu.lidar_R_imu_deg == (0.0, 0.0, 180.0)
+    assert result.config.imu.lidar_t_imu == (1.77, 0.0, -0.05)
+    assert result.imu is not None
+    assert (result.imu.gyro_trusted, result.imu.problem) == (True, "")
+    assert result.imu.sweep_motions["gyro"] >= write.COUNT - 1
+
+
+def test_what_the_user_sets_of_the_imu_wins_over_the_data_set(tmp_path: Path) -> None:
+    dataset = open_dataset(write_mulran(tmp_path, count=1))
+    mine = Config(imu=ImuConfig(lidar_R_imu_deg=(0.0, 0.0, 90.0)))
+    used = effective_config(mine, dataset).imu
+    assert used.lidar_R_imu_deg == (0.0, 0.0, 90.0)
+    assert used.lidar_t_imu == (1.77, 0.0, -0.05)
+
+
+def test_times_and_beams_of_mulran_follow_from_the_order_of_the_points(tmp_path: Path) -> None:
+    expected = write.sweeps()[0]
+    for stamp_is, shift in (("start", 0.0), ("middle", 0.05), ("end", 0.1)):
+        root = write_mulran(tmp_path / stamp_is, "sensor_data", count=1)
+        dataset = MulRanDataset(root, stamp_is=stamp_is)
+        (scan,) = dataset
+        assert isinstance(scan, Scan)
+        assert scan.rows == 64
+        assert scan.times is not None
+        row = np.arange(len(scan.points)) // 1024
+        seen = np.any(scan.points != 0.0, axis=1)
+        order = np.lexsort((63 - row[seen], scan.times[seen]))
+        np.testing.assert_array_equal(scan.points[seen][order], expected.points)
+        np.testing.assert_allclose(scan.times[seen][order], expected.times - shift, atol=1e-9)
+        said = [text for text in dataset.info().problems if "which moment" in text]
+        assert not said
+    assert "which moment" in " ".join(open_dataset(root).info().problems)
+
+
+def test_mulran_says_what_is_missing_or_broken(tmp_path: Path) -> None:
+    root = write_mulran(tmp_path, count=3)
+    files = sorted((root / "Ouster").iterdir())
+    files[0].write_bytes(files[0].read_bytes()[: 30_000 * 16])
+    files[1].write_bytes(files[1].read_bytes()[:-3])
+    files[2].unlink()
+    dataset = open_dataset(root)
+    first, second = dataset
+    assert isinstance(first, BadSweep)
+    assert isinstance(second, BadSweep)
+    assert "30000 points, expected 1024 firings of 64 = 65536" in first.message
+    assert "1048573 bytes is not a multiple of 16 (x, y, z, intensity)" in second.message
+    problems = " ".join(dataset.info().problems)
+    assert f"data_stamp.csv lists 1 sweeps without a file, the first {STAMPS[2]}" in problems
+    (root / "Ouster" / "front.bin").write_bytes(b"")
+    with pytest.raises(DatasetError, match=r"front.bin: expected a name that is the stamp"):
+        open_dataset(root)
+    for file in (root / "Ouster").iterdir():
+        file.unlink()
+    with pytest.raises(DatasetError, match=r"Ouster: no sweeps \(\*.bin\)"):
+        open_dataset(root)
+
+
+def test_poses_of_mulran_may_be_unsorted_but_not_distorted(tmp_path: Path) -> None:
+    root = write_mulran(tmp_path, count=1)
+    file = root / "global_pose.csv"
+    lines = file.read_text().splitlines()
+    file.write_text("\n".join([*lines[::-1], lines[0]]) + "\n")
+    dataset = open_dataset(root)
+    assert dataset.truth is not None
+    np.testing.assert_array_equal(dataset.truth.stamps, write.lidar_truth().stamps)
+    problems = " ".join(dataset.info().problems)
+    assert "global_pose.csv: poses out of order, sorted" in problems
+    assert "global_pose.csv: 1 poses with a repeated stamp left out" in problems
+    file.write_text(
+        "\n".join([lines[0], ",".join([lines[1].split(",")[0], "2.0", *lines[1].split(",")[2:]])])
+        + "\n"
+    )
+    with pytest.raises(DatasetError, match=r"global_pose.csv: row 2 does not hold a rotation"):
+        _ = open_dataset(root).truth
+    file.write_text(lines[0] + "\n1,2,3\n")
+    with pytest.raises(DatasetError, match=r"global_pose.csv:2: expected 13 numbers \(ns r11"):
+        _ = open_dataset(root).truth
+
+
+def test_the_gyro_is_where_the_orientation_says(tmp_path: Path) -> None:
+    root = write_mulran(tmp_path, count=1)
+    expected = open_dataset(root).imu
+    assert expected is not None
+    np.testing.assert_allclose(expected.gyro, write.imu_rows(HALF_TURN)[2], atol=1e-12)
+    np.testing.assert_allclose(expected.acceleration, write.imu_rows(HALF_TURN)[3], atol=1e-12)
+    file = root / "xsens_imu.csv"
+    write.write_xsens(file, HALF_TURN, gyro_last=True)
+    dataset = open_dataset(root)
+    assert dataset.imu is not None
+    np.testing.assert_array_equal(dataset.imu.gyro, expected.gyro)
+    assert "the gyro is in columns 15 to 17" in " ".join(dataset.info().problems)
+    rows = [line.split(",") for line in file.read_text().splitlines()]
+    for row in rows:
+        row[14:17] = row[8:11]  # a gyro nowhere
+    file.write_text("\n".join(",".join(row) for row in rows) + "\n")
+    dataset = open_dataset(root)
+    assert dataset.imu is None
+    assert "the gyro cannot be told: left out" in " ".join(dataset.info().problems)
+    file.write_text("\n".join(",".join(row[:8]) for row in rows) + "\n")
+    dataset = open_dataset(root)
+    assert dataset.imu is None
+    assert "without gyro and accelerometer (8 columns)" in " ".join(dataset.info().problems)
+
+
+@pytest.mark.parametrize("lidar", ["Ouster", "Velodyne"])
+def test_a_helipr_sequence_is_recognised_with_times_rings_and_truth(
+    tmp_path: Path, lidar: str
+) -> None:
+    dataset = open_dataset(write_helipr(tmp_path, lidar))
+    assert isinstance(dataset, HeLiPRDataset)
+    for scan, expected in zip(
+        dataset, write.sweeps("os1-128" if lidar == "Ouster" else "vlp16", 512), strict=True
+    ):
+        assert isinstance(scan, Scan)
+        assert scan.stamp == expected.stamp
+        np.testing.assert_array_equal(scan.points, expected.points)
+        np.testing.assert_array_equal(scan.rings, expected.rings)
+        np.testing.assert_allclose(scan.times, expected.times, atol=1e-8)
+    truth = dataset.truth
+    assert truth is not None
+    np.testing.assert_allclose(
+        truth.map_T_lidar, write.lidar_truth().map_T_lidar, atol=1e-8
+    )  # it is of the lidar already
+    # The toolbox has the lidar in the IMU's axes; the IMU is then on the other side.
+    x, _, z = dataset.sensor["imu.lidar_t_imu"]
+    assert (x > 0.0, z < 0.0) == (True, True)
+    facts = dataset.info().facts
+    assert facts["fields"].startswith("x float32, y float32, z float32, intensity float32")
+    assert "relative to the stamp" in facts["point times"]
+    assert "HeLiPR-Pointcloud-Toolbox" not in facts  # no IMU, no extrinsics shown
+    if lidar == "Ouster":
+        result = run(dataset)
+        assert absolute_error(result.trajectory, truth).rmse < 0.02
+
+
+def test_helipr_takes_the_lidar_asked_for_and_refuses_what_has_no_rings(tmp_path: Path) -> None:
+    write_helipr(tmp_path)
+    write_helipr(tmp_path, "Velodyne")
+    assert "Ouster" in open_dataset(tmp_path).info().kind
+    assert "Velodyne" in open_dataset(tmp_path, lidar="Velodyne").info().kind
+    with pytest.raises(DatasetError, match=r"expected Ouster or Velodyne, got 'Avia': it does not"):
+        open_dataset(tmp_path, lidar="Avia")
+    only_avia = tmp_path / "avia"
+    (only_avia / "LiDAR" / "Avia").mkdir(parents=True)
+    with pytest.raises(DatasetError, match=r"expected LiDAR/Ouster or LiDAR/Velodyne; Avia cannot"):
+        open_dataset(only_avia)
+
+
+def test_helipr_says_what_is_broken(tmp_path: Path) -> None:
+    root = write_helipr(tmp_path)
+    files = sorted((root / "LiDAR" / "Ouster").iterdir())
+    files[1].write_bytes(files[1].read_bytes()[:-1])
+    sweeps = list(open_dataset(root))
+    assert [type(sweep) for sweep in sweeps[:3]] == [Scan, BadSweep, Scan]
+    assert "is not a multiple of 26 (x, y, z, intensity, t, reflectivity" in sweeps[1].message
+    for file in files:
+        file.write_bytes(b"123")
+    with pytest.raises(
+        DatasetError, match=r"Ouster: no usable sweep among the first 10; .*3 bytes"
+    ):
+        open_dataset(root).info()

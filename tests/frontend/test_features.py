@@ -1,0 +1,573 @@
+"""Scan registration against closed forms, a sequential reference, and real sweeps."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config, DeskewConfig, FeatureConfig, SensorConfig
+from loam_gtsam.frontend.features import (
+    _voxel_per_ring,
+    curvature,
+    extract_features,
+    kinks,
+    pick,
+    roughness,
+    sector_bounds,
+    squared_gaps,
+    thinned,
+    unreliable_points,
+    window_fits,
+)
+from loam_gtsam.frontend.organise import organise
+from loam_gtsam.frontend.rings import ELEVATIONS
+from loam_gtsam.types import Features, Scan, SweepError
+
+LOAM = FeatureConfig(post_depth=0.0)
+ROUGH_TOO = Config(features=FeatureConfig(range_noise=0.0, post_depth=0.0))
+AROUND = np.arange(-179.9, 180.0, 0.2)
+AHEAD = np.arange(-50.1, 50.2, 0.2)
+
+
+def world(
+    distance: Callable[[np.ndarray], np.ndarray],
+    elevations: np.ndarray = ELEVATIONS["vlp16"],
+    azimuth_deg: np.ndarray = AROUND,
+) -> Scan:
+    """A scan of vertical surfaces at a horizontal distance, ring after ring, clockwise."""
+    azimuth = np.deg2rad(azimuth_deg[::-1])
+    horizontal = distance(azimuth)
+    rings = np.repeat(np.arange(len(elevations)), len(azimuth))
+    x, y = horizontal * np.cos(azimuth), horizontal * np.sin(azimuth)
+    z = np.tan(np.deg2rad(elevations))[:, None] * horizontal
+    points = np.stack((*np.broadcast_arrays(x, y, z),), axis=-1).reshape(-1, 3)
+    times = np.tile(0.1 * (np.pi - azimuth) / (2 * np.pi), len(elevations))
+    return Scan(points, 5_000_000_000, times=times, rings=rings)
+
+
+def room(azimuth: np.ndarray) -> np.ndarray:
+    """Square room, walls 10 m away."""
+    return 10.0 / np.maximum(np.abs(np.cos(azimuth)), np.abs(np.sin(azimuth)))
+
+
+def pole_and_wall(azimuth: np.ndarray) -> np.ndarray:
+    """Wall 10 m ahead, a thin pole 5 m away at 11 degrees."""
+    wall = 10.0 / np.cos(azimuth)
+    return np.where(np.abs(azimuth - np.deg2rad(11.0)) < np.deg2rad(1.3), 5.0, wall)
+
+
+def noisy_scan(seed: int = 0, points_per_ring: int = 1200, rings: int = 4) -> Scan:
+    """A room with noise on one side and random steps: features of every kind, none regular."""
+    rng = np.random.default_rng(seed)
+    scan = world(room, np.linspace(-9.0, 9.0, rings), np.linspace(-179, 179, points_per_ring))
+    noise = np.where(scan.points[:, 1] > 0.0, 0.005, 0.0002)
+    scale = 1.0 + noise * rng.normal(size=len(scan.points))
+    steps = rng.integers(0, len(scan.points), 20)
+    for step in steps:
+        scale[step : step + 15] *= rng.uniform(0.6, 1.0)
+    return replace(scan, points=scan.points * scale[:, None])
+
+
+# --- closed forms -----------------------------------------------------------------------------
+
+
+def test_square_room_has_edges_at_its_corners_and_planes_on_its_walls() -> None:
+    features = extract_features(world(room), Config())
+    horizontal = np.abs(features.edges[:, :2])
+    # A corner lies between two columns, 7 cm apart along either wall.
+    assert np.all(horizontal > 9.9)
+    assert np.all(np.bincount(features.edge_rings, minlength=16) == 4)
+    assert len(features.sharp) == len(features.edges)
+    # A voxel may straddle a corner, its centroid then lies up to a voxel inside.
+    off_wall = np.abs(np.abs(features.planes[:, :2]).max(axis=1) - 10.0)
+    assert off_wall.max() < 0.2
+    assert np.mean(off_wall < 1e-5) > 0.97
+    assert np.all(np.bincount(features.plane_rings[features.flat], minlength=16) == 24)
+
+
+def test_pole_is_an_edge_and_the_wall_it_hides_is_not() -> None:
+    scan = world(pole_and_wall, azimuth_deg=AHEAD)
+    edges = extract_features(scan, Config()).edges
+    assert len(edges) == 2 * 16
+    assert np.allclose(np.hypot(edges[:, 0], edges[:, 1]), 5.0)
+    unguarded = Config(features=FeatureConfig(occlusion_gap=1e9, grazing_ratio=1e9))
+    flank = extract_features(scan, unguarded).edges
+    assert np.any(np.hypot(flank[:, 0], flank[:, 1]) > 9.0)
+
+
+def test_occlusion_rejects_the_six_points_behind_on_either_side() -> None:
+    scan = world(pole_and_wall, np.array([0.0]), AHEAD)
+    xyz = scan.points.T.astype(np.float32)
+    starts = np.array([0, xyz.shape[1]])
+    gaps = squared_gaps(xyz, starts)
+    rejected = unreliable_points(xyz, gaps, starts, replace(LOAM, grazing_ratio=1e9))
+    pole = np.flatnonzero(np.hypot(xyz[0], xyz[1]) < 6.0)
+    expected = np.concatenate((pole[0] - 1 - np.arange(6), pole[-1] + 1 + np.arange(6)))
+    assert np.array_equal(np.flatnonzero(rejected), np.sort(expected))
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [({}, 6), ({"occlusion_gap": 2.3}, 0), ({"occlusion_gap": 2.2}, 6)],
+)
+def test_occlusion_gap(change: dict[str, float], count: int) -> None:
+    # 20 points at 5 m, then 20 at 6.5 m on almost the same ray: squared gap 2.25.
+    azimuth = 0.001 * np.arange(40)
+    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
+    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
+    xyz = xyz.astype(np.float32)
+    starts = np.array([0, 40])
+    settings = replace(LOAM, grazing_ratio=1e9, **change)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    assert np.array_equal(np.flatnonzero(rejected), 20 + np.arange(count))
+
+
+@pytest.mark.parametrize(("turn", "one_ray"), [(0.09, True), (0.11, False)])
+def test_occlusion_needs_the_two_on_one_ray(turn: float, one_ray: bool) -> None:
+    azimuth = 0.001 * np.arange(40) + np.where(np.arange(40) < 20, 0.0, turn)
+    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
+    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
+    xyz = xyz.astype(np.float32)
+    starts = np.array([0, 40])
+    settings = replace(LOAM, grazing_ratio=1e9)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    assert rejected.any() == one_ray
+
+
+def test_occlusion_does_not_reach_into_the_next_ring() -> None:
+    # The ring ends three points behind the occlusion; the next ring starts elsewhere.
+    distance = np.concatenate((np.full(20, 5.0), np.full(3, 6.5), np.full(20, 30.0)))
+    azimuth = 0.001 * np.arange(43)
+    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
+    xyz = xyz.astype(np.float32)
+    starts = np.array([0, 23, 43])
+    settings = replace(LOAM, grazing_ratio=1e9)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    assert np.array_equal(np.flatnonzero(rejected), [20, 21, 22])
+
+
+def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
+    # A wall along x at y = 1 seen every 0.2 degrees: gaps of about r^2 * 0.0035 m.
+    azimuth = np.deg2rad(np.arange(4.0, 90.0, 0.2))
+    xyz = np.stack((1 / np.tan(azimuth), np.ones(len(azimuth)), np.zeros(len(azimuth))))
+    xyz = xyz.astype(np.float32)
+    starts = np.array([0, len(azimuth)])
+    settings = replace(LOAM, occlusion_gap=1e9)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    distance = np.hypot(xyz[0], xyz[1])
+    bound = np.sqrt(LOAM.grazing_ratio) / np.deg2rad(0.2)
+    assert rejected[1:-1][distance[1:-1] > 1.05 * bound].all()
+    assert not rejected[distance < 0.95 * bound].any()
+    # One large gap is an edge, not a grazed surface.
+    step = np.zeros((3, 30), np.float32)
+    step[0] = np.where(np.arange(30) < 15, 5.0, 9.0)
+    step[1] = 0.01 * np.arange(30)
+    assert not unreliable_points(
+        step, squared_gaps(step, np.array([0, 30])), np.array([0, 30]), settings
+    ).any()
+
+
+def test_grazed_wall_gives_no_edges() -> None:
+    def street(azimuth: np.ndarray) -> np.ndarray:
+        return np.minimum(2.0 / np.maximum(np.abs(np.sin(azimuth)), 1e-9), 60.0)
+
+    scan = world(street, azimuth_deg=np.arange(-179.9, -0.5, 0.2))
+    unguarded = Config(features=FeatureConfig(grazing_ratio=1e9))
+    far = lambda f: np.count_nonzero(np.abs(f.edges[:, 0]) > 12.0)  # noqa: E731
+    assert far(extract_features(scan, unguarded)) > 0
+    assert far(extract_features(scan, Config())) == 0
+
+
+# --- curvature, windows, sectors --------------------------------------------------------------
+
+
+@pytest.mark.parametrize("half_window", [1, 5])
+def test_curvature_is_the_squared_sum_of_differences(half_window: int) -> None:
+    xyz = np.random.default_rng(0).uniform(-50, 50, (3, 60)).astype(np.float32)
+    found = curvature(xyz, half_window)
+    for i in range(half_window, 60 - half_window):
+        around = xyz[:, i - half_window : i + half_window + 1].astype(float)
+        expected = np.sum((around - xyz[:, i : i + 1]).sum(axis=1) ** 2)
+        assert found[i] == pytest.approx(expected, rel=1e-4)
+
+
+def test_windows_stay_in_their_ring() -> None:
+    fits = window_fits(np.array([0, 12, 15, 40]), 5)
+    assert np.array_equal(np.flatnonzero(fits), [5, 6, *range(20, 35)])
+
+
+def test_sectors_split_what_has_a_window() -> None:
+    bounds = sector_bounds(np.array([0, 12, 15, 57]), 5, 3)
+    assert bounds[:3].tolist() == [[5, 5], [5, 6], [6, 7]]
+    assert np.all(bounds[3:6, 0] == bounds[3:6, 1])  # the ring of three points
+    assert bounds[6:].tolist() == [[20, 30], [30, 41], [41, 52]]
+
+
+# --- picks ------------------------------------------------------------------------------------
+
+
+def sequential_picks(
+    xyz: np.ndarray, starts: np.ndarray, settings: FeatureConfig
+) -> tuple[list[int], list[int], list[int]]:
+    """(sharp, edges, flat) by LOAM's own order: sector by sector, edges then flat points."""
+    window = settings.half_window
+    bend = curvature(xyz, window)
+    gaps = squared_gaps(xyz, starts)
+    taken = unreliable_points(xyz, gaps, starts, settings)
+    sharp: list[int] = []
+    edges: list[int] = []
+    flat: list[int] = []
+
+    def suppress(i: int) -> None:
+        taken[i] = True
+        for way in (1, -1):
+            for k in range(1, window + 1):
+                if gaps[i + way * k - (way > 0)] > settings.max_gap:
+                    break
+                taken[i + way * k] = True
+
+    for low, high in sector_bounds(starts, window, settings.sectors):
+        order = low + np.argsort(bend[low:high], kind="stable")
+        count = 0
+        for i in order[::-1]:
+            if taken[i] or bend[i] <= settings.edge_curvature:
+                continue
+            if count == settings.edges_per_sector:
+                break
+            (sharp if count < settings.sharp_per_sector else edges).append(int(i))
+            count += 1
+            suppress(int(i))
+        count = 0
+        for i in order:
+            if taken[i] or bend[i] >= settings.plane_curvature:
+                continue
+            if count == settings.flat_per_sector:
+                break
+            flat.append(int(i))
+            count += 1
+            suppress(int(i))
+    return sharp, sharp + edges, flat
+
+
+def rows_of(features: np.ndarray, scan: Scan, index: np.ndarray) -> set[int]:
+    """Where, in organised order, features stand; exact, for edges and flat points are raw."""
+    where = {tuple(point): i for i, point in enumerate(scan.points[index])}
+    return {where[tuple(point)] for point in features}
+
+
+def test_picks_of_one_sector_are_those_of_the_sequential_algorithm() -> None:
+    settings = FeatureConfig(sectors=1, edges_per_sector=12, post_depth=0.0)
+    config = Config(features=settings)
+    for seed in range(5):
+        scan = noisy_scan(seed)
+        sweep = organise(scan, config)
+        features = extract_features(scan, config)
+        sharp, edges, flat = sequential_picks(sweep.xyz, sweep.ring_starts, settings)
+        assert rows_of(features.edges[features.sharp], scan, sweep.index) == set(sharp)
+        assert rows_of(features.edges, scan, sweep.index) == set(edges)
+        assert rows_of(features.planes[features.flat], scan, sweep.index) == set(flat)
+
+
+def test_picks_of_six_sectors_differ_only_near_borders() -> None:
+    config = Config(features=LOAM)
+    scan = noisy_scan(3)
+    sweep = organise(scan, config)
+    features = extract_features(scan, config)
+    _, edges, _ = sequential_picks(sweep.xyz, sweep.ring_starts, LOAM)
+    found = rows_of(features.edges, scan, sweep.index)
+    assert len(found ^ set(edges)) < 0.1 * len(edges)
+
+
+def counts_by_sector(rows: list[int], sweep_starts: np.ndarray) -> np.ndarray:
+    bounds = sector_bounds(sweep_starts, 5, 6)
+    return np.array([sum(low <= row < high for row in rows) for low, high in bounds])
+
+
+@pytest.mark.parametrize("points_per_ring", [22, 60, 800])
+def test_counts_and_spacing(points_per_ring: int) -> None:
+    # Suppression never stops early, and nothing but spacing and counts rejects.
+    settings = FeatureConfig(max_gap=1e9, occlusion_gap=1e9, grazing_ratio=1e9)
+    config = Config(features=settings)
+    scan = noisy_scan(1, points_per_ring)
+    sweep = organise(scan, config)
+    features = extract_features(scan, config)
+    edges = sorted(rows_of(features.edges, scan, sweep.index))
+    sharp = sorted(rows_of(features.edges[features.sharp], scan, sweep.index))
+    flat = sorted(rows_of(features.planes[features.flat], scan, sweep.index))
+    assert counts_by_sector(edges, sweep.ring_starts).max() <= 20
+    assert counts_by_sector(sharp, sweep.ring_starts).max() <= 2
+    assert counts_by_sector(flat, sweep.ring_starts).max() <= 4
+    assert np.diff(sorted(edges + flat)).min() > 5
+    bend = curvature(sweep.xyz, 5)
+    assert bend[edges].min() > 0.1
+    assert max(bend[flat], default=0.0) < 0.1
+
+
+def test_every_sector_with_edges_has_a_sharp_one() -> None:
+    # Sectors of a few points: many wait for a neighbour's pick before they get their first.
+    settings = FeatureConfig(sectors=150, sharp_per_sector=1, edges_per_sector=3)
+    scan, config = noisy_scan(), Config(features=settings)
+    sweep = organise(scan, config)
+    features = extract_features(scan, config)
+    edges, sharp = (
+        np.array(sorted(rows_of(points, scan, sweep.index)))
+        for points in (features.edges, features.edges[features.sharp])
+    )
+    bounds = sector_bounds(sweep.ring_starts, 5, 150)
+    sector_of = lambda rows: np.searchsorted(bounds[:, 0], rows, side="right")  # noqa: E731
+    assert np.array_equal(sector_of(sharp), np.unique(sector_of(edges)))
+
+
+def test_suppression_stops_at_a_gap() -> None:
+    score = np.zeros(40, np.float32)
+    score[[18, 20]] = 2.0, 1.0
+    eligible = score > 0.0
+    cells = np.array([[5, 35]])
+    for gap_at, expected in ((None, [18]), (19, [18, 20]), (20, [18])):
+        linked = np.ones(40, dtype=bool)
+        if gap_at is not None:
+            linked[gap_at] = False
+        found, rank = pick(score, eligible, cells, 5, linked, 5, np.ones(40, dtype=bool))
+        assert found.tolist() == expected
+        assert rank.tolist() == list(range(len(expected)))
+
+
+def test_limit_of_zero_picks_nothing() -> None:
+    scan = noisy_scan()
+    none = FeatureConfig(sharp_per_sector=0, edges_per_sector=0, flat_per_sector=0)
+    features = extract_features(scan, Config(features=none))
+    assert (len(features.edges), len(features.sharp), len(features.flat)) == (0, 0, 0)
+    assert len(features.planes) > 100
+
+
+# --- planes, times, reference -----------------------------------------------------------------
+
+
+def test_rest_is_the_voxel_filtered_remainder_of_each_ring() -> None:
+    scan, config = noisy_scan(2), ROUGH_TOO
+    sweep = organise(scan, config)
+    features = extract_features(scan, config)
+    used = rows_of(features.edges, scan, sweep.index)
+    used |= rows_of(features.planes[features.flat], scan, sweep.index)
+    ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
+    first = sweep.span[0]  # the reference time
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for row in np.flatnonzero(window_fits(sweep.ring_starts, 5)):
+        if row not in used:
+            cell = np.floor(sweep.xyz[:, row] * np.float32(1 / 0.2)).astype(int)
+            groups.setdefault((int(ring[row]), *cell.tolist()), []).append(int(row))
+    expected = np.array(
+        [
+            [
+                *sweep.xyz[:, rows].mean(axis=1, dtype=float),
+                sweep.times[rows].mean() - first,
+                key[0],
+            ]
+            for key, rows in sorted(groups.items())
+        ]
+    )
+    assert len(features.flat) > 20
+    rest = slice(len(features.flat), None)
+    assert features.planes[rest] == pytest.approx(expected[:, :3], abs=1e-5)
+    assert features.plane_times[rest] == pytest.approx(expected[:, 3], abs=1e-12)
+    assert np.array_equal(features.plane_rings[rest], expected[:, 4])
+
+
+def test_rings_that_meet_in_a_voxel_stay_apart() -> None:
+    xyz = np.full((3, 4), 0.1, np.float32)
+    points, times, rings = _voxel_per_ring(xyz, np.arange(4.0), np.array([0, 0, 1, 1]), 0.2)
+    assert points == pytest.approx(np.full((2, 3), 0.1))
+    assert (times.tolist(), rings.tolist()) == ([0.5, 2.5], [0, 1])
+
+
+@pytest.mark.parametrize("bound", [0.1, 1e-3])
+def test_flat_points_are_below_the_bound(bound: float) -> None:
+    settings = FeatureConfig(plane_curvature=bound, flat_per_sector=100)
+    scan, config = noisy_scan(), Config(features=settings)
+    sweep = organise(scan, config)
+    features = extract_features(scan, config)
+    bend = curvature(sweep.xyz, 5)
+    flat = rows_of(features.planes[features.flat], scan, sweep.index)
+    assert 0.1 * bound < bend[list(flat)].max() < bound
+
+
+def test_voxel_of_zero_keeps_every_point() -> None:
+    scan = noisy_scan()
+    every = FeatureConfig(plane_voxel=0.0, range_noise=0.0)
+    features = extract_features(scan, Config(features=every))
+    assert len(features.edges) + len(features.planes) == len(scan.points) - 4 * 10
+
+
+@pytest.mark.parametrize(("reference", "shift"), [("start", -0.02), ("end", 0.09), ("stamp", 0.0)])
+def test_reference_time(reference: str, shift: float) -> None:
+    scan = world(room)
+    scan = replace(scan, span=(-0.02, 0.09))
+    config = Config(deskew=DeskewConfig(reference=reference))  # type: ignore[arg-type]
+    features = extract_features(scan, config)
+    assert features.stamp == 5_000_000_000 + round(shift * 1e9)
+    assert features.span == pytest.approx((-0.02 - shift, 0.09 - shift))
+    azimuth = np.arctan2(features.edges[:, 1], features.edges[:, 0])
+    measured = 0.1 * (np.pi - azimuth) / (2 * np.pi)
+    assert features.edge_times == pytest.approx(measured - shift, abs=1e-9)
+
+
+# --- order and repeatability ------------------------------------------------------------------
+
+
+def assert_same(one: Features, two: Features) -> None:
+    for name in Features.__slots__:
+        assert np.array_equal(getattr(one, name), getattr(two, name)), name
+
+
+def test_order_of_the_points_does_not_matter_and_runs_repeat() -> None:
+    scan = noisy_scan(5)
+    order = np.random.default_rng(0).permutation(len(scan.points))
+    assert scan.times is not None
+    assert scan.rings is not None
+    shuffled = replace(
+        scan, points=scan.points[order], times=scan.times[order], rings=scan.rings[order]
+    )
+    expected = extract_features(scan, Config())
+    assert_same(extract_features(scan, Config()), expected)
+    assert_same(extract_features(shuffled, Config()), expected)
+
+
+# --- refusals ---------------------------------------------------------------------------------
+
+
+def test_rings_too_short_for_a_window_are_refused_and_one_long_one_is_enough() -> None:
+    scan = noisy_scan(0, points_per_ring=10)
+    with pytest.raises(SweepError, match="longest of 4 rings has 10 points, at least 11"):
+        extract_features(scan, Config())
+    longer = noisy_scan(0, points_per_ring=11)
+    assert len(extract_features(longer, ROUGH_TOO).planes) > 0
+
+
+def test_one_ring_is_refused() -> None:
+    scan = noisy_scan(0, rings=1)
+    with pytest.raises(SweepError, match=r"1 ring\(s\) from field.*expected 2 to 256"):
+        extract_features(scan, Config())
+
+
+# --- noise and surfaces -----------------------------------------------------------------------
+
+
+def along_wall(distance: float, azimuths: np.ndarray, noise: np.ndarray | float = 0.0):
+    """(3, N) one ring on a wall at y = distance, ranges off by noise."""
+    ranges = distance / np.sin(azimuths) + noise
+    return np.stack([ranges * np.cos(azimuths), ranges * np.sin(azimuths), 0 * ranges]).astype("f4")
+
+
+GRAZED = np.deg2rad(np.arange(6.0, 174.0, 0.2))
+
+
+def test_a_wall_is_smooth_and_straight_however_grazed() -> None:
+    wall = along_wall(1.7, GRAZED)
+    middle = np.arange(5, len(GRAZED) - 5)
+    assert curvature(wall, 5)[:20].max() > 1.0  # what LOAM's curvature takes for an edge
+    assert roughness(wall)[middle].max() < 2e-3
+    assert kinks(wall, 5, middle).max() < 2e-3
+
+
+def test_roughness_and_kinks_are_in_units_of_the_range_noise() -> None:
+    rng = np.random.default_rng(0)
+    wall = along_wall(8.0, GRAZED, 0.02 * rng.normal(size=len(GRAZED)))
+    middle = np.arange(5, len(GRAZED) - 5)
+    assert np.sqrt(np.mean(kinks(wall, 5, middle) ** 2)) == pytest.approx(0.02, rel=0.2)
+    smooth = roughness(wall)[middle]
+    assert 0.008 < np.median(smooth) < 0.02  # the smoothest of three windows
+    # One window alone: the residual variance of a fitted line, as numpy finds it.
+    few = along_wall(8.0, GRAZED[:5], 0.02 * rng.normal(size=5))
+    squared = np.sum(few.astype(float) ** 2, axis=0)
+    inverse, place = 1 / np.sqrt(squared), np.arange(5)
+    off = (inverse - np.polyval(np.polyfit(place, inverse, 1), place)) * squared[2]
+    assert roughness(few)[2] == pytest.approx(np.sqrt(np.sum(off**2) / 3), rel=0.1)
+
+
+def test_next_to_a_step_a_surface_is_smooth_and_the_step_is_a_kink() -> None:
+    step = along_wall(8.0, GRAZED, np.where(np.arange(len(GRAZED)) < 400, 0.0, 3.0))
+    rough = roughness(step)
+    assert rough[390:410].max() < 0.01
+    # Five neighbours are beyond the step: 5 * 3 m * (8 m / 11 m), or its inverse, over sqrt(110).
+    expected = np.array([0.0, 15.0 * 8 / 11, 15.0 * 11 / 8]) / np.sqrt(110)
+    assert kinks(step, 5, np.array([380, 399, 400])) == pytest.approx(expected, abs=0.02)
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(0.02, True), (0.3, False)])
+def test_foliage_gives_no_planes_and_a_noisy_wall_does(noise: float, kept: bool) -> None:
+    scan = world(lambda azimuth: np.full(len(azimuth), 12.0))
+    ranges = np.linalg.norm(scan.points, axis=1)
+    off = noise * np.random.default_rng(1).normal(size=len(ranges))
+    scan = replace(scan, points=scan.points * (1 + off / ranges)[:, None])
+    bare = len(extract_features(scan, ROUGH_TOO).planes)
+    share = len(extract_features(scan, Config()).planes) / bare
+    assert share > 0.9 if kept else share < 0.4
+
+
+def test_too_short_a_sweep_is_rough_everywhere() -> None:
+    assert np.isinf(roughness(along_wall(8.0, GRAZED[:4]))).all()
+
+
+# --- real data --------------------------------------------------------------------------------
+
+
+def real_scan(folder: Path, number: int = 0) -> Scan:
+    path = folder / f"{number:06d}.bin"
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    return Scan(np.fromfile(path, dtype=np.float32).reshape(-1, 4)[:, :3], 0)
+
+
+def test_town_gives_what_the_published_code_gave(shared_data: Path) -> None:
+    # Edge points per sweep in the recording of the C++ loam_velodyne on the same sweeps.
+    for number, recorded in enumerate((1813, 1805, 1791, 1788, 1808, 1789)):
+        scan = real_scan(shared_data / "sim_town" / "scans", number)
+        features = extract_features(scan, Config(features=LOAM))
+        assert abs(len(features.edges) - recorded) <= 5
+
+
+def test_kitti_and_ouster_sweeps(shared_data: Path) -> None:
+    for folder, model in (("kitti_2011_09_26_0002", "hdl64"), ("ouster_os1_128", "os1-128")):
+        scan = real_scan(shared_data / folder / "velodyne")
+        rings = 64 if model == "hdl64" else 128
+        times = SensorConfig(times="none" if model == "os1-128" else "auto")
+        features = extract_features(scan, Config(sensor=times))
+        assert len(features.sharp) > rings * 6
+        assert len(features.flat) > rings * 12
+        assert len(features.edges) < rings * 120
+        assert features.plane_rings.max() == rings - 1
+
+
+@pytest.mark.parametrize("known", [False, True])
+def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None:
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-2.0, 2.0, (500, 3))
+    times = rng.uniform(0.0, 0.1, 500)
+    raw = Features.from_points(7, points, points[:300])
+    raw = replace(raw, edge_times=times, plane_times=times[:300], span=(0.0, 0.1), not_finite=3)
+    if known:
+        raw = replace(raw, edge_kinks=times + 1.0)
+    config = replace(Config().map, edge_voxel=0.5, plane_voxel=1.0)
+    thin = thinned(raw, config)
+    for size, held, moments, all_points in (
+        (0.5, thin.edges, thin.edge_times, points),
+        (1.0, thin.planes, thin.plane_times, points[:300]),
+    ):
+        cells = [tuple(cell) for cell in np.floor(all_points / size).astype(int)]
+        assert len(held) == len(moments) == len(set(cells))
+        for point, moment in zip(held, moments, strict=True):
+            inside = [cell == tuple(np.floor(point / size).astype(int)) for cell in cells]
+            np.testing.assert_allclose(point, all_points[inside].mean(axis=0), atol=1e-12)
+            assert moment == pytest.approx(times[: len(inside)][inside].mean(), abs=1e-12)
+    assert (thin.stamp, thin.span, thin.not_finite) == (7, (0.0, 0.1), 3)
+    assert thin.edge_kinks is not None
+    expected = thin.edge_times + 1.0 if known else np.full(len(thin.edges), np.inf)
+    np.testing.assert_allclose(thin.edge_kinks, expected)
+    assert len(thin.edge_rings) == len(thin.edges)
+    assert len(thin.plane_rings) == len(thin.planes)
+    assert thinned(thin, config) is thin
+    assert thinned(thin, replace(config, plane_voxel=2.0)) is not thin

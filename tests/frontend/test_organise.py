@@ -1,0 +1,385 @@
+"""Rings and times of a sweep: every source, every refusal."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config, DeskewConfig, SensorConfig
+from loam_gtsam.frontend.organise import assign_rings, organise, usable_columns
+from loam_gtsam.frontend.rings import ELEVATIONS, rings_from_file_order
+from loam_gtsam.types import Scan, SweepError
+
+VLP16 = ELEVATIONS["vlp16"]
+COLUMNS = 360
+
+
+def sensor(**fields: object) -> Config:
+    return Config(sensor=SensorConfig(**fields))  # type: ignore[arg-type]
+
+
+def firing(
+    elevations: np.ndarray, clockwise: bool = True, start_deg: float = 180.0, turn: float = 1.0
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(points, rings, fraction of the sweep) in firing order: column after column.
+
+    Half a step off the start azimuth, so that rounding decides nothing.
+    """
+    columns = round(COLUMNS * turn)
+    fraction = (np.arange(columns) + 0.5) / COLUMNS
+    azimuth = np.deg2rad(start_deg) + (-1 if clockwise else 1) * 2 * np.pi * fraction
+    distance = 10.0 + 3.0 * np.sin(3 * azimuth)
+    azimuth, elevation = np.meshgrid(azimuth, np.deg2rad(elevations), indexing="ij")
+    horizontal = distance[:, None] * np.cos(elevation)
+    points = np.stack(
+        (
+            horizontal * np.cos(azimuth),
+            horizontal * np.sin(azimuth),
+            distance[:, None] * np.sin(elevation),
+        ),
+        axis=-1,
+    ).reshape(-1, 3)
+    rings = np.tile(np.arange(len(elevations)), columns)
+    return points.astype(np.float32), rings, np.repeat(fraction, len(elevations))
+
+
+def rings_of(scan: Scan, config: Config) -> np.ndarray:
+    return assign_rings(usable_columns(scan, config), config.sensor).rings
+
+
+# --- usable points ----------------------------------------------------------------------------
+
+
+def test_drops_points_with_all_their_columns() -> None:
+    points, rings, fraction = firing(VLP16)
+    bad = np.array([3, 500, 1000, 4000])
+    points[bad] = [[np.nan] * 3, [np.inf, 0, 0], [0.1, 0.1, 0.1], [200.0, 0, 0]]
+    times = 0.1 * fraction
+    sweep = organise(Scan(points, 0, times=times, rings=rings), Config())
+    assert sweep.dropped == 4
+    kept = np.setdiff1d(np.arange(len(points)), bad)
+    assert np.array_equal(np.sort(sweep.index), kept)
+    assert np.array_equal(sweep.times, times[sweep.index])
+    assert np.array_equal(sweep.xyz.T, points[sweep.index])
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])
+def test_refuses_a_sweep_without_usable_points(value: float) -> None:
+    with pytest.raises(SweepError, match=r"sweep of 50 points.*0 of them within 0\.5 to 120 m"):
+        organise(Scan(np.full((50, 3), value), 0), Config())
+
+
+def test_refuses_an_empty_sweep_and_ten_points_but_takes_eleven() -> None:
+    points, rings, _ = firing(VLP16)
+    for count in (0, 10):
+        with pytest.raises(SweepError, match=f"sweep of {count} points.*at least 11"):
+            organise(Scan(points[:count], 0, rings=rings[:count]), sensor(times="none"))
+    assert len(organise(Scan(points[:11], 0, rings=rings[:11]), sensor(times="none")).index) == 11
+
+
+def test_a_sweep_in_millimetres_is_asked_about_its_unit() -> None:
+    points = firing(VLP16)[0]
+    with pytest.raises(
+        SweepError, match=r"0 of them within .*; half are farther than \d+ m: are they in"
+    ):
+        organise(Scan(points * 1e3, 0), Config())
+
+
+# --- rings ------------------------------------------------------------------------------------
+
+
+def test_all_sources_agree() -> None:
+    points, rings, _ = firing(VLP16)
+    by_row = np.argsort(rings, kind="stable")
+    from_field = rings_of(Scan(points, 0, rings=rings), sensor(rings="field"))
+    from_elevation = rings_of(Scan(points, 0), sensor(rings="elevation"))
+    from_rows = rings_of(Scan(points[by_row], 0, rows=16), sensor(rings="rows"))
+    # Ring after ring in ascending azimuth from straight ahead, as KITTI's files are.
+    azimuth = np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi)
+    by_file = np.lexsort((azimuth, rings))
+    from_file = rings_of(Scan(points[by_file], 0), sensor(rings="rows"))
+    assert np.array_equal(from_field, rings)
+    assert np.array_equal(from_elevation, rings)
+    assert np.array_equal(from_rows, rings[by_row])
+    assert np.array_equal(from_file, rings[by_file])
+
+
+def test_auto_prefers_field_then_rows_then_elevation() -> None:
+    points, rings, _ = firing(VLP16)
+    by_row = np.argsort(rings, kind="stable")
+    config = Config()
+    for scan, method in (
+        (Scan(points, 0, rings=rings), "field"),
+        (Scan(points[by_row], 0, rows=16), "rows"),
+        (Scan(points[by_row], 0), "file order"),
+        (Scan(points, 0), "elevation"),
+    ):
+        found = organise(scan, config).rings
+        assert (found.method, found.count) == (method, 16)
+        assert "16 rings" in found.note
+
+
+@pytest.mark.parametrize("largest", [900, 100_000])
+def test_ring_labels_of_any_kind_are_ordered_by_elevation(largest: int) -> None:
+    points, rings, _ = firing(VLP16)
+    labels = np.array([7, -3, largest, 12, 5, 99, 44, 8, 1, 2, 3, 4, 6, 9, 10, 11])
+    scan = Scan(points, 0, rings=labels[rings])
+    assert np.array_equal(rings_of(scan, Config()), rings)
+
+
+def test_rows_survive_dropped_points_and_empty_rows() -> None:
+    points, rings, _ = firing(VLP16)
+    order = np.argsort(rings, kind="stable")
+    image, ring_image = points[order].copy(), rings[order]
+    image[ring_image == 4] = np.nan
+    image[::7] = np.nan
+    sweep = organise(Scan(image, 0, rows=16), Config())
+    assert sweep.rings.count == 15
+    expected = ring_image - (ring_image > 4)
+    columns = usable_columns(Scan(image, 0, rows=16), Config())
+    assert np.array_equal(sweep.rings.rings, expected[columns.index])
+
+
+@pytest.mark.parametrize("model", sorted(ELEVATIONS))
+def test_velodyne_tables_are_detected(model: str) -> None:
+    points, rings, _ = firing(ELEVATIONS[model])
+    noise = np.random.default_rng(1).normal(0, 0.02, (len(points), 1))
+    points = (points * (1 + noise / 10)).astype(np.float32)  # range noise leaves the elevation
+    found = organise(Scan(points, 0), Config()).rings
+    assert np.array_equal(found.rings, rings)
+    assert model in found.note
+    assert np.array_equal(rings_of(Scan(points, 0), sensor(model=model)), rings)
+
+
+def test_beams_that_saw_nothing_leave_no_hole_in_the_numbers() -> None:
+    points, rings, _ = firing(VLP16)
+    seen = (rings < 9) | (rings > 11)
+    found = organise(Scan(points[seen], 0), Config()).rings
+    assert found.count == 13
+    assert np.array_equal(found.rings, rings[seen] - 3 * (rings[seen] > 11))
+
+
+def test_stray_returns_make_no_beams() -> None:
+    points, rings, _ = firing(np.linspace(-20.0, 20.5, 32))
+    stray = np.random.default_rng(0).integers(0, len(points), 150)
+    points[stray, 2] += np.linspace(-0.8, 0.8, 150, dtype=np.float32)
+    found = organise(Scan(points, 0), Config()).rings
+    assert found.count == 32
+    good = np.setdiff1d(np.arange(len(points)), stray)
+    assert np.array_equal(found.rings[good], rings[good])
+
+
+@pytest.mark.parametrize("cut", [0.0, 180.0, 30.0])
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_file_order_with_ragged_ring_starts(cut: float, sign: float) -> None:
+    # At a quarter turn the first ring may begin late; elsewhere the cut is known to half a degree.
+    late = 2.0 if cut % 90.0 == 0.0 else 0.4
+    turned = [np.arange(late, 359.5, 0.2), np.arange(0.1, 359.7, 0.2), np.arange(0.3, 359.9, 0.2)]
+    azimuth = np.deg2rad(cut + sign * np.concatenate(turned))
+    azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth)).astype(np.float32)
+    found, _ = rings_from_file_order(azimuth)
+    assert found is not None
+    assert np.array_equal(found.rings, np.repeat(np.arange(3), [len(part) for part in turned]))
+
+
+@pytest.mark.parametrize("beams", [16, 32, 64, 128])
+@pytest.mark.parametrize("height", [0.0, 0.03618])
+def test_ouster_beams_are_found_in_the_data(beams: int, height: float) -> None:
+    # Units differ from the nominal angles: stretch the spacing smoothly.
+    nominal = np.linspace(-1.0, 1.0, beams)
+    elevations = (nominal - 0.03 * np.sin(3 * nominal)) * 21.3
+    points, rings, _ = firing(elevations)
+    points[:, 2] += np.float32(height)
+    config = sensor(model=f"os1-{beams}", min_range=3.0)
+    assert np.array_equal(rings_of(Scan(points, 0), config), rings)
+    assert np.array_equal(rings_of(Scan(points, 0), Config()), rings)
+
+
+def test_model_with_fewer_beams_than_the_data_is_refused() -> None:
+    points, _, _ = firing(np.linspace(-21.0, 20.7, 64))
+    assert rings_of(Scan(points, 0), sensor(model="os1-64")).max() == 63
+    with pytest.raises(SweepError, match="near one of 64, at most 32 expected"):
+        rings_of(Scan(points, 0), sensor(model="os1-32"))
+
+
+def test_velodyne_model_whose_span_does_not_hold_the_data_is_refused() -> None:
+    points, _, _ = firing(ELEVATIONS["hdl32"])
+    with pytest.raises(SweepError, match=r"points lie between .* of vlp16 \(-15 to 15 degrees\)"):
+        rings_of(Scan(points, 0), sensor(model="vlp16"))
+
+
+def test_elevations_without_beams_are_refused_with_what_was_tried() -> None:
+    rng = np.random.default_rng(0)
+    direction = rng.normal(size=(5000, 3))
+    points = 10 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+    with pytest.raises(SweepError) as caught:
+        organise(Scan(points, 0), Config())
+    for part in ("ring field: the scan has none", "row order: azimuth", "elevation: no table",
+                 "set sensor.rings and sensor.model"):  # fmt: skip
+        assert part in str(caught.value)
+
+
+def test_missing_ring_field_is_refused_when_asked_for() -> None:
+    points, _, _ = firing(VLP16)
+    with pytest.raises(SweepError, match="ring field: the scan has none"):
+        organise(Scan(points, 0), sensor(rings="field"))
+
+
+@pytest.mark.parametrize("count", [1, 300])
+def test_too_few_and_too_many_rings_are_refused(count: int) -> None:
+    points, _, _ = firing(VLP16)
+    labels = np.arange(len(points)) % count
+    with pytest.raises(SweepError, match=f"{count} ring.*expected 2 to 256"):
+        organise(Scan(points, 0, rings=labels), Config())
+
+
+def test_one_turn_in_file_order_is_one_ring_and_refused() -> None:
+    points, rings, _ = firing(VLP16)
+    with pytest.raises(SweepError, match=r"runs around 1 time\(s\)"):
+        rings_of(Scan(points[rings == 3], 0), sensor(rings="rows"))
+
+
+# --- times ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+@pytest.mark.parametrize("start_deg", [180.0, 0.0, 90.0])
+@pytest.mark.parametrize(("stamp", "offset"), [("start", 0.0), ("middle", -0.5), ("end", -1.0)])
+def test_times_from_azimuth(clockwise: bool, start_deg: float, stamp: str, offset: float) -> None:
+    points, rings, fraction = firing(VLP16, clockwise, start_deg)
+    config = sensor(times="azimuth", start_azimuth_deg=start_deg, period=0.2, stamp=stamp)
+    sweep = organise(Scan(points, 0, rings=rings), config)
+    assert sweep.times == pytest.approx(0.2 * (fraction[sweep.index] + offset), abs=1e-6)
+    assert sweep.span == pytest.approx((0.2 * offset, 0.2 * (offset + 1.0)))
+    assert ("counterclockwise" in sweep.timing.note) != clockwise
+
+
+def test_sweep_that_overlaps_its_start_keeps_its_order() -> None:
+    points, rings, fraction = firing(VLP16, start_deg=187.0, turn=1.04)
+    sweep = organise(Scan(points, 0, rings=rings), Config())
+    expected = 0.1 * (fraction[sweep.index] - 7.0 / 360.0)
+    assert expected.min() < 0.0 < 0.1 < expected.max()
+    assert sweep.times == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_spin_that_contradicts_the_order_is_obeyed() -> None:
+    points, rings, _ = firing(VLP16, start_deg=187.0, turn=1.04)
+    sweep = organise(Scan(points, 0, rings=rings), sensor(spin="counterclockwise"))
+    azimuth = np.arctan2(sweep.xyz[1], sweep.xyz[0])
+    assert sweep.times == pytest.approx(0.1 * (azimuth / (2 * np.pi) + 0.5), abs=1e-6)
+
+
+def test_ring_major_files_do_not_tell_the_sense_but_can_be_told() -> None:
+    points, rings, fraction = firing(VLP16)
+    ascending = np.lexsort((np.arctan2(points[:, 1], points[:, 0]) % (2 * np.pi), rings))
+    for spin, expected in (("auto", fraction), ("counterclockwise", 1.0 - fraction)):
+        sweep = organise(Scan(points[ascending], 0), sensor(spin=spin))
+        assert sweep.times == pytest.approx(0.1 * expected[ascending][sweep.index], abs=1e-6)
+        same = np.diff(sweep.rings.rings[: len(sweep.index) // 16]) == 0
+        assert np.all(np.diff(sweep.times[: len(sweep.index) // 16])[same] > 0)
+
+
+def test_shuffled_points_need_the_sense_of_rotation() -> None:
+    points, rings, fraction = firing(VLP16)
+    order = np.random.default_rng(0).permutation(len(points))
+    scan = Scan(points[order], 0, rings=rings[order])
+    with pytest.raises(SweepError, match=r"cannot tell the sense of rotation.*set sensor\.spin"):
+        organise(scan, Config())
+    sweep = organise(scan, sensor(spin="clockwise"))
+    assert sweep.times == pytest.approx(0.1 * fraction[order][sweep.index], abs=1e-6)
+
+
+def test_times_from_the_field_and_its_absence() -> None:
+    points, rings, fraction = firing(VLP16)
+    times = 0.1 * fraction - 0.03
+    sweep = organise(Scan(points, 0, rings=rings, times=times), Config())
+    assert sweep.timing.method == "field"
+    assert sweep.span == (times.min(), times.max())
+    assert np.array_equal(sweep.times, times[sweep.index])
+    given = Scan(points, 0, rings=rings, times=times, span=(-0.05, 0.2))
+    assert organise(given, Config()).span == (-0.05, 0.2)
+    with pytest.raises(SweepError, match=r"no times; set sensor\.times to azimuth"):
+        organise(Scan(points, 0, rings=rings), sensor(times="field"))
+
+
+def test_no_times_when_told_or_not_needed() -> None:
+    points, rings, _ = firing(VLP16)
+    scan = Scan(points, 0, rings=rings, times=np.linspace(0, 0.1, len(points)))
+    for config, given in (
+        (sensor(times="none"), scan),
+        (Config(deskew=DeskewConfig(enabled=False)), replace(scan, times=None)),
+    ):
+        sweep = organise(given, config)
+        assert (sweep.timing.method, sweep.span) == ("none", (0.0, 0.0))
+        assert not sweep.times.any()
+    assert organise(replace(scan, times=None), Config()).timing.method == "azimuth"
+
+
+def test_a_few_nonsense_times_are_dropped_but_wrong_units_are_refused() -> None:
+    points, rings, fraction = firing(VLP16)
+    times = 0.1 * fraction
+    times[[5, 77]] = 1e9, np.nan
+    sweep = organise(Scan(points, 0, rings=rings, times=times), Config())
+    assert sweep.dropped == 2
+    assert sweep.span[1] < 0.1
+    with pytest.raises(SweepError, match=r"point times span .* s in one sweep.*not in seconds"):
+        organise(Scan(points, 0, rings=rings, times=1e9 * fraction), Config())
+
+
+# --- order ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("times", ["field", "none"])
+def test_order_is_ring_by_ring_in_firing_order(times: str) -> None:
+    points, rings, fraction = firing(VLP16)
+    shuffled = np.random.default_rng(2).permutation(len(points))
+    reference = np.lexsort((fraction, rings))
+    for order in (np.arange(len(points)), reference, reference[::-1], shuffled):
+        scan = Scan(points[order], 0, rings=rings[order], times=0.1 * fraction[order])
+        sweep = organise(scan, sensor(times=times))
+        assert np.array_equal(order[sweep.index], reference)
+        assert np.array_equal(sweep.ring_starts, np.arange(17) * COLUMNS)
+        assert np.array_equal(sweep.ring_of_start, np.arange(16))
+
+
+# --- real data --------------------------------------------------------------------------------
+
+
+def read_bin(path: Path) -> np.ndarray:
+    if not path.exists():
+        pytest.skip(f"no {path}")
+    return np.fromfile(path, dtype=np.float32).reshape(-1, 4)[:, :3]
+
+
+def test_simulated_town(shared_data: Path) -> None:
+    points = read_bin(shared_data / "sim_town" / "scans" / "000007.bin")
+    sweep = organise(Scan(points, 0), Config())
+    assert (sweep.rings.count, sweep.rings.method) == (16, "elevation")
+    azimuth = np.arctan2(points[:, 1].astype(float), points[:, 0])[sweep.index]
+    assert sweep.times == pytest.approx(0.1 * (np.pi - azimuth) / (2 * np.pi), abs=1e-6)
+
+
+def test_kitti_has_64_rings_falling_in_elevation(shared_data: Path) -> None:
+    points = read_bin(shared_data / "kitti_2011_09_26_0002" / "velodyne" / "000020.bin")
+    sweep = organise(Scan(points, 0), sensor(stamp="middle"))
+    assert (sweep.rings.count, sweep.rings.method) == (64, "file order")
+    slope = sweep.xyz[2] / np.hypot(sweep.xyz[0], sweep.xyz[1])
+    medians = [np.median(part) for part in np.split(slope, sweep.ring_starts[1:-1])]
+    assert np.all(np.diff(medians) < 0)
+    forward = np.abs(np.arctan2(sweep.xyz[1], sweep.xyz[0])) < 0.01
+    assert np.abs(sweep.times[forward]).max() < 2e-4  # the stamp is when it faces forward
+
+
+def test_ouster_has_128_rings_with_one_point_a_column(shared_data: Path) -> None:
+    folder = shared_data / "ouster_os1_128"
+    points = read_bin(folder / "velodyne" / "000001.bin")
+    nanoseconds = np.fromfile(folder / "t_ns" / "000001.u64", dtype=np.uint64).astype(np.int64)
+    times = 1e-9 * (nanoseconds - nanoseconds[0])
+    sweep = organise(Scan(points, 0, times=times), Config())
+    assert sweep.rings.count == 128
+    for part in np.split(sweep.times, sweep.ring_starts[1:-1]):
+        repeated = np.count_nonzero(np.diff(part) == 0.0)
+        assert repeated <= 0.01 * len(part)

@@ -1,0 +1,130 @@
+"""Thin things: found where they stand alone, and not where they do not."""
+
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config, FeatureConfig
+from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
+from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.frontend.poles import find_posts
+
+STEP = np.deg2rad(0.2)
+
+
+def ring(ranges, first=0.0):
+    """(3, N) points of one level ring, one beam every 0.2 degrees; lost beams are NaN."""
+    angle = first - STEP * np.arange(len(ranges))
+    points = np.array([np.cos(angle), np.sin(angle), 0.0 * angle]) * ranges
+    return points[:, np.isfinite(ranges)].astype(np.float32)
+
+
+def found(points, depth=0.5, width=0.5, most=10, starts=None):
+    bounds = np.array([0, points.shape[1]] if starts is None else starts)
+    return find_posts(points, bounds, depth, width, most)
+
+
+def wall(count=200, metres=12.0):
+    return np.full(count, metres)
+
+
+def test_a_run_before_a_wall_is_one_post_on_the_axis():
+    ranges = wall()
+    # A round post of 0.1 m at 8 m: as a beam meets it.
+    angle = STEP * (np.arange(200) - 100.0)
+    across = 8.0 * np.sin(angle)
+    met = np.abs(across) < 0.1
+    ranges[met] = 8.0 * np.cos(angle[met]) - np.sqrt(0.01 - across[met] ** 2)
+    posts = found(ring(ranges))
+    assert len(posts) == 1
+    assert (posts.first[0], posts.last[0]) == (np.flatnonzero(met)[0], np.flatnonzero(met)[-1])
+    assert np.linalg.norm(posts.points[0]) == pytest.approx(8.0, abs=0.02)
+    assert posts.depths[0] == pytest.approx(4.0, abs=0.15)
+    assert np.array_equal(np.flatnonzero(posts.members(200)), np.flatnonzero(met))
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [
+        ({}, 1),
+        ({"depth": 4.5}, 0),  # it stands only 4 m before the wall
+        ({"width": 0.1}, 0),  # five beams at 8 m are 0.14 m
+        ({"most": 4}, 0),
+    ],
+)
+def test_depth_width_and_number_decide(change, count):
+    ranges = wall()
+    ranges[100:105] = 8.0
+    assert len(found(ring(ranges), **change)) == count
+
+
+def test_a_hole_in_a_wall_and_a_step_are_no_posts():
+    hole = wall()
+    hole[100:105] = 15.0
+    assert len(found(ring(hole))) == 0
+    step = wall()
+    step[:100] = 8.0
+    assert len(found(ring(step))) == 0
+    step[100:105] = 10.0  # nearer than one side only
+    assert len(found(ring(step))) == 0
+
+
+def test_before_the_sky_nothing_has_to_be_farther():
+    ranges = np.full(200, np.nan)
+    ranges[50:54], ranges[120:123] = 20.0, 30.0
+    posts = found(ring(ranges))
+    assert len(posts) == 2
+    assert np.isinf(posts.depths).all()
+    # The only thing on a ring: its end is followed by its start, a turn later.
+    ranges[120:123] = np.nan
+    assert len(found(ring(ranges))) == 1
+
+
+def test_one_lost_beam_does_not_cut_a_wall_and_two_only_with_depth():
+    lost = wall()
+    lost[[60, 66, 67, 72]] = np.nan
+    assert len(found(ring(lost))) == 0  # twelve metres on either side of every gap
+
+
+def test_rings_do_not_touch():
+    ranges = wall()
+    ranges[-3:] = 8.0
+    both = np.concatenate([ring(ranges), ring(wall(metres=9.0))], axis=1)
+    posts = found(both, starts=[0, 200, 400])
+    # The three are cut from the next ring; their own ring goes on, a turn later, at its start.
+    assert posts.members(400)[200:].sum() == 0
+
+
+def test_no_points_of_a_kind_is_no_error():
+    assert len(found(ring(wall()))) == 0
+    assert found(ring(wall())).points.shape == (0, 3)
+    assert not found(ring(wall())).members(200).any()
+
+
+def scene():
+    """Three poles of 6 cm on flat ground, at 6, 12 and 25 m."""
+    poles = [[6.0, 0.0, 0.06, -1.0, 5.0], [0.0, 12.0, 0.06, -1.0, 5.0], [-25.0, 1.0, 0.06, -1, 5.0]]
+    way = np.stack([0.0 * np.arange(6.0), 0.5 * np.arange(6.0)], axis=1)
+    return Scene("poles", Solids(cylinders=np.array(poles)), way, False, 0.2, 1.5, (0, 0, 0, 0))
+
+
+def near_poles(features, world, points):
+    truth = world.world_T_start
+    there = points @ truth[:3, :3].T + truth[:3, 3]
+    gaps = np.linalg.norm(there[:, None, :2] - world.scene.solids.cylinders[None, :, :2], axis=2)
+    return (gaps.min(axis=1) < 0.4) & (there[:, 2] > 0.2)
+
+
+def test_poles_become_edges_near_their_axes_and_stay_out_of_the_planes():
+    world = SimulatedWorld(scene(), frames=2)
+    with_posts = extract_features(world[0], Config())
+    without = extract_features(world[0], Config(features=FeatureConfig(post_depth=0.0)))
+    on = near_poles(with_posts, world, with_posts.edges)
+    assert on.sum() > 20
+    assert on.sum() > 2 * near_poles(without, world, without.edges).sum()
+    points = with_posts.edges[on] @ world.world_T_start[:3, :3].T + world.world_T_start[:3, 3]
+    axes = world.scene.solids.cylinders[:, :2]
+    off = np.linalg.norm(points[:, None, :2] - axes[None], axis=2).min(axis=1)
+    assert np.median(off) < 0.03
+    assert with_posts.edge_kinks[on].min() > 0.5
+    assert near_poles(with_posts, world, with_posts.planes).sum() == 0
+    assert with_posts.sharp.max(initial=-1) < len(with_posts.edges)

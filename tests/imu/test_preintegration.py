@@ -1,0 +1,631 @@
+"""Pre-integrated motion: closed forms, blind directions, biases, and behaviour in trouble."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.imu.preintegration import InertialOdometry
+from loam_gtsam.imu.preintegration_factors import scan_factor, scan_residual, square_root
+from loam_gtsam.types import ImuSamples, InputError, SweepError
+
+START = 1_700_000_000_000_000_000
+STEP = 5_000_000  # nanoseconds, 200 Hz
+FRAME = 100_000_000
+DOWN = np.array([0.0, 0.0, -9.81])
+UP = -DOWN
+KNOWN = np.diag([1e6] * 3 + [1e4] * 3)  # 1 mrad, 1 cm
+GOOD = {
+    "pose_sigma": (1e-6, 1e-6),
+    "velocity_sigma": 1e-6,
+    "gyro_bias_sigma": 1e-7,
+    "acceleration_bias_sigma": 1e-7,
+    "gravity_sigma": 1e-8,
+}
+"""Everything known at the start."""
+
+
+def samples(gyro=(0.0, 0.0, 0.0), acceleration=UP, seconds=1.0, before=0.0):
+    """Samples from START; gyro and acceleration are vectors, or functions of (N,) seconds."""
+    stamps = START + np.arange(-round(before * 200), round(seconds * 200) + 1) * STEP
+    t = (stamps - START) * 1e-9
+    rows = [
+        np.asarray(value(t) if callable(value) else np.tile(value, (len(t), 1)), dtype=float)
+        for value in (gyro, acceleration)
+    ]
+    return ImuSamples(stamps, None, *rows)
+
+
+def odometry(config=None, gravity=DOWN, pose=None, velocity=None, **known):
+    return InertialOdometry(
+        config or ImuConfig(), gravity, START, pose or gtsam.Pose3(), velocity, **known
+    )
+
+
+def pose(rotation, translation):
+    return gtsam.Pose3(gtsam.Rot3(rotation), np.asarray(translation, dtype=float))
+
+
+# -- closed forms ----------------------------------------------------------------------------------
+
+
+def test_constant_acceleration():
+    force = UP + np.array([1.5, -0.5, 0.2])
+    found = odometry(velocity=np.array([2.0, 0.0, 0.0])).predict(
+        START + FRAME * 5, samples(acceleration=force)
+    )
+    np.testing.assert_allclose(
+        found.map_T_lidar.translation(),
+        [2.0 * 0.5 + 1.5 * 0.125, -0.5 * 0.125, 0.2 * 0.125],
+        atol=1e-9,
+    )
+    np.testing.assert_allclose(found.velocity, [2.75, -0.25, 0.1], atol=1e-9)
+    assert found.stamp == START + FRAME * 5
+
+
+def test_constant_turn():
+    rate, speed, t = 0.8, 5.0, 0.5
+    found = odometry(velocity=np.array([speed, 0.0, 0.0])).predict(
+        START + round(t * 1e9), samples((0.0, 0.0, rate), UP + np.array([0.0, rate * speed, 0.0]))
+    )
+    angle, radius = rate * t, speed / rate
+    np.testing.assert_allclose(
+        found.map_T_lidar.matrix(),
+        pose(
+            gtsam.Rot3.Rz(angle).matrix(),
+            [radius * np.sin(angle), radius * (1 - np.cos(angle)), 0.0],
+        ).matrix(),
+        atol=2e-5,  # 200 pieces a second, each with a constant rate
+    )
+    np.testing.assert_allclose(
+        found.velocity, [speed * np.cos(angle), speed * np.sin(angle), 0.0], atol=2e-5
+    )
+
+
+def test_a_map_that_is_not_levelled():
+    # Everything as above, seen from a map tilted by T: poses, velocities and gravity turn with it.
+    tilt = gtsam.Rot3.RzRyRx(0.3, -0.4, 0.5)
+    force = UP + np.array([1.5, -0.5, 0.2])
+    found = odometry(
+        gravity=tilt.matrix() @ DOWN,
+        pose=pose(tilt.matrix(), [10.0, 20.0, 30.0]),
+        velocity=tilt.matrix() @ [2.0, 0.0, 0.0],
+    ).predict(START + FRAME * 5, samples(acceleration=force))
+    level = odometry(velocity=np.array([2.0, 0.0, 0.0])).predict(
+        START + FRAME * 5, samples(acceleration=force)
+    )
+    np.testing.assert_allclose(
+        found.map_T_lidar.matrix(),
+        pose(tilt.matrix(), [10.0, 20.0, 30.0]).compose(level.map_T_lidar).matrix(),
+        atol=1e-9,
+    )
+    np.testing.assert_allclose(found.velocity, tilt.matrix() @ level.velocity, atol=1e-9)
+    np.testing.assert_allclose(found.covariance, level.covariance, rtol=1e-6, atol=1e-12)
+
+
+def test_an_imu_off_the_lidar_that_starts_to_turn():
+    # The lidar turns on the spot with 2 rad/s^2; the IMU feels both of Euler's and the centripetal.
+    arm, angular = np.array([0.5, 0.2, 0.3]), 2.0
+
+    def rate(t):
+        return np.outer(angular * t, [0.0, 0.0, 1.0])
+
+    def force(t):
+        w = rate(t)
+        return UP + np.cross([0.0, 0.0, angular], arm) + np.cross(w, np.cross(w, arm))
+
+    found = odometry(ImuConfig(lidar_t_imu=tuple(arm))).predict(
+        START + FRAME * 3, samples(rate, force)
+    )
+    np.testing.assert_allclose(found.map_T_lidar.translation(), 0.0, atol=1e-5)
+    np.testing.assert_allclose(found.velocity, 0.0, atol=1e-4)
+    assert found.map_T_lidar.rotation().yaw() == pytest.approx(0.5 * angular * 0.09, abs=1e-9)
+
+
+def test_biases_are_taken_off():
+    gyro, acceleration = np.array([0.02, -0.01, 0.03]), np.array([0.1, 0.2, -0.1])
+    found = odometry(gyro_bias=gyro, acceleration_bias=acceleration).predict(
+        START + FRAME, samples(gyro, UP + acceleration)
+    )
+    np.testing.assert_allclose(found.map_T_lidar.matrix(), np.eye(4), atol=1e-12)
+
+
+@pytest.mark.parametrize("offset", [0, 1, 1_234_567, STEP - 1])
+def test_the_ends_are_cut_and_interpolated(offset):
+    # Acceleration rises linearly: the straight lines between samples are exact, so that the
+    # velocity is too, wherever between two samples a frame begins and ends.
+    jerk = 3.0
+    data = samples(acceleration=lambda t: UP + np.outer(jerk * t, [1.0, 0.0, 0.0]))
+    begin, end = offset, FRAME + offset // 2
+    odo = InertialOdometry(ImuConfig(), DOWN, START + begin, gtsam.Pose3())
+    found = odo.predict(START + end, data)
+    expected = 0.5 * jerk * ((end * 1e-9) ** 2 - (begin * 1e-9) ** 2)
+    assert found.velocity[0] == pytest.approx(expected, abs=1e-9)
+
+
+# -- the covariance of a prediction ----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (0.5, -0.3, 0.2)])
+@pytest.mark.parametrize("scale", [1.0, 1e-3], ids=["unsure", "known"])
+def test_covariance_is_that_of_the_errors(arm, scale):
+    """Start, biases, gravity and samples drawn from their own distributions; NEES of 300 draws."""
+    rng = np.random.default_rng(1)
+    config = ImuConfig(lidar_t_imu=arm, acceleration_noise=0.02, gyro_noise=0.002)
+    turn, force = np.array([0.3, -0.2, 0.5]), UP + np.array([1.0, 0.5, 0.0])
+    stop, speed = START + 5 * FRAME, np.array([3.0, 0.0, 0.0])
+    clean = samples(turn, force)
+    exact = odometry(config, velocity=speed).predict(stop, clean)
+    known = {
+        "pose_sigma": (0.01 * scale, 0.02 * scale),
+        "velocity_sigma": 0.05 * scale,
+        "gyro_bias_sigma": 0.01 * scale,
+        "acceleration_bias_sigma": 0.05 * scale,
+        "gravity_sigma": 0.01 * scale,
+    }
+
+    def draw(sigma, size=3):
+        return sigma * scale * rng.standard_normal(size)
+
+    errors = []
+    for _ in range(300):
+        # White noise of a density, sampled at 200 Hz.
+        noise = rng.standard_normal((2, len(clean.stamps), 3)) * np.sqrt(200.0)
+        data = ImuSamples(
+            clean.stamps,
+            None,
+            turn + draw(0.01) + 0.002 * noise[0],
+            force + draw(0.05) + 0.02 * noise[1],
+        )
+        start = gtsam.Pose3().retract(np.append(draw(0.01), draw(0.02)))
+        tilt = gtsam.Rot3.Expmap(np.append(draw(0.01, 2), 0.0))
+        gravity = tilt.matrix() @ DOWN + draw(0.02, 1) / scale * [0.0, 0.0, 1.0]
+        found = odometry(config, gravity, start, speed + draw(0.05), **known).predict(stop, data)
+        error = exact.map_T_lidar.localCoordinates(found.map_T_lidar)
+        errors.append(error @ np.linalg.solve(found.covariance, error))
+    # 300 draws of chi^2(6): the mean has a standard deviation of sqrt(12 / 300) = 0.2.
+    assert 5.2 < np.mean(errors) < 6.8
+
+
+def test_a_covariance_is_that_of_the_lidar():
+    # 50 mrad and 1 mm of the lidar are 25 mm of an IMU half a metre off.
+    config = ImuConfig(lidar_t_imu=(0.0, 0.0, 0.5))
+    odo = odometry(config, **(GOOD | {"pose_sigma": (0.05, 0.001)}))
+    found = odo.predict(START + STEP, samples())
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(found.covariance)), np.repeat([0.05, 0.001], 3), rtol=0.01
+    )
+    assert odo.state.covariance[3, 3] == pytest.approx(0.025**2, rel=0.01)
+
+
+# -- what the scan says ----------------------------------------------------------------------------
+
+
+def test_the_scan_residual_against_numerical_derivatives():
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        measured, arm = gtsam.Pose3().retract(rng.standard_normal(6)), rng.standard_normal(3)
+        lidar_T_imu = pose(np.eye(3), arm)
+        at = measured.compose(lidar_T_imu).retract(0.3 * rng.standard_normal(6))
+        _, derivative = scan_residual(at, lidar_T_imu, measured)
+        numerical = np.column_stack(
+            [
+                scan_residual(at.retract(h), lidar_T_imu, measured)[0]
+                - scan_residual(at.retract(-h), lidar_T_imu, measured)[0]
+                for h in 1e-6 * np.eye(6)
+            ]
+        )
+        np.testing.assert_allclose(derivative, numerical / 2e-6, atol=1e-8)
+
+
+def test_the_scan_residual_is_the_tangent_of_the_lidar():
+    measured = gtsam.Pose3().retract(np.array([0.1, -0.2, 0.3, 1.0, 2.0, 3.0]))
+    small = 1e-5 * np.array([3.0, -1.0, 2.0, 4.0, 1.0, -2.0])
+    arm = pose(np.eye(3), [0.5, 0.1, -0.2])
+    error, _ = scan_residual(measured.retract(small).compose(arm), arm, measured)
+    np.testing.assert_allclose(error, small, atol=1e-9)
+
+
+def blind(rotation, axis, information=KNOWN):
+    """``information`` without the direction ``axis`` of the map."""
+    along = np.append(np.zeros(3), rotation.T @ axis)
+    across = np.eye(6) - np.outer(along, along)
+    return across @ information @ across
+
+
+def test_a_blind_direction_stays_blind_at_every_estimate():
+    # Fixed in the map, not in the body: an estimate that is turned a little, or shifted along the
+    # blind direction, must not see it.
+    rng = np.random.default_rng(3)
+    axis = np.array([0.6, 0.8, 0.0])
+    measured = gtsam.Pose3().retract(rng.standard_normal(6))
+    root, offset = square_root(blind(measured.rotation().matrix(), axis), np.zeros(6))
+    assert len(root) == 5
+    factor = scan_factor(0, gtsam.Pose3(), measured, root, offset)
+    here = measured.retract(0.01 * rng.standard_normal(6))
+    values, shifted = gtsam.Values(), gtsam.Values()
+    values.insert(0, here)
+    shifted.insert(0, pose(here.rotation().matrix(), here.translation() + 7.0 * axis))
+    assert factor.error(shifted) == pytest.approx(factor.error(values), rel=1e-9)
+    jacobian = factor.linearize(values).jacobian()[0]
+    along = np.append(np.zeros(3), here.rotation().matrix().T @ axis)
+    np.testing.assert_allclose(jacobian @ along, 0.0, atol=1e-7)
+
+
+@pytest.mark.parametrize("rank", [0, 1, 3, 6])
+def test_square_root_of_any_rank(rank):
+    rng = np.random.default_rng(rank)
+    rows = rng.standard_normal((rank, 6)) * np.repeat([1e4, 10.0], 3)
+    information, gradient = rows.T @ rows, rows.T @ rng.standard_normal(rank)
+    root, offset = square_root(information, gradient)
+    assert root.shape == (rank, 6)
+    np.testing.assert_allclose(root.T @ root, information, rtol=1e-9, atol=1e-3)
+    np.testing.assert_allclose(root.T @ offset, gradient, rtol=1e-6, atol=1e-6)
+
+
+def test_information_of_rotation_alone_and_of_translation_alone():
+    for part in (slice(0, 3), slice(3, 6)):
+        information = np.zeros((6, 6))
+        information[part, part] = 1e6 * np.eye(3)
+        information[0, 3] = information[3, 0] = 1e-11  # rounding
+        assert len(square_root(information, np.zeros(6))[0]) == 3
+
+
+@pytest.mark.parametrize(
+    ("information", "what"),
+    [
+        (np.diag([1e6, 1e6, 1e6, 1e4, 1e4, -1.0]), "negative eigenvalue"),
+        (1e19 * np.eye(6), "up to 1e.18"),
+        (np.full((6, 6), np.nan), "finite numbers"),
+        (np.eye(3), r"shape \(6, 6\)"),
+    ],
+)
+def test_information_that_is_none(information, what):
+    odo = odometry()
+    odo.predict(START + FRAME, samples())
+    with pytest.raises(InputError, match=what):
+        odo.update(gtsam.Pose3(), information)
+    odo.update(gtsam.Pose3(), KNOWN)  # the prediction is still there
+
+
+def test_negative_eigenvalues_of_rounding_are_accepted():
+    root, _ = square_root(np.diag([1e6, 1e6, 1e6, 1e4, 1e4, -1e-8]), np.zeros(6))
+    assert len(root) == 5
+
+
+def test_zero_information_is_a_skip():
+    data = samples((0.1, 0.2, 0.3), UP + np.array([0.5, 0.0, 0.0]))
+    one, other = odometry(), odometry()
+    one.predict(START + FRAME, data)
+    other.predict(START + FRAME, data)
+    one.update(gtsam.Pose3().retract(np.ones(6)), np.zeros((6, 6)))
+    other.skip()
+    np.testing.assert_array_equal(one.state.map_T_imu.matrix(), other.state.map_T_imu.matrix())
+    np.testing.assert_array_equal(one.state.covariance, other.state.covariance)
+
+
+def test_the_gradient_takes_the_prior_out():
+    # A solve of scan and prior together ends between the two. Handed over with its gradient, the
+    # scan alone is heard: as if its own optimum had been handed over.
+    rng = np.random.default_rng(4)
+    half = rng.standard_normal((6, 6)) @ np.diag(np.repeat([1e3, 1e2], 3))
+    information, off = half.T @ half, 1e-4 * rng.standard_normal(6)
+    optimum = gtsam.Pose3().retract(1e-4 * rng.standard_normal(6))
+    states = []
+    for measured, gradient in (
+        (optimum, None),
+        (optimum.retract(off), -information @ off),
+        (optimum.retract(off), None),
+    ):
+        odo = odometry()
+        odo.predict(START + FRAME, samples())
+        odo.update(measured, information, gradient)
+        states.append(odo.state.map_T_imu)
+    right, same, wrong = states
+    assert np.abs(right.localCoordinates(same)).max() < 1e-7
+    assert np.abs(right.localCoordinates(wrong)).max() > 1e-5
+
+
+# -- over many frames ------------------------------------------------------------------------------
+
+
+def turning_on_the_spot(frames, gyro_bias, acceleration_bias, noise=0.0, config=None, **known):
+    """A platform that turns about the vertical at 0.6 rad/s, seen by a scan of 1 mrad and 1 cm."""
+    rng, rate, odo = np.random.default_rng(5), 0.6, odometry(config, **known)
+    data = samples(gyro_bias + np.array([0.0, 0.0, rate]), UP + acceleration_bias, 0.1 * frames)
+    for k in range(1, frames + 1):
+        odo.predict(START + k * FRAME, data)
+        truth = pose(gtsam.Rot3.Rz(0.1 * k * rate).matrix(), np.zeros(3))
+        scan = truth.retract(noise * rng.standard_normal(6) * np.repeat([1e-3, 1e-2], 3))
+        odo.update(scan, KNOWN)
+    return odo
+
+
+def test_biases_and_gravity_are_found():
+    gyro, acceleration = np.array([0.002, -0.001, 0.0015]), np.array([0.03, -0.02, 0.04])
+    tilted = gtsam.Rot3.Expmap(np.array([0.008, -0.006, 0.0])).matrix() @ DOWN
+    odo = turning_on_the_spot(120, gyro, acceleration, noise=1.0, gravity=tilted)
+    state = odo.state
+    sigmas = np.sqrt(np.diag(state.covariance))
+    assert np.all(np.abs(state.gyro_bias - gyro) < 3.0 * sigmas[12:15])
+    assert np.all(np.abs(state.acceleration_bias - acceleration) < 3.0 * sigmas[9:12])
+    assert np.all(np.abs(state.map_gravity - DOWN) < 3.0 * sigmas[15:18])
+    # At first 0.1 m/s^2, 0.01 rad/s and 0.01 rad of gravity.
+    assert np.all(sigmas[9:11] < 0.005)
+    assert np.all(sigmas[12:15] < 3e-4)
+    assert np.all(sigmas[15:17] < 0.005)
+    assert np.linalg.norm(state.velocity) < 0.02
+
+
+def test_a_short_window_knows_what_a_long_one_does():
+    gyro, acceleration = np.array([0.002, -0.001, 0.0015]), np.array([0.03, -0.02, 0.04])
+    short, long = (
+        turning_on_the_spot(40, gyro, acceleration, noise=1.0, config=ImuConfig(lag=lag)).state
+        for lag in (2, 100)
+    )
+    sigmas = np.sqrt(np.diag(long.covariance))
+    np.testing.assert_allclose(np.sqrt(np.diag(short.covariance)), sigmas, rtol=0.05)
+    assert np.all(np.abs(short.gyro_bias - long.gyro_bias) < 0.3 * sigmas[12:15])
+    assert np.all(np.abs(short.velocity - long.velocity) < 0.3 * sigmas[6:9])
+
+
+def test_the_window_does_not_grow():
+    lengths = []
+    for frames in (3, 4, 5, 30):
+        odo = turning_on_the_spot(frames, np.zeros(3), np.zeros(3), config=ImuConfig(lag=4))
+        lengths.append(len(odo._window))
+    assert lengths == [3, 4, 4, 4]
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    world = SimulatedWorld("corridor_bare")
+    stamps = world.truth.stamps[:320] + FRAME // 2
+    return world, world.imu, stamps, world.truth_at(stamps).map_T_lidar
+
+
+def through_the_corridor(corridor, config=None, blind_from=150):
+    """Predictions, of which the scan corrects all but the way along from frame ``blind_from``."""
+    world, imu, stamps, truth = corridor
+    rng = np.random.default_rng(6)
+    map_R_world = world.world_T_start[:3, :3].T
+    axis = map_R_world[:, 0]
+    odo = InertialOdometry(
+        config or ImuConfig(), map_R_world @ DOWN, int(stamps[0]), gtsam.Pose3(truth[0])
+    )
+    found = []
+    for k in range(1, len(stamps)):
+        found.append(odo.predict(int(stamps[k]), imu))
+        scan = gtsam.Pose3(truth[k]).retract(rng.standard_normal(6) * np.repeat([1e-3, 1e-2], 3))
+        if k < blind_from:
+            odo.update(scan, KNOWN)
+        else:
+            odo.update(scan, blind(scan.rotation().matrix(), axis))
+    assert odo.restarts == 0
+    return found, axis
+
+
+def test_a_featureless_corridor(corridor):
+    found, axis = through_the_corridor(corridor)
+    truth = corridor[3]
+    errors = np.array(
+        [p.map_T_lidar.translation() - t[:3, 3] for p, t in zip(found, truth[1:], strict=True)]
+    )
+    last, driven = errors[-1] @ axis, (truth[-1] - truth[150])[:3, 3] @ axis
+    toward = np.append(np.zeros(3), found[-1].map_T_lidar.rotation().matrix().T @ axis)
+    sigma = np.sqrt(toward @ found[-1].covariance @ toward)
+    assert driven > 80.0
+    assert abs(last) < 0.005 * driven
+    # Honest, and a prediction that grows: the scans' 1 mrad of rotation do not leak into it.
+    assert abs(last) < 3.0 * sigma
+    assert 0.15 < sigma < 1.0
+    across = errors[150:] - np.outer(errors[150:] @ axis, axis)
+    assert np.sqrt((across**2).mean()) < 0.01
+
+
+def test_the_same_again_is_the_same(corridor):
+    short = (*corridor[:2], corridor[2][:60], corridor[3][:60])
+    runs = [through_the_corridor(short, ImuConfig(lag=10), 30)[0][-1] for _ in range(2)]
+    np.testing.assert_array_equal(runs[0].map_T_lidar.matrix(), runs[1].map_T_lidar.matrix())
+    np.testing.assert_array_equal(runs[0].covariance, runs[1].covariance)
+
+
+# -- trouble ---------------------------------------------------------------------------------------
+
+
+def broken(**changes):
+    data = samples()
+    fields = {name: getattr(data, name) for name in ("stamps", "gyro", "acceleration")}
+    for name, change in changes.items():
+        fields[name] = change(fields[name].copy())
+    return ImuSamples(fields["stamps"], None, fields["gyro"], fields["acceleration"])
+
+
+def put(row, value):
+    def change(array):
+        array[row] = value
+        return array
+
+    return change
+
+
+def only(kept):
+    return {name: lambda array: array[kept] for name in ("stamps", "gyro", "acceleration")}
+
+
+def without(first, last):
+    """All but rows first to last."""
+    return only(np.r_[0:first, last + 1 : 201])
+
+
+@pytest.mark.parametrize(
+    ("data", "what"),
+    [
+        (broken(**only(slice(1, None))), "cover"),
+        (broken(**only(slice(0, 20))), "cover"),
+        (broken(**only(slice(0, 0))), "got none"),
+        (broken(**without(3, 18)), "up to 0.06"),
+        (broken(stamps=put(5, START + 4 * STEP)), "above 0"),
+        (broken(stamps=put(5, START + 3 * STEP)), "above 0"),
+        (broken(gyro=put(4, np.nan)), "finite"),
+        (broken(acceleration=put(4, np.inf)), "finite"),
+    ],
+)
+def test_samples_that_do_not_do(data, what):
+    odo = odometry(ImuConfig(max_gap=0.06))
+    before = odo.state
+    with pytest.raises(SweepError, match=what):
+        odo.predict(START + FRAME, data)
+    assert odo.state is before
+    odo.predict(START + FRAME, samples())
+    odo.update(gtsam.Pose3(), KNOWN)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        broken(**only(slice(0, 21))),  # from the one stamp to the other exactly
+        broken(**without(3, 13)),  # a gap of 60 ms
+        broken(gyro=put(30, np.nan)),  # later
+    ],
+)
+def test_samples_that_just_do(data):
+    found = odometry(ImuConfig(max_gap=0.06)).predict(START + FRAME, data)
+    np.testing.assert_allclose(found.map_T_lidar.matrix(), np.eye(4), atol=1e-12)
+
+
+def test_samples_of_the_wrong_shape():
+    data = samples()
+    with pytest.raises(InputError, match=r"gyro: expected shape \(201, 3\)"):
+        odometry().predict(
+            START + FRAME, ImuSamples(data.stamps, None, data.gyro[:5], data.acceleration)
+        )
+
+
+def test_a_stamp_that_is_not_later():
+    with pytest.raises(SweepError, match="later than"):
+        odometry().predict(START, samples(before=0.1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "what"),
+    [
+        ({"gravity": np.zeros(3)}, "map_gravity"),
+        ({"gravity": np.ones(2)}, "map_gravity"),
+        ({"velocity": np.full(3, np.nan)}, "velocity"),
+        ({"gyro_bias": np.zeros(6)}, "gyro_bias"),
+        ({"gravity_sigma": 0.0}, "sigmas"),
+        ({"pose_sigma": (0.001, np.nan)}, "sigmas"),
+    ],
+)
+def test_a_start_that_is_none(arguments, what):
+    with pytest.raises(InputError, match=what):
+        odometry(**arguments)
+
+
+def test_nothing_is_taken_in_that_was_not_predicted():
+    odo = odometry()
+    with pytest.raises(InputError, match="predict"):
+        odo.update(gtsam.Pose3(), KNOWN)
+    odo.predict(START + FRAME, samples())
+    odo.skip()
+    with pytest.raises(InputError, match="predict"):
+        odo.skip()
+
+
+def test_a_prediction_left_alone_is_forgotten():
+    data = samples((0.0, 0.0, 0.1), UP + np.array([1.0, 0.0, 0.0]))
+    one, other = odometry(), odometry()
+    one.predict(START + FRAME, data)
+    np.testing.assert_array_equal(
+        one.predict(START + 2 * FRAME, data).covariance,
+        other.predict(START + 2 * FRAME, data).covariance,
+    )
+
+
+def drive(odo, frames, speed, jump=None, start=1):
+    """A straight way at constant speed, with the scan ``jump`` away from some frame on."""
+    data = samples(seconds=0.1 * (start + frames))
+    for k in range(start, start + frames):
+        found = odo.predict(START + k * FRAME, data)
+        truth = pose(np.eye(3), [speed * 0.1 * k, 0.0, 0.0])
+        odo.update(truth if jump is None else jump.compose(truth), KNOWN)
+    return found
+
+
+def test_a_jump_of_the_scan_begins_anew_and_leaves_the_biases():
+    odo = odometry(velocity=np.array([5.0, 0.0, 0.0]))
+    drive(odo, 30, 5.0)
+    before = odo.state
+    jump = pose(np.eye(3), [0.0, 3.0, 1.0])
+    drive(odo, 1, 5.0, jump, start=31)
+    assert odo.restarts == 1
+    # Along the way, where the scan did not jump, the velocity is known as well as before.
+    assert odo.state.covariance[6, 6] < 2.0 * before.covariance[6, 6]
+    assert odo.state.covariance[7, 7] > 1.0
+    found = drive(odo, 9, 5.0, jump, start=32)
+    assert odo.restarts == 1
+    np.testing.assert_allclose(found.map_T_lidar.translation(), [20.0, 3.0, 1.0], atol=0.01)
+    sigmas = np.sqrt(np.diag(before.covariance))
+    assert np.all(np.abs(odo.state.acceleration_bias - before.acceleration_bias) < sigmas[9:12])
+
+
+@pytest.mark.parametrize("claimed", [1e17, 1e-3])
+def test_a_jump_with_information_of_any_size(claimed):
+    odo = odometry()
+    odo.predict(START + FRAME, samples())
+    odo.update(pose(np.eye(3), [1e6, 0.0, 0.0]), claimed * np.eye(6))
+    assert odo.restarts == 1
+    found = odo.predict(START + 2 * FRAME, samples())
+    assert np.isfinite(found.covariance).all()
+    odo.update(found.map_T_lidar, KNOWN)
+    assert odo.restarts == 1
+
+
+def test_a_disagreement_within_reason_does_not():
+    odo = odometry(velocity=np.array([5.0, 0.0, 0.0]))
+    drive(odo, 30, 5.0)
+    drive(odo, 10, 5.0, pose(np.eye(3), [0.0, 0.1, 0.0]), start=31)
+    assert odo.restarts == 0
+
+
+def test_a_start_at_unknown_speed():
+    odo = odometry()  # velocity zero, to 0.5 m/s
+    found = drive(odo, 10, 30.0)
+    assert odo.restarts == 1
+    np.testing.assert_allclose(found.map_T_lidar.translation(), [30.0, 0.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(odo.state.velocity, [30.0, 0.0, 0.0], atol=0.05)
+
+
+def test_a_graph_that_cannot_be_solved_begins_anew():
+    # Noise so small that no digits are left for the scan.
+    tiny = dict.fromkeys(
+        ("acceleration_noise", "gyro_noise", "acceleration_bias_walk", "gyro_bias_walk"), 1e-9
+    )
+    odo = odometry(ImuConfig(**tiny))
+    odo.predict(START + FRAME, samples())
+    odo.update(gtsam.Pose3().retract(np.full(6, 1e-3)), KNOWN)
+    assert odo.restarts == 1
+    assert odo.state.stamp == START + FRAME
+    np.testing.assert_allclose(odo.state.map_T_imu.matrix(), np.eye(4), atol=1e-9)
+    assert odo.predict(START + 2 * FRAME, samples()).stamp == START + 2 * FRAME
+
+
+def test_restart_after_a_gap():
+    odo = turning_on_the_spot(60, np.array([0.002, -0.001, 0.0015]), np.array([0.03, 0.0, 0.04]))
+    before = odo.state
+    there = pose(np.eye(3), [1.0, 2.0, 3.0])
+    odo.restart(before.stamp + 100 * FRAME, there, np.array([1.0, 0.0, 0.0]))
+    state = odo.state
+    assert odo.restarts == 0  # asked for, not needed
+    np.testing.assert_array_equal(state.map_T_imu.matrix(), there.matrix())
+    np.testing.assert_array_equal(state.gyro_bias, before.gyro_bias)
+    grown = np.diag(state.covariance) - np.diag(before.covariance)
+    np.testing.assert_allclose(grown[9:12], 10.0 * odo.config.acceleration_bias_walk**2)
+    np.testing.assert_allclose(grown[12:15], 10.0 * odo.config.gyro_bias_walk**2)
+    np.testing.assert_array_equal(grown[15:], 0.0)
+    with pytest.raises(InputError, match="or later"):
+        odo.restart(before.stamp, there, np.zeros(3))
+    with pytest.raises(InputError, match="sigmas"):
+        odo.restart(state.stamp, there, np.zeros(3), velocity_sigma=0.0)

@@ -1,0 +1,340 @@
+"""Runs that are stopped, killed, and gone on with."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import fields, replace
+
+import gtsam
+import numpy as np
+import pytest
+from support.list_dataset import ListDataset
+
+from loam_gtsam.cli import run as _cli_run
+from loam_gtsam.config import Config, preset
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.datasets import open_dataset
+from loam_gtsam.io import run_files as export
+from loam_gtsam.io.checkpoint import Checkpoint
+from loam_gtsam.io.state import freeze, thaw
+from loam_gtsam.pipeline import run
+from loam_gtsam.types import DatasetError, OutputError
+
+
+def changed(config=None, **sections):
+    config = config or Config()
+    for name, values in sections.items():
+        config = replace(config, **{name: replace(getattr(config, name), **values)})
+    return config
+
+
+def assert_same(one, two):
+    """All but the times it took."""
+    assert len(one.updates) == len(two.updates)
+    for number, (first, second) in enumerate(zip(one.updates, two.updates, strict=True)):
+        for item in fields(first):
+            if item.name not in ("timings", "uncertainty"):
+                left, right = getattr(first, item.name), getattr(second, item.name)
+                if isinstance(left, gtsam.Pose3):
+                    left, right = left.matrix(), right.matrix()
+                np.testing.assert_array_equal(left, right, f"frame {number}: {item.name}")
+    np.testing.assert_array_equal(one.trajectory.map_T_lidar, two.trajectory.map_T_lidar)
+    np.testing.assert_array_equal(one.edge_points, two.edge_points)
+    np.testing.assert_array_equal(one.plane_points, two.plane_points)
+    assert one.map_stats == two.map_stats
+    if one.loops is not None:
+        assert one.loops.counts() == two.loops.counts()
+
+
+def stopped(dataset, config, folder, at, **options):
+    """A run that is interrupted after a frame, with what was there before."""
+
+    def stop(number, update):
+        if number + 1 == at:
+            raise KeyboardInterrupt
+
+    checkpoint = Checkpoint(folder, seconds=1e9, resume=True)
+    return run(dataset, config, on_frame=stop, checkpoint=checkpoint, **options)
+
+
+LOOPS = {
+    "loops": {"enabled": True, "min_way": 6.0},
+    "pose_graph": {"keyframe_distance": 1.0},
+}
+CASES = {
+    "plain": ("street_loop?frames=14", Config(), [1, 2, 5]),
+    "imu in the graph": ("corridor?frames=16", changed(imu={"preintegration": True}), [3, 11]),
+    "scan to scan": ("trees?frames=8", changed(odometry={"method": "scan_to_scan"}), [4]),
+    "classical": ("room?frames=8", preset("aloam"), [4]),
+    "loops": ("street_loop?frames=30", changed(**LOOPS), [12, 25]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_run_that_was_stopped_goes_on_to_the_last_bit(case, tmp_path):
+    world, config, stops = CASES[case]
+    dataset = open_dataset(f"sim:{world}")
+    whole = run(dataset, config)
+    for at in stops:
+        assert len(stopped(dataset, config, tmp_path / "checkpoint", at).updates) == at
+    assert_same(stopped(dataset, config, tmp_path / "checkpoint", None), whole)
+
+
+def test_a_map_with_cubes_in_memory_and_on_disk_goes_on_as_it_was(tmp_path):
+    places = {"archive_megabytes": 0.01, "archive_dir": str(tmp_path)}
+    config = changed(map=places | {"window": (3, 3, 3), "window_margin": 0}).map
+    rng = np.random.default_rng(0)
+
+    def drive(cubes, start, end, rng):
+        for step in range(start, end):
+            here = np.array([40.0 * step, 0.0, 0.0])
+            cubes.recenter(here)
+            cubes.insert(here + rng.uniform(-60.0, 60.0, (400, 3)))
+            around = cubes.neighbourhood(np.eye(4) + np.pad(here[:, None], ((0, 1), (3, 0))))
+            cubes.nearest(here + rng.uniform(-20.0, 20.0, (50, 3)), 5, 10.0, around)
+
+    cubes, again = CubeMap(config, 0.5), CubeMap(config, 0.5)
+    drive(cubes, 0, 12, rng)
+    assert 0 < len(list(tmp_path.rglob("cube_*.npy"))) < cubes.stats.archived
+    thaw(freeze({"map": cubes}, {"config": config}), {"map": again}, {"config": config})
+    for same in (cubes, again):
+        drive(same, 12, 14, np.random.default_rng(1))
+        drive(same, 8, 12, np.random.default_rng(2))  # back, to cubes of the archive
+    assert again.stats == cubes.stats
+    assert again.stats.restored > 0
+    np.testing.assert_array_equal(again.points(archived=True), cubes.points(archived=True))
+
+
+def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):
+    dataset = open_dataset("sim:room?frames=5")
+    checkpoint = Checkpoint(tmp_path / "checkpoint", seconds=0.0)
+    assert_same(run(dataset, checkpoint=checkpoint), run(dataset))
+    names = sorted(path.name for path in checkpoint.folder.iterdir())
+    frames = [f"frames_{n:07d}_{n + 1:07d}.npz" for n in range(5)]
+    assert names == [*frames, "state_0000005.npz"]
+    checkpoint.remove()
+    assert not checkpoint.folder.exists()
+
+
+def test_time_tells_when_a_checkpoint_is_due(tmp_path):
+    assert Checkpoint(tmp_path, seconds=0.0).due
+    assert not Checkpoint(tmp_path, seconds=60.0).due
+
+
+def test_without_resume_an_old_checkpoint_is_forgotten(tmp_path):
+    dataset = open_dataset("sim:room?frames=3")
+    stopped(dataset, Config(), tmp_path / "checkpoint", 2)
+    result = run(dataset, checkpoint=Checkpoint(tmp_path / "checkpoint"))
+    assert len(result.updates) == 3
+    assert not (tmp_path / "checkpoint").exists()
+
+
+def test_nobody_elses_folder_is_removed(tmp_path):
+    (tmp_path / "mine.txt").write_text("mine")
+    Checkpoint(tmp_path).remove()
+    assert (tmp_path / "mine.txt").exists()
+
+
+def test_another_configuration_is_told(tmp_path):
+    dataset = open_dataset("sim:room?frames=3")
+    stopped(dataset, Config(), tmp_path / "checkpoint", 2)
+    with pytest.raises(OutputError, match="another run: its configuration"):
+        stopped(dataset, changed(solver={"iterations": 7}), tmp_path / "checkpoint", None)
+    with pytest.raises(OutputError, match="another run: its data set was room"):
+        stopped(open_dataset("sim:trees?frames=3"), Config(), tmp_path / "checkpoint", None)
+
+
+@pytest.mark.parametrize("keep", [slice(1, None), slice(1)], ids=["other sweeps", "too few"])
+def test_other_sweeps_are_told(keep, tmp_path):
+    scans = list(open_dataset("sim:room?frames=4"))
+    folder = tmp_path / "checkpoint"
+    stopped(ListDataset(scans), Config(), folder, 2)
+    with pytest.raises(DatasetError, match="of the run to go on with"):
+        stopped(ListDataset(scans[keep]), Config(), folder, None, keep_partial=True)
+
+
+@pytest.mark.parametrize("pattern", ["state_*", "frames_*"])
+@pytest.mark.parametrize("damage", ["cut", "other", "gone"])
+def test_a_damaged_checkpoint_is_told(pattern, damage, tmp_path):
+    dataset = open_dataset("sim:room?frames=3")
+    stopped(dataset, Config(), tmp_path / "checkpoint", 2)
+    file = next((tmp_path / "checkpoint").glob(pattern))
+    if damage == "gone":
+        if pattern == "state_*":
+            pytest.skip("then there is none to go on from")
+        file.unlink()
+    else:
+        file.write_bytes(file.read_bytes()[:1000] if damage == "cut" else b"not an archive")
+    with pytest.raises(OutputError, match="cannot be read"):
+        stopped(dataset, Config(), tmp_path / "checkpoint", None)
+
+
+def test_a_run_goes_on_without_checkpoints_if_they_cannot_be_written(tmp_path, caplog):
+    (tmp_path / "file").write_text("")
+    checkpoint = Checkpoint(tmp_path / "file" / "checkpoint", seconds=0.0)
+    assert len(run(open_dataset("sim:room?frames=4"), checkpoint=checkpoint).updates) == 4
+    assert caplog.text.count("no checkpoint") == 1
+
+
+def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path):
+    dataset = open_dataset("sim:room?frames=6")
+    frames = []
+
+    def interrupting(context):
+        frames.append(context.stamp)
+        if len(frames) == 3:
+            raise KeyboardInterrupt
+        return []
+
+    checkpoint = Checkpoint(tmp_path / "checkpoint", seconds=0.0)
+    cut = run(dataset, extra_factors=interrupting, checkpoint=checkpoint)
+    assert cut.interrupted
+    again = Checkpoint(tmp_path / "checkpoint", resume=True)
+    result = run(dataset, extra_factors=interrupting, checkpoint=again)
+    assert_same(result, run(dataset, extra_factors=lambda context: []))
+
+
+# -- files that take their places together ------------------------------------------------------
+
+
+def write(folder, names, text):
+    with export.replacing_all(folder, ("a", "b", "picture", "last"), last="last") as new:
+        for name in names:
+            (new / name).write_text(text)
+
+
+def content(folder):
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_new_files_replace_old_ones_together(tmp_path):
+    (tmp_path / "notes").write_text("mine")
+    write(tmp_path, ["a", "b", "picture", "last"], "old")
+    write(tmp_path, ["a", "b", "last"], "new")
+    assert content(tmp_path) == {"notes": "mine", "a": "new", "b": "new", "last": "new"}
+
+
+def test_an_error_while_writing_leaves_the_old_files(tmp_path):
+    write(tmp_path, ["a", "last"], "old")
+
+    def fill_the_disk():
+        with export.replacing_all(tmp_path, ("a", "last"), last="last") as new:
+            (new / "a").write_text("half")
+            raise OSError(28, "no space left on this disk")
+
+    with pytest.raises(OutputError, match="disk"):
+        fill_the_disk()
+    assert content(tmp_path) == {"a": "old", "last": "old"}
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_a_move_that_was_cut_off_is_finished_by_the_next_run(moved, tmp_path, monkeypatch):
+    write(tmp_path, ["a", "b", "picture", "last"], "old")
+    left = [moved]
+
+    def cut_off(source, target, replace=os.replace):
+        # To the places of files, not the renames that make whole files and folders.
+        if target.parent == tmp_path and target.name in ("a", "b", "last"):
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path, ["a", "b", "last"], "new")
+    monkeypatch.undo()
+    assert not (tmp_path / "last").exists()  # nobody takes it for whole
+    export.make_folder(tmp_path)
+    assert content(tmp_path) == {"a": "new", "b": "new", "last": "new"}
+
+
+def test_a_plan_cannot_name_files_elsewhere(tmp_path):
+    folder = tmp_path / "run"
+    complete = folder / ".loam_gtsam_complete"
+    complete.mkdir(parents=True)
+    (tmp_path / "precious").write_text("mine")
+    (complete / "last").write_text("new")
+    plan = {"new": ["last"], "gone": ["../precious", str(tmp_path / "precious")]}
+    (complete / ".plan").write_text(json.dumps(plan))
+    export.make_folder(folder)
+    assert content(folder) == {"last": "new"}
+    assert (tmp_path / "precious").exists()
+
+
+# -- from the command line ----------------------------------------------------------------------
+
+COMMAND = (sys.executable, "-m", "loam_gtsam.cli", "run", "sim:room?frames=60", "--no-plot")
+
+
+def arrays(folder):
+    with np.load(folder / "run.npz") as file:
+        return {name: file[name] for name in file.files if not name.startswith("stage_")}
+
+
+def test_killed_again_and_again_a_run_comes_to_the_same_end(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    subprocess.run([*COMMAND, "--output", whole], check=True, capture_output=True)
+    again = [*COMMAND, "--output", killed, "--resume", "--checkpoint", "0.05"]
+    for wanted in (10, 35):
+        process = subprocess.Popen(again, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        while process.poll() is None and not reached(killed, wanted):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGKILL)
+        assert process.wait() == -signal.SIGKILL
+        assert not (killed / "summary.json").exists()
+    subprocess.run(again, check=True, capture_output=True)
+    assert not (killed / "checkpoint").exists()
+    for name, array in arrays(whole).items():
+        np.testing.assert_array_equal(arrays(killed)[name], array, name)
+    for name in ("map.ply", "trajectory.tum", "trajectory_covariance.csv"):
+        assert (killed / name).read_bytes() == (whole / name).read_bytes()
+
+
+def reached(folder, frames):
+    states = [path.stem for path in (folder / "checkpoint").glob("state_*.npz")]
+    return any(int(name.removeprefix("state_")) >= frames for name in states)
+
+
+def test_results_that_cannot_be_written_go_elsewhere(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+
+    def full(there):
+        if "wanted" in there.parts:
+            raise OutputError("disk full")
+        (there / "results").write_text("all of it")
+        return ["results"]
+
+    with pytest.raises(OutputError, match=r"disk full. The results were written to .*instead"):
+        _cli_run._write_somewhere(tmp_path / "wanted", full)
+    assert [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")] == [
+        "all of it"
+    ]
+
+
+def test_a_person_is_asked_for_another_folder(tmp_path, monkeypatch):
+    answers = iter([str(tmp_path / "wanted" / "again"), str(tmp_path / "other")])
+    monkeypatch.setattr("typer.prompt", lambda *args, **options: next(answers))
+    for stream in (sys.stdin, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
+
+    def full(there):
+        if "wanted" in there.parts:
+            raise OutputError("disk full")
+        return ["results"]
+
+    assert _cli_run._write_somewhere(tmp_path / "wanted", full) == (tmp_path / "other", ["results"])
+
+
+def test_if_nothing_can_be_written_the_first_problem_is_told(tmp_path, monkeypatch):
+    def full(there):
+        raise OutputError("disk full")
+
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    with pytest.raises(OutputError, match=r"^disk full$"):
+        _cli_run._write_somewhere(tmp_path / "wanted", full)

@@ -1,0 +1,294 @@
+"""Loops: places that are found again, places that only look alike, and why candidates fall."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.sim.scenes import BUILDERS
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.workers import extract
+from loam_gtsam.loops.closure import Rejection, ScanLoopCloser, _untied
+from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.loops.pose_graph import PoseGraph
+from loam_gtsam.types import Features, FrameStatus, MapUpdate, Uncertainty
+
+OWN = np.diag(np.repeat([2e-4, 3e-3], 3) ** 2)
+STEP = np.diag(np.repeat([5e-4, 5e-3], 3) ** 2)
+
+
+class World:
+    """Points of walls, posts and the ground, seen without occlusion up to 20 m."""
+
+    def __init__(self, seed, walls=40, posts=80, low=-25.0, high=65.0):
+        rng = np.random.default_rng(seed)
+        x, y = (line.ravel() for line in np.meshgrid(*[np.arange(low, high, 0.5)] * 2))
+        planes = [np.column_stack([x, y, np.full(len(x), -1.7)])]
+        for _ in range(walls):
+            along, up = (line.ravel() for line in np.meshgrid(np.arange(0, 8, 0.5),
+                                                              np.arange(-1.5, 4, 0.5)))  # fmt: skip
+            turn, foot = rng.uniform(0, np.pi), rng.uniform(low, high, 2)
+            planes.append(np.column_stack([foot[0] + along * np.cos(turn),
+                                           foot[1] + along * np.sin(turn), up]))  # fmt: skip
+        feet = rng.uniform(low, high, (posts, 2))
+        heights = np.arange(-1.6, 3.0, 0.25)
+        self.planes = np.concatenate(planes)
+        self.edges = np.column_stack([np.repeat(feet, len(heights), axis=0),
+                                      np.tile(heights, posts)])  # fmt: skip
+
+    def seen(self, map_T_lidar, stamp, rng):
+        parts = []
+        for points in (self.edges, self.planes):
+            local = map_T_lidar.transformTo(points.T).T
+            local = local[np.linalg.norm(local, axis=1) < 20.0]
+            parts.append(local + rng.normal(0.0, 0.01, local.shape))
+        return Features.from_points(stamp, *parts)
+
+
+class Corridor(World):
+    """Two long walls, a floor and a ceiling; every place looks the same."""
+
+    def __init__(self):
+        rng = np.random.default_rng(0)
+        x = np.repeat(np.arange(-60.0, 100.0, 0.4), 8)
+        side = np.tile(np.linspace(-1.5, 1.5, 8), len(x) // 8)
+        jitter = rng.uniform(-0.2, 0.2, len(x))
+        walls = [np.column_stack([x + jitter, side, np.full(len(x), z)]) for z in (-1.5, 1.5)]
+        walls += [np.column_stack([x + jitter, np.full(len(x), y), side]) for y in (-1.5, 1.5)]
+        self.planes, self.edges = np.concatenate(walls), np.zeros((0, 3))
+
+
+def there_and_back(heading, aside=1.0, turn_at=40):
+    """On along x and back again, with another heading on the way back."""
+    out = [gtsam.Pose3(gtsam.Rot3(), np.array([float(x), 0, 0])) for x in range(0, turn_at, 2)]
+    back = [gtsam.Pose3(gtsam.Rot3.Yaw(heading), np.array([float(x), aside, 0.1]))
+            for x in range(turn_at, 2, -2)]  # fmt: skip
+    return out + back
+
+
+def updates(poses, drift=(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), step=STEP):
+    """Solved frames with a drift a step, and covariances that know of it."""
+    odometry, known, made = poses[0], 1e-8 * np.eye(6), []
+    for number, pose in enumerate(poses):
+        if number:
+            motion = poses[number - 1].between(pose).retract(np.array(drift))
+            odometry = odometry.compose(motion)
+            to_map = odometry.AdjointMap()
+            known = known + to_map @ step @ to_map.T
+        parts = Uncertainty(OWN, np.zeros((6, 6)), None, known, 1.0, 100.0)
+        from_map = odometry.inverse().AdjointMap()
+        covariance = OWN + from_map @ known @ from_map.T
+        made.append(MapUpdate(number * 10**8, odometry, FrameStatus.OK, covariance=covariance,
+                              uncertainty=parts))  # fmt: skip
+    return made
+
+
+def settings(**loops):
+    config = Config()
+    chosen = {"min_way": 15.0, "min_share": 0.4} | loops  # these worlds are thinly sampled
+    pose_graph = replace(config.pose_graph, keyframe_distance=1.0)
+    return replace(config, pose_graph=pose_graph, loops=replace(config.loops, **chosen))
+
+
+def driven(world, poses, made, config, seed=0):
+    """The graph of a run in which every frame is a keyframe, and the loops that were found."""
+    rng = np.random.default_rng(seed)
+    graph, closer = PoseGraph(config), ScanLoopCloser(config)
+    loops = []
+    for pose, update in zip(poses, made, strict=True):
+        keyframe = graph.add(update, world.seen(pose, update.stamp, rng))
+        loop = closer.detect(keyframe, graph)
+        if loop is not None:
+            loops.append(loop)
+            graph.add_loop(loop)
+    return graph, closer, loops
+
+
+def off(loop, poses):
+    """Metres and rad."""
+    true = poses[loop.earlier].between(poses[loop.later])
+    error = true.localCoordinates(loop.earlier_T_later)
+    return np.linalg.norm(error[3:]), np.linalg.norm(error[:3])
+
+
+# -- places that are found -------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.9, np.pi])
+def test_a_place_is_found_again_with_any_heading(heading):
+    poses = there_and_back(heading)
+    made = updates(poses, drift=(0.0, 0.0, 5e-4, 0.015, 0.005, 0.01))
+    graph, closer, loops = driven(World(1), poses, made, settings())
+    assert len(loops) > 8
+    assert max(off(loop, poses)[0] for loop in loops) < 0.1
+    assert max(off(loop, poses)[1] for loop in loops) < 0.01
+    assert all(graph.active)
+    assert closer.statistics.verified == len(loops)
+    assert closer.statistics.keyframes == len(graph) == len(poses)
+    last = len(poses) - 1
+    true, before = poses[last].translation(), made[last].map_T_lidar.translation()
+    assert np.linalg.norm(before - true) > 0.2
+    assert np.linalg.norm(graph.pose(last).translation() - true) < 0.1
+
+
+def test_a_street_is_recognised_on_the_way_back():
+    """The built-in street, along it and back on the other lane."""
+    lane = np.arange(-60.0, 61.0, 30.0)
+    bend = np.array([[80.0, -54], [88, -45], [84, -36], [76, -40], [70, -50]])
+    out, back = (np.column_stack([lane, np.full(5, y)]) for y in (-55.0, -53.0))
+    way = np.concatenate([out, bend, back[::-1]])
+    scene = replace(BUILDERS["street_loop"](0), waypoints=way, closed=False)
+    world = SimulatedWorld(scene, columns=450, speed=10.0)
+    config = settings(min_way=20.0, min_share=0.5)
+    numbers = [*range(40, 82, 3), *range(312, 336, 6)]  # what lies between is left out
+    truth = world.truth_at(np.array([world[n].stamp for n in numbers])).map_T_lidar
+    poses = [gtsam.Pose3(pose) for pose in truth]
+    graph, closer = PoseGraph(config), ScanLoopCloser(config)
+    found = []
+    for number, update in zip(numbers, updates(poses), strict=True):
+        scan = world[number]
+        features = extract(scan, config).features
+        ends = world.truth_at(np.array([scan.stamp, scan.stamp + 10**8])).map_T_lidar
+        twist = gtsam.Pose3.Logmap(gtsam.Pose3(ends[0]).between(gtsam.Pose3(ends[1]))) / 0.1
+        stamped = replace(update, stamp=features.stamp, twist=twist)
+        keyframe = graph.add(stamped, features)
+        loop = closer.detect(keyframe, graph)
+        if loop is not None:
+            found.append(loop)
+    assert len(found) >= 2
+    for loop in found:
+        assert off(loop, poses)[0] < 0.1
+        assert off(loop, poses)[1] < 0.005
+        assert abs(loop.earlier_T_later.rotation().yaw()) > 3.0
+
+
+def test_same_input_same_loops():
+    poses = there_and_back(0.7, turn_at=24)
+    runs = [driven(World(1), poses, updates(poses), settings())[2] for _ in range(2)]
+    assert len(runs[0]) == len(runs[1]) > 0
+    for one, two in zip(*runs, strict=True):
+        assert (one.earlier, one.later, one.share) == (two.earlier, two.later, two.share)
+        np.testing.assert_array_equal(one.earlier_T_later.matrix(), two.earlier_T_later.matrix())
+        np.testing.assert_array_equal(one.covariance, two.covariance)
+
+
+def test_the_covariance_is_about_right():
+    poses = there_and_back(2.0)
+    _, _, loops = driven(World(3), poses, updates(poses), settings())
+    nees = []
+    for loop in loops:
+        error = (
+            poses[loop.earlier].between(poses[loop.later]).localCoordinates(loop.earlier_T_later)
+        )
+        nees.append(error @ np.linalg.solve(loop.covariance, error))
+    assert len(loops) > 8
+    assert 0.05 < np.mean(nees) < 12.0  # of 6; the poses here have none of the error they claim
+
+
+# -- places that are not ---------------------------------------------------------------------------
+
+
+def test_a_corridor_is_no_place():
+    poses = there_and_back(0.0, aside=0.3)
+    _, closer, loops = driven(Corridor(), poses, updates(poses), settings())
+    assert loops == []
+    assert closer.statistics.rejected[Rejection.DEGENERATE] > 8
+
+
+def test_another_place_that_the_drift_would_allow_is_rejected():
+    """On the way back the world is another one, as behind a building that the gate reaches over."""
+    poses = there_and_back(np.pi, turn_at=20)
+    config = settings(max_unlike=1.0)  # leave it to the registration
+    graph, closer = PoseGraph(config), ScanLoopCloser(config)
+    rng = np.random.default_rng(0)
+    worlds = [World(1)] * 10 + [World(2)] * (len(poses) - 10)
+    for world, pose, update in zip(worlds, poses, updates(poses), strict=True):
+        keyframe = graph.add(update, world.seen(pose, update.stamp, rng))
+        assert closer.detect(keyframe, graph) is None
+    rejected = closer.statistics.rejected
+    assert rejected[Rejection.LITTLE_OVERLAP] + rejected[Rejection.DISAGREES] > 3
+    strict = ScanLoopCloser(settings(max_unlike=0.05))
+    assert strict.detect(graph.keyframes[-1], graph) is None
+    assert strict.statistics.rejected == {Rejection.UNLIKE: 1}
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"min_share": 1.0}, Rejection.LITTLE_OVERLAP),
+        ({"min_aligned": 1e6}, Rejection.DEGENERATE),
+    ],
+)
+def test_every_test_of_a_registration_can_reject(change, reason):
+    poses = there_and_back(0.5, turn_at=20)
+    graph, closer, _ = driven(World(1), poses, updates(poses), settings(min_way=12.0))
+    good = closer.verify(graph.keyframes[-1], 1, graph)
+    assert isinstance(good, LoopClosure)
+    assert (good.earlier, good.later) == (1, len(poses) - 1)
+    assert 0.5 < good.share <= 1.0
+    assert off(good, poses)[0] < 0.1
+    assert 0.9 < good.agreement <= 1.0
+    strict = ScanLoopCloser(settings(min_way=12.0, **change))
+    assert strict.verify(graph.keyframes[-1], 1, graph) is reason
+
+
+def test_matches_that_lie_elsewhere_disagree():
+    poses = there_and_back(0.5, turn_at=20)
+    config = settings(min_way=12.0)
+    graph, closer, _ = driven(World(1), poses, updates(poses), config)
+    assert isinstance(closer.verify(graph.keyframes[-1], 1, graph), LoopClosure)
+    exact = replace(config.matching, point_sigma=0.001, fit_uncertainty=False)  # noise is 0.01
+    strict = ScanLoopCloser(replace(config, matching=exact))
+    assert strict.verify(graph.keyframes[-1], 1, graph) is Rejection.DISAGREES
+
+
+def test_too_few_features_to_solve():
+    poses = there_and_back(0.5, turn_at=20)
+    graph, closer, _ = driven(World(1), poses, updates(poses), settings(min_way=12.0))
+    last = graph.keyframes[-1]
+    few = replace(last, edges=last.edges[:5], planes=last.planes[:20], distinct=last.distinct[:5])
+    # What cannot be solved overlaps with nothing.
+    assert closer.verify(few, 1, graph) is Rejection.FEW_MATCHES
+
+
+def test_where_not_to_look():
+    poses = there_and_back(0.5, turn_at=20)
+    made = updates(poses)
+    world, rng = World(1), np.random.default_rng(0)
+
+    def reasons(config, features=True, made=made):
+        graph, closer = PoseGraph(config), ScanLoopCloser(config)
+        for pose, update in zip(poses, made, strict=True):
+            seen = world.seen(pose, update.stamp, rng) if features else None
+            keyframe = graph.add(update, seen)
+        closer.detect(keyframe, graph)
+        return closer.statistics.rejected
+
+    assert reasons(settings(), features=False) == {Rejection.NO_FEATURES: 1}
+    assert reasons(settings(min_way=1e3)) == {Rejection.TOO_RECENT: 1}
+    tight = {"gate": 0.0, "gate_drift": 0.0, "gate_sigmas": 3.0}
+    assert reasons(settings(**tight)) == {Rejection.OUT_OF_REACH: 1}
+    # The same with poses that are less sure of themselves.
+    unsure = updates(poses, step=1e4 * STEP)
+    assert reasons(settings(**tight), made=unsure)[Rejection.OUT_OF_REACH] == 0
+    assert reasons(settings(**tight | {"gate": 30.0}))[Rejection.OUT_OF_REACH] == 0
+    assert reasons(settings(**tight | {"gate_drift": 1.0}))[Rejection.OUT_OF_REACH] == 0
+
+
+def test_what_loops_have_tied_is_looked_for_less_far():
+    """The drift that nobody knows grows with the way from the last loop, not from the start."""
+    graph = PoseGraph(settings())
+    for update in updates(
+        [gtsam.Pose3(gtsam.Rot3(), np.array([2.0 * k, 0, 0])) for k in range(40)]
+    ):
+        graph.add(update)
+    last = graph.keyframes[-1]
+    np.testing.assert_allclose(_untied(last, graph), 78.0 - 2.0 * np.arange(40), atol=1e-6)
+    loop = LoopClosure(3, 35, graph.pose(3).between(graph.pose(35)), OWN)
+    assert graph.add_loop(loop)
+    tied = _untied(last, graph)
+    assert tied[3] == pytest.approx(8.0)  # from the end of the loop to the last
+    assert tied[0] == pytest.approx(8.0 + 6.0)
+    assert tied[37] == pytest.approx(4.0)

@@ -1,0 +1,166 @@
+"""The map follows the loops, and the mapper's own pose does not jump."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from test_closure import OWN, World, there_and_back, updates
+
+from loam_gtsam.config import Config
+from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.loops.map_correction import LoopMapping
+from loam_gtsam.mapper import Mapper
+from loam_gtsam.registration.solvers import GtsamSolver
+
+UP = np.array([0.0, 0.0, 3.0])
+POSES = there_and_back(np.pi)
+DRIFT = (0.0, 0.0, 0.002, 0.0, 0.02, 0.0)  # rad and m a step
+
+
+def settings(**pose_graph):
+    config = Config()
+    chosen = {"keyframe_distance": 0.5, "walk": 0.05, "turn_walk_deg": 0.3} | pose_graph
+    return replace(config, pose_graph=replace(config.pose_graph, **chosen))
+
+
+class Known:
+    """A loop closer that knows the truth, from some keyframe on."""
+
+    def __init__(self, first):
+        self.first = first
+
+    def detect(self, keyframe, history):
+        later, earlier = keyframe.index, len(POSES) - 1 - keyframe.index
+        if later < self.first or later - earlier < 2:
+            return None
+        return LoopClosure(earlier, later, POSES[earlier].between(POSES[later]), OWN)
+
+
+def driven(first, **pose_graph):
+    """A way out and back, with a mark above each keyframe in the mapper's map."""
+    config = settings(**pose_graph)
+    mapper = Mapper(config)
+    loops = LoopMapping(mapper, config, Known(first))
+    world, rng = World(0), np.random.default_rng(0)
+    closed = []
+    for update in updates(POSES, DRIFT):
+        features = world.seen(gtsam.Pose3(), update.stamp, rng)
+        closed.append(loops.add(update, features))
+        mapper.edge_map.owner = mapper.keyframe
+        mapper.edge_map.insert((update.map_T_lidar.translation() + UP)[None])
+    return mapper, loops, closed
+
+
+def marks(mapper):
+    return np.sort(mapper.map_points()[0], axis=0)
+
+
+def test_the_map_follows_its_keyframes():
+    mapper, loops, closed = driven(first=30)
+    assert not any(closed[:30])
+    assert all(closed[30:])
+    wanted = loops.graph.poses()[:, :3, 3] + loops.graph.poses()[:, :3, :3] @ UP
+    off = np.abs(marks(mapper) - np.sort(wanted, axis=0)).max()
+    assert off > 1e-6  # the mapper's frame is another
+    corrected = np.sort(loops.map_points()[0], axis=0)
+    np.testing.assert_allclose(corrected, np.sort(wanted, axis=0), atol=2e-3)
+    truth = np.array([pose.translation() for pose in POSES])
+    odometry = np.array([update.map_T_lidar.translation() for update in updates(POSES, DRIFT)])
+    before = np.linalg.norm(odometry - truth, axis=1).max()
+    after = np.linalg.norm(loops.graph.poses()[:, :3, 3] - truth, axis=1).max()
+    assert after < 0.5 * before
+
+
+def test_the_newest_keyframe_and_its_points_stay():
+    mapper, loops, _ = driven(first=len(POSES) - 1)
+    last = loops.graph.keyframes[-1]
+    newest = loops.map_T_odom.inverse().compose(loops.graph.pose(last.index))
+    np.testing.assert_allclose(newest.matrix(), last.odom_T_lidar.matrix(), atol=1e-9)
+    points = mapper.map_points()[0]
+    mark = last.odom_T_lidar.translation() + UP
+    assert np.linalg.norm(points - mark, axis=1).min() < 1e-9
+    assert loops.moved > 0
+
+
+@pytest.mark.parametrize(("metres", "moves"), [(100.0, False), (0.0, True)])
+def test_only_keyframes_that_lie_elsewhere_move_their_points(metres, moves):
+    mapper, loops, _ = driven(first=30, follow_distance=metres, follow_angle_deg=180.0)
+    assert (loops.moved > 0) == moves
+    before = marks(mapper)
+    loops.follow(metres, 180.0)  # nothing is left to do
+    np.testing.assert_array_equal(marks(mapper), before)
+
+
+def test_counts_and_ends_are_those_of_the_graph():
+    _, loops, _ = driven(first=30)
+    counts = loops.counts()
+    assert counts == {"keyframes": len(POSES), "loops": len(POSES) - 30, "on": len(POSES) - 30}
+    ends, on = loops.ends()
+    assert ends.shape == (counts["loops"], 2, 3)
+    assert on.all()
+    assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 4.2
+
+
+class Drifting:
+    """A solver that turns a little too far in every frame."""
+
+    def __init__(self, config):
+        self.solver, self.last = GtsamSolver(config), None
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        found = self.solver.solve(associate, guess, priors, motion)
+        if self.last is not None:
+            way = np.linalg.norm(self.last.between(found.map_T_lidar).translation())
+            turn = gtsam.Pose3(gtsam.Rot3.Yaw(0.002 * way), np.zeros(3))
+            found = replace(found, map_T_lidar=found.map_T_lidar.compose(turn))
+        self.last = found.map_T_lidar
+        return found
+
+
+def ring(laps, radius=35.0, step=2.0):
+    angles = np.arange(0.0, 2.0 * np.pi * laps, step / radius)
+    return [
+        gtsam.Pose3(
+            gtsam.Rot3.Yaw(angle + np.pi / 2),
+            np.array([20.0 + radius * np.cos(angle), 20.0 + radius * np.sin(angle), 0.0]),
+        )
+        for angle in angles
+    ]
+
+
+def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
+    """Once round a ring, of which 20 m are in view, and on."""
+    config = settings(turn_walk_deg=0.2)
+    config = replace(config, loops=replace(config.loops, min_way=60.0, min_share=0.4))
+    poses, world = ring(1.15), World(1)
+
+    def rounds(closing):
+        rng, odometry, jumps = np.random.default_rng(0), [], []
+        mapper = Mapper(config, Drifting(config.solver))
+        loops = LoopMapping(mapper, config)
+        for number, pose in enumerate(poses):
+            features = world.seen(pose, number * 10**8, rng)
+            guess = odometry[-1].compose(poses[number - 1].between(pose)) if number else pose
+            update = mapper.register(features, guess)
+            odometry.append(update.map_T_lidar)
+            jumps.append(np.linalg.norm(guess.localCoordinates(update.map_T_lidar)[3:]))
+            if closing:
+                loops.add(update, features)
+        if not closing:
+            return odometry, jumps
+        to_map = loops.map_T_odom
+        assert loops.map_points()[1].shape[1] == 3
+        return [to_map.compose(pose) for pose in odometry], jumps, loops
+
+    def off(found, first):
+        return max(p.range(q) for p, q in zip(poses[first:], found[first:], strict=True))
+
+    (closed, jumps, loops), (left_open, _) = rounds(True), rounds(False)
+    assert loops.counts()["on"] >= 3
+    assert loops.moved > 0
+    assert off(left_open, 120) > 0.5
+    assert off(closed, 120) < 0.5 * off(left_open, 120)
+    assert max(jumps) < 0.2  # odom is continuous
+    again = rounds(True)[0]
+    assert all(one.equals(two, 0.0) for one, two in zip(closed, again, strict=True))

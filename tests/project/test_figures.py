@@ -1,0 +1,51 @@
+"""The command that makes the README's pictures."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+image = pytest.importorskip("matplotlib.image")
+
+
+@pytest.fixture(scope="module")
+def figures() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("figures", ROOT / "docs/figures/readme.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_one_command_makes_every_picture_of_the_readme(figures: ModuleType, tmp_path: Path) -> None:
+    assert figures.main(["--frames", "6", "--output", str(tmp_path)]) == 0
+    made = {path.name for path in tmp_path.iterdir()}
+    assert all(image.imread(tmp_path / name).std() > 0.02 for name in made)
+    shown = re.findall(r"\]\(docs/images/([\w.]+)\)", (ROOT / "README.md").read_text("utf-8"))
+    assert shown
+    assert set(shown) <= made == set(figures.PICTURES)
+
+
+def test_the_readme_has_few_and_small_pictures() -> None:
+    shown = re.findall(r"\]\((docs/images/[\w.]+)\)", (ROOT / "README.md").read_text("utf-8"))
+    assert len(shown) <= 3
+    assert all((ROOT / name).stat().st_size < 400_000 for name in shown)
+
+
+def test_the_way_through_the_town_is_round_its_corners(figures: ModuleType) -> None:
+    import numpy as np
+
+    way = figures.streets()
+    steps = np.diff(way, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    assert lengths.max() < 1.2
+    turns = np.arccos(
+        np.clip((steps[:-1] * steps[1:]).sum(axis=1) / lengths[:-1] / lengths[1:], -1, 1)
+    )
+    assert np.degrees(turns).max() < 12.0

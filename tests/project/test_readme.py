@@ -1,0 +1,180 @@
+"""The README and the docs say what is so: commands, links, pictures, code, keys."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from loam_gtsam import Config
+from loam_gtsam.cli.app import app
+from loam_gtsam.cli.run import PLOT_FILES, TRUTH_FILE
+from loam_gtsam.io.run_files import RUN_FILES, stage_seconds, write_npz
+from loam_gtsam.types import FrameStatus
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    """The fenced blocks of one language."""
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+
+
+def steps(script: str) -> list[str]:
+    """Commands of a shell script; what CI wraps around them is taken off."""
+    script = re.sub(r"\s*&&\s*", "\n", script)
+    script = script.replace('"${PYTHON:-python3}"', "python3").replace('"$scratch/venv', '".venv')
+    commands = []
+    for line in script.splitlines():
+        words = shlex.split(line, comments=True)
+        words = [word for word in words if word not in ("step", "--quiet")]
+        if words:
+            commands.append(" ".join(words))
+    return commands
+
+
+def test_ci_runs_the_install_commands_of_the_readme() -> None:
+    installs = blocks(ROOT / "README.md", "bash")
+    tested = "\n".join(
+        line for line in (ROOT / ".ci/run").read_text("utf-8").splitlines()
+        if line.startswith(("step", ". "))
+    )  # fmt: skip
+    tested_steps = steps(tested)
+    assert len(installs) == 2
+    assert "loam-gtsam demo" in installs[0]
+    assert "python -m pytest" in installs[1]
+    for block in installs:
+        place = 0
+        for command in steps(block):
+            # CI may add options (fewer frames, an output folder), and must keep the order.
+            rest = tested_steps[place:]
+            found = [n for n, step in enumerate(rest) if (step + " ").startswith(command + " ")]
+            assert found, f"not in .ci/run, or not in this order: {command}"
+            place += found[0]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_and_pictures_are_there(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text("utf-8"), flags=re.M | re.S)
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if re.match(r"https?://", target):
+            continue
+        name, _, anchor = target.partition("#")
+        file = (page.parent / name).resolve() if name else page
+        assert file.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in anchors(file), f"{page.name}: {target}"
+
+
+def anchors(page: Path) -> set[str]:
+    """Anchors of the headings, as the usual Markdown hosts make them."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text("utf-8"), re.M)
+    return {
+        re.sub(r"[^\w -]", "", heading).strip().lower().replace(" ", "-") for heading in headings
+    }
+
+
+def test_every_page_is_on_the_map() -> None:
+    index = ROOT / "docs/index.md"
+    linked = {
+        (index.parent / target.partition("#")[0]).resolve()
+        for target in re.findall(r"\]\(([^)\s]+)\)", index.read_text("utf-8"))
+    }
+    pages = {page for page in PAGES if page != index}
+    assert pages <= linked, pages - linked
+
+
+EXECUTED = ("README", "quickstart", "own_factor", "own_loop_closer", "own_sensor", "bags_out")
+CODE = [
+    pytest.param(code, id=f"{page.stem}-{number}")
+    for page in PAGES
+    for number, code in enumerate(blocks(page, "python"))
+    if page.stem in EXECUTED
+]
+
+
+@pytest.mark.parametrize("code", CODE)
+def test_python_blocks_run(
+    code: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, Any] = {"__name__": "block"}
+    exec(compile(code, "block", "exec"), names)
+    if "update" in names:
+        assert names["update"].status == "ok"
+    if "planes" in names:
+        assert len(names["planes"]) > 1000
+
+
+SHELL = [
+    (page, line.strip())
+    for page in PAGES
+    for language in ("console", "bash")
+    for block in blocks(page, language)
+    for line in block.splitlines()
+    if line.strip().startswith("loam-gtsam ")
+]
+
+
+@pytest.mark.parametrize(("page", "line"), SHELL, ids=[line for _, line in SHELL])
+def test_commands_parse(page: Path, line: str) -> None:
+    _, name, *words = shlex.split(line, comments=True)
+    group: Any = typer.main.get_command(app)
+    command = group.commands[name]  # an unknown command is a KeyError
+    command.make_context(name, list(words))  # an unknown option is a usage error
+    for entry in (words[n + 1] for n, word in enumerate(words) if word == "--set"):
+        section, _, field = entry.partition("=")[0].partition(".")
+        assert field in {f.name for f in dataclasses.fields(getattr(Config(), section))}
+
+
+def test_parameters_named_in_the_docs_exist() -> None:
+    config = Config()
+    sections = [item.name for item in dataclasses.fields(config)]
+    named = re.compile(rf"(?<!\[)`(?:--set )?({'|'.join(sections)})\.([a-z]\w+)")
+    found = 0
+    for page in PAGES:
+        for section, field in named.findall(page.read_text("utf-8")):
+            if field in ("py", "ply", "png", "csv", "tum", "g2o"):  # a file
+                continue
+            found += 1
+            assert hasattr(getattr(config, section), field), f"{page.name}: {section}.{field}"
+    assert found > 20
+
+
+def test_outputs_page_lists_every_file_and_key(tmp_path: Path) -> None:
+    text = (ROOT / "docs/outputs.md").read_text("utf-8")
+    write_npz(tmp_path / "run.npz", [])
+    with np.load(tmp_path / "run.npz") as arrays:
+        keys = set(arrays.files)
+    for name in (*RUN_FILES, *PLOT_FILES, TRUTH_FILE, *keys):
+        assert f"`{name}`" in text, name
+
+
+def test_every_status_is_explained() -> None:
+    text = (ROOT / "docs/conventions.md").read_text("utf-8")
+    for status in FrameStatus:
+        assert f"| `{status}` |" in text
+
+
+def test_every_stage_is_explained() -> None:
+    from loam_gtsam import SimulatedWorld, run
+
+    names, _ = stage_seconds(run(SimulatedWorld("room", frames=2, columns=300)).updates)
+    text = (ROOT / "docs/profile.md").read_text("utf-8")
+    assert [name for name in names if f"| `{name}` |" not in text] == []
+
+
+def test_the_pictures_are_small() -> None:
+    pictures = list((ROOT / "docs/images").iterdir())
+    assert pictures
+    assert all(picture.stat().st_size < 500_000 for picture in pictures)

@@ -1,0 +1,607 @@
+"""The classical solvers: steps and optima of the factor graph, and what is theirs alone."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from loam_gtsam.config import Config, MatchingConfig, SolverConfig, preset
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.factors import scan_match_factor
+from loam_gtsam.mapper import Mapper, make_solver
+from loam_gtsam.pipeline import run
+from loam_gtsam.registration import classical
+from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches, match_planes
+from loam_gtsam.registration.classical import (
+    ALoamSolver,
+    ClassicalSolver,
+    aloam_rows,
+    degeneracy_projector,
+    euler_jacobian,
+    loam_rows,
+)
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, Solution, match_rows
+from loam_gtsam.types import Features, FrameStatus, InputError
+
+TRUTH = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
+OFFSET = np.array([0.02, -0.01, 0.02, 0.07, 0.13, -0.13])
+SIX = np.eye(6)
+
+
+def unit(rng, count):
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def edge_matches(points, centres, directions, weights):
+    count = len(points)
+    return EdgeMatches(
+        points, centres, directions, np.zeros(count), np.ones(count), weights, np.arange(count)
+    )
+
+
+def plane_matches(points, normals, offsets, weights):
+    count = len(points)
+    return PlaneMatches(
+        points, normals, offsets, np.zeros(count), np.ones(count), weights, np.arange(count)
+    )
+
+
+def make_matches(n_edges=40, n_planes=200, noise=0.0, seed=0):
+    """Matches of unit sigma that TRUTH satisfies exactly, but for noise."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-20, 20, (n_edges + n_planes, 3))
+    there = TRUTH.transformFrom(points.T).T + noise * rng.normal(size=points.shape)
+    directions, normals = unit(rng, n_edges), unit(rng, n_planes)
+    centres = there[:n_edges] + directions * rng.uniform(-3, 3, (n_edges, 1))
+    offsets = -np.einsum("ij,ij->i", normals, there[n_edges:])
+    return ScanMatches(
+        edge_matches(points[:n_edges], centres, directions, rng.uniform(0.2, 1.0, n_edges)),
+        plane_matches(points[n_edges:], normals, offsets, rng.uniform(0.2, 1.0, n_planes)),
+    )
+
+
+def floor_and_wall(n_wall, seed=0):
+    """300 points of a floor, n_wall of a wall across x, some of a wall across y; pose: identity."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-10, 10, (500 + n_wall, 3))
+    normals = np.repeat(np.eye(3), [n_wall, 200, 300], axis=0)
+    offsets = -np.einsum("ij,ij->i", normals, points)
+    nothing = np.empty((0, 3))
+    return ScanMatches(
+        edge_matches(nothing, nothing, nothing, np.empty(0)),
+        plane_matches(points, normals, offsets, np.ones(len(points))),
+    )
+
+
+def solver(kind, **changes):
+    """Without LOAM's projector, which finds a few hundred matches too few, unless asked for."""
+    method = {GtsamSolver: "gtsam", ClassicalSolver: "loam", ALoamSolver: "aloam"}[kind]
+    return kind(SolverConfig(**{"method": method, "degeneracy_threshold": 0.0} | changes))
+
+
+def difference(a, b):
+    return np.abs(a.localCoordinates(b)).max()
+
+
+def graph_step(matches, pose):
+    """The Gauss-Newton step of the factor graph, in the package's tangent."""
+    factor = scan_match_factor(POSE_KEY, match_rows(matches))
+    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(factor)
+    values.insert(POSE_KEY, pose)
+    return graph.linearize(values).optimize().at(POSE_KEY)
+
+
+def numerical(function, size=1e-6):
+    return np.stack([(function(size * e) - function(-size * e)) / (2 * size) for e in SIX], axis=1)
+
+
+def by_euler(pose, x):
+    """Add to (rx, ry, rz, x, y, z) in LOAM's camera-like axes, written out as matrices there."""
+    lidar_r_loam = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    r = lidar_r_loam.T @ pose.rotation().matrix() @ lidar_r_loam
+    rx = np.arcsin(-r[1, 2]) + x[0]
+    ry = np.arctan2(r[0, 2], r[2, 2]) + x[1]
+    rz = np.arctan2(r[1, 0], r[1, 1]) + x[2]
+    turned = (gtsam.Rot3.Ry(ry) * gtsam.Rot3.Rx(rx) * gtsam.Rot3.Rz(rz)).matrix()
+    return gtsam.Pose3(
+        gtsam.Rot3(lidar_r_loam @ turned @ lidar_r_loam.T),
+        pose.translation() + lidar_r_loam @ x[3:],
+    )
+
+
+# -- one step, and the optimum, are those of the factor graph --------------------------------------
+
+
+def faced(matches, pose):
+    """The same matches with each line replaced by the plane through it that faces its point."""
+    rows, p = loam_rows(matches, pose), matches.planes
+    weights = np.concatenate([matches.edges.weights, p.weights])
+    nothing = np.empty((0, 3))
+    return ScanMatches(
+        edge_matches(nothing, nothing, nothing, np.empty(0)),
+        plane_matches(rows.points, rows.normals, rows.offsets, weights),
+    )
+
+
+@pytest.mark.parametrize("n_edges", [0, 60])
+def test_one_step_of_loam_is_that_of_the_factor_graph(n_edges):
+    """With edges, of the graph that has LOAM's single row for each of them."""
+    pose = TRUTH.retract(OFFSET)
+    matches = make_matches(n_edges=n_edges, noise=0.02)
+    solution = solver(ClassicalSolver, iterations=1).solve(lambda pose: matches, pose)
+    expected = graph_step(faced(matches, pose), pose)
+    assert np.abs(expected).max() > 0.1
+    moved = by_euler(pose, np.linalg.solve(euler_jacobian(pose), expected))
+    assert difference(solution.map_T_lidar, moved) < 1e-9
+
+
+def test_with_edges_the_step_is_not_that_of_two_rows():
+    """One row knows nothing of the curvature around the line; documented in docs/classical.md."""
+    pose, matches = TRUTH.retract(OFFSET), make_matches(n_edges=60, noise=0.02)
+    two_rows, one_row = graph_step(matches, pose), graph_step(faced(matches, pose), pose)
+    assert np.abs(two_rows - one_row).max() > 1e-4
+
+
+def test_one_undamped_step_of_aloam_is_that_of_the_factor_graph(monkeypatch):
+    monkeypatch.setattr(classical, "_START_RADIUS", 1e16)
+    pose, matches = TRUTH.retract(OFFSET), make_matches(noise=0.02)
+    moved = (
+        solver(ALoamSolver, iterations=1, inner_iterations=1, huber_delta=0.0)
+        .solve(lambda pose: matches, pose)
+        .map_T_lidar
+    )
+    turn = pose.rotation().matrix()
+    rotation = gtsam.Rot3.Logmap(pose.rotation().inverse() * moved.rotation())
+    shift = turn.T @ (moved.translation() - pose.translation())
+    expected = graph_step(matches, pose)
+    np.testing.assert_allclose(np.concatenate([rotation, shift]), expected, atol=1e-9)
+
+
+def test_the_damping_is_that_of_ceres():
+    """The first step solves (H + diag(H) / 1e4) x = -g."""
+    pose, matches = TRUTH.retract(OFFSET), make_matches(noise=0.02)
+    once = solver(ALoamSolver, iterations=1, inner_iterations=1, huber_delta=0.0)
+    moved = once.solve(lambda pose: matches, pose).map_T_lidar
+    r, j = aloam_rows(matches).residuals(pose)
+    to_map = np.kron(np.eye(2), pose.rotation().matrix())
+    j = j @ to_map.T
+    h = j.T @ j
+    x = np.linalg.solve(h + np.diag(h.diagonal()) / 1e4, -j.T @ r)
+    expected = gtsam.Pose3(gtsam.Rot3.Expmap(x[:3]) * pose.rotation(), pose.translation() + x[3:])
+    assert difference(moved, expected) < 1e-9
+    assert difference(moved, pose.retract(graph_step(matches, pose))) > 1e-6
+
+
+@pytest.mark.parametrize("n_edges", [0, 40])
+@pytest.mark.parametrize("guess", [OFFSET, -3 * OFFSET])
+def test_solved_to_convergence_the_optima_agree(n_edges, guess):
+    matches = make_matches(n_edges=n_edges, noise=0.02)
+    exact = {"rotation_tolerance_deg": 1e-9, "translation_tolerance": 1e-10, "step_sigmas": 0.0}
+    loam, aloam, graph = (
+        solver(kind, iterations=60, **exact, **more).solve(
+            lambda pose: matches, TRUTH.retract(guess)
+        )
+        for kind, more in (
+            (ClassicalSolver, {}),
+            (ALoamSolver, {"huber_delta": 0.0, "cost_tolerance": 0.0}),
+            (GtsamSolver, {}),
+        )
+    )
+    assert difference(TRUTH, graph.map_T_lidar) > 1e-4  # the noise moved it
+    assert difference(loam.map_T_lidar, graph.map_T_lidar) < 1e-6
+    assert difference(aloam.map_T_lidar, graph.map_T_lidar) < 1e-6
+    assert loam.error_after == pytest.approx(graph.error_after, rel=1e-9)
+    assert aloam.error_after == pytest.approx(graph.error_after, rel=1e-9)
+    assert loam.error_before == pytest.approx(graph.error_before, rel=1e-9)
+    np.testing.assert_allclose(aloam.information, graph.information, rtol=1e-5, atol=1e-2)
+
+
+def test_on_edges_alone_loam_goes_to_and_fro():
+    """A row per edge is half of what is known about it: the step is twice too long."""
+    matches, exact = make_matches(n_edges=200, n_planes=0, noise=0.02), {"step_sigmas": 0.0}
+    still = {"rotation_tolerance_deg": 1e-9, "translation_tolerance": 1e-10}
+    loam, graph = (
+        solver(kind, iterations=60, **exact, **still).solve(
+            lambda pose: matches, TRUTH.retract(OFFSET)
+        )
+        for kind in (ClassicalSolver, GtsamSolver)
+    )
+    assert (graph.converged, loam.converged) == (True, False)
+    assert 1e-4 < difference(loam.map_T_lidar, graph.map_T_lidar) < 0.1
+
+
+# -- what all solvers promise ----------------------------------------------------------------------
+
+BOTH = pytest.mark.parametrize("kind", [ClassicalSolver, ALoamSolver])
+
+
+@BOTH
+def test_recovers_a_known_pose_and_reports_it(kind):
+    matches = make_matches()
+    solution = solver(kind).solve(lambda pose: matches, TRUTH.retract(OFFSET))
+    assert isinstance(solution, Solution)
+    assert difference(solution.map_T_lidar, TRUTH) < 1e-5
+    assert (solution.solved, solution.converged) == (True, True)
+    assert solution.matches is matches
+    assert solution.solver_iterations >= solution.iterations > 1
+    assert solution.error_after < 1e-6 < solution.error_before
+
+
+@BOTH
+def test_too_few_matches_give_the_guess_back(kind):
+    guess, matches = TRUTH.retract(OFFSET), make_matches(n_edges=10, n_planes=40)
+    assert solver(kind, min_matches=50).solve(lambda pose: matches, guess).solved
+    refused = solver(kind, min_matches=51).solve(lambda pose: matches, guess)
+    assert (refused.solved, refused.converged, refused.iterations) == (False, False, 1)
+    assert refused.map_T_lidar.equals(guess, 0.0)
+    assert not refused.information.any()
+
+
+@BOTH
+def test_matches_lost_on_the_way_give_the_guess_back(kind):
+    guess, asked = TRUTH.retract(OFFSET), []
+
+    def associate(pose):
+        asked.append(pose)
+        return make_matches(n_edges=0, n_planes=200 if len(asked) == 1 else 10, noise=0.02)
+
+    refused = solver(kind).solve(associate, guess)
+    assert (refused.solved, refused.iterations) == (False, 2)
+    assert refused.map_T_lidar.equals(guess, 0.0)
+
+
+@BOTH
+def test_a_prior_is_refused_not_ignored(kind):
+    prior = gtsam.PriorFactorPose3(POSE_KEY, TRUTH, gtsam.noiseModel.Unit.Create(6))
+    matches = make_matches()
+    with pytest.raises(InputError, match=r"priors: .* got 1; use solver.method: gtsam"):
+        solver(kind).solve(lambda pose: matches, TRUTH, [prior])
+
+
+@BOTH
+def test_the_same_input_gives_the_same_bits(kind):
+    matches = make_matches(noise=0.05)
+    a, b = (solver(kind).solve(lambda pose: matches, TRUTH.retract(OFFSET)) for _ in range(2))
+    assert a.map_T_lidar.matrix().tobytes() == b.map_T_lidar.matrix().tobytes()
+    assert a.information.tobytes() == b.information.tobytes()
+
+
+def test_loam_stops_when_the_step_is_small_and_aloam_never():
+    def solve(kind, **changes):
+        matches = make_matches(noise=0.02)
+        return solver(kind, iterations=7, **changes).solve(lambda pose: matches, TRUTH)
+
+    wide = {"rotation_tolerance_deg": 50.0, "translation_tolerance": 5.0}
+    for changes, converged, loam_iterations in (
+        (wide, True, 1),
+        (wide | {"rotation_tolerance_deg": 0.0}, False, 7),
+        (wide | {"translation_tolerance": 0.0}, False, 7),
+    ):
+        loam, aloam = solve(ClassicalSolver, **changes), solve(ALoamSolver, **changes)
+        assert (loam.converged, loam.iterations) == (converged, loam_iterations)
+        assert (aloam.converged, aloam.iterations) == (converged, 7)
+
+
+# -- LOAM's own ------------------------------------------------------------------------------------
+
+
+def test_euler_jacobian_is_the_derivative_in_loams_own_axes():
+    pose = TRUTH
+    expected = numerical(lambda x: pose.localCoordinates(by_euler(pose, x)))
+    np.testing.assert_allclose(euler_jacobian(pose), expected, atol=1e-8)
+
+
+def test_loam_rows_are_distances_with_their_gradients_times_s():
+    matches, pose = make_matches(noise=0.1), TRUTH.retract(OFFSET)
+    e, p = matches.edges, matches.planes
+
+    def distances(step):
+        moved = pose.retract(step)
+        away = moved.transformFrom(e.points.T).T - e.centres
+        planes = np.einsum("ij,ij->i", p.normals, moved.transformFrom(p.points.T).T) + p.offsets
+        lines = np.linalg.norm(np.cross(away, e.directions), axis=1)
+        return np.concatenate([e.weights * lines, p.weights * planes])
+
+    residual, jacobian = loam_rows(matches, pose).residuals(pose)
+    np.testing.assert_allclose(residual, distances(np.zeros(6)), atol=1e-12)
+    np.testing.assert_allclose(jacobian, numerical(distances), atol=1e-5)
+
+
+def test_a_point_on_its_line_adds_nothing_and_divides_by_nothing():
+    line = np.array([[0.0, 0.0, 1.0]])
+    base = make_matches(n_edges=0).planes
+    on_line = edge_matches(line * 2.0, line, line, np.ones(1))
+    residual, jacobian = loam_rows(ScanMatches(on_line, base), gtsam.Pose3()).residuals(
+        gtsam.Pose3()
+    )
+    assert residual[0] == 0.0
+    assert not jacobian[0].any()
+
+
+def test_information_is_that_of_the_rows_at_the_pose():
+    matches = make_matches(noise=0.05)
+    for kind in (ClassicalSolver, ALoamSolver):
+        solution = solver(kind, iterations=1, huber_delta=0.0).solve(
+            lambda pose: matches, TRUTH.retract(OFFSET)
+        )
+        pose = solution.map_T_lidar
+        rows = loam_rows(matches, pose) if kind is ClassicalSolver else aloam_rows(matches)
+        _, j = rows.residuals(pose)
+        np.testing.assert_allclose(solution.information, j.T @ j, rtol=1e-9, atol=1e-6)
+
+
+def test_weak_directions_below_the_threshold_stay_and_others_move():
+    """40 rows across x make an eigenvalue of 40."""
+    matches, guess = floor_and_wall(40), gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.1]))
+
+    def solve(threshold):
+        frozen = solver(ClassicalSolver, degeneracy_threshold=threshold)
+        return frozen.solve(lambda pose: matches, guess).map_T_lidar
+
+    free = solve(0.0)
+    assert difference(free, gtsam.Pose3()) < 1e-6
+    assert difference(solve(10.0), free) < 1e-12
+    held = solve(100.0)
+    np.testing.assert_allclose(held.translation(), [0.3, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(held.translation()[1:], 0.0, atol=0.01)
+    assert held.x() > 0.28
+
+
+def test_the_projector_is_that_of_the_first_association():
+    guess, asked = gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.1])), []
+
+    def solve(first, later):
+        asked.clear()
+
+        def associate(pose):
+            asked.append(pose)
+            return floor_and_wall(first if len(asked) == 1 else later)
+
+        weak = solver(ClassicalSolver, degeneracy_threshold=100.0)
+        return weak.solve(associate, guess).map_T_lidar.x()
+
+    assert abs(solve(300, 300)) < 1e-6
+    assert solve(40, 300) > 0.28
+    assert abs(solve(300, 40)) < 1e-6
+
+
+def test_projector_keeps_what_is_known_and_the_published_one_does_not():
+    rng = np.random.default_rng(3)
+    basis, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+    normal = basis @ np.diag([1.0, 99.0, 101.0, 1e3, 1e4, 1e5]) @ basis.T
+    correct = degeneracy_projector(normal, 100.0)
+    np.testing.assert_allclose(correct @ basis[:, :2], 0.0, atol=1e-9)
+    np.testing.assert_allclose(correct @ basis[:, 2:], basis[:, 2:], atol=1e-9)
+    wrong = degeneracy_projector(normal, 100.0, published=True)
+    assert np.abs(wrong @ basis[:, :2]).max() > 0.1
+    for published in (False, True):
+        whole = degeneracy_projector(normal, 0.5, published=published)
+        np.testing.assert_allclose(whole, SIX, atol=1e-9)
+
+
+def test_the_published_projector_is_selectable():
+    matches, guess = floor_and_wall(40), gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.1]))
+    correct, published = (
+        solver(ClassicalSolver, degeneracy_threshold=100.0, degeneracy_projector=name)
+        .solve(lambda pose: matches, guess)
+        .map_T_lidar
+        for name in ("correct", "published")
+    )
+    assert difference(correct, published) > 0.01
+
+
+def test_a_direction_without_any_row_is_no_error():
+    matches, guess = floor_and_wall(0), gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.1]))
+    solution = solver(ClassicalSolver).solve(lambda pose: matches, guess)
+    np.testing.assert_allclose(solution.map_T_lidar.translation()[1:], 0.0, atol=1e-6)
+    assert np.isfinite(solution.map_T_lidar.matrix()).all()
+
+
+# -- A-LOAM's own ----------------------------------------------------------------------------------
+
+
+def with_outliers(n_edges):
+    matches = make_matches(n_edges=n_edges, noise=0.02)
+    ones = np.ones(len(matches.planes))
+    shifted = matches.planes.offsets + np.where(np.arange(len(ones)) % 8 == 0, 0.7, 0.0)
+    return ScanMatches(
+        replace(matches.edges, weights=np.ones(n_edges)),
+        replace(matches.planes, weights=ones, offsets=shifted),
+    )
+
+
+def test_the_optimum_is_that_of_scipys_huber_loss():
+    matches = with_outliers(0)
+    rows = aloam_rows(matches)
+    reference = least_squares(
+        lambda x: rows.residuals(TRUTH.retract(x))[0],
+        np.zeros(6),
+        loss="huber",
+        f_scale=0.1,
+        xtol=1e-14,
+        ftol=1e-14,
+        gtol=1e-12,
+    )
+    exact = solver(ALoamSolver, iterations=10, inner_iterations=10, cost_tolerance=0.0)
+    solution = exact.solve(lambda pose: matches, TRUTH.retract(OFFSET))
+    assert difference(solution.map_T_lidar, TRUTH.retract(reference.x)) < 1e-6
+    assert solution.error_after == pytest.approx(reference.cost, rel=1e-9)
+    plain = solver(ALoamSolver, huber_delta=0.0).solve(lambda pose: matches, TRUTH)
+    assert difference(solution.map_T_lidar, TRUTH) < 0.5 * difference(plain.map_T_lidar, TRUTH)
+
+
+def test_the_loss_is_on_the_distance_of_an_edge_not_on_its_two_rows():
+    """(0.09, 0.09) is 0.127 from the line: above a delta of 0.1, though neither row is."""
+    line = np.array([[0.0, 0.0, 1.0]])
+    point = np.array([[0.09, 0.09, 3.0]])
+    far = edge_matches(point, np.zeros((1, 3)), line, np.ones(1))
+    planes = floor_and_wall(100).planes
+    solution = solver(ALoamSolver, iterations=1).solve(
+        lambda pose: ScanMatches(far, planes), gtsam.Pose3()
+    )
+    distance = np.hypot(0.09, 0.09)
+    assert solution.error_before == pytest.approx(0.1 * distance - 0.5 * 0.1**2, rel=1e-9)
+
+
+def test_a_step_that_raises_the_cost_is_not_taken_but_damped():
+    """Seven planes that contradict one another by metres."""
+    matches = make_matches(n_edges=0, n_planes=7, noise=3.0)
+
+    def cost(pose):
+        return 0.5 * np.sum(aloam_rows(matches).residuals(pose)[0] ** 2)
+
+    def solve(inner):
+        once = solver(
+            ALoamSolver, min_matches=6, iterations=1, inner_iterations=inner, huber_delta=0.0
+        )
+        return once.solve(lambda pose: matches, TRUTH)
+
+    assert cost(TRUTH.retract(graph_step(matches, TRUTH))) > cost(TRUTH)
+    rejected = solve(1)
+    assert rejected.map_T_lidar.equals(TRUTH, 0.0)
+    assert rejected.error_after == rejected.error_before == pytest.approx(cost(TRUTH))
+    assert solve(30).error_after < 0.1 * cost(TRUTH)
+
+
+def test_the_last_small_step_is_not_taken():
+    matches = make_matches(noise=0.02)
+
+    def solve(tolerance):
+        once = solver(ALoamSolver, iterations=1, inner_iterations=20, cost_tolerance=tolerance)
+        return once.solve(lambda pose: matches, TRUTH)
+
+    assert solve(1.0).map_T_lidar.equals(TRUTH, 0.0)
+    assert solve(1.0).solver_iterations == 1
+    assert not solve(1e-6).map_T_lidar.equals(TRUTH, 1e-5)
+    assert 1 < solve(1e-6).solver_iterations < 20
+
+
+# -- matching options ------------------------------------------------------------------------------
+
+PLAIN = MatchingConfig(
+    plane_ratio=0.0, min_incidence_sine=0.0, fit_uncertainty=False, plane_fit="unit_offset"
+)
+
+
+def patches(rng, centre, normal, count=200, scatter=0.01):
+    """Groups of five points of a plane and one query 5 cm off it."""
+    normal = np.asarray(normal) / np.linalg.norm(normal)
+    sideways = np.linalg.svd(normal[None])[2][1:]
+    spread = rng.uniform(-0.4, 0.4, (count, 5, 2)) @ sideways
+    groups = np.asarray(centre) + spread + scatter * rng.normal(size=(count, 5, 3))
+    return groups, np.asarray(centre) + 0.05 * normal + np.zeros((count, 3))
+
+
+def match(groups, queries, config):
+    squared = np.full(groups.shape[:2], 0.1)
+    return match_planes(queries, queries, groups, squared, np.eye(4), config)
+
+
+def test_unit_offset_is_the_least_squares_of_a_n_minus_one():
+    groups, queries = patches(np.random.default_rng(0), [20.0, -7.0, 3.0], [1.0, -0.5, 0.2])
+    found = match(groups, queries, PLAIN)
+    assert len(found) == len(groups)
+    for i in (0, 77, 199):
+        n = np.linalg.lstsq(groups[i], -np.ones(5), rcond=None)[0]
+        np.testing.assert_allclose(found.normals[i], n / np.linalg.norm(n), atol=1e-9)
+        np.testing.assert_allclose(found.offsets[i], 1.0 / np.linalg.norm(n), rtol=1e-9)
+    heights = np.einsum("ij,ij->i", found.normals, queries) + found.offsets
+    np.testing.assert_allclose(found.distances, heights, atol=1e-12)
+
+
+def test_unit_offset_cannot_have_a_plane_through_the_origin():
+    groups, queries = patches(
+        np.random.default_rng(0), [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], scatter=0.0
+    )
+    assert len(match(groups, queries, PLAIN)) == 0
+    assert len(match(groups, queries, replace(PLAIN, plane_fit="centroid"))) == len(groups)
+
+
+def test_points_exactly_in_a_plane_or_on_a_line():
+    groups, queries = patches(
+        np.random.default_rng(0), [4.0, 4.0, 2.0], [0.0, 0.0, 1.0], scatter=0.0
+    )
+    found = match(groups, queries, PLAIN)
+    np.testing.assert_allclose(found.normals, np.tile([0, 0, -1.0], (len(groups), 1)), atol=1e-9)
+    np.testing.assert_allclose(found.offsets, 2.0, atol=1e-9)
+    same = np.broadcast_to([4.0, 4.0, 2.0], (3, 5, 3)).copy()
+    assert len(match(same, same[:, 0], PLAIN)) == 0
+
+
+@pytest.mark.parametrize(("name", "reach"), [("lidar", 4.0), ("map", 25.0)])
+def test_the_range_in_a_weight_is_from_the_sensor_or_the_map_origin(name, reach):
+    groups, _ = patches(np.random.default_rng(0), [0.0, 25.0, 0.0], [0.0, 1.0, 0.0], 1, 0.0)
+    pose = np.eye(4)
+    pose[:3, 3] = [0.0, 21.0, 0.0]
+    query = np.array([[0.0, 25.0, 0.0]])
+    config = replace(PLAIN, weight_range=name, plane_fit="centroid")
+    groups[:, :, 1] += 0.1
+    found = match_planes(query, query, groups, np.full((1, 5), 0.1), pose, config)
+    assert found.weights[0] == pytest.approx(1.0 - 0.9 * 0.1 / np.sqrt(reach), rel=1e-9)
+
+
+# -- in the mapper ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("default", GtsamSolver), ("loam", ClassicalSolver), ("aloam", ALoamSolver)],
+)
+def test_a_preset_names_its_solver(name, kind):
+    config = preset(name)
+    assert type(make_solver(config.solver)) is kind
+    assert type(Mapper(config).solver) is kind
+
+
+@pytest.mark.parametrize("name", ["loam", "aloam"])
+def test_a_preset_maps_raw_sweeps(name):
+    world = SimulatedWorld("street_loop", frames=10)
+    result = run(world, preset(name))
+    assert all(u.status.solved for u in result.updates[1:])
+    there = world.truth.map_T_lidar[:10]
+    expected = np.linalg.inv(there[0]) @ there
+    assert np.linalg.norm(expected[-1, :3, 3]) > 0.3
+    assert np.linalg.norm((result.trajectory.map_T_lidar - expected)[:, :3, 3], axis=1).max() < 0.12
+    assert np.linalg.eigvalsh(result.updates[-1].information).min() > 1.0
+
+
+class _Watch:
+    """A solver that associates twice, and keeps the planes' points of each time."""
+
+    def __init__(self):
+        self.solves = []
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        matches = [associate(guess), associate(guess.retract(np.full(6, 1e-3)))]
+        self.solves.append([match.planes for match in matches])
+        return Solution(guess, True, True, matches[1], 2, 2, 1.0, 0.0, np.eye(6))
+
+
+@pytest.mark.parametrize("refine", [True, False])
+def test_refine_does_the_first_sweeps_and_the_deskew_again(refine):
+    config = replace(
+        Config(),
+        deskew=replace(Config().deskew, refine=refine),
+    )
+    watch = _Watch()
+    mapper = Mapper(config, watch)
+    rng = np.random.default_rng(0)
+    for i in range(3):
+        walls = rng.uniform(-1, 1, (4000, 3)) * [6, 4, 2]
+        axis = rng.integers(0, 3, 4000)
+        walls[np.arange(4000), axis] = np.sign(walls[np.arange(4000), axis]) * [6, 4, 2][0]
+        features = Features.from_points(i * 100_000_000, walls[:200], walls)
+        times = rng.uniform(0.0, 0.1, 4000)
+        features = replace(features, plane_times=times, span=(0.0, 0.1))
+        twist = np.array([0.0, 0.0, 0.2, 1.0, 0.0, 0.0])
+        update = mapper.register(features, gtsam.Pose3(), twist)
+        assert update.status is (FrameStatus.FIRST if i == 0 else FrameStatus.OK)
+    assert len(watch.solves) == (4 if refine else 2)
+    first, second = watch.solves[-1]
+    shared, i, j = np.intersect1d(first.indices, second.indices, return_indices=True)
+    assert len(shared) > 100
+    assert np.array_equal(first.points[i], second.points[j]) is not refine

@@ -1,0 +1,379 @@
+"""Which directions a scan fixes: closed-form scenes, false information, and what takes over."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config, SolverConfig
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.mapper import Mapper
+from loam_gtsam.pipeline import effective_config
+from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.degeneracy import localizability, unseen_by_planes
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, MotionPrior
+from loam_gtsam.types import FrameStatus
+
+LEAST = SolverConfig().min_aligned
+POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.2, -0.3, 1.1), np.array([40.0, -7.0, 3.0]))
+NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
+
+
+def surfaces(points, normals, tilt=0.05, noise=0.0, seed=0):
+    """Matches seen from POSE with planes through the points; normals wrong by ``noise`` rad."""
+    rng = np.random.default_rng(seed)
+    count = len(points)
+    wrong = normals + noise * rng.normal(size=(count, 3))
+    wrong /= np.linalg.norm(wrong, axis=1)[:, None]
+    rotation = POSE.rotation().matrix()
+    there = points @ rotation.T + POSE.translation()
+    turned = wrong @ rotation.T
+    return PlaneMatches(
+        points,
+        turned,
+        -np.einsum("ij,ij->i", turned, there),
+        np.zeros(count),
+        np.full(count, 0.03),
+        np.ones(count),
+        np.arange(count),
+        np.full(count, tilt),
+    )
+
+
+def room(sides=((1, 6.0), (2, 2.0)), count=400, extent=(15.0, 6.0, 2.0), seed=0):
+    """Points on pairs of walls: (axis, distance)."""
+    rng = np.random.default_rng(seed)
+    points, normals = [], []
+    for axis, distance in sides:
+        wall = rng.uniform(-1, 1, (count, 3)) * extent
+        wall[:, axis] = distance * np.sign(rng.normal(size=count))
+        points.append(wall)
+        normals.append(np.tile(np.eye(3)[axis], (count, 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def angle(direction, axis):
+    """Degrees between a tangent vector and one of the six axes, in metres at the points."""
+    unit = direction * np.array([10.0, 10, 10, 1, 1, 1])
+    return np.degrees(np.arccos(abs(unit[axis]) / np.linalg.norm(unit)))
+
+
+def found(planes, edges=NO_EDGES):
+    return localizability(ScanMatches(edges, planes), POSE)
+
+
+def test_a_room_has_no_weak_direction():
+    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
+    seen = found(surfaces(points, normals, noise=0.05))
+    assert len(seen.weak(LEAST)) == 0
+    assert seen.projector(LEAST) is None
+    assert np.all(np.diff(seen.aligned) >= 0)
+
+
+def test_a_corridor_is_weak_along_its_axis_although_its_noise_is_information():
+    points, normals = room()
+    planes = surfaces(points, normals, noise=0.05)
+    rows = planes.normals @ POSE.rotation().matrix()
+    claimed = np.sum((rows[:, 0] / planes.sigmas) ** 2)
+    assert claimed**-0.5 < 0.03  # a standard deviation of centimetres, from noise alone
+    weak = found(planes).weak(LEAST)
+    assert len(weak) == 1
+    assert angle(weak[0], 3) < 5.0
+
+
+def test_enough_of_an_end_wall_lifts_it():
+    points, normals = room()
+    end = np.column_stack([np.full(40, 20.0), *np.random.default_rng(3).uniform(-2, 2, (2, 40))])
+    for count, weak in ((3, 1), (40, 0)):
+        both = np.concatenate([points, end[:count]])
+        across = np.concatenate([normals, np.tile([1.0, 0, 0], (count, 1))])
+        assert len(found(surfaces(both, across, noise=0.05)).weak(LEAST)) == weak
+
+
+def test_on_one_plane_three_directions_are_weak():
+    points, normals = room(((2, 2.0),), extent=(15.0, 15.0, 2.0))
+    points[:, 2] = -2.0
+    weak = found(surfaces(points, normals)).weak(LEAST)
+    assert len(weak) == 3
+    # x, y and yaw: none of them lifts or tilts.
+    assert np.abs(weak[:, [0, 1, 5]]).max() < 0.02 * np.abs(weak).max()
+
+
+def test_a_tunnel_is_weak_along_and_around():
+    rng = np.random.default_rng(0)
+    around, along = rng.uniform(-np.pi, np.pi, 1500), rng.uniform(-20, 20, 1500)
+    normals = np.column_stack([0 * along, np.cos(around), np.sin(around)])
+    points = 3.0 * normals
+    points[:, 0] = along
+    weak = found(surfaces(points, normals, tilt=0.03, noise=0.02)).weak(LEAST)
+    assert len(weak) == 2
+    assert np.abs(weak[:, [1, 2, 4, 5]]).max() < 0.05 * np.abs(weak[:, [0, 3]]).max()
+
+
+def poles(count, distinct):
+    rng = np.random.default_rng(1)
+    feet = rng.uniform(-12, 12, (6, 3))
+    points = np.repeat(feet, count // 6, axis=0)
+    points[:, 2] = rng.uniform(-1, 3, len(points))
+    rotation = POSE.rotation().matrix()
+    up = np.tile(rotation[:, 2], (len(points), 1))
+    there = points @ rotation.T + POSE.translation()
+    n = len(points)
+    ones = np.ones(n)
+    return EdgeMatches(
+        points,
+        there,
+        up,
+        0 * ones,
+        0.05 * ones,
+        ones,
+        np.arange(n),
+        0.02 * ones,
+        distinct * ones > 0,
+    )
+
+
+@pytest.mark.parametrize(("distinct", "weak"), [(True, 0), (False, 3)])
+def test_poles_lift_an_open_field_if_they_are_distinct(distinct, weak):
+    points, normals = room(((2, 2.0),), extent=(15.0, 15.0, 2.0))
+    points[:, 2] = -2.0
+    seen = found(surfaces(points, normals), poles(120, distinct))
+    assert len(seen.weak(LEAST)) == weak
+
+
+def ground_and_poles(distinct=True):
+    """Planes that hold the guess along x and y by noise, and poles where they truly stand."""
+    points, normals = room(((2, 2.0),), count=1500, extent=(15.0, 15.0, 2.0))
+    points[:, 2] = -2.0
+    planes = surfaces(points, normals, noise=0.05)
+    held = GUESS.matrix()[:3, :3] @ points.T + GUESS.translation()[:, None]
+    offsets = -np.einsum("ij,ij->i", planes.normals, held.T)
+    return ScanMatches(poles(60, distinct), replace(planes, offsets=offsets))
+
+
+@pytest.mark.parametrize(
+    ("policy", "distinct", "off"),
+    [("prior", True, 0.02), ("off", True, 0.09), ("prior", False, 0.5)],
+)
+def test_poles_say_where_they_see_and_planes_do_not(policy, distinct, off):
+    """The noise of a thousand planes holds the guess; the poles know better, if they are any."""
+    matches = ground_and_poles(distinct)
+    solver = GtsamSolver(SolverConfig(degeneracy=policy, kernel_width=np.inf, inner_iterations=5))
+    solution = solver.solve(lambda _: matches, GUESS, (), MotionPrior(GUESS, 1e4 * np.eye(6)))
+    error = np.linalg.norm(POSE.localCoordinates(solution.map_T_lidar)[3:5])
+    assert error == pytest.approx(off, rel=0.3, abs=0.02)
+    assert (solution.n_weak > 0) == (not distinct)
+
+
+def test_planes_are_believed_where_lines_see_too_little():
+    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
+    seen = found(surfaces(points, normals), poles(6, True))
+    args = ScanMatches(poles(6, True), surfaces(points, normals)), POSE, seen
+    assert unseen_by_planes(*args, LEAST) is None  # they see everything
+    thin = surfaces(*room(((1, 6.0), (2, 2.0), (0, 15.0)), count=7))
+    few = ScanMatches(poles(6, True), thin)
+    both = localizability(few, POSE)
+    just = 0.99 * both.aligned[0]
+    assert both.by_planes.min() < just  # but with the lines it is enough
+    assert unseen_by_planes(few, POSE, both, just) is None
+    assert unseen_by_planes(few, POSE, both, 1.1 * both.aligned[0]) is not None
+
+
+def test_directions_do_not_depend_on_the_map_frame():
+    points, normals = room()
+    planes = surfaces(points, normals, noise=0.05)
+    here = found(planes)
+    moved = gtsam.Pose3(gtsam.Rot3.Yaw(2.0), np.array([500.0, 20, 0]))
+    turn = moved.rotation().matrix()
+    offsets = planes.offsets - planes.normals @ turn.T @ moved.translation()
+    elsewhere = replace(planes, normals=planes.normals @ turn.T, offsets=offsets)
+    there = localizability(ScanMatches(NO_EDGES, elsewhere), moved.compose(POSE))
+    np.testing.assert_allclose(there.aligned, here.aligned, rtol=1e-6)
+
+
+def corridor_solution(policy, guess, information, priors=()):
+    points, normals = room()
+    matches = ScanMatches(NO_EDGES, surfaces(points, normals, noise=0.05))
+    solver = GtsamSolver(SolverConfig(degeneracy=policy, inner_iterations=5))
+    return solver.solve(lambda _: matches, guess, priors, MotionPrior(guess, information))
+
+
+GUESS = POSE.compose(
+    gtsam.Pose3(gtsam.Rot3.Expmap([0.01, -0.01, 0.02]), np.array([0.5, 0.1, -0.1]))
+)
+
+
+@pytest.mark.parametrize("policy", ["prior", "project"])
+def test_along_the_weak_direction_the_expected_motion_stays(policy):
+    solution = corridor_solution(policy, GUESS, 1e4 * np.eye(6))
+    error = POSE.localCoordinates(solution.map_T_lidar)
+    assert solution.n_weak == 1
+    assert error[3] == pytest.approx(POSE.localCoordinates(GUESS)[3], abs=0.02)
+    assert np.abs(np.delete(error, 3)).max() < 0.01
+    along = solution.localizability.weak(LEAST)[0]
+    claimed = along @ solution.information @ along
+    assert claimed == pytest.approx(1e4 if policy == "prior" else 1e10, rel=0.1)
+    assert along @ solution.scan_information @ along < 1e-6 * claimed
+
+
+def test_switched_off_the_noise_is_believed():
+    solution = corridor_solution("off", GUESS, 1e4 * np.eye(6))
+    assert solution.weak is None
+    assert len(solution.localizability.weak(LEAST)) == 1  # reported all the same
+    assert abs(POSE.localCoordinates(solution.map_T_lidar)[3]) < 0.1
+
+
+def test_a_users_factor_decides_along_the_weak_direction():
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.001)
+    factor = gtsam.GPSFactor(POSE_KEY, POSE.translation(), noise)
+    solution = corridor_solution("prior", GUESS, 1e2 * np.eye(6), [factor])
+    assert abs(POSE.localCoordinates(solution.map_T_lidar)[3]) < 0.01
+
+
+def test_in_a_room_the_motion_prior_does_nothing():
+    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
+    matches = ScanMatches(NO_EDGES, surfaces(points, normals))
+    solver = GtsamSolver(SolverConfig())
+    alone = solver.solve(lambda _: matches, GUESS)
+    beside = solver.solve(lambda _: matches, GUESS, (), MotionPrior(GUESS, 1e9 * np.eye(6)))
+    assert beside.weak is None
+    assert alone.map_T_lidar.equals(beside.map_T_lidar, 0.0)
+
+
+def test_per_axis_a_corridor_leaves_x_open_and_nothing_else():
+    points, normals = room()
+    axes = found(surfaces(points, normals, noise=0.05)).axes()
+    assert axes[3] < LEAST
+    assert np.delete(axes, 3).min() > 5 * LEAST
+    whole = found(surfaces(*room(((0, 15.0), (1, 6.0), (2, 2.0))), noise=0.05)).axes()
+    assert whole.min() > 5 * LEAST
+
+
+def test_per_axis_a_corridor_across_the_lidar_leaves_two_axes_open():
+    points, normals = room()
+    turn = gtsam.Rot3.Yaw(np.pi / 4).matrix()
+    axes = found(surfaces(points @ turn.T, normals @ turn.T, noise=0.05)).axes()
+    assert axes[[3, 4]].max() < LEAST
+    assert np.delete(axes, [3, 4]).min() > 5 * LEAST
+
+
+def test_per_axis_the_count_of_a_pure_translation_is_that_of_its_normals():
+    # Walls across x, y and z around the origin: nothing couples the axes.
+    rng = np.random.default_rng(0)
+    half = np.concatenate([rng.uniform(-5, 5, (50, 3)) for _ in range(3)])
+    normals = np.repeat(np.eye(3), 50, axis=0)
+    points = np.concatenate([half, half * (-1, 1, 1), half * (1, -1, 1), half * (-1, -1, 1)])
+    points = np.concatenate([points, -points])
+    matches = surfaces(points, np.tile(normals, (8, 1)), tilt=0.01)
+    np.testing.assert_allclose(found(matches).axes()[3:], 400.0, rtol=1e-3)
+
+
+def test_information_along_a_direction_is_that_of_the_factor():
+    points, normals = room()
+    planes = surfaces(points, normals, noise=0.05)
+    seen = found(planes)
+    rows = planes.normals @ POSE.rotation().matrix()
+    jacobian = np.hstack([np.cross(points, rows), rows]) / planes.sigmas[:, None]
+    expected = ((jacobian @ seen.directions.T) ** 2).sum(axis=0)
+    np.testing.assert_allclose(seen.information, expected, rtol=1e-6)
+
+
+def test_seen_from_another_place_on_the_vehicle_the_same_points_move_by_as_much():
+    points, normals = room()
+    here = found(surfaces(points, normals, noise=0.05))
+    there_T_here = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.1, 0.2, -0.4), np.array([2.0, -1.0, 0.5]))
+    there = here.seen_from(there_T_here)
+    seen = np.array([there_T_here.transformFrom(point) for point in points])
+    for first, second in zip(here.directions, there.directions, strict=True):
+        before = np.cross(first[:3], points) + first[3:]
+        after = np.cross(second[:3], seen) + second[3:]
+        np.testing.assert_allclose(after, before @ there_T_here.rotation().matrix().T, atol=1e-9)
+        assert second @ there.displacement @ second == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("off", "weak"), [(0.02, 1), (4.0, 0)])
+def test_round_one_pole_a_turn_is_weak_and_round_two_it_is_not(off, weak):
+    points, normals = room(((2, 2.0),), extent=(15.0, 15.0, 2.0))
+    points[:, 2] = -2.0
+    rng = np.random.default_rng(5)
+    at = np.tile([6.0, 1.0, 0.0], (60, 1)) + off * rng.normal(size=(60, 3)) * (1, 1, 0)
+    at[:, 2] = rng.uniform(-1, 3, 60)
+    rotation = POSE.rotation().matrix()
+    up, ones = np.tile(rotation[:, 2], (60, 1)), np.ones(60)
+    there = at @ rotation.T + POSE.translation()
+    edges = EdgeMatches(at, there, up, 0 * ones, 0.05 * ones, ones, np.arange(60), 0.02 * ones)
+    seen = found(surfaces(points, normals), edges).weak(LEAST)
+    assert len(seen) == weak
+    if weak:
+        turn = seen[0] / seen[0][2]
+        np.testing.assert_allclose(turn, [0, 0, 1, 1, -6, 0], atol=0.15)  # (6, 1) stays
+
+
+# -- whole sweeps of the built-in places ----------------------------------------------------------
+
+UNSEEN = {
+    "corridor_bare": [[0, 0, 0, 1, 0, 0]],
+    "open_field": [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 1, 0]],
+    "single_plane": [[0, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0, 0, 0, 0, 0, 1]],
+    "single_pole": [[0, 0, 1, 0, 0, 0]],
+    "tunnel": [[0, 0, 0, 1, 0, 0], [1, 0, 0, 0, 3.0, 0]],
+}
+"""Motions about the world's origin that no beam shows, [rotation, translation]; the tunnel's axis
+is 3 m above it."""
+FIRST = {"corridor_bare": 250}
+"""Sweep to begin with, when the platform moves; in the corridor out of sight of its ends."""
+
+
+def drive(scene, sweeps=12, first=50, **solver):
+    """Updates and true world poses, with odometry that is one per cent too long as the guess."""
+    world = SimulatedWorld(scene)
+    config = effective_config(Config(solver=SolverConfig(**solver)), world)
+    truth = (world.world_T_start @ world.truth.map_T_lidar)[first : first + sweeps + 1]
+    poses = [gtsam.Pose3(pose) for pose in truth]
+    mapper, guess, updates = Mapper(config), gtsam.Pose3(), []
+    for i in range(sweeps):
+        step = 1.01 * gtsam.Pose3.Logmap(poses[i].between(poses[i + 1]))
+        features = extract_features(world[first + i], config)
+        updates.append(mapper.register(features, guess, 10.0 * step))
+        guess = updates[-1].map_T_lidar.compose(gtsam.Pose3.Expmap(step))
+    return world, updates, poses[:-1]
+
+
+def largest_angle(found, true, points):
+    """Largest principal angle in degrees, by the displacement of the points of the sweep."""
+    form = np.zeros((6, 6))
+    for x, y, z in points:
+        moves = np.hstack([[[0, z, -y], [-z, 0, x], [y, -x, 0]], np.eye(3)])
+        form += moves.T @ moves / len(points)
+    root = np.linalg.cholesky(form)
+    a, b = (np.linalg.qr((rows @ root).T)[0] for rows in (found, true))
+    return np.degrees(np.arccos(min(np.linalg.svd(a.T @ b, compute_uv=False).min(), 1.0)))
+
+
+@pytest.mark.parametrize("scene", UNSEEN)
+def test_weak_directions_of_a_place_are_the_true_ones_and_the_others_stay_accurate(scene):
+    first = FIRST.get(scene, 50)
+    world, updates, poses = drive(scene, first=first)
+    motions = np.array(UNSEEN[scene], float)
+    for number, (update, pose) in enumerate(zip(updates[1:], poses[1:], strict=True), 1):
+        assert update.status is FrameStatus.DEGENERATE, update.message
+        true = motions @ pose.inverse().AdjointMap().T
+        points = world[first + number].points[::200].astype(float)
+        weak = update.directions[update.localizability < LEAST]
+        assert len(weak) == len(motions), update.localizability
+        assert largest_angle(weak, true, points) < 5.0
+    # What is left of the error once the unseen motions are taken out of it.
+    error = poses[0].between(poses[-1]).localCoordinates(updates[-1].map_T_lidar)
+    rest = error - true.T @ np.linalg.lstsq(true.T, error, rcond=None)[0]
+    assert np.abs(rest[3:]).max() < 0.05
+    assert np.abs(rest[:3]).max() < 0.005
+
+
+@pytest.mark.parametrize("scene", ["room", "street_loop", "trees"])
+def test_no_false_alarm(scene):
+    _, updates, _ = drive(scene, sweeps=6, first=40)
+    assert {update.status for update in updates[1:]} == {FrameStatus.OK}
+    assert min(update.localizability[0] for update in updates[1:]) > LEAST
+    assert min(update.axis_localizability.min() for update in updates[1:]) > LEAST

@@ -1,0 +1,549 @@
+"""What the mapper makes of an IMU, on scans solved by the real solver and IMUs in closed form."""
+
+import dataclasses
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.config import ImuConfig, SolverConfig
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu_prior import Level, roll_pitch, roll_pitch_jacobian, tilt_information
+from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.imu_tracker import ImuAid
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
+from loam_gtsam.types import ImuSamples, TiltPrior
+
+START = 1_700_000_000_000_000_000
+NOW = START + 500_000_000
+FRAME = 100_000_000
+SOLVER = GtsamSolver(SolverConfig(rotation_tolerance_deg=1e-9, translation_tolerance=1e-9))
+
+
+def rot(roll, pitch, yaw):
+    """Rz Ry Rx, degrees."""
+    return gtsam.Rot3.RzRyRx(*np.radians([roll, pitch, yaw]))
+
+
+def seen_by_imu(world_R_lidar, *, seconds=1.0, rate=(0.0, 0.0, 0.0), bias=(0.0, 0.0, 0.0)):
+    """Samples at 200 Hz of a lidar that is at ``world_R_lidar`` at NOW and turns evenly."""
+    stamps = START + 5_000_000 * np.arange(round(200 * seconds))
+    turns = Rotation.from_rotvec(np.outer((stamps - NOW) * 1e-9, rate))
+    attitude = Rotation.from_matrix(world_R_lidar.matrix()) * turns
+    gyro = np.tile(np.add(rate, bias), (len(stamps), 1))
+    return ImuSamples(stamps, attitude.as_quat(), gyro, attitude.inv().apply([0.0, 0.0, 9.81]))
+
+
+def part(samples, index):
+    return ImuSamples(*(getattr(samples, item.name)[index] for item in dataclasses.fields(samples)))
+
+
+def aid_for(measured, level_R_map=None, **config):
+    """An aid that knows up in the map; ``measured`` is the IMU's rotation or its samples."""
+    samples = seen_by_imu(measured) if isinstance(measured, gtsam.Rot3) else measured
+    config = ImuConfig(**config)
+    aid = ImuAid(config, ImuBuffer(config, samples))
+    aid.level = Level(level_R_map or gtsam.Rot3(), 0.0, 0.0, 1, "still")
+    return aid
+
+
+def scene(rng, map_T_lidar, n_edges=40, n_planes=250):
+    """Matches of a room with poles, seen from a pose, with 2 cm of noise."""
+    matrix = map_T_lidar.matrix()
+    sides = np.array([9.0, 6.0, 2.5])
+    inside = rng.uniform(-1, 1, (n_planes, 3)) * sides
+    axis = rng.integers(0, 3, n_planes)
+    rows = np.arange(n_planes)
+    inside[rows, axis] = np.sign(inside[rows, axis]) * sides[axis]
+    normals = np.eye(3)[axis] @ matrix[:3, :3].T
+    poles = np.column_stack([rng.uniform(-8, 8, (n_edges, 2)), rng.uniform(-2, 2, n_edges)])
+    directions = np.tile(matrix[:3, 2], (n_edges, 1))
+
+    def there(points):
+        noise = 0.02 * rng.normal(size=points.shape)
+        return points @ matrix[:3, :3].T + matrix[:3, 3] + noise
+
+    def matched(kind, points, **columns):
+        count = len(points)
+        columns |= {
+            "points": points,
+            "sigmas": rng.uniform(0.02, 0.06, count),
+            "weights": rng.uniform(0.3, 1.0, count),
+            "indices": np.arange(count),
+        }
+        none = np.zeros(count)
+        return kind(
+            **{item.name: columns.get(item.name, none) for item in dataclasses.fields(kind)}
+        )
+
+    offsets = -np.einsum("ij,ij->i", normals, there(inside))
+    return ScanMatches(
+        matched(EdgeMatches, poles, centres=there(poles), directions=directions),
+        matched(PlaneMatches, inside, normals=normals, offsets=offsets),
+    )
+
+
+def solve(rng, map_T_lidar, factors=()):
+    matches = scene(rng, map_T_lidar)
+    return SOLVER.solve(lambda pose: matches, map_T_lidar, factors)
+
+
+def with_information(pose, information):
+    """A solution that the solver might have come to."""
+    solution = solve(np.random.default_rng(0), gtsam.Pose3())
+    return dataclasses.replace(solution, map_T_lidar=pose, information=information)
+
+
+def close(a, b, tolerance=1e-12):
+    return a.equals(b, tolerance)
+
+
+# -- equivalent ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("weight", [0.0005, 0.002, 0.05, 0.5])
+def test_scan_and_imu_meet_at_the_mean_of_the_blend(weight):
+    """Solved scans at tilts up to 60 degrees, in maps that are not level."""
+    rng = np.random.default_rng(1)
+    for _ in range(12):
+        tilt = rng.uniform(-60, 60, 2)
+        level_R_map = gtsam.Rot3.Expmap(0.3 * rng.normal(size=3))
+        level_R_lidar = rot(*tilt, rng.uniform(-180, 180))
+        truth = gtsam.Pose3(level_R_map.inverse().compose(level_R_lidar), rng.normal(0, 30, 3))
+        measured = rot(*(tilt + rng.uniform(-1, 1, 2)), rng.uniform(-180, 180))
+        aid = aid_for(measured, level_R_map, prior="equivalent", weight=weight)
+        solution = solve(rng, truth)
+        found, tilt_prior = aid.tilted(NOW, solution)
+        assert tilt_prior is TiltPrior.EQUIVALENT
+        before = roll_pitch(level_R_map.compose(solution.map_T_lidar.rotation()))
+        after = roll_pitch(level_R_map.compose(found.map_T_lidar.rotation()))
+        mean = (1 - weight) * before + weight * roll_pitch(measured)
+        np.testing.assert_allclose(after, mean, atol=1e-6)
+        assert np.abs(after - before).max() > 1e-3 * weight
+
+
+def test_the_information_grows_by_that_of_the_prior():
+    solution = solve(np.random.default_rng(2), gtsam.Pose3())
+    found, _ = aid_for(rot(0.01, -0.02, 0), weight=0.2).tilted(NOW, solution)
+    jacobian = roll_pitch_jacobian(solution.map_T_lidar.rotation())
+    knows = tilt_information(solution.information, solution.map_T_lidar.rotation())
+    expected = solution.information + 0.25 * jacobian.T @ knows @ jacobian
+    scale = 1e-3 * expected.max()
+    np.testing.assert_allclose(found.information, expected, atol=scale)
+
+
+# -- where equivalent vanishes, sigma takes over ---------------------------------------------------
+
+
+def vague(sigma_deg):
+    """A scan that knows roll only to ``sigma_deg`` and the rest to a milliradian or millimetre."""
+    return np.diag([np.radians(sigma_deg) ** -2.0, 1e6, 1e6, 1e6, 1e6, 1e6])
+
+
+@pytest.mark.parametrize(
+    ("sigma_deg", "tilt", "share"),
+    [
+        (0.49, TiltPrior.EQUIVALENT, 0.002),
+        (0.51, TiltPrior.GRAVITY, 0.51**2 / (0.51**2 + 0.25)),
+        (50.0, TiltPrior.GRAVITY, 50.0**2 / (50.0**2 + 0.25)),
+    ],
+)
+def test_gravity_takes_over_where_the_scan_knows_less_than_the_imu(sigma_deg, tilt, share):
+    """The worked example of docs/maths/imu_prior.md."""
+    aid = aid_for(rot(0.1, 0, 0), sigma_deg=0.5, weight=0.002)
+    solution = with_information(gtsam.Pose3(), vague(sigma_deg))
+    found, by = aid.tilted(NOW, solution)
+    assert by is tilt
+    moved = np.degrees(roll_pitch(found.map_T_lidar.rotation()))
+    np.testing.assert_allclose(moved, [0.1 * share, 0.0], atol=1e-6)
+    # What is known of roll is the sum of the two in every case.
+    imu = share / (1.0 - share) * np.radians(sigma_deg) ** -2.0
+    assert found.information[0, 0] == pytest.approx(np.radians(sigma_deg) ** -2.0 + imu, rel=1e-4)
+
+
+def test_what_only_the_expected_motion_says_about_the_tilt_does_not_count():
+    """Roll is in the information, but it is a direction that the solver found to be weak."""
+    solution = with_information(gtsam.Pose3(), 1e6 * np.eye(6))
+    aid = aid_for(rot(0.1, 0, 0))
+    assert aid.tilted(NOW, solution)[1] is TiltPrior.EQUIVALENT
+    blind = dataclasses.replace(solution, weak=np.diag([1.0, 0, 0, 0, 0, 0]))
+    assert aid.tilted(NOW, blind)[1] is TiltPrior.GRAVITY
+    forward = dataclasses.replace(solution, weak=np.diag([0, 0, 0, 1.0, 0, 0]))
+    assert aid.tilted(NOW, forward)[1] is TiltPrior.EQUIVALENT
+
+
+def test_a_scan_that_says_nothing_about_the_tilt_gets_it_from_gravity():
+    """A wall straight ahead fixes pitch and yaw, and a roll about its normal not at all."""
+    information = np.diag([0.0, 1e6, 1e6, 1e6, 0.0, 0.0])
+    solution = with_information(gtsam.Pose3(), information)
+    found, tilt = aid_for(rot(3, 0, 0)).tilted(NOW, solution)
+    assert tilt is TiltPrior.GRAVITY
+    assert np.isfinite(found.information).all()
+    np.testing.assert_allclose(
+        np.degrees(roll_pitch(found.map_T_lidar.rotation())), [3.0, 0.0], atol=1e-3
+    )
+    np.testing.assert_allclose(found.map_T_lidar.translation(), 0.0, atol=1e-6)
+
+
+# -- sigma -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("sigma_deg", [0.02, 0.1, 1.0])
+def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
+    rng = np.random.default_rng(3)
+    measured = rot(0.02, -0.03, 0)
+    aid = aid_for(measured, prior="sigma", sigma_deg=sigma_deg)
+    seed = int(rng.integers(1000))
+    truth = gtsam.Pose3(rot(0, 0, 40), np.array([10.0, 0.0, 0.0]))
+    alone = solve(np.random.default_rng(seed), truth)
+    factors = aid.factors(NOW)
+    assert len(factors) == 1
+    both = solve(np.random.default_rng(seed), truth, factors)
+    same, tilt = aid.tilted(NOW, both)
+    assert tilt is TiltPrior.GRAVITY
+    assert same is both  # it was in the solve
+    jacobian = roll_pitch_jacobian(alone.map_T_lidar.rotation())
+    covariance = np.linalg.inv(alone.information)
+    of_tilt = jacobian @ covariance @ jacobian.T
+    gain = covariance @ jacobian.T @ np.linalg.inv(of_tilt + np.radians(sigma_deg) ** 2 * np.eye(2))
+    innovation = roll_pitch(measured) - roll_pitch(alone.map_T_lidar.rotation())
+    expected = gain @ innovation
+    moved = alone.map_T_lidar.localCoordinates(both.map_T_lidar)
+    np.testing.assert_allclose(moved, expected, atol=1e-3 * np.linalg.norm(expected))
+
+
+def test_only_sigma_is_a_factor_of_the_solve():
+    for prior in ("off", "blend", "equivalent"):
+        assert aid_for(rot(1, 0, 0), prior=prior).factors(NOW) == ()
+    assert len(aid_for(rot(1, 0, 0), prior="sigma").factors(NOW)) == 1
+
+
+# -- off and blend ---------------------------------------------------------------------------------
+
+
+def test_off_leaves_the_pose():
+    aid = aid_for(rot(5, 0, 0), prior="off")
+    solution = solve(np.random.default_rng(4), gtsam.Pose3())
+    assert aid.tilted(NOW, solution) == (solution, TiltPrior.NONE)
+    pose, tilt = aid.blended(NOW, solution.map_T_lidar)
+    assert pose is solution.map_T_lidar
+    assert tilt is TiltPrior.NONE
+
+
+def test_blend_is_done_after_the_solve():
+    level_R_map = rot(-4, 3, 10)
+    aid = aid_for(rot(5, -2, 0), level_R_map, prior="blend", weight=0.1)
+    solution = solve(np.random.default_rng(5), gtsam.Pose3(level_R_map.inverse(), np.ones(3)))
+    assert aid.tilted(NOW, solution) == (solution, TiltPrior.NONE)
+    pose, tilt = aid.blended(NOW, solution.map_T_lidar)
+    assert tilt is TiltPrior.BLEND
+    before = roll_pitch(level_R_map.compose(solution.map_T_lidar.rotation()))
+    after = roll_pitch(level_R_map.compose(pose.rotation()))
+    np.testing.assert_allclose(after, 0.9 * before + 0.1 * np.radians([5, -2]), atol=1e-9)
+
+
+# -- steep -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("seconds", "least", "most"), [(0.0, 6.0, 15.0), (0.1, 1.0, 4.0)])
+def test_the_tilt_of_a_frame_is_the_mean_over_its_sweep(seconds, least, most):
+    """Samples of 10 mrad of noise, on a platform that turns: the gyro brings them together."""
+    rng = np.random.default_rng(4)
+    samples = seen_by_imu(rot(3.0, -2.0, 40.0), rate=(0.3, -0.2, 0.8))
+    noise = Rotation.from_rotvec(0.01 * rng.normal(size=(len(samples.stamps), 3)))
+    noisy = (Rotation.from_quat(samples.orientation) * noise).as_quat()
+    noisy = dataclasses.replace(samples, orientation=noisy)
+    errors = []
+    for step in range(-8, 9):
+        stamp = NOW + step * 20_000_000
+        aid = aid_for(noisy, prior="blend", weight=0.999, average_seconds=seconds)
+        exact = aid_for(samples, prior="blend", weight=0.999, average_seconds=0.0)
+        found, true = (one.blended(stamp, gtsam.Pose3())[0].rotation() for one in (aid, exact))
+        errors.append(1e3 * (roll_pitch(found) - roll_pitch(true)))
+    spread = float(np.sqrt(np.mean(np.square(errors))))  # mrad
+    assert least < spread < most
+
+
+@pytest.mark.parametrize("pitch", [90.0, -90.0, 85.01, -85.01])
+@pytest.mark.parametrize("prior", ["equivalent", "blend"])
+def test_near_a_pitch_of_90_degrees_the_gravity_direction_takes_over(pitch, prior):
+    aid = aid_for(rot(20, pitch, 0), prior=prior, weight=0.1)
+    pose = gtsam.Pose3(rot(22, np.sign(pitch) * 89.0, 50), np.ones(3))
+    solution = solve(np.random.default_rng(6), pose)
+    if prior == "equivalent":
+        found, tilt = aid.tilted(NOW, solution)
+        assert np.isfinite(found.information).all()
+        found = found.map_T_lidar
+    else:
+        found, tilt = aid.blended(NOW, solution.map_T_lidar)
+    assert tilt is TiltPrior.GRAVITY
+    imu_up = aid.buffer.orientation(NOW).matrix()[2]
+
+    def away(at):
+        return np.arccos(np.clip(at.rotation().matrix()[2] @ imu_up, -1, 1))
+
+    # Nearer to the IMU, and no yaw out of nothing: it moved by no more than it had to.
+    assert away(found) < away(solution.map_T_lidar)
+    turned = np.linalg.norm(solution.map_T_lidar.localCoordinates(found)[:3])
+    assert turned < 1.01 * away(solution.map_T_lidar)
+
+
+@pytest.mark.parametrize("steep", ["pose", "imu"])
+def test_a_steep_pitch_counts_however_well_the_scan_knows_it(steep):
+    pitches = (85.2, 84.0) if steep == "pose" else (84.0, 85.2)
+    pose = gtsam.Pose3(rot(20, pitches[0], 50), np.ones(3))
+    solution = with_information(pose, 1e9 * np.eye(6))
+    assert aid_for(rot(20, pitches[1], 0)).tilted(NOW, solution)[1] is TiltPrior.GRAVITY
+    below = dataclasses.replace(solution, map_T_lidar=gtsam.Pose3(rot(20, 84.0, 50), np.ones(3)))
+    assert aid_for(rot(20, 84.0, 0)).tilted(NOW, below)[1] is TiltPrior.EQUIVALENT
+
+
+@pytest.mark.parametrize("prior", ["equivalent", "blend"])
+def test_below_85_degrees_it_is_the_mode_itself(prior):
+    aid = aid_for(rot(20, 84.0, 0), prior=prior)
+    solution = solve(np.random.default_rng(6), gtsam.Pose3(rot(20, 84.5, 50), np.ones(3)))
+    tilt = aid.tilted(NOW, solution)[1]
+    if prior == "blend":
+        tilt = aid.blended(NOW, solution.map_T_lidar)[1]
+    assert tilt == prior
+
+
+def test_nothing_jumps_where_the_modes_take_turns():
+    """A lidar that pitches through 85 degrees, IMU 0.2 degrees off: steps stay small."""
+    information = 1e6 * np.eye(6)
+    turned = []
+    for pitch in (84.9, 84.99, 85.01, 85.1):
+        measured = rot(10.2, pitch - 0.2, 0)
+        solution = with_information(gtsam.Pose3(rot(10, pitch, 30), np.zeros(3)), information)
+        found, _ = aid_for(measured).tilted(NOW, solution)
+        turned.append(solution.map_T_lidar.localCoordinates(found.map_T_lidar)[:3])
+    steps = np.linalg.norm(np.diff(turned, axis=0), axis=1)
+    assert np.degrees(steps.max()) < 0.02 * 0.2
+
+
+# -- what is missing -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("prior", ["equivalent", "blend", "sigma"])
+@pytest.mark.parametrize("gap", [0.09, 0.11])
+def test_in_a_gap_the_prior_is_dropped(prior, gap):
+    samples = seen_by_imu(rot(1, 0, 0))
+    away = np.abs(samples.stamps - NOW) * 1e-9
+    aid = aid_for(part(samples, away >= 0.5 * gap - 0.001), prior=prior, max_gap=0.1)
+    solution = solve(np.random.default_rng(7), gtsam.Pose3())
+    found, tilt = aid.tilted(NOW, solution)
+    pose = found.map_T_lidar
+    if prior == "blend":
+        pose, tilt = aid.blended(NOW, pose)
+    dropped = gap > 0.1
+    assert (tilt is TiltPrior.DROPPED) is dropped
+    assert len(aid.factors(NOW)) == (prior == "sigma" and not dropped)
+    if prior != "sigma":
+        assert close(pose, solution.map_T_lidar) is dropped
+
+
+def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_it():
+    samples = seen_by_imu(rot(4, 3, 0), seconds=2.0)
+    late = part(samples, samples.stamps >= NOW + FRAME)
+    config = ImuConfig()
+    aid = ImuAid(config, ImuBuffer(config, late))
+    assert close(aid.start(NOW), gtsam.Pose3())
+    solution = solve(np.random.default_rng(8), gtsam.Pose3())
+    assert aid.tilted(NOW, solution) == (solution, TiltPrior.DROPPED)
+    aid.find_level(NOW, solution.map_T_lidar)
+    assert aid.level is None
+    aid.find_level(NOW + 2 * FRAME, solution.map_T_lidar)
+    found = roll_pitch(aid.level.level_R_map.compose(solution.map_T_lidar.rotation()))
+    np.testing.assert_allclose(np.degrees(found), [4, 3], atol=1e-6)
+    level = aid.level
+    aid.find_level(NOW + 3 * FRAME, gtsam.Pose3(rot(0, 20, 0), np.zeros(3)))
+    assert aid.level is level  # once is for all
+    assert aid.tilted(NOW + 3 * FRAME, solution)[1] is TiltPrior.EQUIVALENT
+
+
+# -- the start -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("tilt", [(4, -3), (180, 0), (-100, 60), (20, 90), (0, -90)])
+def test_the_first_pose_is_level_at_the_origin(tilt):
+    attitude = rot(*tilt, 77)
+    config = ImuConfig()
+    pose = ImuAid(config, ImuBuffer(config, seen_by_imu(attitude))).start(NOW)
+    np.testing.assert_allclose(pose.rotation().matrix()[2], attitude.matrix()[2], atol=1e-9)
+    np.testing.assert_array_equal(pose.translation(), np.zeros(3))
+    if abs(tilt[1]) < 90:
+        np.testing.assert_allclose(pose.rotation().yaw(), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("level", [True, False])
+@pytest.mark.parametrize("given", [None, gtsam.Pose3(rot(30, 10, 90), np.ones(3))])
+def test_a_map_that_is_not_levelled_knows_up_too(level, given):
+    """With a start of the user's own, that one counts."""
+    samples = seen_by_imu(rot(4, -3, 77))
+    config = ImuConfig(level=level)
+    aid = ImuAid(config, ImuBuffer(config, samples))
+    pose = aid.start(NOW, given)
+    if given is not None:
+        assert pose is given
+    elif not level:
+        assert close(pose, gtsam.Pose3())
+    found = roll_pitch(aid.level.level_R_map.compose(pose.rotation()))
+    np.testing.assert_allclose(np.degrees(found), [4, -3], atol=1e-6)
+
+
+@pytest.mark.parametrize(("rate", "bias"), [(0.0, 0.01), (0.3, 0.0)])
+def test_a_rest_at_the_start_gives_the_bias_of_the_gyro(rate, bias):
+    samples = seen_by_imu(rot(0, 0, 0), rate=(0, 0, rate), bias=(0, 0, bias))
+    config = ImuConfig()
+    aid = ImuAid(config, ImuBuffer(config, samples))
+    aid.start(NOW)
+    np.testing.assert_allclose(aid.buffer.gyro_bias, [0, 0, bias], atol=1e-12)
+    assert aid.level.source == ("moving" if rate else "still")
+
+
+# -- the gyro against the scans --------------------------------------------------------------------
+
+
+def frames(rate, count):
+    """(stamp, pose) of a lidar that turns evenly."""
+    return [
+        (NOW + i * FRAME, gtsam.Pose3(gtsam.Rot3.Expmap(0.1 * i * np.array(rate)), np.zeros(3)))
+        for i in range(count)
+    ]
+
+
+def turning_aid(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):
+    config = ImuConfig()
+    samples = seen_by_imu(rot(0, 0, 0), seconds=seconds, rate=rate, bias=bias)
+    return ImuAid(config, ImuBuffer(config, samples))
+
+
+def test_the_bias_of_the_gyro_is_learnt():
+    rate, bias = (0.05, -0.1, 0.2), (0.02, -0.01, 0.015)
+    aid = turning_aid(rate, bias)
+    poses = frames(rate, 200)
+    for last, now in pairwise(poses):
+        aid.compare_gyro(last, now)
+    # 2 % of what is left at every frame, about the axes of the lidar
+    left = np.linalg.norm(aid.buffer.gyro_bias - bias) / np.linalg.norm(bias)
+    assert left == pytest.approx(0.98**199, rel=0.1)
+    assert aid.gyro is aid.buffer
+
+
+def test_a_gyro_that_turns_otherwise_is_given_up_after_five_frames_and_may_come_back():
+    aid = turning_aid((0.0, 0.0, 0.8))
+    wrong, right = frames((0.8, 0.0, 0.0), 30), frames((0.0, 0.0, 0.8), 60)
+    for i in range(1, 5):
+        aid.compare_gyro(wrong[i - 1], wrong[i])
+        assert aid.gyro is aid.buffer
+        assert aid.between(NOW, NOW + FRAME) is not None
+    aid.compare_gyro(wrong[4], wrong[5])
+    assert aid.gyro is None
+    assert aid.between(NOW, NOW + FRAME) is None
+    np.testing.assert_array_equal(aid.buffer.gyro_bias, np.zeros(3))  # nothing learnt from it
+    for i in range(6, 30):
+        aid.compare_gyro(wrong[i - 1], wrong[i])
+    for i in range(31, 36):  # the count of faults is bounded
+        assert aid.gyro is None
+        aid.compare_gyro(right[i - 1], right[i])
+    aid.compare_gyro(right[35], right[36])
+    assert aid.gyro is aid.buffer
+
+
+@pytest.mark.parametrize(("degrees", "agrees"), [(0.29, True), (0.31, False)])
+def test_how_much_gyro_and_scan_may_differ(degrees, agrees):
+    """At rest 0.3 degrees a frame; half of the turn more when turning."""
+    for turn in (0.0, 4.0):
+        by_scan = np.radians([0.0, 0.0, turn])
+        config = ImuConfig()
+        off = by_scan + np.radians([0.0, 0.0, degrees + 0.5 * turn])
+        samples = seen_by_imu(rot(0, 0, 0), seconds=3.0, rate=tuple(off / 0.1))
+        aid = ImuAid(config, ImuBuffer(config, samples))
+        poses = frames(by_scan / 0.1, 6)
+        for last, now in pairwise(poses):
+            aid.compare_gyro(last, now)
+            aid.buffer.gyro_bias = np.zeros(3)
+        assert (aid.gyro is not None) is agrees
+
+
+def test_frames_that_cannot_be_compared_teach_nothing():
+    aid = turning_aid((0.0, 0.0, 0.8), seconds=2.0)
+    pose = gtsam.Pose3()
+    beyond = START + 5 * 10**9
+    for first, second in ((NOW, NOW), (NOW + FRAME, NOW), (beyond, beyond + FRAME)):
+        for _ in range(6):
+            aid.compare_gyro((first, pose), (second, pose))
+    np.testing.assert_array_equal(aid.buffer.gyro_bias, np.zeros(3))
+    assert aid.gyro is aid.buffer
+    aid.compare_gyro((NOW, pose), (NOW + FRAME, gtsam.Pose3(gtsam.Rot3.Yaw(0.07), np.zeros(3))))
+    assert aid.buffer.gyro_bias.any()
+
+
+def test_factors_are_on_the_pose_of_the_frame():
+    (factor,) = aid_for(rot(1, 0, 0), prior="sigma").factors(NOW)
+    assert list(factor.keys()) == [POSE_KEY]
+
+
+# -- pre-integration -------------------------------------------------------------------------------
+
+
+def accelerating(acceleration, seconds=2.0):
+    """A level lidar that starts at NOW with 1 m/s and gathers speed along x."""
+    stamps = NOW - 200_000_000 + 5_000_000 * np.arange(round(200 * seconds))
+    count = len(stamps)
+    level, still = np.tile([0.0, 0, 0, 1], (count, 1)), np.zeros((count, 3))
+    return ImuSamples(stamps, level, still, np.tile([acceleration, 0.0, 9.81], (count, 1)))
+
+
+def at(frame, acceleration):
+    seconds = frame * FRAME * 1e-9
+    along = seconds + 0.5 * acceleration * seconds**2
+    return NOW + frame * FRAME, gtsam.Pose3(gtsam.Rot3(), np.array([along, 0.0, 0.0]))
+
+
+def observed(aid, frames, acceleration, information):
+    for last, now in pairwise(frames):
+        aid.predict(at(now, acceleration)[0])
+        aid.observe(at(last, acceleration), at(now, acceleration), information)
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_pre_integration_predicts_what_constant_velocity_cannot(on):
+    aid = aid_for(accelerating(2.0), preintegration=on)
+    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    stamp, truth = at(8, 2.0)
+    predicted = aid.predict(stamp)
+    if not on:
+        assert predicted is None
+        return
+    error = truth.localCoordinates(predicted.map_T_lidar)
+    assert np.abs(error).max() < 2e-3  # constant velocity is off by 20 mm
+    assert predicted.velocity[0] == pytest.approx(2.6, abs=0.02)
+
+
+def test_where_the_scan_says_nothing_the_prediction_runs_on_and_says_so():
+    aid = aid_for(accelerating(2.0), preintegration=True)
+    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    blind = np.diag([1e6, 1e6, 1e6, 0.0, 1e6, 1e6])
+    sigmas = []
+    for last, now in pairwise(range(7, 14)):
+        predicted = aid.predict(at(now, 2.0)[0])
+        sigmas.append(np.sqrt(predicted.covariance[3, 3]))
+        wrong = at(now, 2.0)[1].compose(gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0])))
+        aid.observe(at(last, 2.0), (at(now, 2.0)[0], wrong), blind)
+    predicted = aid.predict(at(14, 2.0)[0])
+    off = at(14, 2.0)[1].localCoordinates(predicted.map_T_lidar)[3]
+    assert abs(off) < min(0.05, 3.0 * np.sqrt(predicted.covariance[3, 3]))
+    assert np.all(np.diff(sigmas[1:]) > 0)
+
+
+def test_a_gap_in_the_imu_leaves_the_prediction_out_and_it_begins_anew():
+    samples = accelerating(2.0)
+    since = (samples.stamps - NOW) * 1e-9
+    aid = aid_for(part(samples, (since < 0.82) | (since > 1.15)), preintegration=True)
+    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    assert aid.predict(at(10, 2.0)[0]) is None
+    observed(aid, range(11, 15), 2.0, 1e6 * np.eye(6))
+    assert aid.predict(at(15, 2.0)[0]) is not None

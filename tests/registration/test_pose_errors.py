@@ -1,0 +1,326 @@
+"""Covariances of a run: parts, drift, the motion between two frames, and what must not change."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config, preset
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.mapper import Mapper
+from loam_gtsam.pipeline import run
+from loam_gtsam.registration import pose_errors as covariance_module
+from loam_gtsam.registration.pose_errors import PoseErrors, relative_covariance
+from loam_gtsam.registration.scan_error import ScanError
+from loam_gtsam.registration.solvers import POSE_KEY, Solution
+from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
+
+FRAME = 100_000_000
+
+
+def some_covariance(rng, scale=1e-4):
+    root = scale * rng.normal(size=(6, 6))
+    return root @ root.T
+
+
+def some_pose(rng):
+    return gtsam.Pose3.Expmap(np.concatenate([rng.normal(0, 0.5, 3), rng.normal(0, 20.0, 3)]))
+
+
+def room(map_T_lidar, stamp, rng, noise=0.02, low=-6.0, high=6.0):
+    """Features of a room from ``low`` to ``high`` along x, seen from a pose."""
+    points = rng.uniform(-1, 1, (4000, 3)) * (1.0, 4.0, 2.0)
+    points[:, 0] = rng.uniform(low, high, 4000)
+    axis = rng.integers(0, 3, 4000)
+    side = rng.random(4000) < 0.5
+    walls = np.stack([np.where(side, high, low), np.where(side, 4.0, -4.0),
+                      np.where(side, 2.0, -2.0)], axis=1)  # fmt: skip
+    rows = np.arange(4000)
+    points[rows, axis] = walls[rows, axis]
+    points[rows, axis] += rng.normal(0.0, noise, 4000)
+    local = map_T_lidar.transformTo(points.T).T
+    return Features.from_points(stamp, np.zeros((0, 3)), local)
+
+
+@pytest.fixture(scope="module")
+def moving():
+    """A run through the built-in street that is under way."""
+    world = SimulatedWorld("street_loop", frames=66, columns=900)
+    mapped = run(_Part(world, 40, 66), no_imu())
+    return mapped.updates
+
+
+class _Part:
+    """Some sweeps of a world."""
+
+    name, truth, imu = "part", None, None
+
+    def __init__(self, world, first, last):
+        self.sensor = world.sensor
+        self._sweeps = [world[i] for i in range(first, last)]
+
+    def __len__(self):
+        return len(self._sweeps)
+
+    def __iter__(self):
+        return iter(self._sweeps)
+
+    def info(self):
+        raise NotImplementedError
+
+
+def no_imu(**covariance):
+    config = Config()
+    return replace(
+        config,
+        imu=replace(config.imu, enabled=False),
+        covariance=replace(config.covariance, **covariance),
+    )
+
+
+# -- the motion between two frames -----------------------------------------------------------------
+
+
+def made_up(stamp, pose, own, drift, shared=None, follows=None):
+    shared = np.zeros((6, 6)) if shared is None else shared
+    parts = Uncertainty(own, shared, follows, drift, 1.0, 100.0)
+    return MapUpdate(stamp, pose, FrameStatus.OK, uncertainty=parts)
+
+
+def numerical(function):
+    """(6, 6) derivative of a tangent at zero by central differences."""
+    step = 1e-6
+    columns = [(function(step * axis) - function(-step * axis)) / (2.0 * step)
+               for axis in np.eye(6)]  # fmt: skip
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("consecutive", [False, True])
+def test_relative_covariance_is_that_of_perturbed_poses(consecutive):
+    rng = np.random.default_rng(5)
+    one, two = some_pose(rng), some_pose(rng)
+    joint = rng.normal(size=(12, 12)) * 1e-4
+    joint = joint @ joint.T  # own errors of the earlier and of the later frame
+    drifts = some_covariance(rng), some_covariance(rng)
+    earlier = made_up(1, one, joint[:6, :6], drifts[0])
+    later = made_up(2, two, joint[6:, 6:], drifts[0] + drifts[1], joint[6:, :6],
+                    follows=1 if consecutive else 0)  # fmt: skip
+    between = one.between(two)
+
+    def off(first, second):
+        return between.localCoordinates(first.between(second))
+
+    by_first = numerical(lambda d: off(one.retract(d), two))
+    by_second = numerical(lambda d: off(one, two.retract(d)))
+    by_map = numerical(lambda d: off(one, gtsam.Pose3.Expmap(d).compose(two)))
+    if not consecutive:
+        joint[:6, 6:] = joint[6:, :6] = 0.0
+    own = np.hstack([by_first, by_second])
+    expected = own @ joint @ own.T + by_map @ drifts[1] @ by_map.T
+    found = relative_covariance(earlier, later)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-6 * np.abs(expected).max())
+    assert np.linalg.eigvalsh(found).min() > 0.0
+
+
+def test_frames_must_be_solved_and_in_order():
+    rng = np.random.default_rng(0)
+    zero = np.zeros((6, 6))
+    one, two = (made_up(stamp, some_pose(rng), some_covariance(rng), zero) for stamp in (1, 2))
+    predicted = MapUpdate(3, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN)
+    with pytest.raises(InputError, match=r"later: expected .* solved.*unusable_scan"):
+        relative_covariance(one, predicted)
+    with pytest.raises(InputError, match="earlier: expected a frame that was solved"):
+        relative_covariance(predicted, two)
+    for pair in ((two, one), (one, one)):
+        with pytest.raises(InputError, match="later: expected a stamp after"):
+            relative_covariance(*pair)
+    assert relative_covariance(one, two).shape == (6, 6)
+
+
+# -- frames of a run -------------------------------------------------------------------------------
+
+
+def test_every_solved_frame_has_its_covariances(moving):
+    first, *others = moving
+    assert first.status is FrameStatus.FIRST
+    assert first.uncertainty is None
+    assert np.isnan(first.covariance).all()
+    for earlier, update in pairwise(others):
+        assert update.uncertainty.follows == earlier.stamp
+        for matrix in (update.covariance, update.uncertainty.own,
+                       relative_covariance(earlier, update)):  # fmt: skip
+            np.testing.assert_array_equal(matrix, matrix.T)
+            assert np.linalg.eigvalsh(matrix).min() > 0.0
+        grown = update.uncertainty.drift - earlier.uncertainty.drift
+        assert np.linalg.eigvalsh(grown).min() > -1e-9 * np.trace(grown)
+        np.testing.assert_allclose(update.raw_covariance @ update.information, np.eye(6), atol=1e-6)
+        assert 0.02 < update.uncertainty.residual_variance < 3.0
+        rows = 2 * update.n_edge_matches + update.n_plane_matches
+        assert rows / 30 < update.uncertainty.effective_matches < 2 * rows
+    assert others[0].uncertainty.follows is None
+    np.testing.assert_array_equal(others[0].uncertainty.shared, 0.0)
+
+
+def test_drift_is_a_matter_of_the_way(moving):
+    """Ten metres of new street drift more than one; the covariance in the map grows."""
+    near = relative_covariance(moving[10], moving[11])
+    far = relative_covariance(moving[10], moving[20])
+    assert np.trace(far[3:, 3:]) > 1.5 * np.trace(near[3:, 3:])
+    assert np.trace(moving[-1].covariance[3:, 3:]) > np.trace(moving[2].covariance[3:, 3:])
+
+
+def test_who_stands_still_does_not_drift():
+    rng = np.random.default_rng(1)
+    mapper = Mapper()
+    updates = [mapper.register(room(gtsam.Pose3(), i * FRAME, rng)) for i in range(40)]
+    drifts = [np.trace(u.uncertainty.drift[3:, 3:]) for u in updates[1:]]
+    late = drifts[-1] - drifts[19]
+    assert 0.0 <= late < 0.1 * drifts[0]
+    assert drifts[0] > 0.0  # the first sweep's noise stays in the map
+    # Walls that were not there before
+    changed = mapper.register(room(gtsam.Pose3(), 40 * FRAME, rng, low=-6.3, high=6.3))
+    assert np.trace(changed.uncertainty.drift[3:, 3:]) - drifts[-1] > 5.0 * late / 20
+
+
+def test_ground_that_is_new_drifts_by_the_factor():
+    def drift(factor):
+        world = SimulatedWorld("room", frames=6, columns=600)
+        return run(world, no_imu(drift=factor)).updates[-1].uncertainty.drift
+
+    once = drift(1.0)
+    assert np.trace(once) > 0.0
+    np.testing.assert_allclose(drift(3.0), 3.0 * once, rtol=1e-9)
+    np.testing.assert_array_equal(drift(0.0), 0.0)
+
+
+def test_no_pose_depends_on_the_calibration():
+    world = SimulatedWorld("room", frames=5, columns=600)
+    one = run(world, no_imu()).updates
+    other = run(world, no_imu(drift=0.0, match_cell=5.0, ground_cell=3.0, window=2)).updates
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a.map_T_lidar.matrix(), b.map_T_lidar.matrix())
+        np.testing.assert_array_equal(a.raw_covariance, b.raw_covariance)
+    assert not np.allclose(one[-1].covariance, other[-1].covariance, rtol=0.01)
+
+
+def test_the_same_run_has_the_same_covariances():
+    world = SimulatedWorld("room", frames=4, columns=600)
+    for a, b in zip(*[run(world).updates for _ in range(2)], strict=True):
+        np.testing.assert_array_equal(a.covariance, b.covariance)
+
+
+def test_a_prior_of_ones_own_holds_the_pose_in_spite_of_drift():
+    rng = np.random.default_rng(1)
+    mapper = Mapper()
+    for i in range(5):
+        mapper.register(room(gtsam.Pose3(), i * FRAME, rng))
+    sigmas = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-6])
+    noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+    height = gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)
+    free = mapper.register(room(gtsam.Pose3(), 5 * FRAME, rng))
+    held = mapper.register(room(gtsam.Pose3(), 6 * FRAME, rng), priors=[height])
+    assert held.covariance[5, 5] < 1e-11  # as the axes of lidar and map allow
+    assert free.covariance[5, 5] > 1e-8
+
+
+@pytest.mark.parametrize("name", ["loam", "aloam"])
+def test_classical_solvers_have_covariances_of_the_same_size(name):
+    world = SimulatedWorld("room", frames=8, columns=900)
+    ours = run(world, no_imu()).updates[-1]
+    config = preset(name)
+    theirs = run(world, replace(config, imu=replace(config.imu, enabled=False))).updates[-1]
+    ratio = np.sqrt(np.diag(theirs.uncertainty.own) / np.diag(ours.uncertainty.own))
+    assert ratio.min() > 0.2
+    assert ratio.max() < 5.0
+
+
+# -- the reference time ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("reference", "share"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])
+def test_the_reference_has_its_share_in_two_sweeps(reference, share):
+    config = no_imu()
+    config = replace(config, deskew=replace(config.deskew, reference=reference))
+    world = SimulatedWorld("room", frames=12, columns=900)
+    both = run(_Part(world, 6, 12), config).updates[-1].uncertainty
+    ratio = np.trace(both.shared[3:, 3:]) / np.trace(both.own[3:, 3:])
+    # Equal errors of both frames: h (1 - h) over (1 - h)^2 + h^2, less what acceleration adds
+    expected = share * (1.0 - share) / ((1.0 - share) ** 2 + share**2)
+    assert abs(ratio) <= abs(expected) * 1.3
+    assert np.sign(np.round(ratio, 6)) == np.sign(expected)
+    if share:
+        assert abs(ratio) > 0.3 * abs(expected)
+
+
+class _Sweep:
+    """As much of a sweep as the reference time needs."""
+
+    def __init__(self, stamp, motion):
+        self.stamp, self.motion, self.middle, self.duration = stamp, motion, 0.05, 0.1
+
+
+def own_errors(acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30):
+    """Own error at the start of the last of many sweeps along x."""
+    errors = PoseErrors(Config())
+    for k in range(frames):
+        x = 0.5 * acceleration * (0.1 * k) ** 2
+        middle = gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
+        sweep = _Sweep(k * FRAME, motion)
+        own, _, errors._last = errors._own(sweep.stamp, sweep, middle, covariance, np.eye(6))
+    return own
+
+
+def test_what_a_constant_velocity_misses():
+    """Eighth of a T^2 from the chord, and a twenty-fourth for the sweep itself."""
+    still, fast = (own_errors(a, np.zeros((6, 6)))[3, 3] for a in (0.0, 3.0))
+    assert still == 0.0
+    assert fast == pytest.approx((3.0 * 0.1**2 / 6.0) ** 2, rel=1e-6)
+    # Errors whose second differences explain any such acceleration
+    noisy = np.diag([0.0, 0.0, 0.0, 1e-2, 1e-2, 1e-2])
+    quiet = own_errors(3.0, noisy)
+    np.testing.assert_allclose(quiet, 0.5 * noisy, atol=1e-4)
+
+
+def test_a_gyro_leaves_its_noise():
+    own = own_errors(0.0, np.zeros((6, 6)), SweepMotion.GYRO)
+    expected = Config().imu.gyro_noise ** 2 * 0.05
+    np.testing.assert_allclose(np.diag(own)[:3], expected, rtol=1e-9)
+    np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
+
+
+# -- frame by frame --------------------------------------------------------------------------------
+
+
+def calibrated(errors, number):
+    """A frame at rest, whatever its matches are."""
+    update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
+    solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
+    sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
+    return errors.calibrated(update, sweep, solution)
+
+
+def test_ground_that_replaces_none_counts_half(monkeypatch):
+    def error(solution, width, seen, config, **_):
+        seen.cells(np.zeros((1, 3)))
+        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), np.zeros((6, 6)), 1.0, 10.0)
+
+    monkeypatch.setattr(covariance_module, "scan_error", error)
+    errors = PoseErrors(Config())
+    drifts = [calibrated(errors, k).uncertainty.drift[0, 0] for k in range(3)]
+    once = Config().covariance.drift * 1e-8
+    np.testing.assert_allclose(drifts, [0.5 * once, 1.5 * once, 2.5 * once])
+
+
+def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), np.zeros((6, 6)), 1.0, 10.0)
+    answers = iter([good, good, None, good])
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: next(answers))
+    errors = PoseErrors(Config())
+    updates = [calibrated(errors, k) for k in range(4)]
+    assert updates[1].uncertainty.follows == updates[0].stamp
+    assert updates[2].uncertainty is None
+    assert np.isnan(updates[2].covariance).all()
+    assert updates[3].uncertainty.follows is None
+    np.testing.assert_array_equal(updates[3].uncertainty.shared, 0.0)

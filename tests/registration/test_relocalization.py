@@ -1,0 +1,308 @@
+"""Sweeps that do not fit the map: noticed, searched for, found; and none of that otherwise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config, RelocalizationConfig
+from loam_gtsam.datasets.arrays import ArrayDataset
+from loam_gtsam.datasets.sim.disturbances import Disturbed, MissingSweeps, MovingObjects, Outliers
+from loam_gtsam.datasets.sim.kidnapping import Kidnapped
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.pipeline import Pipeline, run
+from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.relocalization import Fit, Watch, places, some
+from loam_gtsam.types import FrameStatus
+
+AT = 22
+"""The sweep before which the lidar is put somewhere else."""
+
+
+def with_search(**changes):
+    return replace(Config(), relocalization=replace(Config().relocalization, **changes))
+
+
+OFF = with_search(enabled=False)
+
+
+@pytest.fixture(scope="module")
+def drive():
+    """Some sweeps of the room, which it sees from end to end."""
+    return SimulatedWorld("room", frames=28, columns=600)
+
+
+@pytest.fixture(scope="module")
+def calm(drive):
+    return ArrayDataset(list(drive), truth=drive.truth, sensor=drive.sensor)
+
+
+def put(drive, calm, move=(0.0, 0.0, 0.0), turn_deg=0.0):
+    """The drive with a kidnapping, made of as few new sweeps as possible."""
+    moved = Kidnapped(drive, AT, move, turn_deg)
+    sweeps = [*list(calm)[:AT], *(moved[i] for i in range(AT, len(drive)))]
+    return ArrayDataset(sweeps, truth=moved.truth, sensor=drive.sensor)
+
+
+@pytest.fixture(scope="module")
+def kidnapped(drive, calm):
+    """Across the room and turned, out of which no solve finds its way."""
+    return put(drive, calm, (-3.0, 2.0, 0.0), 120.0)
+
+
+def errors(result, dataset):
+    away = result.trajectory.map_T_lidar[:, :3, 3] - dataset.truth.map_T_lidar[:, :3, 3]
+    return np.linalg.norm(away, axis=1)
+
+
+# -- what fits -------------------------------------------------------------------------------------
+
+
+def matches(edge_distances, plane_distances, sigma=0.1):
+    n, m = len(edge_distances), len(plane_distances)
+    ones = lambda count: np.ones((count, 3))  # noqa: E731
+    return ScanMatches(
+        EdgeMatches(
+            ones(n), ones(n), ones(n), np.asarray(edge_distances), np.full(n, sigma), np.ones(n),
+            np.arange(n),
+        ),
+        PlaneMatches(
+            ones(m), ones(m), np.ones(m), np.asarray(plane_distances), np.full(m, sigma),
+            np.ones(m), np.arange(m),
+        ),
+    )  # fmt: skip
+
+
+def test_a_fit_counts_matches_within_three_sigmas_on_either_side():
+    fit = Fit.of(matches([0.0, 0.29, 0.31], [-0.29, -0.31]), offered=10)
+    assert fit == Fit(share=0.5, agreement=0.6)
+    assert fit.total == pytest.approx(0.3)
+    assert Fit.of(matches([], []), offered=10) == Fit(0.0, 0.0)
+
+
+def test_the_usual_is_the_median_of_what_went_into_the_map():
+    watch = Watch(RelocalizationConfig(memory=3))
+    assert not watch.ready
+    for share in (0.1, 0.5, 0.6, 0.9):
+        watch.accept(Fit(share, 1.0), gtsam.Pose3())
+    assert watch.ready
+    assert watch.usual == Fit(0.6, 1.0)
+
+
+@pytest.fixture
+def watch():
+    watch = Watch(RelocalizationConfig(memory=2))
+    for _ in range(2):
+        watch.accept(Fit(0.6, 1.0), gtsam.Pose3())
+    return watch
+
+
+@pytest.mark.parametrize(
+    ("fit", "misfit", "again"),
+    [
+        (Fit(0.6, 1.0), False, True),
+        (Fit(0.6, 0.85), False, False),  # in between: neither
+        (Fit(0.6, 0.79), True, False),
+        (Fit(0.3, 1.0), False, False),  # new ground
+        (Fit(0.2, 1.0), True, False),
+    ],
+)
+def test_two_thresholds_keep_apart_lost_and_found(watch, fit, misfit, again):
+    assert watch.misfit(fit) is misfit
+    assert watch.fits_again(fit) is again
+
+
+def test_nothing_is_unusual_at_the_start():
+    watch = Watch(RelocalizationConfig(memory=2))
+    watch.accept(Fit(0.6, 1.0), gtsam.Pose3())
+    assert not watch.misfit(Fit(0.0, 0.0))
+    assert not watch.jumped(np.full(6, 100.0), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("step", "seconds", "jumped"),
+    [
+        ([0, 0, 0, 0.29, 0, 0], 0.1, False),
+        ([0, 0, 0, 0.31, 0, 0], 0.1, True),
+        ([0, 0, 0.29, 0, 0, 0], 0.1, False),
+        ([0, 0, 0.31, 0, 0, 0], 0.1, True),
+        ([0, 0, 0, 5.0, 0, 0], 0.6, False),  # five sweeps are missing
+    ],
+)
+def test_a_jump_is_what_no_acceleration_explains(watch, step, seconds, jumped):
+    assert watch.jumped(np.array(step, float), seconds) is jumped
+
+
+def test_the_search_grows_and_remembers_where_it_fitted_last():
+    config = RelocalizationConfig(memory=1, radius=4.0, radius_growth=2.0, max_radius=9.0)
+    watch = Watch(config)
+    here, far = gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([20.0, 0.0, 0.0]))
+    assert watch.around(far) == [far]
+    watch.accept(Fit(0.6, 1.0), here)
+    assert watch.around(here) == [here]
+    assert watch.around(far) == [far, here]
+    radii = []
+    for watch.lost in range(4):
+        radii.append(watch.radius)
+    assert radii == [4.0, 6.0, 8.0, 9.0]
+    watch.accept(Fit(0.6, 1.0), here)
+    assert watch.lost == 0
+
+
+# -- where it would fit ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def corner():
+    """An L of two unlike walls: looks different from everywhere."""
+    rng = np.random.default_rng(3)
+    long = np.column_stack([rng.uniform(0, 12, 3000), np.zeros(3000), rng.uniform(-1, 2, 3000)])
+    short = np.column_stack([np.zeros(1200), rng.uniform(0, 5, 1200), rng.uniform(-1, 2, 1200)])
+    return np.concatenate([long, short])
+
+
+@pytest.mark.parametrize(
+    ("away", "turn"), [((0.0, 0.0), 0.0), ((4.0, -3.0), 0.7), ((-6.3, 2.4), -2.6)]
+)
+def test_the_likeliest_place_is_the_true_one(corner, away, turn):
+    predicted = gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([4.0, 3.0, 0.3]))
+    step = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.array([*away, 0.0]))
+    truth = predicted.compose(step)
+    seen = truth.transformTo(corner[::15].T).T
+    found = places(seen, corner, [predicted], radius=8.0, count=4)
+    assert 1 <= len(found) <= 4
+    error = truth.localCoordinates(found[0])
+    assert np.linalg.norm(error[3:]) < 1.0
+    assert np.abs(error[:3]).max() < np.radians(6.0)
+    for i, first in enumerate(found):
+        for second in found[:i]:
+            apart = first.localCoordinates(second)
+            assert np.linalg.norm(apart[3:]) >= 1.5 or abs(apart[2]) >= np.radians(12.0)
+
+
+def test_several_centres_are_searched(corner):
+    truth = gtsam.Pose3(gtsam.Rot3(), np.array([4.0, 3.0, 0.3]))
+    seen = truth.transformTo(corner[::15].T).T
+    nowhere = gtsam.Pose3(gtsam.Rot3(), np.array([300.0, 0.0, 0.0]))
+    assert places(seen, corner, [nowhere], 3.0, 4) == []
+    found = places(seen, corner, [nowhere, truth], 3.0, 4)
+    assert truth.range(found[0]) < 1.0
+
+
+def test_a_few_points_stand_for_a_sweep():
+    edges, planes = np.zeros((1000, 3)), np.ones((50, 3))
+    assert some(edges, planes).sum() == 3 * 50
+    assert 50 < len(some(edges, planes)) < 200
+    assert some(edges[:0], planes[:0]).shape == (0, 3)
+
+
+# -- whole runs ------------------------------------------------------------------------------------
+
+
+def test_an_ordinary_run_is_the_same_without_the_watch(calm):
+    watched, bare = run(calm), run(calm, OFF)
+    assert np.array_equal(watched.trajectory.map_T_lidar, bare.trajectory.map_T_lidar)
+    assert all(update.message == "" for update in watched.updates[1:] if update.status == "ok")
+
+
+@pytest.mark.parametrize(
+    "disturbances",
+    [[MissingSweeps((12, 20))], [MissingSweeps((20,), 5)], [Outliers(0.2)], [MovingObjects()]],
+    ids=["one missing", "five missing", "outliers", "passing objects"],
+)
+def test_disturbances_do_not_make_sweeps_lost(calm, disturbances):
+    disturbed = Disturbed(calm, disturbances)
+    result = run(disturbed)
+    assert all(update.status.solved for update in result.updates[1:])
+    stamps = [sweep.stamp for sweep in disturbed]
+    rows = np.searchsorted(calm.truth.stamps, stamps)
+    away = result.trajectory.map_T_lidar - calm.truth.map_T_lidar[rows]
+    assert np.linalg.norm(away[:, :3, 3], axis=1).max() < 0.2
+
+
+def test_a_kidnapped_lidar_is_found_at_once(kidnapped):
+    result = run(kidnapped)
+    update = result.updates[AT]
+    assert update.status.solved
+    assert "relocalised, moved by 3." in update.message
+    assert "relocalize" in update.timings
+    assert errors(result, kidnapped).max() < 0.15
+    # Without the watch it is not: a second map grows beside the first.
+    wrong = run(kidnapped, OFF)
+    assert all(later.status.solved for later in wrong.updates[1:])
+    assert errors(wrong, kidnapped)[AT] > 1.0
+
+
+@pytest.mark.parametrize(("move", "turn_deg"), [((0.0, 1.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 30.0)])
+def test_a_jump_is_no_motion(drive, calm, move, turn_deg):
+    """The solve finds these by itself; what would be wrong is the motion within the sweep."""
+    dataset = put(drive, calm, move, turn_deg)
+    result, bare = run(dataset), run(dataset, OFF)
+    assert "moved by" in result.updates[AT].message
+    assert np.linalg.norm(result.updates[AT].twist) < 2.0
+    assert np.linalg.norm(bare.updates[AT].twist) > 4.0
+    assert errors(result, dataset).max() < 0.05
+    assert errors(bare, dataset)[AT:].max() > 1.2 * errors(result, dataset)[AT:].max()
+
+
+def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
+    """A search too narrow at first: some sweeps are lost."""
+    config = with_search(radius=0.0, radius_growth=1.0)
+    pipeline = Pipeline(config)
+    sizes = []
+    updates = []
+    for sweep in kidnapped:
+        updates.append(pipeline.process(sweep))
+        sizes.append(pipeline.mapper.plane_map.count())
+    lost = [n for n, update in enumerate(updates) if update.status is FrameStatus.LOST]
+    assert lost
+    assert lost == list(range(AT, AT + len(lost)))
+    assert {sizes[n] for n in lost} == {sizes[AT - 1]}
+    first = updates[AT]
+    assert np.isnan(first.covariance).all()
+    assert not first.information.any()
+    assert np.allclose(first.twist, updates[AT - 1].twist)  # predicted
+    assert "of the matches agree" in first.message
+    back = updates[AT + len(lost)]
+    assert back.status.solved
+    assert f"after {len(lost)} lost sweeps" in back.message
+    assert sizes[-1] > sizes[AT - 1]
+    truth = kidnapped.truth.map_T_lidar[-1, :3, 3]
+    assert np.linalg.norm(updates[-1].map_T_lidar.translation() - truth) < 0.15
+
+
+def test_a_reset_starts_a_new_map(calm):
+    pipeline = Pipeline()
+    sweeps = list(calm)
+    for sweep in sweeps[:12]:
+        pipeline.process(sweep)
+    before = pipeline.mapper.plane_map.count()
+    pipeline.mapper.reset()
+    assert pipeline.mapper.plane_map.count() == 0
+    update = pipeline.process(sweeps[12])
+    assert update.status is FrameStatus.FIRST
+    assert update.map_T_lidar.equals(gtsam.Pose3(), 1e-12)
+    assert not pipeline.mapper.watch.ready
+    assert pipeline.process(sweeps[13]).status.solved
+    assert 0 < pipeline.mapper.plane_map.count() < before
+
+
+def test_few_matches_twice_in_a_row_start_a_search(calm):
+    """The guess leads away from the map; the sweep is found where the last one was."""
+    pipeline = Pipeline()
+    sweeps = list(calm)
+    for sweep in sweeps[:20]:
+        last = pipeline.process(sweep)
+    mapper = pipeline.mapper
+    here = last.map_T_lidar
+    far = gtsam.Pose3(here.rotation(), here.translation() + np.array([40.0, 0.0, 0.0]))
+    mapper.last = replace(last, map_T_lidar=far)
+    assert pipeline.process(sweeps[20]).status is FrameStatus.FEW_MATCHES
+    found = pipeline.process(sweeps[21])
+    assert found.status.solved
+    assert "relocalised after 1 lost sweeps" in found.message
+    away = found.map_T_lidar.translation() - calm.truth.map_T_lidar[21, :3, 3]
+    assert np.linalg.norm(away) < 0.1

@@ -1,0 +1,208 @@
+"""The error of one scan: Monte-Carlo solves with errors that are independent, shared, or priors."""
+
+import dataclasses
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import CovarianceConfig
+from loam_gtsam.geometry import voxel_keys
+from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.scan_error import SeenGround, scan_error
+from loam_gtsam.registration.solvers import Solution, match_rows
+
+CONFIG = CovarianceConfig()
+SIGMA = 0.05
+"""Metres: what the matches claim."""
+POSE = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.4, 3.0, -2.0, 0.5]))
+
+
+def no_edges():
+    nothing = np.zeros((0, 3))
+    return EdgeMatches(nothing, nothing, nothing, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
+
+
+def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
+    """The optimum of plane matches whose points are off their planes by ``errors``, in metres."""
+    count = len(points)
+    there = pose.transformFrom(points.T).T
+    offsets = errors - np.einsum("ij,ij->i", normals, there)
+    planes = PlaneMatches(points, normals, offsets, errors, np.full(count, SIGMA), np.ones(count),
+                          np.arange(count))  # fmt: skip
+    matches = ScanMatches(no_edges(), planes)
+    residuals, jacobian = match_rows(matches).residuals(pose)
+    keep = np.eye(6) if weak is None else np.eye(6) - weak
+    information = keep.T @ jacobian.T @ jacobian @ keep
+    if prior is not None:
+        information = information + prior
+    step = -np.linalg.solve(information, keep.T @ jacobian.T @ residuals)
+    return Solution(
+        pose.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information, weak=weak,
+        unseen=weak, beacons=np.zeros(count, np.bool_),
+    ), step  # fmt: skip
+
+
+def surroundings(rng, count=1500, axes=3):
+    """Points on walls along ``axes`` of the map, as seen from the pose, and their normals."""
+    normals = np.eye(3)[rng.integers(0, axes, count) + 3 - axes]
+    there = rng.uniform(-15.0, 15.0, (count, 3)) + POSE.translation()
+    return POSE.transformTo(there.T).T, normals, there
+
+
+def error_of(solution, **changes):
+    config = dataclasses.replace(CONFIG, **changes)
+    found = scan_error(solution, np.inf, SeenGround(config.ground_cell), config)
+    assert found is not None
+    return found
+
+
+def trials(draw, count=400, seed=0):
+    """Mean covariance that is told, that of the steps, and mean inverse information."""
+    rng = np.random.default_rng(seed)
+    points, normals, there = surroundings(rng)
+    told, steps = [], []
+    for _ in range(count):
+        solution, step = solved(points, normals, draw(rng, there))
+        told.append(error_of(solution).covariance)
+        steps.append(step)
+    return np.mean(told, axis=0), np.cov(np.array(steps).T), np.linalg.inv(solution.information)
+
+
+def spread(told, actual):
+    """Eigenvalues of what happens over what is told: all 1 if it is right."""
+    root = np.linalg.cholesky(np.linalg.inv(told))
+    return np.linalg.eigvalsh(root.T @ actual @ root)
+
+
+def by_cell(rng, there):
+    """One error for all points of a cell of 1.6 m."""
+    _, numbers = np.unique(voxel_keys(there, CONFIG.match_cell), return_inverse=True)
+    return rng.normal(0.0, 0.02, numbers.max() + 1)[numbers]
+
+
+def test_residuals_tell_the_scatter():
+    told, actual, raw = trials(lambda rng, there: rng.normal(0.0, 0.02, len(there)))
+    ratios = spread(told, actual)
+    assert ratios.min() > 0.75
+    assert ratios.max() < 1.35
+    assert spread(raw, actual).max() < 0.25  # (0.02 / 0.05)^2 = 0.16
+
+
+def test_errors_that_neighbours_share_do_not_average_out():
+    rng = np.random.default_rng(3)
+    corners = rng.uniform(-14.0, 14.0, (150, 3)) // CONFIG.match_cell * CONFIG.match_cell
+    there = np.repeat(corners, 10, axis=0) + rng.uniform(0.1, 1.5, (1500, 3))
+    normals = np.repeat(np.eye(3)[rng.integers(0, 3, 150)], 10, axis=0)
+    points = POSE.transformTo(there.T).T
+    told, alone, steps = [], [], []
+    for _ in range(300):
+        solution, step = solved(points, normals, by_cell(rng, there))
+        told.append(error_of(solution).covariance)
+        alone.append(error_of(solution, match_cell=0.01).covariance)
+        steps.append(step)
+    actual = np.cov(np.array(steps).T)
+    ratios = spread(np.mean(told, axis=0), actual)
+    assert ratios.min() > 0.7
+    assert ratios.max() < 1.5
+    assert spread(np.mean(alone, axis=0), actual).min() > 4.0
+    last = error_of(solution)
+    assert 80 < last.effective_matches < 300  # 150 cells of ten
+    assert last.residual_variance == pytest.approx((0.02 / SIGMA) ** 2, rel=0.4)
+
+
+def test_matches_without_any_error_leave_a_covariance():
+    rng = np.random.default_rng(0)
+    points, normals, _ = surroundings(rng)
+    found = error_of(solved(points, normals, np.zeros(1500))[0])
+    assert np.linalg.eigvalsh(found.covariance).min() > 0.0
+
+
+def test_a_prior_of_its_own_is_believed():
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    errors = rng.normal(0.0, 0.02, len(there))
+    prior = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 1e12])
+    found = error_of(solved(points, normals, errors, prior=prior)[0])
+    free = error_of(solved(points, normals, errors)[0])
+    assert found.covariance[5, 5] == pytest.approx(1e-12, rel=1e-3)
+    assert free.covariance[5, 5] > 1e-8
+    assert found.user[5, 5] == pytest.approx(1.0, abs=1e-4)
+    np.testing.assert_allclose(free.user, 0.0, atol=1e-4)
+
+
+def test_information_of_another_scale_is_no_prior():
+    """The classical solvers count rows as measured to 1 m."""
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    scaled = dataclasses.replace(solution, information=solution.information * SIGMA**2)
+    results = [
+        scan_error(one, np.inf, SeenGround(0.8), CONFIG, with_priors=False)
+        for one in (solution, scaled)
+    ]
+    np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
+
+
+def test_along_a_weak_direction_there_is_the_expected_motion_only():
+    rng = np.random.default_rng(0)
+    points, normals, _ = surroundings(rng, axes=2)  # nothing across x of the map
+    along = np.concatenate([np.zeros(3), POSE.rotation().matrix().T @ [1.0, 0.0, 0.0]])
+    weak = np.outer(along, along)
+    prior = 400.0 * weak  # 0.05 m
+    found = error_of(solved(points, normals, rng.normal(0, 0.02, 1500), prior=prior, weak=weak)[0])
+    assert along @ found.covariance @ along == pytest.approx(0.05**2, rel=1e-6)
+    assert along @ found.renewed @ along == pytest.approx(0.05**2, rel=1e-6)
+    np.testing.assert_allclose(found.user @ along, 0.0, atol=1e-9)
+
+
+def test_along_unseen_directions_only_the_beacons_count():
+    """1500 walls across x, of which ten count; then the covariance is that of the ten."""
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    along = np.concatenate([np.zeros(3), POSE.rotation().matrix().T @ [1.0, 0.0, 0.0]])
+    unseen = np.outer(along, along)
+    across = np.flatnonzero(np.abs(normals[:, 0]) > 0.5)
+    beacons = np.zeros(len(points), np.bool_)
+    beacons[across[:10]] = True
+    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    rows = match_rows(solution.matches)
+    told = rows.residuals(solution.map_T_lidar)[1] @ (np.eye(6) - unseen)
+    told[beacons] = rows.where(beacons).residuals(solution.map_T_lidar)[1]
+    few = dataclasses.replace(solution, unseen=unseen, beacons=beacons, information=told.T @ told)
+    before, after = (along @ error_of(one).covariance @ along for one in (solution, few))
+    assert 10 < after / before < 200  # 500 walls against 10
+
+
+def test_singular_information_gives_no_covariance():
+    rng = np.random.default_rng(0)
+    points, normals, _ = surroundings(rng, axes=1)
+    matches = solved(points, normals, np.zeros(1500), prior=np.eye(6))[0].matches
+    nothing = Solution(POSE, True, True, matches, 1, 1, 0.0, 0.0, np.zeros((6, 6)))
+    assert scan_error(nothing, np.inf, SeenGround(0.8), CONFIG) is None
+
+
+def test_only_new_ground_is_renewed():
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    seen = SeenGround(CONFIG.ground_cell)
+    first = scan_error(solution, np.inf, seen, CONFIG)
+    again = scan_error(solution, np.inf, seen, CONFIG)
+    assert np.linalg.eigvalsh(first.renewed).min() > 0.0
+    np.testing.assert_allclose(again.renewed, 0.0, atol=1e-20)
+    np.testing.assert_array_equal(first.covariance, again.covariance)
+
+
+def test_ground_is_new_once_and_forgotten_in_time():
+    seen = SeenGround(1.0, remembered=3)
+    row = np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [0.6, 0.5, 0.5]])
+    numbers, new = seen.cells(row)
+    assert numbers[0] == numbers[2] != numbers[1]
+    assert new.all()
+    assert not seen.cells(row)[1].any()
+    seen.cells(row + np.array([10.0, 0.0, 0.0]))  # fills the generation
+    assert not seen.cells(row)[1].any()
+    for n in (20.0, 30.0, 40.0, 50.0):
+        assert seen.cells(row + np.array([n, 0.0, 0.0]))[1].all()
+    assert seen.cells(row)[1].all()

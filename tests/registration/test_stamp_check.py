@@ -1,0 +1,254 @@
+"""Which stamps are used, which are refused and why, and what follows a clock that was set."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from io import StringIO
+
+import gtsam
+import numpy as np
+import pytest
+from rich.console import Console
+from support.list_dataset import ListDataset
+
+from loam_gtsam import Checkpoint, Features, FeatureSweep, Mapper, MapUpdate, SweepFault
+from loam_gtsam.cli.report import summary
+from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.pipeline import Pipeline, run
+from loam_gtsam.registration.stamp_check import IN_A_ROW, StampCheck
+from loam_gtsam.types import BadSweep, FrameStatus, Scan
+
+TENTH = 10**8
+SECOND = 10**9
+DAY = 86_400 * SECOND
+START = 1_700_000_000 * SECOND
+
+
+def judged(stamps: list[int]) -> list[str]:
+    """The fault of each stamp after the first, empty if it was used."""
+    check, last, faults = StampCheck(), stamps[0], []
+    for stamp in stamps[1:]:
+        refusal = check.refuse(stamp, last)
+        faults.append("" if refusal is None else str(refusal.fault))
+        if refusal is None:
+            last = stamp
+        elif refusal.clock_step:
+            last += refusal.clock_step
+    return faults
+
+
+def steps(first: int, count: int, step: int = TENTH) -> list[int]:
+    return [first + k * step for k in range(count)]
+
+
+def test_stamps_that_ascend_are_used():
+    assert judged(steps(START, 20)) == [""] * 19
+    assert judged([START, START + 1, START + 10 * SECOND]) == ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("off", "fault"),
+    [
+        (0, "duplicate_stamp"),
+        (-1, "late"),
+        (-10 * SECOND, "late"),
+        (-10 * SECOND - 1, "stamp_back"),
+        (-START, "stamp_back"),
+        (10 * SECOND, ""),
+        (10 * SECOND + 1, "stamp_ahead"),
+        (3650 * DAY, "stamp_ahead"),
+    ],
+)
+def test_one_stamp_that_is_off_costs_one_sweep(off, fault):
+    good = steps(START, 5)
+    after = steps(good[-1] + (off if not fault else 0) + TENTH, 3)
+    assert judged([*good, good[-1] + off, *after]) == ["", "", "", "", fault, "", "", ""]
+
+
+def test_a_slow_sensor_may_take_ten_of_its_steps():
+    good = steps(START, 4, 60 * SECOND)
+    assert judged([*good, good[-1] + 600 * SECOND]) == [""] * 4
+    assert judged([*good, good[-1] + 601 * SECOND])[-1] == "stamp_ahead"
+    assert judged([*good, good[-1] - 600 * SECOND])[-1] == "late"
+
+
+def test_a_clock_set_ahead_is_followed_after_some_sweeps():
+    faults = judged([*steps(START, 5), *steps(START + DAY, 10)])
+    assert faults == [""] * 4 + ["stamp_ahead"] * (IN_A_ROW - 1) + ["clock_set_ahead"] + [""] * 5
+
+
+def test_after_the_clock_was_set_it_goes_on_from_one_step_before():
+    check = StampCheck()
+    check.refuse(START + TENTH, START)
+    there = steps(START + DAY, IN_A_ROW)
+    refusals = [check.refuse(stamp, START + TENTH) for stamp in there]
+    last = refusals[-1]
+    assert last is not None
+    assert START + TENTH + last.clock_step == there[0] - TENTH
+    assert "86399.8 s ahead" in last.message
+    assert all(refusal is not None and refusal.clock_step == 0 for refusal in refusals[:-1])
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_wrong_stamps_that_do_not_agree_are_no_clock(sign):
+    wrong = [START + sign * DAY * k for k in (9, 3, 7, 2, 5, 4, 8, 1)]
+    fault = "stamp_ahead" if sign > 0 else "stamp_back"
+    assert judged([*steps(START, 3), *wrong]) == ["", "", *[fault] * 8]
+
+
+def test_a_good_sweep_between_wrong_ones_starts_the_count_again():
+    good, wrong = steps(START, 9), steps(START + DAY, 8)
+    mixed = [*good[:3], *wrong[:4], good[3], *wrong[4:]]
+    assert judged(mixed) == ["", "", *["stamp_ahead"] * 4, "", *["stamp_ahead"] * 4]
+
+
+def test_sweeps_that_come_twice_count_once_towards_a_clock():
+    twice = [stamp for stamp in steps(START + DAY, IN_A_ROW) for _ in range(2)]
+    faults = judged([*steps(START, 3), *twice])
+    assert faults[2:].count("stamp_ahead") == 2 * IN_A_ROW - 2
+    assert faults[-2] == "clock_set_ahead"
+
+
+def test_a_clock_set_back_is_said_and_not_followed():
+    faults = judged([*steps(START, 5), *steps(START - DAY, 20), START + 5 * TENTH])
+    back = 20 - IN_A_ROW + 1
+    assert faults[4:] == ["stamp_back"] * (IN_A_ROW - 1) + ["clock_set_back"] * back + [""]
+
+
+# -- in a run --------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def drive() -> list[Scan]:
+    world = SimulatedWorld("street_loop", frames=52, columns=450)
+    return [world[number] for number in range(28, 52)]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(5)
+
+
+def truth(drive: list[Scan]) -> np.ndarray:
+    world = SimulatedWorld("street_loop", frames=52, columns=450)
+    poses = world.truth.map_T_lidar[28:52]
+    assert [scan.stamp for scan in drive] == world.truth.stamps[28:52].tolist()
+    return np.linalg.inv(poses[0]) @ poses
+
+
+def test_a_run_goes_on_where_it_is_when_the_clock_is_set_ahead(drive):
+    later = [replace(scan, stamp=scan.stamp + 365 * DAY) for scan in drive[15:]]
+    result = run(ListDataset([*drive[:15], *later]))
+    assert result.faults == {"stamp_ahead": IN_A_ROW - 1, "clock_set_ahead": 1}
+    for number in range(15 + IN_A_ROW, len(drive)):
+        update = result.updates[number]
+        assert update.status is FrameStatus.OK
+        away = update.map_T_lidar.translation() - truth(drive)[number, :3, 3]
+        assert np.linalg.norm(away) < 0.15
+        assert np.sqrt(np.diag(update.covariance)).max() < 0.1
+    first = result.updates[15 + IN_A_ROW]
+    before = result.updates[14]
+    np.testing.assert_allclose(first.twist[3:], before.twist[3:], atol=0.6)  # not over a year
+    assert (np.diff(result.trajectory.stamps) > 0).all()
+
+
+def test_one_stamp_years_ahead_does_not_end_a_run(drive):
+    wrong = replace(drive[15], stamp=drive[15].stamp + 3650 * DAY)
+    result = run(ListDataset([*drive[:15], wrong, *drive[16:20]]))
+    assert result.faults == {"stamp_ahead": 1}
+    assert "s after the last one" in result.updates[15].message
+    assert all(update.status is FrameStatus.OK for update in result.updates[16:])
+
+
+def test_a_clock_set_back_says_what_to_do_and_a_reset_does_it(drive):
+    pipeline = Pipeline()
+    for scan in drive[:4]:
+        pipeline.process(scan)
+    earlier = [replace(scan, stamp=scan.stamp - DAY) for scan in drive[4:12]]
+    updates = [pipeline.process(scan) for scan in earlier[:6]]
+    assert [update.fault for update in updates[-2:]] == [SweepFault.CLOCK_SET_BACK] * 2
+    assert "reset the mapper" in updates[-1].message
+    pipeline.mapper.reset()
+    statuses = [pipeline.process(scan).status for scan in earlier[6:]]
+    assert statuses == [FrameStatus.FIRST, FrameStatus.OK]
+
+
+@pytest.mark.parametrize("moment", ["start", "end"])
+def test_an_unusable_sweep_does_not_cost_the_next_one(drive, moment):
+    # The stamp of a sweep may be its end, and the pose that of its start: one sweep earlier.
+    scans = drive[:6]
+    if moment == "end":
+        scans = [
+            replace(scan, stamp=scan.stamp + TENTH, times=scan.times - 0.1, span=(-0.1, 0.0))
+            for scan in scans
+        ]
+    empty = replace(scans[3], points=scans[3].points[:0], times=None, rings=None)
+    unread = BadSweep(scans[4].stamp, "unreadable")
+    result = run(ListDataset([*scans[:3], empty, unread, scans[5]]))
+    assert result.faults == {"empty": 1, "unreadable": 1}
+    assert result.updates[5].status is FrameStatus.OK
+    assert np.diff(result.trajectory.stamps).tolist() == [TENTH] * 5
+
+
+def test_recorded_odometry_of_a_late_sweep_is_not_counted_twice(rng):
+    walls = rng.uniform(-8.0, 8.0, (4000, 3))
+    walls[np.arange(4000), np.arange(4000) % 3] = 8.0 * rng.choice([-1.0, 1.0], 4000)
+    columns = np.column_stack([np.repeat([[5.0, 5.0], [-5.0, 4.0]], 60, axis=0),
+                               np.tile(np.linspace(-3.0, 3.0, 60), 2)])  # fmt: skip
+
+    def sweep(number: int) -> FeatureSweep:
+        odom_T_lidar = gtsam.Pose3(gtsam.Rot3(), np.array([0.8 * number, 0.0, 0.0]))
+        seen = [points - odom_T_lidar.translation() for points in (columns, walls)]
+        return FeatureSweep(Features.from_points(number * TENTH, *seen), odom_T_lidar)
+
+    asked: list[gtsam.Pose3] = []
+    pipeline = Pipeline()
+    register = pipeline.mapper.register
+    pipeline.mapper.register = lambda features, guess=None: (
+        asked.append(guess)
+        or register(  # type: ignore[method-assign]
+            features, guess
+        )
+    )
+    for number in (0, 1, 3, 2, 4):
+        pipeline.process(sweep(number))
+    np.testing.assert_allclose(asked[-1].translation(), [3.2, 0.0, 0.0], atol=0.05)
+
+
+def test_features_that_are_not_finite_are_a_fault(rng):
+    mapper = Mapper()
+    points = rng.uniform(-5.0, 5.0, (300, 3))
+    mapper.register(Features.from_points(0, points[:100], points))
+    for number, name in enumerate(("edges", "planes", "edge_times", "plane_times"), 1):
+        features = Features.from_points(number * TENTH, points[:100], points)
+        spoilt = getattr(features, name).copy()
+        spoilt[7] = np.nan
+        update = mapper.register(replace(features, **{name: spoilt}))
+        assert (update.status, update.fault) == ("unusable_scan", "not_finite")
+
+
+def test_a_run_that_was_stopped_between_doubted_sweeps_goes_on_as_it_was(drive, tmp_path):
+    later = [replace(scan, stamp=scan.stamp + DAY) for scan in drive[6:14]]
+    dataset = ListDataset([*drive[:6], *later])
+
+    def stop(number: int, update: MapUpdate) -> None:
+        if number == 8:
+            raise KeyboardInterrupt
+
+    whole = run(dataset)
+    run(dataset, on_frame=stop, checkpoint=Checkpoint(tmp_path / "here"))
+    on = run(dataset, checkpoint=Checkpoint(tmp_path / "here", resume=True))
+    assert [u.fault for u in on.updates] == [u.fault for u in whole.updates]
+    assert on.faults == {"stamp_ahead": IN_A_ROW - 1, "clock_set_ahead": 1}
+    np.testing.assert_array_equal(on.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
+
+
+def test_the_summary_on_the_screen_names_what_was_not_used():
+    scans = list(SimulatedWorld("room", frames=3, columns=300))
+    nothing = replace(scans[1], points=np.full_like(scans[1].points, np.nan))
+    console = Console(file=StringIO(), width=100)
+    for sweeps in ([scans[0], nothing, scans[2], scans[2]], scans):
+        console.print(summary(run(ListDataset(sweeps)), "x", 1.0, {}))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "1 not_finite, 1 duplicate_stamp" in text
+    assert text.count("not used") == 1

@@ -1,0 +1,253 @@
+"""Trajectory errors: closed forms, degenerate paths, and evo where it is installed."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.studies.evaluation import absolute_error, align, align_rotations, interpolate
+from loam_gtsam.types import InputError, Trajectory
+
+LATERAL = np.array([0.0, 1.0, 1.0])
+
+
+def pose(rng, size=1.0):
+    return gtsam.Pose3.Expmap(rng.normal(size=6) * size).matrix()
+
+
+def rotation(*vector):
+    return gtsam.Rot3.Expmap(np.array(vector, dtype=float)).matrix()
+
+
+def path(count=60, seed=0, step=1e8):
+    """A winding path with turning orientations."""
+    rng = np.random.default_rng(seed)
+    poses, at = [], gtsam.Pose3()
+    for _ in range(count):
+        poses.append(at.matrix())
+        at = at.compose(
+            gtsam.Pose3.Expmap(np.r_[rng.normal(0, 0.1, 3), 1.0, rng.normal(0, 0.2, 2)])
+        )
+    stamps = 1_700_000_000_000_000_000 + (np.arange(count) * step).astype(np.int64)
+    return Trajectory(stamps, np.array(poses))
+
+
+def straight(count=50):
+    """Along x with identity orientation."""
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3] = np.arange(count)
+    return Trajectory(np.arange(count) * 100_000_000, poses)
+
+
+def changed(trajectory, poses):
+    return Trajectory(trajectory.stamps, poses)
+
+
+# -- alignment -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_align_recovers_a_rigid_transform(seed):
+    rng = np.random.default_rng(seed)
+    truth, points = pose(rng, 3.0), rng.normal(size=(30, 3)) * [50, 10, 1]
+    found = align(points, points @ truth[:3, :3].T + truth[:3, 3])
+    np.testing.assert_allclose(found, truth, atol=1e-11)
+    # The positions decide alone, whatever is offered for what they leave open.
+    np.testing.assert_array_equal(
+        align(points, points @ truth[:3, :3].T + truth[:3, 3], rotation(1, 2, 3)), found
+    )
+
+
+def test_align_does_not_mirror():
+    points = np.random.default_rng(1).normal(size=(20, 3))
+    found = align(points, points * [1, 1, -1])
+    assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("flat", [(1, 1, 0), (0, 1, 1)])
+def test_align_recovers_a_rotation_from_a_plane(flat):
+    rng = np.random.default_rng(2)
+    truth, points = pose(rng), rng.normal(size=(30, 3)) * flat
+    found = align(points, points @ truth[:3, :3].T + truth[:3, 3])
+    np.testing.assert_allclose(found, truth, atol=1e-11)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_on_a_line_the_roll_comes_from_the_offered_rotation(seed):
+    rng = np.random.default_rng(seed)
+    truth = pose(rng, 2.0)
+    line = np.linspace(0, 300, 40)[:, None] * [0.6, 0.8, 0.0]
+    line += [100.0, 0, 3]
+    moved = line @ truth[:3, :3].T + truth[:3, 3]
+    np.testing.assert_allclose(align(line, moved, truth[:3, :3]), truth, atol=1e-5)
+    anyhow = align(line, moved)
+    np.testing.assert_allclose(anyhow[:3, :3] @ anyhow[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(anyhow[:3, :3]) == pytest.approx(1.0)
+    np.testing.assert_allclose(line @ anyhow[:3, :3].T + anyhow[:3, 3], moved, atol=1e-5)
+
+
+def test_without_motion_the_rotation_is_the_offered_one():
+    still, there = np.zeros((5, 3)), np.tile([1.0, 2, 3], (5, 1))
+    np.testing.assert_allclose(align(still, there)[:3, :3], np.eye(3), atol=1e-15)
+    found = align(still, there, rotation(0.1, 0.2, 0.3))
+    np.testing.assert_allclose(found[:3, :3], rotation(0.1, 0.2, 0.3), atol=1e-12)
+    np.testing.assert_allclose(found[:3, 3], [1, 2, 3], atol=1e-15)
+
+
+def test_align_rotations_recovers_a_turn_and_averages():
+    rng = np.random.default_rng(3)
+    some = np.array([pose(rng)[:3, :3] for _ in range(20)])
+    turn = rotation(0.3, -1.0, 2.0)
+    np.testing.assert_allclose(align_rotations(some, turn @ some), turn, atol=1e-12)
+    # Offsets of +a and -a about one axis average to none.
+    offsets = np.array([rotation(0, 0, 0.2), rotation(0, 0, -0.2)])
+    np.testing.assert_allclose(align_rotations(some[:2], offsets @ some[:2]), np.eye(3), atol=1e-12)
+
+
+# -- interpolation ---------------------------------------------------------------------------------
+
+
+def test_interpolation_of_constant_velocity_and_rotation_is_exact():
+    rate, velocity = np.array([0.3, -0.2, 0.5]), np.array([10.0, -2.0, 0.5])
+    stamps = 1_700_000_000_000_000_000 + np.array([0, 1, 3, 4]) * 100_000_000
+
+    def at(stamps_):
+        seconds = (stamps_ - stamps[0]) * 1e-9
+        poses = np.tile(np.eye(4), (len(seconds), 1, 1))
+        poses[:, :3, :3] = [rotation(*(rate * s)) for s in seconds]
+        poses[:, :3, 3] = np.outer(seconds, velocity)
+        return Trajectory(stamps_, poses)
+
+    between = stamps[0] + np.array([0, 33_333_333, 250_000_001, 400_000_000])
+    found = interpolate(at(stamps), between)
+    np.testing.assert_array_equal(found.stamps, between)
+    np.testing.assert_allclose(found.map_T_lidar, at(between).map_T_lidar, atol=1e-12)
+
+
+@pytest.mark.parametrize("outside", [-1, 10_000_000_001])
+def test_interpolation_ends_where_the_trajectory_ends(outside):
+    some = path(11, step=1e9)
+    start = some.stamps[0]
+    assert len(interpolate(some, start + np.array([0, 10_000_000_000]))) == 2
+    with pytest.raises(InputError, match="leave the trajectory"):
+        interpolate(some, start + np.array([5, outside]))
+
+
+@pytest.mark.parametrize("stamps", [[0, 1, 1, 2], [0, 2, 1, 3]])
+def test_stamps_that_do_not_increase_are_named(stamps):
+    bad = Trajectory(np.array(stamps), np.tile(np.eye(4), (4, 1, 1)))
+    with pytest.raises(InputError, match="got 1 at index 2"):
+        interpolate(bad, np.array([1]))
+    with pytest.raises(InputError, match=r"absolute_error: .* increasing stamps"):
+        absolute_error(bad, bad)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_a_reference_without_a_stretch_is_refused(count):
+    short = Trajectory(np.arange(count), np.tile(np.eye(4), (count, 1, 1)))
+    with pytest.raises(InputError, match=f"2 or more poses .* got {count}"):
+        absolute_error(path(), short)
+
+
+# -- absolute error --------------------------------------------------------------------------------
+
+
+def test_a_rigid_change_is_no_error_unless_unaligned():
+    truth = path()
+    moved = changed(truth, pose(np.random.default_rng(4), 2.0) @ truth.map_T_lidar)
+    error = absolute_error(moved, truth)
+    assert error.maximum < 1e-11
+    assert error.rotation_rmse_deg < 1e-5
+    raw = absolute_error(moved, truth, aligned=False)
+    assert raw.rmse > 1.0
+    assert raw.rotation_rmse_deg > 10.0
+
+
+def test_known_offsets_give_known_numbers():
+    truth = path(4)
+    poses = truth.map_T_lidar.copy()
+    poses[:, 2, 3] += [0.0, 0.1, 0.2, -0.4]
+    poses[2, :3, :3] = poses[2, :3, :3] @ rotation(0, 0, np.radians(2.0))
+    error = absolute_error(changed(truth, poses), truth, aligned=False)
+    np.testing.assert_allclose(error.translations, [0, 0.1, 0.2, 0.4], atol=1e-12)
+    np.testing.assert_array_equal(error.stamps, truth.stamps)
+    assert error.rmse == pytest.approx(np.sqrt(0.21 / 4))
+    assert error.median == pytest.approx(0.15)
+    assert error.maximum == pytest.approx(0.4)
+    assert error.rotation_rmse_deg == pytest.approx(1.0)
+
+
+def test_white_noise_gives_its_own_size():
+    truth = path(2000, seed=5)
+    rng = np.random.default_rng(6)
+    poses = truth.map_T_lidar.copy()
+    poses[:, :3, 3] += rng.normal(0, 0.05, (2000, 3))
+    assert absolute_error(changed(truth, poses), truth).rmse == pytest.approx(
+        0.05 * np.sqrt(3), rel=0.05
+    )
+
+
+def test_the_reference_is_interpolated_and_what_lies_outside_is_left_out():
+    truth = straight(21)
+    stamps = truth.stamps[:-1] + 50_000_000
+    poses = np.tile(np.eye(4), (20, 1, 1))
+    poses[:, 0, 3] = np.arange(20) + 0.5
+    inner = Trajectory(truth.stamps[5:9], truth.map_T_lidar[5:9])
+    error = absolute_error(Trajectory(stamps, poses), inner, aligned=False)
+    np.testing.assert_array_equal(error.stamps, stamps[5:8])
+    assert error.maximum < 1e-12
+    with pytest.raises(InputError, match=r"3 or more poses .* got 2"):
+        absolute_error(Trajectory(stamps[:7], poses[:7]), inner)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-6, 1e-2])
+def test_on_a_straight_path_the_orientation_error_is_that_of_the_orientations(noise):
+    """Positions on a line do not say how far one path is rolled against the other."""
+    truth = straight()
+    rng = np.random.default_rng(7)
+    poses = truth.map_T_lidar.copy()
+    poses[:, :3, 3] += LATERAL * rng.normal(0, noise, (50, 3))
+    wobble = np.where(np.arange(50) % 2, 1.0, -1.0) * np.radians(0.5)
+    poses[:, :3, :3] = [rotation(angle, 0, 0) for angle in wobble]
+    turned = pose(rng, 2.0) @ poses  # a gauge that must not matter
+    error = absolute_error(changed(truth, turned), truth)
+    assert error.rotation_rmse_deg == pytest.approx(0.5, rel=1e-6)
+    assert error.rmse <= np.sqrt(2) * noise * 1.3 + 1e-6
+
+
+def test_a_standstill_has_no_error():
+    still = Trajectory(np.arange(5), np.tile(np.eye(4), (5, 1, 1)))
+    error = absolute_error(
+        changed(still, pose(np.random.default_rng(8)) @ still.map_T_lidar), still
+    )
+    assert error.maximum < 1e-12
+    assert error.rotation_rmse_deg < 1e-5
+
+
+def test_equals_evo():
+    metrics = pytest.importorskip("evo.core.metrics")
+    trajectory = pytest.importorskip("evo.core.trajectory")
+    truth = path()
+    rng = np.random.default_rng(9)
+    noisy = np.array([p @ pose(rng, 0.02) for p in truth.map_T_lidar])
+    ours = changed(truth, pose(rng) @ noisy)
+
+    def theirs(some):
+        stamps = some.stamps * 1e-9
+        return trajectory.PoseTrajectory3D(poses_se3=list(some.map_T_lidar), timestamps=stamps)
+
+    def evo_rmse(relation, aligned):
+        reference, estimate = theirs(truth), theirs(ours)
+        if aligned:
+            estimate.align(reference)
+        metric = metrics.APE(relation)
+        metric.process_data((reference, estimate))
+        return metric.get_statistic(metrics.StatisticsType.rmse)
+
+    part, angle = metrics.PoseRelation.translation_part, metrics.PoseRelation.rotation_angle_deg
+    error, raw = absolute_error(ours, truth), absolute_error(ours, truth, aligned=False)
+    assert error.rmse == pytest.approx(evo_rmse(part, True), rel=1e-9)
+    assert raw.rmse == pytest.approx(evo_rmse(part, False), rel=1e-9)
+    assert raw.rotation_rmse_deg == pytest.approx(evo_rmse(angle, False), rel=1e-6)
+    # Fitted to the orientations themselves, these are at least as near as evo leaves them.
+    assert error.rotation_rmse_deg <= evo_rmse(angle, True)
+    assert error.rotation_rmse_deg == pytest.approx(evo_rmse(angle, True), rel=0.1)

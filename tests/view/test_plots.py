@@ -1,0 +1,164 @@
+"""Pictures are written, small, the same every time, and drawn from the data."""
+
+from __future__ import annotations
+
+import sys
+
+import numpy as np
+import pytest
+
+from loam_gtsam.types import FrameStatus, MapUpdate, OutputError, Trajectory
+from loam_gtsam.view import plots as visualization
+from loam_gtsam.view.frame_plot import plot_frame
+from loam_gtsam.view.frame_view import RESIDUAL_COLOURS, FrameView, MapView
+
+gtsam = pytest.importorskip("gtsam")
+image = pytest.importorskip("matplotlib.image")
+
+
+def circle(count: int = 100) -> Trajectory:
+    angle = np.linspace(0.0, 6.0, count)
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 0, 3], poses[:, 1, 3] = 20.0 * np.sin(angle), 20.0 * np.cos(angle)
+    return Trajectory(np.arange(count) * 100_000_000, poses)
+
+
+def updates(count: int) -> list[MapUpdate]:
+    pose = gtsam.Pose3()
+    timings = {"read": 0.01, "solve": 0.02}
+    return [MapUpdate(n, pose, FrameStatus.OK, timings=timings if n else {}) for n in range(count)]
+
+
+def has_colour(path, colour: str, pixels_at_least: int = 50) -> bool:
+    """Whether a fair number of pixels is (almost) of a colour; text alone has a few greys."""
+    rgb = [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
+    pixels = image.imread(path)[..., :3]
+    return bool((np.abs(pixels - rgb).max(axis=2) < 0.02).sum() >= pixels_at_least)
+
+
+def test_rounding_does_not_stretch_a_logarithmic_axis(tmp_path, monkeypatch):
+    figures = []
+    monkeypatch.setattr(visualization, "save_figure", lambda figure, path: figures.append(figure))
+    curve = np.arange(3.0), np.array([1e-38, 0.1, 0.2])
+    nothing = np.zeros(0), np.zeros(0)
+    visualization.plot_curves("x.png", {"y": {"first": nothing, "b": curve}}, "x", log=True)
+    (axes,) = figures[0].axes
+    assert axes.get_ylim()[0] > 0.01
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["b"]
+
+
+def test_trajectory_with_and_without_truth(tmp_path):
+    visualization.plot_trajectory(tmp_path / "a.png", circle())
+    visualization.plot_trajectory(tmp_path / "b.png", circle(), circle(50))
+    assert has_colour(tmp_path / "a.png", visualization.PATH)
+    assert not has_colour(tmp_path / "a.png", visualization.TRUTH, 400)
+    assert has_colour(tmp_path / "b.png", visualization.TRUTH, 400)
+
+
+def test_map_shows_points_by_height_and_the_path(tmp_path):
+    rng = np.random.default_rng(0)
+    ground = np.column_stack([rng.uniform(-30, 30, (20000, 2)), np.zeros(20000)])
+    wall = np.column_stack([np.full(5000, 15.0), rng.uniform(-30, 30, 5000), np.full(5000, 8.0)])
+    visualization.plot_map(tmp_path / "flat.png", ground[:10], ground)
+    visualization.plot_map(tmp_path / "map.png", wall, ground, circle())
+    dark = visualization._HEIGHT_COLOURS[-1]
+    assert has_colour(tmp_path / "map.png", visualization.PATH)
+    assert has_colour(tmp_path / "map.png", dark)
+    assert not has_colour(tmp_path / "flat.png", visualization.PATH)
+
+
+def test_the_busiest_map_stays_small(tmp_path):
+    noise = np.random.default_rng(0).uniform(-400.0, 400.0, (600_000, 3))
+    visualization.plot_map(tmp_path / "map.png", noise[:0], noise, circle(1000))
+    assert (tmp_path / "map.png").stat().st_size < 500_000
+
+
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_little_data_can_be_drawn(tmp_path, count):
+    few = Trajectory(np.arange(count), np.tile(np.eye(4), (count, 1, 1)))
+    visualization.plot_trajectory(tmp_path / "t.png", few)
+    visualization.plot_map(tmp_path / "m.png", np.zeros((count, 3)), np.zeros((0, 3)), few)
+    visualization.plot_timings(tmp_path / "s.png", updates(count))
+    for name in ("t.png", "m.png", "s.png"):
+        assert image.imread(tmp_path / name).ndim == 3
+
+
+def test_points_that_are_not_finite_are_left_out(tmp_path):
+    points = np.array([[0.0, 0.0, 0.0], [np.nan, 0.0, 1.0], [np.inf, 2.0, 1.0], [5.0, 5.0, 1.0]])
+    visualization.plot_map(tmp_path / "m.png", points, points[:0])
+    assert (tmp_path / "m.png").exists()
+
+
+def test_errors_are_drawn_over_time(tmp_path):
+    stamps = np.arange(50) * 100_000_000
+    visualization.plot_errors(tmp_path / "a.png", stamps, np.linspace(0.0, 0.1, 50))
+    visualization.plot_errors(tmp_path / "none.png", stamps[:0], np.zeros(0))
+    assert has_colour(tmp_path / "a.png", visualization.PATH)
+    assert not has_colour(tmp_path / "none.png", visualization.PATH)
+
+
+def test_loops_are_drawn_in_the_last_panel_only(tmp_path):
+    way = circle().map_T_lidar[:, :3, 3]
+    panels = {"before": (way, way), "after": (way, way)}
+    loops = np.array([[[-15.0, -15.0, 0.0], [15.0, 15.0, 0.0]]])
+    for name, drawn in (("with.png", loops), ("without.png", loops[:0])):
+        visualization.plot_loops(tmp_path / name, panels, drawn)
+    one, other = (image.imread(tmp_path / f"{name}.png") for name in ("with", "without"))
+    columns = np.flatnonzero(np.abs(one - other).max(axis=(0, 2)) > 0.1)
+    assert one.shape == other.shape
+    assert columns.min() > 0.5 * one.shape[1]
+
+
+def frame_view(residuals: np.ndarray, **changes) -> FrameView:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-12.0, 12.0, (len(residuals), 3))
+    values = {
+        "number": 0, "update": updates(1)[0], "map_T_lidar": np.eye(4),
+        "position_covariance": np.diag([0.04, 0.04, 0.04]),
+        "sweep": rng.uniform(-12.0, 12.0, (3000, 3)), "edges": points, "planes": points,
+        "points": points, "feet": points, "residuals": residuals,
+    }  # fmt: skip
+    return FrameView(**(values | changes))
+
+
+def around() -> MapView:
+    nothing = np.zeros((0, 3))
+    return MapView(nothing, nothing, nothing, np.zeros((0, 2, 3)), np.zeros(0, np.bool_))
+
+
+def test_a_frame_shows_its_matches_by_their_residuals(tmp_path):
+    colours = RESIDUAL_COLOURS[0], RESIDUAL_COLOURS[-1]
+    shown = {}
+    for name, residuals in (("good", np.zeros(300)), ("bad", np.full(300, 9.0))):
+        plot_frame(tmp_path / f"{name}.png", frame_view(residuals), around())
+        shown[name] = [has_colour(tmp_path / f"{name}.png", colour, 600) for colour in colours]
+    assert shown == {"good": [True, False], "bad": [False, True]}
+    assert has_colour(tmp_path / "bad.png", visualization.INK, 300)  # the ellipse
+    unknown = np.full((3, 3), np.nan)
+    bare = frame_view(np.zeros(0), sweep=np.zeros((0, 3)), position_covariance=unknown)
+    plot_frame(tmp_path / "bare.png", bare, around())
+    assert not has_colour(tmp_path / "bare.png", visualization.INK, 300)
+
+
+def test_timings_show_a_colour_per_stage(tmp_path):
+    visualization.plot_timings(tmp_path / "s.png", updates(50))
+    for colour in visualization._STAGE_COLOURS[:2]:
+        assert has_colour(tmp_path / "s.png", colour)
+    assert not has_colour(tmp_path / "s.png", visualization._STAGE_COLOURS[3])
+
+
+def test_the_same_data_gives_the_same_bytes(tmp_path):
+    for name in ("a.png", "b.png"):
+        visualization.plot_trajectory(tmp_path / name, circle())
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+
+
+def test_without_matplotlib_the_error_says_what_to_install(tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(OutputError, match=r'pip install "loam_gtsam\[plot\]"'):
+        visualization.plot_trajectory(tmp_path / "t.png", circle())
+    with pytest.raises(OutputError, match=r'pip install "loam_gtsam\[plot\]"'):
+        plot_frame(tmp_path / "f.png", frame_view(np.zeros(0)), around())
+    assert list(tmp_path.iterdir()) == []

@@ -3,6 +3,8 @@
 import gtsam
 import numpy as np
 import pytest
+from support.jacobians import numerical
+from support.matches import unit
 
 from loam_gtsam import factors
 from loam_gtsam.types import InputError
@@ -15,20 +17,6 @@ POSES = [
     gtsam.Pose3.Expmap(np.array([0.0, 0.0, np.pi - 1e-3, 2000.0, -3000.0, 40.0])),
     gtsam.Pose3.Expmap(np.array([2.0, -2.0, 0.5, -1.0, 7.0, 0.2])),
 ]
-
-
-def unit(rng, count):
-    vectors = rng.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def numerical_jacobian(residual, pose, step=1e-6):
-    columns = []
-    for axis in np.eye(6):
-        ahead = residual(pose.retract(step * axis))
-        behind = residual(pose.retract(-step * axis))
-        columns.append((ahead - behind) / (2 * step))
-    return np.stack(columns, axis=1)
 
 
 def make_matches(rng, pose, n_lines=40, n_planes=60, noise=0.05):
@@ -57,8 +45,8 @@ def test_jacobians_equal_numerical_derivatives(pose):
             return factors.point_to_plane_residual(p, point, n, offset)
 
         for residual in (line, plane):
-            numerical = numerical_jacobian(lambda p, f=residual: f(p)[0], pose)
-            np.testing.assert_allclose(residual(pose)[1], numerical, atol=2e-5)
+            expected = numerical(lambda p, f=residual: f(p)[0], pose)
+            np.testing.assert_allclose(residual(pose)[1], expected, atol=2e-5)
 
 
 def test_residuals_in_closed_form():
@@ -140,7 +128,7 @@ def test_uncompressed_rows_agree_with_factor():
     rows = factors.line_rows(lines, centres, directions, weights, 0.1)
     residual, jacobian = rows.residuals(POSES[4])
     np.testing.assert_allclose(
-        jacobian, numerical_jacobian(lambda p: rows.residuals(p)[0], POSES[4]), atol=1e-4
+        jacobian, numerical(lambda p: rows.residuals(p)[0], POSES[4]), atol=1e-4
     )
     values = gtsam.Values()
     values.insert(KEY, POSES[4])

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.jacobians import numerical
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -61,15 +62,6 @@ def fused(pose, information, measured, weight, level_R_map=FLAT, information_of_
     if information_of_tilt is not None:
         prior = type(prior)(prior.roll_pitch, weight / (1 - weight) * information_of_tilt)
     return fuse(pose, information, [roll_pitch_factor(POSE_KEY, prior, level_R_map)])[0]
-
-
-def numerical(function, pose, step=1e-6):
-    """Derivative by the tangent vector at a pose, central differences."""
-    columns = [
-        (function(pose.retract(step * axis)) - function(pose.retract(-step * axis))) / (2 * step)
-        for axis in np.eye(6)
-    ]
-    return np.stack(columns, axis=1)
 
 
 def jacobian_of(factor, pose):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from support.worlds import room_features
 
 from loam_gtsam import mapper as mapper_module
 from loam_gtsam.config import Config
@@ -25,21 +26,6 @@ def with_deskew(**changes):
 
 def with_solver(**changes):
     return replace(Config(), solver=replace(Config().solver, **changes))
-
-
-def room_features(map_T_lidar, stamp, rng, count=6000, noise=0.0):
-    """Features of a 12 x 8 x 4 m room with six poles, seen exactly from a pose."""
-    sides = np.array([6.0, 4.0, 2.0])
-    walls = rng.uniform(-1, 1, (count, 3)) * sides
-    axis = rng.integers(0, 3, count)
-    rows = np.arange(count)
-    walls[rows, axis] = np.sign(walls[rows, axis]) * sides[axis]
-    poles = np.repeat([[x, y, 0.0] for x in (-4.0, 0.5, 3.0) for y in (-2.5, 2.0)], 60, axis=0)
-    poles[:, 2] = rng.uniform(-2, 2, len(poles))
-    local = gtsam.Pose3(np.linalg.inv(map_T_lidar.matrix()))
-    moved = [local.transformFrom(points.T).T for points in (poles, walls)]
-    moved = [points + rng.normal(0, noise, points.shape) for points in moved]
-    return Features.from_points(stamp, *moved)
 
 
 @pytest.fixture

@@ -11,13 +11,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
 from benchmarks import __main__ as tool
 from benchmarks import cases, ouster, peers, report
 from benchmarks.cases import Case, CaseResult, PeerResult, judge
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.types import InputError, LoamError
+
+ROOT = Path(__file__).resolve().parents[2]
 
 TINY = Case("room", "sim:room?frames=6&columns=360", ate_limit=1.0, rivals=("KISS-ICP",))
 

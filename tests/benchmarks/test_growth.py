@@ -11,13 +11,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
 from benchmarks import growth, growth_report, process, recorded
 from benchmarks.growth import COLUMNS, Drive
 from benchmarks.growth_report import GrowthResult
 from benchmarks.recorded import Rival, RivalResult
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.types import FloatArray
+
+ROOT = Path(__file__).resolve().parents[2]
 
 LOOP = Drive("street_loop", frames=10, columns=300)
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
 from benchmarks import robustness
 from benchmarks.robustness import (
     KISS,
@@ -20,6 +19,8 @@ from benchmarks.robustness import (
     finished,
     recovery,
 )
+
+ROOT = Path(__file__).resolve().parents[2]
 
 ABSENT = Path("no such folder")
 TINY = Place("room", frames=24, columns=300, lane=1.2)

@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
 from benchmarks import scene_tables, scenes
 from benchmarks.scene_tables import Row, along, drift, tilt
 from loam_gtsam.config import preset
 from loam_gtsam.types import FloatArray, Trajectory
+
+ROOT = Path(__file__).resolve().parents[2]
 
 TINY = scenes.Place("slopes", frames=5, columns=1200, aids=("none", "equivalent"))
 ABSENT = Path("no such folder")

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
 from benchmarks import soak, soak_faults
 from benchmarks.soak import SoakResult
 from benchmarks.soak_faults import FaultyDrive
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.types import BadSweep, FrameStatus, Scan, SweepFault
+
+ROOT = Path(__file__).resolve().parents[2]
 
 FRAMES = 160
 

@@ -11,11 +11,12 @@ import gtsam
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
 pytest.importorskip("matplotlib")
 from benchmarks import study
 from loam_gtsam.config import Config
 from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+
+ROOT = Path(__file__).resolve().parents[2]
 
 TINY = study.Effort(first=4, targets=1, starts=2, columns=600, mapped=3)
 

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.cli import loam
 from support.list_dataset import ListDataset
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from loam_gtsam.cli import app as cli
 from loam_gtsam.cli import run as _cli_run
 from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
@@ -27,10 +27,6 @@ from loam_gtsam.view import plots as visualization
 
 FRAMES = 4
 PLOTS = visualization.available()
-
-
-def loam(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
 
 
 @pytest.fixture(autouse=True)

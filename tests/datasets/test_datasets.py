@@ -1,15 +1,25 @@
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rosbags.rosbag1 import Writer as Writer1
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from support.bags import (
+    KINDS,
+    LATENCY,
+    ROS1,
+    START,
+    cloud,
+    imu,
+    loam_recording,
+    odometry,
+    store_of,
+    sweep_points,
+    sweeps,
+    write_bag,
+)
 
 from loam_gtsam.datasets import (
     ArrayDataset,
@@ -33,142 +43,6 @@ from loam_gtsam.types import (
     LoamError,
     Scan,
 )
-
-ROS1 = get_typestore(Stores.ROS1_NOETIC)
-ROS2 = get_typestore(Stores.ROS2_HUMBLE)
-START = 1_700_000_000_000_000_000
-LATENCY = 30_000_000
-"""Receive time minus header stamp in the bags below."""
-
-
-# --- writing bags ---------------------------------------------------------------------------
-
-
-def header(store: Any, stamp: int) -> Any:
-    types = store.types
-    time = types["builtin_interfaces/msg/Time"](sec=stamp // 10**9, nanosec=stamp % 10**9)
-    extra = {"seq": 0} if store is ROS1 else {}
-    return types["std_msgs/msg/Header"](stamp=time, frame_id="lidar", **extra)
-
-
-def cloud(store: Any, stamp: int, points: np.ndarray, **columns: np.ndarray) -> Any:
-    types = store.types
-    codes = {"u2": 4, "u4": 6, "f4": 7, "f8": 8}
-    names = ["x", "y", "z", *columns]
-    arrays = [*points.T.astype("f4"), *columns.values()]
-    packed = np.zeros(len(points), [(n, a.dtype.str) for n, a in zip(names, arrays, strict=True)])
-    fields = []
-    for name, array in zip(names, arrays, strict=True):
-        packed[name] = array
-        assert packed.dtype.fields is not None
-        fields.append(
-            types["sensor_msgs/msg/PointField"](
-                name=name,
-                offset=packed.dtype.fields[name][1],
-                datatype=codes[array.dtype.str[1:]],
-                count=1,
-            )
-        )
-    return types["sensor_msgs/msg/PointCloud2"](
-        header=header(store, stamp),
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=packed.itemsize,
-        row_step=packed.nbytes,
-        data=packed.view(np.uint8).reshape(-1),
-        is_dense=True,
-    )
-
-
-def imu(store: Any, stamp: int, *, unknown: bool = False) -> Any:
-    types = store.types
-    vector = types["geometry_msgs/msg/Vector3"]
-    covariance = np.zeros(9)
-    covariance[0] = -1.0 if unknown else 0.0
-    return types["sensor_msgs/msg/Imu"](
-        header=header(store, stamp),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
-        orientation_covariance=covariance,
-        angular_velocity=vector(x=0.1, y=0.2, z=0.3),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(x=0.0, y=0.0, z=9.81),
-        linear_acceleration_covariance=np.zeros(9),
-    )
-
-
-def odometry(
-    store: Any,
-    stamp: int,
-    position: Sequence[float],
-    quaternion: Sequence[float] = (0.0, 0.0, 0.0, 1.0),
-) -> Any:
-    types = store.types
-    vector = types["geometry_msgs/msg/Vector3"](x=0.0, y=0.0, z=0.0)
-    pose = types["geometry_msgs/msg/Pose"](
-        position=types["geometry_msgs/msg/Point"](*map(float, position)),
-        orientation=types["geometry_msgs/msg/Quaternion"](*map(float, quaternion)),
-    )
-    return types["nav_msgs/msg/Odometry"](
-        header=header(store, stamp),
-        child_frame_id="/laser_odom",
-        pose=types["geometry_msgs/msg/PoseWithCovariance"](pose=pose, covariance=np.zeros(36)),
-        twist=types["geometry_msgs/msg/TwistWithCovariance"](
-            twist=types["geometry_msgs/msg/Twist"](linear=vector, angular=vector),
-            covariance=np.zeros(36),
-        ),
-    )
-
-
-Recording = list[tuple[str, int, Any]]
-"""Topic, receive time, message or raw bytes of a cloud."""
-
-
-def write_bag(path: Path, kind: str, recording: Recording) -> Path:
-    """Write the messages as ``ros1``, ``sqlite3`` or ``mcap``; returns what a user would open."""
-    store = ROS1 if kind == "ros1" else ROS2
-    if kind == "ros1":
-        path = path.with_suffix(".bag")
-        writer: Any = Writer1(path)
-        serialize = store.serialize_ros1
-    else:
-        plugin = StoragePlugin.MCAP if kind == "mcap" else StoragePlugin.SQLITE3
-        writer = Writer2(path, version=9, storage_plugin=plugin)
-        serialize = store.serialize_cdr
-    with writer:
-        connections: dict[str, Any] = {}
-        for topic, received, message in recording:
-            raw = isinstance(message, bytes)
-            kind_of = "sensor_msgs/msg/PointCloud2" if raw else message.__msgtype__
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind_of, typestore=store)
-            data = message if raw else serialize(message, kind_of)
-            writer.write(connections[topic], received, data)
-    return path
-
-
-def store_of(kind: str) -> Any:
-    return ROS1 if kind == "ros1" else ROS2
-
-
-def sweep_points(seed: int, count: int = 300) -> np.ndarray:
-    return np.random.default_rng(seed).uniform(-20, 20, (count, 3)).astype("f4")
-
-
-def sweeps(kind: str, count: int = 4, topic: str = "/points") -> Recording:
-    store = store_of(kind)
-    times = np.linspace(0.0, 0.1, 300).astype("f4")
-    rings = (np.arange(300) % 16).astype("u2")
-    stamps = [START + i * 100_000_000 for i in range(count)]
-    return [
-        (topic, s + LATENCY, cloud(store, s, sweep_points(i), ring=rings, time=times))
-        for i, s in enumerate(stamps)
-    ]
-
-
-KINDS = ["ros1", "sqlite3", "mcap"]
-
 
 # --- bags -----------------------------------------------------------------------------------
 
@@ -338,29 +212,6 @@ def test_damage_inside_keeps_what_came_before(tmp_path: Path) -> None:
 
 
 # --- LOAM's topics --------------------------------------------------------------------------
-
-TO_LOAM = [1, 2, 0]  # x_loam = left, y_loam = up, z_loam = forward
-
-
-def loam_recording(
-    *, loam_axes: bool = False, offsets: dict[str, int] | None = None, count: int = 3
-) -> Recording:
-    """Flat clouds that spread least along z; ``offsets`` shift the stamps of a topic."""
-    recording: Recording = []
-    for i in range(count):
-        for topic in ("/laser_cloud_corner_last", "/laser_cloud_surf_last", "/velodyne_cloud_3"):
-            points = sweep_points(i) * np.array([1.0, 1.0, 0.2])
-            stamp = START + i * 100_000_000 + (offsets or {}).get(topic, 0)
-            points = points[:, TO_LOAM] if loam_axes else points
-            recording.append((topic, stamp, cloud(ROS1, stamp, points)))
-        stamp = START + i * 100_000_000
-        position = np.array([i, 0.5 * i, 0.1])
-        axis = np.array([0.1, 0.2, 0.3])  # lidar axes, rotation vector over two
-        quaternion = np.append(axis[TO_LOAM] if loam_axes else axis, np.sqrt(1 - axis @ axis))
-        position = position[TO_LOAM] if loam_axes else position
-        for topic in ("/laser_odom_to_init", "/aft_mapped_to_init"):
-            recording.append((topic, stamp, odometry(ROS1, stamp, position, quaternion)))
-    return recording
 
 
 @pytest.mark.parametrize("loam_axes", [False, True])

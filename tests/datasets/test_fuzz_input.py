@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.bags import KINDS, cloud, imu, loam_recording, store_of, write_bag
 from support.strategies import (
     FEW,
     START,
@@ -25,7 +26,6 @@ from support.strategies import (
     mutations,
     scans,
 )
-from test_datasets import KINDS, cloud, imu, loam_recording, store_of, write_bag
 
 from loam_gtsam.config import (
     Config,

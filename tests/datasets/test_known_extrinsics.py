@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from test_mulran_helipr import write_helipr
+from support.layout_writers import write_helipr
 
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.known import helipr, newer_college, oxford_spires

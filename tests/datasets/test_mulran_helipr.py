@@ -42,36 +42,6 @@ def write_mulran(root: Path, below: str = "", count: int = write.COUNT) -> Path:
     return root
 
 
-def write_helipr(root: Path, lidar: str = "Ouster") -> Path:
-    """As the record of the file player: no padding between the fields."""
-    folder = root / "LiDAR" / lidar
-    folder.mkdir(parents=True)
-    kinds = {
-        "Ouster": (
-            "<f4 <f4 <f4 <f4 <u4 <u2 <u2 <u2",
-            "x y z intensity t reflectivity ring ambient",
-        ),
-        "Velodyne": ("<f4 <f4 <f4 <f4 <u2 <f4", "x y z intensity ring time"),
-    }[lidar]
-    record = np.dtype(list(zip(kinds[1].split(), kinds[0].split(), strict=True)))
-    assert record.itemsize == {"Ouster": 26, "Velodyne": 22}[lidar]
-    for sweep in write.sweeps("os1-128" if lidar == "Ouster" else "vlp16", 512):
-        points = np.zeros(len(sweep.points), record)
-        for axis, name in enumerate("xyz"):
-            points[name] = sweep.points[:, axis]
-        points["ring"] = sweep.rings
-        if lidar == "Ouster":
-            points["t"] = np.rint(sweep.times * 1e9)
-        else:
-            points["time"] = sweep.times
-        points.tofile(folder / f"{sweep.stamp}.bin")
-    truth = write.lidar_truth()
-    write.write_rows(
-        root / "LiDAR_GT" / f"{lidar}_gt.txt", truth.stamps, write.quaternion_rows(truth), " "
-    )
-    return root
-
-
 def test_a_mulran_sequence_is_recognised_and_mapped_in_the_lidar_s_frame(tmp_path: Path) -> None:
     dataset = open_dataset(write_mulran(tmp_path))
     assert isinstance(dataset, MulRanDataset)
@@ -191,7 +161,7 @@ def test_the_gyro_is_where_the_orientation_says(tmp_path: Path) -> None:
 def test_a_helipr_sequence_is_recognised_with_times_rings_and_truth(
     tmp_path: Path, lidar: str
 ) -> None:
-    dataset = open_dataset(write_helipr(tmp_path, lidar))
+    dataset = open_dataset(write.write_helipr(tmp_path, lidar))
     assert isinstance(dataset, HeLiPRDataset)
     for scan, expected in zip(
         dataset, write.sweeps("os1-128" if lidar == "Ouster" else "vlp16", 512), strict=True
@@ -219,8 +189,8 @@ def test_a_helipr_sequence_is_recognised_with_times_rings_and_truth(
 
 
 def test_helipr_takes_the_lidar_asked_for_and_refuses_what_has_no_rings(tmp_path: Path) -> None:
-    write_helipr(tmp_path)
-    write_helipr(tmp_path, "Velodyne")
+    write.write_helipr(tmp_path)
+    write.write_helipr(tmp_path, "Velodyne")
     assert "Ouster" in open_dataset(tmp_path).info().kind
     assert "Velodyne" in open_dataset(tmp_path, lidar="Velodyne").info().kind
     with pytest.raises(DatasetError, match=r"expected Ouster or Velodyne, got 'Avia': it does not"):
@@ -232,7 +202,7 @@ def test_helipr_takes_the_lidar_asked_for_and_refuses_what_has_no_rings(tmp_path
 
 
 def test_helipr_says_what_is_broken(tmp_path: Path) -> None:
-    root = write_helipr(tmp_path)
+    root = write.write_helipr(tmp_path)
     files = sorted((root / "LiDAR" / "Ouster").iterdir())
     files[1].write_bytes(files[1].read_bytes()[:-1])
     sweeps = list(open_dataset(root))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import layout_writers as write
-from test_datasets import cloud, imu, store_of, write_bag
+from support.bags import cloud, imu, store_of, write_bag
 
 from loam_gtsam.datasets import (
     BagDataset,

@@ -6,70 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.bags import STAMP, N, make_message, xyz
 
 from loam_gtsam.datasets.decode.point_times import apply_times, decide_times
 from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2, decode_with_times
 from loam_gtsam.types import DatasetError
-
-STAMP = 1_700_000_000_123_456_789
-DATATYPES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-N = 400
-
-
-def make_message(
-    columns: dict[str, np.ndarray],
-    *,
-    height: int = 1,
-    big: bool = False,
-    gap: int = 0,
-    row_padding: int = 0,
-    stamp: int = STAMP,
-) -> Any:
-    """A PointCloud2 look-alike; ``gap`` bytes before each field, ``row_padding`` after each row."""
-    count = len(next(iter(columns.values())))
-    width = count // height
-    fields, offset = [], 0
-    for name, values in columns.items():
-        code = values.dtype.str[1:]
-        fields.append(
-            SimpleNamespace(name=name, offset=offset + gap, datatype=DATATYPES[code], count=1)
-        )
-        offset += gap + values.dtype.itemsize
-    step = offset + gap
-    row_step = width * step + row_padding
-    data = np.full(height * row_step, 0xAB, np.uint8)
-    for field, values in zip(fields, columns.values(), strict=True):
-        if count == 0:
-            break
-        order = ">" if big else "<"
-        target = np.ndarray(
-            (height, width),
-            values.dtype.newbyteorder(order),
-            data,
-            field.offset,
-            (row_step, step),
-        )
-        target[:] = values.reshape(height, width)
-    data.setflags(write=False)
-    return SimpleNamespace(
-        header=SimpleNamespace(
-            stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9), frame_id="lidar"
-        ),
-        height=height,
-        width=width,
-        fields=fields,
-        is_bigendian=big,
-        point_step=step,
-        row_step=row_step,
-        data=data,
-        is_dense=True,
-    )
-
-
-def xyz(count: int = N, dtype: str = "f4") -> dict[str, np.ndarray]:
-    rng = np.random.default_rng(1)
-    points = rng.uniform(-20, 20, (count, 3)).astype(dtype)
-    return {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2]}
 
 
 def with_time(name: str, values: np.ndarray) -> Any:

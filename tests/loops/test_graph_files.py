@@ -3,9 +3,8 @@
 import gtsam
 import numpy as np
 import pytest
-from typer.testing import CliRunner
+from support.cli import loam
 
-from loam_gtsam.cli.app import app
 from loam_gtsam.io.run_files import read_tum
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.loops.files import read_graph, write_graph
@@ -180,7 +179,7 @@ def test_other_bad_files_are_refused(tmp_path):
 
 
 def command(*words):
-    return CliRunner().invoke(app, ["optimize", *map(str, words)])
+    return loam("optimize", *words)
 
 
 @pytest.mark.parametrize("suffix", [".g2o", ".graph"])

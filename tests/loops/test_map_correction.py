@@ -5,7 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from test_closure import OWN, World, there_and_back, updates
+from support.worlds import OWN, World, there_and_back, updates
 
 from loam_gtsam.config import Config
 from loam_gtsam.loops.keyframes import LoopClosure

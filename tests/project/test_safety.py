@@ -12,11 +12,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from test_datasets import START, cloud, imu, store_of, write_bag
-from test_pointcloud2 import make_message, xyz
-from typer.testing import CliRunner
+from support.bags import START, cloud, imu, make_message, store_of, write_bag, xyz
+from support.cli import loam
 
-from loam_gtsam.cli.app import app
 from loam_gtsam.config import BagConfig, MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
@@ -180,10 +178,6 @@ def test_an_archived_cube_that_claims_more_than_its_file_holds_is_dropped(tmp_pa
 
 def files_below(folder: Path) -> set[str]:
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
-
-
-def loam(*arguments: str) -> Any:
-    return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 EVIL = ["../../evil", "/a/../../../evil", "~/evil", "/[/evil]", "/$(evil)", "/\x1b[2Jevil"]

@@ -1,11 +1,15 @@
 """The classical solvers: steps and optima of the factor graph, and what is theirs alone."""
 
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from support import matches as made
+from support.jacobians import numerical
+from support.matches import TRUTH, difference
 
 from loam_gtsam.config import Config, MatchingConfig, SolverConfig, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -25,14 +29,9 @@ from loam_gtsam.registration.classical import (
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, Solution, match_rows
 from loam_gtsam.types import Features, FrameStatus, InputError
 
-TRUTH = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
 OFFSET = np.array([0.02, -0.01, 0.02, 0.07, 0.13, -0.13])
 SIX = np.eye(6)
-
-
-def unit(rng, count):
-    vectors = rng.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+make_matches = partial(made.make_matches, n_planes=200, sigma=1.0)
 
 
 def edge_matches(points, centres, directions, weights):
@@ -46,20 +45,6 @@ def plane_matches(points, normals, offsets, weights):
     count = len(points)
     return PlaneMatches(
         points, normals, offsets, np.zeros(count), np.ones(count), weights, np.arange(count)
-    )
-
-
-def make_matches(n_edges=40, n_planes=200, noise=0.0, seed=0):
-    """Matches of unit sigma that TRUTH satisfies exactly, but for noise."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-20, 20, (n_edges + n_planes, 3))
-    there = TRUTH.transformFrom(points.T).T + noise * rng.normal(size=points.shape)
-    directions, normals = unit(rng, n_edges), unit(rng, n_planes)
-    centres = there[:n_edges] + directions * rng.uniform(-3, 3, (n_edges, 1))
-    offsets = -np.einsum("ij,ij->i", normals, there[n_edges:])
-    return ScanMatches(
-        edge_matches(points[:n_edges], centres, directions, rng.uniform(0.2, 1.0, n_edges)),
-        plane_matches(points[n_edges:], normals, offsets, rng.uniform(0.2, 1.0, n_planes)),
     )
 
 
@@ -82,10 +67,6 @@ def solver(kind, **changes):
     return kind(SolverConfig(**{"method": method, "degeneracy_threshold": 0.0} | changes))
 
 
-def difference(a, b):
-    return np.abs(a.localCoordinates(b)).max()
-
-
 def graph_step(matches, pose):
     """The Gauss-Newton step of the factor graph, in the package's tangent."""
     factor = scan_match_factor(POSE_KEY, match_rows(matches))
@@ -93,10 +74,6 @@ def graph_step(matches, pose):
     graph.add(factor)
     values.insert(POSE_KEY, pose)
     return graph.linearize(values).optimize().at(POSE_KEY)
-
-
-def numerical(function, size=1e-6):
-    return np.stack([(function(size * e) - function(-size * e)) / (2 * size) for e in SIX], axis=1)
 
 
 def by_euler(pose, x):

@@ -6,6 +6,7 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from support.jacobians import numerical
 
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -87,14 +88,6 @@ def made_up(stamp, pose, own, drift, shared=None, follows=None):
     shared = np.zeros((6, 6)) if shared is None else shared
     parts = Uncertainty(own, shared, follows, drift, 1.0, 100.0)
     return MapUpdate(stamp, pose, FrameStatus.OK, uncertainty=parts)
-
-
-def numerical(function):
-    """(6, 6) derivative of a tangent at zero by central differences."""
-    step = 1e-6
-    columns = [(function(step * axis) - function(-step * axis)) / (2.0 * step)
-               for axis in np.eye(6)]  # fmt: skip
-    return np.array(columns).T
 
 
 @pytest.mark.parametrize("consecutive", [False, True])

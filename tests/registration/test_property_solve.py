@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from support.matches import make_matches
 from support.strategies import FEW, generators
-from test_mapper import room_features
-from test_solvers import make_matches
+from support.worlds import room_features
 
 from loam_gtsam.config import Config, MatchingConfig, SolverConfig, preset
 from loam_gtsam.datasets import SimulatedWorld

@@ -5,6 +5,7 @@ import dataclasses
 import gtsam
 import numpy as np
 import pytest
+from support.matches import TRUTH, difference, make_matches
 
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
@@ -17,48 +18,14 @@ from loam_gtsam.registration.solvers import (
 )
 
 CONFIG = SolverConfig()
-TRUTH = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
 # 2 degrees and 0.2 m
 OFFSET = np.concatenate(
     [np.radians(2.0) * np.array([2, -1, 2]) / 3, 0.2 * np.array([1, 2, -2]) / 3]
 )
 
 
-def unit(rng, count):
-    vectors = rng.normal(size=(count, 3))
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
-
-
-def make_matches(pose=TRUTH, n_edges=40, n_planes=120, noise=0.0, seed=0):
-    """Matches that ``pose`` satisfies exactly, but for noise across the lines and planes."""
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-20, 20, (n_edges + n_planes, 3))
-    matrix = pose.matrix()
-    there = points @ matrix[:3, :3].T + matrix[:3, 3] + noise * rng.normal(size=points.shape)
-    directions, normals = unit(rng, n_edges), unit(rng, n_planes)
-    centres = there[:n_edges] + directions * rng.uniform(-3, 3, (n_edges, 1))
-    offsets = -np.einsum("ij,ij->i", normals, there[n_edges:])
-
-    def rest(count):
-        return (
-            np.zeros(count),
-            rng.uniform(0.02, 0.1, count),
-            rng.uniform(0.2, 1.0, count),
-            np.arange(count),
-        )
-
-    return ScanMatches(
-        EdgeMatches(points[:n_edges], centres, directions, *rest(n_edges)),
-        PlaneMatches(points[n_edges:], normals, offsets, *rest(n_planes)),
-    )
-
-
 def changed(**changes):
     return dataclasses.replace(CONFIG, **changes)
-
-
-def difference(a, b):
-    return np.abs(a.localCoordinates(b)).max()
 
 
 def same(a, b):

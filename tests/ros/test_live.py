@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.bags import ROS1, START, cloud, loam_recording, write_bag
 from support.live_replay import (
     IMU,
     MS,
@@ -27,7 +28,6 @@ from support.live_replay import (
     recorded,
     replay,
 )
-from test_datasets import ROS1, START, cloud, loam_recording, write_bag
 
 from loam_gtsam.config import Config, DeskewConfig, ImuConfig, LiveConfig
 from loam_gtsam.datasets import open_dataset

@@ -1,14 +1,9 @@
-"""The nodes between messages and mapper: with small stand-ins for ROS, and with ROS 1 itself."""
+"""The ROS 2 node between messages and mapper, with a small stand-in for ROS."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
-import os
-import shutil
-import signal
-import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -20,8 +15,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from support.bags import loam_recording, write_bag
 from support.live_replay import IMU, POINTS, bag_of, recorded
-from test_datasets import loam_recording, write_bag
 
 from loam_gtsam.config import LiveConfig
 from loam_gtsam.datasets import open_dataset
@@ -207,7 +202,7 @@ def test_the_page_on_live_runs_lists_every_parameter_and_field() -> None:
 
 
 class FakeRos2:
-    """What ``loam_gtsam.ros.node`` uses of rclpy, and a network that plays messages while it spins."""
+    """What the node uses of rclpy, and a network that plays messages while it spins."""
 
     def __init__(self, parameters: dict[str, Any], messages: Raw) -> None:
         self.parameters, self.messages = parameters, messages
@@ -327,159 +322,9 @@ def test_a_wrong_parameter_ends_the_ros_2_node(monkeypatch: pytest.MonkeyPatch) 
     assert world.calls[1:] == ["destroy", "shutdown"]
 
 
-@pytest.mark.parametrize(
-    ("name", "missing", "advice"),
-    [
-        ("loam_gtsam.ros.node", "rclpy", "source /opt/ros/DISTRO/setup.bash"),
-        ("loam_gtsam.ros.ros1", "rospy", "python3-rospy, and use a virtual environment"),
-    ],
-)
-def test_without_ros_the_error_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, name: str, missing: str, advice: str
-) -> None:
-    monkeypatch.setitem(sys.modules, missing, None)
+def test_without_ros_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    name = "loam_gtsam.ros.node"
+    monkeypatch.setitem(sys.modules, "rclpy", None)
     monkeypatch.delitem(sys.modules, name, raising=False)
-    with pytest.raises(ImportError, match=advice):
+    with pytest.raises(ImportError, match=r"source /opt/ros/DISTRO/setup.bash"):
         importlib.import_module(name)
-
-
-# --- ROS 1, as far as the node calls it -----------------------------------------------------
-
-
-class FakeAnyMsg:
-    """A message of any type, as bytes."""
-
-    _buff: bytes
-
-    def deserialize(self, raw: bytes) -> None:
-        self._buff = raw
-
-
-class FakeRos1:
-    """What ``loam_gtsam.ros.ros1`` uses of rospy."""
-
-    def __init__(self, parameters: dict[str, Any], messages: Raw) -> None:
-        self.parameters, self.messages = parameters, messages
-        self.callbacks: dict[str, Callable[[FakeAnyMsg], None]] = {}
-        self.advertised: dict[str, tuple[str, str]] = {}
-        self.published: Raw = []
-        self.said: list[str] = []
-
-    def publisher(self, topic: str, data_class: Any, queue_size: int) -> Any:
-        self.advertised[topic] = (data_class._type, data_class._md5sum)
-        return SimpleNamespace(
-            data_class=data_class,
-            publish=lambda message: self.published.append((topic, message._buff)),
-        )
-
-    def subscribe(self, topic: str, kind: type, callback: Any, **options: int) -> None:
-        assert kind is FakeAnyMsg
-        self.callbacks[topic] = callback
-
-    def spin(self) -> None:
-        for topic, raw in self.messages:
-            message = FakeAnyMsg()
-            message.deserialize(raw)
-            self.callbacks[topic](message)
-        wait_for(lambda: sum(topic == PATH for topic, _ in self.published) == 1)
-        self.report(None)
-
-    def timer(self, period: float, callback: Callable[[Any], None]) -> None:
-        self.report = callback
-
-    def module(self) -> ModuleType:
-        return module(
-            "rospy",
-            AnyMsg=FakeAnyMsg,
-            Duration=SimpleNamespace(from_sec=float),
-            Publisher=self.publisher,
-            Subscriber=self.subscribe,
-            Timer=self.timer,
-            get_param=lambda name, default: self.parameters.get(name, default),
-            init_node=lambda name: None,
-            loginfo=lambda text, value: self.said.append(text % value),
-            spin=self.spin,
-        )
-
-
-def test_the_ros_1_node_maps_what_it_hears(
-    monkeypatch: pytest.MonkeyPatch, bags: dict[str, Path], offline: RunResult
-) -> None:
-    world = FakeRos1({"~imu_topic": IMU}, raw_messages(bags["ros1"]))
-    imported(monkeypatch, "loam_gtsam.ros.ros1", world.module()).main()
-    # The checksums are those of ROS Noetic.
-    assert world.advertised == {
-        TF: ("tf2_msgs/TFMessage", "94810edda583a504dfda3829e70d7eec"),
-        ODOMETRY: ("nav_msgs/Odometry", "cd5e73d190d741a2f92e81eda573aca7"),
-        REGISTERED: ("sensor_msgs/PointCloud2", "1158d486dd51d683ce2f1be655c3c181"),
-        SURROUND: ("sensor_msgs/PointCloud2", "1158d486dd51d683ce2f1be655c3c181"),
-        PATH: ("nav_msgs/Path", "6227e2b7e9cce15051f669a5e197bbf7"),
-    }
-    assert_published(world.published, True, offline)
-    assert "sweeps mapped" in world.said[0]
-
-
-# --- ROS 1 itself, where it is installed ----------------------------------------------------
-
-
-@pytest.fixture
-def ros1_environment(tmp_path: Path) -> Iterator[dict[str, str]]:
-    """Of a ROS 1 network on the loopback interface, with a master."""
-    master = shutil.which("rosmaster")
-    if master is None:
-        pytest.skip("rosmaster is not installed")
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    environment = os.environ | {
-        "ROS_MASTER_URI": f"http://127.0.0.1:{port}",
-        "ROS_IP": "127.0.0.1",
-        "ROS_HOME": str(tmp_path),
-        # Debian's own come last: its numpy is an older one.
-        "PYTHONPATH": os.pathsep.join([*filter(None, sys.path), "/usr/lib/python3/dist-packages"]),
-    }
-    if subprocess.run([sys.executable, "-c", "import rospy"], env=environment).returncode:
-        pytest.skip("this Python does not find rospy")
-    plain = {name: text for name, text in environment.items() if name != "PYTHONPATH"}
-    process = subprocess.Popen([master, "--core", "-p", str(port)], env=plain)
-    try:
-        wait_for(lambda: answers(port))
-        yield environment
-    finally:
-        process.terminate()
-        process.wait(10.0)
-
-
-def answers(port: int) -> bool:
-    with socket.socket() as attempt:
-        return attempt.connect_ex(("127.0.0.1", port)) == 0
-
-
-def test_ros_1_itself_on_loopback(
-    ros1_environment: dict[str, str], bags: dict[str, Path], offline: RunResult, tmp_path: Path
-) -> None:
-    asked = [f"_cloud_topic:={POINTS}", f"_imu_topic:={IMU}", f"_output:={tmp_path / 'run'}"]
-    node = subprocess.Popen(
-        [sys.executable, "-m", "loam_gtsam.ros.ros1", *asked], env=ros1_environment
-    )
-    try:
-        script = [sys.executable, Path(__file__).with_name("ros1_world.py"), bags["ros1"], "2.0"]
-        found = tmp_path / "odometry"
-        subprocess.run(
-            [*script, str(FRAMES), found], env=ros1_environment, check=True, timeout=120.0
-        )
-    finally:
-        node.send_signal(signal.SIGINT)
-        assert node.wait(60.0) == 0
-    # All messages of a topic are of one length, for names and covariances are.
-    store = get_typestore(Stores.ROS1_NOETIC)
-    raw = found.read_bytes()
-    size = len(raw) // FRAMES
-    places = [
-        store.deserialize_ros1(raw[at : at + size], TYPES[ODOMETRY]).pose.pose.position
-        for at in range(0, len(raw), size)
-    ]
-    np.testing.assert_array_equal(
-        [[p.x, p.y, p.z] for p in places], [u.map_T_lidar.translation() for u in offline.updates]
-    )
-    assert len(read_tum(tmp_path / "run" / "trajectory.tum")) == FRAMES

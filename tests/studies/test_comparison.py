@@ -14,10 +14,9 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from support.cli import loam
 from support.list_dataset import ListDataset
-from typer.testing import CliRunner, Result
 
-from loam_gtsam.cli import app as cli
 from loam_gtsam.config import PRESETS, Config, config_from_dict
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -528,17 +527,13 @@ def test_poses_of_the_others_belong_to_the_middle(name, sweeps):
 # -- the command -----------------------------------------------------------------------------------
 
 
-def loam(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["compare", *(str(a) for a in arguments)])
-
-
 @pytest.fixture
 def command(tmp_path, monkeypatch, dataset):
     """``compare`` on a list of sweeps, in an empty folder and a wide screen."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "300")
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: dataset)
-    return lambda *arguments: loam("x", *arguments)
+    return lambda *arguments: loam("compare", "x", *arguments)
 
 
 def rows(path):

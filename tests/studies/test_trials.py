@@ -19,10 +19,10 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from support.cli import loam
 from support.list_dataset import ListDataset
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from loam_gtsam.cli import app as cli
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import run
@@ -66,7 +66,7 @@ def write_spec(folder: Path, text: str) -> Path:
 
 
 def sweep(*arguments: object) -> Result:
-    return CliRunner().invoke(cli.app, ["sweep", *map(str, arguments)])
+    return loam("sweep", *arguments)
 
 
 def one_line(result: Result) -> str:

@@ -125,3 +125,31 @@ def write_pcd(path: Path, columns: dict[str, np.ndarray], data: str = "binary") 
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes("\n".join(header).encode() + b"\n" + points.tobytes())
+
+
+def write_helipr(root: Path, lidar: str = "Ouster") -> Path:
+    """As the record of the file player: no padding between the fields."""
+    folder = root / "LiDAR" / lidar
+    folder.mkdir(parents=True)
+    kinds = {
+        "Ouster": (
+            "<f4 <f4 <f4 <f4 <u4 <u2 <u2 <u2",
+            "x y z intensity t reflectivity ring ambient",
+        ),
+        "Velodyne": ("<f4 <f4 <f4 <f4 <u2 <f4", "x y z intensity ring time"),
+    }[lidar]
+    record = np.dtype(list(zip(kinds[1].split(), kinds[0].split(), strict=True)))
+    assert record.itemsize == {"Ouster": 26, "Velodyne": 22}[lidar]
+    for sweep in sweeps("os1-128" if lidar == "Ouster" else "vlp16", 512):
+        points = np.zeros(len(sweep.points), record)
+        for axis, name in enumerate("xyz"):
+            points[name] = sweep.points[:, axis]
+        points["ring"] = sweep.rings
+        if lidar == "Ouster":
+            points["t"] = np.rint(sweep.times * 1e9)
+        else:
+            points["time"] = sweep.times
+        points.tofile(folder / f"{sweep.stamp}.bin")
+    truth = lidar_truth()
+    write_rows(root / "LiDAR_GT" / f"{lidar}_gt.txt", truth.stamps, quaternion_rows(truth), " ")
+    return root

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from test_datasets import cloud, header, store_of, write_bag
+from support.bags import cloud, header, store_of, write_bag
 
 from loam_gtsam.datasets.bags.bag_reader import Message, read_messages
 from loam_gtsam.datasets.sim.world import SimulatedWorld

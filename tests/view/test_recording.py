@@ -10,10 +10,10 @@ import gtsam
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
+from support.cli import loam
 from support.list_dataset import ListDataset
-from typer.testing import CliRunner, Result
+from typer.testing import Result
 
-from loam_gtsam.cli import app as cli
 from loam_gtsam.config import Config, DeskewConfig
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -156,9 +156,8 @@ def _empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "300")
 
 
-def loam(*arguments: object) -> Result:
-    always = ["--no-plot", "--output", "out"]
-    return CliRunner().invoke(cli.app, ["run", *map(str, arguments), *always])
+def run_command(*arguments: object) -> Result:
+    return loam("run", *arguments, "--no-plot", "--output", "out")
 
 
 class Sweeps(ListDataset):
@@ -170,17 +169,17 @@ ROOM = "sim:room?frames=3&columns=450"
 
 
 def test_a_bag_is_written_and_replaced_if_asked() -> None:
-    done = loam(ROOM, "--bag", "bags/a.bag", "--set", "bag.surround_every=0")
+    done = run_command(ROOM, "--bag", "bags/a.bag", "--set", "bag.surround_every=0")
     assert done.exit_code == 0, done.output
     assert "Bag written to bags/a.bag" in done.output
     counts = topics(Path("bags/a.bag"))
     assert counts[ODOMETRY] == counts[REGISTERED] == 3
     assert SURROUND not in counts
-    again = loam(ROOM, "--bag", "bags/a.bag")
+    again = run_command(ROOM, "--bag", "bags/a.bag")
     assert again.exit_code == 1
     assert "bags/a.bag: the bag exists; add overwrite=True (--overwrite)" in again.output
     assert SURROUND not in topics(Path("bags/a.bag"))
-    assert loam(ROOM, "--bag", "bags/a.bag", "--overwrite").exit_code == 0
+    assert run_command(ROOM, "--bag", "bags/a.bag", "--overwrite").exit_code == 0
     assert topics(Path("bags/a.bag"))[SURROUND] == 1
 
 
@@ -192,17 +191,17 @@ def test_the_input_is_never_replaced(
 ) -> None:
     Path("here").mkdir()
     monkeypatch.chdir("here")
-    assert loam(ROOM, "--bag", name).exit_code == 0
-    refused = loam(opened, "--bag", name, "--overwrite")
+    assert run_command(ROOM, "--bag", name).exit_code == 0
+    refused = run_command(opened, "--bag", name, "--overwrite")
     assert refused.exit_code == 1
     assert f"--bag {name}: the input must not be replaced" in refused.output
-    beside = loam(opened, "--bag", f"b{name}", "--overwrite")
+    beside = run_command(opened, "--bag", f"b{name}", "--overwrite")
     assert "must not be replaced" not in beside.output
     assert topics(Path(name))[ODOMETRY] == 3
 
 
 def test_without_the_option_there_is_no_bag() -> None:
-    done = loam(ROOM)
+    done = run_command(ROOM)
     assert done.exit_code == 0
     assert "Bag" not in done.output
     assert [path.name for path in Path().iterdir()] == ["out"]
@@ -212,14 +211,14 @@ def test_a_run_that_breaks_off_leaves_a_whole_bag(monkeypatch: pytest.MonkeyPatc
     scans = [*SimulatedWorld("room", frames=2, columns=450)]
     dataset = Sweeps([*scans, RuntimeError("the disk is gone")])
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: dataset)
-    done = loam("x", "--bag", "a.mcap")
+    done = run_command("x", "--bag", "a.mcap")
     assert isinstance(done.exception, RuntimeError)
     assert topics(Path("a.mcap"))[ODOMETRY] == 2
 
 
 def test_a_run_without_sweeps_leaves_no_bag(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: Sweeps([]))
-    assert loam("x", "--bag", "a.bag").exit_code == 1
+    assert run_command("x", "--bag", "a.bag").exit_code == 1
     assert [path.name for path in Path().iterdir()] == []
 
 
@@ -231,7 +230,7 @@ def test_a_bag_that_cannot_be_written_costs_no_results(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(BagWriter, "_kept", BagWriter._append, raising=False)
     monkeypatch.setattr(BagWriter, "_append", fail)
-    done = loam(ROOM, "--bag", "a.bag")
+    done = run_command(ROOM, "--bag", "a.bag")
     assert done.exit_code != 0
     assert len(read_tum("out/trajectory.tum")) == 3
     assert "No space left" in json.loads(Path("out/summary.json").read_text())["error"]

@@ -9,27 +9,18 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from support.cli import loam
+from support.frames import STAMP, around, frame
 from support.list_dataset import ListDataset
-from typer.testing import CliRunner
 
-from loam_gtsam.cli import app as cli
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import run
-from loam_gtsam.types import FrameStatus, MapUpdate, OutputError
-from loam_gtsam.view.frame_view import FrameView, MapView
+from loam_gtsam.types import OutputError
 from loam_gtsam.view.observers import watch
 from loam_gtsam.view.rerun_viewer import RerunViewer
 from loam_gtsam.view.rrd_file import RrdFile
 
 gtsam = pytest.importorskip("gtsam")
-NONE = np.zeros((0, 3))
-STAMP = 1_700_000_000_123_456_789
-
-
-def loam(*arguments):
-    return CliRunner().invoke(cli.app, [str(a) for a in arguments])
-
-
 # -- without Rerun -----------------------------------------------------------------------------
 
 
@@ -99,24 +90,6 @@ def chunks():
         return rows, found, len(reader.blueprints())
 
     return read
-
-
-def frame(number, **changes):
-    update = MapUpdate(STAMP + number, gtsam.Pose3(), FrameStatus.OK)
-    points = np.random.default_rng(number).normal(size=(50, 3))
-    values = {
-        "number": number, "update": update, "map_T_lidar": np.eye(4),
-        "position_covariance": np.diag([4e-4, 1e-4, 9e-4]), "sweep": points, "edges": points[:5],
-        "planes": points[:9], "points": points[:7], "feet": points[:7] + 0.01,
-        "residuals": np.linspace(0.0, 4.0, 7),
-    }  # fmt: skip
-    return FrameView(**(values | changes))
-
-
-def around():
-    points = np.random.default_rng(0).normal(size=(900, 3))
-    ends = np.zeros((3, 2, 3))
-    return MapView(points[:300], points[300:], points, ends, np.array([True, False, True]))
 
 
 def column(found, entity, name):
@@ -227,8 +200,9 @@ def test_an_error_in_the_run_closes_the_file_and_no_frame_leaves_none(tmp_path, 
 def test_a_recording_of_a_killed_process_can_be_read(tmp_path, chunks):
     code = f"""
 import os, sys, time
-sys.path.insert(0, {os.path.dirname(__file__)!r})
-from test_viewer import RerunViewer, around, frame
+sys.path[:0] = {sys.path!r}
+from support.frames import around, frame
+from loam_gtsam.view.rerun_viewer import RerunViewer
 viewer = RerunViewer({str(tmp_path / "run.rrd")!r})
 for number in range(5):
     viewer.show(frame(number), around)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.decode.tables import clean_imu, read_lines, read_table
-from loam_gtsam.imu.quaternions import inverse, logarithm, quaternion_product
 from loam_gtsam.types import FloatArray, ImuSamples, IntArray
 
 _COLUMNS = "ns qx qy qz qw ex ey ez ax ay az bx by bz cx cy cz"
@@ -70,9 +70,10 @@ def _gyro_columns(stamps: IntArray, values: FloatArray) -> str | None:
     if len(first) == 0:
         return None
     values = values[order]
-    q = values[:, :4].T / np.maximum(np.linalg.norm(values[:, :4], axis=1), 1e-12)
-    turned = quaternion_product(inverse(q[:, first]), q[:, last])
-    rates = (logarithm(turned) / (seconds[last] - seconds[first])).T
+    known = np.linalg.norm(values[:, :4], axis=1) > 1e-12
+    world_R_imu = Rotation.from_quat(np.where(known[:, None], values[:, :4], [0.0, 0.0, 0.0, 1.0]))
+    turned = (world_R_imu[first].inv() * world_R_imu[last]).as_rotvec()
+    rates = turned / (seconds[last] - seconds[first])[:, None]
     total = np.vstack([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
     means = (total[last] - total[first]) / (last - first)[:, None]
     distance = {

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from loam_gtsam.io.run_files import RUN_FILES, make_folder
+from loam_gtsam.io.run_files import RUN_FILES
 
 _BYTES = ("trajectory.tum", "trajectory_kitti.txt", "trajectory_covariance.csv", "map.ply")
 """Files that hold no times."""
@@ -71,18 +71,21 @@ def _replaced(scratch: Path, kills: int, chance: random.Random) -> list[str]:
     seconds = _complete(new, 20)
     shutil.copytree(old, killed)
     faults: list[str] = []
-    replaced = 0
+    replaced = cut_off = 0
     for _ in range(kills):
         _killed(_command(killed, 20, "--overwrite"), chance, 1.1 * seconds)
-        make_folder(killed)  # as the next run does
-        is_new = not _differences(killed, new)
-        replaced += is_new
-        if not is_new:
-            faults += _differences(killed, old)
+        if not (killed / "summary.json").exists():
+            cut_off += 1  # in the milliseconds of the move: nothing says that they are complete
+        elif not _differences(killed, new):
+            replaced += 1
         else:
-            shutil.rmtree(killed)
-            shutil.copytree(old, killed)
-    print(f"{kills} times: {replaced} times the new results, else the old ones")
+            faults += _differences(killed, old)
+            continue
+        shutil.rmtree(killed)
+        shutil.copytree(old, killed)
+    print(
+        f"{kills} times: {replaced} the new results, {cut_off} marked incomplete, else the old ones"
+    )
     return faults
 
 

@@ -34,11 +34,11 @@ from loam_gtsam.factors import scan_match_factor as scan_match_factor
 from loam_gtsam.frontend.features import extract_features as extract_features
 from loam_gtsam.imu.buffer import ImuBuffer as ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint as Checkpoint
-from loam_gtsam.io.run_files import package_version
-from loam_gtsam.io.run_files import read_tum as read_tum
 from loam_gtsam.io.run_files import write_run as write_run
-from loam_gtsam.io.run_files import write_tum as write_tum
 from loam_gtsam.io.state import checkpointed as checkpointed
+from loam_gtsam.io.trajectories import read_tum as read_tum
+from loam_gtsam.io.trajectories import write_tum as write_tum
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.batch import SavedGraph as SavedGraph
 from loam_gtsam.loops.batch import optimize_graph as optimize_graph
 from loam_gtsam.loops.closure import LoopCloser as LoopCloser
@@ -98,7 +98,7 @@ if TYPE_CHECKING:
     from loam_gtsam.datasets import SimulatedWorld as SimulatedWorld
     from loam_gtsam.datasets import decode_pointcloud2 as decode_pointcloud2
 
-__version__ = package_version()
+__version__ = installed_version()
 
 _LOADERS = (
     "ArrayDataset",

@@ -25,7 +25,7 @@ from loam_gtsam.config import (
     with_value,
 )
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.io.run_files import replacing
+from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.types import LoamError, OutputError
 
 _DEBUG = "loam_gtsam.debug"
@@ -471,7 +471,7 @@ def show_config(
         return
     if output.exists() and not overwrite:
         raise OutputError(f"{output}: the file exists; add --overwrite or choose another name")
-    with replacing(output) as file:
+    with atomic_file(output) as file:
         file.write(text.encode("utf-8"))
 
 

@@ -22,7 +22,7 @@ from loam_gtsam.cli.run import (
     stop_requests,
 )
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.io.run_files import make_folder, replacing_all
+from loam_gtsam.io.atomic import make_folder, staged_files
 from loam_gtsam.studies.comparison import Contender, compare
 from loam_gtsam.studies.comparison_report import (
     ACCURACY_COLUMNS,
@@ -75,7 +75,7 @@ def execute(
         results = Results.of(comparison, shared_guess)
         # What an earlier comparison left would not belong to this one.
         left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
-        with replacing_all(folder, left, last=REPORT_FILE) as new:
+        with staged_files(folder, left, last=REPORT_FILE) as new:
             files = write(results, new, plot)
     if not options.quiet:
         console = Console()

@@ -8,7 +8,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from loam_gtsam.io.run_files import write_tum
+from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
 from loam_gtsam.types import DatasetError, OutputError, Trajectory

@@ -31,8 +31,10 @@ from rich.progress import (
 from loam_gtsam.cli.report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
+from loam_gtsam.io.atomic import make_folder, staged_files
 from loam_gtsam.io.checkpoint import Checkpoint
-from loam_gtsam.io.run_files import RUN_FILES, make_folder, replacing_all, write_run, write_tum
+from loam_gtsam.io.run_files import RUN_FILES, write_run
+from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.pipeline import Observer, OnFrame, Pipeline, RunResult, effective_config, run
 from loam_gtsam.studies.evaluation import absolute_error, align, align_rotations, interpolate
@@ -320,7 +322,7 @@ def _write(
     """Write all files, with pictures if ``drawn`` is given; names of what was written."""
     extra = {"accuracy": accuracy or None, "input": asdict(info)}
     files = list(RUN_FILES)
-    with replacing_all(folder, RUN_OUTPUTS, last="summary.json") as new:
+    with staged_files(folder, RUN_OUTPUTS, last="summary.json") as new:
         write_run(result, new, dataset=_described(info), extra=extra)
         if dataset.truth is not None:
             write_tum(new / TRUTH_FILE, dataset.truth)

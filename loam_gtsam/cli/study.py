@@ -20,7 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from loam_gtsam.cli.run import file_name, stop_requests
-from loam_gtsam.io.run_files import make_folder
+from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.studies.trial_spec import Spec, load_spec
 from loam_gtsam.studies.trial_table import (
     TABLE_FILE,

@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.io.run_files import make_folder, package_version, replacing
+from loam_gtsam.io.atomic import atomic_file, make_folder
 from loam_gtsam.io.state import Frozen, freeze, thaw
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import MapUpdate, OutputError
 
 _STATE = re.compile(r"state_(\d+)\.npz")
@@ -87,7 +88,7 @@ class Checkpoint:
         OutputError
             If the checkpoint is of another run or version, or cannot be read.
         """
-        self._about = {"loam_gtsam": package_version(), **about}
+        self._about = {"loam_gtsam": installed_version(), **about}
         newest = self._newest()
         if newest is None or not self._resume:
             self.remove()
@@ -173,7 +174,7 @@ class Checkpoint:
 
 def _write(path: Path, frozen: Frozen, header: Mapping[str, Any]) -> None:
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         np.savez(file, **frozen, **{_HEADER: text})  # type: ignore[arg-type]
 
 

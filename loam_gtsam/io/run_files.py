@@ -1,39 +1,29 @@
-"""Trajectories, maps and reports as files that other tools read.
+"""Results of a run as files: map, covariances, everything about every frame, and a summary.
 
-Every file is written beside its final name and then renamed: whatever interrupts a write leaves
-the old file or the new one, never half of one.
-
-Poses are ``map_T_lidar`` (x forward, y left, z up) in all formats; no camera axes anywhere.
+Every file is written beside its final name and then renamed, see :mod:`loam_gtsam.io.atomic`.
 """
 
 # ruff: noqa: D102 (the properties of the protocol are documented where they are implemented)
 
 from __future__ import annotations
 
-import json
-import os
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
-from decimal import Decimal
-from importlib.metadata import PackageNotFoundError, version
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, dump_config
+from loam_gtsam.io.atomic import atomic_file, make_folder, write_json, write_text
+from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import (
-    MAX_STAMP,
-    DatasetError,
     FloatArray,
     FrameStatus,
     InputError,
     IntArray,
     MapUpdate,
-    OutputError,
     Trajectory,
     Uncertainty,
 )
@@ -41,10 +31,6 @@ from loam_gtsam.types import (
 _NS = 10**9
 _MAX_MESSAGES = 20
 """Messages of frames kept in ``summary.json``; ``run.npz`` has them all."""
-
-_NEW, _COMPLETE = ".loam_gtsam_new", ".loam_gtsam_complete"
-"""Folders of new files: while they are being written, and when all are."""
-_PLAN = ".plan"
 
 EDGE_COLOUR, PLANE_COLOUR = (214, 96, 32), (110, 125, 140)
 """Red, green, blue of the two kinds of map points in the PLY file."""
@@ -94,116 +80,6 @@ class Run(Protocol):
     def faults(self) -> dict[str, int]: ...
 
 
-@contextmanager
-def replacing(path: str | Path) -> Iterator[BinaryIO]:
-    """A binary file that takes the place of ``path`` when the block ends without an error.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; ``path`` is then as it was.
-    """
-    path = Path(path)
-    # The same folder, for a rename is atomic only within one file system.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot write the file: {error.strerror or error}; "
-            "choose another folder or free some space"
-        ) from error
-    finally:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def write_tum(
-    path: str | Path, trajectory: Trajectory, *, comments: Mapping[str, str] | None = None
-) -> None:
-    """Write ``stamp x y z qx qy qz qw`` per line (TUM format, as evo reads it).
-
-    Parameters
-    ----------
-    trajectory : stamps become seconds with nine decimals, exactly
-    comments : written as ``# key: value`` at the top
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    notes = dict(comments or {}) | {"columns": "stamp_s x y z qx qy qz qw (map_T_lidar)"}
-    lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
-    poses = trajectory.map_T_lidar
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else []
-    for stamp, xyz, quaternion in zip(
-        trajectory.stamps.tolist(), poses[:, :3, 3], quaternions, strict=True
-    ):
-        numbers = [f"{value:.9f}" for value in xyz] + [f"{value:.12f}" for value in quaternion]
-        lines.append(" ".join([_seconds(stamp), *numbers]))
-    _write_text(path, "\n".join(lines) + "\n")
-
-
-def read_tum(path: str | Path) -> Trajectory:
-    """Read a TUM file; stamps are exact to the nanosecond.
-
-    Raises
-    ------
-    DatasetError
-        If the file cannot be read, naming the line that does not fit.
-    """
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DatasetError(f"{path}: cannot read the trajectory: {error}") from error
-    stamps: list[int] = []
-    rows: list[list[float]] = []
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            nanoseconds = Decimal(words[0]) * _NS
-            if not abs(nanoseconds) <= MAX_STAMP:
-                raise ValueError("out of range")
-            stamp = int(nanoseconds.to_integral_value())
-            row = [float(word) for word in words[1:]]
-        except (ArithmeticError, ValueError) as error:
-            raise DatasetError(f"{path}:{number}: not numbers: {line[:80]!r}") from error
-        if len(row) != 7 or not np.isfinite(row).all() or not any(row[3:]):
-            raise DatasetError(
-                f"{path}:{number}: expected 8 finite numbers, stamp x y z qx qy qz qw with a "
-                f"quaternion that is not zero; got {line[:80]!r}"
-            )
-        stamps.append(stamp)
-        rows.append(row)
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    if rows:
-        values = np.array(rows)
-        poses[:, :3, :3] = Rotation.from_quat(values[:, 3:]).as_matrix()
-        poses[:, :3, 3] = values[:, :3]
-    return Trajectory(np.array(stamps, np.int64), poses)
-
-
-def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
-    """Write the upper three rows of each pose, row by row, 12 numbers a line (KITTI format).
-
-    The axes are those of the lidar, not KITTI's camera.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    rows = trajectory.map_T_lidar[:, :3, :].reshape(-1, 12).tolist()
-    _write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
-
-
 def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     """Write the calibrated covariance of every pose that :func:`write_tum` writes, in its order.
 
@@ -229,8 +105,8 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
             continue
         values = update.covariance[rows, columns]
         cells = [f"{value:.9g}" if np.isfinite(value) else "" for value in values]
-        lines.append(",".join((_seconds(update.stamp), str(update.status), *cells)))
-    _write_text(path, "\n".join(lines) + "\n")
+        lines.append(",".join((stamp_text(update.stamp), str(update.status), *cells)))
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def stage_seconds(updates: Sequence[MapUpdate]) -> tuple[tuple[str, ...], FloatArray]:
@@ -292,7 +168,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         arrays[name] = np.array([getattr(u, name) for u in updates], np.int64)
     for name in ("error_before", "error_after"):
         arrays[name] = np.array([getattr(u, name) for u in updates], np.float64)
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
@@ -346,7 +222,7 @@ def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.
         *properties,
         "end_header",
     ]
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         file.write(("\n".join(header) + "\n").encode("ascii"))
         file.write(vertices.data)
 
@@ -376,7 +252,7 @@ def write_run(
     """
     folder = make_folder(directory)
     trajectory = result.trajectory
-    records = {"made by": f"loam_gtsam {package_version()}", "data set": dataset}
+    records = {"made by": f"loam_gtsam {installed_version()}", "data set": dataset}
     if result.interrupted or result.error:
         records["incomplete"] = "the run ended early"
     write_tum(folder / "trajectory.tum", trajectory, comments=records)
@@ -384,9 +260,9 @@ def write_run(
     write_covariances(folder / "trajectory_covariance.csv", result.updates)
     write_npz(folder / "run.npz", result.updates)
     write_ply(folder / "map.ply", result.edge_points, result.plane_points)
-    _write_text(folder / "config.yaml", dump_config(result.config))
+    write_text(folder / "config.yaml", dump_config(result.config))
     summary = summarise(result) | {"dataset": dataset} | dict(extra or {})
-    _write_text(folder / "summary.json", json.dumps(_plain(summary), indent=2) + "\n")
+    write_json(folder / "summary.json", summary)
 
 
 def summarise(result: Run) -> dict[str, Any]:
@@ -396,7 +272,7 @@ def summarise(result: Run) -> dict[str, Any]:
     messages = [f"frame {n}: {u.status}: {u.message}" for n, u in enumerate(result.updates)
                 if u.message]  # fmt: skip
     return {
-        "loam_gtsam": package_version(),
+        "loam_gtsam": installed_version(),
         "frames": len(result.updates),
         "poses": len(trajectory),
         "interrupted": result.interrupted,
@@ -472,121 +348,5 @@ def _imu_part(imu: Any) -> dict[str, Any]:
     }
 
 
-@contextmanager
-def replacing_all(folder: Path, known: Sequence[str], last: str) -> Iterator[Path]:
-    """A folder for new files, which take the places of the old ones together.
-
-    If the block ends with an error, or the process in it, the old files are as they were. After the
-    block the files are moved, one rename each, ``last`` at the end: where it is, all are of one
-    run. What a process that dies in between leaves to do, :func:`make_folder` does.
-
-    Parameters
-    ----------
-    folder : where they are to be; other files in it stay
-    known : names that an earlier run may have left; those that are not written anew are removed
-    last : the name that says that all are there
-
-    Raises
-    ------
-    OutputError
-        If that cannot be done.
-    """
-    new, complete = folder / _NEW, folder / _COMPLETE
-    try:
-        shutil.rmtree(new, ignore_errors=True)
-        new.mkdir()
-        yield new
-        names = sorted((path.name for path in new.iterdir()), key=lambda name: name == last)
-        plan = {"new": names, "gone": sorted({*known, last} - set(names[:-1]))}
-        _write_text(new / _PLAN, json.dumps(plan))
-        os.replace(new, complete)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot write there: {error.strerror or error}; choose another folder or "
-            "free some space"
-        ) from error
-    finally:
-        shutil.rmtree(new, ignore_errors=True)
-    _move_all(folder)
-
-
-def _move_all(folder: Path) -> None:
-    """Move new files, all of which are written, to their places; go on where that was cut off."""
-    complete = folder / _COMPLETE
-    if not complete.is_dir():
-        return
-    try:
-        plan = json.loads((complete / _PLAN).read_text(encoding="utf-8"))
-        # Names of files only: whatever the plan says, nothing outside is touched.
-        new, gone = ([Path(name).name for name in plan[key]] for key in ("new", "gone"))
-        if (complete / new[-1]).exists():
-            for name in gone:
-                (folder / name).unlink(missing_ok=True)
-        for name in new:
-            if (complete / name).exists():
-                os.replace(complete / name, folder / name)
-        shutil.rmtree(complete)
-    except (OSError, ValueError, KeyError, IndexError) as error:
-        raise OutputError(
-            f"{complete}: cannot move these files to {folder}: {error}; they are whole: move them "
-            "by hand, or choose another folder"
-        ) from error
-
-
-def make_folder(directory: str | Path) -> Path:
-    """Make a folder and check that files can be written there.
-
-    New files whose move was cut off, see :func:`replacing_all`, are moved to their places.
-
-    Raises
-    ------
-    OutputError
-        If not.
-    """
-    folder = Path(directory)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot make this output folder: {error.strerror or error}"
-        ) from error
-    _move_all(folder)
-    probe = folder / ".loam_gtsam_probe"
-    with replacing(probe):
-        pass
-    probe.unlink(missing_ok=True)
-    return folder
-
-
-def package_version() -> str:
-    """Version of the installed package."""
-    try:
-        return version("loam_gtsam")
-    except PackageNotFoundError:  # a source tree on the path
-        return "unknown"
-
-
-def _seconds(stamp: int) -> str:
-    """Decimal seconds of integer nanoseconds; a float would round today's stamps to 0.2 us."""
-    whole, rest = divmod(abs(stamp), _NS)
-    return f"{'-' if stamp < 0 else ''}{whole}.{rest:09d}"
-
-
 def _stack(rows: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:
     return np.array(rows, np.float64).reshape(shape)
-
-
-def _plain(value: Any) -> Any:
-    """As JSON takes it: NaN and infinity, which it cannot say, become null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(entry) for key, entry in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(entry) for entry in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return int(value) if isinstance(value, np.integer) else value
-
-
-def _write_text(path: str | Path, text: str) -> None:
-    with replacing(path) as file:
-        file.write(text.encode("utf-8"))

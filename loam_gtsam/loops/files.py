@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.io.run_files import replacing
+from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.types import DatasetError, FloatArray, InputError, OutputError
 
@@ -96,7 +96,7 @@ def _write_g2o(path: Path, saved: SavedGraph) -> None:
         lines.append(f"{_EDGE} {first} {second} {_pose_text(factor.measured())} {numbers}")
     if left_out:
         lines.insert(1, f"# {left_out} factors are left out, which g2o does not know")
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         file.write(("\n".join(lines) + "\n").encode("ascii"))
 
 
@@ -227,7 +227,7 @@ def _write_gtsam(path: Path, saved: SavedGraph) -> None:
     stamps = sorted(saved.stamps.items())
     parts.append("".join(f"{key} {stamp}\n" for key, stamp in stamps))
     for suffix, text in zip(GTSAM_SUFFIXES, parts, strict=True):
-        with replacing(path.with_suffix(suffix)) as file:
+        with atomic_file(path.with_suffix(suffix)) as file:
             file.write(text.encode("ascii"))
 
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from rosbags import rosbag1, rosbag2
 
 from loam_gtsam.config import BagConfig
-from loam_gtsam.io.closing import ClosedByBlock
+from loam_gtsam.io.atomic import ClosingWriter
 from loam_gtsam.ros.frame_messages import TYPES, FrameMessages, Points
 from loam_gtsam.types import FrameStatus, MapUpdate, OutputError
 
@@ -31,7 +31,7 @@ _HEADER_RECORD = 4096
 counts them in, and ``rosbag reindex`` would then write over the first 8 bytes of the messages."""
 
 
-class BagWriter(ClosedByBlock):
+class BagWriter(ClosingWriter):
     """Writes a run into a new bag while it goes on.
 
     Until it is closed the bag is called ``PATH.active``, as ``rosbag record`` has it. Leaving the

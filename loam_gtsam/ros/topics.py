@@ -19,7 +19,8 @@ from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.decode.loam_messages import ODOMETRY as LOAM_ODOMETRY
-from loam_gtsam.io.run_files import make_folder, write_run
+from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.io.run_files import write_run
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.ros.frame_messages import ODOMETRY, REGISTERED, TYPES, FrameMessages
 from loam_gtsam.ros.live import LiveMapper

@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from loam_gtsam.config import Config, config_to_dict
-from loam_gtsam.io.run_files import replacing, stage_seconds, write_tum
+from loam_gtsam.io.atomic import atomic_file
+from loam_gtsam.io.run_files import stage_seconds
+from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.studies.comparison import (
     Comparison,
     FrameDifferences,
@@ -250,7 +252,7 @@ def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> 
 
 
 def _write_text(path: Path, text: str) -> None:
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         file.write(text.encode("utf-8"))
 
 

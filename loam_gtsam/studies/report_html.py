@@ -8,7 +8,7 @@ from html import escape
 from pathlib import Path
 from string import Template
 
-from loam_gtsam.io.run_files import replacing
+from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.types import OutputError
 
 _PAGE = Template("""<!DOCTYPE html>
@@ -83,7 +83,7 @@ def write_report(
         intro="\n".join(f'<p class="note">{escape(text)}</p>' for text in intro),
         body="\n".join(body),
     )
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         file.write(page.encode("utf-8"))
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from loam_gtsam.config import config_to_dict
-from loam_gtsam.io.run_files import replacing
+from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.studies.trial_spec import Spec
 from loam_gtsam.studies.trials import COLUMNS, Row, Trial, empty_row, versions
 from loam_gtsam.types import OutputError
@@ -42,7 +42,7 @@ class TrialStore:
         OutputError
             If the file cannot be written.
         """
-        with replacing(self._file(row["trial"])) as file:
+        with atomic_file(self._file(row["trial"])) as file:
             file.write((json.dumps(row, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
     def load(self, trial: Trial) -> Row | None:
@@ -79,7 +79,7 @@ def write_table(path: Path, rows: Iterable[Row], spec: Spec) -> None:
     configs = {trial.config_hash: config_to_dict(trial.config) for trial in spec.trials}
     metadata = {"loam_gtsam.spec": spec.text, "loam_gtsam.configs": json.dumps(configs)}
     schema = arrow.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()], metadata)
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         parquet.write_table(arrow.Table.from_pylist(list(rows), schema), file)
 
 

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.io.run_files import replacing, stage_seconds
+from loam_gtsam.io.atomic import atomic_file
+from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, OutputError, Trajectory
 
 INK, FAINT, PATH, TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
@@ -387,7 +388,7 @@ def save_figure(figure: Any, path: str | Path) -> None:
     figure.savefig(png, format="png", bbox_inches="tight", pad_inches=0.12)
     if png.tell() > _MAX_BYTES:
         png = _with_palette(png)
-    with replacing(path) as file:
+    with atomic_file(path) as file:
         file.write(png.getvalue())
 
 

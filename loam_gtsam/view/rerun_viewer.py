@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.io.closing import ClosedByBlock
+from loam_gtsam.io.atomic import ClosingWriter
 from loam_gtsam.types import FloatArray, FrameStatus, OutputError
 from loam_gtsam.view.frame_view import FrameView, MapView, residual_colours
 from loam_gtsam.view.rrd_file import RrdFile
@@ -48,7 +48,7 @@ _MOST_PATH = 2_000
 _FINE = (FrameStatus.OK, FrameStatus.FIRST)
 
 
-class RerunViewer(ClosedByBlock):
+class RerunViewer(ClosingWriter):
     """Shows the frames of a run; :func:`loam_gtsam.view.observers.watch` makes them.
 
     Leaving the block closes the file, after an error or Ctrl-C too; what a killed process wrote

@@ -1,7 +1,5 @@
 """Runs that are stopped, killed, and gone on with."""
 
-import json
-import os
 import signal
 import subprocess
 import sys
@@ -17,7 +15,6 @@ from loam_gtsam.cli import run as _cli_run
 from loam_gtsam.config import Config, preset
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import open_dataset
-from loam_gtsam.io import run_files as export
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.pipeline import run
@@ -195,74 +192,6 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
     again = Checkpoint(tmp_path / "checkpoint", resume=True)
     result = run(dataset, extra_factors=interrupting, checkpoint=again)
     assert_same(result, run(dataset, extra_factors=lambda context: []))
-
-
-# -- files that take their places together ------------------------------------------------------
-
-
-def write(folder, names, text):
-    with export.replacing_all(folder, ("a", "b", "picture", "last"), last="last") as new:
-        for name in names:
-            (new / name).write_text(text)
-
-
-def content(folder):
-    return {path.name: path.read_text() for path in folder.iterdir()}
-
-
-def test_new_files_replace_old_ones_together(tmp_path):
-    (tmp_path / "notes").write_text("mine")
-    write(tmp_path, ["a", "b", "picture", "last"], "old")
-    write(tmp_path, ["a", "b", "last"], "new")
-    assert content(tmp_path) == {"notes": "mine", "a": "new", "b": "new", "last": "new"}
-
-
-def test_an_error_while_writing_leaves_the_old_files(tmp_path):
-    write(tmp_path, ["a", "last"], "old")
-
-    def fill_the_disk():
-        with export.replacing_all(tmp_path, ("a", "last"), last="last") as new:
-            (new / "a").write_text("half")
-            raise OSError(28, "no space left on this disk")
-
-    with pytest.raises(OutputError, match="disk"):
-        fill_the_disk()
-    assert content(tmp_path) == {"a": "old", "last": "old"}
-
-
-@pytest.mark.parametrize("moved", [0, 1, 2])
-def test_a_move_that_was_cut_off_is_finished_by_the_next_run(moved, tmp_path, monkeypatch):
-    write(tmp_path, ["a", "b", "picture", "last"], "old")
-    left = [moved]
-
-    def cut_off(source, target, replace=os.replace):
-        # To the places of files, not the renames that make whole files and folders.
-        if target.parent == tmp_path and target.name in ("a", "b", "last"):
-            if not left[0]:
-                raise KeyboardInterrupt
-            left[0] -= 1
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", cut_off)
-    with pytest.raises(KeyboardInterrupt):
-        write(tmp_path, ["a", "b", "last"], "new")
-    monkeypatch.undo()
-    assert not (tmp_path / "last").exists()  # nobody takes it for whole
-    export.make_folder(tmp_path)
-    assert content(tmp_path) == {"a": "new", "b": "new", "last": "new"}
-
-
-def test_a_plan_cannot_name_files_elsewhere(tmp_path):
-    folder = tmp_path / "run"
-    complete = folder / ".loam_gtsam_complete"
-    complete.mkdir(parents=True)
-    (tmp_path / "precious").write_text("mine")
-    (complete / "last").write_text("new")
-    plan = {"new": ["last"], "gone": ["../precious", str(tmp_path / "precious")]}
-    (complete / ".plan").write_text(json.dumps(plan))
-    export.make_folder(folder)
-    assert content(folder) == {"last": "new"}
-    assert (tmp_path / "precious").exists()
 
 
 # -- from the command line ----------------------------------------------------------------------

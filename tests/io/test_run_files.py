@@ -8,34 +8,22 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
+from support.trajectories import random_trajectory
 
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.io import run_files as export
+from loam_gtsam.io.trajectories import read_tum, write_kitti, write_tum
 from loam_gtsam.pipeline import RunResult
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
-    DatasetError,
     FloatArray,
     FrameStatus,
     InputError,
     MapUpdate,
-    OutputError,
     Trajectory,
     Uncertainty,
 )
-
-
-def random_trajectory(count: int, seed: int = 0) -> Trajectory:
-    rng = np.random.default_rng(seed)
-    poses = np.tile(np.eye(4), (count, 1, 1))
-    if count:
-        poses[:, :3, :3] = Rotation.random(count, random_state=seed).as_matrix()
-        poses[:, :3, 3] = rng.normal(0.0, 1000.0, (count, 3))
-    stamps = 1_700_000_000_123_456_789 + np.arange(count, dtype=np.int64) * 100_000_007
-    return Trajectory(stamps, poses)
 
 
 def symmetric() -> FloatArray:
@@ -97,39 +85,6 @@ def read_ply(path: Path) -> tuple[list[str], np.ndarray]:
     return lines, np.frombuffer(body, np.dtype(fields))
 
 
-@settings(deadline=None)  # a busy machine is no fault
-@given(
-    st.lists(st.integers(min_value=-(2**62), max_value=2**62), min_size=1, max_size=5, unique=True)
-)
-def test_tum_stamps_survive_to_the_nanosecond(tmp_path_factory, stamps):
-    path = tmp_path_factory.mktemp("tum") / "t.tum"
-    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    export.write_tum(path, Trajectory(np.array(stamps, np.int64), poses))
-    assert export.read_tum(path).stamps.tolist() == stamps
-
-
-def test_tum_poses_survive(tmp_path):
-    trajectory = random_trajectory(50)
-    export.write_tum(tmp_path / "t.tum", trajectory, comments={"made by": "a\ntest"})
-    again = export.read_tum(tmp_path / "t.tum")
-    np.testing.assert_array_equal(again.stamps, trajectory.stamps)
-    np.testing.assert_allclose(again.map_T_lidar, trajectory.map_T_lidar, atol=1e-9)
-    first = (tmp_path / "t.tum").read_text().splitlines()[:2]
-    assert first[0] == "# made by: a test"
-    assert first[1].startswith("# columns:")
-
-
-def test_evo_reads_both_formats(tmp_path):
-    file_interface = pytest.importorskip("evo.tools.file_interface")
-    trajectory = random_trajectory(20)
-    export.write_tum(tmp_path / "t.tum", trajectory, comments={"data set": "x"})
-    export.write_kitti(tmp_path / "t.txt", trajectory)
-    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
-    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "t.txt"))
-    np.testing.assert_allclose(np.array(tum.poses_se3), trajectory.map_T_lidar, atol=1e-8)
-    np.testing.assert_allclose(np.array(kitti.poses_se3), trajectory.map_T_lidar, atol=1e-8)
-
-
 def test_evo_finds_the_same_ate_in_the_files_of_a_run(tmp_path):
     file_interface = pytest.importorskip("evo.tools.file_interface")
     metrics = pytest.importorskip("evo.core.metrics")
@@ -141,8 +96,8 @@ def test_evo_finds_the_same_ate_in_the_files_of_a_run(tmp_path):
     truth[:, :3, 3] += np.random.default_rng(4).normal(0.0, 2.0, (20, 3))
     truth[:, :3] = moved @ truth[:, :3]
     reference = Trajectory(result.trajectory.stamps, truth)
-    export.write_tum(tmp_path / "truth.tum", reference)
-    export.write_kitti(tmp_path / "truth.txt", reference)
+    write_tum(tmp_path / "truth.tum", reference)
+    write_kitti(tmp_path / "truth.txt", reference)
     expected = absolute_error(result.trajectory, reference).rmse
     assert 1.0 < expected < 5.0
     tum = file_interface.read_tum_trajectory_file
@@ -160,35 +115,6 @@ def test_evo_finds_the_same_ate_in_the_files_of_a_run(tmp_path):
         metric.process_data((theirs, ours))
         rmse = metric.get_statistic(metrics.StatisticsType.rmse)
         assert rmse == pytest.approx(expected, rel=1e-6)
-
-
-def test_kitti_has_twelve_numbers_a_line(tmp_path):
-    trajectory = random_trajectory(3)
-    export.write_kitti(tmp_path / "t.txt", trajectory)
-    rows = np.loadtxt(tmp_path / "t.txt")
-    np.testing.assert_allclose(rows, trajectory.map_T_lidar[:, :3].reshape(3, 12), rtol=1e-11)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("# fine\n1.0 0 0 0 0 0 0\n", r"t\.tum:2: expected 8 finite numbers"),
-        ("1.0 0 0 0 0 0 0 1\n1.1 0 0 x 0 0 0 1\n", r"t\.tum:2: not numbers"),
-        ("abc 0 0 0 0 0 0 1\n", r"t\.tum:1: not numbers"),
-        ("nan 0 0 0 0 0 0 1\n", r"t\.tum:1: not numbers"),
-        ("1.0 0 0 nan 0 0 0 1\n", "finite"),
-        ("1.0 0 0 0 0 0 0 0\n", "not zero"),
-    ],
-)
-def test_read_tum_names_the_bad_line(tmp_path, text, message):
-    (tmp_path / "t.tum").write_text(text)
-    with pytest.raises(DatasetError, match=message):
-        export.read_tum(tmp_path / "t.tum")
-
-
-def test_read_tum_of_a_missing_file(tmp_path):
-    with pytest.raises(DatasetError, match="cannot read"):
-        export.read_tum(tmp_path / "none.tum")
 
 
 def test_npz_holds_every_frame_without_pickle(tmp_path):
@@ -286,7 +212,7 @@ def test_a_run_that_ended_early_says_so(tmp_path):
 
 def test_a_run_without_frames_can_be_written(tmp_path):
     export.write_run(make_result(0), tmp_path)
-    assert len(export.read_tum(tmp_path / "trajectory.tum")) == 0
+    assert len(read_tum(tmp_path / "trajectory.tum")) == 0
     with np.load(tmp_path / "run.npz") as data:
         assert data["covariances"].shape == (0, 6, 6)
 
@@ -296,45 +222,6 @@ def test_writing_twice_gives_the_same_bytes(tmp_path):
         export.write_run(make_result(), tmp_path / name, dataset="x")
     for name in export.RUN_FILES:
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
-
-
-def test_an_interrupted_write_leaves_the_old_file(tmp_path):
-    path = tmp_path / "file"
-    path.write_text("old")
-
-    def interrupted() -> None:
-        with export.replacing(path) as file:
-            file.write(b"half of the n")
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        interrupted()
-    assert path.read_text() == "old"
-    with export.replacing(path) as file:
-        file.write(b"new")
-    assert path.read_text() == "new"
-    assert [p.name for p in tmp_path.iterdir()] == ["file"]
-
-
-def test_a_full_disk_is_a_clear_error(tmp_path):
-    path = tmp_path / "file"
-    with (
-        pytest.raises(OutputError, match=r"file: cannot write the file: No space left"),
-        export.replacing(path),
-    ):
-        raise OSError(28, "No space left on device")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
-    (tmp_path / "file").write_text("")
-    for blocked in ("file", "file/below"):
-        with pytest.raises(OutputError, match="cannot make this output folder"):
-            export.make_folder(tmp_path / blocked)
-    assert list(export.make_folder(tmp_path / "new" / "one").iterdir()) == []
-
-
-# -- of an IMU -------------------------------------------------------------------------------------
 
 
 def test_what_an_imu_did_is_written_frame_by_frame_and_summed_up(tmp_path):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from support.cli import loam
 
-from loam_gtsam.io.run_files import read_tum
+from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.loops.files import read_graph, write_graph
 from loam_gtsam.types import DatasetError, InputError, OutputError

@@ -1,0 +1,126 @@
+"""Files are whole or not there, whatever interrupts the writing."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+
+from loam_gtsam.io.atomic import ClosingWriter, atomic_file, make_folder, staged_files, write_json
+from loam_gtsam.types import OutputError
+
+
+def test_an_interrupted_write_leaves_the_old_file(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("old")
+
+    def interrupted() -> None:
+        with atomic_file(path) as file:
+            file.write(b"half of the n")
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    assert path.read_text() == "old"
+    with atomic_file(path) as file:
+        file.write(b"new")
+    assert path.read_text() == "new"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_full_disk_is_a_clear_error(tmp_path):
+    path = tmp_path / "file"
+    with (
+        pytest.raises(OutputError, match=r"file: cannot write the file: No space left"),
+        atomic_file(path),
+    ):
+        raise OSError(28, "No space left on device")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_made_is_a_clear_error(tmp_path):
+    (tmp_path / "file").write_text("")
+    for blocked in ("file", "file/below"):
+        with pytest.raises(OutputError, match="cannot make this output folder"):
+            make_folder(tmp_path / blocked)
+    assert list(make_folder(tmp_path / "new" / "one").iterdir()) == []
+
+
+def test_numbers_that_json_lacks_become_null(tmp_path):
+    write_json(
+        tmp_path / "x.json", {"a": [np.float64("nan"), np.int64(3)], "b": (float("inf"), 0.5)}
+    )
+    assert json.loads((tmp_path / "x.json").read_text()) == {"a": [None, 3], "b": [None, 0.5]}
+
+
+class FullDisk(ClosingWriter):
+    def close(self):
+        raise OutputError("disk full")
+
+
+def test_what_ended_the_block_matters_more_than_an_error_of_closing():
+    with pytest.raises(OutputError, match="disk full"), FullDisk():
+        pass
+    with pytest.raises(ZeroDivisionError), FullDisk():
+        raise ZeroDivisionError
+
+
+# -- files that take their places together ------------------------------------------------------
+
+
+def write(folder, names, text):
+    with staged_files(folder, ("a", "b", "picture", "last"), last="last") as new:
+        for name in names:
+            (new / name).write_text(text)
+
+
+def content(folder):
+    return {path.name: path.read_text() for path in folder.iterdir()}
+
+
+def test_new_files_replace_old_ones_together(tmp_path):
+    (tmp_path / "notes").write_text("mine")
+    write(tmp_path, ["a", "b", "picture", "last"], "old")
+    write(tmp_path, ["a", "b", "last"], "new")
+    assert content(tmp_path) == {"notes": "mine", "a": "new", "b": "new", "last": "new"}
+
+
+def test_an_error_while_writing_leaves_the_old_files(tmp_path):
+    write(tmp_path, ["a", "last"], "old")
+
+    def fill_the_disk():
+        with staged_files(tmp_path, ("a", "last"), last="last") as new:
+            (new / "a").write_text("half")
+            raise OSError(28, "no space left on this disk")
+
+    with pytest.raises(OutputError, match="disk"):
+        fill_the_disk()
+    assert content(tmp_path) == {"a": "old", "last": "old"}
+
+
+@pytest.mark.parametrize("moved", [0, 1, 2])
+def test_files_whose_move_was_cut_off_are_not_taken_for_complete(moved, tmp_path, monkeypatch):
+    write(tmp_path, ["a", "b", "picture", "last"], "old")
+    left = [moved]
+
+    def cut_off(source, target, replace=os.replace):
+        if target.parent == tmp_path:
+            if not left[0]:
+                raise KeyboardInterrupt
+            left[0] -= 1
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", cut_off)
+    with pytest.raises(KeyboardInterrupt):
+        write(tmp_path, ["a", "b", "last"], "new")
+    monkeypatch.undo()
+    assert not (tmp_path / "last").exists()
+    write(tmp_path, ["a", "b", "last"], "newer")
+    assert content(tmp_path) == {"a": "newer", "b": "newer", "last": "newer"}
+
+
+def test_new_files_of_a_killed_process_do_not_get_among_the_next_ones(tmp_path):
+    (tmp_path / ".loam_gtsam_new").mkdir()
+    (tmp_path / ".loam_gtsam_new" / "picture").write_text("of the killed process")
+    write(tmp_path, ["a", "last"], "new")
+    assert content(tmp_path) == {"a": "new", "last": "new"}

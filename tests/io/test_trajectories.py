@@ -1,0 +1,72 @@
+"""Trajectories that are written are read again, by this package and by others."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from support.trajectories import random_trajectory
+
+from loam_gtsam.io.trajectories import read_tum, write_kitti, write_tum
+from loam_gtsam.types import DatasetError, Trajectory
+
+
+@settings(deadline=None)  # a busy machine is no fault
+@given(
+    st.lists(st.integers(min_value=-(2**62), max_value=2**62), min_size=1, max_size=5, unique=True)
+)
+def test_tum_stamps_survive_to_the_nanosecond(tmp_path_factory, stamps):
+    path = tmp_path_factory.mktemp("tum") / "t.tum"
+    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
+    write_tum(path, Trajectory(np.array(stamps, np.int64), poses))
+    assert read_tum(path).stamps.tolist() == stamps
+
+
+def test_tum_poses_survive(tmp_path):
+    trajectory = random_trajectory(50)
+    write_tum(tmp_path / "t.tum", trajectory, comments={"made by": "a\ntest"})
+    again = read_tum(tmp_path / "t.tum")
+    np.testing.assert_array_equal(again.stamps, trajectory.stamps)
+    np.testing.assert_allclose(again.map_T_lidar, trajectory.map_T_lidar, atol=1e-9)
+    first = (tmp_path / "t.tum").read_text().splitlines()[:2]
+    assert first[0] == "# made by: a test"
+    assert first[1].startswith("# columns:")
+
+
+def test_evo_reads_both_formats(tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface")
+    trajectory = random_trajectory(20)
+    write_tum(tmp_path / "t.tum", trajectory, comments={"data set": "x"})
+    write_kitti(tmp_path / "t.txt", trajectory)
+    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
+    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "t.txt"))
+    np.testing.assert_allclose(np.array(tum.poses_se3), trajectory.map_T_lidar, atol=1e-8)
+    np.testing.assert_allclose(np.array(kitti.poses_se3), trajectory.map_T_lidar, atol=1e-8)
+
+
+def test_kitti_has_twelve_numbers_a_line(tmp_path):
+    trajectory = random_trajectory(3)
+    write_kitti(tmp_path / "t.txt", trajectory)
+    rows = np.loadtxt(tmp_path / "t.txt")
+    np.testing.assert_allclose(rows, trajectory.map_T_lidar[:, :3].reshape(3, 12), rtol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("# fine\n1.0 0 0 0 0 0 0\n", r"t\.tum:2: expected 8 finite numbers"),
+        ("1.0 0 0 0 0 0 0 1\n1.1 0 0 x 0 0 0 1\n", r"t\.tum:2: not numbers"),
+        ("abc 0 0 0 0 0 0 1\n", r"t\.tum:1: not numbers"),
+        ("nan 0 0 0 0 0 0 1\n", r"t\.tum:1: not numbers"),
+        ("1.0 0 0 nan 0 0 0 1\n", "finite"),
+        ("1.0 0 0 0 0 0 0 0\n", "not zero"),
+    ],
+)
+def test_read_tum_names_the_bad_line(tmp_path, text, message):
+    (tmp_path / "t.tum").write_text(text)
+    with pytest.raises(DatasetError, match=message):
+        read_tum(tmp_path / "t.tum")
+
+
+def test_read_tum_of_a_missing_file(tmp_path):
+    with pytest.raises(DatasetError, match="cannot read"):
+        read_tum(tmp_path / "none.tum")

@@ -82,7 +82,7 @@ def find_level(
         float(roll),
         float(pitch),
         count,
-        "moving" if buffer.still(stamp) is None else "still",
+        "moving" if buffer.rest_at(stamp) is None else "still",
     )
 
 
@@ -105,11 +105,11 @@ def mean_orientation(buffer: ImuBuffer, stamp: int, reach: float) -> tuple[gtsam
     if here is None:
         return None
     far = round(reach * 1e9)
-    samples = buffer.window(stamp - far, stamp + far)
+    samples = buffer.samples_between(stamp - far, stamp + far)
     assert samples.orientation is not None  # there is one at this moment
     known = np.isfinite(samples.orientation[:, 0])
     seconds: FloatArray = (samples.stamps[known] - stamp).astype(np.float64) * 1e-9
-    turns = buffer.turn(stamp, seconds)
+    turns = buffer.rotations_since(stamp, seconds)
     if turns is None or not len(turns):
         return here, 1
     brought = Rotation.from_quat(samples.orientation[known]) * Rotation.from_rotvec(turns).inv()

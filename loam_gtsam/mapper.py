@@ -28,7 +28,7 @@ from loam_gtsam.registration.association import (
     trial,
 )
 from loam_gtsam.registration.classical import ALoamSolver, ClassicalSolver
-from loam_gtsam.registration.imu_tracker import ImuAid
+from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import ConstantVelocity, Guess, advance
 from loam_gtsam.registration.pose_errors import PoseErrors
 from loam_gtsam.registration.relocalization import Fit, Watch, places, some
@@ -118,7 +118,7 @@ class Mapper:
     ----------
     last : the last update
     registered : the last sweep as it went into the map; None if it did not
-    imu_aid : what the mapper makes of the IMU; None without one
+    imu : what the mapper makes of the IMU; None without one
     watch : tells whether sweeps fit the map
     edge_map, plane_map : the map
     keyframe : to which the points of the frames to come belong, see :meth:`move_map`
@@ -145,7 +145,7 @@ class Mapper:
                 f"imu.prior: {prior} is a factor, and solver.method {method} has no graph to put "
                 "it in; use imu.prior blend or off, or solver.method gtsam"
             )
-        self.imu_aid = None if imu is None else ImuAid(self.config.imu, imu)
+        self.imu = None if imu is None else ImuTracker(self.config.imu, imu)
         self.extra_factors = extra_factors
         self.keyframe = 0
         self.reset()
@@ -198,15 +198,15 @@ class Mapper:
         if not all(np.isfinite(part).all() for part in points):
             message = "features of the sweep are NaN or infinite"
             return self._unused(features.stamp, message, SweepFault.NOT_FINITE)
-        aid, last = self.imu_aid, self.last
+        aid, last = self.imu, self.last
         if last is None and aid is not None:
-            guess = aid.start(features.stamp, guess)
+            guess = aid.first_pose(features.stamp, guess)
         if guess is None or twist is None:
             predicted = ConstantVelocity(aid).guess(features, last)
             guess = predicted.map_T_lidar if guess is None else guess
             twist = predicted.twist if twist is None else twist
         start = Guess(guess, np.asarray(twist, np.float64))
-        sweep = MovingSweep(features, self.config, None if aid is None else aid.gyro)
+        sweep = MovingSweep(features, self.config, None if aid is None else aid.trusted_gyro)
         if sweep.is_empty:
             message = "the sweep has no features"
             return self._unused(features.stamp, message, SweepFault.NO_FEATURES)
@@ -291,7 +291,7 @@ class Mapper:
         last, status = self.last, FrameStatus.UNUSABLE_SCAN
         if last is None:
             return MapUpdate(stamp, gtsam.Pose3(), status, message, fault=fault)
-        guess = ConstantVelocity(self.imu_aid).at(stamp, last)
+        guess = ConstantVelocity(self.imu).at(stamp, last)
         self.last = MapUpdate(
             stamp, guess.map_T_lidar, status, message, twist=guess.twist, fault=fault
         )
@@ -466,7 +466,7 @@ class Mapper:
 
     def _factors(self, stamp: int, guess: gtsam.Pose3) -> Sequence[gtsam.NonlinearFactor]:
         """The IMU's factors and the user's, on the pose of a moment."""
-        factors = [] if self.imu_aid is None else [*self.imu_aid.factors(stamp)]
+        factors = [] if self.imu is None else [*self.imu.factors(stamp)]
         if self.extra_factors is not None:
             context = PoseContext(POSE_KEY, stamp, guess, self._last_middle)
             factors += _checked(self.extra_factors(context))
@@ -474,7 +474,7 @@ class Mapper:
 
     def _expected(self, sweep: MovingSweep, guess: Guess) -> tuple[Guess, MotionPrior]:
         """The motion that takes over where the scan says nothing: pre-integrated, or constant."""
-        aid = self.imu_aid
+        aid = self.imu
         predicted = None if aid is None else aid.predict(sweep.stamp)
         if predicted is not None:
             velocity = predicted.map_T_lidar.rotation().matrix().T @ predicted.velocity
@@ -493,7 +493,7 @@ class Mapper:
         self, sweep: MovingSweep, solution: Solution, twist: FloatArray
     ) -> tuple[Solution, Guess, TiltPrior]:
         """The pose at the reference time, with the IMU's roll and pitch."""
-        aid, to_reference = self.imu_aid, sweep.middle_T_reference(twist)
+        aid, to_reference = self.imu, sweep.middle_T_reference(twist)
         if aid is None:
             pose = solution.map_T_lidar.compose(to_reference)
             return solution, Guess(pose, twist), TiltPrior.NONE
@@ -501,10 +501,10 @@ class Mapper:
             now = sweep.stamp, solution.map_T_lidar
             aid.compare_gyro(self._last_middle, now)
             aid.observe(self._last_middle, now, solution.scan_information)
-        solution, tilt = aid.tilted(sweep.stamp, solution)
+        solution, tilt = aid.add_tilt(sweep.stamp, solution)
         pose = solution.map_T_lidar.compose(to_reference)
         if tilt is TiltPrior.NONE:
-            pose, tilt = aid.blended(sweep.reference_stamp, pose)
+            pose, tilt = aid.blend_tilt(sweep.reference_stamp, pose)
         aid.find_level(sweep.reference_stamp, pose)  # for the frames to come
         return solution, Guess(pose, twist), tilt
 

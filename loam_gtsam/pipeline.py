@@ -21,7 +21,7 @@ from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import ExtraFactors, Mapper
-from loam_gtsam.registration.imu_tracker import ImuAid
+from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Odometry, make_odometry
 from loam_gtsam.types import (
     BadSweep,
@@ -145,7 +145,7 @@ class Pipeline:
         self.config = config or Config()
         self.mapper = Mapper(self.config, imu=imu, extra_factors=extra_factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
-        self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu_aid)
+        self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu)
         self._last_odom: gtsam.Pose3 | None = None
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.loops: LoopMapping | None = None
@@ -212,9 +212,9 @@ class Pipeline:
         shared = {"solver": mapper.solver, **_sections("config", self.config)}
         if mapper.extra_factors is not None:
             shared["extra_factors"] = mapper.extra_factors
-        if mapper.imu_aid is not None:
-            roots["imu"] = mapper.imu_aid
-            shared["samples"] = mapper.imu_aid.buffer
+        if mapper.imu is not None:
+            roots["imu"] = mapper.imu
+            shared["samples"] = mapper.imu.buffer
         if loops is not None:
             roots |= {"loops": loops, "graph": loops.graph, "closer": loops.closer}
         return roots, shared
@@ -244,7 +244,7 @@ class Pipeline:
             },
             interrupted=interrupted,
             error=error,
-            imu=None if mapper.imu_aid is None else _imu_summary(mapper.imu_aid, updates),
+            imu=None if mapper.imu is None else _imu_summary(mapper.imu, updates),
             loops=self.loops,
         )
 
@@ -419,7 +419,7 @@ def _stamp(sweep: Sweep) -> int:
     return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
 
 
-def _imu_summary(aid: ImuAid, updates: Sequence[MapUpdate]) -> ImuSummary:
+def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
     solved = [update for update in updates if update.status.solved]
     stamps = np.array([update.stamp for update in solved], np.int64)
     poses = np.array([update.map_T_lidar.matrix() for update in solved]).reshape(-1, 4, 4)
@@ -429,7 +429,7 @@ def _imu_summary(aid: ImuAid, updates: Sequence[MapUpdate]) -> ImuSummary:
         gyro_bias=aid.buffer.gyro_bias,
         sweep_motions=Counter(str(update.sweep_motion) for update in updates),
         tilt_priors=Counter(str(update.tilt_prior) for update in updates),
-        gyro_trusted=aid.gyro is not None,
+        gyro_trusted=aid.trusted_gyro is not None,
         problem=extrinsic_problem(aid.buffer, stamps, poses) if len(solved) > 1 else "",
     )
 

@@ -344,7 +344,7 @@ def test_a_start_of_the_users_own_keeps_its_map_and_learns_where_up_is(rng):
     first = mapper.register(room_features(gtsam.Pose3(), 0, rng), guess=start)
     assert first.map_T_lidar.equals(start, 1e-12)
     up = start.rotation().matrix() @ attitude.matrix()[2]
-    np.testing.assert_allclose(mapper.imu_aid.level.map_up, up, atol=1e-9)
+    np.testing.assert_allclose(mapper.imu.level.map_up, up, atol=1e-9)
     update = mapper.register(room_features(gtsam.Pose3(), SECOND // 10, rng), guess=start)
     assert update.tilt_prior is TiltPrior.EQUIVALENT
     # The IMU agrees, so it changes nothing.
@@ -357,10 +357,10 @@ def test_the_imu_moves_roll_and_pitch_of_a_frame_by_its_weight(rng):
     for weight in (0.0, 0.1):
         config = replace(Config(), imu=replace(Config().imu, weight=weight, still_seconds=0.1))
         buffer = imu_of(gtsam.Rot3.Roll(0.01))
-        start = imu_of(gtsam.Rot3(), seconds=0.75).window(-SECOND // 2, SECOND // 8)
-        late = buffer.window(SECOND // 8 + 1, 2 * SECOND)
+        start = imu_of(gtsam.Rot3(), seconds=0.75).samples_between(-SECOND // 2, SECOND // 8)
+        late = buffer.samples_between(SECOND // 8 + 1, 2 * SECOND)
         mapper = Mapper(config, imu=ImuBuffer(config.imu, start))
-        mapper.imu_aid.buffer.add(late)
+        mapper.imu.buffer.add(late)
         same = np.random.default_rng(3)
         mapper.register(room_features(gtsam.Pose3(), 0, same, noise=0.01))
         update = mapper.register(room_features(gtsam.Pose3(), SECOND // 2, same, noise=0.01))

@@ -81,7 +81,7 @@ class MovingSweep:
                 turns = _turns_by_orientation(imu, self.stamp, moments, config.imu.max_gap)
                 motion = SweepMotion.ORIENTATION
             else:
-                turns = imu.turn(self.stamp, moments)
+                turns = imu.rotations_since(self.stamp, moments)
                 motion = SweepMotion.GYRO
             if turns is not None:
                 self.motion = motion
@@ -173,10 +173,10 @@ class MovingSweep:
 def _turns_by_orientation(
     imu: ImuBuffer, stamp: int, moments: FloatArray, max_gap: float
 ) -> FloatArray | None:
-    """As :meth:`ImuBuffer.turn`, from the attitudes, between which turns are interpolated."""
+    """As :meth:`ImuBuffer.rotations_since`, interpolated between the IMU's orientations."""
     first, end = moments.min(), moments.max()
     begins, ends = (stamp + round(float(seconds) * 1e9) for seconds in (first, end))
-    samples = imu.window(begins, ends)
+    samples = imu.samples_between(begins, ends)
     middle = imu.orientation(stamp)
     before, after = imu.orientation(begins), imu.orientation(ends)
     if middle is None or before is None or after is None or samples.orientation is None:

@@ -11,29 +11,29 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.quaternions import as_rot3
 from loam_gtsam.types import FloatArray, IntArray
 
-STILL_LEAST = 0.1
+REST_LEAST = 0.1
 """Seconds a still window must span at least."""
-STILL_SAMPLES = 10
+REST_SAMPLES = 10
 """Samples a still window must have at least."""
-STILL_GYRO = 0.02
+REST_GYRO = 0.02
 """rad/s, scatter per axis at rest: several times the noise of consumer MEMS gyros at 200 Hz."""
-STILL_ACCELERATION = 0.15
+REST_ACCELERATION = 0.15
 """m/s^2, scatter per axis at rest: above an idling engine, below any driving (VINS-Mono takes
 0.25 for "enough excitation" of a hand-held start)."""
-STILL_DRIFT = 4.0
+REST_DRIFT = 4.0
 """Standard deviations by which the means of the two halves of a still window may differ. What the
 scatter does not show, this does: a platform that begins to move."""
-STILL_DRIFT_FLOOR = (5e-4, 0.01)
+REST_DRIFT_FLOOR = (5e-4, 0.01)
 """rad/s and m/s^2, allowed on top: noise is not quite white."""
-STILL_TURN = 0.05
+REST_TURN = 0.05
 """rad/s, mean rate at rest: the largest bias of consumer MEMS gyros (3 deg/s). A platform that
 turns evenly at less than that cannot be told from a bias."""
-STILL_GRAVITY = 0.5
+REST_GRAVITY = 0.5
 """m/s^2 by which the mean acceleration at rest may differ from gravity: 5 %, a scale and a bias."""
 
 
 @dataclass(frozen=True, slots=True)
-class StillWindow:
+class RestWindow:
     """A stretch of samples at rest, lidar axes.
 
     Attributes
@@ -68,13 +68,13 @@ def find_rest(
     gyro: FloatArray,
     acceleration: FloatArray,
     quaternions: FloatArray | None = None,
-) -> StillWindow | None:
+) -> RestWindow | None:
     """These samples, if they are at rest.
 
-    At rest is: gyro and acceleration scatter little (:data:`STILL_GYRO`,
-    :data:`STILL_ACCELERATION`) and do not drift (:data:`STILL_DRIFT`), the mean rate is a possible
-    bias (:data:`STILL_TURN`), the mean acceleration is gravity (:data:`STILL_GRAVITY`), and there
-    are enough samples without a gap (:data:`STILL_LEAST`, :data:`STILL_SAMPLES`).
+    At rest is: gyro and acceleration scatter little (:data:`REST_GYRO`,
+    :data:`REST_ACCELERATION`) and do not drift (:data:`REST_DRIFT`), the mean rate is a possible
+    bias (:data:`REST_TURN`), the mean acceleration is gravity (:data:`REST_GRAVITY`), and there
+    are enough samples without a gap (:data:`REST_LEAST`, :data:`REST_SAMPLES`).
 
     Parameters
     ----------
@@ -83,19 +83,19 @@ def find_rest(
     gyro, acceleration : (N, 3) rad/s and m/s^2, lidar axes
     quaternions : (N, 4) x y z w of ``world_R_lidar``, NaN where unknown
     """
-    if len(stamps) < STILL_SAMPLES or stamps[-1] - stamps[0] < STILL_LEAST * 1e9:
+    if len(stamps) < REST_SAMPLES or stamps[-1] - stamps[0] < REST_LEAST * 1e9:
         return None
     mean_gyro, mean_acceleration = gyro.mean(axis=0), acceleration.mean(axis=0)
     weight = float(np.linalg.norm(mean_acceleration))
-    drift_gyro, drift_acceleration = STILL_DRIFT_FLOOR
+    drift_gyro, drift_acceleration = REST_DRIFT_FLOOR
     if (
         np.diff(stamps).max() > config.max_gap * 1e9
-        or gyro.std(axis=0).max() > STILL_GYRO
-        or acceleration.std(axis=0).max() > STILL_ACCELERATION
+        or gyro.std(axis=0).max() > REST_GYRO
+        or acceleration.std(axis=0).max() > REST_ACCELERATION
         or _drifts(gyro, drift_gyro)
         or _drifts(acceleration, drift_acceleration)
-        or np.linalg.norm(mean_gyro) > STILL_TURN
-        or abs(weight - config.gravity) > STILL_GRAVITY
+        or np.linalg.norm(mean_gyro) > REST_TURN
+        or abs(weight - config.gravity) > REST_GRAVITY
     ):
         return None
     world_R_lidar = None
@@ -105,7 +105,7 @@ def find_rest(
             # q and -q are one rotation: bring all to one side before they are averaged.
             mean = np.where(known @ known[0] < 0.0, -1.0, 1.0) @ known
             world_R_lidar = as_rot3(mean / np.linalg.norm(mean))
-    return StillWindow(
+    return RestWindow(
         first=int(stamps[0]),
         last=int(stamps[-1]),
         samples=len(stamps),
@@ -121,7 +121,7 @@ def rest_at_start(
     gyro: FloatArray,
     acceleration: FloatArray,
     quaternions: FloatArray | None = None,
-) -> StillWindow | None:
+) -> RestWindow | None:
     """The first ``still_seconds`` of a stream, or a half or a quarter of them, if at rest.
 
     Parameters are those of :func:`find_rest`, at least one sample.
@@ -141,4 +141,4 @@ def _drifts(values: FloatArray, floor: float) -> bool:
     half = len(values) // 2
     change = np.abs(values[half:].mean(axis=0) - values[:half].mean(axis=0))
     chance = 2.0 * values.std(axis=0) / np.sqrt(len(values))
-    return bool((change > STILL_DRIFT * chance + floor).any())
+    return bool((change > REST_DRIFT * chance + floor).any())

@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.imu.at_rest import STILL_SAMPLES, StillWindow, find_rest, rest_at_start
+from loam_gtsam.imu.at_rest import REST_SAMPLES, RestWindow, find_rest, rest_at_start
 from loam_gtsam.imu.attitude_filter import GravityFilter
 from loam_gtsam.imu.quaternions import (
     as_rot3,
@@ -27,7 +27,7 @@ from loam_gtsam.imu.quaternions import (
 )
 from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, InputError, IntArray
 
-STILL_AHEAD = 0.1
+REST_AHEAD = 0.1
 """Seconds after the asked stamp that still count to its still window: one sweep."""
 FROZEN_TURN = 0.2
 """rad/s; an orientation that never changes while the gyro says more than this is a placeholder."""
@@ -96,8 +96,9 @@ class ImuBuffer:
 
     Attributes
     ----------
-    gyro_bias : (3,) rad/s in lidar axes, subtracted by :meth:`turn` and :meth:`between`. It does
-        not touch :meth:`orientation`, whose filter takes the bias of the rest at the start.
+    gyro_bias : (3,) rad/s in lidar axes, subtracted by :meth:`rotations_since` and
+        :meth:`rotation_between`. It does not touch :meth:`orientation`, whose filter takes the
+        bias of the rest at the start.
 
     Raises
     ------
@@ -244,7 +245,7 @@ class ImuBuffer:
             return None
         return before.slerp((stamp - int(stamps[i])) / step, as_rot3(quaternions[j]))
 
-    def turn(self, stamp: int, seconds: FloatArray) -> FloatArray | None:
+    def rotations_since(self, stamp: int, seconds: FloatArray) -> FloatArray | None:
         """How the lidar has turned since ``stamp``, from the gyro.
 
         Parameters
@@ -290,10 +291,10 @@ class ImuBuffer:
         turned += vectors.take(node, axis=1)
         return turned.T
 
-    def between(self, first: int, second: int) -> gtsam.Rot3 | None:
-        """``first_R_second`` of two stamps from the gyro; None as for :meth:`turn`."""
+    def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
+        """``first_R_second`` of two stamps from the gyro; None as for :meth:`rotations_since`."""
         if second < first:
-            backwards = self.between(second, first)
+            backwards = self.rotation_between(second, first)
             return None if backwards is None else backwards.inverse()
         found = self._rates(first, second, first)
         if found is None:
@@ -304,7 +305,7 @@ class ImuBuffer:
         steps = rotation_steps(times, _interpolate(times, *found))
         return as_rot3(running_product(exponential(steps))[:, -1])
 
-    def window(self, first: int, last: int) -> ImuSamples:
+    def samples_between(self, first: int, last: int) -> ImuSamples:
         """Copy of the samples from ``first`` to ``last``, both included, in lidar axes.
 
         The orientation is that of :meth:`orientation`, NaN where unknown.
@@ -319,13 +320,13 @@ class ImuBuffer:
             acceleration=self._acceleration[part].copy(),
         )
 
-    def still(self, stamp: int) -> StillWindow | None:
+    def rest_at(self, stamp: int) -> RestWindow | None:
         """The samples of the last ``still_seconds``, and 0.1 s more, if the lidar is at rest.
 
         What at rest means is said at :func:`loam_gtsam.imu.at_rest.find_rest`.
         """
         first = stamp - round(self._config.still_seconds * 1e9)
-        samples = self.window(first, stamp + round(STILL_AHEAD * 1e9))
+        samples = self.samples_between(first, stamp + round(REST_AHEAD * 1e9))
         return find_rest(
             self._config, samples.stamps, samples.gyro, samples.acceleration, samples.orientation
         )
@@ -404,7 +405,7 @@ class ImuBuffer:
 
     @property
     def _placeholder(self) -> bool:
-        enough = self._quaternions >= STILL_SAMPLES
+        enough = self._quaternions >= REST_SAMPLES
         return enough and self._frozen and self._fastest > FROZEN_TURN
 
     def _source(self) -> tuple[str, list[str]]:
@@ -442,7 +443,7 @@ class ImuBuffer:
             )
         return "gravity_filter", problems
 
-    def _rest_at_start(self, quaternions: FloatArray | None = None) -> StillWindow | None:
+    def _rest_at_start(self, quaternions: FloatArray | None = None) -> RestWindow | None:
         return rest_at_start(
             self._config, self._stamps, self._gyro, self._acceleration, quaternions
         )
@@ -486,7 +487,7 @@ def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArr
             f"extrinsic_problem: expected (N,) stamps and (N, 4, 4) or (N, 3, 3) poses, got "
             f"{stamps.shape} and {poses.shape}"
         )
-    turns = [buffer.between(int(a), int(b)) for a, b in pairwise(stamps)]
+    turns = [buffer.rotation_between(int(a), int(b)) for a, b in pairwise(stamps)]
     known = np.array([turn is not None for turn in turns], dtype=np.bool_)
     if known.sum() < EXTRINSIC_FRAMES:
         return ""

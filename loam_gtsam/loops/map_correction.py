@@ -67,8 +67,8 @@ class LoopMapping:
         -------
         Whether a loop was closed.
         """
-        aid = self._mapper.imu_aid
-        self.graph.imu = None if aid is None else aid.gyro  # which the mapper may give up
+        aid = self._mapper.imu
+        self.graph.imu = None if aid is None else aid.trusted_gyro  # which the mapper may give up
         keyframe = self.graph.add(update, features)
         if keyframe is None:
             return False

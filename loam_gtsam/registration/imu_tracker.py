@@ -40,7 +40,7 @@ against one map last over frames (built-in scenes: mean squared errors of 1 to 4
 information's over 10 to 50 frames)."""
 
 
-class ImuAid:
+class ImuTracker:
     """Use of an IMU in mapping, as ``config`` says.
 
     Parameters
@@ -55,6 +55,12 @@ class ImuAid:
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
         self.config = config
         self.buffer = buffer
+        self._given_bias = buffer.gyro_bias
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all frames: as a new tracker on the same buffer, with the bias it was given."""
+        self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
         self._disagreements = 0
         self._inertial: InertialOdometry | None = None
@@ -69,16 +75,16 @@ class ImuAid:
         vars(self).update(state)
 
     @property
-    def gyro(self) -> ImuBuffer | None:
+    def trusted_gyro(self) -> ImuBuffer | None:
         """The buffer, while its gyro agrees with the scans."""
         return self.buffer if self._disagreements < _DISTRUST else None
 
-    def between(self, first: int, second: int) -> gtsam.Rot3 | None:
+    def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps by the gyro; None while it is not to be trusted."""
-        gyro = self.gyro
-        return None if gyro is None else gyro.between(first, second)
+        gyro = self.trusted_gyro
+        return None if gyro is None else gyro.rotation_between(first, second)
 
-    def start(self, stamp: int, given: gtsam.Pose3 | None = None) -> gtsam.Pose3:
+    def first_pose(self, stamp: int, given: gtsam.Pose3 | None = None) -> gtsam.Pose3:
         """Where the first sweep is: at the origin, of a map whose z axis points up if wanted.
 
         Parameters
@@ -86,7 +92,7 @@ class ImuAid:
         stamp : nanoseconds
         given : where a user wants it, in a map of the user's own; up is then found in that map
         """
-        still = self.buffer.still(stamp)
+        still = self.buffer.rest_at(stamp)
         if still is not None:
             self.buffer.gyro_bias = still.gyro
         levelled = self.config.level and given is None
@@ -109,7 +115,7 @@ class ImuAid:
             return ()
         return (self._gravity(measured),)
 
-    def tilted(self, stamp: int, solution: Solution) -> tuple[Solution, TiltPrior]:
+    def add_tilt(self, stamp: int, solution: Solution) -> tuple[Solution, TiltPrior]:
         """Bring roll and pitch into the solution for a moment, where they are a factor."""
         config = self.config
         if config.prior in ("off", "blend"):
@@ -131,7 +137,7 @@ class ImuAid:
         pose, information = fuse(pose, information, [factor])
         return replace(solution, map_T_lidar=pose, information=information), tilt
 
-    def blended(self, stamp: int, map_T_lidar: gtsam.Pose3) -> tuple[gtsam.Pose3, TiltPrior]:
+    def blend_tilt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> tuple[gtsam.Pose3, TiltPrior]:
         """LOAM's blend of the pose of a moment, if that is the mode."""
         if self.config.prior != "blend":
             return map_T_lidar, TiltPrior.NONE
@@ -152,7 +158,7 @@ class ImuAid:
         ----------
         last, now : stamp and pose
         """
-        turned = self.buffer.between(last[0], now[0])
+        turned = self.buffer.rotation_between(last[0], now[0])
         if turned is None or now[0] <= last[0]:  # sweeps of unlike length
             return
         scan = last[1].rotation().between(now[1].rotation())
@@ -175,7 +181,7 @@ class ImuAid:
         if self._inertial is None:
             return None
         margin = round(self.config.max_gap * 1e9)
-        samples = self.buffer.window(self._inertial.state.stamp - margin, stamp + margin)
+        samples = self.buffer.samples_between(self._inertial.state.stamp - margin, stamp + margin)
         try:
             prediction = self._inertial.predict(stamp, samples)
         except SweepError:
@@ -214,7 +220,7 @@ class ImuAid:
         """``world_R_lidar``, None if there is none or if up is not known in the map."""
         if self.level is None:
             return None
-        if self.gyro is None or not self.config.average_seconds:
+        if self.trusted_gyro is None or not self.config.average_seconds:
             return self.buffer.orientation(stamp)
         found = mean_orientation(self.buffer, stamp, 0.5 * self.config.average_seconds)
         return None if found is None else found[0]

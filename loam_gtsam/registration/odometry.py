@@ -55,7 +55,7 @@ def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsa
 class Turns(Protocol):
     """Tells how the lidar turned: an :class:`~loam_gtsam.imu.ImuBuffer` or the mapper's IMU."""
 
-    def between(self, first: int, second: int) -> gtsam.Rot3 | None:
+    def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps, None if unknown."""
         ...
 
@@ -75,7 +75,7 @@ class ConstantVelocity:
         if last is None:
             return Guess(gtsam.Pose3(), np.zeros(6))
         seconds = min((stamp - last.stamp) * 1e-9, _LONGEST)
-        turned = None if self.imu is None else self.imu.between(last.stamp, stamp)
+        turned = None if self.imu is None else self.imu.rotation_between(last.stamp, stamp)
         if turned is None:
             return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)
         # With the rotation known it is the velocity in the map that stays, not that of the body.

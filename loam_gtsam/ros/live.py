@@ -21,7 +21,7 @@ from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.imu_messages import decode_imu
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
-from loam_gtsam.imu.buffer import STILL_AHEAD
+from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.mapper import ExtraFactors
 from loam_gtsam.pipeline import Observer, Pipeline
@@ -251,12 +251,12 @@ class LiveMapper:
 
     def _must_wait(self, current: ReadySweep) -> bool:
         """Whether samples of a sweep may still come."""
-        imu, config, aid = self._imu, self._config, self.pipeline.mapper.imu_aid
+        imu, config, aid = self._imu, self._config, self.pipeline.mapper.imu
         if imu is None or aid is None or current.needs is None:
             return False
         # Up is found from the samples before the first sweep and as long after it.
         levelling = aid.level is None and not self._no_level
-        more = round(max(config.imu.still_seconds, STILL_AHEAD) * 1e9) if levelling else 0
+        more = round(max(config.imu.still_seconds, REST_AHEAD) * 1e9) if levelling else 0
         if imu.covers(current.needs + more):
             return False
         patience = round(config.live.imu_wait * 1e9) + more

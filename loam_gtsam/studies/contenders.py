@@ -158,7 +158,7 @@ class Ours:
     def __init__(self, name: str, config: Config, imu: ImuBuffer | None = None) -> None:
         self.name, self.config = name, config
         self.mapper = Mapper(config, imu=imu)
-        self.odometry = make_odometry(config.odometry, self.mapper.imu_aid)
+        self.odometry = make_odometry(config.odometry, self.mapper.imu)
         self.updates: list[MapUpdate] = []
 
     def register(self, sweep: Prepared, given: Step | None) -> Step | None:

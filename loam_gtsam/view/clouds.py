@@ -123,7 +123,7 @@ def _deskewed(
     )
     # As it was for this frame: the gyro may have been given up since.
     turned = update.sweep_motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
-    imu = mapper.imu_aid.buffer if turned and mapper.imu_aid is not None else None
+    imu = mapper.imu.buffer if turned and mapper.imu is not None else None
     moving = MovingSweep(points, mapper.config, imu, thin=False)
     moving.deskew(update.twist)
     back = moving.middle_T_reference(update.twist).inverse()

@@ -181,7 +181,7 @@ def test_levelling_turns_up_to_z_the_shortest_way():
 def test_turn_is_exact_over_a_sweep(start):
     stamp = int(ns(start))
     seconds = np.random.default_rng(3).uniform(-0.03, 0.1, 500)
-    found = ImuBuffer(CONFIG, moving()).turn(stamp, seconds)
+    found = ImuBuffer(CONFIG, moving()).rotations_since(stamp, seconds)
     exact = motion(np.array([start]))[0].inv() * motion(start + seconds)[0]
     assert found.shape == (500, 3)
     assert (Rotation.from_rotvec(found).inv() * exact).magnitude().max() < 1e-5
@@ -193,12 +193,12 @@ def test_turn_subtracts_the_bias_and_zero_seconds_turn_nothing():
     bias = np.array([0.03, -0.02, 0.01])
     buffer = ImuBuffer(CONFIG, dataclasses.replace(samples, gyro=samples.gyro + bias))
     seconds = np.array([0.0, 0.05, 0.1])
-    plain = ImuBuffer(CONFIG, samples).turn(int(ns(1.0)), seconds)
-    assert not np.allclose(buffer.turn(int(ns(1.0)), seconds), plain, atol=1e-3)
+    plain = ImuBuffer(CONFIG, samples).rotations_since(int(ns(1.0)), seconds)
+    assert not np.allclose(buffer.rotations_since(int(ns(1.0)), seconds), plain, atol=1e-3)
     buffer.gyro_bias = bias
-    assert np.allclose(buffer.turn(int(ns(1.0)), seconds), plain, atol=1e-12)
+    assert np.allclose(buffer.rotations_since(int(ns(1.0)), seconds), plain, atol=1e-12)
     assert np.array_equal(plain[0], np.zeros(3))
-    assert buffer.turn(int(ns(1.0)), np.zeros(0)).shape == (0, 3)
+    assert buffer.rotations_since(int(ns(1.0)), np.zeros(0)).shape == (0, 3)
     for wrong in (np.zeros(2), [0.0, np.nan, 0.0]):
         with pytest.raises(InputError, match="gyro_bias: expected 3"):
             buffer.gyro_bias = wrong
@@ -207,24 +207,24 @@ def test_turn_subtracts_the_bias_and_zero_seconds_turn_nothing():
 def test_stamps_are_not_rounded_to_what_a_float_can_hold():
     samples = moving(0.5)
     even = dataclasses.replace(samples, gyro=np.tile([0.0, 0.0, 1.0], (100, 1)))
-    turned = ImuBuffer(CONFIG, even).between(START + 20_000_001, START + 20_000_101)
+    turned = ImuBuffer(CONFIG, even).rotation_between(START + 20_000_001, START + 20_000_101)
     assert turned.yaw() == pytest.approx(1e-7, rel=1e-6)
 
 
 def test_turn_ends_where_the_data_does():
     buffer = ImuBuffer(CONFIG, moving(1.0))
     last = int(ns(0.995))
-    assert buffer.turn(int(ns(0.0)), np.array([-1e-6])) is None
-    assert buffer.turn(int(ns(0.0)), np.array([0.0])) is not None
-    held = buffer.turn(last, np.array([0.0999]))
+    assert buffer.rotations_since(int(ns(0.0)), np.array([-1e-6])) is None
+    assert buffer.rotations_since(int(ns(0.0)), np.array([0.0])) is not None
+    held = buffer.rotations_since(last, np.array([0.0999]))
     assert np.allclose(held[0], motion(np.array([0.995]))[1] * 0.0999, atol=1e-6)
-    assert buffer.turn(last, np.array([0.1001])) is None
-    assert buffer.turn(last + 50_000_000, np.array([0.04])) is not None
-    assert buffer.turn(last + 200_000_000, np.array([0.0])) is None
-    assert ImuBuffer(CONFIG).turn(START, np.array([0.0])) is None
+    assert buffer.rotations_since(last, np.array([0.1001])) is None
+    assert buffer.rotations_since(last + 50_000_000, np.array([0.04])) is not None
+    assert buffer.rotations_since(last + 200_000_000, np.array([0.0])) is None
+    assert ImuBuffer(CONFIG).rotations_since(START, np.array([0.0])) is None
     for wrong in (np.zeros((2, 2)), np.array([np.nan])):
         with pytest.raises(InputError, match=r"seconds: expected a \(K,\) array"):
-            buffer.turn(last, wrong)
+            buffer.rotations_since(last, wrong)
 
 
 def test_turn_and_between_do_not_bridge_a_long_gap():
@@ -233,21 +233,21 @@ def test_turn_and_between_do_not_bridge_a_long_gap():
     for gap, bridged in ((0.09, True), (0.11, False)):
         buffer = ImuBuffer(CONFIG, part(samples, (seconds < 1.0) | (seconds > 1.0 + gap)))
         for found in (
-            buffer.turn(int(ns(0.98)), np.array([0.15])),
-            buffer.turn(int(ns(1.05)), np.array([0.0])),
-            buffer.between(int(ns(0.5)), int(ns(1.5))),
+            buffer.rotations_since(int(ns(0.98)), np.array([0.15])),
+            buffer.rotations_since(int(ns(1.05)), np.array([0.0])),
+            buffer.rotation_between(int(ns(0.5)), int(ns(1.5))),
         ):
             assert (found is not None) is bridged
-        assert buffer.between(int(ns(0.2)), int(ns(0.99))) is not None
+        assert buffer.rotation_between(int(ns(0.2)), int(ns(0.99))) is not None
 
 
 def test_turn_does_not_interpolate_across_a_half_turn():
     samples = moving(1.0)
     buffer = ImuBuffer(CONFIG, dataclasses.replace(samples, gyro=np.tile([0, 0, 5.0], (200, 1))))
-    assert buffer.turn(START, np.array([0.59]))[0, 2] == pytest.approx(2.95)
-    assert buffer.turn(START, np.array([0.61])) is None
+    assert buffer.rotations_since(START, np.array([0.59]))[0, 2] == pytest.approx(2.95)
+    assert buffer.rotations_since(START, np.array([0.61])) is None
     # Each side counts for itself.
-    both = buffer.turn(int(ns(0.45)), np.array([-0.4, 0.4]))
+    both = buffer.rotations_since(int(ns(0.45)), np.array([-0.4, 0.4]))
     assert np.allclose(both[:, 2], [-2.0, 2.0])
 
 
@@ -255,11 +255,11 @@ def test_between_is_exact_and_its_own_inverse():
     buffer = ImuBuffer(CONFIG, moving())
     first, second = 0.3012345, 3.7
     exact = motion(np.array([first]))[0].inv() * motion(np.array([second]))[0]
-    found = buffer.between(int(ns(first)), int(ns(second)))
+    found = buffer.rotation_between(int(ns(first)), int(ns(second)))
     assert angle(found, exact[0]) < 3e-5
-    assert angle(buffer.between(int(ns(second)), int(ns(first))), found.inverse()) < 1e-12
-    assert angle(buffer.between(int(ns(1.0)), int(ns(1.0))), Rotation.identity()) == 0.0
-    assert buffer.between(int(ns(-0.01)), int(ns(1.0))) is None
+    assert angle(buffer.rotation_between(int(ns(second)), int(ns(first))), found.inverse()) < 1e-12
+    assert angle(buffer.rotation_between(int(ns(1.0)), int(ns(1.0))), Rotation.identity()) == 0.0
+    assert buffer.rotation_between(int(ns(-0.01)), int(ns(1.0))) is None
 
 
 # -- orientation -----------------------------------------------------------------------------------
@@ -317,7 +317,7 @@ def test_samples_without_quaternion_are_interpolated_among_those_with():
         assert (found is not None) is known, index
         if known:
             assert angle(found, Rotation.from_quat(samples.orientation[index])) < 2e-3
-    assert buffer.turn(int(samples.stamps[300]), np.array([0.1])) is not None
+    assert buffer.rotations_since(int(samples.stamps[300]), np.array([0.1])) is not None
     report = buffer.report
     assert (report.no_orientation, report.unnormalised, report.not_finite) == (41, 1, 0)
     assert len(report.problems) == 2
@@ -338,8 +338,10 @@ def test_everything_comes_out_in_lidar_axes(orientation):
     expected, found = ImuBuffer(CONFIG, samples), ImuBuffer(config, there)
     stamp = int(ns(1.01))
     assert angle(found.orientation(stamp), expected.orientation(stamp)) < 1e-9
-    assert angle(found.between(START, stamp), expected.between(START, stamp)) < 1e-9
-    a, b = found.window(START, stamp), expected.window(START, stamp)
+    assert (
+        angle(found.rotation_between(START, stamp), expected.rotation_between(START, stamp)) < 1e-9
+    )
+    a, b = found.samples_between(START, stamp), expected.samples_between(START, stamp)
     assert len(a.stamps) == 203
     for name in ("gyro", "acceleration"):
         assert np.allclose(getattr(a, name), getattr(b, name), atol=1e-12)
@@ -354,9 +356,9 @@ def answers(buffer, samples):
     """Bytes of everything a buffer says."""
     stamps = samples.stamps[::97].tolist()
     rotations_ = [buffer.orientation(s + 3) for s in stamps]
-    rotations_ += [buffer.between(stamps[0], s) for s in stamps]
-    turned = buffer.turn(stamps[3], np.linspace(-0.05, 0.1, 40))
-    window = buffer.window(stamps[0], stamps[-1])
+    rotations_ += [buffer.rotation_between(stamps[0], s) for s in stamps]
+    turned = buffer.rotations_since(stamps[3], np.linspace(-0.05, 0.1, 40))
+    window = buffer.samples_between(stamps[0], stamps[-1])
     return b"".join(
         [r.matrix().tobytes() for r in rotations_]
         + [turned.tobytes(), window.stamps.tobytes(), window.gyro.tobytes()]
@@ -409,7 +411,7 @@ def test_of_equal_stamps_the_first_to_come_is_kept():
     other = dataclasses.replace(samples, gyro=samples.gyro + 1.0)
     buffer = ImuBuffer(CONFIG, samples)
     buffer.add(other)
-    assert np.array_equal(buffer.window(START, START + 10**9).gyro, samples.gyro)
+    assert np.array_equal(buffer.samples_between(START, START + 10**9).gyro, samples.gyro)
     assert (len(buffer), buffer.report.duplicates) == (200, 200)
     assert "200 samples repeat a stamp" in " ".join(buffer.report.problems)
 
@@ -506,18 +508,18 @@ def test_still_window_gives_bias_gravity_and_orientation():
     noise = Rotation.from_rotvec(0.003 * np.random.default_rng(5).standard_normal((200, 3)))
     quaternions = (truth * noise).as_quat() * np.where(np.arange(200) % 2, 1, -1)[:, None]
     buffer = ImuBuffer(CONFIG, dataclasses.replace(samples, orientation=quaternions))
-    window = buffer.still(int(ns(0.6)))
+    window = buffer.rest_at(int(ns(0.6)))
     assert (window.first, window.last, window.samples) == (ns(0.1), ns(0.7), 121)
     assert np.allclose(window.gyro, [0.002, -0.001, 0.0015], atol=1e-3)
     assert np.allclose(window.acceleration, truth.inv().apply([0, 0, G]), atol=0.02)
     assert angle(window.world_R_lidar, truth) < 1e-3
     assert window.disagreement < 2e-3
     without = ImuBuffer(dataclasses.replace(CONFIG, gravity=0.0), samples)
-    assert without.still(int(ns(0.6))) is None
-    assert ImuBuffer(CONFIG, moving()).still(int(ns(1.0))) is None
+    assert without.rest_at(int(ns(0.6))) is None
+    assert ImuBuffer(CONFIG, moving()).rest_at(int(ns(1.0))) is None
     # 0.1 s of rest before and the first sweep are enough.
-    assert buffer.still(START).samples == 21
-    assert buffer.still(START - 50_000_000) is None
+    assert buffer.rest_at(START).samples == 21
+    assert buffer.rest_at(START - 50_000_000) is None
 
 
 @pytest.mark.parametrize(
@@ -552,7 +554,7 @@ def tilt_errors(world, config=CONFIG, samples=None):
     """Degrees between up by the filter and true up, and the buffer."""
     samples = dataclasses.replace(world.imu if samples is None else samples, orientation=None)
     buffer = ImuBuffer(config, samples)
-    window = buffer.window(int(samples.stamps[0]), int(samples.stamps[-1]))
+    window = buffer.samples_between(int(samples.stamps[0]), int(samples.stamps[-1]))
     up = Rotation.from_quat(window.orientation).as_matrix()[:, 2]
     true_up = (world.world_T_start @ world.truth_at(samples.stamps).map_T_lidar)[:, 2, :3]
     return np.rad2deg(np.arccos(np.clip((up * true_up).sum(axis=1), -1.0, 1.0))), buffer
@@ -616,10 +618,10 @@ def test_an_acceleration_that_is_not_gravity_gives_no_orientation():
         buffer = ImuBuffer(CONFIG, samples)
         assert buffer.report.orientation == source
         assert (buffer.orientation(int(ns(1.0))) is None) is (source == "none")
-        assert buffer.turn(int(ns(1.0)), np.array([0.1])) is not None
+        assert buffer.rotations_since(int(ns(1.0)), np.array([0.1])) is not None
         if source == "none":
             assert "is not near 9.81 m/s^2" in buffer.report.problems[0]
-            assert buffer.window(START, START + 10**9).orientation is None
+            assert buffer.samples_between(START, START + 10**9).orientation is None
 
 
 @pytest.mark.parametrize(("gap", "forgets"), [(2.0, False), (30.0, True)])

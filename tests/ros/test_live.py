@@ -208,7 +208,7 @@ def test_units_of_g_and_missing_orientations_are_read_as_those_of_a_bag(tmp_path
     results = replay(live, clock, messages_of(path))
     offline = run(open_dataset(path))
     assert_the_same(live, results, offline)
-    aid = live.pipeline.mapper.imu_aid
+    aid = live.pipeline.mapper.imu
     assert aid is not None
     assert aid.level is not None
     assert "gravity_filter" in aid.buffer.report.orientation

@@ -80,7 +80,7 @@ class Gyro:
     def __init__(self, rate, until=STAMP + 10 * PERIOD):
         self.rate, self.until = np.array(rate), until
 
-    def between(self, first, second):
+    def rotation_between(self, first, second):
         if second > self.until:
             return None
         return gtsam.Rot3.Expmap(self.rate * (second - first) * 1e-9)

@@ -17,7 +17,7 @@ from loam_gtsam import Config, preset
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs/from_loam.md"
 LINK = re.compile(r'\[`([\w.]+)`\]\((\S+\.py)(?: "([^"]+)")?\)')
-SECTIONS = {section.name for section in dataclasses.fields(Config())}
+SECTIONS = set(Config.__annotations__)
 
 
 def rows(heading: str) -> list[list[str]]:
@@ -41,8 +41,9 @@ def value_of(name: str, config: Config) -> Any:
     module, _, key = name.partition(".")
     if module in SECTIONS and hasattr(getattr(config, module), key):
         return getattr(getattr(config, module), key)
-    folder = "datasets." if module == "loam_messages" else ""
-    return getattr(importlib.import_module(f"loam_gtsam.{folder}{module}"), key)
+    (path,) = (ROOT / "loam_gtsam").rglob(f"{module}.py")
+    name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    return getattr(importlib.import_module(name), key)
 
 
 @pytest.fixture(scope="module")

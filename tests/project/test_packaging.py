@@ -31,12 +31,6 @@ def test_the_version_is_that_of_the_project_file_everywhere() -> None:
         assert found[1] == project, page
 
 
-@pytest.mark.parametrize("part", ["tests", "docs", "examples", "benchmarks", ".ci"])
-def test_the_source_distribution_takes_the_whole_checkout(part: str) -> None:
-    assert f"graft {part}\n" in (ROOT / "MANIFEST.in").read_text("utf-8")
-    assert (ROOT / part).is_dir()
-
-
 COMPLETED = [
     ("loam-gtsam ins", "inspect"),
     ("loam-gtsam run --over", "--overwrite"),

@@ -190,14 +190,6 @@ def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
     return keys
 
 
-def one_per_voxel(points: NDArray[np.floating], size: float) -> bool:
-    """Whether points, (N, 3) or more columns, are as :func:`voxel_filter` leaves them."""
-    if size <= 0.0 or len(points) == 0:
-        return True
-    keys = voxel_keys(points, size)
-    return bool((keys[1:] > keys[:-1]).all())
-
-
 def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     """Centroid of the points in each voxel, ordered by voxel.
 

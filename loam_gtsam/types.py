@@ -166,10 +166,13 @@ class Features:
     sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
         (used by scan-to-scan odometry).
     span : (first, last) seconds from ``stamp`` covered by the sweep.
-    edge_kinks : (E,) metres by which each edge stands out of its ring, in the unit in which range
-        noise has its own standard deviation (``kinks`` of the feature extraction); None if
-        unknown: all edges then count as real ones.
+    edge_prominence : (E,) metres by which each edge stands out of its ring, scaled so that range
+        noise alone gives it the standard deviation of the noise
+        (:func:`loam_gtsam.frontend.curvature.prominence`). None if unknown: all edges then count
+        as real ones.
     not_finite : points of the sweep that were NaN or infinite
+    voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
+        point each (:func:`loam_gtsam.frontend.features.thinned`); None if they hold all points.
     """
 
     stamp: int
@@ -182,8 +185,9 @@ class Features:
     sharp: IntArray
     flat: IntArray
     span: tuple[float, float] = (0.0, 0.0)
-    edge_kinks: FloatArray | None = None
+    edge_prominence: FloatArray | None = None
     not_finite: int = 0
+    voxel_sizes: tuple[float, float] | None = None
 
     @classmethod
     def from_points(

@@ -529,7 +529,7 @@ def test_foliage_does_not_hold_the_pose(seed, range_noise, tracked):
     config = Config()
     config = replace(
         config,
-        # Without posts: the trunks alone would do.
+        # Without poles: the trunks alone would do.
         features=replace(config.features, range_noise=range_noise, post_depth=0.0),
         imu=replace(config.imu, enabled=False),
     )

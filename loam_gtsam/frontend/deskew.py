@@ -62,9 +62,9 @@ class MovingSweep:
         self.stamp = features.stamp + round(self.middle * 1e9)
         if thin:
             features = thinned(features, config.map)
-        kinks, least = features.edge_kinks, _DISTINCT * config.features.range_noise
+        prominence, least = features.edge_prominence, _DISTINCT * config.features.range_noise
         self.distinct: BoolArray = (
-            np.ones(len(features.edges), np.bool_) if kinks is None else kinks > least
+            np.ones(len(features.edges), np.bool_) if prominence is None else prominence > least
         )
         self._points = [features.edges, features.planes]
         times = features.edge_times, features.plane_times

@@ -1,8 +1,8 @@
-"""Thin things that stand alone: poles, trunks, table legs.
+"""Pole features: poles, trunks and table legs, which are thin and stand alone.
 
 LOAM judges a point by five neighbours on either side of it on the same surface, which a pole of
-ten centimetres does not offer: most of its points count as grazed or occluded. Where nothing else
-stands, they are all there is to hold on to.
+ten centimetres does not offer: most points of a pole count as grazed or occluded. On open ground
+poles are nevertheless all that holds the pose.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ of its radius before its axis."""
 
 
 @dataclass(frozen=True, slots=True)
-class Posts:
-    """Thin things of a sweep, one for each ring that meets them.
+class Poles:
+    """Poles of a sweep, one for each ring that meets a pole.
 
     Attributes
     ----------
-    points : (M, 3) metres, on the axis of a round post through the points of the run
+    points : (M, 3) metres, on the axis of a round pole through the points of the run
     first, last : (M,) first and last point of each run
-    depths : (M,) metres by which they stand before what is beside them; infinite before nothing
+    depths : (M,) metres by which a pole stands before what is beside it; infinite if nothing is
     """
 
     points: FloatArray
@@ -42,8 +42,13 @@ class Posts:
     def __len__(self) -> int:
         return len(self.points)
 
+    @property
+    def middles(self) -> IntArray:
+        """(M,) the point in the middle of each run."""
+        return (self.first + self.last) // 2
+
     def members(self, count: int) -> BoolArray:
-        """(count,) which points of the sweep belong to one."""
+        """(count,) which of the ``count`` points of the sweep belong to a pole."""
         step = np.zeros(count + 1, np.int64)
         np.add.at(step, self.first, 1)
         np.add.at(step, self.last + 1, -1)
@@ -51,23 +56,28 @@ class Posts:
         return inside
 
 
-def find_posts(
+def find_poles(
     xyz: NDArray[np.float32],
     ring_starts: IntArray,
     depth: float,
     width: float,
     most: int,
-) -> Posts:
-    """Runs of a ring that are narrow, and nearer than what is on either side of them.
+) -> Poles:
+    """Find the runs of a ring that are narrow, and nearer than what is on either side of them.
 
     Parameters
     ----------
     xyz : (3, N) metres, ring after ring in firing order
     ring_starts : (R + 1,) where each ring begins; the last entry is N
-    depth : metres by which a run stands before the next points on both sides; nothing there will do
-    width : metres across it at most
+    depth : metres by which a run must stand before the next points on both sides, where there are
+        any; 0 finds no poles
+    width : metres across a run at most
     most : points of a run at most
     """
+    nothing = np.zeros(0, np.int64)
+    none = Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
+    if depth <= 0.0:
+        return none
     count = int(ring_starts[-1])
     own = ring_starts[1:] > ring_starts[:-1]
     heads, tails = ring_starts[:-1][own], ring_starts[1:][own] - 1
@@ -81,10 +91,10 @@ def find_posts(
     farther = ranges[following] - ranges
     reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
     apart = turn > _LINKED_BEAMS * spacing
-    # On a ring of a few points its end may lie beside its start, and still be a turn away.
+    # On a ring of a few points the last may lie beside the first, and still be a turn away.
     apart[tails[tails - heads < most]] = True
     cut = apart | (np.hypot(farther, turn * ranges) > reach)
-    # Runs do not go on from the end of a ring to its start: one that does is cut there.
+    # A run does not go on from the end of a ring to its start: it is cut there.
     ends = cut.copy()
     ends[tails] = True
     last = np.flatnonzero(ends)
@@ -101,8 +111,7 @@ def find_posts(
     chosen &= depths > depth
     first, last, depths, length = first[chosen], last[chosen], depths[chosen], length[chosen]
     if len(first) == 0:
-        nothing = np.zeros(0, np.int64)
-        return Posts(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
+        return none
     sums = np.concatenate([np.zeros((3, 1)), np.cumsum(xyz, axis=1, dtype=np.float64)], axis=1)
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
@@ -110,4 +119,4 @@ def find_posts(
     radii = 0.5 * across * distance
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
-    return Posts(points[narrow], first[narrow], last[narrow], depths[narrow])
+    return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 
 from loam_gtsam.config import Config, DeskewConfig, FeatureConfig, SensorConfig
-from loam_gtsam.frontend.features import (
-    _voxel_per_ring,
+from loam_gtsam.frontend.curvature import (
     curvature,
-    extract_features,
-    kinks,
-    pick,
-    roughness,
-    sector_bounds,
     squared_gaps,
-    thinned,
     unreliable_points,
     window_fits,
+)
+from loam_gtsam.frontend.features import (
+    extract_features,
+    pick_by_sector,
+    sector_bounds,
+    thinned,
+    voxel_filter_by_ring,
 )
 from loam_gtsam.frontend.organise import organise
 from loam_gtsam.frontend.rings import ELEVATIONS
@@ -99,78 +99,6 @@ def test_pole_is_an_edge_and_the_wall_it_hides_is_not() -> None:
     assert np.any(np.hypot(flank[:, 0], flank[:, 1]) > 9.0)
 
 
-def test_occlusion_rejects_the_six_points_behind_on_either_side() -> None:
-    scan = world(pole_and_wall, np.array([0.0]), AHEAD)
-    xyz = scan.points.T.astype(np.float32)
-    starts = np.array([0, xyz.shape[1]])
-    gaps = squared_gaps(xyz, starts)
-    rejected = unreliable_points(xyz, gaps, starts, replace(LOAM, grazing_ratio=1e9))
-    pole = np.flatnonzero(np.hypot(xyz[0], xyz[1]) < 6.0)
-    expected = np.concatenate((pole[0] - 1 - np.arange(6), pole[-1] + 1 + np.arange(6)))
-    assert np.array_equal(np.flatnonzero(rejected), np.sort(expected))
-
-
-@pytest.mark.parametrize(
-    ("change", "count"),
-    [({}, 6), ({"occlusion_gap": 2.3}, 0), ({"occlusion_gap": 2.2}, 6)],
-)
-def test_occlusion_gap(change: dict[str, float], count: int) -> None:
-    # 20 points at 5 m, then 20 at 6.5 m on almost the same ray: squared gap 2.25.
-    azimuth = 0.001 * np.arange(40)
-    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
-    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
-    xyz = xyz.astype(np.float32)
-    starts = np.array([0, 40])
-    settings = replace(LOAM, grazing_ratio=1e9, **change)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    assert np.array_equal(np.flatnonzero(rejected), 20 + np.arange(count))
-
-
-@pytest.mark.parametrize(("turn", "one_ray"), [(0.09, True), (0.11, False)])
-def test_occlusion_needs_the_two_on_one_ray(turn: float, one_ray: bool) -> None:
-    azimuth = 0.001 * np.arange(40) + np.where(np.arange(40) < 20, 0.0, turn)
-    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
-    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
-    xyz = xyz.astype(np.float32)
-    starts = np.array([0, 40])
-    settings = replace(LOAM, grazing_ratio=1e9)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    assert rejected.any() == one_ray
-
-
-def test_occlusion_does_not_reach_into_the_next_ring() -> None:
-    # The ring ends three points behind the occlusion; the next ring starts elsewhere.
-    distance = np.concatenate((np.full(20, 5.0), np.full(3, 6.5), np.full(20, 30.0)))
-    azimuth = 0.001 * np.arange(43)
-    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
-    xyz = xyz.astype(np.float32)
-    starts = np.array([0, 23, 43])
-    settings = replace(LOAM, grazing_ratio=1e9)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    assert np.array_equal(np.flatnonzero(rejected), [20, 21, 22])
-
-
-def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
-    # A wall along x at y = 1 seen every 0.2 degrees: gaps of about r^2 * 0.0035 m.
-    azimuth = np.deg2rad(np.arange(4.0, 90.0, 0.2))
-    xyz = np.stack((1 / np.tan(azimuth), np.ones(len(azimuth)), np.zeros(len(azimuth))))
-    xyz = xyz.astype(np.float32)
-    starts = np.array([0, len(azimuth)])
-    settings = replace(LOAM, occlusion_gap=1e9)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    distance = np.hypot(xyz[0], xyz[1])
-    bound = np.sqrt(LOAM.grazing_ratio) / np.deg2rad(0.2)
-    assert rejected[1:-1][distance[1:-1] > 1.05 * bound].all()
-    assert not rejected[distance < 0.95 * bound].any()
-    # One large gap is an edge, not a grazed surface.
-    step = np.zeros((3, 30), np.float32)
-    step[0] = np.where(np.arange(30) < 15, 5.0, 9.0)
-    step[1] = 0.01 * np.arange(30)
-    assert not unreliable_points(
-        step, squared_gaps(step, np.array([0, 30])), np.array([0, 30]), settings
-    ).any()
-
-
 def test_grazed_wall_gives_no_edges() -> None:
     def street(azimuth: np.ndarray) -> np.ndarray:
         return np.minimum(2.0 / np.maximum(np.abs(np.sin(azimuth)), 1e-9), 60.0)
@@ -182,22 +110,7 @@ def test_grazed_wall_gives_no_edges() -> None:
     assert far(extract_features(scan, Config())) == 0
 
 
-# --- curvature, windows, sectors --------------------------------------------------------------
-
-
-@pytest.mark.parametrize("half_window", [1, 5])
-def test_curvature_is_the_squared_sum_of_differences(half_window: int) -> None:
-    xyz = np.random.default_rng(0).uniform(-50, 50, (3, 60)).astype(np.float32)
-    found = curvature(xyz, half_window)
-    for i in range(half_window, 60 - half_window):
-        around = xyz[:, i - half_window : i + half_window + 1].astype(float)
-        expected = np.sum((around - xyz[:, i : i + 1]).sum(axis=1) ** 2)
-        assert found[i] == pytest.approx(expected, rel=1e-4)
-
-
-def test_windows_stay_in_their_ring() -> None:
-    fits = window_fits(np.array([0, 12, 15, 40]), 5)
-    assert np.array_equal(np.flatnonzero(fits), [5, 6, *range(20, 35)])
+# --- sectors --------------------------------------------------------------
 
 
 def test_sectors_split_what_has_a_window() -> None:
@@ -331,7 +244,7 @@ def test_suppression_stops_at_a_gap() -> None:
         linked = np.ones(40, dtype=bool)
         if gap_at is not None:
             linked[gap_at] = False
-        found, rank = pick(score, eligible, cells, 5, linked, 5, np.ones(40, dtype=bool))
+        found, rank = pick_by_sector(score, eligible, cells, 5, linked, 5, np.ones(40, dtype=bool))
         assert found.tolist() == expected
         assert rank.tolist() == list(range(len(expected)))
 
@@ -379,9 +292,16 @@ def test_rest_is_the_voxel_filtered_remainder_of_each_ring() -> None:
 
 def test_rings_that_meet_in_a_voxel_stay_apart() -> None:
     xyz = np.full((3, 4), 0.1, np.float32)
-    points, times, rings = _voxel_per_ring(xyz, np.arange(4.0), np.array([0, 0, 1, 1]), 0.2)
+    points, times, rings = voxel_filter_by_ring(xyz, np.arange(4.0), np.array([0, 0, 1, 1]), 0.2)
     assert points == pytest.approx(np.full((2, 3), 0.1))
     assert (times.tolist(), rings.tolist()) == ([0.5, 2.5], [0, 1])
+
+
+def test_voxels_two_hundred_thousand_apart_are_not_taken_for_one() -> None:
+    far = np.array([[0.0005, 262.1445, 0.0], [0.0015, 0.0005, 0.0]], np.float32)
+    points, times, rings = voxel_filter_by_ring(far.T, np.arange(2.0), np.array([0, 0]), 0.001)
+    assert points == pytest.approx(far)
+    assert (times.tolist(), rings.tolist()) == ([0.0, 1.0], [0, 0])
 
 
 @pytest.mark.parametrize("bound", [0.1, 1e-3])
@@ -456,47 +376,6 @@ def test_one_ring_is_refused() -> None:
 # --- noise and surfaces -----------------------------------------------------------------------
 
 
-def along_wall(distance: float, azimuths: np.ndarray, noise: np.ndarray | float = 0.0):
-    """(3, N) one ring on a wall at y = distance, ranges off by noise."""
-    ranges = distance / np.sin(azimuths) + noise
-    return np.stack([ranges * np.cos(azimuths), ranges * np.sin(azimuths), 0 * ranges]).astype("f4")
-
-
-GRAZED = np.deg2rad(np.arange(6.0, 174.0, 0.2))
-
-
-def test_a_wall_is_smooth_and_straight_however_grazed() -> None:
-    wall = along_wall(1.7, GRAZED)
-    middle = np.arange(5, len(GRAZED) - 5)
-    assert curvature(wall, 5)[:20].max() > 1.0  # what LOAM's curvature takes for an edge
-    assert roughness(wall)[middle].max() < 2e-3
-    assert kinks(wall, 5, middle).max() < 2e-3
-
-
-def test_roughness_and_kinks_are_in_units_of_the_range_noise() -> None:
-    rng = np.random.default_rng(0)
-    wall = along_wall(8.0, GRAZED, 0.02 * rng.normal(size=len(GRAZED)))
-    middle = np.arange(5, len(GRAZED) - 5)
-    assert np.sqrt(np.mean(kinks(wall, 5, middle) ** 2)) == pytest.approx(0.02, rel=0.2)
-    smooth = roughness(wall)[middle]
-    assert 0.008 < np.median(smooth) < 0.02  # the smoothest of three windows
-    # One window alone: the residual variance of a fitted line, as numpy finds it.
-    few = along_wall(8.0, GRAZED[:5], 0.02 * rng.normal(size=5))
-    squared = np.sum(few.astype(float) ** 2, axis=0)
-    inverse, place = 1 / np.sqrt(squared), np.arange(5)
-    off = (inverse - np.polyval(np.polyfit(place, inverse, 1), place)) * squared[2]
-    assert roughness(few)[2] == pytest.approx(np.sqrt(np.sum(off**2) / 3), rel=0.1)
-
-
-def test_next_to_a_step_a_surface_is_smooth_and_the_step_is_a_kink() -> None:
-    step = along_wall(8.0, GRAZED, np.where(np.arange(len(GRAZED)) < 400, 0.0, 3.0))
-    rough = roughness(step)
-    assert rough[390:410].max() < 0.01
-    # Five neighbours are beyond the step: 5 * 3 m * (8 m / 11 m), or its inverse, over sqrt(110).
-    expected = np.array([0.0, 15.0 * 8 / 11, 15.0 * 11 / 8]) / np.sqrt(110)
-    assert kinks(step, 5, np.array([380, 399, 400])) == pytest.approx(expected, abs=0.02)
-
-
 @pytest.mark.parametrize(("noise", "kept"), [(0.02, True), (0.3, False)])
 def test_foliage_gives_no_planes_and_a_noisy_wall_does(noise: float, kept: bool) -> None:
     scan = world(lambda azimuth: np.full(len(azimuth), 12.0))
@@ -506,10 +385,6 @@ def test_foliage_gives_no_planes_and_a_noisy_wall_does(noise: float, kept: bool)
     bare = len(extract_features(scan, ROUGH_TOO).planes)
     share = len(extract_features(scan, Config()).planes) / bare
     assert share > 0.9 if kept else share < 0.4
-
-
-def test_too_short_a_sweep_is_rough_everywhere() -> None:
-    assert np.isinf(roughness(along_wall(8.0, GRAZED[:4]))).all()
 
 
 # --- real data --------------------------------------------------------------------------------
@@ -550,7 +425,7 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
     raw = Features.from_points(7, points, points[:300])
     raw = replace(raw, edge_times=times, plane_times=times[:300], span=(0.0, 0.1), not_finite=3)
     if known:
-        raw = replace(raw, edge_kinks=times + 1.0)
+        raw = replace(raw, edge_prominence=times + 1.0)
     config = replace(Config().map, edge_voxel=0.5, plane_voxel=1.0)
     thin = thinned(raw, config)
     for size, held, moments, all_points in (
@@ -564,10 +439,10 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
             np.testing.assert_allclose(point, all_points[inside].mean(axis=0), atol=1e-12)
             assert moment == pytest.approx(times[: len(inside)][inside].mean(), abs=1e-12)
     assert (thin.stamp, thin.span, thin.not_finite) == (7, (0.0, 0.1), 3)
-    assert thin.edge_kinks is not None
+    assert thin.edge_prominence is not None
     expected = thin.edge_times + 1.0 if known else np.full(len(thin.edges), np.inf)
-    np.testing.assert_allclose(thin.edge_kinks, expected)
+    np.testing.assert_allclose(thin.edge_prominence, expected)
     assert len(thin.edge_rings) == len(thin.edges)
     assert len(thin.plane_rings) == len(thin.planes)
     assert thinned(thin, config) is thin
-    assert thinned(thin, replace(config, plane_voxel=2.0)) is not thin
+    assert len(thinned(thin, replace(config, plane_voxel=2.0)).planes) < len(thin.planes)

@@ -1,4 +1,4 @@
-"""Thin things: found where they stand alone, and not where they do not."""
+"""Poles: found where they stand alone, and not where they do not."""
 
 import numpy as np
 import pytest
@@ -6,7 +6,7 @@ import pytest
 from loam_gtsam.config import Config, FeatureConfig
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
-from loam_gtsam.frontend.poles import find_posts
+from loam_gtsam.frontend.poles import find_poles
 
 STEP = np.deg2rad(0.2)
 
@@ -20,26 +20,26 @@ def ring(ranges, first=0.0):
 
 def found(points, depth=0.5, width=0.5, most=10, starts=None):
     bounds = np.array([0, points.shape[1]] if starts is None else starts)
-    return find_posts(points, bounds, depth, width, most)
+    return find_poles(points, bounds, depth, width, most)
 
 
 def wall(count=200, metres=12.0):
     return np.full(count, metres)
 
 
-def test_a_run_before_a_wall_is_one_post_on_the_axis():
+def test_a_run_before_a_wall_is_one_pole_on_the_axis():
     ranges = wall()
-    # A round post of 0.1 m at 8 m: as a beam meets it.
+    # A round pole of 0.1 m at 8 m: as a beam meets it.
     angle = STEP * (np.arange(200) - 100.0)
     across = 8.0 * np.sin(angle)
     met = np.abs(across) < 0.1
     ranges[met] = 8.0 * np.cos(angle[met]) - np.sqrt(0.01 - across[met] ** 2)
-    posts = found(ring(ranges))
-    assert len(posts) == 1
-    assert (posts.first[0], posts.last[0]) == (np.flatnonzero(met)[0], np.flatnonzero(met)[-1])
-    assert np.linalg.norm(posts.points[0]) == pytest.approx(8.0, abs=0.02)
-    assert posts.depths[0] == pytest.approx(4.0, abs=0.15)
-    assert np.array_equal(np.flatnonzero(posts.members(200)), np.flatnonzero(met))
+    poles = found(ring(ranges))
+    assert len(poles) == 1
+    assert (poles.first[0], poles.last[0]) == (np.flatnonzero(met)[0], np.flatnonzero(met)[-1])
+    assert np.linalg.norm(poles.points[0]) == pytest.approx(8.0, abs=0.02)
+    assert poles.depths[0] == pytest.approx(4.0, abs=0.15)
+    assert np.array_equal(np.flatnonzero(poles.members(200)), np.flatnonzero(met))
 
 
 @pytest.mark.parametrize(
@@ -57,7 +57,7 @@ def test_depth_width_and_number_decide(change, count):
     assert len(found(ring(ranges), **change)) == count
 
 
-def test_a_hole_in_a_wall_and_a_step_are_no_posts():
+def test_a_hole_in_a_wall_and_a_step_are_no_poles():
     hole = wall()
     hole[100:105] = 15.0
     assert len(found(ring(hole))) == 0
@@ -71,9 +71,9 @@ def test_a_hole_in_a_wall_and_a_step_are_no_posts():
 def test_before_the_sky_nothing_has_to_be_farther():
     ranges = np.full(200, np.nan)
     ranges[50:54], ranges[120:123] = 20.0, 30.0
-    posts = found(ring(ranges))
-    assert len(posts) == 2
-    assert np.isinf(posts.depths).all()
+    poles = found(ring(ranges))
+    assert len(poles) == 2
+    assert np.isinf(poles.depths).all()
     # The only thing on a ring: its end is followed by its start, a turn later.
     ranges[120:123] = np.nan
     assert len(found(ring(ranges))) == 1
@@ -89,9 +89,9 @@ def test_rings_do_not_touch():
     ranges = wall()
     ranges[-3:] = 8.0
     both = np.concatenate([ring(ranges), ring(wall(metres=9.0))], axis=1)
-    posts = found(both, starts=[0, 200, 400])
+    poles = found(both, starts=[0, 200, 400])
     # The three are cut from the next ring; their own ring goes on, a turn later, at its start.
-    assert posts.members(400)[200:].sum() == 0
+    assert poles.members(400)[200:].sum() == 0
 
 
 def test_no_points_of_a_kind_is_no_error():
@@ -116,15 +116,15 @@ def near_poles(features, world, points):
 
 def test_poles_become_edges_near_their_axes_and_stay_out_of_the_planes():
     world = SimulatedWorld(scene(), frames=2)
-    with_posts = extract_features(world[0], Config())
+    with_poles = extract_features(world[0], Config())
     without = extract_features(world[0], Config(features=FeatureConfig(post_depth=0.0)))
-    on = near_poles(with_posts, world, with_posts.edges)
+    on = near_poles(with_poles, world, with_poles.edges)
     assert on.sum() > 20
     assert on.sum() > 2 * near_poles(without, world, without.edges).sum()
-    points = with_posts.edges[on] @ world.world_T_start[:3, :3].T + world.world_T_start[:3, 3]
+    points = with_poles.edges[on] @ world.world_T_start[:3, :3].T + world.world_T_start[:3, 3]
     axes = world.scene.solids.cylinders[:, :2]
     off = np.linalg.norm(points[:, None, :2] - axes[None], axis=2).min(axis=1)
     assert np.median(off) < 0.03
-    assert with_posts.edge_kinks[on].min() > 0.5
-    assert near_poles(with_posts, world, with_posts.planes).sum() == 0
-    assert with_posts.sharp.max(initial=-1) < len(with_posts.edges)
+    assert with_poles.edge_prominence[on].min() > 0.5
+    assert near_poles(with_poles, world, with_poles.planes).sum() == 0
+    assert with_poles.sharp.max(initial=-1) < len(with_poles.edges)

@@ -1,0 +1,181 @@
+"""Measures along the rings of a sweep: how bent, how rough and how trustworthy each point is.
+
+Equations: docs/maths/features.md. Throughout, ``xyz`` is (3, N) float32 in metres, ring after ring
+in firing order, and ``ring_starts`` (R + 1,) says where each ring begins, its last entry being N.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.config import FeatureConfig
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
+
+_LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
+"""Residual sum of squares of a straight line through five even samples, from their second
+differences a, b, c: ``0.4 (a^2 + c^2) + 0.7 b^2 + 0.8 b (a + c) + 0.4 a c``, the quadratic form of
+``(D D^T)^-1`` with D the second differences of five samples."""
+
+
+def window_fits(ring_starts: IntArray, half_window: int) -> BoolArray:
+    """(N,) true where the window around a point stays within its ring."""
+    count = int(ring_starts[-1])
+    fits = np.ones(count, dtype=bool)
+    near = (ring_starts[:, None] + np.arange(-half_window, half_window)).ravel()
+    fits[near[(near >= 0) & (near < count)]] = False
+    return fits
+
+
+def curvature(xyz: NDArray[np.float32], half_window: int) -> NDArray[np.float32]:
+    """LOAM's curvature: squared norm of the sum of differences to the neighbours on the ring.
+
+    Parameters
+    ----------
+    xyz : (3, N) points of the sweep
+    half_window : neighbours on either side
+
+    Returns
+    -------
+    (N,) square metres. Meaningless where :func:`window_fits` is false.
+    """
+    width = 2 * half_window + 1
+    inner = xyz.shape[1] - width + 1
+    total = xyz[:, half_window : half_window + inner] * np.float32(-width)
+    for shift in range(width):
+        total += xyz[:, shift : shift + inner]
+    result = np.zeros(xyz.shape[1], dtype=np.float32)
+    result[half_window : half_window + inner] = _squared_norm(total)
+    return result
+
+
+def prominence(xyz: NDArray[np.float32], half_window: int, chosen: IntArray) -> FloatArray:
+    """How far points stand out, along their beams, of the surface through their neighbours.
+
+    On *every* plane the inverse range is linear in the direction of the beam. So a point of a wall,
+    however grazed, lies where the mean of its neighbours on one side and the mean of those on the
+    other side predict it, interpolated by angle. :func:`curvature` is large on a grazed wall, whose
+    points are spread unevenly. Evenly weighted inverse ranges would be off where a beam was lost.
+
+    Parameters
+    ----------
+    xyz : (3, N) points of the sweep
+    half_window : w, neighbours on either side
+    chosen : (M,) indices of points whose windows stay within their rings
+
+    Returns
+    -------
+    (M,) metres: the distance along the beam, divided by ``sqrt(1 + (a^2 + b^2) / w)``, its standard
+    deviation for unit range noise, with a and b = 1 - a the weights of the two sides
+    """
+    window = xyz[:, chosen[:, None] + np.arange(-half_window, half_window + 1)].astype(np.float64)
+    inverse = 1.0 / np.sqrt((window * window).sum(axis=0))
+    beams = window * inverse
+    turned = np.sqrt(((beams - beams[:, :, half_window, None]) ** 2).sum(axis=0))
+    before, after = slice(0, half_window), slice(half_window + 1, None)
+    left, right = turned[:, before].mean(axis=1), turned[:, after].mean(axis=1)
+    share = np.divide(right, left + right, out=np.full(len(chosen), 0.5), where=left + right > 0.0)
+    centre = inverse[:, half_window]
+    expected = share * inverse[:, before].mean(axis=1)
+    expected += (1.0 - share) * inverse[:, after].mean(axis=1)
+    unit = np.sqrt(1.0 + (share**2 + (1.0 - share) ** 2) / half_window)
+    off: FloatArray = np.abs(expected - centre) / (centre**2 * unit)
+    return off
+
+
+def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Scatter along the beam of five consecutive points of a ring about a smooth surface.
+
+    A straight line is fitted to the inverse ranges (see :func:`prominence`); its residuals have
+    three degrees of freedom, the second differences. Of the windows that end at, are centred on and
+    begin at a point the smoothest counts, so that points next to an edge are not rough.
+
+    Parameters
+    ----------
+    xyz : (3, N) points of the sweep
+
+    Returns
+    -------
+    (N,) metres, a standard deviation; infinite within two points of the ends
+    """
+    squared = _squared_norm(xyz)
+    inverse = 1.0 / np.sqrt(squared)
+    count = len(inverse)
+    best = np.full(count, np.inf, dtype=np.float32)
+    if count < 5:
+        return best
+    second = (inverse[:-2] - 2.0 * inverse[1:-1] + inverse[2:]) * squared[1:-1]
+    left, centre, right = second[:-2], second[1:-1], second[2:]
+    outer, inner, beside, across = _LINE_RESIDUALS
+    scatter = outer * (left * left + right * right) + inner * (centre * centre)
+    scatter += beside * (centre * (left + right)) + across * (left * right)
+    middle = best[2:-2]
+    middle[:] = scatter
+    middle[2:] = np.minimum(middle[2:], scatter[:-2])
+    middle[:-2] = np.minimum(middle[:-2], scatter[2:])
+    rough: NDArray[np.float32] = np.sqrt(np.maximum(best, 0.0) / np.float32(3.0))
+    return rough
+
+
+def squared_gaps(xyz: NDArray[np.float32], ring_starts: IntArray) -> NDArray[np.float32]:
+    """(N,) squared distance to the next point of the ring, square metres; infinite at its end."""
+    gaps = np.empty(xyz.shape[1], dtype=np.float32)
+    gaps[:-1] = _squared_norm(xyz[:, 1:] - xyz[:, :-1])
+    gaps[ring_starts[1:] - 1] = np.inf
+    return gaps
+
+
+def unreliable_points(
+    xyz: NDArray[np.float32],
+    gaps: NDArray[np.float32],
+    ring_starts: IntArray,
+    settings: FeatureConfig,
+) -> BoolArray:
+    """Points LOAM never picks: on the rim of an occluded surface, or on a grazed one.
+
+    Parameters
+    ----------
+    xyz : (3, N) points of the sweep
+    gaps : (N,) from :func:`squared_gaps`
+    ring_starts : (R + 1,) first point of each ring, and N
+    settings : ``occlusion_gap``, ``occlusion_ratio``, ``grazing_ratio`` and ``half_window`` are
+        used
+
+    Returns
+    -------
+    (N,) true for a point to leave out
+
+    Notes
+    -----
+    Two neighbours lie on almost the same ray if they are far apart, and close once the farther one
+    is drawn in to the range of the nearer one. The nearer surface then cuts off the farther one,
+    whose end is no edge: that point and the five behind it are left out (figure 4b of the paper).
+    Where both gaps of a point are large for its range, the surface is seen at a grazing angle
+    (figure 4a).
+    """
+    squared = _squared_norm(xyz)
+    limit = squared * np.float32(settings.grazing_ratio)
+    out = np.zeros(len(squared), dtype=bool)
+    out[1:] = (gaps[1:] > limit[1:]) & (gaps[:-1] > limit[1:])
+
+    first = np.flatnonzero(gaps > settings.occlusion_gap)
+    first = first[gaps[first] < np.inf]
+    second = first + 1
+    near_is_second = squared[first] > squared[second]
+    near = np.where(near_is_second, second, first)
+    far = np.where(near_is_second, first, second)
+    range_near, range_far = np.sqrt(squared[near]), np.sqrt(squared[far])
+    apart = np.linalg.norm(xyz[:, near] - xyz[:, far] * (range_near / range_far), axis=0)
+    one_ray = apart < settings.occlusion_ratio * range_near
+    far, away = far[one_ray], np.where(near_is_second, -1, 1)[one_ray]
+    hidden = far[:, None] + away[:, None] * np.arange(settings.half_window + 1)
+    ring = np.searchsorted(ring_starts, far, side="right")[:, None]
+    same_ring = (hidden >= ring_starts[ring - 1]) & (hidden < ring_starts[ring])
+    out[hidden[same_ring]] = True
+    return out
+
+
+def _squared_norm(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N,) of (3, N); several times faster than a reduction along the short axis."""
+    squared: NDArray[np.float32] = xyz[0] * xyz[0] + xyz[1] * xyz[1] + xyz[2] * xyz[2]
+    return squared

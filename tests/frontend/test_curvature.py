@@ -1,0 +1,152 @@
+"""Measures along a ring against closed forms: curvature, occlusion, grazing, roughness."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from loam_gtsam.config import FeatureConfig
+from loam_gtsam.frontend.curvature import (
+    curvature,
+    prominence,
+    roughness,
+    squared_gaps,
+    unreliable_points,
+    window_fits,
+)
+
+LOAM = FeatureConfig(post_depth=0.0)
+GRAZED = np.deg2rad(np.arange(6.0, 174.0, 0.2))
+
+
+def one_ring(azimuth: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """(3, N) points of one level ring."""
+    xyz = np.stack((distance * np.cos(azimuth), distance * np.sin(azimuth), 0 * azimuth))
+    return xyz.astype(np.float32)
+
+
+@pytest.mark.parametrize("half_window", [1, 5])
+def test_curvature_is_the_squared_sum_of_differences(half_window: int) -> None:
+    xyz = np.random.default_rng(0).uniform(-50, 50, (3, 60)).astype(np.float32)
+    found = curvature(xyz, half_window)
+    for i in range(half_window, 60 - half_window):
+        around = xyz[:, i - half_window : i + half_window + 1].astype(float)
+        expected = np.sum((around - xyz[:, i : i + 1]).sum(axis=1) ** 2)
+        assert found[i] == pytest.approx(expected, rel=1e-4)
+
+
+def test_windows_stay_in_their_ring() -> None:
+    fits = window_fits(np.array([0, 12, 15, 40]), 5)
+    assert np.array_equal(np.flatnonzero(fits), [5, 6, *range(20, 35)])
+
+
+def test_occlusion_rejects_the_six_points_behind_on_either_side() -> None:
+    azimuth = np.deg2rad(np.arange(-50.1, 50.2, 0.2))
+    xyz = one_ring(azimuth, np.where(np.abs(azimuth - 0.2) < 0.023, 5.0, 10.0 / np.cos(azimuth)))
+    starts = np.array([0, xyz.shape[1]])
+    gaps = squared_gaps(xyz, starts)
+    rejected = unreliable_points(xyz, gaps, starts, replace(LOAM, grazing_ratio=1e9))
+    pole = np.flatnonzero(np.hypot(xyz[0], xyz[1]) < 6.0)
+    expected = np.concatenate((pole[0] - 1 - np.arange(6), pole[-1] + 1 + np.arange(6)))
+    assert np.array_equal(np.flatnonzero(rejected), np.sort(expected))
+
+
+@pytest.mark.parametrize(
+    ("change", "count"),
+    [({}, 6), ({"occlusion_gap": 2.3}, 0), ({"occlusion_gap": 2.2}, 6)],
+)
+def test_occlusion_gap(change: dict[str, float], count: int) -> None:
+    # 20 points at 5 m, then 20 at 6.5 m on almost the same ray: squared gap 2.25.
+    azimuth = 0.001 * np.arange(40)
+    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
+    xyz = one_ring(azimuth, distance)
+    starts = np.array([0, 40])
+    settings = replace(LOAM, grazing_ratio=1e9, **change)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    assert np.array_equal(np.flatnonzero(rejected), 20 + np.arange(count))
+
+
+@pytest.mark.parametrize(("turn", "one_ray"), [(0.09, True), (0.11, False)])
+def test_occlusion_needs_the_two_on_one_ray(turn: float, one_ray: bool) -> None:
+    azimuth = 0.001 * np.arange(40) + np.where(np.arange(40) < 20, 0.0, turn)
+    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
+    xyz = one_ring(azimuth, distance)
+    starts = np.array([0, 40])
+    settings = replace(LOAM, grazing_ratio=1e9)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    assert rejected.any() == one_ray
+
+
+def test_occlusion_does_not_reach_into_the_next_ring() -> None:
+    # The ring ends three points behind the occlusion; the next ring starts elsewhere.
+    distance = np.concatenate((np.full(20, 5.0), np.full(3, 6.5), np.full(20, 30.0)))
+    azimuth = 0.001 * np.arange(43)
+    xyz = one_ring(azimuth, distance)
+    starts = np.array([0, 23, 43])
+    settings = replace(LOAM, grazing_ratio=1e9)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    assert np.array_equal(np.flatnonzero(rejected), [20, 21, 22])
+
+
+def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
+    # A wall along x at y = 1 seen every 0.2 degrees: gaps of about r^2 * 0.0035 m.
+    azimuth = np.deg2rad(np.arange(4.0, 90.0, 0.2))
+    xyz = np.stack((1 / np.tan(azimuth), np.ones(len(azimuth)), np.zeros(len(azimuth))))
+    xyz = xyz.astype(np.float32)
+    starts = np.array([0, len(azimuth)])
+    settings = replace(LOAM, occlusion_gap=1e9)
+    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    distance = np.hypot(xyz[0], xyz[1])
+    bound = np.sqrt(LOAM.grazing_ratio) / np.deg2rad(0.2)
+    assert rejected[1:-1][distance[1:-1] > 1.05 * bound].all()
+    assert not rejected[distance < 0.95 * bound].any()
+    # One large gap is an edge, not a grazed surface.
+    step = np.zeros((3, 30), np.float32)
+    step[0] = np.where(np.arange(30) < 15, 5.0, 9.0)
+    step[1] = 0.01 * np.arange(30)
+    assert not unreliable_points(
+        step, squared_gaps(step, np.array([0, 30])), np.array([0, 30]), settings
+    ).any()
+
+
+def along_wall(distance: float, azimuths: np.ndarray, noise: np.ndarray | float = 0.0):
+    """(3, N) one ring on a wall at y = distance, ranges off by noise."""
+    return one_ring(azimuths, distance / np.sin(azimuths) + noise)
+
+
+def test_a_wall_is_smooth_and_straight_however_grazed() -> None:
+    wall = along_wall(1.7, GRAZED)
+    middle = np.arange(5, len(GRAZED) - 5)
+    assert curvature(wall, 5)[:20].max() > 1.0  # what LOAM's curvature takes for an edge
+    assert roughness(wall)[middle].max() < 2e-3
+    assert prominence(wall, 5, middle).max() < 2e-3
+
+
+def test_roughness_and_prominence_are_in_units_of_the_range_noise() -> None:
+    rng = np.random.default_rng(0)
+    wall = along_wall(8.0, GRAZED, 0.02 * rng.normal(size=len(GRAZED)))
+    middle = np.arange(5, len(GRAZED) - 5)
+    assert np.sqrt(np.mean(prominence(wall, 5, middle) ** 2)) == pytest.approx(0.02, rel=0.2)
+    smooth = roughness(wall)[middle]
+    assert 0.008 < np.median(smooth) < 0.02  # the smoothest of three windows
+    # One window alone: the residual variance of a fitted line, as numpy finds it.
+    few = along_wall(8.0, GRAZED[:5], 0.02 * rng.normal(size=5))
+    squared = np.sum(few.astype(float) ** 2, axis=0)
+    inverse, place = 1 / np.sqrt(squared), np.arange(5)
+    off = (inverse - np.polyval(np.polyfit(place, inverse, 1), place)) * squared[2]
+    assert roughness(few)[2] == pytest.approx(np.sqrt(np.sum(off**2) / 3), rel=0.1)
+
+
+def test_next_to_a_step_a_surface_is_smooth_and_the_step_stands_out() -> None:
+    step = along_wall(8.0, GRAZED, np.where(np.arange(len(GRAZED)) < 400, 0.0, 3.0))
+    rough = roughness(step)
+    assert rough[390:410].max() < 0.01
+    # Five neighbours are beyond the step: 5 * 3 m * (8 m / 11 m), or its inverse, over sqrt(110).
+    expected = np.array([0.0, 15.0 * 8 / 11, 15.0 * 11 / 8]) / np.sqrt(110)
+    assert prominence(step, 5, np.array([380, 399, 400])) == pytest.approx(expected, abs=0.02)
+
+
+def test_too_short_a_sweep_is_rough_everywhere() -> None:
+    assert np.isinf(roughness(along_wall(8.0, GRAZED[:4]))).all()

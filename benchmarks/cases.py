@@ -293,7 +293,7 @@ def run_case(case: Case, peers: bool = True) -> CaseResult:
         case.name,
         case.note,
         sweeps=len(result.updates),
-        path=interpolate(truth, error.stamps).length,
+        path=interpolate(truth, error.stamps).path_length,
         ate=error.rmse,
         peers=(*found, *(PeerResult(f"{label} (known)", ate) for label, ate in case.known)),
         stages=stages,

@@ -243,7 +243,7 @@ def city(path: Path) -> Iterator[str]:
         config = replace(config, loops=replace(config.loops, enabled=enabled))
         result = run(world, config, workers=1)
         error = absolute_error(result.trajectory, world.truth)
-        length = world.truth.length
+        length = world.truth.path_length
         seconds = {
             name: sum(update.timings.get(name, 0.0) for update in result.updates)
             for name in ("prepare", "match", "solve", "insert", "covariance", "features", "loops")

@@ -68,7 +68,7 @@ def run_case(peers: bool = True) -> CaseResult:
         NAME,
         note="real OS1-128, three sweeps; see the table of steps",
         sweeps=len(result.updates),
-        path=result.trajectory.length,
+        path=result.trajectory.path_length,
         stages=stages,
         verdicts=(
             Verdict(

@@ -175,7 +175,7 @@ class Runs:
             noise=np.nan if imu is None else noise,
             variant=variant,
             sweeps=len(dataset),
-            path_m=recording.truth.length,
+            path_m=recording.truth.path_length,
             ate_m=error.rmse,
             max_m=error.maximum,
             drift_m=drift(poses, truth),

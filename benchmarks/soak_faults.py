@@ -14,8 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from loam_gtsam.datasets import SimulatedWorld
-from loam_gtsam.datasets.base import Sweep
-from loam_gtsam.types import BadSweep, BoolArray, ImuSamples, IntArray, Scan
+from loam_gtsam.types import BadSweep, BoolArray, ImuSamples, IntArray, Scan, Sweep
 
 SECOND = 10**9
 HOUR, DAY = 3600 * SECOND, 86_400 * SECOND

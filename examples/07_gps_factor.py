@@ -48,7 +48,7 @@ def off_along(result_positions: np.ndarray) -> np.ndarray:
 alone = off_along(run(world, config).trajectory.map_T_lidar[:, :3, 3])
 result = run(world, config, extra_factors=gps)
 with_gps = off_along(result.trajectory.map_T_lidar[:, :3, 3])
-print(f"scans alone: off by {alone.max():.2f} m of {world.truth.length:.1f} m")
+print(f"scans alone: off by {alone.max():.2f} m of {world.truth.path_length:.1f} m")
 print(
     f"with GPS: {np.median(with_gps[had_one]):.2f} m in the {len(had_one)} sweeps with a position"
 )

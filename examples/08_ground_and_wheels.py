@@ -62,7 +62,7 @@ def both(context: PoseContext) -> Sequence[gtsam.NonlinearFactor]:
 
 
 errors = {}
-travelled = world.truth.length
+travelled = world.truth.path_length
 for name, factors in (("scans alone", None), ("with floor and wheels", both)):
     result = run(world, off, extra_factors=factors)
     away = result.trajectory.map_T_lidar[:, :3, 3] - world.truth.map_T_lidar[:, :3, 3]

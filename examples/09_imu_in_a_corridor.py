@@ -28,5 +28,5 @@ inertial = run(world, replace(config, imu=replace(config.imu, preintegration=Tru
 blind = [update for update in inertial.updates if update.status == "degenerate"]
 errors = off_along(constant), off_along(inertial)
 print(f"{len(blind)} of {len(world)} sweeps are degenerate, e.g.: {blind[0].message}")
-print(f"constant velocity: {errors[0]:+.2f} m along, of {world.truth.length:.1f} m")
+print(f"constant velocity: {errors[0]:+.2f} m along, of {world.truth.path_length:.1f} m")
 print(f"pre-integrated:    {errors[1]:+.2f} m along")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.geometry import find, transform, voxel_keys
+from loam_gtsam.geometry import as_array, as_points, as_vector, find, transform, voxel_keys
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
 from loam_gtsam.voxels.archive import Archive, CubeIndex, CubePoints, Owners
 
@@ -172,7 +172,7 @@ class CubeMap:
         InputError
             If the pose is not a finite (4, 4) array in range of the voxel grid.
         """
-        pose = _finite(map_T_lidar, "map_T_lidar", (4, 4))
+        pose = as_array(map_T_lidar, "map_T_lidar", (4, 4))
         cell = self._cell_of(pose[:3, 3])
         shape = np.array(self._config.neighbourhood)
         low = (cell - shape // 2).tolist()
@@ -211,7 +211,7 @@ class CubeMap:
         InputError
             If the array is not (N, 3) floats, all finite; the map is then unchanged.
         """
-        points = _finite(points_map, "points_map", (None, 3))
+        points = as_points(points_map, "points_map")
         self._put(points, np.full(len(points), self.owner, np.int32))
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
@@ -345,7 +345,7 @@ class CubeMap:
         The same calls in the same order give the same answer; the order of points at equal distance
         is otherwise unspecified.
         """
-        queries = _finite(queries, "queries", (None, 3))
+        queries = as_points(queries, "queries")
         if k < 1:
             raise InputError(f"k: expected at least 1, got {k}")
         if not max_distance > 0.0:
@@ -418,7 +418,7 @@ class CubeMap:
 
     def _cell_of(self, position: FloatArray) -> IntArray:
         """Index of the sensor's cube, (3,)."""
-        position = _finite(position, "position", (3,))
+        position = as_vector(position, "position")
         limit = _VOXEL_LIMIT * self._voxel_size
         if np.abs(position).max() >= limit:
             raise InputError(
@@ -661,23 +661,3 @@ def _merge(
 def _index(cell: IntArray) -> CubeIndex:
     x, y, z = cell.tolist()
     return x, y, z
-
-
-def _finite(value: object, name: str, shape: tuple[int | None, ...]) -> FloatArray:
-    """Check a float array's shape (None: any length) and content; return it as float64."""
-    wanted = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ")"
-    if (
-        not isinstance(value, np.ndarray)
-        or value.dtype.kind != "f"
-        or value.ndim != len(shape)
-        or any(n is not None and n != m for n, m in zip(shape, value.shape, strict=True))
-    ):
-        got = f"shape {value.shape} of {value.dtype}" if isinstance(value, np.ndarray) else value
-        raise InputError(f"{name}: expected a {wanted} float array, got {got}")
-    if not np.isfinite(value).all():
-        bad = int(np.count_nonzero(~np.isfinite(value)))
-        raise InputError(
-            f"{name}: expected finite numbers, got {bad} NaN or infinite of {value.size}; "
-            "remove those rows first"
-        )
-    return value.astype(np.float64, copy=False)

@@ -104,7 +104,7 @@ def complement_basis(directions: FloatArray) -> FloatArray:
     return np.ascontiguousarray(np.array(rows).transpose(2, 0, 1))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MatchRows:
     """Matches as whitened plane rows: ``r = scale * (n . (R p + t) + d)``.
 

@@ -1,4 +1,4 @@
-"""Closed-form geometry on arrays of points: rigid motion, fits, voxels.
+"""Closed-form geometry on arrays of points: checks, rigid motion, fits, voxels.
 
 Everything here is vectorised over points and free of state. Tangent order is
 ``[rotation, translation]`` (see :mod:`loam_gtsam.types`).
@@ -7,11 +7,54 @@ Everything here is vectorised over points and free of state. Tangent order is
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from loam_gtsam.types import BoolArray, FloatArray, IntArray
+from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
 
 _SMALL_ANGLE = 1e-9
+
+
+def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:
+    """Anything that numpy makes an array of, as float64, if it is of that shape and finite.
+
+    See :func:`check_array` for the parameters and the errors.
+    """
+    try:
+        array = np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{name}: expected an array, got {error}") from error
+    check_array(array, name, shape, "numbers")
+    finite = np.isfinite(array)
+    if not finite.all():
+        bad = array.size - np.count_nonzero(finite)
+        raise InputError(
+            f"{name}: expected finite numbers, got {bad} NaN or infinite ones of {array.size}"
+        )
+    return array.astype(np.float64, copy=False)
+
+
+def as_points(value: ArrayLike, name: str) -> FloatArray:
+    """(N, 3) finite float64, checked as by :func:`as_array`."""
+    return as_array(value, name, ("N", 3))
+
+
+def as_vector(value: ArrayLike, name: str, size: int = 3) -> FloatArray:
+    """(size,) finite float64, checked as by :func:`as_array`."""
+    return as_array(value, name, (size,))
+
+
+def as_stamps(value: ArrayLike, name: str) -> IntArray:
+    """(N,) int64 nanoseconds; InputError for anything but integers."""
+    stamps = np.asarray(value)
+    if not stamps.size:
+        stamps = stamps.astype(np.int64)
+    try:
+        check_array(stamps, name, ("N",), "integers")
+    except InputError as error:
+        raise InputError(
+            f"{error}; np.round(seconds * 1e9).astype(np.int64) makes nanoseconds of seconds"
+        ) from None
+    return stamps.astype(np.int64, copy=False)
 
 
 def transform(a_T_b: FloatArray, points: NDArray[np.floating]) -> FloatArray:
@@ -19,6 +62,16 @@ def transform(a_T_b: FloatArray, points: NDArray[np.floating]) -> FloatArray:
     moved: FloatArray = points @ a_T_b[:3, :3].T
     moved += a_T_b[:3, 3]
     return moved
+
+
+def inverse_pose(a_T_b: FloatArray) -> FloatArray:
+    """``b_T_a`` of one rigid transform (4, 4), or of each of (N, 4, 4)."""
+    inverse = np.zeros_like(a_T_b)
+    rotation = np.swapaxes(a_T_b[..., :3, :3], -1, -2)
+    inverse[..., :3, :3] = rotation
+    inverse[..., :3, 3] = (-rotation @ a_T_b[..., :3, 3:])[..., 0]
+    inverse[..., 3, 3] = 1.0
+    return inverse
 
 
 def move_points(

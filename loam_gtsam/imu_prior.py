@@ -194,7 +194,7 @@ def tilt_information(information: FloatArray, rotation: gtsam.Rot3) -> FloatArra
     return _inverse(_tilt_covariance(information, roll_pitch_jacobian(rotation))[1])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RollPitchPrior:
     """A Gaussian on roll and pitch.
 

@@ -85,7 +85,7 @@ ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
 """Called once for every sweep that is solved; returns factors on ``context.key``."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Registered:
     """A sweep as it went into the map, to be looked at.
 

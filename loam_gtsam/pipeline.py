@@ -13,7 +13,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config, ImuConfig, SensorConfig, dump_config
-from loam_gtsam.datasets.base import Dataset, Sweep
+from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead
 from loam_gtsam.imu.buffer import ImuBuffer, ImuReport, extrinsic_problem
 from loam_gtsam.imu_prior import Level
@@ -29,11 +29,12 @@ from loam_gtsam.types import (
     Features,
     FeatureSweep,
     FloatArray,
-    FrameStatus,
     InputError,
     MapUpdate,
     Scan,
+    Sweep,
     Trajectory,
+    stack_poses,
 )
 
 OnFrame = Callable[[int, MapUpdate], None]
@@ -41,7 +42,7 @@ OnFrame = Callable[[int, MapUpdate], None]
 _Section = TypeVar("_Section", SensorConfig, ImuConfig)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ImuSummary:
     """What was made of the IMU in a run.
 
@@ -64,7 +65,7 @@ class ImuSummary:
     problem: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
     """What a run computed, complete or not.
 
@@ -105,9 +106,8 @@ class RunResult:
     @property
     def odometry(self) -> Trajectory:
         """One pose per sweep with a valid stamp, as it was found then."""
-        good = [u for u in self.updates if u.status is not FrameStatus.BAD_STAMP]
-        poses = np.array([u.map_T_lidar.matrix() for u in good]).reshape(-1, 4, 4)
-        return Trajectory(np.array([u.stamp for u in good], np.int64), poses)
+        good = [u for u in self.updates if u.status.has_pose]
+        return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
     @property
     def status_counts(self) -> dict[str, int]:
@@ -192,7 +192,7 @@ class Pipeline:
         else:
             pose = last.map_T_lidar.compose(last_odom.between(sweep.odom_T_lidar))
             update = self.mapper.register(sweep.features, pose)
-        if update.status is not FrameStatus.BAD_STAMP:  # then the last pose is that of another
+        if update.status.has_pose:  # then the last pose is that of another
             self._last_odom = sweep.odom_T_lidar
         return self._with_loops(update, sweep.features)
 
@@ -422,7 +422,7 @@ def _stamp(sweep: Sweep) -> int:
 def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
     solved = [update for update in updates if update.status.solved]
     stamps = np.array([update.stamp for update in solved], np.int64)
-    poses = np.array([update.map_T_lidar.matrix() for update in solved]).reshape(-1, 4, 4)
+    poses = stack_poses(update.map_T_lidar for update in solved)
     return ImuSummary(
         report=aid.buffer.report,
         level=aid.level,

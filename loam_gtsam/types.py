@@ -11,7 +11,8 @@ Conventions (the same everywhere):
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
 
@@ -22,7 +23,6 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
 
 MAX_STAMP = 1 << 62
 """Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
@@ -50,34 +50,57 @@ class OutputError(LoamError):
     """A file or a picture could not be written."""
 
 
+def check_array(
+    value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
+) -> None:
+    """Raise InputError unless a value is an array of a given shape and kind of numbers.
+
+    Parameters
+    ----------
+    value, name : what is checked, and what it is called in ``name: expected (N, 3) floats, got
+        shape (7, 4) of float32``
+    shape : of the array; a letter stands for any length, as in ``("N", 3)``
+    numbers : "floats", "integers", or "numbers" for either
+    """
+    kinds = {"floats": "f", "integers": "iu"}.get(numbers, "fiu")
+    got = type(value).__name__
+    if isinstance(value, np.ndarray):
+        same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]
+        if value.dtype.kind in kinds and value.ndim == len(shape) and all(same):
+            return
+        got = f"shape {value.shape} of {value.dtype}"
+    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+    raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
+
+
 class SweepFault(StrEnum):
     """What was wrong with a sweep that was not used."""
 
     UNREADABLE = "unreadable"
-    """Its loader could not read it."""
+    """The file or message could not be read."""
     EMPTY = "empty"
-    """It has no points at all."""
+    """The sweep has no points at all."""
     NOT_FINITE = "not_finite"
-    """Too few of its points, or not all of its features, are finite numbers."""
+    """Too few points are finite numbers, or some features are not."""
     TOO_FEW_POINTS = "too_few_points"
-    """Too few points, or too few that are within range."""
+    """Too few points, or too few within range."""
     BAD_TIMES = "bad_times"
-    """The times of its points cannot be had, or be seconds of one sweep."""
+    """The times of the points are missing, or no seconds within one sweep."""
     BAD_RINGS = "bad_rings"
-    """Its beams cannot be told apart."""
+    """The beams cannot be told apart."""
     NO_FEATURES = "no_features"
     DUPLICATE_STAMP = "duplicate_stamp"
-    """That of the sweep before;  The other stamps: :mod:`loam_gtsam.registration.stamp_check`."""
+    """The stamp is that of the sweep before (:mod:`loam_gtsam.registration.stamp_check`)."""
     LATE = "late"
-    """A later sweep has come already."""
+    """A later sweep was used already."""
     STAMP_BACK = "stamp_back"
-    """So much earlier that it is no late sweep: its stamp is wrong."""
+    """The stamp is so much earlier than that of the last sweep used that it must be wrong."""
     STAMP_AHEAD = "stamp_ahead"
-    """So much later that its stamp is doubted."""
+    """The stamp is so much later than that of the last sweep used that it is doubted."""
     CLOCK_SET_BACK = "clock_set_back"
-    """Sweep after sweep is earlier than the last one used: nothing can be used until a reset."""
+    """Several sweeps in a row are earlier than the last one used; only a reset helps."""
     CLOCK_SET_AHEAD = "clock_set_ahead"
-    """Sweep after sweep is far ahead; from the next one on that is the clock."""
+    """Several sweeps in a row are far ahead; from the next one on their clock is followed."""
 
 
 class SweepError(LoamError):
@@ -94,7 +117,7 @@ class SweepError(LoamError):
         self.fault = fault
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """One sweep of the sensor, as it was measured (not de-skewed).
 
@@ -123,37 +146,23 @@ class Scan:
     rows: int = 0
 
     def __post_init__(self) -> None:
-        points = self.points
-        if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"Scan.points: expected an (N, 3) array, got {_describe(points)}")
-        if points.dtype.kind != "f":
-            raise InputError(f"Scan.points: expected a float dtype, got {points.dtype}")
-        if not isinstance(self.stamp, (int, np.integer)):
+        check_array(self.points, "Scan.points", ("N", 3))
+        if not (isinstance(self.stamp, (int, np.integer)) and abs(int(self.stamp)) <= MAX_STAMP):
             raise InputError(
-                f"Scan.stamp: expected integer nanoseconds, got {self.stamp!r}; "
-                "round(seconds * 1e9) makes them of seconds"
+                "Scan.stamp: expected integer nanoseconds up to 2^62 (the year 2116), got "
+                f"{self.stamp!r}; round(seconds * 1e9) makes them of seconds"
             )
-        if abs(int(self.stamp)) > MAX_STAMP:
-            raise InputError(
-                f"Scan.stamp: expected nanoseconds up to 2^62 (the year 2116), got {self.stamp}"
-            )
-        for name, kinds in (("times", "f"), ("rings", "iu")):
+        for name, numbers in (("times", "floats"), ("rings", "integers")):
             column = getattr(self, name)
-            if column is None:
-                continue
-            if not isinstance(column, np.ndarray) or column.shape != points.shape[:1]:
-                raise InputError(
-                    f"Scan.{name}: expected shape ({len(points)},), one value per point, "
-                    f"got {_describe(column)}"
-                )
-            if column.dtype.kind not in kinds:
-                kind = "a float" if kinds == "f" else "an integer"
-                raise InputError(f"Scan.{name}: expected {kind} dtype, got {column.dtype}")
-        if self.rows and len(points) % self.rows:
-            raise InputError(f"Scan.rows: {len(points)} points do not divide into {self.rows} rows")
+            if column is not None:
+                check_array(column, f"Scan.{name}", (len(self.points),), numbers)
+        if self.rows and len(self.points) % self.rows:
+            raise InputError(
+                f"Scan.rows: {len(self.points)} points do not divide into {self.rows} rows"
+            )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Features:
     """Edge and plane points of one sweep, at the positions they were measured (not de-skewed).
 
@@ -205,32 +214,29 @@ class Features:
         InputError
             If a shape or a dtype is wrong, or a point is not finite or farther than any lidar sees.
         """
-        for name, points in (("edges", edges), ("planes", planes)):
-            if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3:
-                raise InputError(f"{name}: expected an (N, 3) array, got {_describe(points)}")
-            if points.dtype.kind != "f":
-                raise InputError(f"{name}: expected a float dtype, got {points.dtype}")
+        for name, points in {"edges": edges, "planes": planes}.items():
+            check_array(points, name, ("N", 3))
             wild = int(np.count_nonzero(~(np.abs(points) < _FARTHEST).all(axis=1)))
             if wild:
                 raise InputError(
                     f"{name}: expected metres below {_FARTHEST:g}, got {wild} points of "
                     f"{len(points)} that are NaN, infinite or farther; remove them first"
                 )
-        n_edges, n_planes = len(edges), len(planes)
+        edge_numbers, plane_numbers = np.arange(len(edges)), np.arange(len(planes))
         return cls(
-            stamp=stamp,
-            edges=edges.astype(np.float64),
-            planes=planes.astype(np.float64),
-            edge_times=np.zeros(n_edges),
-            plane_times=np.zeros(n_planes),
-            edge_rings=np.zeros(n_edges, np.int64),
-            plane_rings=np.zeros(n_planes, np.int64),
-            sharp=np.arange(n_edges),
-            flat=np.arange(n_planes),
+            stamp,
+            edges.astype(np.float64),
+            planes.astype(np.float64),
+            edge_times=np.zeros(len(edges)),
+            plane_times=np.zeros(len(planes)),
+            edge_rings=np.zeros_like(edge_numbers),
+            plane_rings=np.zeros_like(plane_numbers),
+            sharp=edge_numbers,
+            flat=plane_numbers,
         )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FeatureSweep:
     """Features and odometry of one sweep made by another front end (e.g. LOAM's own topics).
 
@@ -254,7 +260,11 @@ class BadSweep:
     message: str
 
 
-@dataclass(frozen=True, slots=True)
+Sweep = Scan | FeatureSweep | BadSweep
+"""What a data set yields: a measured sweep, one with features, or one that could not be read."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class ImuSamples:
     """A stretch of IMU data.
 
@@ -273,7 +283,7 @@ class ImuSamples:
     acceleration: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Trajectory:
     """Poses over time.
 
@@ -287,20 +297,28 @@ class Trajectory:
     map_T_lidar: FloatArray
 
     def __post_init__(self) -> None:
-        if self.map_T_lidar.shape != (len(self.stamps), 4, 4):
-            raise InputError(
-                f"Trajectory: expected poses of shape ({len(self.stamps)}, 4, 4), "
-                f"got {self.map_T_lidar.shape}"
-            )
+        check_array(self.map_T_lidar, "Trajectory.map_T_lidar", (len(self.stamps), 4, 4), "numbers")
+
+    @classmethod
+    def from_poses(
+        cls, stamps: Sequence[int] | IntArray, poses: Iterable[gtsam.Pose3]
+    ) -> Trajectory:
+        """N poses at N stamps in nanoseconds."""
+        return cls(np.array(stamps, np.int64), stack_poses(poses))
 
     def __len__(self) -> int:
         return len(self.stamps)
 
     @property
-    def length(self) -> float:
+    def path_length(self) -> float:
         """Metres travelled."""
         steps = np.diff(self.map_T_lidar[:, :3, 3], axis=0)
         return float(np.linalg.norm(steps, axis=1).sum())
+
+
+def stack_poses(poses: Iterable[gtsam.Pose3]) -> FloatArray:
+    """(N, 4, 4) matrices of N poses; (0, 4, 4) if there are none."""
+    return np.array([pose.matrix() for pose in poses], np.float64).reshape(-1, 4, 4)
 
 
 class FrameStatus(StrEnum):
@@ -310,8 +328,7 @@ class FrameStatus(StrEnum):
     NOT_CONVERGED = "not_converged"
     """Solved, but the last step was still above the stop rule at the iteration limit."""
     DEGENERATE = "degenerate"
-    """Solved, but the scan says nothing about some direction, which the expected motion decided;
-    the message names it."""
+    """Solved, but the scan leaves a direction free; the expected motion decided it."""
     FIRST = "first"
     """Nothing to match against yet: the guess is the pose, and the map starts here."""
     SPARSE_MAP = "sparse_map"
@@ -324,13 +341,17 @@ class FrameStatus(StrEnum):
     UNUSABLE_SCAN = "unusable_scan"
     """The sweep has no usable points or features; the pose is predicted."""
     BAD_STAMP = "bad_stamp"
-    """The stamp is not later than the one before, or far too late; the sweep is skipped, the pose
-    repeated."""
+    """The stamp is not later than the last one, or far ahead; the last pose is repeated."""
 
     @property
     def solved(self) -> bool:
         """Whether the pose comes from a solve."""
         return self in (FrameStatus.OK, FrameStatus.NOT_CONVERGED, FrameStatus.DEGENERATE)
+
+    @property
+    def has_pose(self) -> bool:
+        """Whether the frame has a pose of its own time; a frame with a bad stamp has none."""
+        return self is not FrameStatus.BAD_STAMP
 
 
 class SweepMotion(StrEnum):
@@ -357,7 +378,7 @@ class TiltPrior(StrEnum):
     """Asked for, but there is no orientation of that moment (a gap, or the end of the stream)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
     """The parts of a solved pose's error (:mod:`loam_gtsam.registration.pose_errors`).
 
@@ -381,7 +402,7 @@ class Uncertainty:
     effective_matches: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.
 
@@ -417,6 +438,9 @@ class MapUpdate:
     timings : seconds per stage
     fault : what was wrong with the sweep, if the status is ``UNUSABLE_SCAN`` or ``BAD_STAMP``
     n_not_finite : points of the sweep that were NaN or infinite, if it was used
+    map_T_middle : pose at the middle of the sweep, the moment at which matches are made and to
+        which priors and own factors belong; None if nothing was matched
+    middle_stamp : nanoseconds of that moment; 0 if nothing was matched
     """
 
     stamp: int
@@ -444,6 +468,8 @@ class MapUpdate:
     timings: Mapping[str, float] = field(default_factory=dict)
     fault: SweepFault | None = None
     n_not_finite: int = 0
+    map_T_middle: gtsam.Pose3 | None = None
+    middle_stamp: int = 0
 
     @property
     def raw_covariance(self) -> FloatArray:
@@ -453,17 +479,7 @@ class MapUpdate:
         classical solvers (``solver.method`` loam or aloam), whose rows count as measured
         to 1 m, it is to be multiplied by the variance of a residual in m^2.
         """
-        if not self.status.solved:
-            return np.full((6, 6), np.nan)
-        try:
-            inverse: FloatArray = np.linalg.inv(self.information).astype(np.float64, copy=False)
-            return inverse
-        except np.linalg.LinAlgError:
-            return np.full((6, 6), np.nan)
-
-
-def _describe(value: object) -> str:
-    """Shape and dtype of an array, or the type of anything else."""
-    if isinstance(value, np.ndarray):
-        return f"shape {value.shape} of {value.dtype}"
-    return type(value).__name__
+        if self.status.solved:
+            with suppress(np.linalg.LinAlgError):
+                return np.asarray(np.linalg.inv(self.information), np.float64)
+        return np.full((6, 6), np.nan)

@@ -52,7 +52,7 @@ def test_a_trajectory_needs_one_pose_per_stamp():
 def test_length_of_a_trajectory():
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, :3, 3] = [[0, 0, 0], [3, 4, 0], [3, 4, 12]]
-    assert Trajectory(np.arange(3), poses).length == pytest.approx(17.0)
+    assert Trajectory(np.arange(3), poses).path_length == pytest.approx(17.0)
 
 
 def test_raw_covariance_is_the_inverse_of_the_information_of_a_solved_frame():

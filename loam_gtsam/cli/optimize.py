@@ -55,9 +55,9 @@ def execute(
     stamps = {key: saved.stamps[key] for key in keys if key in saved.stamps}
     write_graph(target, SavedGraph(result.factors, result.poses, stamps))
     if trajectory is not None:
-        poses = np.array([result.poses.atPose3(key).matrix() for key in keys])
-        times = np.array([stamps[key] for key in keys], np.int64)
-        write_tum(trajectory, Trajectory(times, poses), comments={"graph": path.name})
+        poses = [result.poses.atPose3(key) for key in keys]
+        corrected = Trajectory.from_poses([stamps[key] for key in keys], poses)
+        write_tum(trajectory, corrected, comments={"graph": path.name})
     if not quiet:
         console = Console()
         console.print(_table(saved, result, keys))

@@ -12,7 +12,7 @@ from rich.table import Table
 from rich.text import Text
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset, Sweep
+from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.io.run_files import stage_seconds
@@ -24,6 +24,7 @@ from loam_gtsam.types import (
     ImuSamples,
     MapUpdate,
     Scan,
+    Sweep,
     SweepError,
 )
 
@@ -51,7 +52,7 @@ def summary(
     if result.faults:
         faults = ", ".join(f"{count} {fault}" for fault, count in result.faults.items())
         table.add_row("not used", faults)
-    table.add_row("path", f"{result.trajectory.length:.1f} m")
+    table.add_row("path", f"{result.trajectory.path_length:.1f} m")
     table.add_row(
         "map", f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points"
     )

@@ -30,7 +30,7 @@ from rich.progress import (
 
 from loam_gtsam.cli.report import NOT_MAPPED, profile_table, summary
 from loam_gtsam.config import Config, dump_config
-from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
+from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.io.atomic import make_folder, staged_files
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.io.run_files import RUN_FILES, write_run
@@ -38,7 +38,7 @@ from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.pipeline import Observer, OnFrame, Pipeline, RunResult, effective_config, run
 from loam_gtsam.studies.evaluation import absolute_error, align, align_rotations, interpolate
-from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Trajectory
+from loam_gtsam.types import DatasetError, LoamError, MapUpdate, OutputError, Sweep, Trajectory
 from loam_gtsam.view import frame_plot
 from loam_gtsam.view import plots as visualization
 from loam_gtsam.view.observers import LastFrame, watch
@@ -293,7 +293,7 @@ def compare(
         "ate_rmse_m": error.rmse,
         "ate_max_m": error.maximum,
         "compared_poses": len(error.stamps),
-        "compared_length_m": there.length,
+        "compared_length_m": there.path_length,
     }
     return accuracy, Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
 

@@ -16,9 +16,9 @@ from urllib.parse import parse_qsl
 
 from loam_gtsam.datasets.base import Dataset as Dataset
 from loam_gtsam.datasets.base import DatasetInfo as DatasetInfo
-from loam_gtsam.datasets.base import Sweep as Sweep
 from loam_gtsam.datasets.known.layouts import known_loader
 from loam_gtsam.types import DatasetError
+from loam_gtsam.types import Sweep as Sweep
 
 if TYPE_CHECKING:
     from loam_gtsam.datasets.arrays import ArrayDataset as ArrayDataset

@@ -11,14 +11,12 @@ from typing import Any, Protocol, runtime_checkable
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
-    FeatureSweep,
     ImuSamples,
     IntArray,
     Scan,
+    Sweep,
     Trajectory,
 )
-
-Sweep = Scan | FeatureSweep | BadSweep
 
 
 @dataclass(slots=True)

@@ -43,7 +43,7 @@ _SEAM = 0.9
 """Fraction of a turn: a step back this large, in firing order, passes the start of the sweep."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TimeAssignment:
     """When each point was measured.
 
@@ -61,7 +61,7 @@ class TimeAssignment:
     note: str
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SweepColumns:
     """The usable points of a scan, one row per coordinate, and what came with them.
 
@@ -94,7 +94,7 @@ class SweepColumns:
         return azimuth
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class OrganisedSweep:
     """A sweep, ring after ring, each ring in firing order.
 

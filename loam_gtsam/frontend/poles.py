@@ -23,7 +23,7 @@ _ROUND = 0.25 * np.pi
 of its radius before its axis."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Poles:
     """Poles of a sweep, one for each ring that meets a pole.
 

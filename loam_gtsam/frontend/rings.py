@@ -44,7 +44,7 @@ _STRAY = 0.1
 typical peak (the one the median point belongs to); lower ones are stray returns."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RingAssignment:
     """The beam of each point.
 

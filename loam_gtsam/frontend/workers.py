@@ -19,9 +19,8 @@ from threading import Thread
 from typing import Any
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.frontend.features import extract_features, thinned
-from loam_gtsam.types import Features, Scan, SweepError, SweepFault
+from loam_gtsam.types import Features, Scan, Sweep, SweepError, SweepFault
 
 _AHEAD = 2
 """Sweeps read ahead of the current one, a process: one at work and one that waits for it."""

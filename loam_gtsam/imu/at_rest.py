@@ -32,7 +32,7 @@ REST_GRAVITY = 0.5
 """m/s^2 by which the mean acceleration at rest may differ from gravity: 5 %, a scale and a bias."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RestWindow:
     """A stretch of samples at rest, lidar axes.
 

@@ -26,7 +26,7 @@ _BLOCK = 512
 depend on how the samples came in."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FilterState:
     """What the gravity filter knows at one sample.
 

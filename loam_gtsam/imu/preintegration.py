@@ -52,7 +52,7 @@ _Scan = tuple[gtsam.Pose3, FloatArray, FloatArray | None]
 """Pose, information and gradient of a scan, as :meth:`InertialOdometry.update` takes them."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
     """Where the IMU says the next frame is.
 

@@ -23,7 +23,7 @@ _SMALL_STEP = 1e-2
 next frame takes that away."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class InertialState:
     """The newest frame of the window.
 

@@ -20,12 +20,12 @@ from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import (
     FloatArray,
-    FrameStatus,
-    InputError,
     IntArray,
     MapUpdate,
     Trajectory,
     Uncertainty,
+    check_array,
+    stack_poses,
 )
 
 _NS = 10**9
@@ -101,7 +101,7 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     names = [f"{axes[i]}_{axes[j]}" for i, j in zip(rows, columns, strict=True)]
     lines = [",".join(("stamp_s", "status", *names))]
     for update in updates:
-        if update.status is FrameStatus.BAD_STAMP:
+        if not update.status.has_pose:
             continue
         values = update.covariance[rows, columns]
         cells = [f"{value:.9g}" if np.isfinite(value) else "" for value in values]
@@ -146,7 +146,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     names, seconds = stage_seconds(updates)
     arrays: dict[str, NDArray[Any]] = {
         "stamps": np.array([u.stamp for u in updates], np.int64),
-        "map_T_lidar": _stack([u.map_T_lidar.matrix() for u in updates], (count, 4, 4)),
+        "map_T_lidar": stack_poses(u.map_T_lidar for u in updates),
         "status": np.array([str(u.status) for u in updates], np.str_),
         "messages": np.array([u.message for u in updates], np.str_),
         "covariances": _stack([u.covariance for u in updates], (count, 6, 6)),
@@ -206,8 +206,7 @@ def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.
         If the file cannot be written.
     """
     for name, points in (("edges", edges), ("planes", planes)):
-        if points.ndim != 2 or points.shape[1] != 3:
-            raise InputError(f"write_ply: {name}: expected shape (N, 3), got {points.shape}")
+        check_array(points, f"write_ply: {name}", ("N", 3))
     vertices = np.zeros(len(edges) + len(planes), _PLY_VERTEX)
     vertices["xyz"] = np.concatenate((edges, planes))
     vertices["label"] = np.arange(len(vertices)) >= len(edges)
@@ -285,7 +284,7 @@ def summarise(result: Run) -> dict[str, Any]:
             "points": sum(u.n_not_finite for u in result.updates),
         },
         "messages": messages[:_MAX_MESSAGES],
-        "path_length_m": trajectory.length,
+        "path_length_m": trajectory.path_length,
         "duration_s": float(np.ptp(trajectory.stamps)) / _NS if len(trajectory) else 0.0,
         "frame_ms_median": 1e3 * float(np.median(seconds)) if len(seconds) else None,
         "edge_points": len(result.edge_points),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.geometry import symmetric
+from loam_gtsam.geometry import as_array, as_vector, symmetric
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import BoolArray, FloatArray, InputError, MapUpdate
 
@@ -17,7 +17,7 @@ _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
 """rad and m added to every standard deviation: a factor must not be infinitely sure."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
     """A frame that is a pose of the graph.
 
@@ -50,7 +50,7 @@ class Keyframe:
         return self.update.map_T_lidar
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class LoopClosure:
     """The motion between two keyframes, found by looking at the same place.
 
@@ -103,7 +103,7 @@ def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gauss
     InputError
         If the matrix is no covariance: GTSAM would make NaN of it in silence.
     """
-    matrix = checked("covariance", covariance, (size, size))
+    matrix = as_array(covariance, "covariance", (size, size))
     if not np.allclose(matrix, matrix.T, rtol=1e-6, atol=1e-12 * np.abs(matrix).max()):
         raise InputError("covariance: expected a symmetric matrix; give 0.5 * (C + C.T)")
     values, vectors = np.linalg.eigh(symmetric(matrix))
@@ -115,15 +115,7 @@ def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gauss
 
 def direction(name: str, vector: ArrayLike) -> gtsam.Unit3:
     """The direction of a (3,) vector of any length; InputError if it has none."""
-    array = checked(name, vector, (3,))
+    array = as_vector(vector, name)
     if not np.linalg.norm(array) > 0.0:
         raise InputError(f"{name}: expected a direction, got the zero vector")
     return gtsam.Unit3(array)
-
-
-def checked(name: str, value: ArrayLike, shape: tuple[int, ...]) -> FloatArray:
-    """The value as an array, if it has that shape and is finite; else InputError."""
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name}: expected finite numbers of shape {shape}, got {value!r}")
-    return array

@@ -18,7 +18,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.geometry import transform
+from loam_gtsam.geometry import as_vector, transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.batch import (
     OptimizedGraph,
@@ -31,7 +31,6 @@ from loam_gtsam.loops.consistency import LoopConsistency
 from loam_gtsam.loops.keyframes import (
     Keyframe,
     LoopClosure,
-    checked,
     direction,
     noise_model,
     odometry_between,
@@ -39,10 +38,10 @@ from loam_gtsam.loops.keyframes import (
 from loam_gtsam.types import (
     Features,
     FloatArray,
-    FrameStatus,
     InputError,
     MapUpdate,
     Trajectory,
+    stack_poses,
 )
 
 _RELINEARIZE = 1e-3
@@ -171,7 +170,7 @@ class PoseGraph:
             If there is no such keyframe, or the covariance is not positive definite.
         """
         self._known(index)
-        where = checked("position", position, (3,))
+        where = as_vector(position, "position")
         self._add_factor(gtsam.GPSFactor(index, where, noise_model(covariance, 3)))
         self._journal.append(("position", index, position, covariance))
 
@@ -257,8 +256,7 @@ class PoseGraph:
 
     def poses(self) -> FloatArray:
         """(N, 4, 4) ``map_T_lidar`` of all keyframes."""
-        matrices = [self._poses.atPose3(index).matrix() for index in range(len(self))]
-        return np.array(matrices, np.float64).reshape(-1, 4, 4)
+        return stack_poses(self._poses.atPose3(index) for index in range(len(self)))
 
     def covariance(self, index: int) -> FloatArray:
         """(6, 6) marginal covariance of a keyframe's pose in the map."""
@@ -303,7 +301,7 @@ class PoseGraph:
         session : which run that was, see :meth:`new_session`
         """
         keyframes = [keyframe for keyframe in self.keyframes if keyframe.session == session]
-        good = [update for update in updates if update.status is not FrameStatus.BAD_STAMP]
+        good = [update for update in updates if update.status.has_pose]
         stamps = np.array([update.stamp for update in good], np.int64)
         starts = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
         nexts = np.searchsorted(starts, stamps, side="right").tolist()
@@ -311,8 +309,7 @@ class PoseGraph:
             self._corrected(update, after, keyframes)
             for update, after in zip(good, nexts, strict=True)
         ]
-        matrices = np.array([pose.matrix() for pose in poses], np.float64)
-        return Trajectory(stamps, matrices.reshape(-1, 4, 4))
+        return Trajectory.from_poses(stamps, poses)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane features of all keyframes in the map, (E, 3) and (P, 3) metres."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from loam_gtsam.config import LoopConfig
+from loam_gtsam.geometry import as_points
 from loam_gtsam.types import FloatArray, InputError
 
 _BELOW = 3.0
@@ -32,8 +33,7 @@ def describe(points: FloatArray, config: LoopConfig) -> FloatArray:
         Metres above a level below the lidar; 0 where there is no point. Sectors count from x
         towards y.
     """
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise InputError(f"points: expected an (N, 3) array, got shape {points.shape}")
+    points = as_points(points, "points")
     rings, sectors = config.rings, config.sectors
     ranges = np.hypot(points[:, 0], points[:, 1])
     near = ranges < config.reach

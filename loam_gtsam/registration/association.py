@@ -19,7 +19,7 @@ from loam_gtsam.types import BoolArray, FloatArray, IntArray
 _TINY = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class EdgeMatches:
     """Points matched with lines of the map.
 
@@ -50,7 +50,7 @@ class EdgeMatches:
         return len(self.points)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PlaneMatches:
     """Points matched with planes ``n . q + d = 0`` of the map.
 

@@ -41,7 +41,7 @@ _MIN_DECREASE = 1e-3
 """A step is taken if the cost falls by more than this share of what the linear model says."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Optimum:
     """What an inner solve on fixed matches found."""
 

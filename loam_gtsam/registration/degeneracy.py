@@ -28,7 +28,7 @@ _HELD = 0.5
 """Part of the least number of matches that lines must be for planes to be left out beside them."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Localizability:
     """How well a scan fixes its pose, by direction, the weakest first.
 

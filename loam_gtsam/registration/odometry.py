@@ -14,7 +14,7 @@ from loam_gtsam.geometry import move_points
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Guess:
     """A predicted pose at the reference time of a sweep, and the motion within that sweep.
 

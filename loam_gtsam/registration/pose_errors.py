@@ -64,7 +64,7 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     return symmetric(covariance)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Middle:
     """A solved frame at the middle of its sweep.
 

@@ -26,7 +26,7 @@ _WAITING = 0.1
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class ScanError:
     """What the matches of one frame say about its error, all about the middle of the sweep.
 

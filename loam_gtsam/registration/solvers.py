@@ -52,7 +52,7 @@ _CERTAIN = 1e10
 Associate = Callable[[gtsam.Pose3], ScanMatches]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Solution:
     """What a solver returns.
 
@@ -112,7 +112,7 @@ class Solution:
         return kept
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MotionPrior:
     """Where the pose is expected, for the directions in which a scan does not say it.
 

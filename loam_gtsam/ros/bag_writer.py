@@ -19,7 +19,7 @@ from rosbags import rosbag1, rosbag2
 from loam_gtsam.config import BagConfig
 from loam_gtsam.io.atomic import ClosingWriter
 from loam_gtsam.ros.frame_messages import TYPES, FrameMessages, Points
-from loam_gtsam.types import FrameStatus, MapUpdate, OutputError
+from loam_gtsam.types import MapUpdate, OutputError
 
 _ROS2_VERSION: Literal[8] = 8
 """Of ``metadata.yaml``. Humble cannot parse version 9, and later releases read both
@@ -99,7 +99,7 @@ class BagWriter(ClosingWriter):
         """
         if self._writer is None:
             raise OutputError(f"{self.path}: the bag is closed; nothing can be added to it")
-        if update.status is FrameStatus.BAD_STAMP:
+        if not update.status.has_pose:
             return
         # All of a frame or, if a message cannot be made, none.
         frame = list(self._frames.frame(update, lambda: cloud, surround))

@@ -27,7 +27,7 @@ from loam_gtsam.ros.messages import (
     Messages,
     StampedPose,
 )
-from loam_gtsam.types import ConfigError, FrameStatus, MapUpdate
+from loam_gtsam.types import ConfigError, MapUpdate
 
 TF = "/tf"
 ODOMETRY = "/aft_mapped_to_init"
@@ -104,7 +104,7 @@ class FrameMessages:
         InputError
             If a cloud is not (N, 4).
         """
-        if update.status is FrameStatus.BAD_STAMP:
+        if not update.status.has_pose:
             return
         stamp, messages, config = update.stamp, self._messages, self._config
         yield TF, messages.transform(update)

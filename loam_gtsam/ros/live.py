@@ -17,7 +17,6 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.imu_messages import decode_imu
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
@@ -28,7 +27,7 @@ from loam_gtsam.pipeline import Observer, Pipeline
 from loam_gtsam.ros.live_imu import LiveImu
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
 from loam_gtsam.ros.live_sweeps import ReadySweep, SweepDecoder, checked_stamp
-from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate
+from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate, Sweep
 
 _POLL = 0.02
 """Seconds after which a worker looks whether a sweep has waited for long enough."""
@@ -283,7 +282,7 @@ class LiveMapper:
             self._log.statuses[str(update.status)] += 1
             if update.status is FrameStatus.UNUSABLE_SCAN:
                 self._log.fault(update.message)
-            elif update.status is FrameStatus.BAD_STAMP:
+            elif not update.status.has_pose:
                 self._log.late["sweep"] += 1
             self._log.took(*result.seconds)
         return result

@@ -9,7 +9,6 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.loam_messages import (
     CLOUD,
@@ -22,7 +21,15 @@ from loam_gtsam.datasets.decode.loam_messages import (
     finite_points,
 )
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
-from loam_gtsam.types import BadSweep, ConfigError, DatasetError, FeatureSweep, LoamError, Scan
+from loam_gtsam.types import (
+    BadSweep,
+    ConfigError,
+    DatasetError,
+    FeatureSweep,
+    LoamError,
+    Scan,
+    Sweep,
+)
 
 _AFTER_STAMP = {"auto": 1.0, "start": 1.0, "middle": 0.5, "end": 0.0}
 """Share of the period by which a sweep without point times ends after its stamp."""

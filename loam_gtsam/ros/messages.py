@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from loam_gtsam.geometry import symmetric
-from loam_gtsam.types import FloatArray, InputError, MapUpdate, OutputError
+from loam_gtsam.types import FloatArray, MapUpdate, OutputError, check_array
 
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 PATH_TYPE = "nav_msgs/msg/Path"
@@ -140,8 +140,7 @@ class Messages:
         InputError
             If the shape is wrong.
         """
-        if points_map.ndim != 2 or points_map.shape[1] != len(_FIELDS):
-            raise InputError(f"points_map: expected an (N, 4) array, got shape {points_map.shape}")
+        check_array(points_map, "points_map", ("N", len(_FIELDS)))
         rows = np.ascontiguousarray(points_map, dtype="<f4")
         step = rows.itemsize * len(_FIELDS)
         fields = [

@@ -15,7 +15,6 @@ from typing import Any
 from rosbags.typesys import Stores, get_typestore
 
 from loam_gtsam.config import Config, load_config, preset
-from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.decode.loam_messages import ODOMETRY as LOAM_ODOMETRY
@@ -24,7 +23,7 @@ from loam_gtsam.io.run_files import write_run
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.ros.frame_messages import ODOMETRY, REGISTERED, TYPES, FrameMessages
 from loam_gtsam.ros.live import LiveMapper
-from loam_gtsam.types import ConfigError, MapUpdate, OutputError
+from loam_gtsam.types import ConfigError, MapUpdate, OutputError, Sweep
 from loam_gtsam.view.clouds import registered_cloud, surrounding_cloud
 
 PARAMETERS: dict[str, Any] = {

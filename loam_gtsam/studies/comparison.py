@@ -310,7 +310,7 @@ def score(
     return replace(result, problem="; ".join(problems))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameDifferences:
     """Distance of one solver's poses from those of the first-named one, frame by frame.
 

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset, Sweep
+from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -26,6 +26,7 @@ from loam_gtsam.types import (
     InputError,
     MapUpdate,
     Scan,
+    Sweep,
     SweepError,
     Trajectory,
 )
@@ -57,15 +58,14 @@ class SolverRun:
         if self.config is None:
             wanted = [update.status is FrameStatus.OK for update in self.updates]
         else:
-            wanted = [update.status is not FrameStatus.BAD_STAMP for update in self.updates]
+            wanted = [update.status.has_pose for update in self.updates]
         return tuple(np.flatnonzero(wanted).tolist())
 
     @property
     def trajectory(self) -> Trajectory:
         """The poses of the frames ``used``."""
         good = [self.updates[number] for number in self.used]
-        poses = np.array([u.map_T_lidar.matrix() for u in good]).reshape(-1, 4, 4)
-        return Trajectory(np.array([u.stamp for u in good], np.int64), poses)
+        return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
 
 def timed_points(scan: Scan, config: Config) -> TimedPoints:
@@ -82,7 +82,7 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
     return TimedPoints(points, np.asarray(timing.times, np.float64), timing.span)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Step:
     """A guess, seen from the pose before: what can be handed to another solver."""
 

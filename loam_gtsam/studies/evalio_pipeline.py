@@ -24,7 +24,7 @@ from loam_gtsam.datasets.decode.extrinsics import implied_by
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.pipeline import Pipeline, with_implied
-from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, InputError, Scan
+from loam_gtsam.types import FloatArray, ImuSamples, InputError, Scan
 
 try:
     from evalio.pipelines import Pipeline as EvalioPipeline
@@ -186,7 +186,7 @@ class LoamGtsam(EvalioPipeline):
         scan = _as_scan(sweep)
         extraction = extract(scan, self._pipeline.config)
         update = self._pipeline.process(scan, extraction)
-        if update.status is FrameStatus.BAD_STAMP:
+        if not update.status.has_pose:
             return
         stamp = Stamp.from_nsec(update.stamp)
         self.save(stamp, _as_se3(update.map_T_lidar.compose(self._lidar_T_imu)))

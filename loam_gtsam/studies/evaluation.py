@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from loam_gtsam.geometry import transform
+from loam_gtsam.geometry import inverse_pose, transform
 from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
 
 _NO_SPREAD = 1e-9
@@ -18,7 +18,7 @@ _LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 """Number of path lengths of the relative error (KITTI's 8), and what they are multiples of."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class AbsoluteError:
     """Absolute trajectory error (ATE).
 
@@ -147,7 +147,7 @@ def absolute_error(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class RelativeError:
     """Relative pose error (RPE) over path lengths, as KITTI's odometry benchmark has it.
 
@@ -224,8 +224,8 @@ def relative_error(
         ends = np.searchsorted(travelled, travelled + length, side="right")
         starts = np.flatnonzero(ends < len(travelled))
         ends = ends[starts]
-        wanted = _inverse(truth[starts]) @ truth[ends]
-        error = _inverse(wanted) @ _inverse(poses[starts]) @ poses[ends]
+        wanted = inverse_pose(truth[starts]) @ truth[ends]
+        error = inverse_pose(wanted) @ inverse_pose(poses[starts]) @ poses[ends]
         translations.append(100.0 / length * np.linalg.norm(error[:, :3, 3], axis=1))
         rotations.append(_angles_deg(error[:, :3, :3]) / length)
     pairs = np.array([len(errors) for errors in translations], np.int64)
@@ -263,7 +263,7 @@ def pose_differences(
         If fewer than three poses overlap in time, or the reference's stamps do not increase.
     """
     stamps, poses, others = _common("pose_differences", estimate, reference)
-    here, there = _inverse(poses[:1]) @ poses, _inverse(others[:1]) @ others
+    here, there = inverse_pose(poses[:1]) @ poses, inverse_pose(others[:1]) @ others
     metres = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
     rotation = np.swapaxes(there[:, :3, :3], 1, 2) @ here[:, :3, :3]
     return stamps, metres, _angles_deg(rotation)
@@ -289,14 +289,6 @@ def _common(
         )
     stamps = estimate.stamps[inside]
     return stamps, estimate.map_T_lidar[inside], interpolate(reference, stamps).map_T_lidar
-
-
-def _inverse(poses: FloatArray) -> FloatArray:
-    """(N, 4, 4) inverses of rigid transforms."""
-    result = np.tile(np.eye(4), (len(poses), 1, 1))
-    result[:, :3, :3] = np.swapaxes(poses[:, :3, :3], 1, 2)
-    result[:, :3, 3] = -np.einsum("nij,nj->ni", result[:, :3, :3], poses[:, :3, 3])
-    return result
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:

@@ -24,7 +24,7 @@ class PeerError(LoamError):
     """A peer is not installed, not known, or cannot be imported."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TimedPoints:
     """The usable points of a sweep, for systems that want arrays.
 
@@ -40,7 +40,7 @@ class TimedPoints:
     span: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PeerPose:
     """A pose (4, 4) in the peer's own map, when it is valid (nanoseconds), what it took."""
 

@@ -189,7 +189,7 @@ def _ours(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun
     poses = iter(result.trajectory.map_T_lidar)
     updates = tuple(
         update
-        if update.status is FrameStatus.BAD_STAMP
+        if not update.status.has_pose
         else replace(update, map_T_lidar=gtsam.Pose3(next(poses)))
         for update in result.updates
     )

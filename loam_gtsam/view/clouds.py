@@ -8,7 +8,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.geometry import transform
@@ -21,6 +20,7 @@ from loam_gtsam.types import (
     FloatArray,
     MapUpdate,
     Scan,
+    Sweep,
     SweepError,
     SweepMotion,
 )

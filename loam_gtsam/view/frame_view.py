@@ -17,7 +17,7 @@ RESIDUAL_COLOURS = ("#2166ac", "#4fb3a9", "#f2cf4a", "#ee8a34", "#c2222f")
 """From a residual of zero to a large one, evenly spaced."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class FrameView:
     """One frame of a run. Everything is in ``map``, corrected by the loops if there are any.
 
@@ -48,7 +48,7 @@ class FrameView:
     residuals: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class MapView:
     """What a run has made so far, in ``map``.
 

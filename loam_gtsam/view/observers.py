@@ -6,11 +6,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from loam_gtsam.datasets.base import Sweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import Registered
 from loam_gtsam.pipeline import Observer, Pipeline
-from loam_gtsam.types import FloatArray, FrameStatus, MapUpdate
+from loam_gtsam.types import FloatArray, MapUpdate, Sweep
 from loam_gtsam.view.clouds import registered_cloud, surrounding_cloud
 from loam_gtsam.view.frame_view import FrameView, FrameWatcher, MapView
 
@@ -50,7 +49,7 @@ class LastFrame:
         """An ``observe`` of :func:`loam_gtsam.pipeline.run` that takes no time."""
         self._number += 1
         self._last = sweep, update, pipeline
-        if update.status is not FrameStatus.BAD_STAMP:
+        if update.status.has_pose:
             self._path.append(np.asarray(update.map_T_lidar.translation()))
 
     @property

@@ -75,7 +75,7 @@ def plot_trajectory(
             label = [f"{len(ends)} {name}", *[""] * (len(ends) - 1)]
             top.plot(ends[:, :, 0].T, ends[:, :, 1].T, style, color=INK, lw=0.8, ms=2, label=label)
     top.set_aspect("equal", adjustable="datalim")
-    top.set(xlabel="x [m]", ylabel="y [m]", title=f"{trajectory.length:.1f} m travelled")
+    top.set(xlabel="x [m]", ylabel="y [m]", title=f"{trajectory.path_length:.1f} m travelled")
     top.legend(frameon=False)
     side.set(xlabel="distance travelled [m]", ylabel="z [m]")
     save_figure(figure, path)

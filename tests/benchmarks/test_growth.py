@@ -78,11 +78,11 @@ def test_memory_is_that_of_the_process(avenue: GrowthResult) -> None:
 
 def test_a_drive_is_as_long_as_asked() -> None:
     world = replace(growth.DRIVES[1], kilometres=0.4).open()
-    driven = world.truth.length
+    driven = world.truth.path_length
     assert 400.0 <= driven < 401.5  # a sweep is a metre
     laps = replace(growth.DRIVES[0], frames=1500).open()
     assert len(laps) == 1500
-    assert laps.truth.length > 2.0 * 600.0
+    assert laps.truth.path_length > 2.0 * 600.0
 
 
 # -- the numbers -----------------------------------------------------------------------------------

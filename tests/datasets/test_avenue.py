@@ -31,7 +31,9 @@ def distance_to_boxes(scene: Scene, points: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("metres", [100.0, 450.0, 3000.0])
 def test_way_is_as_long_as_asked(metres: float) -> None:
     # It is left half a second, five metres, before its end, and corners are cut a little.
-    assert SimulatedWorld(build_avenue(2, metres)).truth.length == pytest.approx(metres, abs=15.0)
+    assert SimulatedWorld(build_avenue(2, metres)).truth.path_length == pytest.approx(
+        metres, abs=15.0
+    )
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -65,7 +67,7 @@ def test_a_longer_way_begins_with_the_same_streets() -> None:
 
 def test_it_is_a_built_in_scene() -> None:
     world = SimulatedWorld("avenue", columns=90)
-    assert world.truth.length == pytest.approx(1000.0, abs=15.0)
+    assert world.truth.path_length == pytest.approx(1000.0, abs=15.0)
     np.testing.assert_array_equal(world.scene.solids.boxes, build_avenue(0).solids.boxes)
 
 

@@ -320,19 +320,19 @@ def test_imu_noise_and_bias_have_the_asked_size():
 def test_street_loop_closes_after_500_metres_and_goes_on():
     world = SimulatedWorld("street_loop")
     truth = world.truth
-    assert truth.length > 500.0
+    assert truth.path_length > 500.0
     back = np.linalg.norm(truth.map_T_lidar[-30:, :3, 3], axis=1)
     closest = truth.map_T_lidar[-30:][back.argmin()]
     assert back.min() < 0.6  # frames are up to a metre apart
     assert Rotation.from_matrix(closest[:3, :3]).magnitude() < 0.05
     longer = SimulatedWorld("street_loop", frames=1500)
-    assert longer.truth.length > 2.0 * truth.length
+    assert longer.truth.path_length > 2.0 * truth.path_length
     assert len(longer[1499].points) > 15_000
 
 
 def test_open_path_gives_as_many_frames_as_it_has():
     world = SimulatedWorld("corridor_bare")
-    assert world.truth.length >= 300.0
+    assert world.truth.path_length >= 300.0
     assert len(SimulatedWorld("corridor_bare", frames=len(world))) == len(world)
     with pytest.raises(ConfigError, match=f"ends after {len(world)} sweeps"):
         SimulatedWorld("corridor_bare", frames=len(world) + 1)
@@ -371,7 +371,7 @@ def test_it_is_a_dataset_and_says_what_it_is():
     assert info.facts["scene"] == "trees"
     assert info.facts["sensor"].startswith("os1-64: 64 beams x 256 columns")
     assert info.facts["frames"] == "20 at 20 Hz"
-    assert float(info.facts["path"].split()[0]) == pytest.approx(world.truth.length, abs=0.06)
+    assert float(info.facts["path"].split()[0]) == pytest.approx(world.truth.path_length, abs=0.06)
     assert world.sensor["period"] == 0.05
     assert world[1].stamp - world[0].stamp == 50_000_000
 
@@ -413,7 +413,7 @@ def test_whole_numbers_are_numbers() -> None:
 def test_sparse_terrain_is_300_metres_past_25_poles_on_waves(seed):
     world = SimulatedWorld("sparse_terrain", seed=seed)
     solids = world.scene.solids
-    assert world.truth.length == pytest.approx(300.0, abs=10.0)
+    assert world.truth.path_length == pytest.approx(300.0, abs=10.0)
     assert len(solids.cylinders) == 25
     assert not len(solids.boxes)
     assert not len(solids.ellipsoids)

@@ -200,7 +200,7 @@ def test_write_run_writes_all_files(tmp_path):
     assert summary["status_counts"] == {"first": 1, "ok": 4}
     assert (summary["ate"], summary["n"]) == (None, 3)
     assert summary["error"] is None
-    assert summary["path_length_m"] == pytest.approx(result.trajectory.length)
+    assert summary["path_length_m"] == pytest.approx(result.trajectory.path_length)
     assert "incomplete" not in (folder / "trajectory.tum").read_text()
 
 

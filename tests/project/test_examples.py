@@ -94,7 +94,7 @@ def imu_in_a_corridor(names: Names, output: str) -> None:
     constant, inertial = names["errors"]
     assert len(names["blind"]) > 40
     assert all(" x;" in update.message for update in names["blind"])
-    assert abs(inertial) < 0.02 * names["world"].truth.length
+    assert abs(inertial) < 0.02 * names["world"].truth.path_length
     assert abs(inertial) < 0.5 * abs(constant)
 
 

@@ -487,7 +487,7 @@ def test_peers_find_the_path(name, world, sweeps):
     result = compare(Sweeps(sweeps, world.truth), [contender(name)])
     scores = score(result.runs[0], result.truth)
     assert result.runs[0].problem == ""
-    assert scores.ate_m < 0.1 * result.truth.length + 0.02
+    assert scores.ate_m < 0.1 * result.truth.path_length + 0.02
     assert scores.map_points > 100
     assert scores.ms_median > 0.0
     assert np.isnan(scores.iterations)

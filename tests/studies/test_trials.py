@@ -224,7 +224,7 @@ def test_a_row_has_the_numbers_of_the_run():
     assert row["rpe_percent"] == relative.translation_percent
     assert row["rpe_shortest_m"] == relative.lengths[0]
     apart = pose_differences(found, truth)[1][-1]
-    assert row["drift_percent"] == pytest.approx(100.0 * apart / truth.length, rel=1e-9)
+    assert row["drift_percent"] == pytest.approx(100.0 * apart / truth.path_length, rel=1e-9)
     assert row["frames"] == 24
     counts = {str(s): row[f"frames_{s}"] for s in FrameStatus if row[f"frames_{s}"]}
     assert counts == result.status_counts

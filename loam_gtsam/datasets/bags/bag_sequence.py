@@ -22,7 +22,7 @@ from loam_gtsam.datasets.decode.tables import (
 from loam_gtsam.types import DatasetError, FloatArray, Trajectory
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rig:
     """What is known of the sensors of a data set.
 

@@ -24,15 +24,6 @@ def pose(numbers: Sequence[float]) -> FloatArray:
     return rigid(Rotation.from_quat(numbers[3:]), numbers[:3])
 
 
-def invert(a_T_b: FloatArray) -> FloatArray:
-    """``b_T_a`` of a rigid (4, 4) transform."""
-    rotation = a_T_b[:3, :3].T
-    inverse = np.eye(4)
-    inverse[:3, :3] = rotation
-    inverse[:3, 3] = -rotation @ a_T_b[:3, 3]
-    return inverse
-
-
 def at_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
     """Poses of the lidar where those of another frame of the same body are given."""
     return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)

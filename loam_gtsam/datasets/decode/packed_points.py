@@ -41,7 +41,7 @@ class Field:
     count: int = 1
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class PackedCloud:
     """What :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_with_times` needs of a message."""
 

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.decode.extrinsics import at_lidar, invert
+from loam_gtsam.datasets.decode.extrinsics import at_lidar
 from loam_gtsam.datasets.decode.tables import clean_imu, describe_rate, in_order, read_lines
 from loam_gtsam.datasets.kitti.times import read_dates
 from loam_gtsam.datasets.known.layouts import first_existing
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
 _EARTH_RADIUS = 6378137.0
@@ -88,7 +89,7 @@ def oxts_truth(
     poses[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + values[:, _LATITUDE]) / 2.0))
     poses[:, 2, 3] = values[:, _ALTITUDE]
     poses[:, :3, 3] -= poses[0, :3, 3].copy()
-    return at_lidar(in_order(stamps, poses, "oxts", problems), invert(lidar_T_imu))
+    return at_lidar(in_order(stamps, poses, "oxts", problems), inverse_pose(lidar_T_imu))
 
 
 def lidar_T_imu_of(root: Path) -> FloatArray | None:
@@ -138,7 +139,7 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
             ) from error
     if len(poses) != len(stamps):
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")
-    return Trajectory(stamps, invert(camera_T_lidar) @ poses @ camera_T_lidar)
+    return Trajectory(stamps, inverse_pose(camera_T_lidar) @ poses @ camera_T_lidar)
 
 
 def _calibration(path: Path) -> dict[str, list[float]]:

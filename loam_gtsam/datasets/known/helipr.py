@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from loam_gtsam.datasets.decode.extrinsics import implied_by, invert
+from loam_gtsam.datasets.decode.extrinsics import implied_by
 from loam_gtsam.datasets.decode.packed_points import read_records
 from loam_gtsam.datasets.decode.tables import in_order, poses_from_quaternions, read_table
 from loam_gtsam.datasets.known.layouts import HELIPR_OTHERS, first_existing, helipr_truth
 from loam_gtsam.datasets.known.stamped_files import PackedFiles, missing_files
 from loam_gtsam.datasets.known.xsens import read_xsens
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
 
 RECORDS = {
@@ -99,7 +100,7 @@ class HeLiPRDataset(PackedFiles):
             stamp_is=stamp_is,
         )
         self._root = root
-        self.sensor = implied_by(invert(IMU_T_LIDAR[self._lidar]))
+        self.sensor = implied_by(inverse_pose(IMU_T_LIDAR[self._lidar]))
         self._extrinsics_source = "HeLiPR-Pointcloud-Toolbox"
         listing = first_existing(root, ["stamp.csv"])
         self._problems += missing_files(listing, self._lidar.lower(), self.stamps)

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
-from loam_gtsam.datasets.decode.extrinsics import invert, pose, rigid
+from loam_gtsam.datasets.decode.extrinsics import pose, rigid
 from loam_gtsam.datasets.decode.packed_points import firing_by_firing, read_pcd
 from loam_gtsam.datasets.known.layouts import (
     NEWER_COLLEGE_SCANS,
@@ -20,6 +20,7 @@ from loam_gtsam.datasets.known.layouts import (
     newer_college_sequences,
 )
 from loam_gtsam.datasets.known.stamped_files import PackedFiles
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
 
 _SENSOR_T_LIDAR = rigid(Rotation.from_euler("z", 180.0, degrees=True), [0.0, 0.0, 0.03618])
@@ -31,7 +32,7 @@ RIG_2020 = Rig(
     topic="/os1_cloud_node/points",
     imu_topic="/os1_cloud_node/imu",
     body_T_lidar=pose([-0.084, -0.025, 0.050, 0.0, 0.0, 0.924, 0.383]),
-    lidar_T_imu=invert(_SENSOR_T_LIDAR) @ _SENSOR_T_IMU,
+    lidar_T_imu=inverse_pose(_SENSOR_T_LIDAR) @ _SENSOR_T_IMU,
     source="Ouster's manual",
 )
 """Points are in the driver's lidar frame, half a turn from the case; reference poses are of the
@@ -42,7 +43,7 @@ RIG_2021 = Rig(
     topic="/os_cloud_node/points",
     imu_topic="/os_cloud_node/imu",
     body_T_lidar=pose([0.001, 0.0, 0.091, 0.0, 0.0, 0.0, 1.0]),
-    lidar_T_imu=invert(
+    lidar_T_imu=inverse_pose(
         pose([0.013801, -0.012207, -0.01514, 0.0032925, -0.004627, -0.0024302, 0.99998])
     ),
     source="the data set's calibration, as evalio quotes it",

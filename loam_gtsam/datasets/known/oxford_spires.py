@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 
 from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
-from loam_gtsam.datasets.decode.extrinsics import implied_by, invert, pose
+from loam_gtsam.datasets.decode.extrinsics import implied_by, pose
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import clean_imu, read_table
 from loam_gtsam.datasets.known.layouts import SPIRES_CLOUDS, spires_bags, spires_truth
 from loam_gtsam.datasets.known.stamped_files import PackedFiles
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
 
 _CAMERA_T_LIDAR = pose(
@@ -33,7 +34,7 @@ RIG = Rig(
     topic="/hesai/pandar",
     imu_topic="/alphasense_driver_ros/imu",
     body_T_lidar=pose([0.0, 0.0, 0.124, 0.0, 0.0, 1.0, 0.0]),
-    lidar_T_imu=invert(_CAMERA_T_LIDAR) @ _CAMERA_T_IMU,
+    lidar_T_imu=inverse_pose(_CAMERA_T_LIDAR) @ _CAMERA_T_IMU,
     source="sensor.yaml of the data set's tools",
 )
 """``T_base_lidar``, and ``T_cam_lidar`` and ``T_cam_imu`` of the front camera, in

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
+from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.types import (
     BoolArray,
     ConfigError,
@@ -24,6 +24,7 @@ from loam_gtsam.types import (
     ImuSamples,
     InputError,
     Scan,
+    Sweep,
     Trajectory,
 )
 

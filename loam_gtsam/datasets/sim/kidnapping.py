@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.base import Dataset, DatasetInfo, Sweep
+from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.types import (
@@ -28,6 +28,7 @@ from loam_gtsam.types import (
     InputError,
     IntArray,
     Scan,
+    Sweep,
     Trajectory,
 )
 

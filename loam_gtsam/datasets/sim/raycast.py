@@ -22,7 +22,7 @@ _GROUND_STEPS = 100
 """A bound, not a typical number (ten); only rays that skim crests need many."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Ground:
     """Height field ``z = level + sum_k a_k sin(u_k x + v_k y + phase_k)``; flat with no waves.
 
@@ -67,7 +67,7 @@ class Ground:
         return along_x, along_y
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Solids:
     """Convex things seen from outside, and the ground; gravity-aligned world frame, metres.
 
@@ -215,7 +215,7 @@ def _cast_ground(
     return ranges.reshape(directions.shape[1:])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class _View:
     """Which columns of a sweep can see what: everything is judged from the sweep's middle and
     grown by how far the sensor strays from it.

@@ -18,7 +18,7 @@ CAR = (0.01, 0.006, 0.006, 0.002)
 """Sway of a car on an even surface: heave (m), roll, pitch and yaw (rad)."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Scene:
     """A place and the way through it; metres, gravity-aligned world frame.
 

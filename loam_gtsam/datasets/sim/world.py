@@ -23,6 +23,7 @@ from loam_gtsam.datasets.sim.avenue import build_avenue
 from loam_gtsam.datasets.sim.motion import GRAVITY, Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import Scene
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import (
     ConfigError,
     FloatArray,
@@ -258,7 +259,7 @@ class SimulatedWorld:
                 f"stamps: the path of {self.scene.name!r} ends at {end}, got {stamps.max()}"
             )
         world_T_lidar = self._motion.world_T_lidar(_seconds(stamps))
-        poses = _inverse(self.world_T_start) @ world_T_lidar
+        poses = inverse_pose(self.world_T_start) @ world_T_lidar
         if len(stamps) and stamps[0] == _EPOCH:
             poses[0] = np.eye(4)  # not only up to rounding
         return Trajectory(stamps=stamps, map_T_lidar=poses)
@@ -287,7 +288,7 @@ class SimulatedWorld:
             "scene": self.scene.name,
             "sensor": f"{self.sensor['model']}: {beams} beams x {columns} columns, clockwise",
             "frames": f"{self._frames} at {self._rate:g} Hz",
-            "path": f"{self.truth.length:.1f} m"
+            "path": f"{self.truth.path_length:.1f} m"
             + (f", {'closed' if self.scene.closed else 'open'}"),
             "noise": f"{self._range_noise:g} m, {100.0 * self._dropout:g} % lost",
             "times": "per point, seconds from the start of the sweep",
@@ -323,10 +324,3 @@ def _seconds(stamps: IntArray) -> FloatArray:
 def _at_least(name: str, value: float, least: float) -> None:
     if not (math.isfinite(value) and value >= least):
         raise ConfigError(f"{name}: expected at least {least:g}, got {value!r}")
-
-
-def _inverse(a_T_b: FloatArray) -> FloatArray:
-    inverse = np.eye(4)
-    inverse[:3, :3] = a_T_b[:3, :3].T
-    inverse[:3, 3] = -a_T_b[:3, :3].T @ a_T_b[:3, 3]
-    return inverse

@@ -591,16 +591,14 @@ def test_float32_points_are_averaged_in_float64() -> None:
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda m: m.insert(np.zeros((3, 4))), r"points_map: expected a \(N, 3\).*\(3, 4\)"),
-        (lambda m: m.insert(np.zeros((3, 3), dtype=int)), "points_map.*int64"),
-        (lambda m: m.insert([[0.0, 0.0, 0.0]]), "points_map"),
+        (lambda m: m.insert(np.zeros((3, 4))), r"points_map: expected \(N, 3\).*\(3, 4\)"),
         (lambda m: m.insert(np.array([[0.0, np.nan, np.inf]])), "points_map: .* 2 NaN"),
         (lambda m: m.nearest(np.zeros(3), 5, 1.0, []), "queries"),
         (lambda m: m.nearest(np.full((1, 3), np.inf), 5, 1.0, []), "queries"),
         (lambda m: m.nearest(np.zeros((1, 3)), 0, 1.0, []), "k: expected at least 1, got 0"),
         (lambda m: m.nearest(np.zeros((1, 3)), 5, 0.0, []), "max_distance"),
         (lambda m: m.nearest(np.zeros((1, 3)), 5, np.nan, []), "max_distance"),
-        (lambda m: m.recenter(np.zeros(2)), r"position: expected a \(3\)"),
+        (lambda m: m.recenter(np.zeros(2)), r"position: expected \(3,\)"),
         (lambda m: m.recenter(np.array([0.0, np.nan, 0.0])), "position"),
         (lambda m: m.recenter(np.array([0.0, 1e300, 0.0])), "position: .*within 524288 m"),
         (lambda m: m.neighbourhood(np.eye(3)), "map_T_lidar"),

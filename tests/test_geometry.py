@@ -7,8 +7,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from loam_gtsam.geometry import (
+    as_points,
+    as_stamps,
+    as_vector,
     fit_lines,
     fit_planes,
+    inverse_pose,
     moments,
     move_points,
     symmetric_eigenvalues,
@@ -17,6 +21,7 @@ from loam_gtsam.geometry import (
     voxel_filter,
     voxel_keys,
 )
+from loam_gtsam.types import InputError
 
 RATES = (0.0, 1e-12, 1e-10, 0.9e-9, 1.1e-9, 1e-8, 1e-6, 1e-3, 0.5, 8.0, 60.0)
 AXES = [*np.eye(3), np.array([1.0, -2.0, 2.0]) / 3.0]
@@ -104,6 +109,44 @@ def test_moving_twice_adds_the_times(twist, a, b):
     np.testing.assert_allclose(
         np.linalg.norm(away, axis=1), np.linalg.norm(np.diff(points, axis=0), axis=1), rtol=1e-7
     )
+
+
+def test_the_inverse_of_a_pose_undoes_it_for_one_and_for_many():
+    poses = [gtsam.Pose3.Expmap(v) for v in np.random.default_rng(9).normal(0, 2, (5, 6))]
+    matrices = np.array([pose.matrix() for pose in poses])
+    for matrix, inverse, pose in zip(matrices, inverse_pose(matrices), poses, strict=True):
+        np.testing.assert_array_equal(inverse, inverse_pose(matrix))
+        np.testing.assert_allclose(inverse, pose.inverse().matrix(), atol=1e-14)
+
+
+# -- checks ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("check", "value", "message"),
+    [
+        (as_points, np.zeros((7, 4)), r"scan: expected \(N, 3\) numbers, got shape \(7, 4\)"),
+        (as_points, [[0, 0, 0], [0, np.nan, np.inf]], "scan: .*2 NaN or infinite ones of 6"),
+        (as_points, [["a", "b", "c"]], "scan: expected .* numbers, got .*<U1"),
+        (as_points, [[1, 2, 3], [4, 5]], "scan: expected an array"),
+        (as_vector, np.zeros(2), r"scan: expected \(3,\) numbers, got shape \(2,\)"),
+        (as_vector, None, "scan: .*object"),
+        (as_stamps, [0.1, 0.2], r"scan: expected \(N,\) integers.*float64; .*\* 1e9"),
+        (as_stamps, np.zeros((2, 1), int), r"scan: expected \(N,\).*\(2, 1\)"),
+    ],
+)
+def test_a_wrong_array_is_refused_by_its_name(check, value, message):
+    with pytest.raises(InputError, match="^" + message):
+        check(value, "scan")
+
+
+def test_a_right_array_becomes_float64_or_int64_and_is_not_copied_if_it_is_so_already():
+    points, stamps = np.ones((2, 3)), np.arange(3)
+    assert as_points(points, "scan") is points
+    assert as_stamps(stamps, "stamps") is stamps
+    assert as_points([[1, 2, 3]], "scan").dtype == np.float64
+    assert as_stamps([], "stamps").dtype == np.int64
+    assert as_vector(np.arange(5), "values", 5).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 # -- eigenvalues -----------------------------------------------------------------------------------

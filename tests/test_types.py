@@ -12,15 +12,18 @@ POINTS = np.zeros((6, 3), np.float32)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"points": np.zeros((6, 4), np.float32)}, r"Scan.points: expected an \(N, 3\).*\(6, 4\)"),
+        (
+            {"points": np.zeros((6, 4), np.float32)},
+            r"Scan.points: expected \(N, 3\) floats.*\(6, 4\)",
+        ),
         ({"points": np.zeros(3)}, r"Scan.points.*\(3,\)"),
         ({"points": [[0.0, 0.0, 0.0]]}, "Scan.points.*list"),
-        ({"points": np.zeros((6, 3), np.int64)}, "Scan.points: expected a float dtype.*int64"),
-        ({"times": np.zeros(5)}, r"Scan.times: expected shape \(6,\).*\(5,\)"),
-        ({"times": np.zeros(6, np.int32)}, "Scan.times: expected a float dtype.*int32"),
+        ({"points": np.zeros((6, 3), np.int64)}, "Scan.points: expected .* floats, got .*int64"),
+        ({"times": np.zeros(5)}, r"Scan.times: expected \(6,\) floats.*\(5,\)"),
+        ({"times": np.zeros(6, np.int32)}, "Scan.times: expected .* floats, got .*int32"),
         ({"rings": np.zeros((6, 1), np.uint8)}, r"Scan.rings.*\(6, 1\)"),
-        ({"rings": np.zeros(6)}, "Scan.rings: expected an integer dtype.*float64"),
-        ({"stamp": 0.1}, "Scan.stamp: expected integer nanoseconds, got 0.1"),
+        ({"rings": np.zeros(6)}, "Scan.rings: expected .* integers, got .*float64"),
+        ({"stamp": 0.1}, "Scan.stamp: expected integer nanoseconds .* got 0.1"),
         ({"rows": 4}, "Scan.rows: 6 points do not divide into 4 rows"),
     ],
 )
@@ -45,14 +48,35 @@ def test_features_of_wrong_shape_or_dtype_are_refused(bad):
 
 
 def test_a_trajectory_needs_one_pose_per_stamp():
-    with pytest.raises(InputError, match=r"\(3, 4, 4\), got \(2, 4, 4\)"):
+    with pytest.raises(InputError, match=r"expected \(3, 4, 4\) numbers, got shape \(2, 4, 4\)"):
         Trajectory(np.arange(3), np.zeros((2, 4, 4)))
 
 
-def test_length_of_a_trajectory():
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, :3, 3] = [[0, 0, 0], [3, 4, 0], [3, 4, 12]]
-    assert Trajectory(np.arange(3), poses).path_length == pytest.approx(17.0)
+def test_a_trajectory_is_made_of_poses_and_knows_the_length_of_its_path():
+    positions = [[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [3.0, 4.0, 12.0]]
+    poses = [gtsam.Pose3(gtsam.Rot3.Rz(0.1), np.array(position)) for position in positions]
+    trajectory = Trajectory.from_poses([3, 5, 8], poses)
+    assert trajectory.stamps.tolist() == [3, 5, 8]
+    np.testing.assert_array_equal(trajectory.map_T_lidar[1], poses[1].matrix())
+    assert trajectory.path_length == pytest.approx(17.0)
+    assert Trajectory.from_poses([], []).map_T_lidar.shape == (0, 4, 4)
+
+
+def test_values_that_hold_arrays_can_be_compared_and_are_equal_only_to_themselves():
+    def values():
+        poses = Trajectory.from_poses([1, 2], [gtsam.Pose3()] * 2)
+        features = Features.from_points(0, np.zeros((2, 3)), np.zeros((2, 3)))
+        update = MapUpdate(0, gtsam.Pose3(), FrameStatus.OK)
+        return Scan(POINTS.copy(), 0), poses, features, update
+
+    for one, other in zip(values(), values(), strict=True):
+        assert one == one
+        assert one != other
+        assert len({one, other}) == 2
+
+
+def test_a_frame_has_a_pose_unless_its_stamp_is_bad():
+    assert [status for status in FrameStatus if not status.has_pose] == [FrameStatus.BAD_STAMP]
 
 
 def test_raw_covariance_is_the_inverse_of_the_information_of_a_solved_frame():

@@ -409,7 +409,7 @@ def test_features_without_a_place_are_refused(value: float) -> None:
 
 @pytest.mark.parametrize("stamp", [2**62 + 1, -(2**62) - 1, 10**40])
 def test_a_sweep_from_beyond_the_year_2116_is_refused(stamp: int) -> None:
-    with pytest.raises(LoamError, match=r"Scan\.stamp: expected nanoseconds up to 2\^62"):
+    with pytest.raises(LoamError, match=r"Scan\.stamp: expected integer nanoseconds up to 2\^62"):
         Scan(points=np.zeros((0, 3)), stamp=stamp)
     assert Scan(points=np.zeros((0, 3)), stamp=2**62).stamp == 2**62
 

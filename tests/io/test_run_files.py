@@ -182,7 +182,7 @@ def test_ply_is_exact_and_tells_edges_from_planes(tmp_path):
 
 
 def test_ply_refuses_other_shapes(tmp_path):
-    with pytest.raises(InputError, match=r"planes: expected shape \(N, 3\), got \(4, 2\)"):
+    with pytest.raises(InputError, match=r"planes: expected \(N, 3\) floats, got shape \(4, 2\)"):
         export.write_ply(tmp_path / "map.ply", np.zeros((1, 3)), np.zeros((4, 2)))
     assert list(tmp_path.iterdir()) == []
 

@@ -79,7 +79,7 @@ def test_a_few_columns_that_agree_are_no_likeness():
 
 
 def test_wrong_shapes_are_refused():
-    with pytest.raises(InputError, match=r"expected an \(N, 3\) array"):
+    with pytest.raises(InputError, match=r"points: expected \(N, 3\)"):
         describe(np.zeros((4, 2)), LoopConfig())
     with pytest.raises(InputError, match="expected equal shapes"):
         unlike(np.zeros((20, 60)), np.zeros((20, 30)))

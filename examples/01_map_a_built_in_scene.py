@@ -9,7 +9,9 @@ world = SimulatedWorld("street_loop", frames=40)  # 709 go once round the block
 result = run(world)
 
 error = absolute_error(result.trajectory, world.truth)
-print(f"{len(result.updates)} sweeps, {result.trajectory.path_length:.1f} m: {result.status_counts}")
+print(
+    f"{len(result.updates)} sweeps, {result.trajectory.path_length:.1f} m: {result.status_counts}"
+)
 print(f"map: {len(result.edge_points)} edge and {len(result.plane_points)} plane points")
 print(f"absolute trajectory error {error.rmse:.3f} m, at most {error.maximum:.3f} m")
 

@@ -30,22 +30,4 @@ def test_one_command_makes_every_picture_of_the_readme(figures: ModuleType, tmp_
     shown = re.findall(r"\]\(docs/images/([\w.]+)\)", (ROOT / "README.md").read_text("utf-8"))
     assert shown
     assert set(shown) <= made == set(figures.PICTURES)
-
-
-def test_the_readme_has_few_and_small_pictures() -> None:
-    shown = re.findall(r"\]\((docs/images/[\w.]+)\)", (ROOT / "README.md").read_text("utf-8"))
-    assert len(shown) <= 3
-    assert all((ROOT / name).stat().st_size < 400_000 for name in shown)
-
-
-def test_the_way_through_the_town_is_round_its_corners(figures: ModuleType) -> None:
-    import numpy as np
-
-    way = figures.streets()
-    steps = np.diff(way, axis=0)
-    lengths = np.linalg.norm(steps, axis=1)
-    assert lengths.max() < 1.2
-    turns = np.arccos(
-        np.clip((steps[:-1] * steps[1:]).sum(axis=1) / lengths[:-1] / lengths[1:], -1, 1)
-    )
-    assert np.degrees(turns).max() < 12.0
+    assert all((ROOT / "docs/images" / name).stat().st_size < 400_000 for name in shown)

@@ -1,8 +1,9 @@
 """Roll and pitch of an IMU as information on the pose: LOAM's blend, and factors in its place.
 
 Angles are those of ``level_R_lidar = Rz(yaw) Ry(pitch) Rx(roll)``, where ``level`` is any frame
-whose z axis points up; the map is such a frame once it is levelled, and otherwise
-:class:`Level` holds the rotation between the two. The mathematics is in docs/maths/imu_prior.md.
+whose z axis points up. The map is such a frame once it is levelled; otherwise
+:class:`~loam_gtsam.imu.level.Level` holds the rotation between the two. The mathematics is in
+docs/maths/imu_prior.md.
 """
 
 from __future__ import annotations
@@ -11,11 +12,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
-from loam_gtsam.config import ImuConfig
 from loam_gtsam.factors import checked_factor
-from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import FloatArray
 
 STEEPEST_PITCH = np.radians(85.0)
@@ -28,92 +26,6 @@ _ROUNDS = 20
 """Rounds to correct the target: 3 for a pull of 1 mrad, 6 for 0.5 rad."""
 _EXACT = 1e-12
 """Rad, by which the corrected mean may miss the blend's."""
-
-
-@dataclass(frozen=True, slots=True)
-class Level:
-    """Which way is up in the map.
-
-    Attributes
-    ----------
-    level_R_map : takes map vectors into a frame whose z axis points up
-    roll, pitch : of the lidar when this was found, rad
-    samples : IMU samples behind it
-    source : "still" if the platform was at rest, else "moving"
-    """
-
-    level_R_map: gtsam.Rot3
-    roll: float
-    pitch: float
-    samples: int
-    source: str
-
-    @property
-    def map_up(self) -> FloatArray:
-        """(3,) unit vector, map frame."""
-        return np.array(self.level_R_map.matrix()[2])
-
-
-def find_level(
-    buffer: ImuBuffer, config: ImuConfig, stamp: int, map_T_lidar: gtsam.Pose3, *, levelled: bool
-) -> Level | None:
-    """Find up from the samples of ``still_seconds`` before a moment and as long after it.
-
-    Parameters
-    ----------
-    stamp : nanoseconds
-    map_T_lidar : pose of that moment; only its rotation counts
-    levelled : the map is to be levelled: the answer's ``level_R_map`` is the identity, and
-        ``roll`` and ``pitch`` say how the lidar stands in it
-
-    Returns
-    -------
-    Level or None
-        None if there is no orientation at that moment.
-    """
-    found = mean_orientation(buffer, stamp, config.still_seconds)
-    if found is None:
-        return None
-    here, count = found
-    roll, pitch = roll_pitch(here)
-    level_R_lidar = gtsam.Rot3.RzRyRx(roll, pitch, 0.0)
-    return Level(
-        gtsam.Rot3() if levelled else level_R_lidar.compose(map_T_lidar.rotation().inverse()),
-        float(roll),
-        float(pitch),
-        count,
-        "moving" if buffer.rest_at(stamp) is None else "still",
-    )
-
-
-def mean_orientation(buffer: ImuBuffer, stamp: int, reach: float) -> tuple[gtsam.Rot3, int] | None:
-    """``world_R_lidar`` of a moment from all samples around it, and how many they are.
-
-    Every sample is brought to that moment by the gyro, so the platform may be turning. If it has
-    turned too far, or the gyro has a gap, it is the orientation of the moment alone.
-
-    Parameters
-    ----------
-    stamp : nanoseconds
-    reach : seconds before and after it
-
-    Returns
-    -------
-    None if there is no orientation at that moment.
-    """
-    here = buffer.orientation(stamp)
-    if here is None:
-        return None
-    far = round(reach * 1e9)
-    samples = buffer.samples_between(stamp - far, stamp + far)
-    assert samples.orientation is not None  # there is one at this moment
-    known = np.isfinite(samples.orientation[:, 0])
-    seconds: FloatArray = (samples.stamps[known] - stamp).astype(np.float64) * 1e-9
-    turns = buffer.rotations_since(stamp, seconds)
-    if turns is None or not len(turns):
-        return here, 1
-    brought = Rotation.from_quat(samples.orientation[known]) * Rotation.from_rotvec(turns).inv()
-    return gtsam.Rot3(brought.mean().as_matrix()), len(turns)
 
 
 def roll_pitch(rotation: gtsam.Rot3) -> FloatArray:
@@ -147,7 +59,7 @@ def blend(
     map_T_lidar : solved pose
     measured : ``world_R_lidar`` of the IMU, z up; its yaw is not used
     weight : share of the IMU, 0.002 in LOAM
-    level_R_map : see :class:`Level`
+    level_R_map : see :class:`~loam_gtsam.imu.level.Level`
 
     Notes
     -----
@@ -165,7 +77,7 @@ def blend_direction(
 ) -> gtsam.Pose3:
     """The blend without angles: up turns by ``weight`` of the way to the IMU's; fit for any tilt.
 
-    Parameters are those of :func:`blend`; ``map_up`` is :attr:`Level.map_up`.
+    Parameters are those of :func:`blend`; ``map_up`` is :attr:`~loam_gtsam.imu.level.Level.map_up`.
     """
     own = map_T_lidar.rotation().matrix().T @ map_up
     imu = np.array(measured.matrix()[2])
@@ -259,7 +171,7 @@ def roll_pitch_factor(
     ----------
     key : of a Pose3 ``map_T_lidar``
     prior : with a positive definite information
-    level_R_map : see :class:`Level`
+    level_R_map : see :class:`~loam_gtsam.imu.level.Level`
     """
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
@@ -280,7 +192,7 @@ def gravity_factor(
     key : of a Pose3 ``map_T_lidar``
     measured : ``world_R_lidar`` of the IMU, z up
     sigma : standard deviation of the direction, rad
-    map_up : (3,) unit, see :attr:`Level.map_up`
+    map_up : (3,) unit, see :attr:`~loam_gtsam.imu.level.Level.map_up`
     """
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
     lidar_up = gtsam.Unit3(np.array(measured.matrix()[2]))

@@ -15,8 +15,10 @@ import numpy as np
 from loam_gtsam.config import Config, ImuConfig, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead
-from loam_gtsam.imu.buffer import ImuBuffer, ImuReport, extrinsic_problem
-from loam_gtsam.imu_prior import Level
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.extrinsic_check import extrinsic_problem
+from loam_gtsam.imu.level import Level
+from loam_gtsam.imu.quality import ImuReport
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.loops.map_correction import LoopMapping

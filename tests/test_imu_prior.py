@@ -1,4 +1,4 @@
-"""The IMU's roll and pitch as a blend and as factors: means, Jacobians, steep pitch, levelling."""
+"""The IMU's roll and pitch as a blend and as factors: means, Jacobians, steep pitch."""
 
 import gtsam
 import numpy as np
@@ -6,8 +6,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.jacobians import numerical
 
-from loam_gtsam.config import ImuConfig
-from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu_prior import (
     STEEPEST_PITCH,
     RollPitchPrior,
@@ -15,7 +13,6 @@ from loam_gtsam.imu_prior import (
     blend_direction,
     blended_angles,
     equivalent_prior,
-    find_level,
     gravity_factor,
     roll_pitch,
     roll_pitch_factor,
@@ -24,7 +21,6 @@ from loam_gtsam.imu_prior import (
     too_steep,
 )
 from loam_gtsam.registration.solvers import POSE_KEY, fuse
-from loam_gtsam.types import ImuSamples
 
 FLAT = gtsam.Rot3()
 WEIGHTS = (0.0005, 0.002, 0.05, 0.5)
@@ -391,111 +387,3 @@ def test_directions_are_finite_where_angles_are_not(pitch):
         pose.rotation().between(blend(pose, measured, 0.002, FLAT).rotation())
     )
     assert np.linalg.norm(jumped) > 5.0 * np.linalg.norm(turned)
-
-
-# -- levelling -------------------------------------------------------------------------------------
-
-
-def samples_of(level_R_lidar, rate=(0.0, 0.0, 0.0), noise=0.0, seconds=2.0):
-    """A lidar that has ``level_R_lidar`` one second after START and turns evenly; 200 Hz."""
-    times = np.arange(round(200 * seconds)) / 200.0
-    rng = np.random.default_rng(0)
-    turns = Rotation.from_rotvec(np.outer(times - 1.0, rate))
-    attitude = Rotation.from_matrix(level_R_lidar.matrix()) * turns
-    seen = attitude * Rotation.from_rotvec(noise * rng.normal(size=(len(times), 3)))
-    return ImuSamples(
-        START + np.round(times * 1e9).astype(np.int64),
-        seen.as_quat(),
-        np.tile(np.array(rate, np.float64), (len(times), 1)),
-        attitude.inv().apply([0.0, 0.0, 9.81]),
-    )
-
-
-def level_of(samples, config=None, pose=None, levelled=False):
-    config = config or ImuConfig()
-    pose = pose or gtsam.Pose3()
-    return find_level(ImuBuffer(config, samples), config, START + 10**9, pose, levelled=levelled)
-
-
-def test_up_is_found_in_any_map_and_yaw_is_left_alone():
-    attitude = rot(12, -7, 130)
-    pose = gtsam.Pose3(rot(50, 20, -80), np.ones(3))
-    level = level_of(samples_of(attitude), pose=pose)
-    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-9)
-    found = level.level_R_map.compose(pose.rotation())
-    np.testing.assert_allclose(np.degrees(found.rpy()), [12, -7, 0], atol=1e-9)
-    np.testing.assert_allclose(
-        level.map_up, pose.rotation().matrix() @ attitude.matrix()[2], atol=1e-9
-    )
-    assert level.source == "still"
-    in_level = level_of(samples_of(attitude), levelled=True)
-    assert in_level.level_R_map.equals(FLAT, 0.0)
-    assert (in_level.roll, in_level.pitch) == (level.roll, level.pitch)
-
-
-@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.8)])
-def test_a_second_of_samples_is_averaged_though_the_lidar_turns(rate):
-    noisy = samples_of(rot(12, -7, 130), rate, noise=0.01)
-    level = level_of(noisy)
-    assert level.samples == 201
-    away = np.array([level.roll, level.pitch]) - np.radians([12, -7])
-    assert np.abs(away).max() < 3.0 * 0.01 / np.sqrt(201.0)
-    assert level.source == ("moving" if any(rate) else "still")
-    # Also where there is little before that moment, so that the turning does not cancel.
-    samples = samples_of(rot(12, -7, 130), rate)
-    recent = ImuSamples(
-        samples.stamps[180:], samples.orientation[180:], samples.gyro[180:],
-        samples.acceleration[180:],
-    )  # fmt: skip
-    level = level_of(recent)
-    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-6)
-    alone = level_of(noisy, ImuConfig(still_seconds=0.0))
-    assert alone.samples == 1
-
-
-def test_samples_without_orientation_do_not_spoil_the_level():
-    samples = samples_of(rot(12, -7, 130))
-    samples.orientation[180:190] = np.nan
-    level = level_of(samples)
-    assert level.samples == 191
-    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-6)
-
-
-def test_no_orientation_at_that_moment_is_no_level():
-    samples = samples_of(rot(12, -7, 130))
-    late = ImuSamples(
-        samples.stamps + 2 * 10**9, samples.orientation, samples.gyro, samples.acceleration
-    )
-    assert level_of(late) is None
-    assert level_of(samples) is not None
-
-
-def rows_of(samples, chosen):
-    return ImuSamples(
-        samples.stamps[chosen], samples.orientation[chosen], samples.gyro[chosen],
-        samples.acceleration[chosen],
-    )  # fmt: skip
-
-
-def test_where_the_gyro_cannot_bring_samples_together_one_orientation_counts():
-    noisy = samples_of(rot(12, -7, 130), noise=0.01)
-    at = ImuBuffer(ImuConfig(), noisy).orientation(START + 10**9)
-    # A gap of 0.4 s ends 0.1 s before that moment.
-    gap = rows_of(noisy, (noisy.stamps < START + 5e8) | (noisy.stamps > START + 9e8))
-    # 3 rad/s turn the lidar by more than 3 rad within a second of it.
-    wild = samples_of(rot(12, -7, 130), (0.0, 0.0, 7.0), noise=0.01)
-    spun = ImuBuffer(ImuConfig(), wild).orientation(START + 10**9)
-    for samples, alone in ((gap, at), (wild, spun)):
-        level = level_of(samples, ImuConfig(still_seconds=1.0))
-        assert level.samples == 1
-        assert [level.roll, level.pitch] == pytest.approx(roll_pitch(alone), abs=1e-12)
-
-
-def test_between_samples_one_orientation_counts_if_none_is_within_reach():
-    samples = samples_of(rot(12, -7, 130), (0.0, 0.4, 0.0))
-    level = find_level(
-        ImuBuffer(ImuConfig(), samples), ImuConfig(still_seconds=0.001),
-        START + 10**9 + 2_500_000, gtsam.Pose3(), levelled=False,
-    )  # fmt: skip
-    assert level.samples == 1
-    assert np.degrees(level.roll) == pytest.approx(12.0, abs=0.1)

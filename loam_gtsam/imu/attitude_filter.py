@@ -21,7 +21,7 @@ from loam_gtsam.imu.quaternions import (
 )
 from loam_gtsam.types import FloatArray, IntArray
 
-_BLOCK = 512
+BLOCK = 512
 """Samples taken at once. Blocks begin at fixed places of the stream, so that the result does not
 depend on how the samples came in."""
 
@@ -124,13 +124,24 @@ class GravityFilter:
         self._states: list[FilterState] = []
         self._done = 0
         self._start_end = 0
+        self._start_dropped = False
         self._room = np.zeros((0, 4))
 
-    def forget(self, place: int, stamp: int) -> None:
-        """The samples from index ``place`` on, the earliest of them at ``stamp``, are new."""
-        del self._states[place // _BLOCK + 1 :]
-        if stamp <= self._start_end:
-            self._states.clear()  # the rest at the start may be another one
+    def changed_from(self, index: int, stamp: int) -> None:
+        """The samples from ``index`` on, the earliest of them at ``stamp``, are new ones."""
+        del self._states[index // BLOCK + 1 :]
+        begin = self._states[0].stamp if self._start_dropped and self._states else self._start_end
+        if stamp <= begin:
+            # The rest at the start may be another one, or the clock was set back.
+            self._states.clear()
+            self._start_dropped = False
+
+    def drop(self, count: int) -> None:
+        """The first ``count`` samples, whole blocks that are done, are held no longer."""
+        del self._states[: count // BLOCK]
+        self._done -= count
+        self._room = self._room[count:].copy()
+        self._start_dropped = True
 
     def orientations(
         self, stamps: IntArray, gyro: FloatArray, acceleration: FloatArray
@@ -149,7 +160,7 @@ class GravityFilter:
         """
         count = len(stamps)
         if not self._states:
-            start = self._start(stamps, gyro, acceleration)
+            start = None if self._start_dropped else self._start(stamps, gyro, acceleration)
             if start is None:
                 return None
             self._states.append(start)
@@ -157,8 +168,8 @@ class GravityFilter:
         if count > len(self._room):
             self._room = np.concatenate([self._room, np.zeros((2 * count - len(self._room), 4))])
         while self._done < count:
-            begin = (len(self._states) - 1) * _BLOCK
-            end = min(begin + _BLOCK, count)
+            begin = (len(self._states) - 1) * BLOCK
+            end = min(begin + BLOCK, count)
             quaternions, state = filter_block(
                 self._states[-1],
                 stamps[begin:end],
@@ -169,7 +180,7 @@ class GravityFilter:
             )
             self._room[begin:end] = quaternions.T
             self._done = end
-            if end - begin == _BLOCK:
+            if end - begin == BLOCK:
                 self._states.append(state)
         return self._room[:count]
 

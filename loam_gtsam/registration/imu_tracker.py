@@ -11,15 +11,13 @@ import numpy as np
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import InertialOdometry, Prediction
 from loam_gtsam.imu_prior import (
-    Level,
     blend,
     blend_direction,
     equivalent_prior,
-    find_level,
     gravity_factor,
-    mean_orientation,
     roll_pitch_factor,
     tilt_information,
     too_steep,

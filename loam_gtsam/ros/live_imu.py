@@ -67,6 +67,7 @@ class LiveImu:
         if self._mapped is not None:
             self.late += sum(stamp <= self._mapped for stamp, _ in rows)
         self._mapped = until
+        self.buffer.forget_old(until)
         if not rows:
             return
         stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)

@@ -183,6 +183,7 @@ class LoamGtsam(EvalioPipeline):
         if self._buffer is not None and self._samples:
             self._buffer.add(_as_samples(self._samples))
             self._samples.clear()
+            self._buffer.forget_old(sweep.stamp.to_nsec())
         scan = _as_scan(sweep)
         extraction = extract(scan, self._pipeline.config)
         update = self._pipeline.process(scan, extraction)

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import ImuConfig, SolverConfig
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu_prior import Level, roll_pitch, roll_pitch_jacobian, tilt_information
+from loam_gtsam.imu.level import Level
+from loam_gtsam.imu_prior import roll_pitch, roll_pitch_jacobian, tilt_information
 from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver

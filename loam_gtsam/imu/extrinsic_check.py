@@ -1,0 +1,79 @@
+"""Whether the configured mounting of the IMU fits the motion that the scans have measured."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.types import FloatArray, InputError, IntArray
+
+EXTRINSIC_LIMIT = np.deg2rad(5.0)
+"""rad from which on a configured rotation is called wrong."""
+EXTRINSIC_SIGMA = np.deg2rad(1.5)
+"""rad, largest standard deviation of the better rotation about any axis for it to be believed."""
+EXTRINSIC_FRAMES = 20
+"""Pairs of frames below which nothing is said."""
+
+
+def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArray) -> str:
+    """Whether another ``lidar_R_imu_deg`` would fit the motion of the scans better.
+
+    The rotations from frame to frame by the gyro and by the scans are the same vectors in two sets
+    of axes; the rotation between the sets is found in closed form (Wahba's problem by SVD:
+    Markley, J. Astronautical Sciences 36, 1988).
+
+    Parameters
+    ----------
+    buffer : with the configured rotation
+    stamps : (N,) nanoseconds
+    map_T_lidar : (N, 4, 4) poses or (N, 3, 3) rotations, from scans alone
+
+    Returns
+    -------
+    A sentence if the best rotation is more than :data:`EXTRINSIC_LIMIT` away and known to
+    :data:`EXTRINSIC_SIGMA`, else "": then all is well or the motion was too poor to tell.
+
+    Raises
+    ------
+    InputError
+        If the shapes do not fit.
+    """
+    stamps, poses = np.asarray(stamps), np.asarray(map_T_lidar, dtype=np.float64)
+    if stamps.ndim != 1 or poses.shape not in ((len(stamps), 4, 4), (len(stamps), 3, 3)):
+        raise InputError(
+            f"extrinsic_problem: expected (N,) stamps and (N, 4, 4) or (N, 3, 3) poses, got "
+            f"{stamps.shape} and {poses.shape}"
+        )
+    turns = [buffer.rotation_between(int(a), int(b)) for a, b in pairwise(stamps)]
+    known = np.array([turn is not None for turn in turns], dtype=np.bool_)
+    if known.sum() < EXTRINSIC_FRAMES:
+        return ""
+    rotations = poses[:, :3, :3]
+    relative = np.einsum("nji,njk->nik", rotations[:-1], rotations[1:])[known]
+    by_scan = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(matrix)) for matrix in relative])
+    by_gyro = np.array([gtsam.Rot3.Logmap(turn) for turn in turns if turn is not None])
+    # How far, unlike about which axis, does not depend on the extrinsics: a pair that disagrees
+    # in that is a lost track or a gyro fault, and would only mislead.
+    unlike = np.abs(np.linalg.norm(by_scan, axis=1) - np.linalg.norm(by_gyro, axis=1))
+    fair = unlike <= 3.0 * np.median(unlike) + 1e-9
+    by_scan, by_gyro = by_scan[fair], by_gyro[fair]
+    left, strength, right = np.linalg.svd(by_scan.T @ by_gyro)
+    sign = float(np.sign(np.linalg.det(left) * np.linalg.det(right)))
+    better = gtsam.Rot3(left @ np.diag([1.0, 1.0, sign]) @ right)
+    away = float(np.linalg.norm(gtsam.Rot3.Logmap(better)))
+    residuals = by_scan - by_gyro @ better.matrix().T
+    variance = float((residuals**2).sum()) / (3 * len(residuals) - 3)
+    # Information about the axis known least, unit weights. Products of the two, not squares of one:
+    # noise, which is not the same in both, must not pass for motion.
+    weakest = strength[1] + sign * strength[2]
+    if away <= EXTRINSIC_LIMIT or variance > EXTRINSIC_SIGMA**2 * weakest:
+        return ""
+    angles = np.rad2deg(better.compose(buffer.lidar_R_imu).rpy()).round().astype(int)
+    return (
+        f"IMU: its rotations fit those of the scans better by {np.rad2deg(away):.0f} degrees with "
+        f"imu.lidar_R_imu_deg = {angles.tolist()}; check how the "
+        "IMU is mounted"
+    )

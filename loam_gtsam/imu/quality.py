@@ -1,0 +1,179 @@
+"""What was wrong with the IMU samples of a run, in numbers and in sentences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.imu.at_rest import REST_SAMPLES, RestWindow
+from loam_gtsam.imu.store import SampleStore
+from loam_gtsam.types import FloatArray, IntArray
+
+FROZEN_TURN = 0.2
+"""rad/s; an orientation that never changes while the gyro measures more is a placeholder."""
+TILT_LIMIT = np.deg2rad(5.0)
+"""rad between up by the orientation and up by the accelerometer at rest, from which on one of them
+is called wrong: an accelerometer bias of 0.85 m/s^2, ten times that of a consumer MEMS."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuReport:
+    """Numbers of a run's IMU samples, and what was put right.
+
+    Attributes
+    ----------
+    samples : samples that were used
+    duplicates : samples dropped because of their stamp; the first to come is kept
+    out_of_order : samples older than one that came before them; sorted in
+    not_finite : samples dropped because of NaN, infinity or an absurd value in stamp, gyro or
+        acceleration
+    unnormalised : quaternions brought to unit length
+    no_orientation : samples without a quaternion, or with a zero, NaN or absurd one
+    gaps : steps between neighbours longer than ``max_gap``
+    rate : median sample rate, Hz; 0 if unknown; of the samples that are still held
+    orientation : source of the orientation: the quaternions ("ahrs"), gyro and acceleration
+        ("gravity_filter"), or "none"
+    problems : the same and more in sentences, empty if all is well
+    """
+
+    samples: int
+    duplicates: int
+    out_of_order: int
+    not_finite: int
+    unnormalised: int
+    no_orientation: int
+    gaps: int
+    rate: float
+    orientation: str
+    problems: tuple[str, ...]
+
+
+class QualityLog:
+    """Counts what is wrong with samples, and finds out whether their orientation is one.
+
+    Parameters
+    ----------
+    config : section ``imu``
+
+    Attributes
+    ----------
+    not_finite, unnormalised, no_orientation : as in :class:`ImuReport`
+    constant : no orientation has differed from the first one so far; also if there was none
+    """
+
+    def __init__(self, config: ImuConfig) -> None:
+        self._config = config
+        self.not_finite = self.unnormalised = self.no_orientation = 0
+        self.constant = True
+        self._first: FloatArray | None = None
+        self._quaternions, self._fastest = 0, 0.0
+        self._dropped = self._dropped_gaps = self._longest_gap = 0
+
+    def watch_orientation(self, quaternions: FloatArray, gyro: FloatArray) -> None:
+        """Note whether the orientation (4, N) ever changes and how fast the gyro (N, 3) turns."""
+        self._fastest = max(self._fastest, float(np.linalg.norm(gyro, axis=1).max()))
+        self._quaternions += quaternions.shape[1]
+        if quaternions.shape[1]:
+            if self._first is None:
+                self._first = quaternions[:, :1].copy()
+            self.constant &= bool((quaternions == self._first).all())
+
+    @property
+    def measured(self) -> bool:
+        """Whether the samples hold an orientation that is no placeholder."""
+        return self._quaternions > 0 and not self._placeholder
+
+    def drop(self, stamps: IntArray) -> None:
+        """Keep the numbers of samples that are dropped: all of ``stamps`` but the last one."""
+        gaps = self._gaps(stamps)
+        self._dropped += len(stamps) - 1
+        self._dropped_gaps += len(gaps)
+        self._longest_gap = max(self._longest_gap, int(gaps.max(initial=0)))
+
+    def report(self, store: SampleStore, rest: RestWindow | None, filtered: bool) -> ImuReport:
+        """The report on all samples so far.
+
+        Parameters
+        ----------
+        store : the samples that are still held
+        rest : the rest at the start of the run, None if it began in motion
+        filtered : whether there is an orientation at all
+        """
+        samples = self._dropped + len(store.stamps)
+        source, problems = self._source(samples, rest, filtered)
+        for number, what in (
+            (store.duplicates, "repeat a stamp: the first of each is kept"),
+            (store.out_of_order, "came late: sorted in"),
+            (store.too_late, "came too late: left out"),
+            (self.not_finite, "hold NaN, infinity or absurd values: left out"),
+            (self.unnormalised, "have a quaternion that is not of unit length: normalised"),
+            (self.no_orientation if source == "ahrs" else 0, "have no orientation: interpolated"),
+        ):
+            if number:
+                problems.append(f"IMU: {number} samples {what}")
+        steps, gaps = np.diff(store.stamps), self._gaps(store.stamps)
+        number = self._dropped_gaps + len(gaps)
+        if number:
+            longest = max(self._longest_gap, int(gaps.max(initial=0)))
+            problems.append(
+                f"IMU: {number} gaps of more than {self._config.max_gap:g} s, the longest "
+                f"{longest * 1e-9:.3g} s: nothing is known inside them"
+            )
+        return ImuReport(
+            samples=samples,
+            duplicates=store.duplicates,
+            out_of_order=store.out_of_order,
+            not_finite=self.not_finite,
+            unnormalised=self.unnormalised,
+            no_orientation=self.no_orientation,
+            gaps=number,
+            rate=1e9 / float(np.median(steps)) if len(steps) else 0.0,
+            orientation=source,
+            problems=tuple(problems),
+        )
+
+    @property
+    def _placeholder(self) -> bool:
+        enough = self._quaternions >= REST_SAMPLES
+        return enough and self.constant and self._fastest > FROZEN_TURN
+
+    def _gaps(self, stamps: IntArray) -> IntArray:
+        steps = np.diff(stamps)
+        return steps[steps > round(self._config.max_gap * 1e9)]
+
+    def _source(
+        self, samples: int, rest: RestWindow | None, filtered: bool
+    ) -> tuple[str, list[str]]:
+        """Where the orientation comes from, and what is wrong with that."""
+        problems = []
+        if self._placeholder:
+            problems.append(
+                f"IMU: the orientation never changes while the gyro says {self._fastest:.2g} "
+                "rad/s: it is a placeholder and not used"
+            )
+        if self.measured:
+            if rest is not None and rest.disagreement > TILT_LIMIT:
+                problems.append(
+                    "IMU: at rest at the start, up by the orientation and up by the accelerometer "
+                    f"are {np.rad2deg(rest.disagreement):.0f} degrees apart: expected the "
+                    "orientation of the IMU in a world with z up (not the north-east-down one) and "
+                    "an acceleration that reads +9.8 upwards; correct the driver or set imu.prior "
+                    "to off"
+                )
+            return "ahrs", problems
+        if not samples:
+            return "none", problems
+        if not filtered:
+            problems.append(
+                "IMU: no orientation, and none to be had from the acceleration, whose mean at the "
+                f"start is not near {self._config.gravity:g} m/s^2 (imu.gravity): expected m/s^2"
+            )
+            return "none", problems
+        if rest is None:
+            problems.append(
+                "IMU: no orientation, and no rest at the start to take the bias of the gyro from: "
+                "roll and pitch may be off by several degrees"
+            )
+        return "gravity_filter", problems

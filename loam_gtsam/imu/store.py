@@ -1,0 +1,100 @@
+"""IMU samples in order of time, in arrays that grow at their end and are dropped at their start."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from loam_gtsam.types import FloatArray, IntArray
+
+
+class SampleStore:
+    """Stamps and values of IMU samples, sorted by stamp, one sample for each stamp.
+
+    Attributes
+    ----------
+    duplicates : number of samples dropped because of their stamp; the first to come is kept
+    out_of_order : number of samples older than one that came before them
+    too_late : number of samples dropped because they are older than :meth:`drop` has left
+    accepts_from : older samples are dropped, nanoseconds; None accepts all
+    """
+
+    def __init__(self) -> None:
+        self.duplicates = self.out_of_order = self.too_late = 0
+        self.accepts_from: int | None = None
+        self._newest_arrival = np.iinfo(np.int64).min
+        self._waiting: list[tuple[IntArray, FloatArray]] = []
+        self._count = 0
+        # Longer than needed: a live stream is then copied a few times in all, not at every merge.
+        self._room_stamps = np.zeros(0, np.int64)
+        self._room = np.zeros((0, 10))
+
+    @property
+    def stamps(self) -> IntArray:
+        """(N,) nanoseconds, ascending; a view that is valid until the next :meth:`merge`."""
+        return self._room_stamps[: self._count]
+
+    @property
+    def values(self) -> FloatArray:
+        """(N, 10) quaternion x y z w, gyro (3), acceleration (3); a view like ``stamps``."""
+        return self._room[: self._count]
+
+    @property
+    def gyro(self) -> FloatArray:
+        """(N, 3) rad/s; a view."""
+        return self.values[:, 4:7]
+
+    @property
+    def acceleration(self) -> FloatArray:
+        """(N, 3) m/s^2; a view."""
+        return self.values[:, 7:]
+
+    def add(self, stamps: IntArray, values: FloatArray) -> None:
+        """Keep samples (N,) and (N, 10), in any order, for the next :meth:`merge`."""
+        if self.accepts_from is not None:
+            young = stamps >= self.accepts_from
+            self.too_late += len(stamps) - int(young.sum())
+            stamps, values = stamps[young], values[young]
+        if len(stamps) == 0:
+            return
+        newest = np.maximum.accumulate(np.concatenate([[self._newest_arrival], stamps]))
+        self.out_of_order += int((stamps < newest[:-1]).sum())
+        self._newest_arrival = int(newest[-1])
+        self._waiting.append((stamps, values))
+
+    def merge(self) -> tuple[int, int] | None:
+        """Sort in what was added.
+
+        Returns
+        -------
+        Index from which on samples have changed, and the stamp of the earliest new sample; None if
+        there was nothing new.
+        """
+        if not self._waiting:
+            return None
+        stamps = np.concatenate([part[0] for part in self._waiting])
+        values = np.concatenate([part[1] for part in self._waiting])
+        self._waiting.clear()
+        earliest = int(stamps.min())
+        # Nothing before this index changes; as a rule the index is the end.
+        at = int(np.searchsorted(self.stamps, earliest))
+        # The old samples first: of equal stamps a stable sort then keeps the first to come.
+        stamps = np.concatenate([self.stamps[at:], stamps])
+        values = np.concatenate([self.values[at:], values])
+        order = np.argsort(stamps, kind="stable")
+        stamps = stamps[order]
+        kept = np.concatenate([[True], stamps[1:] != stamps[:-1]])
+        self.duplicates += len(stamps) - int(kept.sum())
+        self._count = at + int(kept.sum())
+        if self._count > len(self._room):
+            room = 2 * self._count
+            self._room_stamps = np.concatenate([self._room_stamps[:at], np.zeros(room - at, int)])
+            self._room = np.concatenate([self._room[:at], np.zeros((room - at, 10))])
+        self._room_stamps[at : self._count] = stamps[kept]
+        self._room[at : self._count] = values[order][kept]
+        return at, earliest
+
+    def drop(self, count: int) -> None:
+        """Drop the ``count`` oldest samples, fewer than all, and from now on every older one."""
+        self._room_stamps, self._room = self.stamps[count:].copy(), self.values[count:].copy()
+        self._count -= count
+        self.accepts_from = int(self._room_stamps[0])

@@ -1,0 +1,109 @@
+"""Up in the map, found in the samples around a moment."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.imu import START, part, rot
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.level import find_level
+from loam_gtsam.types import ImuSamples
+
+
+def rot3(*degrees):
+    return gtsam.Rot3(rot(*degrees).as_matrix())
+
+
+def samples_of(level_R_lidar, rate=(0.0, 0.0, 0.0), noise=0.0, seconds=2.0):
+    """A lidar that has ``level_R_lidar`` one second after START and turns evenly; 200 Hz."""
+    times = np.arange(round(200 * seconds)) / 200.0
+    rng = np.random.default_rng(0)
+    turns = Rotation.from_rotvec(np.outer(times - 1.0, rate))
+    attitude = Rotation.from_matrix(level_R_lidar.matrix()) * turns
+    seen = attitude * Rotation.from_rotvec(noise * rng.normal(size=(len(times), 3)))
+    return ImuSamples(
+        START + np.round(times * 1e9).astype(np.int64),
+        seen.as_quat(),
+        np.tile(np.array(rate, np.float64), (len(times), 1)),
+        attitude.inv().apply([0.0, 0.0, 9.81]),
+    )
+
+
+def level_of(samples, config=None, pose=None, levelled=False):
+    config = config or ImuConfig()
+    pose = pose or gtsam.Pose3()
+    return find_level(ImuBuffer(config, samples), config, START + 10**9, pose, levelled=levelled)
+
+
+def test_up_is_found_in_any_map_and_yaw_is_left_alone():
+    attitude = rot3(12, -7, 130)
+    pose = gtsam.Pose3(rot3(50, 20, -80), np.ones(3))
+    level = level_of(samples_of(attitude), pose=pose)
+    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-9)
+    found = level.level_R_map.compose(pose.rotation())
+    np.testing.assert_allclose(np.degrees(found.rpy()), [12, -7, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        level.map_up, pose.rotation().matrix() @ attitude.matrix()[2], atol=1e-9
+    )
+    assert level.source == "still"
+    in_level = level_of(samples_of(attitude), levelled=True)
+    assert in_level.level_R_map.equals(gtsam.Rot3(), 0.0)
+    assert (in_level.roll, in_level.pitch) == (level.roll, level.pitch)
+
+
+@pytest.mark.parametrize("rate", [(0.0, 0.0, 0.0), (0.3, -0.2, 0.8)])
+def test_a_second_of_samples_is_averaged_though_the_lidar_turns(rate):
+    noisy = samples_of(rot3(12, -7, 130), rate, noise=0.01)
+    level = level_of(noisy)
+    assert level.samples == 201
+    away = np.array([level.roll, level.pitch]) - np.radians([12, -7])
+    assert np.abs(away).max() < 3.0 * 0.01 / np.sqrt(201.0)
+    assert level.source == ("moving" if any(rate) else "still")
+    # Also where there is little before that moment, so that the turning does not cancel.
+    samples = samples_of(rot3(12, -7, 130), rate)
+    level = level_of(part(samples, slice(180, None)))
+    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-6)
+    alone = level_of(noisy, ImuConfig(still_seconds=0.0))
+    assert alone.samples == 1
+
+
+def test_samples_without_orientation_do_not_spoil_the_level():
+    samples = samples_of(rot3(12, -7, 130))
+    samples.orientation[180:190] = np.nan
+    level = level_of(samples)
+    assert level.samples == 191
+    np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-6)
+
+
+def test_no_orientation_at_that_moment_is_no_level():
+    samples = samples_of(rot3(12, -7, 130))
+    assert level_of(replace(samples, stamps=samples.stamps + 2 * 10**9)) is None
+    assert level_of(samples) is not None
+
+
+def test_where_the_gyro_cannot_bring_samples_together_one_orientation_counts():
+    noisy = samples_of(rot3(12, -7, 130), noise=0.01)
+    at = ImuBuffer(ImuConfig(), noisy).orientation(START + 10**9)
+    # A gap of 0.4 s ends 0.1 s before that moment.
+    gap = part(noisy, (noisy.stamps < START + 5e8) | (noisy.stamps > START + 9e8))
+    # 3 rad/s turn the lidar by more than 3 rad within a second of it.
+    wild = samples_of(rot3(12, -7, 130), (0.0, 0.0, 7.0), noise=0.01)
+    spun = ImuBuffer(ImuConfig(), wild).orientation(START + 10**9)
+    for samples, alone in ((gap, at), (wild, spun)):
+        level = level_of(samples, ImuConfig(still_seconds=1.0))
+        assert level.samples == 1
+        assert [level.roll, level.pitch] == pytest.approx(alone.rpy()[:2], abs=1e-12)
+
+
+def test_between_samples_one_orientation_counts_if_none_is_within_reach():
+    samples = samples_of(rot3(12, -7, 130), (0.0, 0.4, 0.0))
+    level = find_level(
+        ImuBuffer(ImuConfig(), samples), ImuConfig(still_seconds=0.001),
+        START + 10**9 + 2_500_000, gtsam.Pose3(), levelled=False,
+    )  # fmt: skip
+    assert level.samples == 1
+    assert np.degrees(level.roll) == pytest.approx(12.0, abs=0.1)

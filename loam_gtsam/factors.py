@@ -1,5 +1,20 @@
 """Scan matching as GTSAM factors: point to line, point to plane, one by one or a scan at once.
 
+=========================================  ========================================================
+You look for                               It is called here
+=========================================  ========================================================
+``PointToPlaneFactor``, one per match      :func:`point_to_plane_factor`
+``PointToLineFactor`` (edge factor)        :func:`point_to_line_factor`
+a batched or scan factor                   :func:`scan_match_factor` of :class:`MatchRows`
+``CustomFactor`` with an own residual      :func:`checked_factor`, for variables of any type
+``evaluateError`` without a factor         :func:`point_to_plane_residual`,
+                                           :func:`point_to_line_residual`,
+                                           :meth:`MatchRows.residuals`
+=========================================  ========================================================
+
+The functions return a :class:`gtsam.CustomFactor`; every one on a pose takes the key of a Pose3
+``map_T_lidar`` and the noise model that GTSAM's own factors take, robust ones included.
+
 Residuals (``q = R p + t``, pose ``map_T_lidar = (R, t)``, right perturbation ``[rot, trans]``):
 
 * plane ``n . q + d = 0``: one row ``n . q + d``;
@@ -21,17 +36,17 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.geometry import cross
-from loam_gtsam.types import BoolArray, FloatArray, InputError
+from loam_gtsam.geometry import as_array, as_points, as_vector, cross
+from loam_gtsam.types import BoolArray, FloatArray, InputError, check_array
 
 _RIDGE = 1e-9
-"""Share of the planes that holds the anchor of :func:`scan_match_factor` where they do not."""
+"""Weight, relative to that of the planes, that pulls the anchor of :func:`scan_match_factor` to the
+origin. It decides only where the planes leave the anchor free."""
 
 Residual = Callable[[gtsam.Values], tuple[FloatArray, Sequence[FloatArray]]]
 """Maps values to (residual (m,), one Jacobian (m, dim) per key)."""
@@ -122,19 +137,13 @@ class MatchRows:
     scales: FloatArray
 
     def __post_init__(self) -> None:
-        count = len(self.points)
-        expected = {
-            "points": (count, 3),
-            "normals": (count, 3),
-            "offsets": (count,),
-            "scales": (count,),
-        }
-        for name, shape in expected.items():
-            array = getattr(self, name)
-            if not isinstance(array, np.ndarray) or array.shape != shape:
-                raise InputError(f"MatchRows.{name}: expected shape {shape}, got {np.shape(array)}")
-            if not np.isfinite(array).all():
-                raise InputError(f"MatchRows.{name}: contains NaN or infinite values")
+        points = as_points(self.points, "MatchRows.points")
+        set_field = partial(object.__setattr__, self)
+        set_field("points", points)
+        set_field("normals", as_array(self.normals, "MatchRows.normals", points.shape))
+        for name in ("offsets", "scales"):
+            values = as_vector(getattr(self, name), f"MatchRows.{name}", len(points))
+            set_field(name, values)
 
     def residuals(self, map_T_lidar: gtsam.Pose3) -> tuple[FloatArray, FloatArray]:
         """Whitened residuals (M,) and Jacobian (M, 6) at a pose."""
@@ -169,16 +178,18 @@ def line_rows(
     InputError
         If a shape is wrong or a value not finite.
     """
-    p, c = _points("points", points), _points("centres", centres)
-    u = _points("directions", directions)
-    _same_length(points=p, centres=c, directions=u, weights=np.atleast_1d(weights))
+    p, c, u, w = (np.asarray(part, np.float64) for part in (points, centres, directions, weights))
+    check_array(p, "points", ("N", 3))
+    check_array(c, "centres", p.shape)
+    check_array(u, "directions", p.shape)
+    check_array(w, "weights", p.shape[:1])
     basis = complement_basis(u)
     offsets = -np.einsum("nij,nj->ni", basis, c)
     return MatchRows(
         np.repeat(p, 2, axis=0),
         basis.reshape(-1, 3),
         offsets.reshape(-1),
-        np.repeat(np.divide(weights, sigmas, dtype=np.float64), 2),
+        np.repeat(np.divide(w, sigmas, dtype=np.float64), 2),
     )
 
 
@@ -204,12 +215,11 @@ def plane_rows(
     InputError
         If a shape is wrong or a value not finite.
     """
-    return MatchRows(
-        _points("points", points),
-        _points("normals", normals),
-        np.asarray(offsets, np.float64),
-        np.divide(weights, sigmas, dtype=np.float64),
-    )
+    p, n = np.asarray(points, np.float64), np.asarray(normals, np.float64)
+    check_array(p, "points", ("N", 3))
+    check_array(n, "normals", p.shape)
+    scales = np.divide(weights, sigmas, dtype=np.float64)
+    return MatchRows(p, n, np.asarray(offsets, np.float64), scales)
 
 
 def concatenate_rows(parts: Sequence[MatchRows]) -> MatchRows:
@@ -228,7 +238,10 @@ def checked_factor(
     """A CustomFactor that turns a faulty residual function into a Python error.
 
     GTSAM itself crashes the process on a Jacobian of the wrong shape and silently accepts one with
-    the wrong number of columns, so shapes, dtypes and finiteness are checked here.
+    the wrong number of columns, so shapes, dtypes and finiteness are checked here. The variables
+    may be of any type that :class:`gtsam.Values` holds (poses, rotations, points, vectors, numbers,
+    IMU biases, navigation states, calibrations): a Jacobian has as many columns as the variable has
+    tangent directions.
 
     Parameters
     ----------
@@ -248,7 +261,7 @@ def checked_factor(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
     ) -> FloatArray:
         error, derivatives = residual(values)
-        error = _checked_block("residual", error, (rows,))
+        error = as_vector(error, "factor residual", rows)
         if jacobians is not None:
             if len(derivatives) != len(keys):
                 raise InputError(
@@ -256,9 +269,8 @@ def checked_factor(
                 )
             for slot, (key, block) in enumerate(zip(keys, derivatives, strict=True)):
                 shape = (rows, _dimension(values, key))
-                jacobians[slot] = np.asfortranarray(
-                    _checked_block(f"Jacobian {slot}", block, shape)
-                )
+                block = as_array(block, f"factor Jacobian {slot}", shape)
+                jacobians[slot] = np.asfortranarray(block)
         return error
 
     return gtsam.CustomFactor(noise, keys, call)
@@ -285,7 +297,7 @@ def point_to_plane_factor(
     InputError
         If a shape is wrong, a value not finite, or the normal not of unit length.
     """
-    p, n = _vector("point", point), _unit("normal", normal)
+    p, n = as_vector(point, "point"), _unit(normal, "normal")
     if not np.isfinite(offset):
         raise InputError(f"offset: expected a finite number, got {offset}")
     _noise_dimension(noise, 1)
@@ -315,7 +327,7 @@ def point_to_line_factor(
     InputError
         If a shape is wrong, a value not finite, or the direction not of unit length.
     """
-    p, c, u = _vector("point", point), _vector("centre", centre), _unit("direction", direction)
+    p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
     _noise_dimension(noise, 2)
     return _pose_factor(key, noise, partial(point_to_line_residual, point=p, centre=c, direction=u))
 
@@ -417,61 +429,20 @@ def _pose_factor(
 
 
 def _dimension(values: gtsam.Values, key: int) -> int:
-    """Tangent dimension of a variable."""
-    one = gtsam.Values()
-    one.insert(key, _at(values, key))
-    return int(one.dim())
-
-
-def _at(values: gtsam.Values, key: int) -> Any:
-    for getter in (values.atPose3, values.atVector, values.atRot3, values.atPoint3):
-        try:
-            return getter(key)
-        except RuntimeError:
-            continue
-    raise InputError(f"factor: variable {gtsam.DefaultKeyFormatter(key)} has an unsupported type")
-
-
-def _checked_block(name: str, block: object, shape: tuple[int, ...]) -> FloatArray:
+    """Tangent dimension of a variable of any type."""
     try:
-        array = np.asarray(block, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"factor {name}: expected an array of shape {shape}: {error}") from error
-    if array.shape != shape:
-        raise InputError(f"factor {name}: expected shape {shape}, got {array.shape}")
-    if not np.isfinite(array).all():
-        raise InputError(f"factor {name}: contains NaN or infinite values")
-    return array
+        values.atPose3(key)
+    except RuntimeError:  # another type: looked up among all variables, which takes longer
+        return int(values.zeroVectors().at(key).size)
+    return 6
 
 
-def _points(name: str, value: ArrayLike) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InputError(f"{name}: expected an (M, 3) array, got shape {array.shape}")
-    return array
-
-
-def _same_length(**arrays: FloatArray) -> None:
-    lengths = {name: len(array) for name, array in arrays.items()}
-    if len(set(lengths.values())) > 1:
-        raise InputError(f"matches: expected equal lengths, got {lengths}")
-
-
-def _vector(name: str, value: ArrayLike) -> FloatArray:
-    array = np.asarray(value, dtype=np.float64)
-    if array.shape != (3,):
-        raise InputError(f"{name}: expected shape (3,), got {array.shape}")
-    if not np.isfinite(array).all():
-        raise InputError(f"{name}: contains NaN or infinite values: {array}")
-    return array
-
-
-def _unit(name: str, value: ArrayLike) -> FloatArray:
-    array = _vector(name, value)
-    length = float(np.linalg.norm(array))
+def _unit(value: ArrayLike, name: str) -> FloatArray:
+    vector = as_vector(value, name)
+    length = float(np.linalg.norm(vector))
     if abs(length - 1.0) > 1e-6:
         raise InputError(f"{name}: expected unit length, got length {length:.6g}")
-    return array
+    return vector
 
 
 def _noise_dimension(noise: gtsam.noiseModel.Base, dimension: int) -> None:

@@ -22,7 +22,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.geometry import as_array, as_points, as_vector, find, transform, voxel_keys
+from loam_gtsam.geometry import (
+    as_array,
+    as_points,
+    as_vector,
+    find_in_sorted,
+    transform,
+    voxel_keys,
+)
 from loam_gtsam.types import BoolArray, ConfigError, FloatArray, InputError, IntArray
 from loam_gtsam.voxels.archive import Archive, CubeIndex, CubePoints, Owners
 
@@ -588,7 +595,7 @@ class _Cube:
     def average(self, new: _Voxels, owners: Owners) -> None:
         """Mean of the point a voxel has, if any, and the new ones; the owner stays."""
         self._take_in()
-        at, taken = find(self._old.keys, new.keys)
+        at, taken = find_in_sorted(self._old.keys, new.keys)
         held = self._old.points
         old = held[at[taken]]
         sums, counts, lows, highs = new.sums, new.counts, new.lows, new.highs
@@ -604,7 +611,7 @@ class _Cube:
     def settle(self, new: _Content) -> FloatArray:
         """Add the points whose voxels are free, and return them."""
         for held in (self._old.keys, self._new.keys):
-            taken = find(held, new.keys)[1]
+            taken = find_in_sorted(held, new.keys)[1]
             new = new.at(np.flatnonzero(~taken)) if taken.any() else new
         if len(new.keys):
             self._new = self._new.joined(new)

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
 
 _SMALL_ANGLE = 1e-9
+_GRID = 1 << 20
+"""Voxels on either side of the origin that the keys of voxels tell apart."""
 
 
 def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:
@@ -237,8 +239,36 @@ def fit_planes(
 
 
 def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
-    """One integer per voxel of edge length ``size`` (21 bits an axis: +-1,048,576 voxels)."""
-    cells = np.floor(points[:, :3] / size).astype(np.int64) + (1 << 20)
+    """One integer per voxel of edge length ``size``, metres; keys sort by x, then y, then z.
+
+    Raises
+    ------
+    InputError
+        If a point of (N, 3) or more columns is outside the grid of 2^20 voxels on either side of
+        the origin, whose keys are distinct.
+    """
+    cells = _voxel_cells(points, size)
+    if not _within_grid(cells):
+        farthest = np.abs(points[:, :3]).max()
+        raise InputError(
+            f"points: expected metres within {_GRID * size:g} (2^20 voxels of {size:g} m) on each "
+            f"axis, got {farthest:g}; use larger voxels"
+        )
+    return _packed_cells(cells)
+
+
+def _voxel_cells(points: NDArray[np.floating], size: float) -> IntArray:
+    """(N, 3) numbers of the voxels, counted from the corner of the grid."""
+    cells: IntArray = np.floor(points[:, :3] / size).astype(np.int64) + _GRID
+    return cells
+
+
+def _within_grid(cells: IntArray) -> bool:
+    return int(np.bitwise_or.reduce(cells, axis=None)) >> 21 == 0  # a negative number shifts to -1
+
+
+def _packed_cells(cells: IntArray) -> IntArray:
+    """(N,) keys of 21 bits an axis."""
     keys: IntArray = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
     return keys
 
@@ -258,7 +288,11 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     """
     if size <= 0.0 or len(points) == 0:
         return np.asarray(points, dtype=np.float64)
-    keys = voxel_keys(points, size)
+    cells = _voxel_cells(points, size)
+    if _within_grid(cells):
+        keys = _packed_cells(cells)
+    else:  # slower, but for any extent, and in the same order
+        keys = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
@@ -268,13 +302,13 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     return centroids
 
 
-def find(held: IntArray, keys: IntArray) -> tuple[IntArray, BoolArray]:
-    """Where (N,) keys are or belong among (M,) sorted ones, and which are there."""
-    at: IntArray = held.searchsorted(keys)
-    if len(held) == 0:
-        return at, np.zeros(len(keys), np.bool_)
-    taken: BoolArray = held.take(at, mode="clip") == keys
-    return at, taken
+def find_in_sorted(sorted_keys: IntArray, keys: IntArray) -> tuple[IntArray, BoolArray]:
+    """Positions at which (N,) keys are, or belong, among (M,) sorted keys; and which are there."""
+    positions: IntArray = sorted_keys.searchsorted(keys)
+    if len(sorted_keys) == 0:
+        return positions, np.zeros(len(keys), np.bool_)
+    present: BoolArray = sorted_keys.take(positions, mode="clip") == keys
+    return positions, present
 
 
 def symmetric(matrix: FloatArray) -> FloatArray:

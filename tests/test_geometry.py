@@ -10,6 +10,7 @@ from loam_gtsam.geometry import (
     as_points,
     as_stamps,
     as_vector,
+    find_in_sorted,
     fit_lines,
     fit_planes,
     inverse_pose,
@@ -301,3 +302,23 @@ def test_voxel_keys_tell_every_voxel_apart_and_sort_by_x_y_z():
     cells = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
     keys = voxel_keys((cells + 0.5) * 0.25, 0.25)
     assert (np.diff(keys) > 0).all()
+
+
+def test_cells_20_km_apart_never_share_a_key():
+    near, far = np.zeros((1, 3)), np.array([[0.0, (1 << 21) * 0.01, 0.0]])
+    with pytest.raises(InputError, match=r"within 10485.8 \(2\^20 voxels of 0.01 m\).*got 20971.5"):
+        voxel_keys(np.vstack([near, far]), 0.01)
+    with pytest.raises(InputError, match="got 10485.8"):
+        voxel_keys(np.array([[0.0, 0.0, -(1 << 20) * 0.01 - 0.005]]), 0.01)
+    # Without a grid the filter tells them apart all the same, in the same order.
+    rng = np.random.default_rng(11)
+    points = np.vstack([rng.uniform(-0.02, 0.02, (50, 3)) + offset for offset in (near, far, -far)])
+    expected = reference_filter(points, 0.01)
+    np.testing.assert_allclose(voxel_filter(points, 0.01), expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("held", [[], [3, 5, 9]])
+def test_keys_are_found_among_sorted_ones(held):
+    positions, present = find_in_sorted(np.array(held, np.int64), np.array([9, 4, 3, 12, 0]))
+    assert positions.tolist() == np.searchsorted(held, [9, 4, 3, 12, 0]).tolist()
+    assert present.tolist() == [key in held for key in (9, 4, 3, 12, 0)]

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from loam_gtsam.config import CovarianceConfig
-from loam_gtsam.geometry import find, symmetric, transform, voxel_keys
+from loam_gtsam.geometry import find_in_sorted, symmetric, transform, voxel_keys
 from loam_gtsam.registration.solvers import Solution, match_rows
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
@@ -78,8 +78,8 @@ class SeenGround:
         points_map : (N, 3) metres
         """
         keys, numbers = np.unique(voxel_keys(points_map, self._size), return_inverse=True)
-        fresh = ~(find(self._new, keys)[1] | find(self._young, keys)[1])
-        new = fresh & ~find(self._old, keys)[1]
+        fresh = ~(find_in_sorted(self._new, keys)[1] | find_in_sorted(self._young, keys)[1])
+        new = fresh & ~find_in_sorted(self._old, keys)[1]
         self._new = np.sort(np.concatenate((self._new, keys[fresh])), kind="stable")
         if len(self._new) > _WAITING * len(self._young):
             self._young = np.sort(np.concatenate((self._young, self._new)), kind="stable")

@@ -353,6 +353,11 @@ class FrameStatus(StrEnum):
         """Whether the frame has a pose of its own time; a frame with a bad stamp has none."""
         return self is not FrameStatus.BAD_STAMP
 
+    @property
+    def usable(self) -> bool:
+        """Whether the sweep had a valid stamp and usable points, whatever came of it."""
+        return self not in (FrameStatus.UNUSABLE_SCAN, FrameStatus.BAD_STAMP)
+
 
 class SweepMotion(StrEnum):
     """Where the rotation within a sweep came from; its translation is a constant velocity."""

@@ -11,18 +11,17 @@ from rich.console import Console, Group
 from rich.table import Table
 from rich.text import Text
 
-from loam_gtsam.cli.report import NOT_MAPPED
-from loam_gtsam.cli.run import (
-    RunOptions,
+from loam_gtsam.cli.console import (
+    draws_pictures,
     file_name,
     frame_progress,
-    free_folder,
-    no_empty_folder,
-    say_written,
+    output_folder,
+    print_written,
     stop_requests,
 )
+from loam_gtsam.cli.options import CompareOptions
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.io.atomic import make_folder, staged_files
+from loam_gtsam.io.atomic import staged_files
 from loam_gtsam.studies.comparison import Contender, compare
 from loam_gtsam.studies.comparison_report import (
     ACCURACY_COLUMNS,
@@ -37,12 +36,11 @@ from loam_gtsam.studies.comparison_report import (
     spread,
     write,
 )
-from loam_gtsam.types import DatasetError, OutputError
-from loam_gtsam.view import plots as visualization
+from loam_gtsam.types import DatasetError
 
 
 def execute(
-    dataset: Dataset, contenders: Sequence[Contender], shared_guess: bool, options: RunOptions
+    dataset: Dataset, contenders: Sequence[Contender], shared_guess: bool, options: CompareOptions
 ) -> int:
     """Compare, write, report; returns the exit code.
 
@@ -52,18 +50,16 @@ def execute(
         If the comparison cannot start or its results cannot be written, or what ended it early
         (after what was computed until then has been written).
     """
-    plot = visualization.available() if options.plot is None else options.plot
-    if plot and not visualization.available():
-        raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
+    plot = draws_pictures(options.plot)
     wanted = options.output or Path("loam_gtsam_output") / f"{file_name(dataset.name)}_compare"
     known = (*TABLE_FILES, *PICTURES, REPORT_FILE, TRUTH_FILE)
-    wanted = free_folder(wanted, options.overwrite, known)
-    is_new = not wanted.exists()
-    folder = make_folder(wanted)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
-    with no_empty_folder(folder, is_new), stop_requests() as stop:
+    with (
+        output_folder(wanted, known, overwrite=options.overwrite) as folder,
+        stop_requests() as stop,
+    ):
         started = time.perf_counter()
-        with frame_progress(dataset.name, total, stop, options.quiet) as on_frame:
+        with frame_progress(dataset.name, total, stop, quiet=options.quiet) as on_frame:
             comparison = compare(
                 dataset,
                 contenders,
@@ -80,12 +76,12 @@ def execute(
     if not options.quiet:
         console = Console()
         console.print(_summary(results, seconds))
-        say_written(console, stop, comparison.frames, total, folder, files)
+        print_written(console, stop, comparison.frames, total, folder, files)
     if comparison.error is not None:
         raise comparison.error
     if stop.signum is not None:
         return 128 + stop.signum
-    if all(u.status in NOT_MAPPED for run in comparison.runs for u in run.updates):
+    if not any(u.status.usable for run in comparison.runs for u in run.updates):
         message = next((u.message for u in comparison.runs[0].updates if u.message), "")
         raise DatasetError(
             f"{dataset.name}: no solver could use any of the {comparison.frames} sweeps; the "

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from loam_gtsam.cli.options import OptimizeOptions
+from loam_gtsam.config import Config
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
@@ -17,16 +17,7 @@ _LISTED = 10
 """Loops that are switched off and listed."""
 
 
-def execute(
-    path: Path,
-    output: Path | None,
-    trajectory: Path | None,
-    *,
-    robust: bool,
-    max_chi2: float,
-    overwrite: bool,
-    quiet: bool,
-) -> int:
+def execute(options: OptimizeOptions) -> int:
     """Optimise a file; returns the exit code.
 
     Raises
@@ -34,7 +25,8 @@ def execute(
     LoamError
         If a file cannot be read or written, or the graph cannot be solved.
     """
-    target = output or path.with_name(f"{path.stem}_optimized{path.suffix}")
+    path, trajectory = options.graph, options.trajectory
+    target = options.output or path.with_name(f"{path.stem}_optimized{path.suffix}")
     written = [target]
     if target.suffix == GTSAM_SUFFIXES[0]:
         written = [target.with_suffix(suffix) for suffix in GTSAM_SUFFIXES]
@@ -43,7 +35,7 @@ def execute(
     for file in written:
         if file.resolve() == path.resolve():
             raise OutputError(f"{file}: the input must not be replaced; choose another name")
-        if file.exists() and not overwrite:
+        if file.exists() and not options.overwrite:
             raise OutputError(f"{file}: the file exists; add --overwrite or choose another name")
     saved = read_graph(path)
     keys = sorted(saved.poses.keys())
@@ -51,14 +43,17 @@ def execute(
         raise DatasetError(
             f"{path}: has no stamps for some poses, which --trajectory needs; leave it out"
         )
-    result = optimize_graph(saved, robust=robust, max_chi2=max_chi2)
+    max_chi2 = options.max_chi2
+    if max_chi2 is None:
+        max_chi2 = Config().pose_graph.max_chi2
+    result = optimize_graph(saved, robust=options.robust, max_chi2=max_chi2)
     stamps = {key: saved.stamps[key] for key in keys if key in saved.stamps}
     write_graph(target, SavedGraph(result.factors, result.poses, stamps))
     if trajectory is not None:
         poses = [result.poses.atPose3(key) for key in keys]
         corrected = Trajectory.from_poses([stamps[key] for key in keys], poses)
         write_tum(trajectory, corrected, comments={"graph": path.name})
-    if not quiet:
+    if not options.quiet:
         console = Console()
         console.print(_table(saved, result, keys))
         names = ", ".join(str(file) for file in written)

@@ -28,7 +28,6 @@ from loam_gtsam.types import (
     SweepError,
 )
 
-NOT_MAPPED = (FrameStatus.UNUSABLE_SCAN, FrameStatus.BAD_STAMP)
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
 _MESSAGES = 3
 _TRIED_SWEEPS = 5

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.table import Table
 from rich.text import Text
 
-from loam_gtsam.cli.run import file_name, stop_requests
+from loam_gtsam.cli.console import file_name, progress_bar, stop_requests
+from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.studies.trial_spec import Spec, load_spec
 from loam_gtsam.studies.trial_table import (
@@ -35,19 +29,7 @@ from loam_gtsam.types import OutputError
 _SHOWN_ERRORS = 3
 
 
-@dataclass(frozen=True, slots=True)
-class SweepOptions:
-    """Options of ``sweep``; see their help."""
-
-    workers: int | None
-    scheduler: str | None
-    output: Path | None
-    retry_failed: bool
-    overwrite: bool
-    quiet: bool
-
-
-def execute(path: Path, options: SweepOptions) -> int:
+def execute(path: Path, options: StudyOptions) -> int:
     """Run what is not finished, write the table, report; returns the exit code.
 
     Raises
@@ -92,13 +74,13 @@ def _different(trials: Sequence[Trial]) -> list[Trial]:
     return list({trial.id: trial for trial in trials}.values())
 
 
-def _is_left(found: Row | None, options: SweepOptions) -> bool:
+def _is_left(found: Row | None, options: StudyOptions) -> bool:
     return found is None or options.overwrite or (options.retry_failed and bool(found["error"]))
 
 
 @contextmanager
 def _rows(
-    trials: Sequence[Trial], options: SweepOptions, stopped: Callable[[], bool]
+    trials: Sequence[Trial], options: StudyOptions, stopped: Callable[[], bool]
 ) -> Iterator[Iterator[Row]]:
     """The rows of the trials, as they are finished, from wherever they are to run."""
     if not trials:
@@ -124,20 +106,12 @@ def _rows(
 @contextmanager
 def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], None]]:
     """A progress bar on stderr; gives the function to call after each trial."""
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[last]}", style="dim", markup=False),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
-        task = bar.add_task(name, total=total, last="")
+    numbers = itertools.count(1)
+    with progress_bar(name, total, quiet=quiet) as show:
 
         def count(row: Row) -> None:
             end = "failed" if row["error"] else f"{row['wall_s']:.1f} s"
-            bar.update(task, advance=1, last=f"{_label(row)}: {end}")
+            show(next(numbers), f"{_label(row)}: {end}")
 
         yield count
 

@@ -79,8 +79,6 @@ COLUMNS: dict[str, type] = {
 NOT_REPEATABLE = ("ms_median", "ms_95", "wall_s", "host")
 """Columns that differ when the same trial is run again; the others do not."""
 
-_NOT_MAPPED = (FrameStatus.UNUSABLE_SCAN, FrameStatus.BAD_STAMP)
-
 
 @dataclass(frozen=True, slots=True)
 class Trial:
@@ -240,7 +238,7 @@ def _unusable(name: str, finished: SolverRun) -> str | None:
         return f"{name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
     if finished.config is None and finished.problem:
         return finished.problem
-    if all(update.status in _NOT_MAPPED for update in finished.updates):
+    if not any(update.status.usable for update in finished.updates):
         return (
             f"{name}: none of the {len(finished.updates)} sweeps could be used; the first: "
             f"{finished.updates[0].message}; see also: loam-gtsam inspect"

@@ -1,0 +1,172 @@
+"""What the commands share: output folders, Ctrl-C, progress bars, the last lines."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import re
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TextColumn,
+    TimeRemainingColumn,
+)
+
+from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.pipeline import OnFrame
+from loam_gtsam.types import MapUpdate, OutputError
+from loam_gtsam.view import plots
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SHOW_CURSOR = b"\x1b[?25h"
+
+
+def file_name(name: str) -> str:
+    """A name of a data set as that of a file or folder."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "run"
+
+
+@contextmanager
+def output_folder(wanted: Path, known: Sequence[str], *, overwrite: bool) -> Iterator[Path]:
+    """Make the folder for results, and remove it if an error leaves it empty.
+
+    Parameters
+    ----------
+    wanted : if it holds earlier results, a new folder beside it is made (``wanted-2``, ...)
+    known : names of files and folders that are earlier results
+    overwrite : take ``wanted`` whatever it holds
+
+    Raises
+    ------
+    OutputError
+        If the folder cannot be made, or no file can be written in it.
+    """
+    if not overwrite and any((wanted / name).exists() for name in known):
+        wanted = wanted if wanted.name not in ("", "..") else wanted.resolve()
+        candidates = (wanted.with_name(f"{wanted.name}-{n}") for n in itertools.count(2))
+        wanted = next(folder for folder in candidates if not folder.exists())
+    is_new = not wanted.exists()
+    try:
+        yield make_folder(wanted)
+    except BaseException:
+        if is_new:
+            with suppress(OSError):  # it is not empty, or was not made
+                wanted.rmdir()
+        raise
+
+
+def draws_pictures(asked: bool | None) -> bool:
+    """Whether pictures are drawn; if ``asked`` is None, they are if matplotlib is installed.
+
+    Raises
+    ------
+    OutputError
+        If pictures are asked for and matplotlib is missing.
+    """
+    if asked and not plots.available():
+        raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
+    return plots.available() if asked is None else asked
+
+
+@dataclass(slots=True)
+class StopRequest:
+    """The signal that asked the run to stop, if one did."""
+
+    signum: int | None = None
+
+
+@contextmanager
+def stop_requests() -> Iterator[StopRequest]:
+    """Note the first Ctrl-C or SIGTERM instead of acting on it; the second ends the process.
+
+    An exception raised by a signal could surface anywhere, a solver's callback included, and
+    leave half a frame in the map. A note can be read between two frames.
+    """
+    stop = StopRequest()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop  # only the main thread may set handlers
+        return
+
+    def note(signum: int, frame: FrameType | None) -> None:
+        stop.signum = signum
+        # The system's own action needs no interpreter: it ends a long native call as well.
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_DFL)
+        if sys.stderr.isatty():
+            # Unbuffered, for a signal may arrive in the middle of a buffered write.
+            os.write(sys.stderr.fileno(), _SHOW_CURSOR)
+
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    for number, handler in before.items():
+        if handler is not signal.SIG_IGN:  # as under nohup
+            signal.signal(number, note)
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def progress_bar(name: str, total: int, *, quiet: bool) -> Iterator[Callable[[int, str], None]]:
+    """Show a progress bar on stderr; gives the function that sets it to a number, with a note."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[note]}", style="dim", markup=False),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task(name, total=total, note="")
+
+        def show(done: int, note: str) -> None:
+            bar.update(task, completed=done, note=note)
+
+        yield show
+
+
+@contextmanager
+def frame_progress(name: str, total: int, stop: StopRequest, *, quiet: bool) -> Iterator[OnFrame]:
+    """Show a progress bar of frames; gives the function to call after each frame."""
+    started, done = time.perf_counter(), 0
+    with progress_bar(name, total, quiet=quiet) as show:
+
+        def on_frame(number: int, update: MapUpdate) -> None:
+            nonlocal done
+            done += 1  # not number + 1: a run that goes on begins in the middle
+            rate = done / (time.perf_counter() - started)
+            show(number + 1, f"{rate:.1f} frames/s {update.status}")
+            if stop.signum is not None:
+                raise KeyboardInterrupt  # run() ends here, between two frames
+
+        yield on_frame
+
+
+def print_written(
+    console: Console, stop: StopRequest, frames: int, total: int, folder: Path, files: list[str]
+) -> None:
+    """Print the last lines of a command: whether it was stopped, and where its files are."""
+    if stop.signum is not None:
+        name = signal.Signals(stop.signum).name
+        done = f"after frame {frames} of {total}"
+        console.print(f"Stopped by {name} {done}; what was computed until then is written.")
+    print_plain(console, f"Written to {folder}: {', '.join(files)}")
+
+
+def print_plain(console: Console, text: str) -> None:
+    """Print a line that may hold names of files: no markup in it, and never broken."""
+    console.print(text, markup=False, soft_wrap=True)

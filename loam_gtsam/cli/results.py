@@ -1,0 +1,188 @@
+"""The results of ``run`` and ``demo``: accuracy, files, pictures."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from loam_gtsam.config import Config, dump_config
+from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.io.atomic import staged_files
+from loam_gtsam.io.run_files import RUN_FILES, write_run
+from loam_gtsam.io.trajectories import write_tum
+from loam_gtsam.loops.files import write_graph
+from loam_gtsam.pipeline import RunResult, effective_config
+from loam_gtsam.studies.evaluation import absolute_error, align, align_rotations, interpolate
+from loam_gtsam.types import LoamError, OutputError, Trajectory
+from loam_gtsam.view import frame_plot, plots
+from loam_gtsam.view.observers import LastFrame
+
+FRAME_PLOT = "frame.png"
+PLOT_FILES = ("trajectory.png", "map.png", FRAME_PLOT, "timings.png")
+ERROR_PLOT = "errors.png"
+TRUTH_FILE = "truth.tum"
+LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
+RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE)
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """A run with what is known of its input, ready to be written.
+
+    Attributes
+    ----------
+    info : what is known of the data set after the run
+    accuracy : for the summary: errors against the truth, or ``problem``; empty without truth
+    map_truth : the truth in the map frame, for the pictures; None if it cannot be compared
+    """
+
+    run: RunResult
+    dataset: Dataset
+    info: DatasetInfo
+    accuracy: dict[str, Any]
+    map_truth: Trajectory | None
+
+    @staticmethod
+    def of(run: RunResult, dataset: Dataset) -> Results:
+        """Compare a run with the truth of its data set, if there is any."""
+        accuracy, map_truth = _compare_with_truth(run.trajectory, dataset.truth)
+        return Results(run, dataset, _input_info(dataset), accuracy, map_truth)
+
+    def write(self, folder: Path, last: LastFrame | None) -> list[str]:
+        """Write all files.
+
+        Parameters
+        ----------
+        last : what the pictures show of the last frame; None draws no pictures
+
+        Returns
+        -------
+        Names of the files.
+
+        Raises
+        ------
+        OutputError
+            If a file cannot be written; files of an earlier run are then as they were.
+        """
+        extra = {"accuracy": self.accuracy or None, "input": asdict(self.info)}
+        files = list(RUN_FILES)
+        with staged_files(folder, RUN_OUTPUTS, last="summary.json") as new:
+            write_run(self.run, new, dataset=_described(self.info), extra=extra)
+            if self.dataset.truth is not None:
+                write_tum(new / TRUTH_FILE, self.dataset.truth)
+                files.append(TRUTH_FILE)
+            if self.run.loops is not None:
+                write_tum(new / LOOP_FILES[0], self.run.odometry, comments={"frame": "odom"})
+                write_graph(new / LOOP_FILES[1], self.run.loops.graph.saved())
+                files.extend(LOOP_FILES)
+            if last is not None:
+                files.extend(self._draw(new, last))
+        return files
+
+    def _draw(self, folder: Path, last: LastFrame) -> list[str]:
+        files = [name for name in PLOT_FILES if name != FRAME_PLOT or last.seen]
+        run, trajectory, truth = self.run, self.run.trajectory, self.map_truth
+        loops = None if run.loops is None else run.loops.ends()
+        plots.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
+        plots.plot_map(folder / "map.png", run.edge_points, run.plane_points, trajectory)
+        if last.seen:
+            frame_plot.plot_frame(folder / FRAME_PLOT, last.frame(), last.around())
+        plots.plot_timings(folder / "timings.png", run.updates)
+        if truth is not None and self.dataset.truth is not None:
+            error = absolute_error(trajectory, self.dataset.truth)
+            plots.plot_errors(folder / ERROR_PLOT, error.stamps, error.translations)
+            files.append(ERROR_PLOT)
+        return files
+
+
+def write_safely(folder: Path, write: Callable[[Path], list[str]]) -> list[str]:
+    """Write results that took long to compute: if they cannot be written, then elsewhere.
+
+    Parameters
+    ----------
+    folder : where they are wanted
+    write : writes all files into the folder that it is given, and returns their names
+
+    Raises
+    ------
+    OutputError
+        If they could not be written into ``folder``, naming the temporary folder where they are.
+    """
+    try:
+        return write(folder)
+    except OutputError as problem:
+        try:
+            there = Path(tempfile.mkdtemp(prefix=f"loam_gtsam_{folder.name}_"))
+            write(there)
+        except (OSError, OutputError):
+            raise problem from None
+        raise OutputError(f"{problem}. The results were written to {there} instead") from problem
+
+
+def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:
+    """Whether a folder holds the complete results of a run.
+
+    Parameters
+    ----------
+    config, dataset : of the run
+    total : sweeps of the run
+
+    Raises
+    ------
+    OutputError
+        If the folder holds the results of another run.
+    """
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+        written = (folder / "config.yaml").read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return False
+    if summary.get("interrupted") or summary.get("error"):
+        return False
+    now = total, _described(_input_info(dataset)), dump_config(effective_config(config, dataset))
+    if (summary.get("frames"), summary.get("dataset"), written) != now:
+        raise OutputError(
+            f"{folder}: holds the results of another run (data, configuration or number of "
+            "sweeps); choose another folder, or --overwrite without --resume"
+        )
+    return True
+
+
+def _compare_with_truth(
+    trajectory: Trajectory, truth: Trajectory | None
+) -> tuple[dict[str, Any], Trajectory | None]:
+    """Accuracy for the summary, and the truth in the map frame for the pictures."""
+    if truth is None:
+        return {}, None
+    try:
+        error = absolute_error(trajectory, truth)
+    except ValueError as problem:  # no overlap in time, or stamps of the truth that repeat
+        return {"problem": str(problem)}, None
+    there = interpolate(truth, error.stamps)
+    inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
+    here = trajectory.map_T_lidar[inside]
+    turn = align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
+    map_T_truth = align(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
+    accuracy = {
+        "ate_rmse_m": error.rmse,
+        "ate_max_m": error.maximum,
+        "compared_poses": len(error.stamps),
+        "compared_length_m": there.path_length,
+    }
+    return accuracy, Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
+
+
+def _input_info(dataset: Dataset) -> DatasetInfo:
+    """What is known of the input after the run; must not cost the results if it is damaged."""
+    try:
+        return dataset.info()
+    except LoamError as error:
+        return DatasetInfo("data set", dataset.name, problems=[str(error)])
+
+
+def _described(info: DatasetInfo) -> str:
+    return f"{info.kind} {info.path}"

@@ -16,7 +16,10 @@ from support.cli import loam
 from support.list_dataset import ListDataset
 from typer.testing import Result
 
-from loam_gtsam.cli import run as _cli_run
+from loam_gtsam.cli import run as run_command
+from loam_gtsam.cli.console import stop_requests
+from loam_gtsam.cli.options import RunOptions
+from loam_gtsam.cli.results import ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -75,7 +78,7 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
     result = loam("demo", "--scene", "room", "--frames", FRAMES, "--profile")
     assert result.exit_code == 0, result.output
     folder = Path("loam_gtsam_output/room_vlp16")
-    plots = {*_cli_run.PLOT_FILES, _cli_run.ERROR_PLOT} if PLOTS else set()
+    plots = {*PLOT_FILES, ERROR_PLOT} if PLOTS else set()
     assert files_in(folder) == {*RUN_FILES, "truth.tum"} | plots
     accuracy = json.loads((folder / "summary.json").read_text())["accuracy"]
     assert accuracy["compared_poses"] == FRAMES
@@ -110,9 +113,9 @@ def test_run_opens_built_in_worlds_and_uses_every_option():
 def test_a_process_extracts_features_where_it_is_worth_its_start(
     asked, sweeps, cores, expected, monkeypatch
 ):
-    monkeypatch.setattr(_cli_run.os, "cpu_count", lambda: cores)
-    options = _cli_run.RunOptions(None, None, False, None, False, True, workers=asked)
-    assert _cli_run._workers(options, sweeps) == expected
+    monkeypatch.setattr(run_command.os, "cpu_count", lambda: cores)
+    options = RunOptions(workers=asked)
+    assert run_command._workers(options, sweeps) == expected
 
 
 def test_a_configuration_file_is_used_and_set_wins_over_it():
@@ -443,7 +446,7 @@ def test_a_second_signal_ends_the_process_at_once():
 
 def test_handlers_are_put_back():
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with _cli_run.stop_requests() as stop:
+    with stop_requests() as stop:
         os.kill(os.getpid(), signal.SIGTERM)
         assert stop.signum == signal.SIGTERM
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
@@ -452,7 +455,7 @@ def test_handlers_are_put_back():
 def test_an_ignored_signal_stays_ignored(monkeypatch):
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
-        with _cli_run.stop_requests() as stop:
+        with stop_requests() as stop:
             os.kill(os.getpid(), signal.SIGINT)
             assert stop.signum is None
     finally:
@@ -541,7 +544,7 @@ def test_resume_starts_goes_on_and_says_when_all_is_done(opens, scans):
     opens([*scans[:2], DatasetError("the disk was pulled out")])
     arguments = ["run", "x", "--no-plot", "--output", "out", "--resume"]
     assert loam(*arguments).exit_code == 1
-    assert (Path("out") / _cli_run.CHECKPOINT).is_dir()
+    assert (Path("out") / run_command.CHECKPOINT).is_dir()
     opens(scans[:3])
     assert loam(*arguments).exit_code == 0
     assert files_in("out") == set(RUN_FILES)

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from support.list_dataset import ListDataset
 
-from loam_gtsam.cli import run as _cli_run
 from loam_gtsam.config import Config, preset
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import open_dataset
@@ -226,44 +225,3 @@ def test_killed_again_and_again_a_run_comes_to_the_same_end(tmp_path):
 def reached(folder, frames):
     states = [path.stem for path in (folder / "checkpoint").glob("state_*.npz")]
     return any(int(name.removeprefix("state_")) >= frames for name in states)
-
-
-def test_results_that_cannot_be_written_go_elsewhere(tmp_path, monkeypatch):
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
-
-    def full(there):
-        if "wanted" in there.parts:
-            raise OutputError("disk full")
-        (there / "results").write_text("all of it")
-        return ["results"]
-
-    with pytest.raises(OutputError, match=r"disk full. The results were written to .*instead"):
-        _cli_run._write_somewhere(tmp_path / "wanted", full)
-    assert [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")] == [
-        "all of it"
-    ]
-
-
-def test_a_person_is_asked_for_another_folder(tmp_path, monkeypatch):
-    answers = iter([str(tmp_path / "wanted" / "again"), str(tmp_path / "other")])
-    monkeypatch.setattr("typer.prompt", lambda *args, **options: next(answers))
-    for stream in (sys.stdin, sys.stderr):
-        monkeypatch.setattr(stream, "isatty", lambda: True, raising=False)
-
-    def full(there):
-        if "wanted" in there.parts:
-            raise OutputError("disk full")
-        return ["results"]
-
-    assert _cli_run._write_somewhere(tmp_path / "wanted", full) == (tmp_path / "other", ["results"])
-
-
-def test_if_nothing_can_be_written_the_first_problem_is_told(tmp_path, monkeypatch):
-    def full(there):
-        raise OutputError("disk full")
-
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr("tempfile.tempdir", None)
-    with pytest.raises(OutputError, match=r"^disk full$"):
-        _cli_run._write_somewhere(tmp_path / "wanted", full)

@@ -14,7 +14,7 @@ import typer
 
 from loam_gtsam import Config
 from loam_gtsam.cli.app import app
-from loam_gtsam.cli.run import PLOT_FILES, TRUTH_FILE
+from loam_gtsam.cli.results import PLOT_FILES, TRUTH_FILE
 from loam_gtsam.io.run_files import RUN_FILES, stage_seconds, write_npz
 from loam_gtsam.types import FrameStatus
 

@@ -66,7 +66,7 @@ def write_spec(folder: Path, text: str) -> Path:
 
 
 def sweep(*arguments: object) -> Result:
-    return loam("sweep", *arguments)
+    return loam("study", *arguments)
 
 
 def one_line(result: Result) -> str:

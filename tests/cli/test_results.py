@@ -1,0 +1,33 @@
+"""Results that took long to compute are written, if not where they are wanted, then elsewhere."""
+
+import pytest
+
+from loam_gtsam.cli.results import write_safely
+from loam_gtsam.types import OutputError
+
+
+@pytest.fixture(autouse=True)
+def _temporary_files_here(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", None)
+
+
+def test_results_that_cannot_be_written_go_elsewhere(tmp_path):
+    def write(there):
+        if "wanted" in there.parts:
+            raise OutputError("disk full")
+        (there / "results").write_text("all of it")
+        return ["results"]
+
+    with pytest.raises(OutputError, match=r"disk full. The results were written to .*instead"):
+        write_safely(tmp_path / "wanted", write)
+    written = [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")]
+    assert written == ["all of it"]
+
+
+def test_if_nothing_can_be_written_the_first_problem_is_told(tmp_path):
+    def write(there):
+        raise OutputError("disk full")
+
+    with pytest.raises(OutputError, match=r"^disk full$"):
+        write_safely(tmp_path / "wanted", write)

@@ -604,3 +604,11 @@ def test_set_without_a_section_names_one():
 def test_no_help_of_a_command_is_cut_off(monkeypatch):
     monkeypatch.setenv("COLUMNS", "80")
     assert "..." not in loam("--help").output.partition("Commands:")[2]
+
+
+def test_sweep_is_the_old_name_of_study_and_says_so():
+    old, new = (loam(name, "missing.yaml") for name in ("sweep", "study"))
+    assert old.exit_code == new.exit_code == 1
+    assert "study" in old.stderr.splitlines()[0]
+    assert old.stderr.splitlines()[1:] == new.stderr.splitlines()
+    assert "sweep" not in loam("--help").output.partition("Commands:")[2]

@@ -12,7 +12,6 @@ from loam_gtsam.datasets.kitti.folder import raise_elevation
 from loam_gtsam.studies import peers
 from loam_gtsam.studies.contenders import timed_points as timed_points
 from loam_gtsam.studies.peers import PeerPose, TimedPoints
-from loam_gtsam.studies.peers import version as version
 from loam_gtsam.types import FloatArray
 
 

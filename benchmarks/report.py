@@ -13,7 +13,8 @@ from rich.table import Table
 from rich.text import Text
 
 from benchmarks.cases import CaseResult, EvidenceTable
-from benchmarks.peers import load, version
+from benchmarks.peers import load
+from loam_gtsam.io.version import installed_version
 
 STAGES = ("features", "odometry", "prepare", "match", "solve", "insert", "covariance", "wall")
 _PACKAGES = ("loam_gtsam", "gtsam", "numpy", "scipy", "kiss-icp", "small_gicp")
@@ -45,7 +46,7 @@ def machine() -> list[tuple[str, str]]:
     ]
     if hasattr(os, "getloadavg"):
         facts.append(("load average at the end", f"{os.getloadavg()[0]:.1f}"))
-    return facts + [(package, version(package)) for package in _PACKAGES]
+    return facts + [(package, installed_version(package)) for package in _PACKAGES]
 
 
 def summary_table(results: Sequence[CaseResult]) -> EvidenceTable:

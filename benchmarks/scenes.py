@@ -27,7 +27,7 @@ from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.pipeline import effective_config, imu_buffer
-from loam_gtsam.studies.contenders import Ours, Prepared, prepare
+from loam_gtsam.studies.contenders import PipelineRunner, SharedSweep, share_sweeps
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, Scan, Trajectory
 
@@ -144,7 +144,7 @@ class Runs:
 
     def __init__(self, place: Place, recording: Recording) -> None:
         self.place, self.recording = place, recording
-        self._prepared: dict[Any, list[tuple[Prepared, float]]] = {}
+        self._prepared: dict[Any, list[tuple[SharedSweep, float]]] = {}
 
     def run(self, table: str, variant: str, config: Config, noise: float = np.nan) -> Row:
         """One run, with the IMU of that noise if the configuration uses one."""
@@ -154,14 +154,14 @@ class Runs:
             recording.sweeps, imu=imu, truth=recording.truth, sensor=recording.sensor
         )
         config = effective_config(config, dataset)
-        mapper = Ours(variant, config, imu_buffer(dataset, config))
+        runner = PipelineRunner(variant, config, imu_buffer(dataset, config))
         seconds = []
         for sweep, extraction in self._features(dataset, config):
             # Processor time: the clock on the wall also counts what others do on the machine.
             started = time.process_time()
-            mapper.register(sweep, None)
+            runner.register(sweep)
             seconds.append(extraction + time.process_time() - started)
-        found = mapper.result(len(dataset))
+        found = runner.result(len(dataset))
         error = absolute_error(found.trajectory, recording.truth)
         poses = found.trajectory.map_T_lidar
         if imu is None or not config.imu.level:
@@ -188,13 +188,13 @@ class Runs:
             ms=1e3 * float(np.median(seconds[1:])),
         )
 
-    def _features(self, dataset: ArrayDataset, config: Config) -> list[tuple[Prepared, float]]:
+    def _features(self, dataset: ArrayDataset, config: Config) -> list[tuple[SharedSweep, float]]:
         """Features of all sweeps, and the processor time each took."""
         key = config.sensor, config.features, config.deskew.enabled, config.deskew.reference
         if key not in self._prepared:
             own = self._prepared[key] = []
             started = time.process_time()
-            for sweep in prepare(dataset, config, ours=True, theirs=False):
+            for sweep in share_sweeps(dataset, config, features=True, points=False):
                 own.append((sweep, time.process_time() - started))
                 started = time.process_time()
         return self._prepared[key]

@@ -25,6 +25,7 @@ from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import ExtraFactors, Mapper
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Odometry, make_odometry
+from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
@@ -128,6 +129,8 @@ class Pipeline:
     Parameters
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
+    solver : registers a sweep with the map; None makes the solver that the configuration names
+    odometry : predicts the pose of each sweep; None makes the odometry that the configuration names
     extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
     loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
 
@@ -141,13 +144,15 @@ class Pipeline:
         config: Config | None = None,
         *,
         imu: ImuBuffer | None = None,
+        solver: ScanSolver | None = None,
+        odometry: Odometry | None = None,
         extra_factors: ExtraFactors | None = None,
         loop_closer: LoopCloser | None = None,
     ) -> None:
         self.config = config or Config()
-        self.mapper = Mapper(self.config, imu=imu, extra_factors=extra_factors)
+        self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=extra_factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
-        self.odometry: Odometry = make_odometry(self.config.odometry, self.mapper.imu)
+        self.odometry: Odometry = odometry or make_odometry(self.config.odometry, self.mapper.imu)
         self._last_odom: gtsam.Pose3 | None = None
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.loops: LoopMapping | None = None

@@ -127,12 +127,12 @@ def compare(*, source: InputOptions, sensor: SensorOptions, options: CompareOpti
     Ctrl-C stops after the current sweep and writes what was computed; a second one stops at once.
     """
     from loam_gtsam.cli.compare import execute
-    from loam_gtsam.studies.comparison import Contender, contender, solver_names
+    from loam_gtsam.studies.contenders import Contender, find_contender, solver_names
     from loam_gtsam.studies.peers import PEERS
 
     names = options.solvers or [name for name in solver_names() if name not in PEERS]
     contenders = []
-    for entry in map(contender, names):
+    for entry in map(find_contender, names):
         contenders.append(Contender(entry.name, entry.config and sensor.changed(entry.config)))
     raise typer.Exit(execute(source.dataset(), contenders, options.shared_guess, options))
 
@@ -140,7 +140,8 @@ def compare(*, source: InputOptions, sensor: SensorOptions, options: CompareOpti
 _Spec = Annotated[
     Path,
     typer.Argument(
-        metavar="SPEC", help="What to run: sequences, configs, seeds (YAML; see docs/sweep.md)."
+        metavar="SPEC",
+        help="What to run: sequences, configs, seeds (YAML; see docs/parameter_studies.md).",
     ),
 ]
 

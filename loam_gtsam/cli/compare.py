@@ -1,4 +1,4 @@
-"""One comparison from the command line: run, tables, files, pictures, report."""
+"""The command ``compare``: run the solvers, print the tables, write files, pictures and report."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from loam_gtsam.cli.console import (
 from loam_gtsam.cli.options import CompareOptions
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.atomic import staged_files
-from loam_gtsam.studies.comparison import Contender, compare
+from loam_gtsam.studies.comparison import compare_solvers
 from loam_gtsam.studies.comparison_report import (
     ACCURACY_COLUMNS,
     COLUMNS,
@@ -30,25 +30,26 @@ from loam_gtsam.studies.comparison_report import (
     REPORT_FILE,
     TABLE_FILES,
     TRUTH_FILE,
-    Results,
-    best,
-    cell,
-    spread,
-    write,
+    ScoredComparison,
+    best_cells,
+    format_score,
+    median_95_max,
+    write_comparison,
 )
+from loam_gtsam.studies.contenders import Contender
 from loam_gtsam.types import DatasetError
 
 
 def execute(
     dataset: Dataset, contenders: Sequence[Contender], shared_guess: bool, options: CompareOptions
 ) -> int:
-    """Compare, write, report; returns the exit code.
+    """Compare the solvers, write the results and print the tables; returns the exit code.
 
     Raises
     ------
     LoamError
-        If the comparison cannot start or its results cannot be written, or what ended it early
-        (after what was computed until then has been written).
+        If the comparison cannot start or its results cannot be written. An error that ended the
+        comparison early is raised after the results up to there were written.
     """
     plot = draws_pictures(options.plot)
     wanted = options.output or Path("loam_gtsam_output") / f"{file_name(dataset.name)}_compare"
@@ -60,7 +61,7 @@ def execute(
     ):
         started = time.perf_counter()
         with frame_progress(dataset.name, total, stop, quiet=options.quiet) as on_frame:
-            comparison = compare(
+            comparison = compare_solvers(
                 dataset,
                 contenders,
                 max_frames=options.frames,
@@ -68,11 +69,11 @@ def execute(
                 on_frame=on_frame,
             )
         seconds = time.perf_counter() - started
-        results = Results.of(comparison, shared_guess)
-        # What an earlier comparison left would not belong to this one.
+        results = ScoredComparison.of(comparison, shared_guess)
+        # Files of an earlier comparison, also those of solvers that did not run this time.
         left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
         with staged_files(folder, left, last=REPORT_FILE) as new:
-            files = write(results, new, plot)
+            files = write_comparison(results, new, plot)
     if not options.quiet:
         console = Console()
         console.print(_summary(results, seconds))
@@ -90,10 +91,10 @@ def execute(
     return 0
 
 
-def _summary(results: Results, seconds: float) -> Group:
+def _summary(results: ScoredComparison, seconds: float) -> Group:
     title = Text(f"{results.comparison.name}  ({seconds:.1f} s)", style="bold")
-    winners = best(results)
-    # Two tables, accuracy and cost, for together they do not fit a terminal of 80 columns.
+    winners = best_cells(results)
+    # Two tables, accuracy and cost: one table would not fit a terminal of 80 columns.
     parts: list[Any] = []
     for heading, columns in (
         (title, range(ACCURACY_COLUMNS)),
@@ -105,7 +106,7 @@ def _summary(results: Results, seconds: float) -> Group:
         for number, (run, scores) in enumerate(results.rows):
             cells = [
                 Text(
-                    cell(scores, COLUMNS[index]),
+                    format_score(scores, COLUMNS[index]),
                     style="bold green" if (number, index + 1) in winners else "",
                 )
                 for index in columns
@@ -118,8 +119,8 @@ def _summary(results: Results, seconds: float) -> Group:
         for name in ("median [mm]", "95 %", "max", "median [deg]", "95 %", "max"):
             apart.add_column(Text(name), justify="right")
         for name, difference in results.differences.items():
-            numbers = [f"{1e3 * v:.2f}" for v in spread(difference.metres)]
-            numbers += [f"{v:.4f}" for v in spread(difference.degrees)]
+            numbers = [f"{1e3 * v:.2f}" for v in median_95_max(difference.metres)]
+            numbers += [f"{v:.4f}" for v in median_95_max(difference.degrees)]
             apart.add_row(Text(name), *numbers)
         parts.append(apart)
     return Group(*parts, *(Text(f"  {note}", style="dim") for note in results.notes))

@@ -355,7 +355,7 @@ class StudyOptions:
         Path | None,
         typer.Option(
             metavar="DIR",
-            help="Folder for the results [default: loam_gtsam_output/NAME_sweep]. Trials that are "
+            help="Folder for the results [default: loam_gtsam_output/NAME_study]. Trials that are "
             "finished there are not run again.",
         ),
     ] = None

@@ -1,11 +1,11 @@
-"""A sweep over parameters from the command line: what is left to run, progress, table, summary."""
+"""The command ``study``: run the trials that are missing, show progress, write the table."""
 
 from __future__ import annotations
 
 import itertools
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -15,6 +15,12 @@ from rich.text import Text
 from loam_gtsam.cli.console import file_name, progress_bar, stop_requests
 from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.studies.trial_runner import (
+    cluster_workers,
+    local_workers,
+    run_here,
+    run_on,
+)
 from loam_gtsam.studies.trial_spec import Spec, load_spec
 from loam_gtsam.studies.trial_table import (
     TABLE_FILE,
@@ -24,37 +30,36 @@ from loam_gtsam.studies.trial_table import (
     write_table,
 )
 from loam_gtsam.studies.trials import Row, Trial
-from loam_gtsam.types import OutputError
 
 _SHOWN_ERRORS = 3
 
 
 def execute(path: Path, options: StudyOptions) -> int:
-    """Run what is not finished, write the table, report; returns the exit code.
+    """Run the trials that are not finished, write the table and a summary; returns the exit code.
 
     Raises
     ------
     LoamError
-        If the sweep cannot start, a result cannot be written, or the cluster is lost.
+        If the study cannot start, a result cannot be written, or the cluster is lost.
     """
     import_pyarrow()
     spec = load_spec(path)
-    folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_sweep"
+    folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_study"
     make_folder(folder / TRIALS_FOLDER)
     store = TrialStore(folder)
-    left = [trial for trial in _different(spec.trials) if _is_left(store.load(trial), options)]
+    missing = [trial for trial in _different(spec.trials) if _must_run(store.load(trial), options)]
     with stop_requests() as stop:
         try:
             with (
-                _rows(left, options, lambda: stop.signum is not None) as rows,
-                _progress(spec.name, len(left), options.quiet) as count,
+                _rows(missing, options, lambda: stop.signum is not None) as rows,
+                _progress(spec.name, len(missing), options.quiet) as count,
             ):
                 for done in rows:
                     store.save(done)
                     count(done)
         except KeyboardInterrupt:
             pass
-        finally:  # also after an error: what is finished is worth a table
+        finally:  # also after an error: the finished trials are worth a table
             found = [row for row in map(store.load, spec.trials) if row is not None]
             write_table(folder / TABLE_FILE, found, spec)
     failed = [row for row in found if row["error"]]
@@ -63,18 +68,18 @@ def execute(path: Path, options: StudyOptions) -> int:
         console.print("Medians over the seeds")
         for metric in spec.metrics:
             console.print(_summary(spec, found, metric))
-        _say(console, len(spec.trials), found, failed, folder / TABLE_FILE)
+        _print_outcome(console, len(spec.trials), found, failed, folder / TABLE_FILE)
     if stop.signum is not None:
         return 128 + stop.signum
     return 1 if failed else 0
 
 
 def _different(trials: Sequence[Trial]) -> list[Trial]:
-    """Each computation once, for one configuration may have two names."""
+    """Each computation once: two names may stand for the same configuration."""
     return list({trial.id: trial for trial in trials}.values())
 
 
-def _is_left(found: Row | None, options: StudyOptions) -> bool:
+def _must_run(found: Row | None, options: StudyOptions) -> bool:
     return found is None or options.overwrite or (options.retry_failed and bool(found["error"]))
 
 
@@ -82,30 +87,21 @@ def _is_left(found: Row | None, options: StudyOptions) -> bool:
 def _rows(
     trials: Sequence[Trial], options: StudyOptions, stopped: Callable[[], bool]
 ) -> Iterator[Iterator[Row]]:
-    """The rows of the trials, as they are finished, from wherever they are to run."""
-    if not trials:
-        yield iter(())
-        return
-    try:
-        from loam_gtsam.studies import trial_runner as experiment_workers
-    except ImportError as error:
-        raise OutputError(
-            f'sweep needs Dask ({error}): pip install "loam_gtsam[cluster]"'
-        ) from error
-    if options.scheduler is not None:
-        place = experiment_workers.cluster_at(options.scheduler)
-    elif options.workers is not None:
-        place = experiment_workers.local_workers(min(options.workers, len(trials)))
+    """The rows of the trials as they are finished, from where the options have them run."""
+    if options.scheduler is not None and trials:
+        place = cluster_workers(options.scheduler)
+    elif options.workers is not None and trials:
+        place = local_workers(min(options.workers, len(trials)))
     else:
-        yield experiment_workers.run_here(trials, stopped)
+        yield run_here(trials, stopped)
         return
-    with place as client, closing(experiment_workers.run_on(client, trials, stopped)) as rows:
-        yield rows
+    with place as workers:
+        yield run_on(workers, trials, stopped)
 
 
 @contextmanager
 def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], None]]:
-    """A progress bar on stderr; gives the function to call after each trial."""
+    """A progress bar on stderr, as the function to call after each trial."""
     numbers = itertools.count(1)
     with progress_bar(name, total, quiet=quiet) as show:
 
@@ -117,7 +113,7 @@ def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], No
 
 
 def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
-    """Median over the seeds, a line a sequence, a column a configuration."""
+    """Medians over the seeds, one row per sequence and one column per configuration."""
     table = Table("sequence", title=Text(metric, style="bold"), title_justify="left", box=None)
     configs = list(dict.fromkeys(trial.config_name for trial in spec.trials))
     for config in configs:
@@ -137,7 +133,7 @@ def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
     return table
 
 
-def _say(
+def _print_outcome(
     console: Console, total: int, found: Sequence[Row], failed: Sequence[Row], file: Path
 ) -> None:
     for row in failed[:_SHOWN_ERRORS]:

@@ -1,22 +1,29 @@
-"""Several estimators on the same sweeps, and what came of each.
+"""The comparison of several solvers on the same sweeps, and its numbers.
 
-Sweep by sweep, one estimator after the other: all of them see the same state of the machine.
-Features are extracted once per sweep and handed to all of ours; peers get the points and times
-those features were taken from.
+All contenders register a sweep before the next sweep is read, so that they run under the same
+conditions of the machine. Features are extracted once per sweep for all pipelines of this package;
+peers get the points and times that these features were extracted from.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
+from itertools import islice
 
 import numpy as np
 
-from loam_gtsam.config import PRESETS, Config, load_config
+from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.pipeline import OnFrame, effective_config, imu_buffer
-from loam_gtsam.studies.contenders import Ours, SolverRun, Step, Theirs, prepare
+from loam_gtsam.studies.contenders import (
+    Contender,
+    PeerRunner,
+    PipelineRunner,
+    SharedGuess,
+    SolverRun,
+    share_sweeps,
+)
 from loam_gtsam.studies.evaluation import (
     absolute_error,
     distance_travelled,
@@ -25,74 +32,25 @@ from loam_gtsam.studies.evaluation import (
     relative_error,
 )
 from loam_gtsam.studies.peers import PEERS, make_peer
-from loam_gtsam.types import (
-    ConfigError,
-    DatasetError,
-    FloatArray,
-    InputError,
-    IntArray,
-    Trajectory,
-)
+from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray, Trajectory
 
-_PRESET_OF = {"gtsam": "default"}
-"""Solver names that are not the name of their preset."""
 _SHARED = ("sensor", "features")
-"""Sections all of ours take from the first of them, with ``deskew.enabled`` and
-``deskew.reference``: they decide what the features are and which moment a pose belongs to."""
-
-
-@dataclass(frozen=True, slots=True)
-class Contender:
-    """One estimator to run.
-
-    Attributes
-    ----------
-    name : of ours a preset (``gtsam`` is the default one), of a peer as in :data:`PEERS`
-    config : of ours; None for a peer
-    """
-
-    name: str
-    config: Config | None = None
-
-
-def solver_names() -> tuple[str, ...]:
-    """All names :func:`contender` knows: ours first."""
-    named = {preset: name for name, preset in _PRESET_OF.items()}
-    return (*(named.get(preset, preset) for preset in PRESETS), *PEERS)
-
-
-def contender(name: str) -> Contender:
-    """The contender called ``name``; a name that ends in .yaml or .yml is a configuration file.
-
-    Raises
-    ------
-    ConfigError
-        If there is none, or the file does not fit.
-    """
-    if name in PEERS:
-        return Contender(name)
-    if Path(name).suffix in (".yaml", ".yml"):
-        return Contender(Path(name).stem, load_config(name))
-    preset = _PRESET_OF.get(name, name)
-    if preset not in PRESETS:
-        raise ConfigError(
-            f"unknown solver {name!r}; expected one of {', '.join(solver_names())}, or a "
-            "configuration file (.yaml)"
-        )
-    return Contender(name, PRESETS[preset])
+"""Sections of the configuration that all solvers of this package take from the first of them, with
+``deskew.enabled`` and ``deskew.reference``: they decide the features and the moment of a pose."""
 
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What :func:`compare` gives.
+    """The result of :func:`compare_solvers`.
 
     Attributes
     ----------
     name : of the data set
-    runs : in the order they were named
+    runs : one per contender, in their order
     truth : of the data set, or None
-    notes : what a reader of the numbers must know
-    interrupted, error : as :class:`loam_gtsam.pipeline.RunResult`
+    notes : sentences that a reader of the numbers must know
+    interrupted : whether the user stopped the comparison before the data set ended
+    error : what ended the comparison early, or None
     """
 
     name: str
@@ -104,12 +62,12 @@ class Comparison:
 
     @property
     def frames(self) -> int:
-        """Sweeps that all of them have seen."""
+        """Number of sweeps that every contender has registered."""
         return len(self.runs[0].updates)
 
     @property
     def reference(self) -> Trajectory:
-        """What errors are taken against: the truth, else what the first-named solver found."""
+        """The trajectory that errors are taken against: the truth, else that of the first run."""
         return self.runs[0].trajectory if self.truth is None else self.truth
 
 
@@ -119,13 +77,17 @@ class Scores:
 
     Attributes
     ----------
-    ate_m, ate_max_m, rotation_deg : ``AbsoluteError``, aligned
-    rpe_percent, rpe_deg_per_m : ``RelativeError`` over ``lengths`` (m)
-    path_m : length of the reference that was compared
+    ate_m, ate_max_m, rotation_deg : absolute error of the trajectory after alignment, see
+        :class:`loam_gtsam.studies.evaluation.AbsoluteError`
+    rpe_percent, rpe_deg_per_m : relative error over path lengths, see
+        :class:`loam_gtsam.studies.evaluation.RelativeError`
+    path_m : length of the reference trajectory that was compared
     iterations, solver_iterations : associations and solver steps, mean of the solved frames
-    matches : of the last association, median of the solved frames
-    ms_median, ms_95 : milliseconds a frame without reading, after the first frame
-    solved : frames with a pose from a solve
+    matches : number of matches of the last association, median of the solved frames
+    ms_median, ms_95 : milliseconds per frame without reading, the first frame left out
+    map_points : points of the whole map
+    solved : number of frames whose pose was solved
+    lengths : metres, the path lengths of the relative error
     problem : why an error is missing
     """
 
@@ -146,7 +108,7 @@ class Scores:
     problem: str = ""
 
 
-def compare(
+def compare_solvers(
     dataset: Dataset,
     contenders: Sequence[Contender],
     *,
@@ -154,16 +116,16 @@ def compare(
     shared_guess: bool = False,
     on_frame: OnFrame | None = None,
 ) -> Comparison:
-    """Run several estimators on one data set.
+    """Run several solvers on one data set.
 
     Parameters
     ----------
     contenders : the first one is the reference where there is no truth
-    max_frames : stop after so many sweeps
-    shared_guess : give the step each guess of the first of ours makes from its last pose, and its
-        twist, to all of ours; else each predicts from its own motion
+    max_frames : stop after so many sweeps; no further sweep is read
+    shared_guess : all solvers of this package start from the guesses of the first of them, see
+        :class:`loam_gtsam.studies.contenders.SharedGuess`; else each predicts from its own motion
     on_frame : called with the number of each sweep and the first contender's result; a
-        KeyboardInterrupt raised there ends the comparison, and what is there is returned
+        KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far
 
     Returns
     -------
@@ -179,43 +141,26 @@ def compare(
     DatasetError
         If the data set cannot be read.
     """
-    names = [entry.name for entry in contenders]
-    repeated = {name for name in names if names.count(name) > 1}
-    if not names or repeated:
-        raise InputError(
-            f"compare: expected solvers of different names, got {', '.join(names) or 'none'}"
-        )
-    packages = [PEERS[name].package for name in names if name in PEERS and PEERS[name].alone]
-    if len(set(packages)) < len(packages):
-        raise InputError(
-            f"compare: instances of {packages[0]} in one process disturb each other; compare its "
-            "variants in two comparisons"
-        )
+    _check_names(contenders)
     configs, notes = _common_configs(contenders, dataset)
-    estimators: list[Ours | Theirs] = [
-        Theirs(make_peer(entry.name))
-        if config is None
-        else Ours(entry.name, config, imu_buffer(dataset, config))
-        for entry, config in zip(contenders, configs, strict=True)
-    ]
-    first = next((config for config in configs if config is not None), None)
-    config = first or effective_config(Config(), dataset)
-    kinds = {type(estimator) for estimator in estimators}
+    runners = _make_runners(contenders, configs, dataset, shared_guess)
+    ours = [config for config in configs if config is not None]
+    sweeps = share_sweeps(
+        islice(dataset, max_frames),
+        ours[0] if ours else effective_config(Config(), dataset),
+        features=bool(ours),
+        points=len(ours) < len(configs),
+    )
     error: Exception | None = None
     interrupted = False
     done = 0
     try:
-        sweeps = prepare(dataset, config, ours=Ours in kinds, theirs=Theirs in kinds)
-        for number, sweep in enumerate(sweeps):
-            if number == max_frames:
-                break
-            step: Step | None = None
-            for estimator in estimators:
-                made = estimator.register(sweep, step)
-                step = made if shared_guess else None
+        for shared in sweeps:
+            for runner in runners:
+                runner.register(shared)
             done += 1
             if on_frame is not None:
-                on_frame(number, estimators[0].updates[-1])
+                on_frame(done - 1, runners[0].updates[-1])
     except KeyboardInterrupt:
         if not done:
             raise
@@ -230,7 +175,7 @@ def compare(
         )
     return Comparison(
         name=dataset.name,
-        runs=tuple(estimator.result(done) for estimator in estimators),
+        runs=tuple(runner.result(done) for runner in runners),
         truth=dataset.truth,
         notes=tuple(notes),
         interrupted=interrupted,
@@ -238,10 +183,45 @@ def compare(
     )
 
 
-def score_all(comparison: Comparison) -> tuple[Scores, ...]:
-    """The scores of every run, relative errors over the same path lengths.
+def _check_names(contenders: Sequence[Contender]) -> None:
+    """Raise InputError unless the contenders can run side by side."""
+    names = [entry.name for entry in contenders]
+    if not names or len(set(names)) < len(names):
+        raise InputError(
+            f"compare: expected solvers of different names, got {', '.join(names) or 'none'}"
+        )
+    packages = [PEERS[name].package for name in names if name in PEERS and PEERS[name].alone]
+    if len(set(packages)) < len(packages):
+        raise InputError(
+            f"compare: instances of {packages[0]} in one process disturb each other; compare its "
+            "variants in two comparisons"
+        )
 
-    Without truth the first run is the reference, and has no errors itself.
+
+def _make_runners(
+    contenders: Sequence[Contender],
+    configs: Sequence[Config | None],
+    dataset: Dataset,
+    shared_guess: bool,
+) -> list[PipelineRunner | PeerRunner]:
+    """A runner for each contender, in their order."""
+    runners: list[PipelineRunner | PeerRunner] = []
+    guess: SharedGuess | None = None
+    for entry, config in zip(contenders, configs, strict=True):
+        if config is None:
+            runners.append(PeerRunner(make_peer(entry.name)))
+            continue
+        runner = PipelineRunner(entry.name, config, imu_buffer(dataset, config), guess)
+        if shared_guess and guess is None:
+            runner.pipeline.odometry = guess = SharedGuess(runner.pipeline.odometry)
+        runners.append(runner)
+    return runners
+
+
+def score_all(comparison: Comparison) -> tuple[Scores, ...]:
+    """The scores of every run, with relative errors over the same path lengths.
+
+    Without truth the first run is the reference and has no errors itself.
     """
     reference = comparison.reference
     has_none = comparison.truth is None
@@ -253,30 +233,29 @@ def score_all(comparison: Comparison) -> tuple[Scores, ...]:
     found = [entry.lengths for entry in scores if entry.lengths]
     if len(set(found)) < 2:
         return tuple(scores)
-    # The poses of some begin or end elsewhere: take what fits the shortest of their paths.
+    # Some runs have poses over a part of the path only: the lengths must fit the shortest part.
     return tuple(score(run, against, min(found)) for run, against in pairs)
 
 
 def score(
     run: SolverRun, reference: Trajectory | None, lengths: Sequence[float] | None = None
 ) -> Scores:
-    """The numbers of a run.
+    """The scores of one run.
 
     Parameters
     ----------
-    reference : errors are taken against it; no errors if None
-    lengths : metres, of the relative error; what fits the path if None
+    reference : errors are taken against this trajectory; there are no errors if None
+    lengths : metres, path lengths of the relative error; those that fit the path if None
     """
     solved = [update for update in run.updates if update.status.solved]
-    ours = run.config is not None
     seconds = np.array([sum(update.timings.values()) for update in run.updates if update.timings])
-    # The first frame loads, compiles and has no map to match: it is no time of a frame.
+    # The first frame loads code and has no map to match: its time is not that of a usual frame.
     milliseconds = 1e3 * seconds[1:]
     result = Scores(map_points=run.map_points, solved=len(solved), problem=run.problem)
     if len(milliseconds):
         median, high = np.percentile(milliseconds, (50.0, 95.0))
         result = replace(result, ms_median=float(median), ms_95=float(high))
-    if ours and solved:
+    if run.config is not None and solved:
         matches = [update.n_edge_matches + update.n_plane_matches for update in solved]
         result = replace(
             result,
@@ -316,8 +295,9 @@ class FrameDifferences:
 
     Attributes
     ----------
-    frames : (N,) numbers of the frames both have
-    metres, degrees : (N,) see :func:`loam_gtsam.studies.evaluation.pose_differences`
+    frames : (N,) numbers of the frames that both solvers have a pose for
+    metres, degrees : (N,) distance and angle of the poses, see
+        :func:`loam_gtsam.studies.evaluation.pose_differences`
     """
 
     frames: IntArray
@@ -326,7 +306,7 @@ class FrameDifferences:
 
 
 def frame_differences(comparison: Comparison) -> dict[str, FrameDifferences]:
-    """Differences of the other solvers, by name; those too short to compare are left out."""
+    """Differences of the other solvers by name; a run too short to compare is left out."""
     first, *others = comparison.runs
     found = {}
     for run in others:
@@ -343,7 +323,7 @@ def frame_differences(comparison: Comparison) -> dict[str, FrameDifferences]:
 def _common_configs(
     contenders: Sequence[Contender], dataset: Dataset
 ) -> tuple[list[Config | None], list[str]]:
-    """The configurations to use, and a note for each section that had to be made the same."""
+    """The configurations to run with, and a note for each section that had to be made equal."""
     configs: list[Config | None] = []
     notes: list[str] = []
     first: tuple[str, Config] | None = None
@@ -356,7 +336,7 @@ def _common_configs(
             first = entry.name, config
         name, common = first
         shared = {section: getattr(common, section) for section in _SHARED}
-        # How often a sweep is de-skewed anew, and by what, is part of the method, and stays.
+        # How often and from what rotation a sweep is de-skewed again is part of the method.
         own = config.deskew
         shared["deskew"] = replace(common.deskew, refine=own.refine, rotation=own.rotation)
         for section, value in shared.items():

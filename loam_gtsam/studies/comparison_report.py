@@ -1,4 +1,4 @@
-"""What is written of a comparison: scores, tables, pictures and the report."""
+"""The files of a comparison: tables of scores and frames, trajectories, pictures, the report."""
 
 from __future__ import annotations
 
@@ -47,8 +47,8 @@ class Column:
 
     Attributes
     ----------
-    key : of :class:`loam_gtsam.studies.comparison.Scores`
-    digits : after the point
+    key : attribute of :class:`loam_gtsam.studies.comparison.Scores`
+    digits : number of digits after the decimal point
     lower_wins : whether the smallest value is the best
     """
 
@@ -79,12 +79,12 @@ COLUMNS = (
             "still keeps", 0),
 )  # fmt: skip
 ACCURACY_COLUMNS = 5
-"""The first of them; the others say what it cost."""
+"""Number of the first columns that hold errors; the other columns hold the cost."""
 
 
 @dataclass(frozen=True, slots=True)
-class Results:
-    """A comparison and what was worked out of it."""
+class ScoredComparison:
+    """A comparison with the scores of every run and the differences from the first run."""
 
     comparison: Comparison
     shared_guess: bool
@@ -92,7 +92,7 @@ class Results:
     differences: dict[str, FrameDifferences]
 
     @classmethod
-    def of(cls, comparison: Comparison, shared_guess: bool) -> Results:
+    def of(cls, comparison: Comparison, shared_guess: bool) -> ScoredComparison:
         """Score every run."""
         scores = score_all(comparison)
         return cls(comparison, shared_guess, scores, frame_differences(comparison))
@@ -104,12 +104,12 @@ class Results:
 
     @property
     def against(self) -> str:
-        """What errors are taken against."""
+        """Name of the reference of the errors: the truth, or the first-named solver."""
         return "truth" if self.comparison.truth is not None else self.comparison.runs[0].name
 
     @property
     def notes(self) -> list[str]:
-        """What a reader of the tables must know."""
+        """Sentences that a reader of the tables must know."""
         lengths = next((s.lengths for s in self.scores if s.lengths), ())
         path = next((s.path_m for s in self.scores if s.path_m == s.path_m), math.nan)
         about = f"{self.comparison.frames} sweeps; errors against {self.against}"
@@ -125,14 +125,14 @@ class Results:
         return [about, guesses, *self.comparison.notes, *problems]
 
 
-def cell(scores: Scores, column: Column) -> str:
+def format_score(scores: Scores, column: Column) -> str:
     """One score as text, a dash where there is none."""
     value = getattr(scores, column.key)
     return "-" if value != value else f"{value:.{column.digits}f}"
 
 
-def best(results: Results) -> set[tuple[int, int]]:
-    """(row, column) of the best values, counted with the name as column 0."""
+def best_cells(results: ScoredComparison) -> set[tuple[int, int]]:
+    """(row, column) of the best value of each column; column 0 is the name."""
     winners = set()
     for index, column in enumerate(COLUMNS, 1):
         values = np.array([getattr(scores, column.key) for scores in results.scores], np.float64)
@@ -141,7 +141,7 @@ def best(results: Results) -> set[tuple[int, int]]:
     return winners
 
 
-def spread(values: FloatArray) -> tuple[float, float, float]:
+def median_95_max(values: FloatArray) -> tuple[float, float, float]:
     """Median, 95th percentile and maximum."""
     median, high = np.percentile(values, (50.0, 95.0))
     return float(median), float(high), float(values.max())
@@ -150,8 +150,8 @@ def spread(values: FloatArray) -> tuple[float, float, float]:
 # -- files -----------------------------------------------------------------------------------------
 
 
-def write(results: Results, folder: Path, plot: bool) -> list[str]:
-    """Write all files; names of what was written."""
+def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> list[str]:
+    """Write all files; returns their names."""
     comparison = results.comparison
     _write_csv(
         folder / "comparison.csv",
@@ -173,13 +173,13 @@ def write(results: Results, folder: Path, plot: bool) -> list[str]:
         write_tum(folder / name, trajectory)
         files.append(name)
     drawn = _draw(results, folder) if plot else []
-    winners = best(results)
+    winners = best_cells(results)
     write_report(
         folder / REPORT_FILE,
         f"Comparison on {comparison.name}",
         results.notes,
         ["solver", *(column.title for column in COLUMNS)],
-        [[run.name, *(cell(s, column) for column in COLUMNS)] for run, s in results.rows],
+        [[run.name, *(format_score(s, column) for column in COLUMNS)] for run, s in results.rows],
         winners,
         {column.title: column.meaning for column in COLUMNS},
         {PICTURES[name]: folder / name for name in drawn},
@@ -189,7 +189,7 @@ def write(results: Results, folder: Path, plot: bool) -> list[str]:
     return [*files, *drawn, REPORT_FILE]
 
 
-def _summary_json(results: Results) -> dict[str, Any]:
+def _summary_json(results: ScoredComparison) -> dict[str, Any]:
     solvers = []
     for run, scores in results.rows:
         difference = results.differences.get(run.name)
@@ -200,8 +200,8 @@ def _summary_json(results: Results) -> dict[str, Any]:
                 "config": None if run.config is None else config_to_dict(run.config),
                 "scores": {key: _plain(value) for key, value in asdict(scores).items()},
                 "stages_ms": _stages(run),
-                "difference_m": difference and spread(difference.metres),
-                "difference_deg": difference and spread(difference.degrees),
+                "difference_m": difference and median_95_max(difference.metres),
+                "difference_deg": difference and median_95_max(difference.degrees),
             }
         )
     comparison = results.comparison
@@ -223,7 +223,7 @@ _FRAME_COLUMNS = (
 )  # fmt: skip
 
 
-def _frame_rows(results: Results) -> Iterable[list[Any]]:
+def _frame_rows(results: ScoredComparison) -> Iterable[list[Any]]:
     for run in results.comparison.runs:
         apart = results.differences.get(run.name)
         found = {}
@@ -241,7 +241,7 @@ def _frame_rows(results: Results) -> Iterable[list[Any]]:
 
 
 def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
-    """Comma-separated; what is not known is empty."""
+    """Write comma-separated values; a number that is not known is an empty field."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
@@ -271,7 +271,7 @@ def _stages(run: SolverRun) -> dict[str, float]:
 
 
 def _settings(run: SolverRun) -> str:
-    """What a reader needs to repeat the run."""
+    """Version and settings, from which the run can be repeated."""
     if run.config is None:
         about = "its own defaults; see docs/compare.md for its de-skew and the moment of its poses"
         return f"{run.version}; {about}"
@@ -291,22 +291,22 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
 # -- pictures --------------------------------------------------------------------------------------
 
 
-def _draw(results: Results, folder: Path) -> list[str]:
-    """Draw what there is; names of the files."""
+def _draw(results: ScoredComparison, folder: Path) -> list[str]:
+    """Draw the pictures that the comparison has data for; returns the names of the files."""
     comparison = results.comparison
-    moved, errors = {}, {}
+    aligned, errors = {}, {}
     for run in comparison.runs:
         try:
             found = absolute_error(run.trajectory, comparison.reference)
         except InputError:  # too few poses
             continue
-        moved[run.name] = _aligned(run.trajectory, comparison.reference, found.stamps)
+        aligned[run.name] = _aligned(run.trajectory, comparison.reference, found.stamps)
         there = interpolate(comparison.reference, found.stamps).map_T_lidar[:, :3, 3]
         errors[run.name] = distance_travelled(there), found.translations
     pictures: dict[str, Callable[[Path], None]] = {}
-    if moved:
+    if aligned:
         pictures["trajectories.png"] = lambda path: visualization.plot_trajectories(
-            path, moved, _part(comparison.truth, moved.values())
+            path, aligned, _within(comparison.truth, aligned.values())
         )
     if errors and comparison.truth is not None:
         pictures["errors.png"] = lambda path: visualization.plot_curves(
@@ -343,8 +343,8 @@ def _aligned(trajectory: Trajectory, reference: Trajectory, stamps: IntArray) ->
     return Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
 
 
-def _part(truth: Trajectory | None, others: Iterable[Trajectory]) -> Trajectory | None:
-    """The truth over the time of the others."""
+def _within(truth: Trajectory | None, others: Iterable[Trajectory]) -> Trajectory | None:
+    """The part of the truth within the time span of the other trajectories."""
     if truth is None:
         return None
     stamps = np.concatenate([other.stamps for other in others])

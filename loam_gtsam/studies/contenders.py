@@ -1,27 +1,29 @@
-"""What a comparison runs: a mapper of ours or a peer, both fed with the same prepared sweeps."""
+"""The contenders of a comparison, pipelines of this package and other systems, on equal sweeps."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.config import PRESETS, Config, load_config
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
+from loam_gtsam.frontend.workers import Extraction
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.mapper import Mapper
-from loam_gtsam.registration.odometry import make_odometry
-from loam_gtsam.studies.peers import Peer, TimedPoints, version
+from loam_gtsam.io.version import installed_version
+from loam_gtsam.pipeline import Pipeline, RunResult
+from loam_gtsam.registration.odometry import Guess, Odometry
+from loam_gtsam.studies.peers import PEERS, Peer, TimedPoints
 from loam_gtsam.types import (
     BadSweep,
+    ConfigError,
     Features,
     FeatureSweep,
-    FloatArray,
     FrameStatus,
     InputError,
     MapUpdate,
@@ -31,18 +33,68 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
+_PRESET_OF = {"gtsam": "default"}
+"""Solver names that are not the name of their preset."""
+
 
 @dataclass(frozen=True, slots=True)
-class SolverRun:
-    """What one estimator made of the sweeps.
+class Contender:
+    """One solver that a comparison is to run.
 
     Attributes
     ----------
-    name, version : of the contender; that of the package it comes from
+    name : of a solver of this package its preset (``gtsam`` is the default preset), of a peer its
+        name in :data:`loam_gtsam.studies.peers.PEERS`
+    config : of a solver of this package; None for a peer
+    """
+
+    name: str
+    config: Config | None = None
+
+
+def solver_names() -> tuple[str, ...]:
+    """All names that :func:`find_contender` knows, those of this package first."""
+    named = {preset: name for name, preset in _PRESET_OF.items()}
+    return (*(named.get(preset, preset) for preset in PRESETS), *PEERS)
+
+
+def find_contender(name: str) -> Contender:
+    """The contender called ``name``; a name that ends in .yaml or .yml is a configuration file.
+
+    Raises
+    ------
+    ConfigError
+        If no solver has this name, or the configuration file does not fit.
+    """
+    if name in PEERS:
+        return Contender(name)
+    if Path(name).suffix in (".yaml", ".yml"):
+        return Contender(Path(name).stem, load_config(name))
+    preset = _PRESET_OF.get(name, name)
+    if preset not in PRESETS:
+        raise ConfigError(
+            f"unknown solver {name!r}; expected one of {', '.join(solver_names())}, or a "
+            "configuration file (.yaml)"
+        )
+    return Contender(name, PRESETS[preset])
+
+
+# -- results ---------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class SolverRun:
+    """The result of one contender on all sweeps.
+
+    Attributes
+    ----------
+    name : of the contender
+    version : of the package that the contender comes from
     config : as used; None for a peer
-    updates : one per sweep; of a peer only stamp, pose, status and time are meaningful
-    map_points : of the whole map; of a peer those it still keeps, or its voxels
-    problem : what ended it early, else ""
+    updates : one per sweep, corrected by loop closures if there are any; of a peer only stamp,
+        pose, status and time have a meaning
+    map_points : points of the whole map; of a peer the points or voxels that it still keeps
+    problem : what ended the contender early, else ""
     """
 
     name: str
@@ -52,9 +104,29 @@ class SolverRun:
     map_points: int
     problem: str = ""
 
+    @classmethod
+    def of_result(cls, name: str, result: RunResult) -> SolverRun:
+        """The run of a pipeline of this package."""
+        updates = result.updates
+        if result.loops is not None:
+            poses = iter(result.trajectory.map_T_lidar)
+            updates = tuple(
+                replace(update, map_T_lidar=gtsam.Pose3(next(poses)))
+                if update.status.has_pose
+                else update
+                for update in updates
+            )
+        return cls(
+            name=name,
+            version=f"loam_gtsam {installed_version()}",
+            config=result.config,
+            updates=updates,
+            map_points=len(result.edge_points) + len(result.plane_points),
+        )
+
     @property
     def used(self) -> tuple[int, ...]:
-        """Numbers of the frames with a pose of its own; predicted ones count, of ours."""
+        """Numbers of the frames with a pose; a predicted pose counts for a solver of ours."""
         if self.config is None:
             wanted = [update.status is FrameStatus.OK for update in self.updates]
         else:
@@ -68,13 +140,71 @@ class SolverRun:
         return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
 
+# -- sweeps that all contenders share --------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SharedSweep:
+    """One sweep as all contenders take it.
+
+    Attributes
+    ----------
+    sweep : as the data set gives it
+    extraction : the features of a :class:`~loam_gtsam.types.Scan`, for pipelines of this package
+    points : the points of the sweep, for peers
+    problem : why there are no points
+    """
+
+    sweep: Sweep
+    extraction: Extraction | None = None
+    points: TimedPoints | None = None
+    problem: str = ""
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds."""
+        sweep = self.sweep
+        return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
+
+
+def share_sweeps(
+    sweeps: Iterable[Sweep], config: Config, *, features: bool, points: bool
+) -> Iterator[SharedSweep]:
+    """Prepare each sweep once for all contenders.
+
+    Parameters
+    ----------
+    config : decides the features and the points
+    features : extract features, for pipelines of this package
+    points : take the points with their times, for peers
+
+    Raises
+    ------
+    InputError
+        If points are wanted, and the data set has features instead of points.
+    """
+    for sweep in sweeps:
+        if isinstance(sweep, FeatureSweep) and points:
+            raise InputError("peers need the points of raw sweeps; this data set has features only")
+        shared = SharedSweep(sweep, problem=sweep.message if isinstance(sweep, BadSweep) else "")
+        if isinstance(sweep, Scan):
+            if points:
+                try:
+                    shared = replace(shared, points=timed_points(sweep, config))
+                except SweepError as error:
+                    shared = replace(shared, problem=str(error))
+            if features:
+                shared = replace(shared, extraction=_extract_all(sweep, config))
+        yield shared
+
+
 def timed_points(scan: Scan, config: Config) -> TimedPoints:
-    """What a peer is given: the points and times our own pipeline works with.
+    """The points and times of a sweep that features are extracted from, as a peer takes them.
 
     Raises
     ------
     SweepError
-        If the sweep has too few points, or no times can be had.
+        If the sweep has too few points, or their times cannot be known.
     """
     columns = usable_columns(scan, config)
     timing = assign_times(columns, assign_rings(columns, config.sensor), config)
@@ -82,123 +212,90 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
     return TimedPoints(points, np.asarray(timing.times, np.float64), timing.span)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Step:
-    """A guess, seen from the pose before: what can be handed to another solver."""
-
-    last_T_guess: gtsam.Pose3
-    twist: FloatArray | None
-
-
-@dataclass(frozen=True, slots=True)
-class Prepared:
-    """One sweep as the estimators take it.
-
-    Attributes
-    ----------
-    problem : why there are no features, and no points
-    features, seconds : features, and the time their extraction took
-    recorded : motion since the sweep before, by recorded odometry
-    points : for peers
-    """
-
-    stamp: int
-    problem: str = ""
-    features: Features | None = None
-    seconds: float = 0.0
-    recorded: gtsam.Pose3 | None = None
-    points: TimedPoints | None = None
-
-
-def prepare(dataset: Dataset, config: Config, ours: bool, theirs: bool) -> Iterator[Prepared]:
-    """The sweeps of a data set, with features for ours and points for peers if there are any.
-
-    Raises
-    ------
-    InputError
-        If there are peers, and the data set has features instead of sweeps.
-    """
-    last_odom: gtsam.Pose3 | None = None
-    for sweep in dataset:
-        prepared = _prepared(sweep, config, ours, theirs)
-        if isinstance(sweep, FeatureSweep):
-            if last_odom is not None:
-                prepared = replace(prepared, recorded=last_odom.between(sweep.odom_T_lidar))
-            last_odom = sweep.odom_T_lidar
-        yield prepared
-
-
-def _prepared(sweep: Sweep, config: Config, ours: bool, theirs: bool) -> Prepared:
-    if isinstance(sweep, BadSweep):
-        return Prepared(sweep.stamp, sweep.message)
-    if isinstance(sweep, FeatureSweep):
-        if theirs:
-            raise InputError("peers need the points of raw sweeps; this data set has features only")
-        return Prepared(sweep.features.stamp, features=sweep.features)
-    points, features, problem = None, None, ""
+def _extract_all(scan: Scan, config: Config) -> Extraction:
+    """All features of a sweep: each pipeline thins them to the voxels of its own map."""
     started = time.perf_counter()
+    features, problem, fault = None, "", None
     try:
-        points = timed_points(sweep, config) if theirs else None
-        started = time.perf_counter()
-        features = extract_features(sweep, config) if ours else None
+        features = extract_features(scan, config)
     except SweepError as error:
-        problem = str(error)
-    seconds = time.perf_counter() - started
-    return Prepared(sweep.stamp, problem, features, seconds, points=points)
+        problem, fault = str(error), error.fault
+    return Extraction(features, problem, time.perf_counter() - started, fault)
 
 
-class Ours:
-    """A mapper with its own odometry.
+# -- runners ---------------------------------------------------------------------------------------
+
+
+class SharedGuess:
+    """An odometry for several pipelines: the first one predicts, the others take the same step.
+
+    The step is the guess seen from the last pose. The pipeline that asks first for a sweep gets the
+    guess of ``odometry``; every other pipeline gets the same step from its own last pose, with the
+    same twist.
 
     Parameters
     ----------
-    imu : of its own, for it learns the bias of the gyro; None does without
+    odometry : of the first pipeline
     """
 
-    def __init__(self, name: str, config: Config, imu: ImuBuffer | None = None) -> None:
-        self.name, self.config = name, config
-        self.mapper = Mapper(config, imu=imu)
-        self.odometry = make_odometry(config.odometry, self.mapper.imu)
+    def __init__(self, odometry: Odometry) -> None:
+        self._odometry = odometry
+        self._features: Features | None = None
+        self._step: tuple[gtsam.Pose3, Guess] | None = None
+
+    def guess(self, features: Features, last: MapUpdate | None) -> Guess:
+        """See :meth:`loam_gtsam.registration.odometry.Odometry.guess`."""
+        if features is self._features and self._step is not None and last is not None:
+            last_T_guess, first = self._step
+            return Guess(last.map_T_lidar.compose(last_T_guess), first.twist)
+        own = self._odometry.guess(features, last)
+        self._features = features
+        self._step = None if last is None else (last.map_T_lidar.between(own.map_T_lidar), own)
+        return own
+
+
+class PipelineRunner:
+    """A pipeline of this package as a contender.
+
+    Parameters
+    ----------
+    name : of the contender
+    imu : for this pipeline alone, since the buffer learns the bias of the gyro; None does without
+    odometry : see :class:`loam_gtsam.pipeline.Pipeline`
+
+    Attributes
+    ----------
+    updates : one per sweep so far
+    """
+
+    def __init__(
+        self,
+        name: str,
+        config: Config,
+        imu: ImuBuffer | None = None,
+        odometry: Odometry | None = None,
+    ) -> None:
+        self.name = name
+        self.pipeline = Pipeline(config, imu=imu, odometry=odometry)
         self.updates: list[MapUpdate] = []
 
-    def register(self, sweep: Prepared, given: Step | None) -> Step | None:
-        """Register a sweep from a given guess or an own one; returns the step of the guess."""
-        if sweep.features is None:
-            self.updates.append(self.mapper.skip(sweep.stamp, sweep.problem, None))
-            return None
-        started = time.perf_counter()
-        last = self.mapper.last
-        guess, twist = None, None
-        step = given
-        if step is None and sweep.recorded is not None:
-            step = Step(sweep.recorded, None)
-        if last is not None and step is not None:
-            guess, twist = last.map_T_lidar.compose(step.last_T_guess), step.twist
-        elif sweep.recorded is None:
-            own = self.odometry.guess(sweep.features, last)
-            # The first sweep is where the mapper puts it.
-            guess, twist = None if last is None else own.map_T_lidar, own.twist
-        seconds = time.perf_counter() - started
-        update = self.mapper.register(sweep.features, guess, twist)
-        timings = {"features": sweep.seconds, "odometry": seconds} | dict(update.timings)
-        self.updates.append(replace(update, timings=timings))
-        if last is None or guess is None:
-            return None
-        return step or Step(last.map_T_lidar.between(guess), twist)
+    def register(self, shared: SharedSweep) -> None:
+        """Register a sweep."""
+        self.updates.append(self.pipeline.process(shared.sweep, shared.extraction))
 
     def result(self, frames: int) -> SolverRun:
-        """What came of the first so many sweeps."""
-        return SolverRun(
-            name=self.name,
-            version=f"loam_gtsam {version('loam_gtsam')}",
-            config=self.config,
-            updates=tuple(self.updates[:frames]),
-            map_points=sum(len(points) for points in self.mapper.map_points()),
-        )
+        """The run over the first ``frames`` sweeps."""
+        return SolverRun.of_result(self.name, self.pipeline.result(self.updates[:frames]))
 
 
-class Theirs:
-    """A peer; if it fails, the others go on without it."""
+class PeerRunner:
+    """A peer as a contender; if the peer fails, the other contenders go on without it.
+
+    Attributes
+    ----------
+    updates : one per sweep so far
+    problem : what ended the peer early, else ""
+    """
 
     def __init__(self, peer: Peer) -> None:
         self.peer = peer
@@ -206,25 +303,24 @@ class Theirs:
         self.problem = ""
         self._last_stamp: int | None = None
 
-    def register(self, sweep: Prepared, given: Step | None) -> Step | None:
-        """Register a sweep; a peer predicts by itself, so ``given`` is handed on."""
-        self.updates.append(self._update(sweep))
-        return given
+    def register(self, shared: SharedSweep) -> None:
+        """Register a sweep; the peer predicts its guess by itself."""
+        self.updates.append(self._update(shared.stamp, shared))
 
-    def _update(self, sweep: Prepared) -> MapUpdate:
+    def _update(self, stamp: int, shared: SharedSweep) -> MapUpdate:
         nowhere = gtsam.Pose3()
-        if self.problem or sweep.points is None:
-            message = self.problem or sweep.problem
-            return MapUpdate(sweep.stamp, nowhere, FrameStatus.UNUSABLE_SCAN, message)
-        if self._last_stamp is not None and sweep.stamp <= self._last_stamp:
-            return MapUpdate(sweep.stamp, nowhere, FrameStatus.BAD_STAMP)
+        if self.problem or shared.points is None:
+            message = self.problem or shared.problem
+            return MapUpdate(stamp, nowhere, FrameStatus.UNUSABLE_SCAN, message)
+        if self._last_stamp is not None and stamp <= self._last_stamp:
+            return MapUpdate(stamp, nowhere, FrameStatus.BAD_STAMP)
         try:
-            registered = self.peer.register(sweep.stamp, sweep.points)
+            registered = self.peer.register(stamp, shared.points)
         except Exception as error:  # foreign code: it may raise anything
             number = len(self.updates)
             self.problem = f"ended at frame {number}: {type(error).__name__}: {error}"
-            return MapUpdate(sweep.stamp, nowhere, FrameStatus.UNUSABLE_SCAN, self.problem)
-        self._last_stamp = sweep.stamp
+            return MapUpdate(stamp, nowhere, FrameStatus.UNUSABLE_SCAN, self.problem)
+        self._last_stamp = stamp
         return MapUpdate(
             stamp=registered.stamp,
             map_T_lidar=gtsam.Pose3(registered.map_T_lidar),
@@ -233,11 +329,11 @@ class Theirs:
         )
 
     def result(self, frames: int) -> SolverRun:
-        """What came of the first so many sweeps."""
+        """The run over the first ``frames`` sweeps."""
         package = self.peer.package
         return SolverRun(
             name=self.peer.name,
-            version=f"{package} {version(package)}",
+            version=f"{package} {installed_version(package)}",
             config=None,
             updates=tuple(self.updates[:frames]),
             map_points=self.peer.map_points,

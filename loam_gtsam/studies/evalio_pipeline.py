@@ -13,7 +13,6 @@ checks the names after ``-p`` before it looks into the module.) Needs evalio, ``
 from __future__ import annotations
 
 from collections.abc import Mapping, Set
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 import gtsam
@@ -23,6 +22,7 @@ from loam_gtsam.config import Config, config_from_dict, config_to_dict
 from loam_gtsam.datasets.decode.extrinsics import implied_by
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import Pipeline, with_implied
 from loam_gtsam.types import FloatArray, ImuSamples, InputError, Scan
 
@@ -79,11 +79,8 @@ class LoamGtsam(EvalioPipeline):
 
     @staticmethod
     def version() -> str:
-        """Of this package."""
-        try:
-            return version("loam_gtsam")
-        except PackageNotFoundError:  # a source tree on the path
-            return "unknown"
+        """Version of this package."""
+        return installed_version()
 
     @staticmethod
     def default_params() -> dict[str, bool | int | float | str]:

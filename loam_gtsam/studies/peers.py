@@ -7,7 +7,6 @@ differently, and which moment of the sweep its pose belongs to, stands with its 
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import time
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -266,14 +265,6 @@ def make_peer(name: str) -> Peer:
     if name not in PEERS:
         raise PeerError(f"unknown peer {name!r} (known: {', '.join(sorted(PEERS))})")
     return PEERS[name]()
-
-
-def version(package: str) -> str:
-    """Installed version of a package, or "not installed"."""
-    try:
-        return importlib.metadata.version(package)
-    except importlib.metadata.PackageNotFoundError:
-        return "not installed"
 
 
 def _module(peer: Peer, name: str = "") -> Any:

@@ -1,48 +1,68 @@
-"""Where trials run, on Dask: in this process, in processes of this machine, or on a cluster.
-
-Imports dask, which is optional: import this module only where it is needed.
-"""
+"""Where trials run: in this process, in processes of this machine, or on a Dask cluster."""
 
 from __future__ import annotations
 
+import importlib
 import logging
+import multiprocessing
+import os
 import signal
-from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any
-from uuid import uuid4
-
-import dask
-from distributed import Client, Future, LocalCluster, WorkerPlugin, wait
-from distributed.comm.addressing import parse_address, parse_host_port
-from distributed.utils import silence_logging_cmgr
+from typing import Any, Protocol
 
 from loam_gtsam.studies.trials import Row, Trial, empty_row, run_trial, versions
-from loam_gtsam.types import LoamError, MapUpdate
+from loam_gtsam.types import LoamError, MapUpdate, OutputError
 
 _POLL = 0.2
-"""Seconds between two looks at whether the sweep is to stop."""
+"""Seconds between two checks whether the user has asked to stop."""
 _CONNECT_SECONDS = 10
+_DEATHS = 4
+"""Number of worker processes that may die of one trial before the trial counts as failed."""
+_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+"""Environment of workers: the threads of several processes disturb each other's times."""
 
 Stopped = Callable[[], bool]
 """Whether the user has asked to stop."""
 Work = Callable[[Trial], Row]
+"""What a worker does with a trial: :func:`loam_gtsam.studies.trials.run_trial`, except in tests."""
 
 
 class ClusterError(LoamError):
-    """The scheduler cannot be reached, or was lost."""
+    """The scheduler of a cluster cannot be reached, or the connection was lost."""
+
+
+class Workers(Protocol):
+    """Processes that run trials."""
+
+    @property
+    def slots(self) -> int:
+        """Number of trials that can run at the same time."""
+        ...
+
+    def submit(self, work: Work, trial: Trial) -> Future[Row]:
+        """Start a trial; at most ``slots`` trials are under way."""
+        ...
 
 
 def run_here(trials: Sequence[Trial], stopped: Stopped) -> Iterator[Row]:
-    """Run trials in this process, one after the other, by Dask's synchronous scheduler.
+    """Run trials in this process, one after the other.
 
     Raises
     ------
     KeyboardInterrupt
-        After the frame during which it was stopped.
+        After the frame during which the user asked to stop.
     """
 
     def on_frame(number: int, update: MapUpdate) -> None:
@@ -52,58 +72,54 @@ def run_here(trials: Sequence[Trial], stopped: Stopped) -> Iterator[Row]:
     for trial in trials:
         if stopped():
             raise KeyboardInterrupt
-        row: Row = dask.delayed(partial(run_trial, trial, on_frame))().compute(scheduler="sync")
-        yield row
+        yield run_trial(trial, on_frame)
 
 
 def run_on(
-    client: Client, trials: Sequence[Trial], stopped: Stopped, work: Work | None = None
-) -> Generator[Row, None, None]:
-    """Run trials on the workers of a cluster; rows come as they are finished.
+    workers: Workers, trials: Sequence[Trial], stopped: Stopped, work: Work | None = None
+) -> Iterator[Row]:
+    """Run trials on workers; a row comes as soon as its trial is finished.
 
-    A worker gets as many trials as it has threads and no more: the scheduler suspects all that a
-    dying worker held, and gives up those that were there too often.
-
-    Parameters
-    ----------
-    work : what a worker does with a trial; ``run_trial`` if None
+    A trial whose worker process dies runs again. Workers get as many trials as they have slots and
+    no more: the scheduler of a cluster suspects every trial that a dying worker held.
 
     Raises
     ------
     KeyboardInterrupt
-        If it was stopped; trials that run are given up.
+        If the user asked to stop; trials under way are lost.
     ClusterError
-        If the connection to the scheduler is lost.
+        If the connection to the scheduler of a cluster is lost.
     """
-    task = partial(_work, work or run_trial, versions())
+    task = partial(_work_if_same_versions, work or run_trial, versions())
     waiting = deque(trials)
-    running: dict[Future, Trial] = {}
+    running: dict[Future[Row], Trial] = {}
+    deaths: Counter[str] = Counter()
     try:
         while waiting or running:
             if stopped():
                 raise KeyboardInterrupt
-            slots = max(1, sum(client.nthreads().values()))  # one waits for the first worker
-            while waiting and len(running) < slots:
+            # Without any worker, one trial waits at the scheduler for the first one.
+            while waiting and len(running) < max(1, workers.slots):
                 trial = waiting.popleft()
-                # Not the id alone: a scheduler that still holds an old result would hand it out.
-                key = f"trial-{trial.id}-{uuid4()}"
-                running[client.submit(task, trial, key=key, pure=False)] = trial
-            with suppress(TimeoutError), client.as_current():
-                wait(list(running), timeout=_POLL, return_when="FIRST_COMPLETED")
-            for future in [future for future in running if future.done()]:
-                yield _row(future, running.pop(future))
+                running[workers.submit(task, trial)] = trial
+            done, _ = wait(running, timeout=_POLL, return_when=FIRST_COMPLETED)
+            for future in done:
+                trial, error = running.pop(future), future.exception()
+                if isinstance(error, BrokenExecutor):
+                    deaths[trial.id] += 1
+                    if deaths[trial.id] < _DEATHS:
+                        waiting.appendleft(trial)
+                        continue
+                yield future.result() if error is None else _failed(trial, error)
     except (OSError, CancelledError) as error:
         raise ClusterError(
             f"the connection to the scheduler was lost ({error}); finished trials are kept: start "
-            "it and the sweep again"
+            "the scheduler and the study again"
         ) from error
-    finally:
-        with suppress(OSError, CancelledError):
-            client.cancel(list(running))
 
 
-def _work(work: Work, wanted: Mapping[str, str], trial: Trial) -> Row:
-    """On a worker: the trial, if the same versions are installed there."""
+def _work_if_same_versions(work: Work, wanted: Mapping[str, str], trial: Trial) -> Row:
+    """On a worker: the row of a trial, an error unless the versions are those of the caller."""
     here = versions()
     if here != wanted:
         problem = ", ".join(f"{name} {here[name]}" for name in here if here[name] != wanted[name])
@@ -112,59 +128,122 @@ def _work(work: Work, wanted: Mapping[str, str], trial: Trial) -> Row:
     return work(trial)
 
 
-def _row(future: Future, trial: Trial) -> Row:
-    error = future.exception()
-    if isinstance(error, CancelledError):
-        raise error
-    if error is None:
-        row: Row = future.result()
-        return row
-    return empty_row(trial) | {"error": f"{type(error).__name__}: {error}"}
+def _failed(trial: Trial, error: BaseException) -> Row:
+    """The row of a trial that no worker could finish."""
+    text = f"{type(error).__name__}: {error}"
+    if isinstance(error, BrokenExecutor):
+        text = f"KilledWorker: the process of the trial died {_DEATHS} times; is memory short?"
+    return empty_row(trial) | {"error": text}
+
+
+# -- processes of this machine -----------------------------------------------------------------
+
+
+class _LocalWorkers:
+    """Executors of one process each: a process that dies takes no other trial with it."""
+
+    def __init__(self, count: int) -> None:
+        self.slots = count
+        self.children: set[multiprocessing.process.BaseProcess] = set()
+        self.last: dict[ProcessPoolExecutor, Future[Any]] = {}
+
+    def submit(self, work: Work, trial: Trial) -> Future[Row]:
+        """See :class:`Workers`."""
+        idle = (
+            executor
+            for executor, last in self.last.items()
+            if last.done() and not isinstance(last.exception(), BrokenExecutor)
+        )
+        executor = next(idle, None) or self._start()
+        self.last[executor] = future = executor.submit(work, trial)
+        return future
+
+    def _start(self) -> ProcessPoolExecutor:
+        """A new process; Ctrl-C in a terminal reaches every process, and the caller handles it."""
+        others = set(multiprocessing.active_children())
+        executor = ProcessPoolExecutor(
+            1, multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+        )
+        before = {name: os.environ.get(name) for name in _ONE_THREAD}
+        os.environ.update(_ONE_THREAD)
+        try:
+            executor.submit(os.getpid)  # starts the process
+        finally:
+            for name, value in before.items():
+                os.environ.pop(name)
+                if value is not None:
+                    os.environ[name] = value
+        self.children |= set(multiprocessing.active_children()) - others
+        return executor
 
 
 @contextmanager
-def local_workers(count: int) -> Iterator[Client]:
-    """A cluster of processes on this machine, one trial at a time in each."""
-    with (
-        LocalCluster(
-            n_workers=count,
-            threads_per_worker=1,
-            processes=True,
-            memory_limit=0,  # else a long run is killed where it would have swapped
-            dashboard_address=None,
-            silence_logs=logging.ERROR,
-        ) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-        client.register_plugin(_IgnoreInterrupts())
-        yield client
+def local_workers(count: int) -> Iterator[Workers]:
+    """Processes of this machine, one trial at a time in each; trials under way end with them."""
+    workers = _LocalWorkers(count)
+    try:
+        yield workers
+    finally:
+        for child in workers.children.intersection(multiprocessing.active_children()):
+            child.terminate()
+        for executor in workers.last:
+            executor.shutdown(cancel_futures=True)
+
+
+# -- a Dask cluster ----------------------------------------------------------------------------
+
+
+class _ClusterWorkers:
+    """The workers of a Dask cluster."""
+
+    def __init__(self, client: Any) -> None:
+        self._client = client
+        # Not pure: a scheduler that still holds an old result would hand it out again.
+        self.executor: Executor = client.get_executor(pure=False)
+
+    @property
+    def slots(self) -> int:
+        """See :class:`Workers`."""
+        return sum(self._client.nthreads().values())
+
+    def submit(self, work: Work, trial: Trial) -> Future[Row]:
+        """See :class:`Workers`."""
+        return self.executor.submit(work, trial)
 
 
 @contextmanager
-def cluster_at(address: str) -> Iterator[Client]:
-    """A running cluster, by the address of its scheduler.
+def cluster_workers(address: str) -> Iterator[Workers]:
+    """The workers of a running Dask cluster, by the address of its scheduler.
 
     Raises
     ------
+    OutputError
+        If Dask is not installed.
     ClusterError
-        If it cannot be reached.
+        If the scheduler cannot be reached.
     """
-    # Its own logs tell of a lost connection by traceback; the errors below say the same.
-    with silence_logging_cmgr(logging.CRITICAL):
+    try:
+        distributed = importlib.import_module("distributed")
+    except ImportError as error:
+        raise OutputError(
+            f'--scheduler needs Dask ({error}): pip install "loam_gtsam[cluster]"'
+        ) from error
+    addressing = importlib.import_module("distributed.comm.addressing")
+    utils = importlib.import_module("distributed.utils")
+    # Dask logs a lost connection with a traceback; the errors below say the same.
+    with utils.silence_logging_cmgr(logging.CRITICAL):
         try:
-            parse_host_port(parse_address(address)[1])
-            client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+            addressing.parse_host_port(addressing.parse_address(address)[1])
+            client = distributed.Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ClusterError(
                 f"--scheduler {address}: cannot reach a Dask scheduler there: {error}; start one "
                 "with: dask scheduler"
             ) from error
         with client:
-            yield client
-
-
-class _IgnoreInterrupts(WorkerPlugin):  # type: ignore[misc]  # dask is not checked
-    """Ctrl-C in a terminal reaches every process of this machine; the caller alone handles it."""
-
-    def setup(self, worker: Any) -> None:
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+            workers = _ClusterWorkers(client)
+            try:
+                yield workers
+            finally:
+                with suppress(OSError, CancelledError):
+                    workers.executor.shutdown(wait=False)

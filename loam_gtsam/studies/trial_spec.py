@@ -1,4 +1,4 @@
-"""What a sweep over parameters runs: sequences x configurations x seeds, read from YAML."""
+"""The specification of a parameter study: sequences x configurations x seeds, read from YAML."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from urllib.parse import parse_qsl
 from ruamel.yaml import YAML
 
 from loam_gtsam.config import Config, with_value
-from loam_gtsam.studies.comparison import Contender, contender
+from loam_gtsam.studies.contenders import Contender, find_contender
 from loam_gtsam.studies.trials import METRICS, Trial
 from loam_gtsam.types import ConfigError
 
@@ -124,7 +124,7 @@ def _config(where: str, value: Any, folder: Path) -> Contender:
     if Path(solver).suffix in (".yaml", ".yml"):
         solver = str(folder / Path(solver).expanduser())
     try:
-        entry = contender(solver)
+        entry = find_contender(solver)
     except ConfigError as error:
         raise ConfigError(f"{where}: {error}") from error
     changes = _mapping(f"{where}.set", entries.get("set", {}))

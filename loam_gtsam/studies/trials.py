@@ -1,7 +1,6 @@
-"""One trial of an experiment: one run of one estimator on one sequence becomes a row of numbers.
+"""Trials of a parameter study: a trial is one run of one solver on one sequence, and gives a row.
 
-"Sweep" is a turn of the lidar everywhere else ; a sweep over parameters
-is made of *trials* here.
+A row holds the numbers of the run, or the error that ended it.
 """
 
 from __future__ import annotations
@@ -14,28 +13,27 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import islice
 from typing import Any
 
-import gtsam
-
 from loam_gtsam import datasets
 from loam_gtsam.config import Config, config_to_dict
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import OnFrame, effective_config, run
 from loam_gtsam.studies.comparison import score
-from loam_gtsam.studies.contenders import SolverRun, Theirs, prepare
+from loam_gtsam.studies.contenders import PeerRunner, SolverRun, share_sweeps
 from loam_gtsam.studies.evaluation import pose_differences
-from loam_gtsam.studies.peers import make_peer, version
+from loam_gtsam.studies.peers import make_peer
 from loam_gtsam.types import FrameStatus, LoamError, Trajectory
 
 Row = dict[str, Any]
-"""Values of :data:`COLUMNS` by name; None where there is none."""
+"""The values of a trial by the name of their column, see :data:`COLUMNS`; None if not known."""
 
 VERSIONS = ("loam_gtsam", "gtsam", "numpy")
-"""Distributions that decide the numbers of our estimators."""
+"""Packages whose version decides the numbers of the solvers of this package."""
 
 METRICS = (
     "ate_m",
@@ -50,7 +48,7 @@ METRICS = (
     "ms_median",
     "ms_95",
 )
-"""Numbers of a run that can be compared; defined in ``docs/compare.md`` and ``docs/sweep.md``."""
+"""Columns to compare solvers by; see ``docs/compare.md`` and ``docs/parameter_studies.md``."""
 
 COLUMNS: dict[str, type] = {
     "trial": str,
@@ -74,24 +72,24 @@ COLUMNS: dict[str, type] = {
     "wall_s": float,
     "host": str,
 }
-"""Of the table, in its order."""
+"""Name and type of the columns of the table, in their order."""
 
 NOT_REPEATABLE = ("ms_median", "ms_95", "wall_s", "host")
-"""Columns that differ when the same trial is run again; the others do not."""
+"""Columns that differ when the same trial runs again; all other columns are the same."""
 
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One run of one estimator on one sequence.
+    """One run of one solver on one sequence.
 
     Attributes
     ----------
-    sequence, config_name : what the specification calls them
+    sequence, config_name : names of the sequence and of the configuration in the specification
     path, options : of the data set, see :func:`loam_gtsam.datasets.open_dataset`
-    frames : stop after so many sweeps; None takes all
+    frames : number of sweeps after which the trial stops; None takes all sweeps
     seed : of a built-in world; None for recorded data
-    config : as given to the run; of a peer only what it says about the sensor counts
-    peer : name in :data:`loam_gtsam.studies.peers.PEERS`; None for ours
+    config : of the run; a peer uses the section ``sensor`` only
+    peer : name in :data:`loam_gtsam.studies.peers.PEERS`; None for a solver of this package
     """
 
     sequence: str
@@ -105,12 +103,12 @@ class Trial:
 
     @property
     def config_hash(self) -> str:
-        """Of every value of the configuration, or of the peer and what it is told."""
+        """Hash of every value of the configuration, and of the name of the peer."""
         return _hash({"peer": self.peer, "config": config_to_dict(self.config)})
 
     @property
     def id(self) -> str:
-        """Of all that decides the result, so not of the names; the data itself is not read."""
+        """Hash of all that decides the result: not the names of the trial, nor the data itself."""
         return _hash(
             {
                 "path": self.path,
@@ -123,18 +121,18 @@ class Trial:
 
     @property
     def dataset_options(self) -> dict[str, Any]:
-        """For the loader, the seed included."""
+        """Options of the data set, the seed included."""
         return dict(self.options) | ({} if self.seed is None else {"seed": self.seed})
 
 
 @cache
 def versions() -> Mapping[str, str]:
-    """Of what decides the numbers, by column, here and now."""
-    return {f"{name}_version": version(name) for name in VERSIONS}
+    """Installed versions of the packages that decide the numbers, by column."""
+    return {f"{name}_version": installed_version(name) for name in VERSIONS}
 
 
 def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
-    """Run one trial; whatever goes wrong in it becomes the ``error`` of its row.
+    """Run one trial; an error during the trial becomes the ``error`` of its row.
 
     Parameters
     ----------
@@ -143,25 +141,25 @@ def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
     Raises
     ------
     KeyboardInterrupt
-        If the trial was stopped, for half a trial is no result.
+        If the trial was stopped: half a trial is no result.
     """
     row = empty_row(trial) | {"host": socket.gethostname()}
     started = time.perf_counter()
     try:
         dataset = datasets.open_dataset(trial.path, **trial.dataset_options)
-        finished = (_ours if trial.peer is None else _theirs)(trial, dataset, on_frame)
+        finished = (_run_pipeline if trial.peer is None else _run_peer)(trial, dataset, on_frame)
         row |= _numbers(finished, dataset.truth)
         row["error"] = _unusable(dataset.name, finished)
     except LoamError as error:
         row["error"] = f"{type(error).__name__}: {error}"
-    except Exception:  # a mistake of ours or of a peer must not cost the other trials
+    except Exception:  # a defect of this package or of a peer must not end the other trials
         row["error"] = traceback.format_exc()
     row["wall_s"] = time.perf_counter() - started
     return row
 
 
 def empty_row(trial: Trial) -> Row:
-    """What is known of a trial before it runs."""
+    """The row of a trial that has not run."""
     row: Row = dict.fromkeys(COLUMNS)
     return (
         row
@@ -179,36 +177,27 @@ def empty_row(trial: Trial) -> Row:
     )
 
 
-def _ours(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
+def _run_pipeline(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
     result = run(dataset, trial.config, max_frames=trial.frames, on_frame=on_frame)
     if result.interrupted:
         raise KeyboardInterrupt
-    # As corrected by loops, if there are any: these are the poses that the run gives.
-    poses = iter(result.trajectory.map_T_lidar)
-    updates = tuple(
-        update
-        if not update.status.has_pose
-        else replace(update, map_T_lidar=gtsam.Pose3(next(poses)))
-        for update in result.updates
-    )
-    points = len(result.edge_points) + len(result.plane_points)
-    return SolverRun(trial.config_name, "", result.config, updates, points)
+    return SolverRun.of_result(trial.config_name, result)
 
 
-def _theirs(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
+def _run_peer(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
     assert trial.peer is not None
-    estimator = Theirs(make_peer(trial.peer))
+    runner = PeerRunner(make_peer(trial.peer))
     config = effective_config(trial.config, dataset)
-    sweeps = prepare(dataset, config, ours=False, theirs=True)
-    for number, sweep in enumerate(islice(sweeps, trial.frames)):
-        estimator.register(sweep, None)
+    sweeps = share_sweeps(islice(dataset, trial.frames), config, features=False, points=True)
+    for number, shared in enumerate(sweeps):
+        runner.register(shared)
         if on_frame is not None:
-            on_frame(number, estimator.updates[-1])
-    return estimator.result(len(estimator.updates))
+            on_frame(number, runner.updates[-1])
+    return runner.result(len(runner.updates))
 
 
 def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
-    """The columns that a run fills."""
+    """The columns that are computed from a run."""
     scores = score(finished, truth)
     counts = Counter(update.status for update in finished.updates)
     row: Row = {
@@ -225,7 +214,7 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
     if truth is not None and scores.path_m > 0.0:
         _, metres, _ = pose_differences(finished.trajectory, truth)
         row["drift_percent"] = 100.0 * float(metres[-1]) / scores.path_m
-    # NaN is no value, and would not equal itself when two tables are compared.
+    # NaN would not equal itself when two tables are compared.
     return {
         key: None if isinstance(value, float) and not math.isfinite(value) else value
         for key, value in row.items()
@@ -233,7 +222,7 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
 
 
 def _unusable(name: str, finished: SolverRun) -> str | None:
-    """Why a run that ended has no result, if it has none."""
+    """Why a run has no result; None if it has one."""
     if not finished.updates:
         return f"{name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
     if finished.config is None and finished.problem:
@@ -247,6 +236,6 @@ def _unusable(name: str, finished: SolverRun) -> str | None:
 
 
 def _hash(value: Mapping[str, Any]) -> str:
-    """The same for the same values on every machine; an option that is no JSON counts as text."""
+    """A hash that is equal on every machine; a value that JSON does not know counts as text."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]

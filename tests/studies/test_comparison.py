@@ -22,21 +22,22 @@ from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.pipeline import run
-from loam_gtsam.studies import contenders as estimators
-from loam_gtsam.studies import peers
-from loam_gtsam.studies import report_html as _report_html
+from loam_gtsam.studies import contenders, peers
 from loam_gtsam.studies.comparison import (
     Comparison,
-    Contender,
-    compare,
-    contender,
+    compare_solvers,
     frame_differences,
     score,
     score_all,
-    solver_names,
 )
 from loam_gtsam.studies.comparison_report import PICTURES, REPORT_FILE, TABLE_FILES
-from loam_gtsam.studies.contenders import SolverRun, timed_points
+from loam_gtsam.studies.contenders import (
+    Contender,
+    SolverRun,
+    find_contender,
+    solver_names,
+    timed_points,
+)
 from loam_gtsam.studies.evaluation import (
     absolute_error,
     path_lengths,
@@ -44,6 +45,7 @@ from loam_gtsam.studies.evaluation import (
     relative_error,
 )
 from loam_gtsam.studies.peers import PEERS, Peer, PeerError, TimedPoints
+from loam_gtsam.studies.report_html import write_report
 from loam_gtsam.types import (
     BadSweep,
     ConfigError,
@@ -265,9 +267,9 @@ def poses(run_or_result):
 
 def test_our_solver_gives_what_run_gives(dataset):
     alone = run(dataset, Config())
-    result = compare(dataset, [contender("gtsam")])
+    result = compare_solvers(dataset, [find_contender("gtsam")])
     np.testing.assert_array_equal(poses(result.runs[0]), poses(alone))
-    again = compare(dataset, [contender("gtsam")])
+    again = compare_solvers(dataset, [find_contender("gtsam")])
     np.testing.assert_array_equal(poses(result.runs[0]), poses(again.runs[0]))
     assert result.runs[0].map_points == len(alone.edge_points) + len(alone.plane_points)
     scores = score(result.runs[0], result.truth)
@@ -282,9 +284,9 @@ def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, names):
     """Each has its own IMU, blend or prior, and de-skew; the map of each is level."""
     dataset = Sweeps(sweeps, world.truth)
     dataset.imu = world.imu
-    result = compare(dataset, [contender(name) for name in names])
+    result = compare_solvers(dataset, [find_contender(name) for name in names])
     for name, entry in zip(names, result.runs, strict=True):
-        assert entry.config.deskew.rotation == contender(name).config.deskew.rotation
+        assert entry.config.deskew.rotation == find_contender(name).config.deskew.rotation
         alone = run(dataset, entry.config)
         np.testing.assert_array_equal(poses(entry), poses(alone))
         tilts = {str(update.tilt_prior) for update in entry.updates[1:]}
@@ -296,7 +298,7 @@ def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, names):
 def test_what_one_learns_of_the_gyro_is_not_told_to_the_next(sweeps, world):
     dataset = Sweeps(sweeps, world.truth)
     dataset.imu = world.imu
-    runs = compare(dataset, [Contender(name, Config()) for name in "ab"]).runs
+    runs = compare_solvers(dataset, [Contender(name, Config()) for name in "ab"]).runs
     np.testing.assert_array_equal(poses(runs[0]), poses(runs[1]))
     for one, other in zip(runs[0].updates, runs[1].updates, strict=True):
         np.testing.assert_array_equal(one.twist, other.twist)
@@ -304,9 +306,9 @@ def test_what_one_learns_of_the_gyro_is_not_told_to_the_next(sweeps, world):
 
 def test_features_are_extracted_once_for_all(dataset, monkeypatch):
     calls = []
-    real = estimators.extract_features
-    monkeypatch.setattr(estimators, "extract_features", lambda *a: (calls.append(a), real(*a))[1])
-    result = compare(dataset, [Contender(n, Config()) for n in ("one", "two")])
+    real = contenders.extract_features
+    monkeypatch.setattr(contenders, "extract_features", lambda *a: (calls.append(a), real(*a))[1])
+    result = compare_solvers(dataset, [Contender(n, Config()) for n in ("one", "two")])
     assert len(calls) == FRAMES
     np.testing.assert_array_equal(poses(result.runs[0]), poses(result.runs[1]))
     differences = frame_differences(result)
@@ -319,9 +321,10 @@ def test_shared_guess_gives_all_the_guesses_of_the_first(dataset):
     other = config_from_dict({"odometry": {"method": "scan_to_scan"}})
     contenders = [Contender("velocity", Config()), Contender("scan", other)]
     own, shared = (
-        poses(compare(dataset, contenders, shared_guess=flag).runs[1]) for flag in (False, True)
+        poses(compare_solvers(dataset, contenders, shared_guess=flag).runs[1])
+        for flag in (False, True)
     )
-    first = poses(compare(dataset, contenders[:1]).runs[0])
+    first = poses(compare_solvers(dataset, contenders[:1]).runs[0])
     # The two differ in their guesses only.
     np.testing.assert_allclose(shared, first, atol=1e-9)
     assert np.abs(own - first).max() > 1e-6
@@ -331,7 +334,9 @@ def test_what_decides_the_features_is_that_of_the_first(dataset):
     other = config_from_dict(
         {"features": {"sectors": 4}, "deskew": {"reference": "end", "refine": False}}
     )
-    result = compare(dataset, [Contender("a", Config()), Contender("b", other)], max_frames=2)
+    result = compare_solvers(
+        dataset, [Contender("a", Config()), Contender("b", other)], max_frames=2
+    )
     used = result.runs[1].config
     assert used.features == Config().features
     assert used.deskew == replace(other.deskew, reference="start")
@@ -339,14 +344,14 @@ def test_what_decides_the_features_is_that_of_the_first(dataset):
         "b: section features is that of a, so that all get the same features at the same moments",
         "b: section deskew is that of a, so that all get the same features at the same moments",
     )
-    assert compare(dataset, [Contender("a", Config())], max_frames=2).notes == ()
+    assert compare_solvers(dataset, [Contender("a", Config())], max_frames=2).notes == ()
 
 
 def test_all_presets_are_solvers(dataset):
     names = [name for name in solver_names() if name not in PEERS]
     assert names[0] == "gtsam"
-    assert [contender(name).config for name in names] == list(PRESETS.values())
-    result = compare(dataset, [contender(name) for name in names], max_frames=3)
+    assert [find_contender(name).config for name in names] == list(PRESETS.values())
+    result = compare_solvers(dataset, [find_contender(name) for name in names], max_frames=3)
     for entry in result.runs:
         assert score(entry, result.truth).ate_m < 0.1, entry.name
 
@@ -354,7 +359,7 @@ def test_all_presets_are_solvers(dataset):
 def test_a_configuration_file_is_a_solver(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("map:\n  edge_voxel: 0.3\n")
-    mine = contender(str(file))
+    mine = find_contender(str(file))
     assert mine.name == "mine"
     assert mine.config.map.edge_voxel == 0.3
 
@@ -362,23 +367,23 @@ def test_a_configuration_file_is_a_solver(tmp_path):
 @pytest.mark.parametrize("name", ["gtsm", "", "kiss"])
 def test_unknown_solvers_are_refused(name):
     with pytest.raises(ConfigError, match=r"unknown solver .*gtsam, .*kiss-icp.*\.yaml"):
-        contender(name)
+        find_contender(name)
 
 
 @pytest.mark.parametrize("names", [[], ["gtsam", "gtsam"]])
 def test_solvers_must_have_different_names(dataset, names):
     with pytest.raises(InputError, match="different names"):
-        compare(dataset, [contender(name) for name in names])
+        compare_solvers(dataset, [find_contender(name) for name in names])
 
 
 def test_peers_that_disturb_each_other_are_not_run_together(dataset, fake, monkeypatch):
     monkeypatch.setitem(PEERS, "other", type("Other", (FakePeer,), {"name": "other"}))
-    both = [contender("fake"), contender("other")]
-    assert len(compare(dataset, both, max_frames=1).runs) == 2
+    both = [find_contender("fake"), find_contender("other")]
+    assert len(compare_solvers(dataset, both, max_frames=1).runs) == 2
     monkeypatch.setattr(fake, "alone", True)
     with pytest.raises(InputError, match="instances of fake in one process disturb each other"):
-        compare(dataset, both)
-    assert len(compare(dataset, [contender("gtsam"), both[0]], max_frames=1).runs) == 2
+        compare_solvers(dataset, both)
+    assert len(compare_solvers(dataset, [find_contender("gtsam"), both[0]], max_frames=1).runs) == 2
     assert PEERS["genz-icp"].alone
     assert not PEERS["kiss-icp"].alone
 
@@ -387,7 +392,7 @@ def test_bad_sweeps_reach_every_solver(sweeps, fake):
     late = replace(sweeps[1], stamp=sweeps[0].stamp)
     empty = replace(sweeps[3], points=np.full_like(sweeps[3].points, np.nan))
     items = [sweeps[0], BadSweep(sweeps[1].stamp, "torn"), sweeps[2], late, empty, sweeps[4]]
-    result = compare(Sweeps(items), [contender("gtsam"), contender("fake")])
+    result = compare_solvers(Sweeps(items), [find_contender("gtsam"), find_contender("fake")])
     ours, theirs = ([str(u.status) for u in entry.updates] for entry in result.runs)
     assert theirs == ["ok", "unusable_scan", "ok", "bad_stamp", "unusable_scan", "ok"]
     assert ours[1] == ours[4] == "unusable_scan"
@@ -400,7 +405,7 @@ def test_bad_sweeps_reach_every_solver(sweeps, fake):
 
 def test_a_peer_that_fails_does_not_cost_the_others(dataset, fake, monkeypatch):
     monkeypatch.setattr(fake, "fails_at", 2)
-    result = compare(dataset, [contender("fake"), contender("gtsam")])
+    result = compare_solvers(dataset, [find_contender("fake"), find_contender("gtsam")])
     theirs, ours = result.runs
     assert theirs.problem == "ended at frame 2: RuntimeError: cannot [go] on"
     assert len(theirs.trajectory) == 2
@@ -437,28 +442,28 @@ def test_recorded_features_are_for_ours_only(sweeps, fake):
     config = Config()
     recorded = []
     for number, scan in enumerate(sweeps[:3]):
-        features = estimators.extract_features(scan, config)
+        features = contenders.extract_features(scan, config)
         odom = gtsam.Pose3(gtsam.Rot3(), [0.1 * number, 0.0, 0.0])
         recorded.append(FeatureSweep(features, odom))
     data = Sweeps(recorded)
-    result = compare(data, [contender("gtsam")])
+    result = compare_solvers(data, [find_contender("gtsam")])
     np.testing.assert_array_equal(poses(result.runs[0]), poses(run(data, config)))
     assert [u.status for u in result.runs[0].updates][1:] == [FrameStatus.OK] * 2
     with pytest.raises(InputError, match="peers need the points of raw sweeps"):
-        compare(data, [contender("gtsam"), contender("fake")])
+        compare_solvers(data, [find_contender("gtsam"), find_contender("fake")])
 
 
 def test_without_sweeps_there_is_nothing_to_compare():
     with pytest.raises(DatasetError, match="no sweeps in it"):
-        compare(Sweeps([]), [contender("gtsam")])
+        compare_solvers(Sweeps([]), [find_contender("gtsam")])
 
 
 def test_what_came_before_an_error_is_kept(sweeps):
-    result = compare(Sweeps([*sweeps[:2], DatasetError("torn")]), [contender("gtsam")])
+    result = compare_solvers(Sweeps([*sweeps[:2], DatasetError("torn")]), [find_contender("gtsam")])
     assert str(result.error) == "torn"
     assert result.frames == 2
     with pytest.raises(DatasetError, match="torn"):
-        compare(Sweeps([DatasetError("torn")]), [contender("gtsam")])
+        compare_solvers(Sweeps([DatasetError("torn")]), [find_contender("gtsam")])
 
 
 # -- peers -----------------------------------------------------------------------------------------
@@ -484,7 +489,7 @@ def test_an_unknown_peer_is_refused():
 @pytest.mark.parametrize("name", [*PEERS])
 def test_peers_find_the_path(name, world, sweeps):
     pytest.importorskip(PEERS[name].module)
-    result = compare(Sweeps(sweeps, world.truth), [contender(name)])
+    result = compare_solvers(Sweeps(sweeps, world.truth), [find_contender(name)])
     scores = score(result.runs[0], result.truth)
     assert result.runs[0].problem == ""
     assert scores.ate_m < 0.1 * result.truth.path_length + 0.02
@@ -688,7 +693,7 @@ def test_pictures_show_every_solver(tmp_path):
 
 def test_a_picture_that_is_gone_is_an_output_error(tmp_path):
     with pytest.raises(OutputError, match=r"no\.png: cannot read the picture"):
-        _report_html.write_report(
+        write_report(
             tmp_path / "r.html", "t", [], ["a"], [["1"]], [], {}, {"x": tmp_path / "no.png"}, {}
         )
     assert not (tmp_path / "r.html").exists()

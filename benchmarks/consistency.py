@@ -11,7 +11,7 @@ import argparse
 import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import astuple, dataclass, fields
 from itertools import groupby
 from pathlib import Path
 
@@ -125,7 +125,7 @@ def run_seed(job: tuple[Study, int]) -> list[Samples]:
     study, seed = job
     world = SimulatedWorld(study.scene, seed=seed, frames=study.frames, columns=study.columns)
     config = Config()
-    config = replace(config, imu=replace(config.imu, enabled=study.imu))
+    config = config.changed({"imu.enabled": study.imu})
     updates = run(world, config).updates
     truth = [gtsam.Pose3(pose) for pose in world.truth.map_T_lidar]
     return [samples(study, window, updates, truth) for window in study.windows]

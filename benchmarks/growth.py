@@ -89,7 +89,7 @@ QUICK = (
 def measure(drive: Drive) -> GrowthResult:
     """Map the sweeps of a drive one by one, as ``run`` does, and look at the process in between."""
     world = drive.open()
-    config = effective_config(replace(Config(), map=drive.map), world)
+    config = effective_config(Config().changed(map=drive.map), world)
     pipeline = Pipeline(config, imu=imu_buffer(world, config))
     driven = _driven(world.truth)
     updates: list[MapUpdate] = []

@@ -240,7 +240,7 @@ def city(path: Path) -> Iterator[str]:
     world = SimulatedWorld(scene, columns=600, speed=14.0)
     for enabled in (True, False):
         config = _without_imu()
-        config = replace(config, loops=replace(config.loops, enabled=enabled))
+        config = config.changed({"loops.enabled": enabled})
         result = run(world, config, workers=1)
         error = absolute_error(result.trajectory, world.truth)
         length = world.truth.path_length
@@ -269,7 +269,7 @@ def _until(world: SimulatedWorld, metres: float) -> Iterator[Scan]:
 
 def _without_imu() -> Config:
     config = Config()
-    return replace(config, imu=replace(config.imu, enabled=False))
+    return config.changed("imu.enabled=false")
 
 
 def _is_wrong(loop: LoopClosure, poses: Sequence[gtsam.Pose3]) -> bool:

@@ -248,7 +248,7 @@ def measure(task: tuple[Place, str], data: Path) -> list[Measured]:
     assert truth is not None
     config = effective_config(Config(), case.dataset)
     if name == REDESCENDING:
-        config = replace(config, solver=replace(config.solver, kernel="geman_mcclure"))
+        config = config.changed("solver.kernel=geman_mcclure")
     result = run(case.dataset, config)
     statuses = ", ".join(f"{count} {status}" for status, count in _others(result.status_counts))
     found = {OURS: result.trajectory}

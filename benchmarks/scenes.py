@@ -37,7 +37,7 @@ NOISES = (0.003, 0.010)
 
 
 def _with_imu(**changes: Any) -> Config:
-    return replace(Config(), imu=replace(Config().imu, **changes))
+    return Config().changed(imu=Config().imu.changed(**changes))
 
 
 AIDS: Mapping[str, Config] = {
@@ -206,7 +206,7 @@ def measure(place: Place, data: Path) -> list[Row]:
     rows = []
     for name in place.solvers:
         config = preset(name)
-        config = replace(config, imu=replace(config.imu, enabled=False))
+        config = config.changed("imu.enabled=false")
         rows.append(runs.run("solvers", name, config))
     if NONE in place.aids:
         same = [row for row in rows if row.variant == "default"]

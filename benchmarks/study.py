@@ -76,10 +76,7 @@ class Variant:
 
 def _changed(name: str, kernel: str = "", **sections: Mapping[str, Any]) -> Variant:
     """The default with some values of its sections replaced."""
-    config = Config()
-    for section, values in sections.items():
-        config = replace(config, **{section: replace(getattr(config, section), **values)})
-    return Variant(name, config, kernel)
+    return Variant(name, Config().changed(sections), kernel)
 
 
 NO_KERNEL = {"kernel_width": math.inf}
@@ -117,13 +114,11 @@ CORRIDOR = (
     MAIN[1],
     Variant(
         "loam, no projector",
-        replace(MAIN[1].config, solver=replace(MAIN[1].config.solver, degeneracy_threshold=0.0)),
+        MAIN[1].config.changed("solver.degeneracy_threshold=0.0"),
     ),
     Variant(
         "loam, published projector",
-        replace(
-            MAIN[1].config, solver=replace(MAIN[1].config.solver, degeneracy_projector="published")
-        ),
+        MAIN[1].config.changed("solver.degeneracy_projector=published"),
     ),
     MAIN[2],
 )
@@ -233,7 +228,7 @@ class Sweep:
         start, self.truth, end = map(gtsam.Pose3, world.truth_at(stamps).map_T_lidar)
         twist = gtsam.Pose3.Logmap(start.between(end)) / (2.0 * half)
         for kind in kinds:
-            config = replace(Config(), features=kind)
+            config = Config().changed(features=kind)
             moving = MovingSweep(extract_features(scan, config), config)
             moving.deskew(twist)
             self.clouds[kind] = Cloud(moving.edges, moving.planes, moving.distinct)

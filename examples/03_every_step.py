@@ -3,15 +3,13 @@
 Use your own front end, your own guess or your own solver by replacing one of them.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from loam_gtsam import Config, ConstantVelocity, Mapper, SimulatedWorld, extract_features
 
 world = SimulatedWorld("room", sensor="hdl32", frames=6)
 config = Config()
-config = replace(config, matching=replace(config.matching, max_distance=0.8))  # any parameter
+config = config.changed("matching.max_distance=0.8")  # any parameter
 
 odometry = ConstantVelocity()
 mapper = Mapper(config)

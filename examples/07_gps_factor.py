@@ -5,7 +5,6 @@ the unknown pose. What it returns are ordinary GTSAM factors on that key.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -25,7 +24,7 @@ stamps = world.truth.stamps[[*range(0, 28, 3), *range(33, 60, 3)]]
 positions = world.truth_at(stamps).map_T_lidar[:, :3, 3]
 positions = positions + rng.normal(0.0, SIGMA, positions.shape)
 config = Config()
-config = replace(config, imu=replace(config.imu, level=False))
+config = config.changed("imu.level=false")
 had_one: list[int] = []
 
 

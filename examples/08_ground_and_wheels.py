@@ -5,7 +5,6 @@ moved by their increment.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -25,7 +24,7 @@ WHEELS = (
 # A short-sighted lidar between bare walls: no sweep says how far one went.
 world = SimulatedWorld("corridor_bare", frames=60, columns=900, max_range=6.0)
 floor_up = world.world_T_start[2, :3]  # z of the world in the map, which is the first pose's frame
-off = replace(Config(), imu=replace(Config().imu, enabled=False))  # the factors have to do it
+off = Config().changed("imu.enabled=false")  # the factors have to do it
 
 
 def floor(context: PoseContext) -> gtsam.NonlinearFactor:

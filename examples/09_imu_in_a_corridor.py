@@ -5,8 +5,6 @@ biases known from the frames before. The prediction takes over along the directi
 does not fix; the update's ``status`` and ``message`` say when, and which.
 """
 
-from dataclasses import replace
-
 import numpy as np
 
 from loam_gtsam import Config, RunResult, SimulatedWorld, run
@@ -24,7 +22,7 @@ def off_along(result: RunResult) -> float:
 
 config = Config()
 constant = run(world, config)
-inertial = run(world, replace(config, imu=replace(config.imu, preintegration=True)))
+inertial = run(world, config.changed("imu.preintegration=true"))
 blind = [update for update in inertial.updates if update.status == "degenerate"]
 errors = off_along(constant), off_along(inertial)
 print(f"{len(blind)} of {len(world)} sweeps are degenerate, e.g.: {blind[0].message}")

@@ -22,10 +22,11 @@ from loam_gtsam import (
 
 # Small steps for a small room, and an odometry that is known to be bad.
 config = Config()
-config = replace(
-    config,
-    pose_graph=replace(config.pose_graph, keyframe_distance=0.5, walk=0.05, turn_walk_deg=0.5),
-    loops=replace(config.loops, neighbours=3),
+config = config.changed(
+    "pose_graph.keyframe_distance=0.5",
+    "pose_graph.walk=0.05",
+    "pose_graph.turn_walk_deg=0.5",
+    "loops.neighbours=3",
 )
 
 

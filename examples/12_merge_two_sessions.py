@@ -4,8 +4,6 @@ Each was mapped on its own and knows nothing of the other: here one began in ano
 room, looking elsewhere. Loops between them are found as within one run, and tie them together.
 """
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 
@@ -20,10 +18,8 @@ from loam_gtsam import (
 from loam_gtsam.io.run_files import write_ply
 
 config = Config()
-config = replace(  # small steps for a small room
-    config,
-    pose_graph=replace(config.pose_graph, keyframe_distance=0.5),
-    loops=replace(config.loops, neighbours=3, min_way=4.0),
+config = config.changed(  # small steps for a small room
+    "pose_graph.keyframe_distance=0.5", "loops.neighbours=3", "loops.min_way=4.0"
 )
 world = SimulatedWorld("room", frames=90, columns=400, speed=2.0)
 sweeps = [world[number] for number in range(len(world))]

@@ -13,7 +13,7 @@ cubes that are searched together: a sweep touches a dozen, most of them with a h
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from typing import Any, NamedTuple
 
@@ -406,7 +406,7 @@ class CubeMap:
 
     def thinned(self, factor: float) -> CubeMap:
         """The points of the window in a map of their own, with voxels this times as large."""
-        config = replace(self._config, insertion="centroid", archive_dir=None)
+        config = self._config.changed(insertion="centroid", archive_dir=None)
         thin = CubeMap(config, factor * self._voxel_size)
         thin._low = self._low
         thin.insert(self.points())

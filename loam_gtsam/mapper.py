@@ -631,7 +631,7 @@ class _Association:
                 # coarsely, there are others among them.
                 reach = wide * self._matching.max_distance
                 maps = mapper.edge_map.thinned(wide), mapper.plane_map.thinned(wide)
-                matching = replace(self._matching, max_distance=reach)
+                matching = self._matching.changed(max_distance=reach)
                 matches = match_features(*features, *maps, matching, self._distinct)
             matches = at_rows(matches, *self._rows)
             self._found = mapper.plane_map, map_T_lidar, matches

@@ -1,16 +1,15 @@
 """Configuration: YAML there and back, and every way in which a file can be wrong."""
 
-import dataclasses
-import typing
-
 import pytest
 from ruamel.yaml import YAML
 
 from loam_gtsam.config import (
     PRESETS,
     Config,
+    ImuConfig,
     MapConfig,
     MatchingConfig,
+    Parameter,
     SensorConfig,
     SolverConfig,
     config_from_dict,
@@ -22,28 +21,21 @@ from loam_gtsam.config import (
 )
 from loam_gtsam.types import ConfigError, LoamError
 
-
-def fields_of(section):
-    """(section class, field) of every number, text and choice of the tree."""
-    for item in dataclasses.fields(section):
-        value = getattr(section, item.name)
-        if dataclasses.is_dataclass(value):
-            yield from fields_of(value)
-        else:
-            yield type(section), item
-
-
-FIELDS = list(fields_of(Config()))
+FIELDS = [
+    (section.kind, item)
+    for section in Config.parameters().values()
+    for item in section.kind.parameters().values()
+]
 BOUNDS = [
     (owner, item, end)
     for owner, item in FIELDS
     for end in ("low", "high")
-    if item.metadata[end] is not None
+    if getattr(item, end) is not None
 ]
 
 
 def name_of(value):
-    return value.name if isinstance(value, dataclasses.Field) else getattr(value, "__name__", value)
+    return value.name if isinstance(value, Parameter) else getattr(value, "__name__", value)
 
 
 # -- there and back --------------------------------------------------------------------------------
@@ -71,8 +63,7 @@ def test_values_other_than_the_default_survive_too():
 def test_every_key_is_dumped_below_a_comment_with_its_unit_and_source():
     lines = dump_config(Config()).splitlines()
     for owner, item in FIELDS:
-        meta = item.metadata
-        assert meta["doc"], item.name
+        assert item.description, item.name
         at = [i for i, line in enumerate(lines) if line.strip().startswith(f"{item.name}:")]
         comments = []
         for i in at:
@@ -80,9 +71,9 @@ def test_every_key_is_dumped_below_a_comment_with_its_unit_and_source():
             while lines[start - 1].strip().startswith("#"):
                 start -= 1
             comments.append(" ".join(line.strip(" #") for line in lines[start:i]))
-        found = [text for text in comments if meta["doc"] in text]
+        found = [text for text in comments if item.description in text]
         assert found, f"{owner.__name__}.{item.name} has no comment"
-        assert any(meta["unit"] in text and meta["source"] in text for text in found)
+        assert any(item.unit in text and item.source in text for text in found)
 
 
 def test_an_empty_file_is_the_default_and_absent_keys_keep_it(tmp_path):
@@ -104,8 +95,8 @@ def test_an_integer_serves_as_a_float_and_null_as_none():
 
 def test_the_tree_is_frozen():
     for section in (Config(), Config().solver):
-        name = dataclasses.fields(section)[0].name
-        with pytest.raises(dataclasses.FrozenInstanceError):
+        name = next(iter(section.parameters()))
+        with pytest.raises(ValueError, match="frozen"):
             setattr(section, name, getattr(section, name))
 
 
@@ -179,7 +170,7 @@ def test_anchors_and_other_looks_of_a_value_do_not_matter():
     text = "imu: {enabled: &a true, lag: &b 0x10, gravity: &c 1.0e+1}\nbag: {map_frame: &d 'map'}"
     dressed = parse_config(text)
     assert dressed == plain
-    assert {type(value) for value in dataclasses.astuple(dressed.imu)} <= {
+    assert {type(value) for value in vars(dressed.imu).values()} <= {
         bool, int, float, str, tuple, type(None)
     }  # fmt: skip
     assert parse_config(dump_config(dressed)) == plain
@@ -189,14 +180,15 @@ def test_anchors_and_other_looks_of_a_value_do_not_matter():
 
 @pytest.mark.parametrize(("owner", "item", "end"), BOUNDS, ids=name_of)
 def test_every_bound_accepts_itself_and_refuses_what_lies_beyond(owner, item, end):
-    limit = item.metadata[end]
-    hint = typing.get_type_hints(owner)[item.name]
-    whole = hint is not float
+    limit = getattr(item, end)
+    whole = item.kind is int
     step = (1 if whole else 1e-9) * (-1 if end == "low" else 1)
     at, beyond = (int(limit), int(limit) + step) if whole else (float(limit), limit + step)
-    if typing.get_origin(hint) is tuple:
+    if item.size:
         at, beyond = (at,) * 3, (at, at, beyond)
-    assert getattr(owner(**{item.name: at}), item.name) == at
+    others = {upper: at for lower, upper in owner.in_order if lower == item.name and end == "high"}
+    others |= {lower: at for lower, upper in owner.in_order if upper == item.name and end == "low"}
+    assert getattr(owner(**others, **{item.name: at}), item.name) == at
     with pytest.raises(ConfigError, match=rf"{owner.__name__}\.{item.name}: expected at"):
         owner(**{item.name: beyond})
 
@@ -211,8 +203,76 @@ def test_a_constructor_refuses_too():
         SolverConfig(iterations=True)
     with pytest.raises(ConfigError, match=r"MapConfig\.window: expected 3 values"):
         MapConfig(window=(1, 2))
-    with pytest.raises(ConfigError, match=r"Config\.solver"):
-        Config(solver={"iterations": 3})
+    with pytest.raises(
+        ConfigError, match=r"Config\.solver: SolverConfig\.iterations: expected int"
+    ):
+        Config(solver={"iterations": 2.5})
+    with pytest.raises(ConfigError, match=r"SolverConfig\.iteration: unknown key; did you mean"):
+        SolverConfig(iteration=5)
+
+
+PAIRS = [(owner, *pair) for owner in {owner for owner, _ in FIELDS} for pair in owner.in_order]
+
+
+@pytest.mark.parametrize(("owner", "lower", "upper"), PAIRS, ids=name_of)
+def test_a_lower_limit_may_not_exceed_the_upper_one(owner, lower, upper):
+    low, high = owner.parameters()[lower], owner.parameters()[upper]
+    equal = max(low.low, high.low)
+    assert getattr(owner(**{lower: equal, upper: equal}), upper) == equal
+    with pytest.raises(ConfigError, match=rf"{lower}: expected {lower} <= {upper}, got"):
+        owner(**{lower: equal + (1 if low.kind is int else 0.01), upper: equal})
+
+
+def test_a_file_with_limits_in_the_wrong_order_is_refused_at_the_line_of_the_limit():
+    assert PAIRS
+    with pytest.raises(ConfigError, match=r"x\.yaml:3: sensor\.min_range: .* 50\.0 and 1\.0"):
+        parse_config("sensor:\n  rings: auto\n  min_range: 50\n  max_range: 1", "x.yaml")
+    with pytest.raises(ConfigError, match=r"x\.yaml:2: sensor\.max_range: .* 0\.5 and 0\.1"):
+        parse_config("sensor:\n  max_range: 0.1", "x.yaml")
+
+
+def test_a_solve_may_not_need_more_matches_than_are_sought():
+    text = "matching: {max_edges: 10, max_planes: 20}\nsolver: {min_matches: 30}"
+    assert parse_config(text).solver.min_matches == 30
+    assert parse_config("matching: {max_edges: 10, max_planes: 0}").matching.max_planes == 0
+    for wrong in (text.replace(": 30", ": 31"), "\nmatching: {max_edges: 10, max_planes: 39}"):
+        with pytest.raises(ConfigError, match=r"matching: expected solver\.min_matches <= "):
+            parse_config(wrong)
+
+
+# -- one value changed -----------------------------------------------------------------------------
+
+
+def test_values_change_by_text_mapping_or_section_all_at_once():
+    config = Config().changed(
+        "sensor.min_range=200",
+        {"sensor.max_range": 300.0, "solver.iterations": 5, "map": {"window": [9, 9, 5]}},
+        imu=ImuConfig(enabled=False),
+    )
+    assert (config.sensor.min_range, config.sensor.max_range) == (200.0, 300.0)
+    assert (config.solver.iterations, config.map.window) == (5, (9, 9, 5))
+    assert config.imu == ImuConfig().changed(enabled=False)
+    assert config.matching == Config().matching
+    assert Config().changed() == Config()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("solver.iterations=2.5", ("solver.iterations=2.5: solver.iterations: expected int",)),
+        ({"solver.iterations": True}, ("solver.iterations: expected int, got True",)),
+        ("solver.iterationz=5", ("unknown key 'solver.iterationz'; did you mean 'iterations'",)),
+        ("solver.kernel.width=5", ("solver.kernel: expected one of",)),
+        ("solver=5", ("solver is a section, expected a mapping, got 5",)),
+        ("solver.iterations", ("test solver.iterations: expected SECTION.KEY=VALUE",)),
+        ("solver.iterations=[", ("'[' is not a YAML value",)),
+    ],
+)
+def test_a_wrong_change_is_refused_as_a_wrong_file_is(change, words):
+    with pytest.raises(ConfigError) as caught:
+        Config().changed(change, source="test")
+    for word in ("test", *words):
+        assert word in str(caught.value)
 
 
 def test_an_unknown_preset_names_the_nearest():

@@ -21,11 +21,11 @@ SECOND = 1_000_000_000
 
 
 def with_deskew(**changes):
-    return replace(Config(), deskew=replace(Config().deskew, **changes))
+    return Config().changed(deskew=Config().deskew.changed(**changes))
 
 
 def with_solver(**changes):
-    return replace(Config(), solver=replace(Config().solver, **changes))
+    return Config().changed(solver=Config().solver.changed(**changes))
 
 
 @pytest.fixture
@@ -256,11 +256,15 @@ def test_information_is_that_of_the_reference_time():
 
 @pytest.mark.parametrize(("metres", "searches"), [(0.0, 2), (1.0, 1)])
 def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres, searches):
-    config = replace(
-        Config(),
-        deskew=replace(Config().deskew, refine=False),
-        matching=replace(Config().matching, keep_translation=metres, keep_rotation_deg=5.0),
-        solver=replace(Config().solver, iterations=2, step_sigmas=0.0, translation_tolerance=0.0),
+    config = Config().changed(
+        {
+            "deskew.refine": False,
+            "matching.keep_translation": metres,
+            "matching.keep_rotation_deg": 5.0,
+            "solver.iterations": 2,
+            "solver.step_sigmas": 0.0,
+            "solver.translation_tolerance": 0.0,
+        }
     )
     mapper = Mapper(config)
     for i in range(3):
@@ -279,8 +283,8 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
 
 
 def test_cubes_left_behind_are_evicted_counted_and_kept(rng):
-    config = replace(
-        Config(), map=replace(Config().map, cube_size=10.0, window=(5, 5, 5), window_margin=1)
+    config = Config().changed(
+        {"map.cube_size": 10.0, "map.window": (5, 5, 5), "map.window_margin": 1}
     )
     mapper = Mapper(config)
     total = 0
@@ -355,7 +359,7 @@ def test_the_imu_moves_roll_and_pitch_of_a_frame_by_its_weight(rng):
     """Frames of one attitude, an IMU that changes its mind by 10 mrad after the start."""
     results = {}
     for weight in (0.0, 0.1):
-        config = replace(Config(), imu=replace(Config().imu, weight=weight, still_seconds=0.1))
+        config = Config().changed({"imu.weight": weight, "imu.still_seconds": 0.1})
         buffer = imu_of(gtsam.Rot3.Roll(0.01))
         start = imu_of(gtsam.Rot3(), seconds=0.75).samples_between(-SECOND // 2, SECOND // 8)
         late = buffer.samples_between(SECOND // 8 + 1, 2 * SECOND)

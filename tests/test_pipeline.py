@@ -54,7 +54,7 @@ def test_denser_sensors(sensor):
 
 def test_scan_to_scan_guess_maps_as_well():
     world = SimulatedWorld("street_loop", frames=40)
-    config = replace(Config(), odometry=replace(Config().odometry, method="scan_to_scan"))
+    config = Config().changed("odometry.method=scan_to_scan")
     result = run(world, config)
     assert absolute_error(result.trajectory, world.truth).rmse < 0.03
     assert result.updates[5].timings["odometry"] > 0.0
@@ -141,7 +141,7 @@ def test_what_the_data_set_implies_yields_to_the_user():
     data = ListDataset([])
     data.sensor = {"stamp": "middle", "spin": "clockwise"}
     assert effective_config(Config(), data).sensor.stamp == "middle"
-    mine = replace(Config(), sensor=replace(Config().sensor, stamp="end"))
+    mine = Config().changed("sensor.stamp=end")
     sensor = effective_config(mine, data).sensor
     assert (sensor.stamp, sensor.spin) == ("end", "clockwise")
 
@@ -272,7 +272,7 @@ def sweeps(shaken):
 
 def with_imu(config=None, **changes):
     config = config or Config()
-    return replace(config, imu=replace(config.imu, **changes))
+    return config.changed(imu=config.imu.changed(**changes))
 
 
 def data_of(world, scans, keep=None):
@@ -409,7 +409,7 @@ def test_presets_use_the_imu_as_their_systems_do(shaken, sweeps):
 )
 def test_a_solver_without_a_graph_cannot_have_a_prior(shaken, sweeps, method, prior, fits):
     config = with_imu(prior=prior)
-    config = replace(config, solver=replace(preset(method).solver, method=method))
+    config = config.changed(solver=preset(method).solver.changed(method=method))
     if fits:
         assert run(data_of(shaken, sweeps[:2]), config).updates[1].status.solved
     else:
@@ -516,7 +516,7 @@ def test_a_faulty_own_factor_is_an_error_and_no_crash(shaken, sweeps, residual, 
 
 @pytest.mark.parametrize("name", ["loam", "aloam"])
 def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
-    config = replace(preset(name), imu=ImuConfig(enabled=False))
+    config = preset(name).changed(imu=ImuConfig(enabled=False))
     with pytest.raises(InputError, match=r"priors: .* use solver\.method: gtsam"):
         run(data_of(shaken, sweeps[:2]), config, extra_factors=lambda _: [tight(np.zeros(3))])
 
@@ -526,12 +526,9 @@ def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
 def test_foliage_does_not_hold_the_pose(seed, range_noise, tracked):
     """Without the test for smooth rings the woods keep the attitude of the first sweeps."""
     world = SimulatedWorld("trees", frames=35, columns=600, seed=seed)
-    config = Config()
-    config = replace(
-        config,
-        # Without poles: the trunks alone would do.
-        features=replace(config.features, range_noise=range_noise, post_depth=0.0),
-        imu=replace(config.imu, enabled=False),
+    # Without poles: the trunks alone would do.
+    config = Config().changed(
+        {"features.range_noise": range_noise, "features.post_depth": 0.0, "imu.enabled": False}
     )
     positions = run(world, config).trajectory.map_T_lidar[:, :3, 3]
     error = np.linalg.norm(positions - world.truth.map_T_lidar[:, :3, 3], axis=1).max()

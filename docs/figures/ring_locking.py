@@ -10,7 +10,6 @@ would keep and of those they would reject are drawn apart.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -28,7 +27,7 @@ KEPT, REJECTED, FAINT = "#2b7a9b", "#e4572e", "#b9c2c9"
 config = Config()
 gates = config.matching
 # Without gates, and without weights, which would hide large residuals.
-open_gates = replace(gates, max_ring_cosine=1.0, min_incidence_sine=0.0, weight_slope=0.0)
+open_gates = gates.changed(max_ring_cosine=1.0, min_incidence_sine=0.0, weight_slope=0.0)
 world = SimulatedWorld("trees", frames=FRAME + 3)
 
 

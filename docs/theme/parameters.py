@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 from mkdocs.structure.files import File, Files
@@ -26,20 +25,17 @@ def text() -> str:
     """The page as Markdown."""
     parts = [_INTRO]
     default = Config()
-    for section in dataclasses.fields(default):
-        name, values = section.name, getattr(default, section.name)
-        parts.append(f"## {name}\n\n{section.metadata['doc'].capitalize()}.\n")
+    for name, section in Config.parameters().items():
+        values = getattr(default, name)
+        parts.append(f"## {name}\n\n{section.description.capitalize()}.\n")
         parts.append("| key | default | `loam` | `aloam` | meaning |\n|---|---|---|---|---|")
-        for item in dataclasses.fields(values):
-            own = getattr(values, item.name)
-            others = (getattr(getattr(preset(p), name), item.name) for p in ("loam", "aloam"))
+        for key, parameter in values.parameters().items():
+            own = getattr(values, key)
+            others = (getattr(getattr(preset(p), name), key) for p in ("loam", "aloam"))
             columns = ["" if other == own else shown(other) for other in others]
-            meta = item.metadata
-            unit = f" [{meta['unit']}]" if meta["unit"] else ""
-            source = f" ({meta['source']})" if meta["source"] else ""
-            meaning = f"{meta['doc']}{unit}{source}".replace("|", "\\|")
+            meaning = parameter.meaning.replace("|", "\\|")
             parts.append(
-                f"| `{name}.{item.name}` | {shown(own)} | {columns[0]} | {columns[1]} | {meaning} |"
+                f"| `{name}.{key}` | {shown(own)} | {columns[0]} | {columns[1]} | {meaning} |"
             )
         parts.append("")
     return "\n".join(parts)

@@ -1,4 +1,4 @@
-"""Sections of the configuration: pydantic models whose errors name the key and what was expected."""
+"""Sections of the configuration: pydantic models, and errors that name the key."""
 
 from __future__ import annotations
 
@@ -78,8 +78,10 @@ class Parameter:
     @classmethod
     def of(cls, name: str, field: FieldInfo) -> Parameter:
         """What a field of a section says."""
-        hint, constraints = field.annotation, field.metadata
-        args, size, choices, optional = get_args(hint), 0, (), False
+        hint: Any = field.annotation
+        constraints, args = field.metadata, get_args(hint)
+        size, optional = 0, False
+        choices: tuple[str, ...] = ()
         if get_origin(hint) is Literal:
             hint, choices = str, args
         elif get_origin(hint) is tuple:
@@ -96,7 +98,7 @@ class Parameter:
             description=field.description or "",
             unit=extra.get("unit", ""),
             source=extra.get("source", ""),
-            kind=hint or object,
+            kind=hint,
             size=size,
             choices=choices,
             optional=optional,
@@ -141,12 +143,20 @@ class RefusedError(ConfigError):
         return f"{self.section}.{self.keys[0]}: {self.reason}"
 
 
+def out_of_order(
+    keys: tuple[str, ...], lower: str, upper: str, low: float, high: float
+) -> PydanticCustomError:
+    """The error for two parameters, or sums of them, of which the first is above the second."""
+    text = f"expected {lower} <= {upper}, got {low} and {high}"
+    return PydanticCustomError(_PAIR, text, {"keys": keys})
+
+
 class Section(BaseModel):
     """A group of parameters, immutable; every value is checked when one is made."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    _in_order: ClassVar[tuple[tuple[str, str], ...]] = ()
+    in_order: ClassVar[tuple[tuple[str, str], ...]] = ()
     """Pairs of parameters of which the first must not be above the second."""
 
     def __init__(self, **values: Any) -> None:
@@ -170,11 +180,10 @@ class Section(BaseModel):
 
     @model_validator(mode="after")
     def _check_order(self) -> Self:
-        for pair in self._in_order:
+        for pair in self.in_order:
             lower, upper = (getattr(self, key) for key in pair)
             if lower > upper:
-                text = f"expected {pair[0]} <= {pair[1]}, got {lower} and {upper}"
-                raise PydanticCustomError(_PAIR, text, {"keys": pair})  # type: ignore[arg-type]
+                raise out_of_order(pair, *pair, lower, upper)
         return self
 
     @classmethod

@@ -38,7 +38,7 @@ def override(
     for key, value in data.items():
         path = (*above, key)
         if key not in known:
-            name = ".".join(path) if isinstance(key, str) else key
+            name = ".".join(path) if isinstance(key, str) else shown(key)
             raise ConfigError(f"{where(path)}unknown key {shown(name)}{nearest(key, known)}")
         current = getattr(section, key)
         if not isinstance(current, Section):
@@ -64,41 +64,58 @@ def _plain(value: Any) -> Any:
     return bool(value) if isinstance(value, ScalarBoolean) else value
 
 
-def read_changes(
-    changes: Iterable[str | Mapping[str, Any]],
-) -> tuple[dict[str, Any], dict[tuple[str, ...], str]]:
-    """Nested mappings of what is to be changed, and the texts among it by the path of their key.
+def with_changes(
+    section: AnySection, changes: Iterable[str | Mapping[str, Any]], source: str
+) -> AnySection:
+    """A section with changes, all made at once and then checked.
 
     Parameters
     ----------
+    section : the section to change
     changes : texts as ``"solver.iterations=5"``, or mappings of dotted keys to values
+    source : where the changes come from, for error messages
 
     Raises
     ------
     ConfigError
-        If a text is no key with a YAML value.
+        If a text is no key with a YAML value, or as from :func:`override`.
     """
     tree: dict[str, Any] = {}
-    texts: dict[tuple[str, ...], str] = {}
+    texts: dict[tuple[Any, ...], str] = {}
     for change in changes:
-        for key, value in [_assignment(change)] if isinstance(change, str) else change.items():
-            path = tuple(key.split("."))
-            if isinstance(change, str):
-                texts[path] = change
-            branch = tree
-            for name in path[:-1]:
-                below = branch.get(name)
-                branch[name] = dict(below) if isinstance(below, Mapping) else {}
-                branch = branch[name]
-            branch[path[-1]] = value
-    return tree, texts
+        if isinstance(change, str):
+            key, value = _assignment(change, source)
+            texts[tuple(key.split("."))] = change
+            change = {key: value}
+        _merge(tree, change)
+
+    def where(path: tuple[Any, ...]) -> str:
+        place = f"{source} {texts.get(path, '')}".strip()
+        return f"{place}: " if place else ""
+
+    return override(section, tree, where)
 
 
-def _assignment(text: str) -> tuple[str, Any]:
+def _merge(tree: dict[str, Any], change: Mapping[str, Any]) -> None:
+    """Put values of dotted keys into nested dictionaries."""
+    for key, value in change.items():
+        name, dot, rest = key.partition(".")
+        if dot:
+            value = {rest: value}
+        if isinstance(value, Mapping):
+            below = tree.get(name)
+            tree[name] = below if isinstance(below, dict) else {}
+            _merge(tree[name], value)
+        else:
+            tree[name] = value
+
+
+def _assignment(text: str, source: str) -> tuple[str, Any]:
     key, separator, value = text.partition("=")
+    where = f"{source} {text}".strip()
     if not separator or not key.strip():
-        raise ConfigError(f"{text}: expected SECTION.KEY=VALUE")
+        raise ConfigError(f"{where}: expected SECTION.KEY=VALUE")
     try:
         return key.strip(), YAML(typ="safe", pure=True).load(value)
     except Exception as error:  # a day 32 is a ValueError, deep nesting a RecursionError
-        raise ConfigError(f"{text}: {value!r} is not a YAML value") from error
+        raise ConfigError(f"{where}: {value!r} is not a YAML value") from error

@@ -10,7 +10,7 @@ from loam_gtsam.config.base import Section, parameter
 class SensorConfig(Section):
     """What the sweep looks like, where the data does not say it itself."""
 
-    _in_order = (("min_range", "max_range"),)
+    in_order = (("min_range", "max_range"),)
 
     model: Literal["auto", "vlp16", "hdl32", "hdl64", "os1-16", "os1-32", "os1-64", "os1-128"] = (
         parameter("auto", "elevation table for rings from elevation; auto detects it from the data")
@@ -47,6 +47,8 @@ class SensorConfig(Section):
 
 class FeatureConfig(Section):
     """Scan registration: which points become edge and plane features."""
+
+    in_order = (("sharp_per_sector", "edges_per_sector"),)
 
     sectors: int = parameter(6, "sectors per ring", source="LOAM", low=1)
     half_window: int = parameter(

@@ -10,7 +10,7 @@ from loam_gtsam.config.base import Count, Section, parameter
 class MapConfig(Section):
     """The cube map."""
 
-    _in_order = (("edge_voxel", "cube_size"), ("plane_voxel", "cube_size"))
+    in_order = (("edge_voxel", "cube_size"), ("plane_voxel", "cube_size"))
 
     cube_size: float = parameter(50.0, "edge length of a cube", unit="m", source="LOAM", low=1.0)
     window: tuple[Count, Count, Count] = parameter(
@@ -51,7 +51,7 @@ class MapConfig(Section):
 class RelocalizationConfig(Section):
     """When a sweep counts as lost, and where its place is searched for."""
 
-    _in_order = (
+    in_order = (
         ("min_agreement", "found_agreement"),
         ("min_share", "found_share"),
         ("radius", "max_radius"),

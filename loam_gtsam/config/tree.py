@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Self
 
-from loam_gtsam.config.base import Section, nearest, parameter
-from loam_gtsam.config.changes import override, read_changes
+from pydantic import model_validator
+
+from loam_gtsam.config.base import Section, nearest, out_of_order, parameter
+from loam_gtsam.config.changes import with_changes
 from loam_gtsam.config.frontend import DeskewConfig, FeatureConfig, OdometryConfig, SensorConfig
 from loam_gtsam.config.imu import ImuConfig
 from loam_gtsam.config.loops import LoopConfig, PoseGraphConfig
@@ -36,6 +38,14 @@ class Config(Section):
     bag: BagConfig = parameter(BagConfig(), "what is written into a bag, or published")
     live: LiveConfig = parameter(LiveConfig(), "queues of a live run")
 
+    @model_validator(mode="after")
+    def _check_matches(self) -> Self:
+        most, least = self.matching.max_edges + self.matching.max_planes, self.solver.min_matches
+        if most < least and self.matching.max_edges and self.matching.max_planes:
+            sought = "matching.max_edges + matching.max_planes"
+            raise out_of_order(("matching", "solver"), "solver.min_matches", sought, least, most)
+        return self
+
     def changed(self, *changes: str | Mapping[str, Any], source: str = "", **sections: Any) -> Self:
         """A copy with other values: all are changed at once, then checked.
 
@@ -56,13 +66,7 @@ class Config(Section):
         >>> Config().changed("solver.iterations=5", "imu.enabled=false").solver.iterations
         5
         """
-        tree, texts = read_changes(changes)
-
-        def where(path: tuple[Any, ...]) -> str:
-            place = " ".join(filter(None, (source, texts.get(path))))
-            return f"{place}: " if place else ""
-
-        changed = override(self, tree, where) if tree else self
+        changed = with_changes(self, changes, source) if changes else self
         return super(Config, changed).changed(**sections) if sections else changed
 
 

@@ -8,7 +8,7 @@ new keyframe against the features of those around the old one, with the factor g
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import astuple, dataclass, field, replace
+from dataclasses import astuple, dataclass, field
 from enum import StrEnum
 from typing import Any, Protocol
 
@@ -118,8 +118,7 @@ class ScanLoopCloser:
         self._solver = GtsamSolver(self._whole.solver)
         # Of a trial it is enough to be near; what follows it goes the rest of the way.
         self._rough_solver = GtsamSolver(
-            replace(
-                self._whole.solver,
+            self._whole.solver.changed(
                 translation_tolerance=_NEAR[0],
                 rotation_tolerance_deg=_NEAR[1],
             )
@@ -255,7 +254,7 @@ class ScanLoopCloser:
         self, keyframe: Keyframe, candidate: int, history: PoseGraph
     ) -> tuple[CubeMap, CubeMap]:
         """Edge and plane map of the keyframes around the candidate, in its frame."""
-        config = replace(self._whole.map, archive_dir=None, insertion="settled")
+        config = self._whole.map.changed(archive_dir=None, insertion="settled")
         maps = CubeMap(config, config.edge_voxel), CubeMap(config, config.plane_voxel)
         beside = self.config.neighbours
         around = history.keyframes[max(candidate - beside, 0) : candidate + beside + 1]

@@ -159,7 +159,7 @@ def match_features(
         # A pole that few beams met has no five points within max_distance.
         reach = config.wide_search * limit
         near_edges = edge_map.nearest(edges_map[rows], k, reach, around)
-        wide = replace(config, max_distance=reach)
+        wide = config.changed(max_distance=reach)
         more = match_lines(edges[rows], edges_map[rows], *near_edges, pose, wide)
         lines = _joined(lines, replace(more, indices=rows[more.indices]))
     return ScanMatches(replace(lines, distinct=distinct[lines.indices]), surfaces)
@@ -203,8 +203,7 @@ def trial(config: MatchingConfig) -> MatchingConfig:
     def at_most(limit: int, most: int) -> int:
         return min(limit, most) if most else limit
 
-    return replace(
-        config,
+    return config.changed(
         max_edges=at_most(config.trial_edges, config.max_edges),
         max_planes=at_most(config.trial_planes, config.max_planes),
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from typing import Any
 
 from rosbags.typesys import Stores, get_typestore
@@ -191,6 +190,6 @@ def config_of(values: Mapping[str, Any]) -> Config:
         raise ConfigError("give preset or config, not both; a file names its preset itself")
     config = load_config(values["config"]) if values["config"] else preset(values["preset"])
     if values["sensor"] != "auto":
-        config = replace(config, sensor=replace(config.sensor, model=values["sensor"]))
+        config = config.changed({"sensor.model": values["sensor"]})
     frames = {name: values[name] for name in ("map_frame", "lidar_frame") if values[name]}
-    return replace(config, bag=replace(config.bag, **frames))
+    return config.changed(bag=config.bag.changed(**frames))

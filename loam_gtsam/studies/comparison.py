@@ -338,12 +338,12 @@ def _common_configs(
         shared = {section: getattr(common, section) for section in _SHARED}
         # How often and from what rotation a sweep is de-skewed again is part of the method.
         own = config.deskew
-        shared["deskew"] = replace(common.deskew, refine=own.refine, rotation=own.rotation)
+        shared["deskew"] = common.deskew.changed(refine=own.refine, rotation=own.rotation)
         for section, value in shared.items():
             if getattr(config, section) != value:
                 notes.append(
                     f"{entry.name}: section {section} is that of {name}, so that all get the same "
                     "features at the same moments"
                 )
-        configs.append(replace(config, **shared))
+        configs.append(config.changed(**shared))
     return configs, notes

@@ -11,7 +11,7 @@ from urllib.parse import parse_qsl
 
 from ruamel.yaml import YAML
 
-from loam_gtsam.config import Config, with_value
+from loam_gtsam.config import Config
 from loam_gtsam.studies.contenders import Contender, find_contender
 from loam_gtsam.studies.trials import METRICS, Trial
 from loam_gtsam.types import ConfigError
@@ -137,11 +137,10 @@ def _config(where: str, value: Any, folder: Path) -> Contender:
 
 def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
     """``config`` with each ``section.key`` set in turn."""
-    for key, value in changes.items():
+    for key in changes:
         if "." not in key:
             raise ConfigError(f"{where}: expected SECTION.KEY: VALUE, got {key!r}")
-        config = with_value(config, key, value, where)
-    return config
+    return config.changed(changes, source=where)
 
 
 def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[int]:

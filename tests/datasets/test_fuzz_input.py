@@ -463,7 +463,7 @@ def test_a_hostile_imu_never_raises(samples: Any, config: ImuConfig) -> None:
     buffer = ImuBuffer(config, samples)
     buffer.add(samples)
     assert buffer.report.samples <= len(samples.stamps)
-    pipeline = Pipeline(replace(Config(), imu=config), imu=buffer)
+    pipeline = Pipeline(Config().changed(imu=config), imu=buffer)
     for sweep in SWEEPS[:3]:
         checked(pipeline.process(sweep))
 

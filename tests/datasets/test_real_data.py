@@ -1,7 +1,5 @@
 """Real sweeps and recorded outputs of the C++ systems. Skipped where the data is absent."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -16,7 +14,7 @@ from loam_gtsam.types import Trajectory
 @pytest.mark.parametrize(("reference", "truth"), [("start", "gt.tum"), ("end", "gt_end.tum")])
 def test_sim_town_from_raw_sweeps(shared_data, reference, truth):
     """A-LOAM needs perfectly de-skewed sweeps for 0.045 m; loam_velodyne reaches 0.063 m."""
-    config = replace(Config(), deskew=replace(Config().deskew, reference=reference))
+    config = Config().changed({"deskew.reference": reference})
     result = run(open_dataset(shared_data / "sim_town"), config)
     expected = read_tum(shared_data / "sim_town" / truth)
     if reference == "end":  # stamped with the start of its sweep
@@ -38,7 +36,7 @@ def test_ouster(shared_data):
     The reference poses are no truth: plane-based registrations between the sweeps by other means
     agree with ours to millimetres, see docs/benchmarks.
     """
-    config = replace(Config(), deskew=replace(Config().deskew, reference="middle"))
+    config = Config().changed("deskew.reference=middle")
     result = run(open_dataset(shared_data / "ouster_os1_128"), config)
     reference = np.loadtxt(shared_data / "ouster_os1_128" / "ref_poses_kitti.txt")
     reference = reference.reshape(-1, 3, 4)[:, :, 3]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -47,7 +45,7 @@ def test_occlusion_rejects_the_six_points_behind_on_either_side() -> None:
     xyz = one_ring(azimuth, np.where(np.abs(azimuth - 0.2) < 0.023, 5.0, 10.0 / np.cos(azimuth)))
     starts = np.array([0, xyz.shape[1]])
     gaps = squared_gaps(xyz, starts)
-    rejected = unreliable_points(xyz, gaps, starts, replace(LOAM, grazing_ratio=1e9))
+    rejected = unreliable_points(xyz, gaps, starts, LOAM.changed(grazing_ratio=1e9))
     pole = np.flatnonzero(np.hypot(xyz[0], xyz[1]) < 6.0)
     expected = np.concatenate((pole[0] - 1 - np.arange(6), pole[-1] + 1 + np.arange(6)))
     assert np.array_equal(np.flatnonzero(rejected), np.sort(expected))
@@ -63,7 +61,7 @@ def test_occlusion_gap(change: dict[str, float], count: int) -> None:
     distance = np.where(np.arange(40) < 20, 5.0, 6.5)
     xyz = one_ring(azimuth, distance)
     starts = np.array([0, 40])
-    settings = replace(LOAM, grazing_ratio=1e9, **change)
+    settings = LOAM.changed(grazing_ratio=1e9, **change)
     rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
     assert np.array_equal(np.flatnonzero(rejected), 20 + np.arange(count))
 
@@ -74,7 +72,7 @@ def test_occlusion_needs_the_two_on_one_ray(turn: float, one_ray: bool) -> None:
     distance = np.where(np.arange(40) < 20, 5.0, 6.5)
     xyz = one_ring(azimuth, distance)
     starts = np.array([0, 40])
-    settings = replace(LOAM, grazing_ratio=1e9)
+    settings = LOAM.changed(grazing_ratio=1e9)
     rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
     assert rejected.any() == one_ray
 
@@ -85,7 +83,7 @@ def test_occlusion_does_not_reach_into_the_next_ring() -> None:
     azimuth = 0.001 * np.arange(43)
     xyz = one_ring(azimuth, distance)
     starts = np.array([0, 23, 43])
-    settings = replace(LOAM, grazing_ratio=1e9)
+    settings = LOAM.changed(grazing_ratio=1e9)
     rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
     assert np.array_equal(np.flatnonzero(rejected), [20, 21, 22])
 
@@ -96,7 +94,7 @@ def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
     xyz = np.stack((1 / np.tan(azimuth), np.ones(len(azimuth)), np.zeros(len(azimuth))))
     xyz = xyz.astype(np.float32)
     starts = np.array([0, len(azimuth)])
-    settings = replace(LOAM, occlusion_gap=1e9)
+    settings = LOAM.changed(occlusion_gap=1e9)
     rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
     distance = np.hypot(xyz[0], xyz[1])
     bound = np.sqrt(LOAM.grazing_ratio) / np.deg2rad(0.2)

@@ -426,7 +426,7 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
     raw = replace(raw, edge_times=times, plane_times=times[:300], span=(0.0, 0.1), not_finite=3)
     if known:
         raw = replace(raw, edge_prominence=times + 1.0)
-    config = replace(Config().map, edge_voxel=0.5, plane_voxel=1.0)
+    config = Config().map.changed(edge_voxel=0.5, plane_voxel=1.0)
     thin = thinned(raw, config)
     for size, held, moments, all_points in (
         (0.5, thin.edges, thin.edge_times, points),
@@ -445,4 +445,4 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
     assert len(thin.edge_rings) == len(thin.edges)
     assert len(thin.plane_rings) == len(thin.planes)
     assert thinned(thin, config) is thin
-    assert len(thinned(thin, replace(config, plane_voxel=2.0)).planes) < len(thin.planes)
+    assert len(thinned(thin, config.changed(plane_voxel=2.0)).planes) < len(thin.planes)

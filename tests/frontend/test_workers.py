@@ -2,7 +2,6 @@
 
 import logging
 import multiprocessing
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -121,7 +120,7 @@ def test_without_processes_nothing_is_read_ahead(sweeps):
 
 @pytest.mark.parametrize(("method", "thin"), [("constant_velocity", True), ("scan_to_scan", False)])
 def test_features_are_thinned_where_nobody_needs_them_all(sweeps, method, thin):
-    config = replace(Config(), odometry=OdometryConfig(method=method))
+    config = Config().changed(odometry=OdometryConfig(method=method))
     whole = extract_features(sweeps[0], config)
     found = extract(sweeps[0], config).features
     assert (len(found.planes) < len(whole.planes)) is thin

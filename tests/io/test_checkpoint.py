@@ -4,7 +4,7 @@ import signal
 import subprocess
 import sys
 import time
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import gtsam
 import numpy as np
@@ -21,10 +21,7 @@ from loam_gtsam.types import DatasetError, OutputError
 
 
 def changed(config=None, **sections):
-    config = config or Config()
-    for name, values in sections.items():
-        config = replace(config, **{name: replace(getattr(config, name), **values)})
-    return config
+    return (config or Config()).changed(sections)
 
 
 def assert_same(one, two):

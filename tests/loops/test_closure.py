@@ -32,8 +32,8 @@ class Corridor(World):
 def settings(**loops):
     config = Config()
     chosen = {"min_way": 15.0, "min_share": 0.4} | loops  # these worlds are thinly sampled
-    pose_graph = replace(config.pose_graph, keyframe_distance=1.0)
-    return replace(config, pose_graph=pose_graph, loops=replace(config.loops, **chosen))
+    pose_graph = config.pose_graph.changed(keyframe_distance=1.0)
+    return config.changed(pose_graph=pose_graph, loops=config.loops.changed(**chosen))
 
 
 def driven(world, poses, made, config, seed=0):
@@ -183,8 +183,8 @@ def test_matches_that_lie_elsewhere_disagree():
     config = settings(min_way=12.0)
     graph, closer, _ = driven(World(1), poses, updates(poses), config)
     assert isinstance(closer.verify(graph.keyframes[-1], 1, graph), LoopClosure)
-    exact = replace(config.matching, point_sigma=0.001, fit_uncertainty=False)  # noise is 0.01
-    strict = ScanLoopCloser(replace(config, matching=exact))
+    exact = config.matching.changed(point_sigma=0.001, fit_uncertainty=False)  # noise is 0.01
+    strict = ScanLoopCloser(config.changed(matching=exact))
     assert strict.verify(graph.keyframes[-1], 1, graph) is Rejection.DISAGREES
 
 

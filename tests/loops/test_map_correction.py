@@ -21,7 +21,7 @@ DRIFT = (0.0, 0.0, 0.002, 0.0, 0.02, 0.0)  # rad and m a step
 def settings(**pose_graph):
     config = Config()
     chosen = {"keyframe_distance": 0.5, "walk": 0.05, "turn_walk_deg": 0.3} | pose_graph
-    return replace(config, pose_graph=replace(config.pose_graph, **chosen))
+    return config.changed(pose_graph=config.pose_graph.changed(**chosen))
 
 
 class Known:
@@ -132,7 +132,7 @@ def ring(laps, radius=35.0, step=2.0):
 def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     """Once round a ring, of which 20 m are in view, and on."""
     config = settings(turn_walk_deg=0.2)
-    config = replace(config, loops=replace(config.loops, min_way=60.0, min_share=0.4))
+    config = config.changed("loops.min_way=60.0", "loops.min_share=0.4")
     poses, world = ring(1.15), World(1)
 
     def rounds(closing):

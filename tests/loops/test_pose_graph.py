@@ -22,7 +22,7 @@ FRAME = 10**8
 def settings(**pose_graph):
     config = Config()
     chosen = {"keyframe_distance": 0.5, "walk": 0.0, "turn_walk_deg": 0.0} | pose_graph
-    return replace(config, pose_graph=replace(config.pose_graph, **chosen))
+    return config.changed(pose_graph=config.pose_graph.changed(**chosen))
 
 
 def frames(poses, sigmas=SIGMAS):

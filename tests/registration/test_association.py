@@ -28,7 +28,7 @@ AHEAD = 5.0 * X
 
 
 def changed(**changes):
-    return dataclasses.replace(CONFIG, **changes)
+    return CONFIG.changed(**changes)
 
 
 def one(match, point, group, config=CONFIG, pose=None, squared=0.25):
@@ -315,7 +315,7 @@ def test_unit_offset_planes_lose_nothing_where_the_points_lie_in_the_plane_exact
     line_group(0.4 * X, centre=0.0 * X),
 ])  # fmt: skip
 def test_unit_offset_cannot_represent_every_plane(group):
-    config = dataclasses.replace(UNIT_OFFSET, plane_ratio=0.0)
+    config = UNIT_OFFSET.changed(plane_ratio=0.0)
     beside = np.eye(4)
     beside[:3, 3] = 3.0, 2.0, 1.0
     with np.errstate(all="raise"):
@@ -349,7 +349,7 @@ def grid(a, b, step=0.25):
 
 
 def map_of(points, voxel=0.01, **changes):
-    cubes = CubeMap(dataclasses.replace(MapConfig(field_of_view=False), **changes), voxel)
+    cubes = CubeMap(MapConfig(field_of_view=False).changed(**changes), voxel)
     if len(points):
         cubes.insert(points)
     return cubes
@@ -638,9 +638,7 @@ def test_edges_are_searched_for_widely_where_planes_leave_a_translation_open(
 @pytest.mark.parametrize(("most", "expected"), [(0, (20, 70)), (50, (20, 50)), (10, (10, 10))])
 def test_the_configuration_for_trials_never_matches_more(most, expected):
     config = changed(max_edges=most, max_planes=most, trial_edges=20, trial_planes=70)
-    assert trial(config) == dataclasses.replace(
-        config, max_edges=expected[0], max_planes=expected[1]
-    )
+    assert trial(config) == config.changed(max_edges=expected[0], max_planes=expected[1])
 
 
 @pytest.mark.parametrize(("n_map", "found"), [(0, 0), (4, 0), (5, 1)])

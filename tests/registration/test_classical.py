@@ -495,7 +495,7 @@ def test_unit_offset_cannot_have_a_plane_through_the_origin():
         np.random.default_rng(0), [0.0, 0.0, 0.0], [0.0, 0.0, 1.0], scatter=0.0
     )
     assert len(match(groups, queries, PLAIN)) == 0
-    assert len(match(groups, queries, replace(PLAIN, plane_fit="centroid"))) == len(groups)
+    assert len(match(groups, queries, PLAIN.changed(plane_fit="centroid"))) == len(groups)
 
 
 def test_points_exactly_in_a_plane_or_on_a_line():
@@ -515,7 +515,7 @@ def test_the_range_in_a_weight_is_from_the_sensor_or_the_map_origin(name, reach)
     pose = np.eye(4)
     pose[:3, 3] = [0.0, 21.0, 0.0]
     query = np.array([[0.0, 25.0, 0.0]])
-    config = replace(PLAIN, weight_range=name, plane_fit="centroid")
+    config = PLAIN.changed(weight_range=name, plane_fit="centroid")
     groups[:, :, 1] += 0.1
     found = match_planes(query, query, groups, np.full((1, 5), 0.1), pose, config)
     assert found.weights[0] == pytest.approx(1.0 - 0.9 * 0.1 / np.sqrt(reach), rel=1e-9)
@@ -560,10 +560,7 @@ class _Watch:
 
 @pytest.mark.parametrize("refine", [True, False])
 def test_refine_does_the_first_sweeps_and_the_deskew_again(refine):
-    config = replace(
-        Config(),
-        deskew=replace(Config().deskew, refine=refine),
-    )
+    config = Config().changed({"deskew.refine": refine})
     watch = _Watch()
     mapper = Mapper(config, watch)
     rng = np.random.default_rng(0)

@@ -1,6 +1,5 @@
 """Covariances of a run: parts, drift, the motion between two frames, and what must not change."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
@@ -74,11 +73,7 @@ class _Part:
 
 def no_imu(**covariance):
     config = Config()
-    return replace(
-        config,
-        imu=replace(config.imu, enabled=False),
-        covariance=replace(config.covariance, **covariance),
-    )
+    return config.changed("imu.enabled=false", covariance=config.covariance.changed(**covariance))
 
 
 # -- the motion between two frames -----------------------------------------------------------------
@@ -223,7 +218,7 @@ def test_classical_solvers_have_covariances_of_the_same_size(name):
     world = SimulatedWorld("room", frames=8, columns=900)
     ours = run(world, no_imu()).updates[-1]
     config = preset(name)
-    theirs = run(world, replace(config, imu=replace(config.imu, enabled=False))).updates[-1]
+    theirs = run(world, config.changed("imu.enabled=false")).updates[-1]
     ratio = np.sqrt(np.diag(theirs.uncertainty.own) / np.diag(ours.uncertainty.own))
     assert ratio.min() > 0.2
     assert ratio.max() < 5.0
@@ -235,7 +230,7 @@ def test_classical_solvers_have_covariances_of_the_same_size(name):
 @pytest.mark.parametrize(("reference", "share"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])
 def test_the_reference_has_its_share_in_two_sweeps(reference, share):
     config = no_imu()
-    config = replace(config, deskew=replace(config.deskew, reference=reference))
+    config = config.changed({"deskew.reference": reference})
     world = SimulatedWorld("room", frames=12, columns=900)
     both = run(_Part(world, 6, 12), config).updates[-1].uncertainty
     ratio = np.trace(both.shared[3:, 3:]) / np.trace(both.own[3:, 3:])

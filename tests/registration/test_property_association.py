@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -92,10 +91,10 @@ def expected_plane(query: Any, pose: Any, points: Any, config: MatchingConfig) -
 
 CONFIGS = [
     EXACT,
-    replace(EXACT, neighbours=7, max_distance=2.0),
-    replace(EXACT, line_ratio=30.0, plane_ratio=0.3, plane_tolerance=0.05),
-    replace(EXACT, max_ring_cosine=0.5, min_incidence_sine=0.4),
-    replace(EXACT, weight_slope=5.0, min_weight=0.3, weight_range="map"),
+    EXACT.changed(neighbours=7, max_distance=2.0),
+    EXACT.changed(line_ratio=30.0, plane_ratio=0.3, plane_tolerance=0.05),
+    EXACT.changed(max_ring_cosine=0.5, min_incidence_sine=0.4),
+    EXACT.changed(weight_slope=5.0, min_weight=0.3, weight_range="map"),
 ]
 
 

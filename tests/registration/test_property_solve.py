@@ -169,7 +169,7 @@ def test_a_mirrored_scene_has_the_mirrored_pose(name: str, problem: Any) -> None
 
 # -- the mapper ------------------------------------------------------------------------------------
 
-ALL = replace(Config(), matching=MatchingConfig(max_edges=0, max_planes=0))
+ALL = Config().changed(matching=MatchingConfig(max_edges=0, max_planes=0))
 """Every feature is matched: which ones are left out depends on the order of the voxels."""
 
 

@@ -23,7 +23,7 @@ AT = 22
 
 
 def with_search(**changes):
-    return replace(Config(), relocalization=replace(Config().relocalization, **changes))
+    return Config().changed(relocalization=Config().relocalization.changed(**changes))
 
 
 OFF = with_search(enabled=False)

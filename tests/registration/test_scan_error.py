@@ -51,7 +51,7 @@ def surroundings(rng, count=1500, axes=3):
 
 
 def error_of(solution, **changes):
-    config = dataclasses.replace(CONFIG, **changes)
+    config = CONFIG.changed(**changes)
     found = scan_error(solution, np.inf, SeenGround(config.ground_cell), config)
     assert found is not None
     return found

@@ -1,7 +1,5 @@
 """The per-frame solve: known poses, the stop rule, limits, priors, information."""
 
-import dataclasses
-
 import gtsam
 import numpy as np
 import pytest
@@ -25,7 +23,7 @@ OFFSET = np.concatenate(
 
 
 def changed(**changes):
-    return dataclasses.replace(CONFIG, **changes)
+    return CONFIG.changed(**changes)
 
 
 def same(a, b):

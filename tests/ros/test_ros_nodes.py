@@ -194,7 +194,7 @@ def test_the_page_on_live_runs_lists_every_parameter_and_field() -> None:
     page = Path(__file__).resolve().parents[2] / "docs" / "live.md"
     text = page.read_text("utf-8")
     fields = [item.name for item in dataclasses.fields(LiveReport)]
-    keys = [f"live.{item.name}" for item in dataclasses.fields(LiveConfig)]
+    keys = [f"live.{key}" for key in LiveConfig.model_fields]
     assert [name for name in (*PARAMETERS, *fields, *keys) if f"`{name}`" not in text] == []
 
 

@@ -306,7 +306,7 @@ def test_a_peer_gets_the_sweeps_and_the_sensor(monkeypatch):
             return SimpleNamespace(stamp=stamp, map_T_lidar=np.eye(4), seconds=0.001)
 
     monkeypatch.setattr(trials, "make_peer", lambda name: Still())
-    near = replace(Config().sensor, max_range=3.0)
+    near = Config().sensor.changed(max_range=3.0)
     rows = [
         run_trial(trial_of(peer="still", frames=5, config=config))
         for config in (Config(), Config(sensor=near))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
-import types
-import typing
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
 
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, Parameter, Section
 from loam_gtsam.types import ImuSamples, Scan
 
 WILD = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-30, 1e30, 3e38, -3e38, 121.0, 1e6]
@@ -148,39 +145,42 @@ def configs(**fixed: Any) -> st.SearchStrategy[Config]:
     Sections in ``fixed`` are taken as they are.
     """
     sections = {
-        item.name: st.just(fixed[item.name]) if item.name in fixed else _section(item.default)
-        for item in dataclasses.fields(Config)
+        name: st.just(fixed[name]) if name in fixed else _section(item.kind)
+        for name, item in Config.parameters().items()
     }
     return st.builds(Config, **sections)
 
 
-def _section(default: Any) -> st.SearchStrategy[Any]:
-    hints = typing.get_type_hints(type(default))
+def _section(section: type[Section]) -> st.SearchStrategy[Section]:
     values = {
-        item.name: st.just(getattr(default, item.name)) | _value(hints[item.name], item.metadata)
-        for item in dataclasses.fields(default)
+        name: st.just(item.default) | _value(item) for name, item in section.parameters().items()
     }
-    return st.builds(type(default), **values)
+    return st.fixed_dictionaries(values).map(lambda found: section(**_in_order(section, found)))
 
 
-def _value(hint: Any, meta: Any) -> st.SearchStrategy[Any]:
-    origin, args = typing.get_origin(hint), typing.get_args(hint)
-    if origin is Literal:
-        return st.sampled_from(args)
-    if origin in (types.UnionType, typing.Union):
-        return st.none() | _value(next(a for a in args if a is not type(None)), meta)
-    if origin is tuple:
-        return st.tuples(*(_value(arg, meta) for arg in args))
-    low, high = meta["low"], meta["high"]
-    if hint is bool:
-        return st.booleans()
-    if hint is int:
-        least = -(2**63) + 1 if low is None else int(low)
-        return st.integers(least, 2**63 - 1 if high is None else int(high))
-    if hint is float:
-        return st.floats(low, high, allow_nan=False)
-    assert hint is str, f"a strategy for {hint} is missing"
-    return st.text(max_size=20)
+def _in_order(section: type[Section], values: dict[str, Any]) -> dict[str, Any]:
+    lower = {one: min(values[one], values[two]) for one, two in section.in_order}
+    return values | lower
+
+
+def _value(item: Parameter) -> st.SearchStrategy[Any]:
+    single: st.SearchStrategy[Any]
+    if item.choices:
+        single = st.sampled_from(item.choices)
+    elif item.kind is bool:
+        single = st.booleans()
+    elif item.kind is int:
+        least = -(2**63) + 1 if item.low is None else int(item.low)
+        single = st.integers(least, 2**63 - 1 if item.high is None else int(item.high))
+    elif item.kind is float:
+        infinite = not item.size  # entries of tuples are finite
+        single = st.floats(item.low, item.high, allow_nan=False, allow_infinity=infinite)
+    else:
+        assert item.kind is str, f"a strategy for {item} is missing"
+        single = st.text(max_size=20)
+    if item.size:
+        return st.tuples(*[single] * item.size)
+    return st.none() | single if item.optional else single
 
 
 Step = tuple[str, float, int, int]

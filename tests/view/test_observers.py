@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -53,8 +51,8 @@ def sweeps():
 
 def with_loops():
     config = Config()
-    graph = replace(config.pose_graph, keyframe_distance=1e-4, max_chi2=1e9)
-    return replace(config, pose_graph=graph)
+    graph = config.pose_graph.changed(keyframe_distance=1e-4, max_chi2=1e9)
+    return config.changed(pose_graph=graph)
 
 
 def saved(outcome, path):

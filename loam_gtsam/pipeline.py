@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import islice
 from typing import Any, TypeVar
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, ImuConfig, SensorConfig, dump_config
+from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -261,13 +261,12 @@ Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
 look and not to change."""
 
 
-def _sections(name: str, config: Any) -> dict[str, Any]:
+def _sections(name: str, config: Section) -> dict[str, Any]:
     """A section of the configuration and those in it, by name."""
     found = {name: config}
-    for item in fields(config):
-        value = getattr(config, item.name)
-        if is_dataclass(value):
-            found |= _sections(f"{name}.{item.name}", value)
+    for key, value in config:
+        if isinstance(value, Section):
+            found |= _sections(f"{name}.{key}", value)
     return found
 
 
@@ -284,13 +283,13 @@ def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
     prefix = "imu."
     imu = {k.removeprefix(prefix): v for k, v in implied.items() if k.startswith(prefix)}
     sensor = {k: v for k, v in implied.items() if not k.startswith(prefix)}
-    return replace(config, sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
+    return config.changed(sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
 
 
 def _filled(section: _Section, implied: Mapping[str, Any]) -> _Section:
     default = type(section)()
     unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}
-    return replace(section, **unset)
+    return section.changed(**unset)
 
 
 def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:

@@ -139,26 +139,22 @@ class SensorOptions:
     ] = None
 
     def changed(self, config: Config) -> Config:
-        """``config`` with ``--sensor``, then with each ``--set`` in turn.
+        """``config`` with ``--sensor``, then with every ``--set`` at once.
 
         Raises
         ------
         ConfigError
             If there is no such key, or the value is out of bounds.
         """
-        from loam_gtsam.config import config_to_dict, with_value
-
         if self.sensor is not None:
-            config = with_value(config, "sensor.model", self.sensor, f"--sensor {self.sensor}")
+            config = config.changed({"sensor.model": self.sensor}, source="--sensor")
         for entry in self.overrides or []:
-            key, value = _key_value("--set", entry)
+            key, _ = _key_value("--set", entry)
             if "." not in key:
-                sections = config_to_dict(config).items()
-                owners = [name for name, section in sections if key in section]
+                owners = [name for name, section in config if key in type(section).model_fields]
                 meant = f", for example {owners[0]}.{entry}" if owners else ""
                 raise typer.BadParameter(f"--set {entry}: expected SECTION.KEY=VALUE{meant}")
-            config = with_value(config, key, value, f"--set {entry}")
-        return config
+        return config.changed(*(self.overrides or []), source="--set")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

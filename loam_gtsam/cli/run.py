@@ -6,7 +6,6 @@ import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -48,7 +47,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         is raised after the results up to there were written.
     """
     if options.loops:
-        config = replace(config, loops=replace(config.loops, enabled=True))
+        config = config.changed("loops.enabled=true")
     plot = draws_pictures(options.plot)
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)

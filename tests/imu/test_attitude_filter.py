@@ -36,8 +36,8 @@ def test_gravity_filter_finds_up(scene, options, degrees):
 def test_gravity_filter_beats_both_of_its_halves():
     world = SimulatedWorld("shaken", frames=900)
     errors, _ = tilt_errors(world)
-    only_gyro, _ = tilt_errors(world, dataclasses.replace(CONFIG, filter_seconds=1e9))
-    only_acceleration, _ = tilt_errors(world, dataclasses.replace(CONFIG, filter_seconds=0.1))
+    only_gyro, _ = tilt_errors(world, CONFIG.changed(filter_seconds=1e9))
+    only_acceleration, _ = tilt_errors(world, CONFIG.changed(filter_seconds=0.1))
     assert errors[-1000:].mean() < 0.5 * only_gyro[-1000:].mean()
     assert errors[-1000:].mean() < 0.2 * only_acceleration[-1000:].mean()
 

@@ -169,7 +169,7 @@ def test_everything_comes_out_in_lidar_axes(orientation):
     degrees = (180.0, 5.0, -30.0)
     samples = moving(orientation=orientation)
     there = as_seen_by(samples, rot(*degrees))
-    config = dataclasses.replace(CONFIG, lidar_R_imu_deg=degrees)
+    config = CONFIG.changed(lidar_R_imu_deg=degrees)
     expected, found = ImuBuffer(CONFIG, samples), ImuBuffer(config, there)
     stamp = int(ns(1.01))
     assert angle(found.orientation(stamp), expected.orientation(stamp)) < 1e-9

@@ -43,10 +43,10 @@ def test_a_wrong_mounting_is_found_and_named(walk, degrees):
     named = [float(x) for x in said.split("[")[1].split("]")[0].split(",")]
     assert angle(rot(*named), rot(*degrees)) < np.deg2rad(2.0)
     # Set as it says, it is content.
-    config = dataclasses.replace(CONFIG, lidar_R_imu_deg=tuple(named))
+    config = CONFIG.changed(lidar_R_imu_deg=tuple(named))
     assert extrinsic_problem(ImuBuffer(config, there), stamps, poses) == ""
     # From a configuration that is wrong in another way the same is found.
-    config = dataclasses.replace(CONFIG, lidar_R_imu_deg=(20.0, 0.0, 30.0))
+    config = CONFIG.changed(lidar_R_imu_deg=(20.0, 0.0, 30.0))
     assert str([round(x) for x in named]) in extrinsic_problem(
         ImuBuffer(config, there), stamps, poses
     )

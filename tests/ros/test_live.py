@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import ROS1, START, cloud, loam_recording, write_bag
+from support.bags import ROS1, START, cloud, imu, loam_recording, write_bag
 from support.live_replay import (
     IMU,
     MS,
@@ -23,7 +23,6 @@ from support.live_replay import (
     Clock,
     bag_of,
     hand_over,
-    imu_message,
     messages_of,
     recorded,
     replay,
@@ -308,7 +307,7 @@ def test_one_sample_from_the_future_opens_no_gate(bag: Path) -> None:
     clock = Clock()
     live = LiveMapper(imu=True, clock=clock)
     hand_over(live, next(m for m in messages if m.topic == POINTS))
-    wild = replace(samples[0], content=imu_message(ROS1, START + 10**15, np.eye(10)[3]))
+    wild = replace(samples[0], content=imu(ROS1, START + 10**15, np.eye(10)[3]))
     for message in (wild, samples[0]):
         hand_over(live, message)
     assert live.step() is None

@@ -70,18 +70,25 @@ def cloud(store: Any, stamp: int, points: np.ndarray, **columns: np.ndarray) -> 
     )
 
 
-def imu(store: Any, stamp: int, *, unknown: bool = False) -> Any:
-    types = store.types
+def imu(
+    store: Any,
+    stamp: int,
+    values: Sequence[float] = (0.0, 0.0, 0.0, 1.0, 0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
+    *,
+    unknown: bool = False,
+) -> Any:
+    """A sample of quaternion x y z w, rad/s, m/s^2; ``unknown``: it says so of its orientation."""
+    types, row = store.types, [float(value) for value in values]
     vector = types["geometry_msgs/msg/Vector3"]
     covariance = np.zeros(9)
     covariance[0] = -1.0 if unknown else 0.0
     return types["sensor_msgs/msg/Imu"](
         header=header(store, stamp),
-        orientation=types["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.0, w=1.0),
+        orientation=types["geometry_msgs/msg/Quaternion"](*row[:4]),
         orientation_covariance=covariance,
-        angular_velocity=vector(x=0.1, y=0.2, z=0.3),
+        angular_velocity=vector(*row[4:7]),
         angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(x=0.0, y=0.0, z=9.81),
+        linear_acceleration=vector(*row[7:]),
         linear_acceleration_covariance=np.zeros(9),
     )
 

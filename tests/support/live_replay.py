@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from support.bags import cloud, header, store_of, write_bag
+from support.bags import cloud, store_of, write_bag
+from support.bags import imu as imu_sample
 
 from loam_gtsam.datasets.bags.bag_reader import Message, read_messages
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -28,23 +28,6 @@ class Clock:
         return self.now
 
 
-def imu_message(store: Any, stamp: int, row: np.ndarray, unknown: bool = False) -> Any:
-    """Of quaternion x y z w, rad/s, m/s^2."""
-    types, values = store.types, [float(value) for value in row]
-    vector = types["geometry_msgs/msg/Vector3"]
-    covariance = np.zeros(9)
-    covariance[0] = -1.0 if unknown else 0.0
-    return types["sensor_msgs/msg/Imu"](
-        header=header(store, stamp),
-        orientation=types["geometry_msgs/msg/Quaternion"](*values[:4]),
-        orientation_covariance=covariance,
-        angular_velocity=vector(*values[4:7]),
-        angular_velocity_covariance=np.zeros(9),
-        linear_acceleration=vector(*values[7:]),
-        linear_acceleration_covariance=np.zeros(9),
-    )
-
-
 def recorded(
     world: SimulatedWorld, kind: str = "ros1", *, imu: bool = True, unknown: bool = False
 ) -> list[Message]:
@@ -60,7 +43,7 @@ def recorded(
     if samples is not None:
         rows = np.hstack([samples.orientation, samples.gyro, samples.acceleration])
         for stamp, row in zip(samples.stamps.tolist(), rows, strict=True):
-            message = imu_message(store, stamp, row, unknown)
+            message = imu_sample(store, stamp, row, unknown=unknown)
             messages.append(Message(IMU, stamp + 3 * MS, message))
     return sorted(messages, key=lambda message: message.received)
 

@@ -1,6 +1,6 @@
-"""A run that was killed goes on: its state, written to a folder every now and then.
+"""Checkpoints of a run: its state, written to a folder every minute or so, to go on from.
 
-What a run computed after its last checkpoint is computed again; the result has the same bits as
+What a run computed after its last checkpoint is computed again. The result has the same bits as
 that of a run that was never stopped. See docs/outputs.md.
 """
 
@@ -9,10 +9,10 @@ from __future__ import annotations
 import json
 import logging
 import re
-import shutil
 import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +20,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.io.atomic import atomic_file, make_folder
-from loam_gtsam.io.state import Frozen, freeze, thaw
+from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import MapUpdate, OutputError
 
-_STATE = re.compile(r"state_(\d+)\.npz")
 _HEADER = "header"
+_FILE = re.compile(r"(frames_\d+_\d+|state_\d+)\.npz")
+_UNFINISHED = re.compile(rf"\.{_FILE.pattern}\.\d+\.tmp")
 _log = logging.getLogger(__name__)
 
 
 class _Frames:
-    """Frames from one checkpoint to the next."""
+    """Stamps and updates of the frames between two checkpoints."""
 
     def __init__(self, stamps: Sequence[int] = (), updates: Sequence[MapUpdate] = ()) -> None:
         self.stamps, self.updates = list(stamps), list(updates)
 
 
 class Checkpoint:
-    """Where a run keeps its state, and goes on from it.
+    """Folder in which a run keeps its state, and from which a run goes on.
 
     Parameters
     ----------
-    folder : of its own, made when it is needed. Without ``resume`` what an earlier run left there
-        is removed.
-    seconds : from one checkpoint to the next, on the clock on the wall
-    resume : go on from what is in the folder, if there is anything
+    folder : made when the first checkpoint is written. Only files of checkpoints in it are ever
+        removed; without ``resume``, those of an earlier run are removed at the start.
+    seconds : of wall-clock time from one checkpoint to the next
+    resume : go on from the checkpoint in the folder, if there is one
 
     Examples
     --------
@@ -58,14 +59,14 @@ class Checkpoint:
         self.folder = Path(folder)
         self.seconds = seconds
         self._resume = resume
-        self._failed = False
+        self._warned = False
         self._parts: list[int] = []  # how many frames there were at each checkpoint
         self._about: dict[str, Any] = {}
         self._written = time.monotonic()
 
     @property
     def due(self) -> bool:
-        """Whether it is time for the next one."""
+        """Whether it is time for the next checkpoint."""
         return time.monotonic() - self._written >= self.seconds
 
     def begin(
@@ -86,12 +87,23 @@ class Checkpoint:
         Raises
         ------
         OutputError
-            If the checkpoint is of another run or version, or cannot be read.
+            If the state of ``roots`` cannot be kept, if the checkpoint is of another run or
+            version or cannot be read, or if other files in the folder have the names of its files.
         """
         self._about = {"loam_gtsam": installed_version(), **about}
+        self._parts = []
+        try:
+            freeze(roots, shared)
+        except TypeError as error:
+            raise OutputError(f"a checkpoint of this run is not possible: {error}") from error
         newest = self._newest()
         if newest is None or not self._resume:
             self.remove()
+            for path in self._files():
+                raise OutputError(
+                    f"{path}: the file has the name of a checkpoint's file, but is none; delete "
+                    "it or choose another folder"
+                )
             return [], []
         frames = _Frames()
         try:
@@ -118,32 +130,31 @@ class Checkpoint:
         roots: Mapping[str, Any],
         shared: Mapping[str, Any],
     ) -> None:
-        """Write the state after a frame. If it cannot be written the run must not suffer.
+        """Write the state after a frame.
+
+        If the state cannot be written, or something in it cannot be kept, the log says so once and
+        the run goes on.
 
         Parameters
         ----------
         stamps, updates : of all sweeps so far
         roots, shared : as in :meth:`begin`
-
-        Raises
-        ------
-        TypeError
-            If something of a user's own, a loop closer say, cannot be kept.
         """
         done, total = (self._parts or [0])[-1], len(updates)
         if total == done:
             return
         before = self._newest()
         try:
+            state = freeze(roots, shared)
+            frames = freeze({"frames": _Frames(stamps[done:], updates[done:])}, {})
             make_folder(self.folder)
-            new = _Frames(stamps[done:], updates[done:])
-            _write(self._frames_file(done, total), freeze({"frames": new}, {}), {})
+            _write(self._frames_file(done, total), frames, {})
             header = {"about": self._about, "parts": [*self._parts, total]}
-            _write(self.folder / f"state_{total:07d}.npz", freeze(roots, shared), header)
-        except OutputError as error:
-            if not self._failed:
+            _write(self.folder / f"state_{total:07d}.npz", state, header)
+        except Exception as error:  # a user's own __getstate__ may raise anything
+            if not self._warned:
                 _log.warning("no checkpoint: %s; the run goes on without", error)
-            self._failed = True
+            self._warned = True
         else:
             self._parts.append(total)
             if before is not None:
@@ -151,13 +162,24 @@ class Checkpoint:
         self._written = time.monotonic()
 
     def remove(self) -> None:
-        """Forget the checkpoint, once the results of the run are written elsewhere."""
-        if self._newest() is not None or any(self.folder.glob("frames_*.npz")):
-            shutil.rmtree(self.folder, ignore_errors=True)
+        """Remove the checkpoint, once the results of the run are written elsewhere.
+
+        Other files in the folder stay, and then the folder as well.
+        """
+        with suppress(OSError):
+            for path in self._files():
+                if _is_ours(path):
+                    path.unlink(missing_ok=True)
+            for path in self.folder.glob(".*.tmp"):
+                if _UNFINISHED.fullmatch(path.name):  # by a process that was killed
+                    path.unlink(missing_ok=True)
+            self.folder.rmdir()  # fails if it is not empty
+
+    def _files(self) -> Iterator[Path]:
+        return (path for path in self.folder.glob("*.npz") if _FILE.fullmatch(path.name))
 
     def _newest(self) -> Path | None:
-        files = self.folder.glob("state_*.npz")
-        return max((f for f in files if _STATE.fullmatch(f.name)), default=None)
+        return max((f for f in self._files() if f.name.startswith("state")), default=None)
 
     def _frames_file(self, start: int, end: int) -> Path:
         return self.folder / f"frames_{start:07d}_{end:07d}.npz"
@@ -167,9 +189,18 @@ class Checkpoint:
             if about.get(name) != now:
                 raise OutputError(
                     f"{self.folder}: the checkpoint is of another run: its {name} was "
-                    f"{_shown(about.get(name))}, now it is {_shown(now)}; resume with the same, or "
-                    "start again"
+                    f"{_shorten(about.get(name))}, now it is {_shorten(now)}; resume with the "
+                    "same, or start again"
                 )
+
+
+def _is_ours(path: Path) -> bool:
+    """Whether a file is one that a checkpoint wrote."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return {f"{_HEADER}.npy", f"{STRUCTURE}.npy"} <= set(archive.namelist())
+    except (OSError, zipfile.BadZipFile):
+        return False
 
 
 def _write(path: Path, frozen: Frozen, header: Mapping[str, Any]) -> None:
@@ -184,6 +215,6 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     return arrays, json.loads(arrays.pop(_HEADER).tobytes())
 
 
-def _shown(value: object) -> str:
+def _shorten(value: object) -> str:
     text = " ".join(str(value).split())
     return text if len(text) <= 60 else "a longer text"

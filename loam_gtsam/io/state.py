@@ -1,7 +1,7 @@
 """State of objects as plain arrays and JSON, and back: what a checkpoint is made of.
 
 Nothing that is read can run code: classes are looked up by name among those of this package that
-are in use and those that a user marked with :func:`checkpointed`; arrays are read without pickle.
+are imported and those that a user marked with :func:`checkpointed`; arrays are read without pickle.
 Every bit survives, and so does the memory order of arrays, on which the rounding of sums depends.
 """
 
@@ -19,51 +19,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 Frozen = dict[str, NDArray[Any]]
-"""``structure``, JSON as bytes, and all elements of the arrays of a dtype under its name."""
+""":data:`STRUCTURE`, JSON as bytes, and all elements of the arrays of a dtype under its name."""
+STRUCTURE = "structure"
 
 _T = TypeVar("_T", bound=type)
-_CLASSES: dict[str, type] = {}
+_MARKED: dict[str, type] = {}
+_PACKAGE = __name__.partition(".")[0]
 _KINDS = "biuf"
-_STRUCTURE = "structure"
 
 
 def checkpointed(cls: _T) -> _T:
-    """Class decorator: instances may be in a checkpoint.
+    """Class decorator for classes of a user: their instances may be in a checkpoint.
 
     What :meth:`object.__getstate__` gives is kept, and set again by ``__setstate__`` or attribute
     by attribute, as in :mod:`copy`.
     """
-    _CLASSES[_name(cls)] = cls
+    _MARKED[_name(cls)] = cls
     return cls
 
 
 def freeze(roots: Mapping[str, object], shared: Mapping[str, object]) -> Frozen:
-    """The state of objects.
+    """Turn the state of objects into arrays.
 
     Parameters
     ----------
-    roots : whose state is kept; they may refer to each other
-    shared : what they refer to and what is not kept, for it is there again: configuration, samples
+    roots : objects whose state is kept, by name; they may refer to each other
+    shared : objects to which the roots refer and which are not kept, because they are there again
+        when the state is read: configuration, samples of an IMU
 
     Raises
     ------
     TypeError
-        If something is of a class that is neither of this package nor :func:`checkpointed`.
+        If an object is of a class that is neither of this package nor :func:`checkpointed`.
     """
     writer = _Writer({id(value): name for name, value in (*shared.items(), *roots.items())})
-    states = {name: writer.take(_state(root)) for name, root in roots.items()}
+    states = {}
+    for name, root in roots.items():
+        try:
+            states[name] = writer.encode(_state(root))
+        except TypeError as error:
+            raise TypeError(f"{_name(type(root))}: {error}") from error
     return writer.frozen(states)
 
 
 def thaw(
     frozen: Mapping[str, NDArray[Any]], roots: Mapping[str, Any], shared: Mapping[str, Any]
 ) -> None:
-    """Bring ``roots`` into the state in which others of the same names were frozen.
+    """Bring ``roots`` into the state in which objects of the same names were frozen.
 
     Raises
     ------
     ValueError
-        If that cannot be: the state is damaged, or of other objects.
+        If the state is damaged, or of other objects.
     """
     try:
         reader = _Reader(frozen, {**shared, **roots})
@@ -71,7 +78,7 @@ def thaw(
         if states.keys() != roots.keys():
             raise ValueError(f"expected the state of {sorted(roots)}, got that of {sorted(states)}")
         for name, root in roots.items():
-            _set_state(root, reader.give(states[name]))
+            _set_state(root, reader.decode(states[name]))
     except (KeyError, IndexError, TypeError, AttributeError) as error:
         raise ValueError(f"the state does not fit: {type(error).__name__}: {error}") from error
 
@@ -80,20 +87,13 @@ def _name(cls: type) -> str:
     return f"{cls.__module__}.{cls.__qualname__}"
 
 
-def _find(name: str) -> type | None:
-    """The class of that name, if it may be in a checkpoint."""
-    if name in _CLASSES:
-        return _CLASSES[name]
+def _class_of(name: str, base: type = object) -> type:
+    """The class of that name, derived from ``base``; a KeyError if a checkpoint cannot have it."""
     module, _, cls = name.rpartition(".")
-    if module.partition(".")[0] != __name__.partition(".")[0]:
-        return None
-    found = getattr(sys.modules.get(module), cls, None)
-    return found if isinstance(found, type) and _name(found) == name else None
-
-
-def _class(name: str) -> type:
-    found = _find(name)
-    if found is None:
+    found: Any = _MARKED.get(name)
+    if module.partition(".")[0] == _PACKAGE:
+        found = getattr(sys.modules.get(module), cls, None)
+    if not (isinstance(found, type) and issubclass(found, base) and _name(found) == name):
         raise KeyError(name)
     return found
 
@@ -112,6 +112,8 @@ def _set_state(value: Any, state: Any) -> None:
 
 
 class _Writer:
+    """Encoder of objects; what it has met before, or is known by name, is only referred to."""
+
     def __init__(self, known: Mapping[int, str]) -> None:
         self._known = known
         self._seen: dict[int, int] = {}
@@ -123,9 +125,9 @@ class _Writer:
     def frozen(self, states: Mapping[str, Any]) -> Frozen:
         text = json.dumps({"roots": states, "arrays": self._arrays})
         columns = {name: np.concatenate(parts) for name, parts in self._elements.items()}
-        return {_STRUCTURE: np.frombuffer(text.encode(), np.uint8), **columns}
+        return {STRUCTURE: np.frombuffer(text.encode(), np.uint8), **columns}
 
-    def take(self, value: Any) -> Any:
+    def encode(self, value: Any) -> Any:
         """``value`` as JSON: plain ones as they are, others as a list that begins with a tag."""
         if isinstance(value, Enum):
             return ["enum", self._class(value), value.value]
@@ -146,27 +148,33 @@ class _Writer:
         if isinstance(value, np.generic):
             return ["scalar", self._array(np.asarray(value))]
         if kind in (list, tuple, set):
-            return [kind.__name__, [self.take(entry) for entry in value]]
+            return [kind.__name__, self._each(value)]
         if kind is deque:
-            return ["deque", [self.take(entry) for entry in value], value.maxlen]
+            return ["deque", self._each(value), value.maxlen]
         if kind in (dict, Counter):
-            return [kind.__name__, [[self.take(k), self.take(v)] for k, v in value.items()]]
+            return [kind.__name__, [self._each(pair) for pair in value.items()]]
         if kind is gtsam.Pose3:
             return ["pose", self._array(value.matrix())]
         if kind is gtsam.Rot3:
             return ["rotation", self._array(value.matrix())]
         if isinstance(value, tuple):
-            return ["named", self._class(value), [self.take(entry) for entry in value]]
-        return ["object", self._class(value), self.take(_state(value))]
+            return ["named", self._class(value), self._each(value)]
+        return ["object", self._class(value), self.encode(_state(value))]
+
+    def _each(self, values: Any) -> list[Any]:
+        return [self.encode(value) for value in values]
 
     def _class(self, value: object) -> str:
         name = _name(type(value))
-        if _find(name) is not type(value):
-            raise TypeError(
-                f"{name} cannot be in a checkpoint; mark the class with "
-                "loam_gtsam.io.state.checkpointed if its attributes say all about it"
-            )
-        return name
+        try:
+            if _class_of(name) is type(value):
+                return name
+        except KeyError:
+            pass
+        raise TypeError(
+            f"{name} cannot be in a checkpoint; if its attributes say all about it, mark the class "
+            "with loam_gtsam.checkpointed, else leave it out of what __getstate__ gives"
+        )
 
     def _array(self, array: NDArray[Any]) -> int:
         if array.dtype.kind not in _KINDS:
@@ -181,45 +189,44 @@ class _Writer:
 
 
 class _Reader:
+    """Decoder of what :class:`_Writer` encoded."""
+
     def __init__(self, frozen: Mapping[str, NDArray[Any]], known: Mapping[str, Any]) -> None:
         self._frozen, self._known = frozen, known
-        self.structure = json.loads(frozen[_STRUCTURE].tobytes())
+        self.structure = json.loads(frozen[STRUCTURE].tobytes())
         self._made: dict[int, Any] = {}
 
-    def give(self, entry: Any) -> Any:
+    def decode(self, entry: Any) -> Any:
         """The value of an entry of the structure."""
         if not isinstance(entry, list):
             return entry
         tag = entry[0]
         if tag == "enum":
-            return _class(entry[1])(entry[2])
+            return _class_of(entry[1], Enum)(entry[2])
         if tag == "shared":
             return self._known[entry[1]]
         if tag == "again":
             return self._made[entry[1]]
+        if tag in _LEAVES:
+            leaf = self._made[entry[-1]] = _LEAVES[tag](self, entry)
+            return leaf
         # What may refer to itself is known before its content is.
-        if tag in ("list", "dict", "Counter"):
-            return self._filled(tag, entry)
         if tag == "object":
-            made: Any = object.__new__(_class(entry[1]))
+            made: Any = object.__new__(_class_of(entry[1]))
             self._made[entry[-1]] = made
-            _set_state(made, self.give(entry[2]))
+            _set_state(made, self.decode(entry[2]))
             return made
-        leaf = self._made[entry[-1]] = _LEAVES[tag](self, entry)
-        return leaf
+        container = self._made[entry[-1]] = _CONTAINERS[tag]()
+        for part in entry[1]:
+            if tag == "list":
+                container.append(self.decode(part))
+            else:
+                key, value = self.each(part)
+                container[key] = value
+        return container
 
-    def _filled(self, tag: str, entry: list[Any]) -> Any:
-        if tag == "list":
-            items = self._made[entry[-1]] = []
-            items.extend(self.give(part) for part in entry[1])
-            return items
-        pairs = self._made[entry[-1]] = {} if tag == "dict" else Counter()
-        for key, value in entry[1]:
-            pairs[self.give(key)] = self.give(value)
-        return pairs
-
-    def parts(self, entries: list[Any]) -> list[Any]:
-        return [self.give(part) for part in entries]
+    def each(self, entries: list[Any]) -> list[Any]:
+        return [self.decode(part) for part in entries]
 
     def array(self, number: int) -> NDArray[Any]:
         name, shape, turned, start = self.structure["arrays"][number]
@@ -228,13 +235,14 @@ class _Reader:
         return flat.reshape(shape[::-1]).T if turned else flat.reshape(shape)
 
 
+_CONTAINERS: dict[str, Callable[[], Any]] = {"list": list, "dict": dict, "Counter": Counter}
 _LEAVES: dict[str, Callable[[_Reader, list[Any]], Any]] = {
     "array": lambda reader, entry: reader.array(entry[1]),
     "scalar": lambda reader, entry: reader.array(entry[1])[()],
-    "tuple": lambda reader, entry: tuple(reader.parts(entry[1])),
-    "set": lambda reader, entry: set(reader.parts(entry[1])),
-    "deque": lambda reader, entry: deque(reader.parts(entry[1]), maxlen=entry[2]),
-    "named": lambda reader, entry: _class(entry[1])(*reader.parts(entry[2])),
+    "tuple": lambda reader, entry: tuple(reader.each(entry[1])),
+    "set": lambda reader, entry: set(reader.each(entry[1])),
+    "deque": lambda reader, entry: deque(reader.each(entry[1]), maxlen=entry[2]),
+    "named": lambda reader, entry: _class_of(entry[1], tuple)(*reader.each(entry[2])),
     "pose": lambda reader, entry: gtsam.Pose3(reader.array(entry[1])),
     "rotation": lambda reader, entry: gtsam.Rot3(reader.array(entry[1])),
 }

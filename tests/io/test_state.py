@@ -41,6 +41,14 @@ class Counting:
         self.__init__(count)
 
 
+@checkpointed
+class Called:
+    calls = 0
+
+    def __init__(self, *arguments):
+        Called.calls += 1
+
+
 class Unmarked:
     pass
 
@@ -168,3 +176,13 @@ def damaged(**changes):
 def test_a_damaged_state_is_an_error_and_runs_nothing(changes):
     with pytest.raises(ValueError, match=r"."):
         thaw(damaged(**changes), {"root": Root()}, {})
+
+
+@pytest.mark.parametrize("name", ["Pair", "Colour"])
+def test_no_constructor_is_called_but_those_of_enums_and_named_tuples(name):
+    frozen = freeze({"root": Root([Pair(1, 2), Colour.RED])}, {})
+    text = frozen["structure"].tobytes().decode().replace(f"test_state.{name}", "test_state.Called")
+    frozen["structure"] = np.frombuffer(text.encode(), np.uint8)
+    with pytest.raises(ValueError, match="Called"):
+        thaw(frozen, {"root": Root()}, {})
+    assert Called.calls == 0

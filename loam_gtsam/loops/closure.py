@@ -126,9 +126,12 @@ class ScanLoopCloser:
         self._descriptors: list[FloatArray] = []
         self._spreads: list[float] = []
 
-    def __getstate__(self) -> dict[str, Any]:
-        names = "statistics", "_descriptors", "_spreads"
-        return {name: getattr(self, name) for name in names}
+    def __getstate__(self) -> tuple[Any, ...]:
+        return self._whole, self.statistics, self._descriptors, self._spreads
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        self.__init__(state[0])  # type: ignore[misc]
+        self.statistics, self._descriptors, self._spreads = state[1:]
 
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
         """See :meth:`LoopCloser.detect`."""

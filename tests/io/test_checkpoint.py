@@ -16,7 +16,10 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.io.state import freeze, thaw
+from loam_gtsam.loops.closure import ScanLoopCloser
+from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.pipeline import run
+from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.types import DatasetError, OutputError
 
 
@@ -53,27 +56,65 @@ def stopped(dataset, config, folder, at, **options):
     return run(dataset, config, on_frame=stop, checkpoint=checkpoint, **options)
 
 
-LOOPS = {
-    "loops": {"enabled": True, "min_way": 6.0},
-    "pose_graph": {"keyframe_distance": 1.0},
-}
+class NearestPlace:
+    """The closer of a user, as in docs/own_loop_closer.md, with a memory of its own."""
+
+    def __init__(self, config):
+        self.registration = ScanLoopCloser(config)
+        self.positions = []
+
+    def detect(self, keyframe, history):
+        here = keyframe.odom_T_lidar.translation()
+        self.positions.append(here)
+        if len(self.positions) < 8:
+            return None
+        nearest = int(np.argmin(np.linalg.norm(np.array(self.positions[:-7]) - here, axis=1)))
+        found = self.registration.verify(keyframe, nearest, history)
+        return found if isinstance(found, LoopClosure) else None
+
+
+def held_near_the_start(context):
+    """Own factors of a user."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)
+    return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)]
+
+
+LOOPS = changed(loops={"enabled": True, "min_way": 6.0}, pose_graph={"keyframe_distance": 1.0})
+DENSE = changed(pose_graph={"keyframe_distance": 0.5})
 CASES = {
-    "plain": ("street_loop?frames=14", Config(), [1, 2, 5]),
+    "plain": ("street_loop?frames=8", Config(), [1, 2, 5]),
     "imu in the graph": ("corridor?frames=16", changed(imu={"preintegration": True}), [3, 11]),
-    "scan to scan": ("trees?frames=8", changed(odometry={"method": "scan_to_scan"}), [4]),
+    "scan to scan": ("trees?frames=6", changed(odometry={"method": "scan_to_scan"}), [4]),
     "classical": ("room?frames=8", preset("aloam"), [4]),
-    "loops": ("street_loop?frames=30", changed(**LOOPS), [12, 25]),
+    "loops": ("room?frames=60&columns=400&speed=3", LOOPS, [20, 52]),
+    "loops and imu in the graph": (
+        "room?frames=12&columns=400&speed=3",
+        changed(LOOPS, imu={"preintegration": True}),
+        [7],
+    ),
+    "own closer": ("room?frames=40&columns=400&speed=4", DENSE, [12, 33]),
+    "own factors": ("room?frames=6&columns=400", Config(), [3]),
+    "workers": ("room?frames=8&columns=400", Config(), [4]),
+}
+OPTIONS = {
+    "own closer": lambda: {"loop_closer": NearestPlace(DENSE)},
+    "own factors": lambda: {"extra_factors": held_near_the_start},
+    "workers": lambda: {"workers": 1},
 }
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_a_run_that_was_stopped_goes_on_to_the_last_bit(case, tmp_path):
     world, config, stops = CASES[case]
+    options = OPTIONS.get(case, dict)
     dataset = open_dataset(f"sim:{world}")
-    whole = run(dataset, config)
+    whole = run(dataset, config, **options())
+    if case in ("loops", "own closer"):
+        assert whole.loops.counts()["on"] > 0
+    folder = tmp_path / "checkpoint"
     for at in stops:
-        assert len(stopped(dataset, config, tmp_path / "checkpoint", at).updates) == at
-    assert_same(stopped(dataset, config, tmp_path / "checkpoint", None), whole)
+        assert len(stopped(dataset, config, folder, at, **options()).updates) == at
+    assert_same(stopped(dataset, config, folder, None, **options()), whole)
 
 
 def test_a_map_with_cubes_in_memory_and_on_disk_goes_on_as_it_was(tmp_path):
@@ -120,15 +161,71 @@ def test_time_tells_when_a_checkpoint_is_due(tmp_path):
 def test_without_resume_an_old_checkpoint_is_forgotten(tmp_path):
     dataset = open_dataset("sim:room?frames=3")
     stopped(dataset, Config(), tmp_path / "checkpoint", 2)
+    (tmp_path / "checkpoint" / ".state_0000003.npz.77.tmp").write_text("of a killed process")
     result = run(dataset, checkpoint=Checkpoint(tmp_path / "checkpoint"))
     assert len(result.updates) == 3
     assert not (tmp_path / "checkpoint").exists()
 
 
-def test_nobody_elses_folder_is_removed(tmp_path):
-    (tmp_path / "mine.txt").write_text("mine")
+def test_only_files_of_checkpoints_are_ever_removed(tmp_path):
+    dataset = open_dataset("sim:room?frames=3")
+    (tmp_path / "chapters").mkdir()
+    for name in ("thesis.txt", "state.npz", "frames_of_mine.npz", "chapters/1.txt"):
+        (tmp_path / name).write_text("mine")
+    mine = {path.name for path in tmp_path.iterdir()}
+    stopped(dataset, Config(), tmp_path, 2)
+    run(dataset, checkpoint=Checkpoint(tmp_path))  # from the start: the checkpoint goes
+    assert {path.name for path in tmp_path.iterdir()} == mine
+    stopped(dataset, Config(), tmp_path, 2)
     Checkpoint(tmp_path).remove()
-    assert (tmp_path / "mine.txt").exists()
+    assert {path.name for path in tmp_path.iterdir()} == mine
+
+
+@pytest.mark.parametrize("name", ["state_0000002.npz", "frames_0000000_0000002.npz"])
+def test_a_file_of_another_with_the_name_of_a_checkpoint_is_left_and_told(name, tmp_path):
+    np.savez(tmp_path / name, positions=np.zeros(3))
+    with pytest.raises(OutputError, match=f"{name}: the file has the name of a checkpoint's"):
+        run(open_dataset("sim:room?frames=1"), checkpoint=Checkpoint(tmp_path))
+    Checkpoint(tmp_path).remove()
+    assert (tmp_path / name).exists()
+
+
+class Foreign:
+    """Something that a checkpoint does not know."""
+
+
+class Remembering:
+    """A closer whose memory cannot be kept, at once or from the first keyframe on."""
+
+    def __init__(self, *memory):
+        self.memory = list(memory)
+
+    def detect(self, keyframe, history):
+        self.memory.append(Foreign())
+
+
+def test_what_cannot_be_kept_is_told_before_the_first_sweep(tmp_path):
+    dataset = ListDataset([RuntimeError("a sweep was read")])
+    checkpoint = Checkpoint(tmp_path / "checkpoint")
+    message = r"Remembering: .*Foreign cannot be in a checkpoint; .* mark the class"
+    with pytest.raises(OutputError, match=message):
+        run(dataset, loop_closer=Remembering(Foreign()), checkpoint=checkpoint)
+    assert not checkpoint.folder.exists()
+
+
+@pytest.mark.parametrize("end", [KeyboardInterrupt(), DatasetError("the bag breaks off")])
+def test_what_cannot_be_kept_later_costs_checkpoints_but_no_results(end, tmp_path, caplog):
+    scans = list(open_dataset("sim:room?frames=4&columns=400"))
+    checkpoint = Checkpoint(tmp_path / "checkpoint", seconds=0.0)
+    result = run(
+        ListDataset([*scans, end]),
+        loop_closer=Remembering(),
+        checkpoint=checkpoint,
+        keep_partial=True,
+    )
+    assert len(result.updates) == 4
+    assert caplog.text.count("no checkpoint: ") == 1
+    assert "Foreign cannot be in a checkpoint" in caplog.text
 
 
 def test_another_configuration_is_told(tmp_path):

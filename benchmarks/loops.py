@@ -152,7 +152,7 @@ def _closed(
     poses = [gtsam.Pose3(truth[number]) for number in numbers]
     used = [loop for loop, on in zip(graph.loops, graph.active, strict=True) if on]
     wrong = sum(_is_wrong(loop, poses) for loop in used)
-    way = np.array([keyframe.way for keyframe in graph.keyframes])
+    way = np.array([keyframe.travelled for keyframe in graph.keyframes])
     places = np.array([pose.translation() for pose in poses])
     revisits = [
         bool((np.linalg.norm(places[old] - places[k], axis=1) <= NEAR).any())

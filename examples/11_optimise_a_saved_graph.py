@@ -47,7 +47,7 @@ def off(values: gtsam.Values) -> float:
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
 
 
-print(f"{len(saved.loops)} loops, {sum(loop.on for loop in robust.loops)} of them used")
+print(f"{len(saved.loops)} loops, {sum(loop.active for loop in robust.loops)} of them used")
 print(f"off by {off(saved.poses):.2f} m as saved, {off(believed.poses):.2f} m with all loops,")
 print(f"       {off(robust.poses):.2f} m with those that agree")
 sigma = np.sqrt(np.diag(robust.covariance(159))[3:])

@@ -252,6 +252,24 @@ class CubeMap:
             count += len(points)
         return count
 
+    def moved_points(self, moves: Mapping[int, FloatArray]) -> FloatArray:
+        """What :meth:`points` of the whole map would be after :meth:`move`; the map does not change.
+
+        Parameters
+        ----------
+        moves : (4, 4) rigid transforms in the map frame, by the owner of the points
+        """
+        copy = CubeMap(replace(self._config, archive_dir=None), self._voxel_size)
+        copy._low = self._low
+        copy._cubes = {index: cube.copy() for index, cube in self._cubes.items()}
+        copy._archive = Archive(np.inf, None)
+        for index in self._archive.indices():
+            content = self._archive.read(index)
+            if content is not None:
+                copy._archive.store(index, content)
+        copy.move(moves)
+        return copy.points(archived=True)
+
     def _put(self, points: FloatArray, owners: Owners, *, archive: bool = False) -> None:
         """Insert points; with ``archive`` those outside the window go there."""
         # By component: numpy is several times slower along an axis of three.
@@ -591,6 +609,10 @@ class _Cube:
         """All that is kept of the cube in an archive."""
         self._take_in()
         return CubePoints(self._old.points, self._old.owners)
+
+    def copy(self) -> _Cube:
+        """A cube of the same points, which changes on its own."""
+        return _Cube(_Content(*(np.copy(column) for column in self._old.joined(self._new))))
 
     def average(self, new: _Voxels, owners: Owners) -> None:
         """Mean of the point a voxel has, if any, and the new ones; the owner stays."""

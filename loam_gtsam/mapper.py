@@ -244,8 +244,17 @@ class Mapper:
         self.registered = None
         return self._refused(stamp) or self._unused(stamp, message, fault)
 
-    def map_points(self) -> tuple[FloatArray, FloatArray]:
-        """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
+    def map_points(
+        self, moves: Mapping[int, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres.
+
+        Parameters
+        ----------
+        moves : what :meth:`move_map` would do to the points first; the map does not change
+        """
+        if moves:
+            return self.edge_map.moved_points(moves), self.plane_map.moved_points(moves)
         return self.edge_map.points(archived=True), self.plane_map.points(archived=True)
 
     def move_map(self, moves: Mapping[int, FloatArray]) -> int:

@@ -67,7 +67,7 @@ def _table(saved: SavedGraph, result: OptimizedGraph, keys: list[int]) -> Table:
         for poses in (saved.poses, result.poses)
     )
     moved = np.linalg.norm(after - before, axis=1)
-    off = [loop for loop in result.loops if not loop.on]
+    off = [loop for loop in result.loops if not loop.active]
     table = Table(show_header=False, box=None)
     table.add_row("poses, factors", f"{len(keys)}, {saved.factors.size()}")
     table.add_row("loops", f"{len(result.loops)}, of which {len(off)} contradict the others")

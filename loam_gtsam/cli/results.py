@@ -86,7 +86,7 @@ class Results:
     def _draw(self, folder: Path, last: LastFrame) -> list[str]:
         files = [name for name in PLOT_FILES if name != FRAME_PLOT or last.seen]
         run, trajectory, truth = self.run, self.run.trajectory, self.map_truth
-        loops = None if run.loops is None else run.loops.ends()
+        loops = None if run.loops is None else run.loops.loop_ends()
         plots.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
         plots.plot_map(folder / "map.png", run.edge_points, run.plane_points, trajectory)
         if last.seen:

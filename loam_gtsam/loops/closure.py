@@ -219,8 +219,8 @@ class ScanLoopCloser:
     def _near(self, keyframe: Keyframe, history: PoseGraph) -> IntArray | Rejection:
         """Keyframes that may be at the same place."""
         config = self.config
-        ways = keyframe.way - np.array([other.way for other in history.keyframes])
-        old = np.flatnonzero(ways >= config.min_way)
+        travelled = keyframe.travelled - np.array([other.travelled for other in history.keyframes])
+        old = np.flatnonzero(travelled >= config.min_way)
         if len(old) == 0:
             return Rejection.TOO_RECENT
         spreads = np.array(self._spreads)[old] + self._spreads[keyframe.index]
@@ -265,7 +265,7 @@ class ScanLoopCloser:
         chosen = [
             other
             for other in sorted(around, key=lambda other: abs(other.index - candidate))
-            if keyframe.way - other.way >= self.config.min_way or other.index == candidate
+            if keyframe.travelled - other.travelled >= self.config.min_way or other.index == candidate
         ]
         here = history.pose(candidate)
         poses = [here.between(history.pose(other.index)).matrix() for other in chosen]
@@ -328,12 +328,12 @@ def standing_fit(matches: ScanMatches, offered: int) -> Fit:
 
 def _untied(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
     """(N,) metres along which the odometry alone leads to each keyframe: straight, or by a loop."""
-    ways = np.array([other.way for other in history.keyframes])
-    gone = keyframe.way - ways
+    travelled = np.array([other.travelled for other in history.keyframes])
+    gone = keyframe.travelled - travelled
     for loop, on in zip(history.loops, history.active, strict=True):
         if on:
-            since = keyframe.way - ways[loop.later]
-            gone = np.minimum(gone, since + np.abs(ways - ways[loop.earlier]))
+            since = keyframe.travelled - travelled[loop.later]
+            gone = np.minimum(gone, since + np.abs(travelled - travelled[loop.earlier]))
     return gone
 
 

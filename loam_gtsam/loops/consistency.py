@@ -1,7 +1,10 @@
-"""Which loops agree with each other, through the odometry between their ends.
+"""Tests of a loop closure: against the rest of the graph, and against other loop closures.
 
-Pairwise consistency (Mangelson, Dominic, Eustice and Vasudevan, Pairwise Consistent Measurement Set
-Maximization for Robust Multi-Robot Map Merging, ICRA 2018). Equations: docs/maths/pose_graph.md.
+* The squared Mahalanobis distance of a loop closure from what all other factors say, whether the
+  loop closure is in the graph or not: equations (1) and (2) of docs/maths/pose_graph.md.
+* Pairwise consistency: whether two loop closures and the odometry between their ends make a cycle
+  that closes, equation (3) (Mangelson, Dominic, Eustice and Vasudevan, Pairwise Consistent
+  Measurement Set Maximization for Robust Multi-Robot Map Merging, ICRA 2018).
 """
 
 from __future__ import annotations
@@ -9,21 +12,82 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import gtsam
+import numpy as np
 
 from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.loops.batch import chi_squared
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, odometry_between
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import BoolArray, FloatArray
 
 
-class LoopConsistency:
-    """Keeps for every loop the others that it agrees with.
+def chi_squared(
+    measured: gtsam.Pose3,
+    noise: FloatArray,
+    between: gtsam.Pose3,
+    covariance: FloatArray,
+    *,
+    included: bool,
+) -> float:
+    """Squared Mahalanobis distance of a measured motion from what all other factors say.
 
     Parameters
     ----------
-    config : ``max_chi2``, ``walk`` and ``turn_walk_deg``
+    measured : motion between two poses
+    noise : (6, 6) covariance of ``measured``
+    between : the same motion, according to the graph
+    covariance : (6, 6) covariance of ``between``
+    included : whether the measured motion is a factor of the graph
+    """
+    residual = gtsam.Pose3.Logmap(measured.between(between))
+    scatter = noise - covariance if included else noise + covariance
+    values, vectors = np.linalg.eigh(symmetric(scatter))
+    # An included motion that alone fixes some direction cannot be contradicted in that direction.
+    least = 1e-9 * float(np.trace(noise)) / 6.0
+    parts = (vectors.T @ residual) ** 2 / np.maximum(values, least)
+    return float(parts[values > least].sum())
 
-    loops, keyframes : of the graph, which grow with it
+
+def relative_pose_covariance(
+    between: gtsam.Pose3, joint: gtsam.JointMarginal, earlier: int, later: int
+) -> FloatArray:
+    """(6, 6) covariance of ``earlier_T_later`` from the joint covariance of both poses."""
+    to_later = between.inverse().AdjointMap()
+    own, other = joint.at(earlier, earlier), joint.at(later, later)
+    crossed = to_later @ joint.at(earlier, later)
+    covariance: FloatArray = to_later @ own @ to_later.T + other - crossed - crossed.T
+    return covariance
+
+
+def loop_to_switch(active: BoolArray, distances: FloatArray, max_chi2: float) -> int | None:
+    """The loop closure that greedy selection switches next, off or on.
+
+    Parameters
+    ----------
+    active : (L,) which loop closures are in the graph
+    distances : (L,) squared Mahalanobis distance of each from what all the others say
+    max_chi2 : largest distance of a loop closure that agrees with the others
+
+    Returns
+    -------
+    The active loop closure that contradicts the others most, or else the inactive one that fits
+    best; None if all active ones agree with the others and all inactive ones contradict them.
+    """
+    if len(active) == 0:
+        return None
+    worst = int(np.where(active, distances, -1.0).argmax())
+    best = int(np.where(active, np.inf, distances).argmin())
+    if active[worst] and distances[worst] > max_chi2:
+        return worst
+    return best if not active[best] and distances[best] <= max_chi2 else None
+
+
+class LoopConsistency:
+    """Which loop closures of a graph are pairwise consistent.
+
+    Parameters
+    ----------
+    config : ``max_chi2``, ``walk`` and ``turn_walk_deg`` are used
+    loops, keyframes : the lists of the graph, which grow with it
     """
 
     def __init__(
@@ -32,14 +96,18 @@ class LoopConsistency:
         self.config = config
         self._loops = loops
         self._keyframes = keyframes
-        self._known: dict[tuple[int, int], bool] = {}
+        # One byte for each pair, a row for each loop closure: 0 unknown, 1 inconsistent, 2 not.
+        self._compared: list[bytearray] = []
 
     def agreeing(self, number: int) -> set[int]:
-        """The numbers of the other loops that one agrees with; pairs are compared once."""
+        """Numbers of the other loop closures that agree with one; each pair is compared once."""
         return {n for n in range(len(self._loops)) if n != number and self._agree(n, number)}
 
     def clique(self, number: int) -> set[int]:
-        """Loops that agree pairwise, this one among them; as many as are found greedily."""
+        """Numbers of loop closures that agree pairwise, the given one among them.
+
+        The set is as large as greedy search finds it.
+        """
         agreeing = {other: self.agreeing(other) for other in self.agreeing(number)}
         chosen = {number}
         for other in sorted(agreeing, key=lambda n: (-len(agreeing[n]), n)):
@@ -48,19 +116,22 @@ class LoopConsistency:
         return chosen
 
     def _agree(self, one: int, two: int) -> bool:
-        pair = min(one, two), max(one, two)
-        if pair not in self._known:
-            first, second = self._loops[pair[0]], self._loops[pair[1]]
-            self._known[pair] = consistent(second, first, self._keyframes, self.config)
-        return self._known[pair]
+        first, second = min(one, two), max(one, two)
+        while len(self._compared) <= second:
+            self._compared.append(bytearray(len(self._compared)))
+        row = self._compared[second]
+        if not row[first]:
+            loops = self._loops[second], self._loops[first]
+            row[first] = 1 + consistent(*loops, self._keyframes, self.config)
+        return row[first] == 2
 
 
 def consistent(
     one: LoopClosure, two: LoopClosure, keyframes: Sequence[Keyframe], config: PoseGraphConfig
 ) -> bool:
-    """Whether two loops and the odometry between their ends make a cycle that closes.
+    """Whether two loop closures and the odometry between their ends make a cycle that closes.
 
-    If there is no odometry between two ends, which are then of two sessions, nothing contradicts.
+    Ends in different sessions have no odometry between them, so nothing contradicts them.
     """
     ends = (one.earlier, two.earlier), (one.later, two.later)
     if any(keyframes[a].session != keyframes[b].session for a, b in ends):

@@ -1,7 +1,8 @@
 """Pose graphs as files: g2o, and GTSAM's own serialisation.
 
 g2o (Kuemmerle et al., g2o: A General Framework for Graph Optimization, ICRA 2011) knows poses and
-motions between them; GTSAM's text archives know every factor.
+motions between them; GTSAM's text archives know every factor. The pose of keyframe ``i`` has the
+key ``gtsam.symbol("x", i)`` in memory and the number ``i`` in a file.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.loops.batch import SavedGraph
+from loam_gtsam.loops.keyframes import is_pose, pose_key, pose_number
 from loam_gtsam.types import DatasetError, FloatArray, InputError, OutputError
 
 G2O_SUFFIX, GTSAM_SUFFIXES = ".g2o", (".graph", ".values", ".stamps")
@@ -26,6 +28,8 @@ _UPPER = np.triu_indices(6)
 _SWAP = np.array([3, 4, 5, 0, 1, 2])
 """g2o has translation first."""
 _FIXED_SIGMA = 1e-4
+_NUMBERS_END = 1 << 56
+"""Keys from here on are those of ``gtsam.symbol``, smaller ones numbers of poses."""
 
 
 def write_graph(path: str | Path, saved: SavedGraph) -> None:
@@ -76,11 +80,12 @@ def _by_suffix(path: Path, g2o: Callable[..., Any], own: Callable[..., Any]) -> 
 
 def _write_g2o(path: Path, saved: SavedGraph) -> None:
     lines = ["# made by loam_gtsam; information: translation first, then rotation (rad)"]
-    lines += [f"{_STAMP} {key} {stamp}" for key, stamp in sorted(saved.stamps.items())]
-    for key in sorted(saved.poses.keys()):
-        lines.append(f"{_POSE} {key} {_pose_text(saved.poses.atPose3(key))}")
-    if saved.poses.size():
-        lines.append(f"{_FIX} {min(saved.poses.keys())}")
+    stamps = {pose_number(key): stamp for key, stamp in saved.stamps.items()}
+    lines += [f"{_STAMP} {number} {stamp}" for number, stamp in sorted(stamps.items())]
+    poses = {pose_number(key): saved.poses.atPose3(key) for key in saved.keys}
+    lines += [f"{_POSE} {number} {_pose_text(poses[number])}" for number in sorted(poses)]
+    if poses:
+        lines.append(f"{_FIX} {min(poses)}")
     left_out = 0
     for place in range(saved.factors.size()):
         factor = saved.factors.at(place)
@@ -91,7 +96,7 @@ def _write_g2o(path: Path, saved: SavedGraph) -> None:
         if isinstance(noise, gtsam.noiseModel.Robust):
             noise = noise.noise()
         information = noise.information()[np.ix_(_SWAP, _SWAP)][_UPPER]
-        first, second = factor.keys()
+        first, second = map(pose_number, factor.keys())
         numbers = " ".join(f"{value:.17g}" for value in information.tolist())
         lines.append(f"{_EDGE} {first} {second} {_pose_text(factor.measured())} {numbers}")
     if left_out:
@@ -132,7 +137,7 @@ def _read_g2o(path: Path) -> SavedGraph:
         elif tag == _POSE:
             key = _key(fields[0], where)
             if poses.exists(key):
-                raise DatasetError(f"{where}: there already is a pose {key}")
+                raise DatasetError(f"{where}: there already is a pose {pose_number(key)}")
             poses.insert(key, _pose(_floats(fields[1:], where), where))
         else:
             first, second = (_key(word, where) for word in fields[:2])
@@ -147,7 +152,7 @@ def _read_g2o(path: Path) -> SavedGraph:
         _exists(poses, first, where)
         _exists(poses, second, where)
         if first == second:
-            raise DatasetError(f"{where}: expected a motion between two poses, got {first} twice")
+            raise DatasetError(f"{where}: expected a motion between two poses, got the same twice")
         noise = gtsam.noiseModel.Gaussian.Information(_information(numbers[7:], where))
         graph.add(gtsam.BetweenFactorPose3(first, second, _pose(numbers[:7], where), noise))
     return SavedGraph(graph, poses, {key: at for key, at in stamps.items() if poses.exists(key)})
@@ -178,7 +183,7 @@ def _information(upper: FloatArray, where: str) -> FloatArray:
 
 def _exists(poses: gtsam.Values, key: int, where: str) -> None:
     if not poses.exists(key):
-        raise DatasetError(f"{where}: there is no {_POSE} {key}")
+        raise DatasetError(f"{where}: there is no {_POSE} {pose_number(key)}")
 
 
 def _integer(word: str, where: str) -> int:
@@ -189,10 +194,14 @@ def _integer(word: str, where: str) -> int:
 
 
 def _key(word: str, where: str) -> int:
-    key = _integer(word, where)
-    if not 0 <= key < 1 << 63:
-        raise DatasetError(f"{where}: expected a number of a pose from 0 on, got {key}")
-    return key
+    number = _integer(word, where)
+    if not 0 <= number < 1 << 63:
+        raise DatasetError(f"{where}: expected a number of a pose from 0 on, got {number}")
+    return _key_of(number)
+
+
+def _key_of(number: int) -> int:
+    return pose_key(number) if number < _NUMBERS_END else number
 
 
 def _floats(words: list[str], where: str) -> FloatArray:
@@ -218,14 +227,15 @@ def _text(path: Path) -> str:
 
 def _write_gtsam(path: Path, saved: SavedGraph) -> None:
     try:
-        parts = [saved.factors.serialize(), saved.poses.serialize()]
+        factors, poses = _renamed(saved.factors, saved.poses, pose_number)
+        parts = [factors.serialize(), poses.serialize()]
     except RuntimeError as error:
         raise OutputError(
             f"{path}: GTSAM cannot serialise this graph ({error}); factors written in Python "
             "cannot be saved"
         ) from error
-    stamps = sorted(saved.stamps.items())
-    parts.append("".join(f"{key} {stamp}\n" for key, stamp in stamps))
+    stamps = sorted((pose_number(key), stamp) for key, stamp in saved.stamps.items())
+    parts.append("".join(f"{number} {stamp}\n" for number, stamp in stamps))
     for suffix, text in zip(GTSAM_SUFFIXES, parts, strict=True):
         with atomic_file(path.with_suffix(suffix)) as file:
             file.write(text.encode("ascii"))
@@ -244,16 +254,15 @@ def _read_gtsam(path: Path) -> SavedGraph:
                 f"{part}: not the text of a gtsam {type(target).__name__}: {error}"
             ) from error
     for key in poses.keys():  # noqa: SIM118 (no mapping)
-        try:
-            poses.atPose3(key)
-        except RuntimeError as error:
-            raise DatasetError(f"{path}: expected poses only, key {key} has none") from error
+        if key < _NUMBERS_END and not is_pose(poses, key):
+            raise DatasetError(f"{path}: expected poses only, the variable {key} is none")
     # Some texts of other things are read without an error, as nothing.
     known = set(poses.keys())
     for place in range(graph.size()):
         if not known.issuperset(graph.at(place).keys()):
             part = path.with_suffix(GTSAM_SUFFIXES[1])
             raise DatasetError(f"{part}: has no pose for factor {place} of {path}")
+    graph, poses = _renamed(graph, poses, _key_of)
     stamps: dict[int, int] = {}
     part = path.with_suffix(GTSAM_SUFFIXES[2])
     if part.exists():
@@ -263,3 +272,20 @@ def _read_gtsam(path: Path) -> SavedGraph:
                 raise DatasetError(f"{where}: expected a key and a stamp, got {line[:80]!r}")
             stamps[_key(words[0], where)] = _integer(words[1], where)
     return SavedGraph(graph, poses, stamps)
+
+
+def _renamed(
+    factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, rename: Callable[[int], int]
+) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """The same with other keys, as ``rename`` gives them, of poses."""
+    graph, renamed = gtsam.NonlinearFactorGraph(), gtsam.Values(values)
+    for key in values.keys():  # noqa: SIM118 (no mapping)
+        if rename(key) != key:
+            pose = values.atPose3(key)
+            renamed.erase(key)
+            renamed.insert(rename(key), pose)
+    for place in range(factors.size()):
+        factor: Any = factors.at(place)
+        keys = [rename(key) for key in factor.keys()]
+        graph.add(factor if keys == factor.keys() else factor.rekey(keys))
+    return graph, renamed

@@ -1,17 +1,24 @@
-"""Keyframes, loops between them, and their covariances as noise models."""
+"""Keyframes, loop closures between them, their covariances as noise models, and their keys.
+
+The pose of keyframe ``i`` has the key ``gtsam.symbol("x", i)`` in every graph. The frame of the
+mapper's poses is ``odom``: continuous, and drifting; ``map`` is the corrected one (ROS REP-105).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.geometry import as_array, as_vector, symmetric
+from loam_gtsam.config import Config, PoseGraphConfig
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.geometry import as_array, as_vector, symmetric, transform
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.types import BoolArray, FloatArray, InputError, MapUpdate
+from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate, Trajectory
 
 _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
 """rad and m added to every standard deviation: a factor must not be infinitely sure."""
@@ -19,21 +26,21 @@ _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Keyframe:
-    """A frame that is a pose of the graph.
+    """A frame whose pose is a variable of the pose graph.
 
     Attributes
     ----------
-    index : its number, which is its key in the graph
-    update : of the frame; its ``map_T_lidar`` is in the frame that drifts, see ``odom_T_lidar``
-    way : metres gone along the keyframes until here
+    index : number of the keyframe; ``gtsam.symbol("x", index)`` is the key of its pose
+    update : result of the mapper for the frame; its ``map_T_lidar`` is :attr:`odom_T_lidar`
+    travelled : metres travelled from keyframe to keyframe until here
     edges, planes : (E, 3) and (P, 3) metres, de-skewed to the stamp, lidar frame, voxel-filtered
     distinct : (E,) whether an edge stands out of its ring by more than noise makes it
-    session : of how many the run is that the frame is of; no odometry leads from one to another
+    session : number of the run that the frame is of; no odometry leads from one run to another
     """
 
     index: int
     update: MapUpdate
-    way: float
+    travelled: float
     edges: FloatArray
     planes: FloatArray
     distinct: BoolArray
@@ -43,6 +50,11 @@ class Keyframe:
     def stamp(self) -> int:
         """Nanoseconds the pose belongs to."""
         return self.update.stamp
+
+    @property
+    def key(self) -> int:
+        """Key of the pose in the graph."""
+        return pose_key(self.index)
 
     @property
     def odom_T_lidar(self) -> gtsam.Pose3:
@@ -57,10 +69,10 @@ class LoopClosure:
     Attributes
     ----------
     earlier, later : numbers of the keyframes
-    earlier_T_later : the pose of the later one seen from the earlier one
-    covariance : (6, 6) of it, tangent order of the package, perturbation on the right
-    share, agreement : of the features off level ground that were matched, and of those matches that
-        agree; NaN if unknown
+    earlier_T_later : pose of the later keyframe in the frame of the earlier one
+    covariance : (6, 6) covariance of that pose, rotation first, perturbation on the right
+    share : share of the features off level ground that were matched; NaN if unknown
+    agreement : share of those matches within three standard deviations; NaN if unknown
     """
 
     earlier: int
@@ -71,18 +83,116 @@ class LoopClosure:
     agreement: float = np.nan
 
     def factor(self, kernel_width: float = np.inf) -> gtsam.BetweenFactorPose3:
-        """The loop as a factor, with a Huber kernel of that width on its whitened norm."""
+        """The loop closure as a factor, with a Huber kernel of that width on its whitened norm."""
         noise: gtsam.noiseModel.Base = noise_model(self.covariance)
         if np.isfinite(kernel_width):
             kernel = gtsam.noiseModel.mEstimator.Huber.Create(kernel_width)
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)
-        return gtsam.BetweenFactorPose3(self.earlier, self.later, self.earlier_T_later, noise)
+        keys = pose_key(self.earlier), pose_key(self.later)
+        return gtsam.BetweenFactorPose3(*keys, self.earlier_T_later, noise)
+
+
+def pose_key(index: int) -> int:
+    """Key of the pose of a keyframe: ``gtsam.symbol("x", index)``."""
+    return gtsam.symbol("x", index)
+
+
+def is_pose_key(key: int) -> bool:
+    """Whether a key is ``gtsam.symbol("x", index)`` for some index."""
+    return gtsam.symbolChr(key) == ord("x")
+
+
+def pose_number(key: int) -> int:
+    """Number of the keyframe whose pose has the key; other keys stay as they are."""
+    return gtsam.symbolIndex(key) if is_pose_key(key) else key
+
+
+def is_pose(values: gtsam.Values, key: int) -> bool:
+    """Whether the variable is a Pose3."""
+    try:
+        values.atPose3(key)
+    except RuntimeError:
+        return False
+    return True
+
+
+def make_keyframe(
+    index: int,
+    update: MapUpdate,
+    features: Features | None,
+    config: Config,
+    imu: ImuBuffer | None,
+    *,
+    travelled: float,
+    session: int,
+) -> Keyframe:
+    """A keyframe with the features of its sweep, de-skewed to the stamp.
+
+    Parameters
+    ----------
+    features : none leave the keyframe without points
+    config : ``deskew`` and the voxels of ``map`` are used
+    imu : source of the rotation within the sweep; None for constant velocity
+
+    Raises
+    ------
+    InputError
+        If the features are those of another stamp.
+    """
+    edges, planes, distinct = np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.bool_)
+    if features is not None:
+        if features.stamp != update.stamp:
+            raise InputError(
+                f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
+            )
+        sweep = MovingSweep(features, config, imu)
+        sweep.deskew(update.twist)
+        to_reference = sweep.middle_T_reference(update.twist).inverse().matrix()
+        edges, planes = (transform(to_reference, part) for part in (sweep.edges, sweep.planes))
+        distinct = sweep.distinct
+    return Keyframe(index, update, travelled, edges, planes, distinct, session)
+
+
+def interpolate_trajectory(
+    updates: Sequence[MapUpdate],
+    keyframes: Sequence[Keyframe],
+    pose_of: Callable[[int], gtsam.Pose3],
+) -> Trajectory:
+    """The frames of a run, corrected by the keyframes before and after each.
+
+    A frame keeps its motion from either keyframe; where the two disagree, they count in proportion
+    of time.
+
+    Parameters
+    ----------
+    updates : results of the mapper; frames with a bad stamp are left out
+    keyframes : those of the same run, in the order of time
+    pose_of : ``map_T_lidar`` of the keyframe of a number
+    """
+    good = [update for update in updates if update.status.has_pose]
+    stamps = np.array([update.stamp for update in good], np.int64)
+    starts = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
+    nexts = np.searchsorted(starts, stamps, side="right").tolist()
+    poses = []
+    for update, after in zip(good, nexts, strict=True):
+        around = keyframes[max(after - 1, 0) : after + 1]
+        found = [
+            pose_of(keyframe.index).compose(keyframe.odom_T_lidar.between(update.map_T_lidar))
+            for keyframe in around
+        ]
+        pose = found[0] if found else update.map_T_lidar
+        if len(found) == 2:
+            share = (update.stamp - around[0].stamp) / (around[1].stamp - around[0].stamp)
+            step = gtsam.Pose3.Logmap(pose.between(found[1]))
+            pose = pose.compose(gtsam.Pose3.Expmap(share * step))
+        poses.append(pose)
+    return Trajectory.from_poses(stamps, poses)
 
 
 def odometry_between(
     one: Keyframe, two: Keyframe, config: PoseGraphConfig
 ) -> tuple[gtsam.Pose3, FloatArray]:
-    """``one_T_two`` as the mapper has it, in either order of time, and its (6, 6) covariance."""
+    """``one_T_two`` according to the mapper, in either order of time, and its (6, 6) covariance."""
     motion = one.odom_T_lidar.between(two.odom_T_lidar)
     if one.index == two.index:
         return motion, np.zeros((6, 6))
@@ -92,7 +202,7 @@ def odometry_between(
         back = motion.inverse().AdjointMap()
         covariance = back @ relative_covariance(two.update, one.update) @ back.T
     walk = np.repeat([np.radians(config.turn_walk_deg), config.walk], 3)
-    return motion, covariance + np.diag(walk**2 * abs(two.way - one.way))
+    return motion, covariance + np.diag(walk**2 * abs(two.travelled - one.travelled))
 
 
 def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gaussian:

@@ -1,9 +1,9 @@
-"""Loops closed as a run goes, and the map that follows.
+"""Loop closures during a run, and the map that follows them.
 
 The mapper stays in the frame it began in, ``odom``: continuous, for whoever steers by it (ROS
-REP-105). Where a loop says that older keyframes lie elsewhere, seen from the newest one, their
-points move there, and the next sweep is matched with the corrected map. ``map_T_odom`` says where
-it all is.
+REP-105). Where a loop closure says that older keyframes lie elsewhere, seen from the newest one,
+their map points move there, and the next sweep is matched with the corrected map. ``map_T_odom``
+leads from ``odom`` to the corrected frame.
 """
 
 from __future__ import annotations
@@ -24,16 +24,16 @@ class LoopMapping:
 
     Parameters
     ----------
-    mapper : whose frames are given to :meth:`add`
+    mapper : the mapper whose frames are given to :meth:`add`
     config : ``pose_graph`` and ``loops``, and what :class:`PoseGraph` and
         :class:`ScanLoopCloser` use
-    closer : finds the loops; a :class:`ScanLoopCloser` if None
+    closer : finds the loop closures; a :class:`ScanLoopCloser` if None
 
     Attributes
     ----------
-    graph : keyframes and loops
-    closer : finds the loops
-    moved : map points moved so far
+    graph : keyframes and loop closures
+    closer : finds the loop closures
+    points_moved : how many map points were moved so far
     """
 
     def __init__(
@@ -46,9 +46,21 @@ class LoopMapping:
         self._mapper = mapper
         self.graph = PoseGraph(self._config)
         self.closer: LoopCloser = closer or ScanLoopCloser(self._config)
-        self.moved = 0
+        self.points_moved = 0
         self._placed: list[gtsam.Pose3] = []
         """``odom_T_lidar`` of the keyframes, to which their map points are fixed."""
+
+    def reset(self) -> None:
+        """Forget everything, as the mapper's reset does: the next frame is the first of a new run.
+
+        A closer that remembers keyframes must have a ``reset()`` of its own, which is called.
+        """
+        self.graph.reset()
+        reset_closer = getattr(self.closer, "reset", None)
+        if reset_closer is not None:
+            reset_closer()
+        self.points_moved = self._mapper.keyframe = 0
+        self._placed = []
 
     @property
     def map_T_odom(self) -> gtsam.Pose3:
@@ -56,12 +68,12 @@ class LoopMapping:
         return self.graph.correction
 
     def add(self, update: MapUpdate, features: Features) -> bool:
-        """Take a frame that the mapper has just registered.
+        """Add a frame that the mapper has just registered.
 
         Parameters
         ----------
-        update : of the frame
-        features : of its sweep
+        update : result of the mapper
+        features : those of the frame's sweep
 
         Returns
         -------
@@ -78,33 +90,46 @@ class LoopMapping:
         if loop is None or not self.graph.add_loop(loop):
             return False
         config = self._config.pose_graph
-        self.follow(config.follow_distance, config.follow_angle_deg)
+        self.correct_map(config.follow_distance, config.follow_angle_deg)
         return True
 
-    def follow(self, metres: float = 0.0, degrees: float = 0.0) -> None:
-        """Move the map points of the keyframes that lie elsewhere by more than this.
+    def correct_map(self, metres: float = 0.0, degrees: float = 0.0) -> None:
+        """Move the map points of the keyframes that lie elsewhere by more than a limit.
 
-        Seen from the newest keyframe: one that is far away may be off by the angle's share more,
-        as it is not matched with now.
+        Parameters
+        ----------
+        metres, degrees : the limits, seen from the newest keyframe. A keyframe that is far from it
+            may be off by the angle's share of that distance more, for no sweep is matched with its
+            points now.
         """
-        if not self._placed:
-            return
-        here = self._placed[-1]
+        there = self._misplaced(metres, degrees)
+        if there:
+            self.points_moved += self._mapper.move_map(self._moves(there))
+        for index, pose in there.items():
+            self._placed[index] = pose
+
+    def _misplaced(self, metres: float, degrees: float) -> dict[int, gtsam.Pose3]:
+        """Where the keyframes belong in ``odom``, of those that lie elsewhere by more."""
         to_odom = self.map_T_odom.inverse()
-        moves: dict[int, FloatArray] = {}
+        found = {}
         for index, placed in enumerate(self._placed):
             there = to_odom.compose(self.graph.pose(index))
             step = placed.localCoordinates(there)
             turned, shifted = np.degrees(np.linalg.norm(step[:3])), np.linalg.norm(step[3:])
-            allowed = metres + np.radians(degrees) * here.range(placed)
+            allowed = metres + np.radians(degrees) * self._placed[-1].range(placed)
             if turned > degrees or shifted > allowed:
-                moves[index] = there.compose(placed.inverse()).matrix()
-                self._placed[index] = there
-        if moves:
-            self.moved += self._mapper.move_map(moves)
+                found[index] = there
+        return found
+
+    def _moves(self, there: dict[int, gtsam.Pose3]) -> dict[int, FloatArray]:
+        """(4, 4) transforms of the points of keyframes to where these belong."""
+        return {
+            index: pose.compose(self._placed[index].inverse()).matrix()
+            for index, pose in there.items()
+        }
 
     def counts(self) -> dict[str, int]:
-        """Keyframes, loops and how many of them are on; what the closer counted, if it does."""
+        """Numbers of keyframes, loop closures and active ones, and what the closer counted."""
         graph = self.graph
         counts = {"keyframes": len(graph), "loops": len(graph.loops), "on": sum(graph.active)}
         statistics = getattr(self.closer, "statistics", None)
@@ -114,16 +139,18 @@ class LoopMapping:
             counts |= {f"rejected_{reason}": count for reason, count in rejected}
         return counts
 
-    def ends(self) -> tuple[FloatArray, BoolArray]:
-        """(L, 2, 3) where the loops begin and end in the map, metres, and (L,) which are on."""
+    def loop_ends(self) -> tuple[FloatArray, BoolArray]:
+        """(L, 2, 3) both ends of the loop closures in the map, metres, and (L,) which are active."""
         positions = self.graph.poses()[:, :3, 3]
         pairs = [(loop.earlier, loop.later) for loop in self.graph.loops]
         indices = np.array(pairs, np.int64).reshape(-1, 2)
         return positions[indices], np.array(self.graph.active, np.bool_)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
-        """Edge and plane points of the whole corrected map, (E, 3) and (P, 3) metres."""
-        self.follow()
+        """Edge and plane points of the whole corrected map, (E, 3) and (P, 3) metres.
+
+        All keyframes count where the graph has them; the mapper's own map does not change.
+        """
         pose = self.map_T_odom.matrix()
-        edges, planes = self._mapper.map_points()
+        edges, planes = self._mapper.map_points(self._moves(self._misplaced(0.0, 0.0)))
         return transform(pose, edges), transform(pose, planes)

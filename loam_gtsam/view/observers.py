@@ -146,7 +146,7 @@ def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) 
         way = np.concatenate(
             [pipeline.loops.graph.poses()[:, :3, 3], transform(map_T_odom, way[-1:])]
         )
-        ends, on = pipeline.loops.ends()
+        ends, on = pipeline.loops.loop_ends()
     return MapView(points[~is_plane], points[is_plane], way, ends, on)
 
 

@@ -80,15 +80,15 @@ def test_the_newest_keyframe_and_its_points_stay():
     points = mapper.map_points()[0]
     mark = last.odom_T_lidar.translation() + UP
     assert np.linalg.norm(points - mark, axis=1).min() < 1e-9
-    assert loops.moved > 0
+    assert loops.points_moved > 0
 
 
 @pytest.mark.parametrize(("metres", "moves"), [(100.0, False), (0.0, True)])
 def test_only_keyframes_that_lie_elsewhere_move_their_points(metres, moves):
     mapper, loops, _ = driven(first=30, follow_distance=metres, follow_angle_deg=180.0)
-    assert (loops.moved > 0) == moves
+    assert (loops.points_moved > 0) == moves
     before = marks(mapper)
-    loops.follow(metres, 180.0)  # nothing is left to do
+    loops.correct_map(metres, 180.0)  # nothing is left to do
     np.testing.assert_array_equal(marks(mapper), before)
 
 
@@ -96,7 +96,7 @@ def test_counts_and_ends_are_those_of_the_graph():
     _, loops, _ = driven(first=30)
     counts = loops.counts()
     assert counts == {"keyframes": len(POSES), "loops": len(POSES) - 30, "on": len(POSES) - 30}
-    ends, on = loops.ends()
+    ends, on = loops.loop_ends()
     assert ends.shape == (counts["loops"], 2, 3)
     assert on.all()
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 4.2
@@ -158,7 +158,7 @@ def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
 
     (closed, jumps, loops), (left_open, _) = rounds(True), rounds(False)
     assert loops.counts()["on"] >= 3
-    assert loops.moved > 0
+    assert loops.points_moved > 0
     assert off(left_open, 120) > 0.5
     assert off(closed, 120) < 0.5 * off(left_open, 120)
     assert max(jumps) < 0.2  # odom is continuous

@@ -101,7 +101,7 @@ def test_a_frame_is_a_keyframe_when_it_is_far_or_has_turned():
     taken = [graph.add(update) is not None for update in frames(poses)]
     assert taken == [True, False, True, False, True, False]
     assert [keyframe.stamp for keyframe in graph.keyframes] == [0, 2 * FRAME, 4 * FRAME]
-    assert [keyframe.way for keyframe in graph.keyframes] == pytest.approx([0.0, 2.1, 2.1])
+    assert [keyframe.travelled for keyframe in graph.keyframes] == pytest.approx([0.0, 2.1, 2.1])
 
 
 def test_frames_that_were_not_solved_are_none():
@@ -303,7 +303,7 @@ def test_batch_finds_the_same_loops():
         graph.add_loop(loops[number])
     before, active = graph.poses(), graph.active
     result = graph.optimize()
-    assert [loop.on for loop in result.loops] == list(active) == list(graph.active)
+    assert [loop.active for loop in result.loops] == list(active) == list(graph.active)
     assert sum(active) == 5
     np.testing.assert_allclose(graph.poses(), before, atol=1e-3)
     assert result.error_after <= result.error_before

@@ -106,7 +106,7 @@ def own_loop_closer(names: Names, output: str) -> None:
 
 
 def saved_graph(names: Names, output: str) -> None:
-    assert [loop.on for loop in names["robust"].loops] == [True, False] * 10
+    assert [loop.active for loop in names["robust"].loops] == [True, False] * 10
     off, robust = names["off"], names["robust"]
     assert off(robust.poses) < 0.6 * off(names["saved"].poses)
     assert off(names["believed"].poses) > 10.0 * off(robust.poses)

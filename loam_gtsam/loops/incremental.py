@@ -1,0 +1,201 @@
+"""A factor graph in iSAM2, with loop closures that can be switched, kept as steps to repeat.
+
+iSAM2 (Kaess et al., iSAM2: Incremental Smoothing and Mapping Using the Bayes Tree, IJRR 2012)
+linearises each factor where its variables happen to be at the time, so its estimates depend in
+their last bits on the order of all updates, and GTSAM cannot serialise it. A graph that is to go on
+as if it had never been stopped is therefore built again by the same steps.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.loops.consistency import relative_pose_covariance
+from loam_gtsam.types import BoolArray, FloatArray, InputError, OutputError
+
+_RELINEARIZE = 1e-3
+"""rad or m by which a pose moves before iSAM2 linearises anew: the error is of second order."""
+_ROUNDS = 20
+"""Largest number of updates of iSAM2 until the variables stay."""
+_STILL = 1e-5
+"""rad and m; a variable that moves less in an update stays."""
+
+_Step = tuple[Any, ...]
+"""Name of a method of :class:`IncrementalGraph` that changed it, and what it was given."""
+
+
+class IncrementalGraph:
+    """Factors and the current estimate of their variables.
+
+    :meth:`__getstate__` writes factors and values with GTSAM's own serialisation, which keeps every
+    bit.
+
+    Attributes
+    ----------
+    factors : all factors but loop closures
+    values : current estimate
+    """
+
+    def __init__(self) -> None:
+        self.factors = gtsam.NonlinearFactorGraph()
+        self.values = gtsam.Values()
+        self._loops: list[gtsam.NonlinearFactorGraph] = []  # each of one factor
+        self._slots: list[int | None] = []  # place of each loop closure in iSAM2; None: inactive
+        self._isam = _new_isam()
+        self._steps: list[_Step] = []
+
+    def __getstate__(self) -> list[_Step]:
+        try:
+            return [tuple(map(_as_text, step)) for step in self._steps]
+        except RuntimeError as error:
+            raise OutputError(
+                "pose graph: GTSAM cannot serialise a factor or a variable that was added (a "
+                f"factor written in Python?), so the graph cannot be in a checkpoint: {error}"
+            ) from error
+
+    def __setstate__(self, state: list[_Step]) -> None:
+        self.__init__()  # type: ignore[misc]
+        repeat = {
+            "add": self.add,
+            "add_loop": self.add_loop,
+            "switch": self.switch,
+            "restart": self.restart,
+        }
+        for name, *given in state:
+            repeat[name](*map(_from_text, given))
+
+    @property
+    def active(self) -> tuple[bool, ...]:
+        """Which of the loop closures are in the graph."""
+        return tuple(slot is not None for slot in self._slots)
+
+    def is_active(self, number: int) -> bool:
+        """Whether a loop closure is in the graph."""
+        return self._slots[number] is not None
+
+    def add(
+        self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, settle: bool = True
+    ) -> None:
+        """Add factors that are no loop closures.
+
+        Parameters
+        ----------
+        values : start values of the variables that are new
+        settle : update until the estimate stays; not needed for a new pose at the end of a chain,
+            which moves no other one
+
+        Raises
+        ------
+        InputError
+            If iSAM2 cannot solve the graph with them; the graph is then as it was before.
+        """
+        before = gtsam.Values(self.values) if settle else self.values
+        try:
+            self._isam.update(factors, values)
+            self.values.insert(values)
+            if settle:
+                self._settle()
+        except Exception as error:
+            self.restart(before, np.array(self.active, np.bool_))
+            raise InputError(f"factor: iSAM2 cannot solve the graph with it: {error}") from error
+        self.factors.push_back(factors)
+        self._steps.append(("add", factors, values, settle))
+
+    def add_loop(self, factor: gtsam.NonlinearFactorGraph) -> None:
+        """Keep the factor of a loop closure, inactive at first; they are numbered from 0."""
+        self._loops.append(factor)
+        self._slots.append(None)
+        self._steps.append(("add_loop", factor))
+
+    def switch(self, number: int, on: bool) -> None:
+        """Put a loop closure into the graph, or take it out."""
+        slot = self._slots[number]
+        graph = self._loops[number] if on else gtsam.NonlinearFactorGraph()
+        result = self._isam.update(graph, gtsam.Values(), [] if slot is None else [slot])
+        self._slots[number] = result.getNewFactorsIndices()[0] if on else None
+        self._settle()
+        self._steps.append(("switch", number, on))
+
+    def restart(
+        self,
+        values: gtsam.Values,
+        active: BoolArray,
+        factors: gtsam.NonlinearFactorGraph | None = None,
+    ) -> None:
+        """Begin anew in iSAM2, from an estimate and with some of the loop closures.
+
+        Parameters
+        ----------
+        values : the estimate
+        active : (L,) which loop closures are in the graph
+        factors : all factors but loop closures; those that the graph has if None
+        """
+        if factors is not None:
+            self.factors = factors
+        graph = gtsam.NonlinearFactorGraph(self.factors)
+        self._slots = [None] * len(self._loops)
+        for number in np.flatnonzero(active).tolist():
+            self._slots[number] = graph.size()
+            graph.push_back(self._loops[number])
+        self._isam = _new_isam()
+        self._isam.update(graph, values)
+        self.values = self._isam.calculateBestEstimate()
+        # Whatever was done before need not be repeated.
+        kept = gtsam.NonlinearFactorGraph(self.factors)
+        self._steps = [("add_loop", factor) for factor in self._loops]
+        self._steps.append(("restart", values, active, kept))
+
+    def covariance(self, key: int) -> FloatArray:
+        """Marginal covariance of a variable, (6, 6) of a pose."""
+        found: FloatArray = self._isam.marginalCovariance(key)
+        return found
+
+    def relative(self, earlier: int, later: int) -> tuple[gtsam.Pose3, FloatArray]:
+        """``earlier_T_later`` of the poses of two keys and its (6, 6) covariance."""
+        between = self.values.atPose3(earlier).between(self.values.atPose3(later))
+        joint = self._isam.jointMarginalCovariance([earlier, later])
+        return between, relative_pose_covariance(between, joint, earlier, later)
+
+    def _settle(self) -> None:
+        """Update iSAM2 until the variables stay."""
+        before = self.values
+        for _ in range(_ROUNDS):
+            self._isam.update()
+            self.values = self._isam.calculateBestEstimate()
+            if np.abs(before.localCoordinates(self.values).vector()).max() < _STILL:
+                break
+            before = self.values
+
+
+def _new_isam() -> gtsam.ISAM2:
+    params = gtsam.ISAM2Params()
+    params.relinearizeSkip = 1
+    params.setRelinearizeThreshold(_RELINEARIZE)
+    # Cholesky calls the chain of a second session, which hangs on a wide prior, indeterminate.
+    params.setFactorization("QR")
+    return gtsam.ISAM2(params)
+
+
+_TEXTS: dict[str, type] = {cls.__name__: cls for cls in (gtsam.NonlinearFactorGraph, gtsam.Values)}
+
+
+def _as_text(value: Any) -> Any:
+    """Factors or values as (name of the class, text); anything else as it is."""
+    name = type(value).__name__
+    return (name, value.serialize()) if name in _TEXTS else value
+
+
+def _from_text(value: Any) -> Any:
+    """The inverse of :func:`_as_text`."""
+    if not isinstance(value, tuple):
+        return value
+    name, text = value
+    made: Any = _TEXTS[name]()
+    try:
+        made.deserialize(text)
+    except (RuntimeError, MemoryError) as error:
+        raise ValueError(f"not the text of a gtsam {name}: {error}") from error
+    return made

@@ -38,7 +38,9 @@ class NearestKeyframe:
 
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
         """Look for it."""
-        old = [other.index for other in history.keyframes if keyframe.travelled - other.travelled > 8.0]
+        old = [
+            other.index for other in history.keyframes if keyframe.travelled - other.travelled > 8.0
+        ]
         if not old:
             return None
         nearest = min(old, key=lambda n: history.pose(n).range(history.pose(keyframe.index)))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import X  # the key of pose i is X(i), in a file the number i
 
 from loam_gtsam import SavedGraph, optimize_graph, read_graph, write_graph
 
@@ -26,15 +27,16 @@ for step in range(1, 160):
     turn = gtsam.Rot3.Yaw(np.pi / 2.0 if step % 20 == 0 else 0.0)
     truth.append(truth[-1].compose(gtsam.Pose3(turn, np.array([1.0, 0.0, 0.0]))))
 factors, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
-poses.insert(0, truth[0])
+poses.insert(X(0), truth[0])
 for step in range(1, 160):
     motion = measured(step - 1, step)
-    poses.insert(step, poses.atPose3(step - 1).compose(motion))
-    factors.add(gtsam.BetweenFactorPose3(step - 1, step, motion, noise))
+    poses.insert(X(step), poses.atPose3(X(step - 1)).compose(motion))
+    factors.add(gtsam.BetweenFactorPose3(X(step - 1), X(step), motion, noise))
 for start in range(3, 80, 8):
-    factors.add(gtsam.BetweenFactorPose3(start, start + 80, measured(start, start + 80), noise))
+    right = measured(start, start + 80)
+    factors.add(gtsam.BetweenFactorPose3(X(start), X(start + 80), right, noise))
     wrong = gtsam.Pose3(gtsam.Rot3.Yaw(rng.uniform(-3, 3)), rng.normal(0.0, 2.0, 3))
-    factors.add(gtsam.BetweenFactorPose3(start, start + 43, wrong, noise))
+    factors.add(gtsam.BetweenFactorPose3(X(start), X(start + 43), wrong, noise))
 write_graph("city.g2o", SavedGraph(factors, poses))
 
 saved = read_graph("city.g2o")  # or one that PoseGraph.saved() gave, or another system wrote
@@ -43,14 +45,15 @@ believed, robust = optimize_graph(saved, robust=False), optimize_graph(saved)
 
 def off(values: gtsam.Values) -> float:
     """Metres from the truth, root mean square."""
-    errors = [values.atPose3(k).translation() - pose.translation() for k, pose in enumerate(truth)]
+    found = [values.atPose3(X(k)).translation() for k in range(len(truth))]
+    errors = np.array(found) - [pose.translation() for pose in truth]
     return float(np.sqrt(np.mean(np.sum(np.square(errors), axis=1))))
 
 
 print(f"{len(saved.loops)} loops, {sum(loop.active for loop in robust.loops)} of them used")
 print(f"off by {off(saved.poses):.2f} m as saved, {off(believed.poses):.2f} m with all loops,")
 print(f"       {off(robust.poses):.2f} m with those that agree")
-sigma = np.sqrt(np.diag(robust.covariance(159))[3:])
+sigma = np.sqrt(np.diag(robust.covariance(X(159)))[3:])
 print(f"standard deviations of the last position: {sigma.round(3)} m")
 write_graph("city_optimized.graph", SavedGraph(robust.factors, robust.poses))  # GTSAM's own format
 print("written:", *sorted(file.name for file in Path().glob("city*")))

@@ -253,7 +253,7 @@ class CubeMap:
         return count
 
     def moved_points(self, moves: Mapping[int, FloatArray]) -> FloatArray:
-        """What :meth:`points` of the whole map would be after :meth:`move`; the map does not change.
+        """Points of the whole map as they would be after :meth:`move`; the map does not change.
 
         Parameters
         ----------
@@ -612,7 +612,8 @@ class _Cube:
 
     def copy(self) -> _Cube:
         """A cube of the same points, which changes on its own."""
-        return _Cube(_Content(*(np.copy(column) for column in self._old.joined(self._new))))
+        keys, points, owners = self._old.joined(self._new)
+        return _Cube(_Content(keys.copy(), points.copy(), owners.copy()))
 
     def average(self, new: _Voxels, owners: Owners) -> None:
         """Mean of the point a voxel has, if any, and the new ones; the owner stays."""

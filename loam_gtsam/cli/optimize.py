@@ -38,7 +38,7 @@ def execute(options: OptimizeOptions) -> int:
         if file.exists() and not options.overwrite:
             raise OutputError(f"{file}: the file exists; add --overwrite or choose another name")
     saved = read_graph(path)
-    keys = sorted(saved.poses.keys())
+    keys = saved.keys
     if trajectory is not None and set(keys) - set(saved.stamps):
         raise DatasetError(
             f"{path}: has no stamps for some poses, which --trajectory needs; leave it out"

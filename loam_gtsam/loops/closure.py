@@ -22,7 +22,7 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.loops.scan_context import describe, heading_free, unlike
-from loam_gtsam.registration.association import ScanMatches, associate, trial
+from loam_gtsam.registration.association import ScanMatches, associate, subset, trial
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.relocalization import Fit, places, some
 from loam_gtsam.registration.scan_error import SeenGround, scan_error
@@ -38,8 +38,6 @@ _STARTS = 3
 
 _LEVEL = 0.7
 """Cosine between a normal and up from which a plane is level: slopes are no landmarks."""
-_AGREE = 3.0
-"""Standard deviations within which a match agrees: 99.7 % of normal noise."""
 
 
 class LoopCloser(Protocol):
@@ -114,7 +112,6 @@ class ScanLoopCloser:
     def __init__(self, config: Config | None = None) -> None:
         self._whole = config or Config()
         self.config = self._whole.loops
-        self.statistics = LoopStatistics()
         self._solver = GtsamSolver(self._whole.solver)
         # Of a trial it is enough to be near; what follows it goes the rest of the way.
         self._rough_solver = GtsamSolver(
@@ -123,6 +120,11 @@ class ScanLoopCloser:
                 rotation_tolerance_deg=_NEAR[1],
             )
         )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all keyframes and what was counted."""
+        self.statistics = LoopStatistics()
         self._descriptors: list[FloatArray] = []
         self._spreads: list[float] = []
 
@@ -265,7 +267,8 @@ class ScanLoopCloser:
         chosen = [
             other
             for other in sorted(around, key=lambda other: abs(other.index - candidate))
-            if keyframe.travelled - other.travelled >= self.config.min_way or other.index == candidate
+            if keyframe.travelled - other.travelled >= self.config.min_way
+            or other.index == candidate
         ]
         here = history.pose(candidate)
         poses = [here.between(history.pose(other.index)).matrix() for other in chosen]
@@ -316,14 +319,9 @@ def standing_fit(matches: ScanMatches, offered: int) -> Fit:
     matches : in a frame with z up, roughly
     offered : features that were to be matched
     """
-    planes = matches.planes
-    standing = np.abs(planes.normals[:, 2]) < _LEVEL
-    agree = np.abs(planes.distances[standing]) < _AGREE * planes.sigmas[standing]
-    agrees = np.count_nonzero(agree)
-    agrees += np.count_nonzero(matches.edges.distances < _AGREE * matches.edges.sigmas)
-    count = len(agree) + len(matches.edges)
-    others = offered - (len(planes) - len(agree))
-    return Fit(count / max(others, 1), float(agrees) / max(count, 1))
+    standing = np.abs(matches.planes.normals[:, 2]) < _LEVEL
+    level = int(np.count_nonzero(~standing))
+    return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)
 
 
 def _untied(keyframe: Keyframe, history: PoseGraph) -> FloatArray:

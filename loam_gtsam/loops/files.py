@@ -286,6 +286,7 @@ def _renamed(
             renamed.insert(rename(key), pose)
     for place in range(factors.size()):
         factor: Any = factors.at(place)
-        keys = [rename(key) for key in factor.keys()]
-        graph.add(factor if keys == factor.keys() else factor.rekey(keys))
+        keys = list(factor.keys())
+        new = list(map(rename, keys))
+        graph.add(factor if new == keys else factor.rekey(new))
     return graph, renamed

@@ -8,6 +8,7 @@ as if it had never been stopped is therefore built again by the same steps.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import gtsam
@@ -58,7 +59,7 @@ class IncrementalGraph:
 
     def __setstate__(self, state: list[_Step]) -> None:
         self.__init__()  # type: ignore[misc]
-        repeat = {
+        repeat: dict[str, Callable[..., None]] = {
             "add": self.add,
             "add_loop": self.add_loop,
             "switch": self.switch,

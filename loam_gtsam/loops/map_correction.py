@@ -140,7 +140,7 @@ class LoopMapping:
         return counts
 
     def loop_ends(self) -> tuple[FloatArray, BoolArray]:
-        """(L, 2, 3) both ends of the loop closures in the map, metres, and (L,) which are active."""
+        """(L, 2, 3) ends of the loop closures in the map, metres, and (L,) which are active."""
         positions = self.graph.poses()[:, :3, 3]
         pairs = [(loop.earlier, loop.later) for loop in self.graph.loops]
         indices = np.array(pairs, np.int64).reshape(-1, 2)

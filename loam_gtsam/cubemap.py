@@ -259,7 +259,7 @@ class CubeMap:
         ----------
         moves : (4, 4) rigid transforms in the map frame, by the owner of the points
         """
-        copy = CubeMap(replace(self._config, archive_dir=None), self._voxel_size)
+        copy = CubeMap(self._config.changed(archive_dir=None), self._voxel_size)
         copy._low = self._low
         copy._cubes = {index: cube.copy() for index, cube in self._cubes.items()}
         copy._archive = Archive(np.inf, None)

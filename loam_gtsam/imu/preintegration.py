@@ -17,9 +17,9 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, G, V, X
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.geometry import as_array, as_vector
 from loam_gtsam.imu.preintegration_factors import (
     BIASES,
     GRAVITY,
@@ -27,15 +27,17 @@ from loam_gtsam.imu.preintegration_factors import (
     REST,
     STATE,
     VELOCITY,
-    pieces_between,
-    preintegration_parameters,
-    propagate,
-    scan_factor,
+    information_root,
+    samples_between,
     scan_residual,
-    square_root,
 )
-from loam_gtsam.imu.preintegration_window import InertialState, Window
-from loam_gtsam.types import FloatArray, ImuSamples, InputError
+from loam_gtsam.imu.preintegration_window import (
+    InertialState,
+    Window,
+    WindowFrame,
+    predict_state,
+)
+from loam_gtsam.types import FloatArray, ImuSamples, InputError, SweepError
 
 _MAGNITUDE_SIGMA = 0.02
 """m/s^2: half the spread of gravity over the Earth's surface (9.780 to 9.832, WGS 84)."""
@@ -48,20 +50,22 @@ _POSE_SIGMA = (1e-3, 0.01)
 """rad and m of a pose from which a window begins: that of one scan match."""
 _VELOCITY_SIGMA = 0.5
 """m/s: two poses 0.1 s apart, known to 0.03 m."""
-_Scan = tuple[gtsam.Pose3, FloatArray, FloatArray | None]
-"""Pose, information and gradient of a scan, as :meth:`InertialOdometry.update` takes them."""
+_ZERO = (0.0, 0.0, 0.0)
+_UNSOLVABLE = RuntimeError, np.linalg.LinAlgError
+"""What GTSAM and numpy raise where there is no finite solution."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Where the IMU says the next frame is.
+    """Pose and velocity of the next frame by the IMU.
 
     Attributes
     ----------
     stamp : nanoseconds
-    map_T_lidar : the pose
+    map_T_lidar : predicted pose
     velocity : (3,) m/s of the lidar, map frame
-    covariance : (6, 6) of the pose, ``[rotation, translation]``, right perturbation
+    covariance : (6, 6) of the pose, ``[rotation, translation]``, right perturbation; it has an
+        inverse
     """
 
     stamp: int
@@ -94,8 +98,8 @@ class InertialOdometry:
     Attributes
     ----------
     state : the newest frame
-    restarts : how often the window was begun anew by itself: at the scan's pose, because it
-        contradicts the prediction (more than 30 standard deviations); or at the predicted one,
+    restarts : how often the window was begun anew by itself: at the scan's pose, because the scan
+        contradicts the prediction (more than 30 standard deviations); or at the predicted pose,
         because the graph could not be solved. Biases and gravity are kept.
 
     Raises
@@ -104,11 +108,7 @@ class InertialOdometry:
         If a shape or a value is wrong.
     """
 
-    state: InertialState
-    restarts: int
-    _pending: tuple[InertialState, gtsam.NonlinearFactor] | None
-    _asked: tuple[int, ImuSamples] | None
-    """Stamp and samples of the last prediction."""
+    _pending: tuple[WindowFrame, InertialState, gtsam.NonlinearFactor] | None
 
     def __init__(
         self,
@@ -116,9 +116,9 @@ class InertialOdometry:
         map_gravity: FloatArray,
         stamp: int,
         map_T_lidar: gtsam.Pose3,
-        velocity: FloatArray | None = None,
-        gyro_bias: FloatArray | None = None,
-        acceleration_bias: FloatArray | None = None,
+        velocity: FloatArray | tuple[float, ...] = _ZERO,
+        gyro_bias: FloatArray | tuple[float, ...] = _ZERO,
+        acceleration_bias: FloatArray | tuple[float, ...] = _ZERO,
         *,
         pose_sigma: tuple[float, float] = _POSE_SIGMA,
         velocity_sigma: float = _VELOCITY_SIGMA,
@@ -127,58 +127,39 @@ class InertialOdometry:
         gravity_sigma: float = 0.01,
     ) -> None:
         self.config = config
-        gravity = _array("map_gravity", map_gravity)
+        gravity = as_vector(map_gravity, "map_gravity")
         size = float(np.linalg.norm(gravity))
         if size < 1.0:
             raise InputError(f"map_gravity: expected about 9.81 m/s^2, got {size:.3g}")
-        sigmas = [acceleration_bias_sigma, gyro_bias_sigma]
-        _positive(*pose_sigma, velocity_sigma, *sigmas, gravity_sigma)
+        sigmas = acceleration_bias_sigma, gyro_bias_sigma, gravity_sigma
+        _check_positive(*pose_sigma, velocity_sigma, *sigmas)
         self._lidar_T_imu = gtsam.Pose3(gtsam.Rot3(), np.asarray(config.lidar_t_imu, np.float64))
         self._to_lidar: FloatArray = self._lidar_T_imu.AdjointMap()
-        covariance = np.zeros((STATE, STATE))
-        covariance[BIASES, BIASES] = np.diag(np.repeat(np.square(sigmas), 3))
-        along = np.outer(gravity, gravity) / size**2
-        across = np.eye(3) - along
-        covariance[GRAVITY, GRAVITY] = (
-            _MAGNITUDE_SIGMA**2 * along + (size * gravity_sigma) ** 2 * across
-        )
         self.restarts = 0
-        velocity = _array("velocity", velocity)
+        velocity = as_vector(velocity, "velocity")
         state = InertialState(
             stamp,
-            map_T_lidar,
+            map_T_lidar.compose(self._lidar_T_imu),
             velocity,
-            _array("acceleration_bias", acceleration_bias),
-            _array("gyro_bias", gyro_bias),
+            as_vector(acceleration_bias, "acceleration_bias"),
+            as_vector(gyro_bias, "gyro_bias"),
             gravity,
-            covariance,
+            _rest_covariance(gravity, *sigmas),
         )
-        self._begin(
-            state,
-            map_T_lidar,
-            velocity,
-            self._pose_covariance(pose_sigma),
-            velocity_sigma**2 * np.eye(3),
-        )
+        known = _pose_covariance(self._to_lidar, pose_sigma)
+        free = velocity_sigma**2 * np.eye(3)
+        self._start(_start_state(state, state.map_T_imu, velocity, known, free))
 
     def __getstate__(self) -> dict[str, Any]:
-        # GTSAM's factors are made again by going the same way.
-        gone = "_window", "_pending", "state"
-        return {name: value for name, value in vars(self).items() if name not in gone}
+        # GTSAM's factors cannot be kept; the prediction is made again.
+        asked = None if self._pending is None else self._pending[0]
+        return vars(self) | {"_pending": None, "_asked": asked}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
+        asked: WindowFrame | None = state.pop("_asked")
         vars(self).update(state)
-        asked, journal, restarts = self._asked, self._journal, self.restarts
-        self._start(self._base)
-        for stamp, samples, scan in journal:
-            self.predict(stamp, samples)
-            if scan is None:
-                self.skip()
-            else:
-                self.update(*scan)
         if asked is not None:
-            self.predict(*asked)
-        self.restarts = restarts
+            self.predict(asked.stamp, asked.samples)
 
     def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
         """Pose at ``stamp``, from the newest frame and the samples since.
@@ -193,42 +174,28 @@ class InertialOdometry:
         InputError
             If an array has the wrong shape.
         SweepError
-            If the samples do not cover the time between, are not in order or have a gap above
-            ``config.max_gap``. Nothing has changed then; :meth:`restart` at a pose known otherwise.
+            If there is no prediction: the samples do not cover the time between, are not in order,
+            have a gap above ``config.max_gap``, or add up to a motion without a finite covariance.
+            Nothing has changed then; :meth:`restart` at a pose known otherwise.
         """
-        last, n = self.state, self._window.newest
-        steps, gyro, acceleration, rate = pieces_between(
-            samples, last.stamp, stamp, self.config.max_gap
+        last = self.state
+        predicted, factor, rate = predict_state(
+            self.config, last, self._window.newest, stamp, samples
         )
-        # GTSAM takes the attitude at the beginning of a piece for all of it. In the middle the
-        # acceleration has turned by half the piece: without it, 8 mm/s^2 too much in a bend of
-        # 4 m/s^2 and 0.8 rad/s.
-        seen = acceleration - last.acceleration_bias
-        acceleration += 0.5 * steps[:, None] * np.cross(gyro - last.gyro_bias, seen)
-        measured = gtsam.PreintegratedCombinedMeasurements(
-            preintegration_parameters(self.config, last.map_gravity), last.bias
-        )
-        for step, turning, force in zip(steps, gyro, acceleration, strict=True):
-            measured.integrateMeasurement(force, turning, step)
-        there = measured.predict(gtsam.NavState(last.map_T_imu, last.velocity), last.bias)
-        predicted = replace(last, stamp=stamp, map_T_imu=there.pose(), velocity=there.velocity())
-        factor = gtsam.CombinedImuFactorWithGravityVector(
-            X(n), V(n), X(n + 1), V(n + 1), B(n), B(n + 1), G(0), measured
-        )
-        values = last.values(n)
-        values.insert(G(0), last.map_gravity)
-        values.insert(predicted.values(n + 1))
-        covariance = propagate(factor.linearize(values), last.covariance)
-        self._pending = replace(predicted, covariance=covariance), factor
-        self._asked = stamp, samples
         # The IMU goes round the lidar as the platform turns.
         lever = np.cross(rate - last.gyro_bias, self._lidar_T_imu.translation())
-        return Prediction(
+        map_T_imu = predicted.map_T_imu
+        prediction = Prediction(
             stamp,
-            there.pose().compose(self._lidar_T_imu.inverse()),
-            there.velocity() - there.pose().rotation().matrix() @ lever,
-            self._to_lidar @ covariance[POSE, POSE] @ self._to_lidar.T,
+            map_T_imu.compose(self._lidar_T_imu.inverse()),
+            predicted.velocity - map_T_imu.rotation().matrix() @ lever,
+            self._to_lidar @ predicted.covariance[POSE, POSE] @ self._to_lidar.T,
         )
+        if not _has_inverse(prediction.covariance):
+            raise SweepError("IMU samples: the covariance of the motion they make has no inverse")
+        frame = WindowFrame(last, stamp, samples_between(samples, last.stamp, stamp))
+        self._pending = frame, predicted, factor
+        return prediction
 
     def update(
         self, measured: gtsam.Pose3, information: FloatArray, gradient: FloatArray | None = None
@@ -251,32 +218,38 @@ class InertialOdometry:
         ------
         InputError
             If a shape or a value is wrong, or nothing has been predicted.
+        SweepError
+            If no window can begin here; make a new object then.
         """
-        root, offset = square_root(
-            _array("information", information, (6, 6)), _array("gradient", gradient, (6,))
+        root, offset = information_root(
+            as_array(information, "information", (6, 6)),
+            np.zeros(6) if gradient is None else as_vector(gradient, "gradient", 6),
         )
-        predicted, imu_factor = self._take_pending((measured, information, gradient))
+        frame, predicted, imu_factor = self._take_pending()
         if not len(root):
-            self._take_in(predicted, imu_factor)
+            self._append(frame, predicted, imu_factor)
             return
         error, derivative = scan_residual(predicted.map_T_imu, self._lidar_T_imu, measured)
         surprise, rows = root @ error - offset, root @ derivative
         covariance = predicted.covariance[POSE, POSE]
-        expected = rows @ covariance @ rows.T + np.eye(len(rows))
-        if surprise @ np.linalg.solve(expected, surprise) > _JUMP**2:
+        with np.errstate(over="ignore", invalid="ignore"):
+            expected = rows @ covariance @ rows.T + np.eye(len(rows))
+        if not _has_inverse(expected):
             self.restarts += 1
-            gain = np.linalg.solve(expected, rows @ covariance).T
-            left = np.eye(6) - gain @ rows
-            known = left @ covariance @ left.T + gain @ gain.T + _LEAST_SIGMA**2 * np.eye(6)
+            self._start(predicted)
+        elif surprise @ np.linalg.solve(expected, surprise) > _JUMP**2:
+            self.restarts += 1
+            known = _updated(covariance, rows, expected)
             # A velocity that was wrong looks like this too: it is free along the jump, and kept
             # across it, where the scan may be blind.
             seconds = (predicted.stamp - self.state.stamp) * 1e-9
             jump = measured.rotation().matrix() @ error[3:] / seconds
             free = predicted.covariance[VELOCITY, VELOCITY] + np.outer(jump, jump)
-            self._begin(predicted, measured, predicted.velocity, known, free)
-            return
-        scan = scan_factor(X(self._window.newest + 1), self._lidar_T_imu, measured, root, offset)
-        self._take_in(predicted, imu_factor, scan)
+            map_T_imu = measured.compose(self._lidar_T_imu)
+            self._start(_start_state(predicted, map_T_imu, predicted.velocity, known, free))
+        else:
+            frame = replace(frame, scan=(measured, root, offset))
+            self._append(frame, predicted, imu_factor)
 
     def skip(self) -> None:
         """Take the prediction as it is, for a frame of which the scan says nothing.
@@ -285,9 +258,10 @@ class InertialOdometry:
         ------
         InputError
             If nothing has been predicted.
+        SweepError
+            As :meth:`update`.
         """
-        predicted, imu_factor = self._take_pending(None)
-        self._take_in(predicted, imu_factor)
+        self._append(*self._take_pending())
 
     def restart(
         self,
@@ -307,79 +281,106 @@ class InertialOdometry:
         ------
         InputError
             If ``stamp`` is before ``state.stamp``, or a shape or a value is wrong.
+        SweepError
+            As :meth:`update`.
         """
         seconds = (stamp - self.state.stamp) * 1e-9
         if seconds < 0.0:
             raise InputError(f"stamp: expected {self.state.stamp} or later, got {stamp}")
-        _positive(*pose_sigma, velocity_sigma)
+        _check_positive(*pose_sigma, velocity_sigma)
         walks = np.repeat([self.config.acceleration_bias_walk, self.config.gyro_bias_walk], 3)
         covariance = self.state.covariance.copy()
         covariance[BIASES, BIASES] += np.diag(np.square(walks)) * seconds
-        self._begin(
-            replace(self.state, stamp=stamp, covariance=covariance),
-            map_T_lidar,
-            _array("velocity", velocity),
-            self._pose_covariance(pose_sigma),
-            velocity_sigma**2 * np.eye(3),
+        known = _pose_covariance(self._to_lidar, pose_sigma)
+        free = velocity_sigma**2 * np.eye(3)
+        state = replace(self.state, stamp=stamp, covariance=covariance)
+        map_T_imu, velocity = (
+            map_T_lidar.compose(self._lidar_T_imu),
+            as_vector(velocity, "velocity"),
         )
-
-    def _pose_covariance(self, sigmas: tuple[float, float]) -> FloatArray:
-        """Of the IMU, (6, 6), from standard deviations (rad, m) of the lidar."""
-        from_lidar = np.linalg.inv(self._to_lidar)
-        covariance: FloatArray = from_lidar * np.repeat(np.square(sigmas), 3) @ from_lidar.T
-        return covariance
-
-    def _begin(
-        self,
-        state: InertialState,
-        map_T_lidar: gtsam.Pose3,
-        velocity: FloatArray,
-        pose_covariance: FloatArray,
-        velocity_covariance: FloatArray,
-    ) -> None:
-        """A new window at another pose and velocity, with the biases and gravity of ``state``."""
-        covariance = np.zeros((STATE, STATE))
-        covariance[REST, REST] = state.covariance[REST, REST]
-        covariance[POSE, POSE] = pose_covariance
-        covariance[VELOCITY, VELOCITY] = velocity_covariance
-        map_T_imu = map_T_lidar.compose(self._lidar_T_imu)
-        self._start(replace(state, map_T_imu=map_T_imu, velocity=velocity, covariance=covariance))
+        self._start(_start_state(state, map_T_imu, velocity, known, free))
 
     def _start(self, state: InertialState) -> None:
-        self.state = self._base = state
-        self._window = Window(state)
-        self._pending = self._asked = None
-        self._journal: list[tuple[int, ImuSamples, _Scan | None]] = []
+        try:
+            self._window = Window(self.config, self._lidar_T_imu, state)
+        except _UNSOLVABLE as error:
+            raise SweepError(f"IMU: no window can begin from this state: {error}") from error
+        self.state: InertialState = state
+        self._pending = None
 
-    def _take_pending(self, scan: _Scan | None) -> tuple[InertialState, gtsam.NonlinearFactor]:
-        if self._pending is None or self._asked is None:
+    def _take_pending(self) -> tuple[WindowFrame, InertialState, gtsam.NonlinearFactor]:
+        if self._pending is None:
             raise InputError("nothing has been predicted: call predict() once for every frame")
-        self._journal.append((*self._asked, scan))
-        pending, self._pending, self._asked = self._pending, None, None
+        pending, self._pending = self._pending, None
         return pending
 
-    def _take_in(self, predicted: InertialState, *factors: gtsam.NonlinearFactor) -> None:
-        """Add the predicted frame; solve if there is more than the prediction itself."""
-        window = self._window
-        window.append(predicted, *factors)
+    def _append(
+        self, frame: WindowFrame, predicted: InertialState, imu_factor: gtsam.NonlinearFactor
+    ) -> None:
         try:
-            self.state = window.solve(predicted.stamp) if len(factors) > 1 else predicted
-            if len(window) > self.config.lag:
-                window.forget()
-        except (RuntimeError, np.linalg.LinAlgError):
+            self.state = self._window.append(frame, predicted, imu_factor)
+        except _UNSOLVABLE:
             self.restarts += 1
             self._start(predicted)
 
 
-def _array(name: str, value: FloatArray | None, shape: tuple[int, ...] = (3,)) -> FloatArray:
-    """Finite numbers; None is zero."""
-    array = np.zeros(shape) if value is None else np.asarray(value, dtype=np.float64)
-    if array.shape != shape or not np.isfinite(array).all():
-        raise InputError(f"{name}: expected finite numbers of shape {shape}, got {value!r}")
-    return array
+def _pose_covariance(to_lidar: FloatArray, sigmas: tuple[float, float]) -> FloatArray:
+    """(6, 6) of the IMU from standard deviations (rad, m) of the lidar."""
+    from_lidar = np.linalg.inv(to_lidar)
+    covariance: FloatArray = from_lidar * np.repeat(np.square(sigmas), 3) @ from_lidar.T
+    return covariance
 
 
-def _positive(*sigmas: float) -> None:
+def _start_state(
+    state: InertialState,
+    map_T_imu: gtsam.Pose3,
+    velocity: FloatArray,
+    pose_covariance: FloatArray,
+    velocity_covariance: FloatArray,
+) -> InertialState:
+    """The first state of a window: another pose and velocity, with the rest of ``state``."""
+    covariance = np.zeros((STATE, STATE))
+    covariance[REST, REST] = state.covariance[REST, REST]
+    covariance[POSE, POSE] = pose_covariance
+    covariance[VELOCITY, VELOCITY] = velocity_covariance
+    return replace(state, map_T_imu=map_T_imu, velocity=velocity, covariance=covariance)
+
+
+def _updated(covariance: FloatArray, rows: FloatArray, expected: FloatArray) -> FloatArray:
+    """Covariance (6, 6) after measurements of unit noise with the Jacobian ``rows`` (M, 6).
+
+    Parameters
+    ----------
+    expected : (M, M) covariance of the innovation
+    """
+    gain = np.linalg.solve(expected, rows @ covariance).T
+    left = np.eye(6) - gain @ rows
+    updated: FloatArray = left @ covariance @ left.T + gain @ gain.T
+    return updated + _LEAST_SIGMA**2 * np.eye(6)
+
+
+def _rest_covariance(
+    gravity: FloatArray, acceleration_bias_sigma: float, gyro_bias_sigma: float, sigma: float
+) -> FloatArray:
+    """(18, 18) of a state of which only biases and gravity are filled in; ``sigma`` in rad."""
+    size = float(np.linalg.norm(gravity))
+    covariance = np.zeros((STATE, STATE))
+    sigmas = [acceleration_bias_sigma, gyro_bias_sigma]
+    covariance[BIASES, BIASES] = np.diag(np.repeat(np.square(sigmas), 3))
+    along = np.outer(gravity, gravity) / size**2
+    across = np.eye(3) - along
+    covariance[GRAVITY, GRAVITY] = _MAGNITUDE_SIGMA**2 * along + (size * sigma) ** 2 * across
+    return covariance
+
+
+def _has_inverse(matrix: FloatArray) -> bool:
+    try:
+        return bool(np.isfinite(np.linalg.inv(matrix)).all())
+    except np.linalg.LinAlgError:
+        return False
+
+
+def _check_positive(*sigmas: float) -> None:
     if not all(sigma > 0.0 for sigma in sigmas):
         raise InputError(
             f"sigmas: expected all above 0, got {sigmas}; a small one says that it is known"

@@ -29,7 +29,16 @@ _BLOCK = 1e-6
 whole block may be zero up to rounding."""
 
 
-def pieces_between(
+def samples_between(samples: ImuSamples, start: int, stop: int) -> ImuSamples:
+    """Gyro and acceleration from ``start`` to ``stop`` and one sample on either side, copied."""
+    stamps = samples.stamps
+    first, last = np.searchsorted(stamps, start, "right"), np.searchsorted(stamps, stop)
+    part = slice(int(first) - 1, int(last) + 1)
+    gyro, acceleration = samples.gyro[part].copy(), samples.acceleration[part].copy()
+    return ImuSamples(stamps[part].copy(), None, gyro, acceleration)
+
+
+def integration_steps(
     samples: ImuSamples, start: int, stop: int, max_gap: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Pieces of constant rate between the samples, from ``start`` to ``stop`` exactly.
@@ -61,20 +70,18 @@ def pieces_between(
     if not len(stamps) or stamps[0] > start or stamps[-1] < stop:
         have = f"{stamps[0]} to {stamps[-1]}" if len(stamps) else "none"
         raise SweepError(f"IMU samples: expected to cover {start} to {stop}, got {have}")
-    used = slice(
-        int(np.searchsorted(stamps, start, "right")) - 1, int(np.searchsorted(stamps, stop)) + 1
-    )
-    gaps = np.diff(stamps[used])
+    used = samples_between(samples, start, stop)
+    gaps = np.diff(used.stamps)
     if gaps.min() <= 0 or gaps.max() > round(max_gap * 1e9):
         raise SweepError(
             f"IMU samples: expected steps above 0 and up to {max_gap:g} s, "
             f"got {gaps.min() * 1e-9:g} to {gaps.max() * 1e-9:g} s"
         )
-    values = np.hstack([samples.gyro[used], samples.acceleration[used]])
+    values = np.hstack([used.gyro, used.acceleration])
     if not np.isfinite(values).all():
         raise SweepError("IMU samples: expected finite values")
     # Offsets in integers first: floats do not hold nanoseconds since 1970.
-    times = (stamps[used] - start) * 1e-9
+    times = (used.stamps - start) * 1e-9
     knots = np.concatenate([[0.0], times[1:-1], [(stop - start) * 1e-9]])
     joined = np.stack([np.interp(knots, times, column) for column in values.T], axis=1)
     means = 0.5 * (joined[1:] + joined[:-1])
@@ -97,7 +104,7 @@ def preintegration_parameters(
     return parameters
 
 
-def propagate(factor: gtsam.GaussianFactor, covariance: FloatArray) -> FloatArray:
+def propagated_covariance(factor: gtsam.GaussianFactor, covariance: FloatArray) -> FloatArray:
     """Covariance (18, 18) of the next state from that of the last one, equation (2).
 
     The whitened factor says ``A e + C e_next = w`` with unit normal w, where ``e`` holds the last
@@ -106,12 +113,16 @@ def propagate(factor: gtsam.GaussianFactor, covariance: FloatArray) -> FloatArra
     jacobian = factor.jacobian()[0]
     # Columns as the factor has its keys: X, V, next X, next V, B, next B, G.
     x, v, next_x, next_v, b, next_b, g = np.split(jacobian, [6, 9, 15, 18, 24, 30], axis=1)
-    root = np.linalg.inv(np.hstack([next_x, next_v, next_b]))
+    try:
+        root = np.linalg.inv(np.hstack([next_x, next_v, next_b]))
+    except np.linalg.LinAlgError as error:
+        raise SweepError(f"IMU samples: their motion has no covariance: {error}") from error
     transition = np.zeros((STATE, STATE))
-    transition[:15] = -root @ np.hstack([x, v, b, g])
-    transition[GRAVITY, GRAVITY] = np.eye(3)
-    moved: FloatArray = transition @ covariance @ transition.T
-    moved[:15, :15] += root @ root.T
+    with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples
+        transition[:15] = -root @ np.hstack([x, v, b, g])
+        transition[GRAVITY, GRAVITY] = np.eye(3)
+        moved: FloatArray = transition @ covariance @ transition.T
+        moved[:15, :15] += root @ root.T
     return moved
 
 
@@ -153,7 +164,7 @@ def scan_factor(
 
     Parameters
     ----------
-    root, offset : (M, 6) and (M,), see :func:`square_root`
+    root, offset : (M, 6) and (M,), see :func:`information_root`
     """
 
     def call(
@@ -168,7 +179,9 @@ def scan_factor(
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), [key], call)
 
 
-def square_root(information: FloatArray, gradient: FloatArray) -> tuple[FloatArray, FloatArray]:
+def information_root(
+    information: FloatArray, gradient: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """S (M, 6) and c (M,) with ``|S e - c|^2 = e' information e - 2 gradient' e + constant``.
 
     M is the rank; a gradient along directions without information is left out.

@@ -31,7 +31,8 @@ _DISAGREEMENT = (np.radians(0.3), 0.5)
 """Gyro and scan disagree about a frame if they differ by more than this angle plus this share of
 the turn: far above the noise of either, below what a wrong axis or sign makes."""
 _DISTRUST = 5
-"""Frames of disagreement, less those of agreement, after which the gyro is not used."""
+"""Number of frames in which gyro and scan disagree, less the number in which they agree, from which
+on the gyro is not used."""
 _SCAN_VARIANCE = 4.0
 """By which the scan's information is divided before pre-integration believes it: errors of scans
 against one map last over frames (built-in scenes: mean squared errors of 1 to 4 times the
@@ -39,15 +40,16 @@ information's over 10 to 50 frames)."""
 
 
 class ImuTracker:
-    """Use of an IMU in mapping, as ``config`` says.
+    """The IMU's part in mapping, and what it has learnt from the frames so far.
 
     Parameters
     ----------
-    buffer : samples may be added to it at any time
+    config : section ``imu``
+    buffer : the samples; more may be added at any time
 
     Attributes
     ----------
-    level : which way is up in the map; None until there is an orientation
+    level : up in the map; None until there is an orientation
     """
 
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
@@ -83,16 +85,16 @@ class ImuTracker:
         return None if gyro is None else gyro.rotation_between(first, second)
 
     def first_pose(self, stamp: int, given: gtsam.Pose3 | None = None) -> gtsam.Pose3:
-        """Where the first sweep is: at the origin, of a map whose z axis points up if wanted.
+        """Pose of the first sweep: the origin of a map whose z axis points up, if configured.
 
         Parameters
         ----------
         stamp : nanoseconds
-        given : where a user wants it, in a map of the user's own; up is then found in that map
+        given : pose that a user wants, in a map of the user's own; up is then found in that map
         """
-        still = self.buffer.rest_at(stamp)
-        if still is not None:
-            self.buffer.gyro_bias = still.gyro
+        rest = self.buffer.rest_at(stamp)
+        if rest is not None:
+            self.buffer.gyro_bias = rest.gyro
         levelled = self.config.level and given is None
         pose = gtsam.Pose3() if given is None else given
         self.level = find_level(self.buffer, self.config, stamp, pose, levelled=levelled)
@@ -107,14 +109,14 @@ class ImuTracker:
             self.level = find_level(self.buffer, self.config, stamp, map_T_lidar, levelled=False)
 
     def factors(self, stamp: int) -> Sequence[gtsam.NonlinearFactor]:
-        """Factors on the pose of a moment that are known before the solve: mode ``sigma``."""
+        """Factors on the pose of a moment for the solve itself: only with ``imu.prior: sigma``."""
         measured = self._attitude(stamp)
         if self.config.prior != "sigma" or measured is None:
             return ()
         return (self._gravity(measured),)
 
     def add_tilt(self, stamp: int, solution: Solution) -> tuple[Solution, TiltPrior]:
-        """Bring roll and pitch into the solution for a moment, where they are a factor."""
+        """Add the IMU's roll and pitch to the solution of a moment, in the modes with a factor."""
         config = self.config
         if config.prior in ("off", "blend"):
             return solution, TiltPrior.NONE
@@ -136,7 +138,7 @@ class ImuTracker:
         return replace(solution, map_T_lidar=pose, information=information), tilt
 
     def blend_tilt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> tuple[gtsam.Pose3, TiltPrior]:
-        """LOAM's blend of the pose of a moment, if that is the mode."""
+        """Blend roll and pitch into the pose of a moment: only with ``imu.prior: blend``."""
         if self.config.prior != "blend":
             return map_T_lidar, TiltPrior.NONE
         measured = self._attitude(stamp)
@@ -150,11 +152,11 @@ class ImuTracker:
         return blend(map_T_lidar, measured, self.config.weight, up), TiltPrior.BLEND
 
     def compare_gyro(self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3]) -> None:
-        """Learn the gyro's bias from two solved poses; give up a gyro that turns otherwise.
+        """Learn the gyro's bias from two solved poses; distrust a gyro that contradicts them.
 
         Parameters
         ----------
-        last, now : stamp and pose
+        last, now : stamps and poses of the middles of two sweeps
         """
         turned = self.buffer.rotation_between(last[0], now[0])
         if turned is None or now[0] <= last[0]:  # sweeps of unlike length
@@ -171,9 +173,10 @@ class ImuTracker:
         self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
 
     def predict(self, stamp: int) -> Prediction | None:
-        """Pose, velocity and covariance of a moment by pre-integration; None if not to be had.
+        """Pose, velocity and covariance of a moment by pre-integration; None without prediction.
 
-        To be called once a frame, before :meth:`observe` of the same stamp.
+        There is none before the first :meth:`observe`, and none if the samples have a gap or are
+        absurd. To be called once a frame, before :meth:`observe` of the same stamp.
         """
         self._predicted = None
         if self._inertial is None:
@@ -193,26 +196,29 @@ class ImuTracker:
         now: tuple[int, gtsam.Pose3],
         information: FloatArray,
     ) -> None:
-        """What the scan alone said about a moment, for the predictions to come.
+        """Take in what the scan alone said about a moment, for the predictions to come.
 
         Parameters
         ----------
-        last, now : stamp and pose, the middles of two sweeps
+        last, now : stamps and poses of the middles of two sweeps, both solved
         information : (6, 6) of the second, zero along directions in which the scan is not believed
         """
-        if not self.config.preintegration or self.level is None:
-            return
         stamp, pose = now
-        if self._inertial is not None and self._predicted == stamp:
-            self._inertial.update(pose, information / _SCAN_VARIANCE)
+        if not self.config.preintegration or self.level is None or stamp <= last[0]:
             return
-        velocity = (pose.translation() - last[1].translation()) / ((stamp - last[0]) * 1e-9)
-        if self._inertial is None:
+        try:
+            if self._inertial is not None and self._predicted == stamp:
+                self._inertial.update(pose, information / _SCAN_VARIANCE)
+                return
+            velocity = (pose.translation() - last[1].translation()) / ((stamp - last[0]) * 1e-9)
+            if self._inertial is not None:
+                self._inertial.restart(stamp, pose, velocity)
+                return
             gravity = -self.config.gravity * self.level.map_up
             bias = self.buffer.gyro_bias
             self._inertial = InertialOdometry(self.config, gravity, stamp, pose, velocity, bias)
-        else:
-            self._inertial.restart(stamp, pose, velocity)
+        except SweepError:  # no window can begin here: with the next frame, then
+            self._inertial = None
 
     def _attitude(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar``, None if there is none or if up is not known in the map."""

@@ -7,17 +7,18 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.imu import START, part
 
 from loam_gtsam.config import ImuConfig, SolverConfig
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.level import Level
 from loam_gtsam.imu_prior import roll_pitch, roll_pitch_jacobian, tilt_information
+from loam_gtsam.io.state import freeze
 from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import ImuSamples, TiltPrior
 
-START = 1_700_000_000_000_000_000
 NOW = START + 500_000_000
 FRAME = 100_000_000
 SOLVER = GtsamSolver(SolverConfig(rotation_tolerance_deg=1e-9, translation_tolerance=1e-9))
@@ -37,17 +38,13 @@ def seen_by_imu(world_R_lidar, *, seconds=1.0, rate=(0.0, 0.0, 0.0), bias=(0.0, 
     return ImuSamples(stamps, attitude.as_quat(), gyro, attitude.inv().apply([0.0, 0.0, 9.81]))
 
 
-def part(samples, index):
-    return ImuSamples(*(getattr(samples, item.name)[index] for item in dataclasses.fields(samples)))
-
-
-def aid_for(measured, level_R_map=None, **config):
-    """An aid that knows up in the map; ``measured`` is the IMU's rotation or its samples."""
+def tracker_for(measured, level_R_map=None, **config):
+    """A tracker that knows up in the map; ``measured`` is the IMU's rotation or its samples."""
     samples = seen_by_imu(measured) if isinstance(measured, gtsam.Rot3) else measured
     config = ImuConfig(**config)
-    aid = ImuTracker(config, ImuBuffer(config, samples))
-    aid.level = Level(level_R_map or gtsam.Rot3(), 0.0, 0.0, 1, "still")
-    return aid
+    tracker = ImuTracker(config, ImuBuffer(config, samples))
+    tracker.level = Level(level_R_map or gtsam.Rot3(), 0.0, 0.0, 1, "still")
+    return tracker
 
 
 def scene(rng, map_T_lidar, n_edges=40, n_planes=250):
@@ -114,9 +111,9 @@ def test_scan_and_imu_meet_at_the_mean_of_the_blend(weight):
         level_R_lidar = rot(*tilt, rng.uniform(-180, 180))
         truth = gtsam.Pose3(level_R_map.inverse().compose(level_R_lidar), rng.normal(0, 30, 3))
         measured = rot(*(tilt + rng.uniform(-1, 1, 2)), rng.uniform(-180, 180))
-        aid = aid_for(measured, level_R_map, prior="equivalent", weight=weight)
+        tracker = tracker_for(measured, level_R_map, prior="equivalent", weight=weight)
         solution = solve(rng, truth)
-        found, tilt_prior = aid.add_tilt(NOW, solution)
+        found, tilt_prior = tracker.add_tilt(NOW, solution)
         assert tilt_prior is TiltPrior.EQUIVALENT
         before = roll_pitch(level_R_map.compose(solution.map_T_lidar.rotation()))
         after = roll_pitch(level_R_map.compose(found.map_T_lidar.rotation()))
@@ -127,7 +124,7 @@ def test_scan_and_imu_meet_at_the_mean_of_the_blend(weight):
 
 def test_the_information_grows_by_that_of_the_prior():
     solution = solve(np.random.default_rng(2), gtsam.Pose3())
-    found, _ = aid_for(rot(0.01, -0.02, 0), weight=0.2).add_tilt(NOW, solution)
+    found, _ = tracker_for(rot(0.01, -0.02, 0), weight=0.2).add_tilt(NOW, solution)
     jacobian = roll_pitch_jacobian(solution.map_T_lidar.rotation())
     knows = tilt_information(solution.information, solution.map_T_lidar.rotation())
     expected = solution.information + 0.25 * jacobian.T @ knows @ jacobian
@@ -153,9 +150,9 @@ def vague(sigma_deg):
 )
 def test_gravity_takes_over_where_the_scan_knows_less_than_the_imu(sigma_deg, tilt, share):
     """The worked example of docs/maths/imu_prior.md."""
-    aid = aid_for(rot(0.1, 0, 0), sigma_deg=0.5, weight=0.002)
+    tracker = tracker_for(rot(0.1, 0, 0), sigma_deg=0.5, weight=0.002)
     solution = with_information(gtsam.Pose3(), vague(sigma_deg))
-    found, by = aid.add_tilt(NOW, solution)
+    found, by = tracker.add_tilt(NOW, solution)
     assert by is tilt
     moved = np.degrees(roll_pitch(found.map_T_lidar.rotation()))
     np.testing.assert_allclose(moved, [0.1 * share, 0.0], atol=1e-6)
@@ -167,19 +164,19 @@ def test_gravity_takes_over_where_the_scan_knows_less_than_the_imu(sigma_deg, ti
 def test_what_only_the_expected_motion_says_about_the_tilt_does_not_count():
     """Roll is in the information, but it is a direction that the solver found to be weak."""
     solution = with_information(gtsam.Pose3(), 1e6 * np.eye(6))
-    aid = aid_for(rot(0.1, 0, 0))
-    assert aid.add_tilt(NOW, solution)[1] is TiltPrior.EQUIVALENT
+    tracker = tracker_for(rot(0.1, 0, 0))
+    assert tracker.add_tilt(NOW, solution)[1] is TiltPrior.EQUIVALENT
     blind = dataclasses.replace(solution, weak=np.diag([1.0, 0, 0, 0, 0, 0]))
-    assert aid.add_tilt(NOW, blind)[1] is TiltPrior.GRAVITY
+    assert tracker.add_tilt(NOW, blind)[1] is TiltPrior.GRAVITY
     forward = dataclasses.replace(solution, weak=np.diag([0, 0, 0, 1.0, 0, 0]))
-    assert aid.add_tilt(NOW, forward)[1] is TiltPrior.EQUIVALENT
+    assert tracker.add_tilt(NOW, forward)[1] is TiltPrior.EQUIVALENT
 
 
 def test_a_scan_that_says_nothing_about_the_tilt_gets_it_from_gravity():
     """A wall straight ahead fixes pitch and yaw, and a roll about its normal not at all."""
     information = np.diag([0.0, 1e6, 1e6, 1e6, 0.0, 0.0])
     solution = with_information(gtsam.Pose3(), information)
-    found, tilt = aid_for(rot(3, 0, 0)).add_tilt(NOW, solution)
+    found, tilt = tracker_for(rot(3, 0, 0)).add_tilt(NOW, solution)
     assert tilt is TiltPrior.GRAVITY
     assert np.isfinite(found.information).all()
     np.testing.assert_allclose(
@@ -195,14 +192,14 @@ def test_a_scan_that_says_nothing_about_the_tilt_gets_it_from_gravity():
 def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
     rng = np.random.default_rng(3)
     measured = rot(0.02, -0.03, 0)
-    aid = aid_for(measured, prior="sigma", sigma_deg=sigma_deg)
+    tracker = tracker_for(measured, prior="sigma", sigma_deg=sigma_deg)
     seed = int(rng.integers(1000))
     truth = gtsam.Pose3(rot(0, 0, 40), np.array([10.0, 0.0, 0.0]))
     alone = solve(np.random.default_rng(seed), truth)
-    factors = aid.factors(NOW)
+    factors = tracker.factors(NOW)
     assert len(factors) == 1
     both = solve(np.random.default_rng(seed), truth, factors)
-    same, tilt = aid.add_tilt(NOW, both)
+    same, tilt = tracker.add_tilt(NOW, both)
     assert tilt is TiltPrior.GRAVITY
     assert same is both  # it was in the solve
     jacobian = roll_pitch_jacobian(alone.map_T_lidar.rotation())
@@ -217,28 +214,28 @@ def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
 
 def test_only_sigma_is_a_factor_of_the_solve():
     for prior in ("off", "blend", "equivalent"):
-        assert aid_for(rot(1, 0, 0), prior=prior).factors(NOW) == ()
-    assert len(aid_for(rot(1, 0, 0), prior="sigma").factors(NOW)) == 1
+        assert tracker_for(rot(1, 0, 0), prior=prior).factors(NOW) == ()
+    assert len(tracker_for(rot(1, 0, 0), prior="sigma").factors(NOW)) == 1
 
 
 # -- off and blend ---------------------------------------------------------------------------------
 
 
 def test_off_leaves_the_pose():
-    aid = aid_for(rot(5, 0, 0), prior="off")
+    tracker = tracker_for(rot(5, 0, 0), prior="off")
     solution = solve(np.random.default_rng(4), gtsam.Pose3())
-    assert aid.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
-    pose, tilt = aid.blend_tilt(NOW, solution.map_T_lidar)
+    assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
+    pose, tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)
     assert pose is solution.map_T_lidar
     assert tilt is TiltPrior.NONE
 
 
 def test_blend_is_done_after_the_solve():
     level_R_map = rot(-4, 3, 10)
-    aid = aid_for(rot(5, -2, 0), level_R_map, prior="blend", weight=0.1)
+    tracker = tracker_for(rot(5, -2, 0), level_R_map, prior="blend", weight=0.1)
     solution = solve(np.random.default_rng(5), gtsam.Pose3(level_R_map.inverse(), np.ones(3)))
-    assert aid.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
-    pose, tilt = aid.blend_tilt(NOW, solution.map_T_lidar)
+    assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
+    pose, tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)
     assert tilt is TiltPrior.BLEND
     before = roll_pitch(level_R_map.compose(solution.map_T_lidar.rotation()))
     after = roll_pitch(level_R_map.compose(pose.rotation()))
@@ -259,9 +256,11 @@ def test_the_tilt_of_a_frame_is_the_mean_over_its_sweep(seconds, least, most):
     errors = []
     for step in range(-8, 9):
         stamp = NOW + step * 20_000_000
-        aid = aid_for(noisy, prior="blend", weight=0.999, average_seconds=seconds)
-        exact = aid_for(samples, prior="blend", weight=0.999, average_seconds=0.0)
-        found, true = (one.blend_tilt(stamp, gtsam.Pose3())[0].rotation() for one in (aid, exact))
+        tracker = tracker_for(noisy, prior="blend", weight=0.999, average_seconds=seconds)
+        exact = tracker_for(samples, prior="blend", weight=0.999, average_seconds=0.0)
+        found, true = (
+            one.blend_tilt(stamp, gtsam.Pose3())[0].rotation() for one in (tracker, exact)
+        )
         errors.append(1e3 * (roll_pitch(found) - roll_pitch(true)))
     spread = float(np.sqrt(np.mean(np.square(errors))))  # mrad
     assert least < spread < most
@@ -270,17 +269,17 @@ def test_the_tilt_of_a_frame_is_the_mean_over_its_sweep(seconds, least, most):
 @pytest.mark.parametrize("pitch", [90.0, -90.0, 85.01, -85.01])
 @pytest.mark.parametrize("prior", ["equivalent", "blend"])
 def test_near_a_pitch_of_90_degrees_the_gravity_direction_takes_over(pitch, prior):
-    aid = aid_for(rot(20, pitch, 0), prior=prior, weight=0.1)
+    tracker = tracker_for(rot(20, pitch, 0), prior=prior, weight=0.1)
     pose = gtsam.Pose3(rot(22, np.sign(pitch) * 89.0, 50), np.ones(3))
     solution = solve(np.random.default_rng(6), pose)
     if prior == "equivalent":
-        found, tilt = aid.add_tilt(NOW, solution)
+        found, tilt = tracker.add_tilt(NOW, solution)
         assert np.isfinite(found.information).all()
         found = found.map_T_lidar
     else:
-        found, tilt = aid.blend_tilt(NOW, solution.map_T_lidar)
+        found, tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)
     assert tilt is TiltPrior.GRAVITY
-    imu_up = aid.buffer.orientation(NOW).matrix()[2]
+    imu_up = tracker.buffer.orientation(NOW).matrix()[2]
 
     def away(at):
         return np.arccos(np.clip(at.rotation().matrix()[2] @ imu_up, -1, 1))
@@ -296,18 +295,18 @@ def test_a_steep_pitch_counts_however_well_the_scan_knows_it(steep):
     pitches = (85.2, 84.0) if steep == "pose" else (84.0, 85.2)
     pose = gtsam.Pose3(rot(20, pitches[0], 50), np.ones(3))
     solution = with_information(pose, 1e9 * np.eye(6))
-    assert aid_for(rot(20, pitches[1], 0)).add_tilt(NOW, solution)[1] is TiltPrior.GRAVITY
+    assert tracker_for(rot(20, pitches[1], 0)).add_tilt(NOW, solution)[1] is TiltPrior.GRAVITY
     below = dataclasses.replace(solution, map_T_lidar=gtsam.Pose3(rot(20, 84.0, 50), np.ones(3)))
-    assert aid_for(rot(20, 84.0, 0)).add_tilt(NOW, below)[1] is TiltPrior.EQUIVALENT
+    assert tracker_for(rot(20, 84.0, 0)).add_tilt(NOW, below)[1] is TiltPrior.EQUIVALENT
 
 
 @pytest.mark.parametrize("prior", ["equivalent", "blend"])
 def test_below_85_degrees_it_is_the_mode_itself(prior):
-    aid = aid_for(rot(20, 84.0, 0), prior=prior)
+    tracker = tracker_for(rot(20, 84.0, 0), prior=prior)
     solution = solve(np.random.default_rng(6), gtsam.Pose3(rot(20, 84.5, 50), np.ones(3)))
-    tilt = aid.add_tilt(NOW, solution)[1]
+    tilt = tracker.add_tilt(NOW, solution)[1]
     if prior == "blend":
-        tilt = aid.blend_tilt(NOW, solution.map_T_lidar)[1]
+        tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)[1]
     assert tilt == prior
 
 
@@ -318,7 +317,7 @@ def test_nothing_jumps_where_the_modes_take_turns():
     for pitch in (84.9, 84.99, 85.01, 85.1):
         measured = rot(10.2, pitch - 0.2, 0)
         solution = with_information(gtsam.Pose3(rot(10, pitch, 30), np.zeros(3)), information)
-        found, _ = aid_for(measured).add_tilt(NOW, solution)
+        found, _ = tracker_for(measured).add_tilt(NOW, solution)
         turned.append(solution.map_T_lidar.localCoordinates(found.map_T_lidar)[:3])
     steps = np.linalg.norm(np.diff(turned, axis=0), axis=1)
     assert np.degrees(steps.max()) < 0.02 * 0.2
@@ -332,15 +331,15 @@ def test_nothing_jumps_where_the_modes_take_turns():
 def test_in_a_gap_the_prior_is_dropped(prior, gap):
     samples = seen_by_imu(rot(1, 0, 0))
     away = np.abs(samples.stamps - NOW) * 1e-9
-    aid = aid_for(part(samples, away >= 0.5 * gap - 0.001), prior=prior, max_gap=0.1)
+    tracker = tracker_for(part(samples, away >= 0.5 * gap - 0.001), prior=prior, max_gap=0.1)
     solution = solve(np.random.default_rng(7), gtsam.Pose3())
-    found, tilt = aid.add_tilt(NOW, solution)
+    found, tilt = tracker.add_tilt(NOW, solution)
     pose = found.map_T_lidar
     if prior == "blend":
-        pose, tilt = aid.blend_tilt(NOW, pose)
+        pose, tilt = tracker.blend_tilt(NOW, pose)
     dropped = gap > 0.1
     assert (tilt is TiltPrior.DROPPED) is dropped
-    assert len(aid.factors(NOW)) == (prior == "sigma" and not dropped)
+    assert len(tracker.factors(NOW)) == (prior == "sigma" and not dropped)
     if prior != "sigma":
         assert close(pose, solution.map_T_lidar) is dropped
 
@@ -349,19 +348,19 @@ def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_
     samples = seen_by_imu(rot(4, 3, 0), seconds=2.0)
     late = part(samples, samples.stamps >= NOW + FRAME)
     config = ImuConfig()
-    aid = ImuTracker(config, ImuBuffer(config, late))
-    assert close(aid.first_pose(NOW), gtsam.Pose3())
+    tracker = ImuTracker(config, ImuBuffer(config, late))
+    assert close(tracker.first_pose(NOW), gtsam.Pose3())
     solution = solve(np.random.default_rng(8), gtsam.Pose3())
-    assert aid.add_tilt(NOW, solution) == (solution, TiltPrior.DROPPED)
-    aid.find_level(NOW, solution.map_T_lidar)
-    assert aid.level is None
-    aid.find_level(NOW + 2 * FRAME, solution.map_T_lidar)
-    found = roll_pitch(aid.level.level_R_map.compose(solution.map_T_lidar.rotation()))
+    assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.DROPPED)
+    tracker.find_level(NOW, solution.map_T_lidar)
+    assert tracker.level is None
+    tracker.find_level(NOW + 2 * FRAME, solution.map_T_lidar)
+    found = roll_pitch(tracker.level.level_R_map.compose(solution.map_T_lidar.rotation()))
     np.testing.assert_allclose(np.degrees(found), [4, 3], atol=1e-6)
-    level = aid.level
-    aid.find_level(NOW + 3 * FRAME, gtsam.Pose3(rot(0, 20, 0), np.zeros(3)))
-    assert aid.level is level  # once is for all
-    assert aid.add_tilt(NOW + 3 * FRAME, solution)[1] is TiltPrior.EQUIVALENT
+    level = tracker.level
+    tracker.find_level(NOW + 3 * FRAME, gtsam.Pose3(rot(0, 20, 0), np.zeros(3)))
+    assert tracker.level is level  # once is for all
+    assert tracker.add_tilt(NOW + 3 * FRAME, solution)[1] is TiltPrior.EQUIVALENT
 
 
 # -- the start -------------------------------------------------------------------------------------
@@ -384,13 +383,13 @@ def test_a_map_that_is_not_levelled_knows_up_too(level, given):
     """With a start of the user's own, that one counts."""
     samples = seen_by_imu(rot(4, -3, 77))
     config = ImuConfig(level=level)
-    aid = ImuTracker(config, ImuBuffer(config, samples))
-    pose = aid.first_pose(NOW, given)
+    tracker = ImuTracker(config, ImuBuffer(config, samples))
+    pose = tracker.first_pose(NOW, given)
     if given is not None:
         assert pose is given
     elif not level:
         assert close(pose, gtsam.Pose3())
-    found = roll_pitch(aid.level.level_R_map.compose(pose.rotation()))
+    found = roll_pitch(tracker.level.level_R_map.compose(pose.rotation()))
     np.testing.assert_allclose(np.degrees(found), [4, -3], atol=1e-6)
 
 
@@ -398,10 +397,10 @@ def test_a_map_that_is_not_levelled_knows_up_too(level, given):
 def test_a_rest_at_the_start_gives_the_bias_of_the_gyro(rate, bias):
     samples = seen_by_imu(rot(0, 0, 0), rate=(0, 0, rate), bias=(0, 0, bias))
     config = ImuConfig()
-    aid = ImuTracker(config, ImuBuffer(config, samples))
-    aid.first_pose(NOW)
-    np.testing.assert_allclose(aid.buffer.gyro_bias, [0, 0, bias], atol=1e-12)
-    assert aid.level.source == ("moving" if rate else "still")
+    tracker = ImuTracker(config, ImuBuffer(config, samples))
+    tracker.first_pose(NOW)
+    np.testing.assert_allclose(tracker.buffer.gyro_bias, [0, 0, bias], atol=1e-12)
+    assert tracker.level.source == ("moving" if rate else "still")
 
 
 # -- the gyro against the scans --------------------------------------------------------------------
@@ -415,7 +414,7 @@ def frames(rate, count):
     ]
 
 
-def turning_aid(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):
+def turning_tracker(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):
     config = ImuConfig()
     samples = seen_by_imu(rot(0, 0, 0), seconds=seconds, rate=rate, bias=bias)
     return ImuTracker(config, ImuBuffer(config, samples))
@@ -423,34 +422,34 @@ def turning_aid(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):
 
 def test_the_bias_of_the_gyro_is_learnt():
     rate, bias = (0.05, -0.1, 0.2), (0.02, -0.01, 0.015)
-    aid = turning_aid(rate, bias)
+    tracker = turning_tracker(rate, bias)
     poses = frames(rate, 200)
     for last, now in pairwise(poses):
-        aid.compare_gyro(last, now)
+        tracker.compare_gyro(last, now)
     # 2 % of what is left at every frame, about the axes of the lidar
-    left = np.linalg.norm(aid.buffer.gyro_bias - bias) / np.linalg.norm(bias)
+    left = np.linalg.norm(tracker.buffer.gyro_bias - bias) / np.linalg.norm(bias)
     assert left == pytest.approx(0.98**199, rel=0.1)
-    assert aid.trusted_gyro is aid.buffer
+    assert tracker.trusted_gyro is tracker.buffer
 
 
 def test_a_gyro_that_turns_otherwise_is_given_up_after_five_frames_and_may_come_back():
-    aid = turning_aid((0.0, 0.0, 0.8))
+    tracker = turning_tracker((0.0, 0.0, 0.8))
     wrong, right = frames((0.8, 0.0, 0.0), 30), frames((0.0, 0.0, 0.8), 60)
     for i in range(1, 5):
-        aid.compare_gyro(wrong[i - 1], wrong[i])
-        assert aid.trusted_gyro is aid.buffer
-        assert aid.rotation_between(NOW, NOW + FRAME) is not None
-    aid.compare_gyro(wrong[4], wrong[5])
-    assert aid.trusted_gyro is None
-    assert aid.rotation_between(NOW, NOW + FRAME) is None
-    np.testing.assert_array_equal(aid.buffer.gyro_bias, np.zeros(3))  # nothing learnt from it
+        tracker.compare_gyro(wrong[i - 1], wrong[i])
+        assert tracker.trusted_gyro is tracker.buffer
+        assert tracker.rotation_between(NOW, NOW + FRAME) is not None
+    tracker.compare_gyro(wrong[4], wrong[5])
+    assert tracker.trusted_gyro is None
+    assert tracker.rotation_between(NOW, NOW + FRAME) is None
+    np.testing.assert_array_equal(tracker.buffer.gyro_bias, np.zeros(3))  # nothing learnt from it
     for i in range(6, 30):
-        aid.compare_gyro(wrong[i - 1], wrong[i])
+        tracker.compare_gyro(wrong[i - 1], wrong[i])
     for i in range(31, 36):  # the count of faults is bounded
-        assert aid.trusted_gyro is None
-        aid.compare_gyro(right[i - 1], right[i])
-    aid.compare_gyro(right[35], right[36])
-    assert aid.trusted_gyro is aid.buffer
+        assert tracker.trusted_gyro is None
+        tracker.compare_gyro(right[i - 1], right[i])
+    tracker.compare_gyro(right[35], right[36])
+    assert tracker.trusted_gyro is tracker.buffer
 
 
 @pytest.mark.parametrize(("degrees", "agrees"), [(0.29, True), (0.31, False)])
@@ -461,29 +460,29 @@ def test_how_much_gyro_and_scan_may_differ(degrees, agrees):
         config = ImuConfig()
         off = by_scan + np.radians([0.0, 0.0, degrees + 0.5 * turn])
         samples = seen_by_imu(rot(0, 0, 0), seconds=3.0, rate=tuple(off / 0.1))
-        aid = ImuTracker(config, ImuBuffer(config, samples))
+        tracker = ImuTracker(config, ImuBuffer(config, samples))
         poses = frames(by_scan / 0.1, 6)
         for last, now in pairwise(poses):
-            aid.compare_gyro(last, now)
-            aid.buffer.gyro_bias = np.zeros(3)
-        assert (aid.trusted_gyro is not None) is agrees
+            tracker.compare_gyro(last, now)
+            tracker.buffer.gyro_bias = np.zeros(3)
+        assert (tracker.trusted_gyro is not None) is agrees
 
 
 def test_frames_that_cannot_be_compared_teach_nothing():
-    aid = turning_aid((0.0, 0.0, 0.8), seconds=2.0)
+    tracker = turning_tracker((0.0, 0.0, 0.8), seconds=2.0)
     pose = gtsam.Pose3()
     beyond = START + 5 * 10**9
     for first, second in ((NOW, NOW), (NOW + FRAME, NOW), (beyond, beyond + FRAME)):
         for _ in range(6):
-            aid.compare_gyro((first, pose), (second, pose))
-    np.testing.assert_array_equal(aid.buffer.gyro_bias, np.zeros(3))
-    assert aid.trusted_gyro is aid.buffer
-    aid.compare_gyro((NOW, pose), (NOW + FRAME, gtsam.Pose3(gtsam.Rot3.Yaw(0.07), np.zeros(3))))
-    assert aid.buffer.gyro_bias.any()
+            tracker.compare_gyro((first, pose), (second, pose))
+    np.testing.assert_array_equal(tracker.buffer.gyro_bias, np.zeros(3))
+    assert tracker.trusted_gyro is tracker.buffer
+    tracker.compare_gyro((NOW, pose), (NOW + FRAME, gtsam.Pose3(gtsam.Rot3.Yaw(0.07), np.zeros(3))))
+    assert tracker.buffer.gyro_bias.any()
 
 
 def test_factors_are_on_the_pose_of_the_frame():
-    (factor,) = aid_for(rot(1, 0, 0), prior="sigma").factors(NOW)
+    (factor,) = tracker_for(rot(1, 0, 0), prior="sigma").factors(NOW)
     assert list(factor.keys()) == [POSE_KEY]
 
 
@@ -504,18 +503,18 @@ def at(frame, acceleration):
     return NOW + frame * FRAME, gtsam.Pose3(gtsam.Rot3(), np.array([along, 0.0, 0.0]))
 
 
-def observed(aid, frames, acceleration, information):
+def observed(tracker, frames, acceleration, information):
     for last, now in pairwise(frames):
-        aid.predict(at(now, acceleration)[0])
-        aid.observe(at(last, acceleration), at(now, acceleration), information)
+        tracker.predict(at(now, acceleration)[0])
+        tracker.observe(at(last, acceleration), at(now, acceleration), information)
 
 
 @pytest.mark.parametrize("on", [True, False])
 def test_pre_integration_predicts_what_constant_velocity_cannot(on):
-    aid = aid_for(accelerating(2.0), preintegration=on)
-    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    tracker = tracker_for(accelerating(2.0), preintegration=on)
+    observed(tracker, range(8), 2.0, 1e6 * np.eye(6))
     stamp, truth = at(8, 2.0)
-    predicted = aid.predict(stamp)
+    predicted = tracker.predict(stamp)
     if not on:
         assert predicted is None
         return
@@ -525,16 +524,16 @@ def test_pre_integration_predicts_what_constant_velocity_cannot(on):
 
 
 def test_where_the_scan_says_nothing_the_prediction_runs_on_and_says_so():
-    aid = aid_for(accelerating(2.0), preintegration=True)
-    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
+    tracker = tracker_for(accelerating(2.0), preintegration=True)
+    observed(tracker, range(8), 2.0, 1e6 * np.eye(6))
     blind = np.diag([1e6, 1e6, 1e6, 0.0, 1e6, 1e6])
     sigmas = []
     for last, now in pairwise(range(7, 14)):
-        predicted = aid.predict(at(now, 2.0)[0])
+        predicted = tracker.predict(at(now, 2.0)[0])
         sigmas.append(np.sqrt(predicted.covariance[3, 3]))
         wrong = at(now, 2.0)[1].compose(gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0])))
-        aid.observe(at(last, 2.0), (at(now, 2.0)[0], wrong), blind)
-    predicted = aid.predict(at(14, 2.0)[0])
+        tracker.observe(at(last, 2.0), (at(now, 2.0)[0], wrong), blind)
+    predicted = tracker.predict(at(14, 2.0)[0])
     off = at(14, 2.0)[1].localCoordinates(predicted.map_T_lidar)[3]
     assert abs(off) < min(0.05, 3.0 * np.sqrt(predicted.covariance[3, 3]))
     assert np.all(np.diff(sigmas[1:]) > 0)
@@ -543,8 +542,101 @@ def test_where_the_scan_says_nothing_the_prediction_runs_on_and_says_so():
 def test_a_gap_in_the_imu_leaves_the_prediction_out_and_it_begins_anew():
     samples = accelerating(2.0)
     since = (samples.stamps - NOW) * 1e-9
-    aid = aid_for(part(samples, (since < 0.82) | (since > 1.15)), preintegration=True)
-    observed(aid, range(8), 2.0, 1e6 * np.eye(6))
-    assert aid.predict(at(10, 2.0)[0]) is None
-    observed(aid, range(11, 15), 2.0, 1e6 * np.eye(6))
-    assert aid.predict(at(15, 2.0)[0]) is not None
+    tracker = tracker_for(part(samples, (since < 0.82) | (since > 1.15)), preintegration=True)
+    observed(tracker, range(8), 2.0, 1e6 * np.eye(6))
+    assert tracker.predict(at(10, 2.0)[0]) is None
+    observed(tracker, range(11, 15), 2.0, 1e6 * np.eye(6))
+    assert tracker.predict(at(15, 2.0)[0]) is not None
+
+
+def test_sweeps_whose_middles_are_not_in_order_are_not_observed():
+    """A short sweep that begins late in a long one has its middle before that of the long one."""
+    tracker = tracker_for(accelerating(2.0), preintegration=True)
+    observed(tracker, range(4), 2.0, 1e6 * np.eye(6))
+    stamp, pose = at(3, 2.0)
+    for earlier in (stamp, stamp - 1):
+        assert tracker.predict(earlier) is None
+        tracker.observe((stamp, pose), (earlier, pose), np.eye(6))
+    assert tracker.predict(at(4, 2.0)[0]) is not None
+
+
+@pytest.mark.parametrize("absurd", ["gyro", "acceleration"])
+@pytest.mark.parametrize("size", [1e2, 1e4, 9e5])
+def test_an_imu_that_measures_nonsense_makes_no_prediction_and_ends_no_run(absurd, size):
+    """Up to what the buffer lets in, on top of every second frame."""
+    samples, rng = accelerating(0.0), np.random.default_rng(0)
+    values = getattr(samples, absurd) + size * rng.normal(size=(len(samples.stamps), 3)).clip(-1, 1)
+    bad = dataclasses.replace(samples, **{absurd: values})
+    tracker = tracker_for(bad, preintegration=True, gyro_noise=1e3, acceleration_noise=1e3, lag=2)
+    for last, now in pairwise(range(14)):
+        predicted = tracker.predict(at(now, 0.0)[0])
+        assert predicted is None or np.isfinite(np.linalg.inv(predicted.covariance)).all()
+        tracker.observe(at(last, 0.0), at(now, 0.0), 10.0 ** rng.uniform(0, 15) * np.eye(6))
+
+
+def test_after_a_reset_the_tracker_is_a_new_one_to_the_last_bit():
+    """Level, bias, distrust and pre-integration are forgotten."""
+    rate, bias = (0.0, 0.0, 0.8), (0.02, -0.01, 0.015)
+    samples = seen_by_imu(rot(3, -2, 0), seconds=3.0, rate=rate, bias=bias)
+    config = ImuConfig(preintegration=True)
+
+    def run(tracker):
+        tracker.first_pose(NOW)
+        poses, said = frames(rate, 14), []
+        for last, now in pairwise(poses):
+            predicted = tracker.predict(now[0])
+            if predicted is not None:
+                said += [predicted.map_T_lidar.matrix(), predicted.covariance]
+            tracker.compare_gyro(last, now)
+            tracker.observe(last, now, 1e6 * np.eye(6))
+        assert said
+        return [*said, tracker.buffer.gyro_bias, tracker.level.map_up]
+
+    fresh, used = (ImuTracker(config, ImuBuffer(config, samples)) for _ in range(2))
+    wrong = frames((0.8, 0.0, 0.0), 7)
+    run(used)
+    for last, now in pairwise(wrong):
+        used.compare_gyro(last, now)
+    assert used.trusted_gyro is None
+    used.reset()
+    assert used.trusted_gyro is used.buffer
+    assert (used.level, used.predict(NOW + FRAME)) == (None, None)
+    for one, two in zip(run(used), run(fresh), strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def test_the_state_of_a_run_with_pre_integration_does_not_grow():
+    tracker = tracker_for(accelerating(0.1, seconds=8.0), preintegration=True, lag=5)
+    sizes = []
+    for last, now in pairwise(range(60)):
+        observed(tracker, (last, now), 0.1, 1e6 * np.eye(6))
+        shared = {"samples": tracker.buffer, "config": tracker.config}
+        frozen = freeze({"imu": tracker}, shared)
+        sizes.append(sum(column.nbytes for column in frozen.values()))
+    assert max(sizes[10:]) < 1.03 * min(sizes[10:])
+
+
+@pytest.mark.parametrize("preintegration", [False, True])
+def test_samples_fed_live_and_forgotten_lead_to_the_same(preintegration, monkeypatch):
+    monkeypatch.setattr("loam_gtsam.imu.buffer.MEMORY", 1.0)
+    rate, config = (0.0, 0.1, 0.5), ImuConfig(preintegration=preintegration, prior="blend")
+    samples = seen_by_imu(rot(3, -2, 0), seconds=12.0, rate=rate, bias=(0.02, -0.01, 0.015))
+    at_once = ImuTracker(config, ImuBuffer(config, samples))
+    live = ImuTracker(config, ImuBuffer(config))
+    poses = frames(rate, 100)
+    for last, now in pairwise(poses):
+        since = last[0] + 200_000_000 if last[0] > NOW else START
+        new = (samples.stamps >= since) & (samples.stamps < now[0] + 200_000_000)
+        live.buffer.forget_old(now[0])
+        live.buffer.add(part(samples, new))
+        said = []
+        for tracker in (at_once, live):
+            if last[0] == NOW:
+                tracker.first_pose(NOW)
+            predicted = tracker.predict(now[0])
+            tracker.compare_gyro(last, now)
+            tracker.observe(last, now, 1e6 * np.eye(6))
+            blended = tracker.blend_tilt(*now)[0].matrix()
+            said.append([predicted and predicted.covariance, tracker.buffer.gyro_bias, blended])
+        np.testing.assert_equal(*said)
+    assert len(live.buffer) < 0.6 * len(samples.stamps) < len(at_once.buffer)

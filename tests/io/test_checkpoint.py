@@ -83,7 +83,11 @@ LOOPS = changed(loops={"enabled": True, "min_way": 6.0}, pose_graph={"keyframe_d
 DENSE = changed(pose_graph={"keyframe_distance": 0.5})
 CASES = {
     "plain": ("street_loop?frames=8", Config(), [1, 2, 5]),
-    "imu in the graph": ("corridor?frames=16", changed(imu={"preintegration": True, "lag": 5}), [3, 11]),
+    "imu in the graph": (
+        "corridor?frames=16",
+        changed(imu={"preintegration": True, "lag": 5}),
+        [3, 11],
+    ),
     "scan to scan": ("trees?frames=6", changed(odometry={"method": "scan_to_scan"}), [4]),
     "classical": ("room?frames=8", preset("aloam"), [4]),
     "loops": ("room?frames=60&columns=400&speed=3", LOOPS, [20, 52]),

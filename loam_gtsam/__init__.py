@@ -23,6 +23,7 @@ from loam_gtsam.cubemap import CubeMap as CubeMap
 from loam_gtsam.datasets import Dataset as Dataset
 from loam_gtsam.datasets import DatasetInfo as DatasetInfo
 from loam_gtsam.datasets import open_dataset as open_dataset
+from loam_gtsam.datasets.decode.tables import read_tum as read_tum
 from loam_gtsam.factors import MatchRows as MatchRows
 from loam_gtsam.factors import checked_factor as checked_factor
 from loam_gtsam.factors import concatenate_rows as concatenate_rows
@@ -36,7 +37,6 @@ from loam_gtsam.imu.buffer import ImuBuffer as ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint as Checkpoint
 from loam_gtsam.io.run_files import write_run as write_run
 from loam_gtsam.io.state import checkpointed as checkpointed
-from loam_gtsam.io.trajectories import read_tum as read_tum
 from loam_gtsam.io.trajectories import write_tum as write_tum
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.batch import SavedGraph as SavedGraph

@@ -51,10 +51,10 @@ def as_stamps(value: ArrayLike, name: str) -> IntArray:
     if not stamps.size:
         stamps = stamps.astype(np.int64)
     try:
-        check_array(stamps, name, ("N",), "integers")
+        check_array(stamps, name, ("N",), "integer nanoseconds")
     except InputError as error:
         raise InputError(
-            f"{error}; np.round(seconds * 1e9).astype(np.int64) makes nanoseconds of seconds"
+            f"{error}; np.round(seconds * 1e9).astype(np.int64) makes them of seconds"
         ) from None
     return stamps.astype(np.int64, copy=False)
 

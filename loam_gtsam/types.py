@@ -60,9 +60,9 @@ def check_array(
     value, name : what is checked, and what it is called in ``name: expected (N, 3) floats, got
         shape (7, 4) of float32``
     shape : of the array; a letter stands for any length, as in ``("N", 3)``
-    numbers : "floats", "integers", or "numbers" for either
+    numbers : what they are; only integers, or only floats, if it says so
     """
-    kinds = {"floats": "f", "integers": "iu"}.get(numbers, "fiu")
+    kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
     got = type(value).__name__
     if isinstance(value, np.ndarray):
         same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]

@@ -132,7 +132,7 @@ def test_the_inverse_of_a_pose_undoes_it_for_one_and_for_many():
         (as_points, [[1, 2, 3], [4, 5]], "scan: expected an array"),
         (as_vector, np.zeros(2), r"scan: expected \(3,\) numbers, got shape \(2,\)"),
         (as_vector, None, "scan: .*object"),
-        (as_stamps, [0.1, 0.2], r"scan: expected \(N,\) integers.*float64; .*\* 1e9"),
+        (as_stamps, [0.1, 0.2], r"scan: expected \(N,\) integer nanoseconds.*float64; .*\* 1e9"),
         (as_stamps, np.zeros((2, 1), int), r"scan: expected \(N,\).*\(2, 1\)"),
     ],
 )

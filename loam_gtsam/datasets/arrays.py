@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
+from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
 
 _SHORTEST = 1_000_000
@@ -124,22 +125,15 @@ def _stamps(stamps: Any, stamps_s: Any) -> IntArray:
             "(float seconds)"
         )
     if stamps is not None:
-        values = np.asarray(stamps)
-        if values.ndim != 1 or (values.dtype.kind not in "iu" and values.size):
-            raise InputError(
-                f"stamps: expected 1-D integer nanoseconds, got {values.ndim}-D {values.dtype}; "
-                "use stamps_s for seconds"
-            )
-        step = float(np.median(np.diff(values.astype(np.int64)))) if len(values) > 2 else 0.0
+        values = as_stamps(stamps, "stamps")
+        step = float(np.median(np.diff(values))) if len(values) > 2 else 0.0
         if 0.0 < step < _SHORTEST:
             raise InputError(
                 f"stamps: the sweeps are {step:g} ns apart; expected nanoseconds, stamps_s takes "
                 "seconds"
             )
-        return values.astype(np.int64)
-    seconds = np.asarray(stamps_s)
-    if seconds.ndim != 1 or seconds.dtype.kind not in "fiu" or not np.isfinite(seconds).all():
-        raise InputError("stamps_s: expected a 1-D sequence of finite seconds")
+        return values
+    seconds = as_array(stamps_s, "stamps_s", ("N",))
     # Whole and fractional seconds apart: their product with 1e9 would lose the last digits.
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)

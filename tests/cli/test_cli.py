@@ -22,9 +22,9 @@ from loam_gtsam.cli.options import RunOptions
 from loam_gtsam.cli.results import ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io.run_files import RUN_FILES
-from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
 from loam_gtsam.view import plots as visualization

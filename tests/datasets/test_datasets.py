@@ -622,8 +622,8 @@ def test_reference_poses_and_imu_of_a_folder(tmp_path: Path) -> None:
     ("name", "text", "match"),
     [
         ("gt.tum", "0 1 2 3 0 0 0 1\n0 1 2 3 0 0 1\n", "gt.tum:2: expected 8 numbers"),
-        ("gt.tum", "0 1 2 3 0 0 0 0\n", "pose 1 of 1 is not a pose"),
-        ("gt.tum", "0 1 nan 3 0 0 0 1\n", "row 1 of 1 holds NaN"),
+        ("gt.tum", "0 1 2 3 0 0 0 0\n", "gt.tum:1: .*quaternion of length 0"),
+        ("gt.tum", "0 1 nan 3 0 0 0 1\n", "gt.tum:1: .*NaN"),
         ("imu.csv", "0,0,0,0,1,0,0,0,0,0,x\n", "imu.csv:1: expected 11 numbers"),
     ],
 )
@@ -717,11 +717,11 @@ def test_array_disorder_is_reported() -> None:
     [
         (([np.zeros((3, 2))], [0]), {}, r"scans\[0\]: expected an \(N, 3\).*got \(3, 2\)"),
         (([[1.0, 2.0, 3.0]], [0]), {}, r"scans\[0\]: .*got list"),
-        (([np.zeros((3, 3), int)], [0]), {}, r"scans\[0\]: Scan.points: expected a float dtype"),
-        (([np.zeros((3, 3))], [0.0]), {}, "use stamps_s for seconds"),
+        (([np.zeros((3, 3), int)], [0]), {}, r"scans\[0\]: Scan.points: .* floats"),
+        (([np.zeros((3, 3))], [0.0]), {}, "makes them of seconds"),
         (([np.zeros((3, 3))],), {}, "give the stamps"),
         (([np.zeros((3, 3))], [0]), {"stamps_s": [0.0]}, "give the stamps of the sweeps once"),
-        (([np.zeros((3, 3))],), {"stamps_s": [np.nan]}, "finite seconds"),
+        (([np.zeros((3, 3))],), {"stamps_s": [np.nan]}, "stamps_s: expected"),
         (([np.zeros((3, 3))], [0, 1]), {}, "stamps: expected 1 entries, got 2"),
         (([np.zeros((3, 3))], [0]), {"times": []}, "times: expected 1 entries, got 0"),
         (([np.zeros((3, 3))], [0]), {"times": [np.zeros(2)]}, r"scans\[0\]: Scan.times"),

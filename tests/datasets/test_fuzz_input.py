@@ -38,10 +38,10 @@ from loam_gtsam.config import (
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.rings import rings_from_labels
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.registration.odometry import ConstantVelocity

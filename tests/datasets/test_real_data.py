@@ -5,7 +5,7 @@ import pytest
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import open_dataset
-from loam_gtsam.io.trajectories import read_tum
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.pipeline import run
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Trajectory

@@ -12,8 +12,9 @@ from scipy.spatial.transform import Rotation
 from support.trajectories import random_trajectory
 
 from loam_gtsam.config import Config, load_config
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.io import run_files as export
-from loam_gtsam.io.trajectories import read_tum, write_kitti, write_tum
+from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.pipeline import RunResult
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (

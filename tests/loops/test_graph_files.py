@@ -6,7 +6,7 @@ import pytest
 from gtsam.symbol_shorthand import X
 from support.cli import loam
 
-from loam_gtsam.io.trajectories import read_tum
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.loops.files import read_graph, write_graph
 from loam_gtsam.types import DatasetError, InputError, OutputError

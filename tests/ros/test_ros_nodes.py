@@ -20,8 +20,8 @@ from support.live_replay import IMU, POINTS, bag_of, recorded
 
 from loam_gtsam.config import LiveConfig
 from loam_gtsam.datasets import open_dataset
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.ros.frame_messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, TYPES
 from loam_gtsam.ros.live_report import LiveReport

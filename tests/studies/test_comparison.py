@@ -19,8 +19,8 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam.config import PRESETS, Config, config_from_dict
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.pipeline import run
 from loam_gtsam.studies import contenders, peers
 from loam_gtsam.studies.comparison import (

@@ -16,9 +16,9 @@ from typer.testing import Result
 
 from loam_gtsam.config import Config, DeskewConfig
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.io.trajectories import read_tum
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.ros.bag_writer import BagWriter

@@ -15,9 +15,8 @@ from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.decode.extrinsics import at_lidar, describe_extrinsics, implied_by
 from loam_gtsam.datasets.decode.tables import (
     in_order,
-    poses_from_quaternions,
     read_lines,
-    read_table,
+    read_pose_table,
 )
 from loam_gtsam.types import DatasetError, FloatArray, Trajectory
 
@@ -124,10 +123,9 @@ def read_poses(path: Path, body_T_lidar: FloatArray, problems: list[str]) -> Tra
     """
     first = next((line for line in read_lines(path) if not line.startswith("#")), "")
     if "," in first:
-        stamps, values = read_table(path, "secs nsecs x y z qx qy qz qw", ",")
+        stamps, poses = read_pose_table(path, "secs nsecs x y z qx qy qz qw", ",")
     else:
-        stamps, values = read_table(path, "t x y z qx qy qz qw", None)
+        stamps, poses = read_pose_table(path, "t x y z qx qy qz qw", None)
     if len(stamps) == 0:
         raise DatasetError(f"{path}: no poses")
-    poses = poses_from_quaternions(values[:, :3], values[:, 3:], str(path))
     return at_lidar(in_order(stamps, poses, path.name, problems), body_T_lidar)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.datasets.decode.pointcloud2 import NO_TIMES, decode_pointcloud2, message_stamp
-from loam_gtsam.datasets.decode.tables import poses_from_quaternions
+from loam_gtsam.datasets.decode.tables import pose_matrix
 from loam_gtsam.types import DatasetError, Features, FeatureSweep, FloatArray, LoamError
 
 EDGES = "/laser_cloud_corner_last"
@@ -110,9 +110,10 @@ class FeatureDecoder:
         """
         pose = message.pose.pose
         p, q = pose.position, pose.orientation
-        message_T = poses_from_quaternions(
-            np.array([[p.x, p.y, p.z]]), np.array([[q.x, q.y, q.z, q.w]]), f"topic {topic}"
-        )[0]
+        try:
+            message_T = pose_matrix([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
+        except ValueError as error:
+            raise DatasetError(f"topic {topic}: not a pose: {error}") from error
         change = np.eye(4)
         change[:3, :3] = self._lidar_R_message
         converted: FloatArray = change @ message_T @ change.T

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from decimal import Decimal
 from pathlib import Path
+from typing import TypeVar
 
+import gtsam
 import numpy as np
 
 from loam_gtsam.types import (
@@ -24,6 +28,8 @@ _ABSURD = 1e6
 """rad/s and m/s^2 that no IMU measures."""
 UNIT_TOLERANCE = 0.1
 """By which the length of a quaternion may differ from one for it to be an orientation."""
+
+_Row = TypeVar("_Row")
 
 
 def seconds_to_ns(text: str) -> int:
@@ -66,7 +72,7 @@ def read_stamps(path: Path) -> IntArray:
 
 
 def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
-    """Rows of a time and numbers; ``#`` starts a comment line.
+    """Rows of a time and finite numbers; blank lines and those that start with ``#`` do not count.
 
     Parameters
     ----------
@@ -85,30 +91,78 @@ def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArra
     DatasetError
         Naming the line that does not fit.
     """
+    width = len(columns.split()) - (2 if columns.startswith("secs") else 1)
+    stamps, rows = _read_rows(path, columns, separator, _finite)
+    return stamps, np.array(rows, dtype=np.float64).reshape(len(rows), width)
+
+
+def read_pose_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
+    """Stamps (N,) and poses (N, 4, 4) of a table whose last columns are ``x y z qx qy qz qw``.
+
+    For the parameters and errors see :func:`read_table`.
+    """
+    stamps, poses = _read_rows(path, columns, separator, pose_matrix)
+    return stamps, np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+
+
+def read_tum(path: str | Path) -> Trajectory:
+    """Read a trajectory in TUM format: ``t x y z qx qy qz qw`` per line, seconds and metres.
+
+    Stamps are exact to the nanosecond.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read, naming the line that does not fit.
+    """
+    return Trajectory(*read_pose_table(Path(path), "t x y z qx qy qz qw", None))
+
+
+def pose_matrix(numbers: Sequence[float]) -> FloatArray:
+    """(4, 4) transform of ``x y z qx qy qz qw``.
+
+    Raises
+    ------
+    ValueError
+        If a number is not finite, or the quaternion is not roughly of unit length.
+    """
+    x, y, z, w = _finite(numbers)[3:]
+    length = math.sqrt(x * x + y * y + z * z + w * w)
+    if not 0.5 < length < 2.0:
+        raise ValueError(f"quaternion of length {length:g}")
+    pose = np.eye(4)
+    pose[:3, :3] = gtsam.Rot3.Quaternion(w / length, x / length, y / length, z / length).matrix()
+    pose[:3, 3] = numbers[:3]
+    return pose
+
+
+def _finite(numbers: Sequence[float]) -> Sequence[float]:
+    if not all(map(math.isfinite, numbers)):
+        raise ValueError("NaN or infinity")
+    return numbers
+
+
+def _read_rows(
+    path: Path, columns: str, separator: str | None, convert: Callable[[Sequence[float]], _Row]
+) -> tuple[IntArray, list[_Row]]:
+    """Stamps (N,), and what ``convert`` makes of the other numbers of each row."""
     names = columns.split()
-    times = 2 if names[0] == "secs" else 1
     stamps, rows = [], []
     for number, line in enumerate(read_lines(path), start=1):
-        if line.lstrip().startswith("#"):
-            continue
-        cells = line.split(separator)
-        if number == 1 and [cell.strip() for cell in cells] == names:
+        cells = [cell.strip() for cell in line.split(separator)]
+        if not line.strip() or line.lstrip().startswith("#") or (number == 1 and cells == names):
             continue
         try:
             if len(cells) != len(names):
                 raise ValueError(f"{len(cells)} columns")
             stamps.append(_stamp(names[0], cells))
-            rows.append([float(cell) for cell in cells[times:]])
+            rows.append(convert([float(cell) for cell in cells[2 if names[0] == "secs" else 1 :]]))
         except ValueError as error:
             raise DatasetError(
                 f"{path}:{number}: expected {len(names)} numbers ({columns}), "
-                f"got {line.strip()[:80]!r}"
+                f"got {line.strip()[:80]!r}: {error}"
             ) from error
-    values = np.array(rows, dtype=np.float64).reshape(len(rows), len(names) - times)
-    bad = np.flatnonzero(~np.isfinite(values).all(axis=1))
-    if len(bad):
-        raise DatasetError(f"{path}: row {bad[0] + 1} of {len(rows)} holds NaN or infinity")
-    return np.array(stamps, dtype=np.int64), values
+    return np.array(stamps, dtype=np.int64), rows
 
 
 def _stamp(clock: str, cells: list[str]) -> int:
@@ -130,40 +184,6 @@ def in_order(stamps: IntArray, poses: FloatArray, source: str, problems: list[st
     if dropped := len(stamps) - int(first.sum()):
         problems.append(f"{source}: {dropped} poses with a repeated stamp left out")
     return Trajectory(stamps[order[first]], poses[order[first]])
-
-
-def read_tum(path: Path) -> Trajectory:
-    """TUM trajectory: ``t x y z qx qy qz qw`` per line, seconds and metres."""
-    stamps, values = read_table(path, "t x y z qx qy qz qw", None)
-    return Trajectory(stamps, poses_from_quaternions(values[:, :3], values[:, 3:], str(path)))
-
-
-def poses_from_quaternions(
-    translations: FloatArray, quaternions: FloatArray, source: str
-) -> FloatArray:
-    """(N, 4, 4) transforms from (N, 3) metres and (N, 4) quaternions x y z w of any length."""
-    # A rotation matrix does not need the length to be exactly 1, but it needs a direction.
-    norms = np.linalg.norm(quaternions, axis=1)
-    bad = np.flatnonzero(~((norms > 0.5) & (norms < 2.0) & np.isfinite(translations).all(axis=1)))
-    if len(bad):
-        raise DatasetError(
-            f"{source}: pose {bad[0] + 1} of {len(norms)} is not a pose: translation "
-            f"{translations[bad[0]].tolist()}, quaternion {quaternions[bad[0]].tolist()}"
-        )
-    x, y, z, w = (quaternions / norms[:, None]).T
-    poses = np.zeros((len(norms), 4, 4))
-    poses[:, 0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    poses[:, 0, 1] = 2.0 * (x * y - z * w)
-    poses[:, 0, 2] = 2.0 * (x * z + y * w)
-    poses[:, 1, 0] = 2.0 * (x * y + z * w)
-    poses[:, 1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    poses[:, 1, 2] = 2.0 * (y * z - x * w)
-    poses[:, 2, 0] = 2.0 * (x * z - y * w)
-    poses[:, 2, 1] = 2.0 * (y * z + x * w)
-    poses[:, 2, 2] = 1.0 - 2.0 * (x * x + y * y)
-    poses[:, :3, 3] = translations
-    poses[:, 3, 3] = 1.0
-    return poses
 
 
 def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from loam_gtsam.datasets.decode.extrinsics import implied_by
 from loam_gtsam.datasets.decode.packed_points import read_records
-from loam_gtsam.datasets.decode.tables import in_order, poses_from_quaternions, read_table
+from loam_gtsam.datasets.decode.tables import in_order, read_pose_table
 from loam_gtsam.datasets.known.layouts import HELIPR_OTHERS, first_existing, helipr_truth
 from loam_gtsam.datasets.known.stamped_files import PackedFiles, missing_files
 from loam_gtsam.datasets.known.xsens import read_xsens
@@ -117,8 +117,7 @@ class HeLiPRDataset(PackedFiles):
         path = helipr_truth(self._root, self._lidar)
         if path is None:
             return None
-        stamps, values = read_table(path, "ns x y z qx qy qz qw", None)
-        poses = poses_from_quaternions(values[:, :3], values[:, 3:], str(path))
+        stamps, poses = read_pose_table(path, "ns x y z qx qy qz qw", None)
         return in_order(stamps, poses, path.name, self._problems)
 
 

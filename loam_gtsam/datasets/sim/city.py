@@ -15,6 +15,7 @@ from loam_gtsam.datasets.sim.scenes import (
     points_at,
     rolling,
 )
+from loam_gtsam.geometry import as_array
 from loam_gtsam.types import FloatArray, InputError
 
 _STREAM = 9
@@ -44,9 +45,7 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
     InputError
         If there are no two points 100 m apart along the way.
     """
-    way = np.asarray(way, np.float64)
-    if way.ndim != 2 or way.shape[1] != 2 or not np.isfinite(way).all():
-        raise InputError(f"way: expected (N, 2) finite metres, got shape {way.shape}")
+    way = as_array(way, "way", ("N", 2))
     distances = chord(way)
     length = float(distances[-1])
     if not len(way) or length < 100.0:

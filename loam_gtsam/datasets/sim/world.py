@@ -23,7 +23,7 @@ from loam_gtsam.datasets.sim.avenue import build_avenue
 from loam_gtsam.datasets.sim.motion import GRAVITY, Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import Scene
-from loam_gtsam.geometry import inverse_pose
+from loam_gtsam.geometry import as_stamps, inverse_pose
 from loam_gtsam.types import (
     ConfigError,
     FloatArray,
@@ -246,13 +246,7 @@ class SimulatedWorld:
         InputError
             If the stamps are no row of integers, or later than the end of an open path.
         """
-        stamps = np.asarray(stamps)
-        if stamps.ndim != 1 or stamps.dtype.kind not in "iu":
-            raise InputError(
-                f"stamps: expected (N,) integer nanoseconds, got shape {stamps.shape} of "
-                f"{stamps.dtype}"
-            )
-        stamps = stamps.astype(np.int64)
+        stamps = as_stamps(stamps, "stamps")
         end = _EPOCH + int(self._motion.duration * 1e9) + _IMU_MARGIN
         if not self.scene.closed and np.any(stamps > end):
             raise InputError(

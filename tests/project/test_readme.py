@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 import typer
 
-from loam_gtsam import Config
+import loam_gtsam
+from loam_gtsam import Config, cubemap
 from loam_gtsam.cli.app import app
 from loam_gtsam.cli.results import PLOT_FILES, TRUTH_FILE
 from loam_gtsam.io.run_files import RUN_FILES, stage_seconds, write_npz
@@ -145,6 +146,22 @@ def test_outputs_page_lists_every_file_and_key(tmp_path: Path) -> None:
         keys = set(arrays.files)
     for name in (*RUN_FILES, *PLOT_FILES, TRUTH_FILE, *keys):
         assert f"`{name}`" in text, name
+
+
+def test_names_in_the_table_of_other_names_are_there() -> None:
+    table = (
+        (ROOT / "docs/index.md").read_text("utf-8").split("## Known by another name")[1].split("\n## ")[0]
+    )
+    here = [line.split("|")[3] for line in table.splitlines() if line.startswith("|")]
+    named = re.findall(
+        r"`(?:loam_gtsam\.cubemap\.)?([A-Za-z_]\w*(?:\.[a-z]\w*)?)[`(]", " ".join(here)
+    )
+    assert len(named) > 20
+    for name in named:
+        section, _, field = name.partition(".")
+        owner = loam_gtsam if hasattr(loam_gtsam, section) else Config()
+        found = getattr(owner, section, None) or getattr(cubemap, section)
+        assert not field or hasattr(found, field) or field in vars(found)["__annotations__"], name
 
 
 def test_every_status_is_explained() -> None:

@@ -150,7 +150,10 @@ def test_outputs_page_lists_every_file_and_key(tmp_path: Path) -> None:
 
 def test_names_in_the_table_of_other_names_are_there() -> None:
     table = (
-        (ROOT / "docs/index.md").read_text("utf-8").split("## Known by another name")[1].split("\n## ")[0]
+        (ROOT / "docs/index.md")
+        .read_text("utf-8")
+        .split("## Known by another name")[1]
+        .split("\n## ")[0]
     )
     here = [line.split("|")[3] for line in table.splitlines() if line.startswith("|")]
     named = re.findall(

@@ -8,8 +8,7 @@ import numpy as np
 from loam_gtsam import Config, ConstantVelocity, Mapper, SimulatedWorld, extract_features
 
 world = SimulatedWorld("room", sensor="hdl32", frames=6)
-config = Config()
-config = config.changed("matching.max_distance=0.8")  # any parameter
+config = Config().changed("matching.max_distance=0.8")  # any parameter
 
 odometry = ConstantVelocity()
 mapper = Mapper(config)

@@ -12,14 +12,8 @@ import numpy as np
 from loam_gtsam import Config, PoseContext, SimulatedWorld, checked_factor, run
 
 FLOOR_SIGMAS = (0.005, 0.002, 0.002)  # height in m, tilt in rad: how flat the floor is
-WHEELS = (
-    10.0,
-    10.0,
-    0.01,
-    0.003,
-    0.003,
-    10.0,
-)  # rad, then m per sweep: no roll, no pitch, no height
+# rad, then metres, per sweep: wheels measure no roll, no pitch and no height.
+WHEELS = (10.0, 10.0, 0.01, 0.003, 0.003, 10.0)
 
 # A short-sighted lidar between bare walls: no sweep says how far one went.
 world = SimulatedWorld("corridor_bare", frames=60, columns=900, max_range=6.0)

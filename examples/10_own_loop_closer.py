@@ -21,8 +21,7 @@ from loam_gtsam import (
 )
 
 # Small steps for a small room, and an odometry that is known to be bad.
-config = Config()
-config = config.changed(
+config = Config().changed(
     "pose_graph.keyframe_distance=0.5",
     "pose_graph.walk=0.05",
     "pose_graph.turn_walk_deg=0.5",

@@ -17,8 +17,7 @@ from loam_gtsam import (
 )
 from loam_gtsam.io.run_files import write_ply
 
-config = Config()
-config = config.changed(  # small steps for a small room
+config = Config().changed(  # small steps for a small room
     "pose_graph.keyframe_distance=0.5", "loops.neighbours=3", "loops.min_way=4.0"
 )
 world = SimulatedWorld("room", frames=90, columns=400, speed=2.0)

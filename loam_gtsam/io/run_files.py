@@ -3,18 +3,16 @@
 Every file is written beside its final name and then renamed, see :mod:`loam_gtsam.io.atomic`.
 """
 
-# ruff: noqa: D102 (the properties of the protocol are documented where they are implemented)
-
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, dump_config
+from loam_gtsam.config import dump_config
 from loam_gtsam.io.atomic import atomic_file, make_folder, write_json, write_text
 from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
 from loam_gtsam.io.version import installed_version
@@ -22,11 +20,13 @@ from loam_gtsam.types import (
     FloatArray,
     IntArray,
     MapUpdate,
-    Trajectory,
     Uncertainty,
     check_array,
     stack_poses,
 )
+
+if TYPE_CHECKING:
+    from loam_gtsam.pipeline import ImuSummary, RunResult
 
 _NS = 10**9
 _MAX_MESSAGES = 20
@@ -35,9 +35,7 @@ _MAX_MESSAGES = 20
 EDGE_COLOUR, PLANE_COLOUR = (214, 96, 32), (110, 125, 140)
 """Red, green, blue of the two kinds of map points in the PLY file."""
 
-_PLY_VERTEX = np.dtype(
-    [("xyz", "<f8", 3), ("rgb", "u1", 3), ("label", "u1")],
-)
+_PLY_VERTEX = np.dtype([("xyz", "<f8", 3), ("rgb", "u1", 3), ("label", "u1")])
 
 RUN_FILES = (
     "trajectory.tum",
@@ -51,33 +49,7 @@ RUN_FILES = (
 """What :func:`write_run` writes."""
 
 
-class Run(Protocol):
-    """What is written of a run; :class:`loam_gtsam.pipeline.RunResult` is one."""
-
-    @property
-    def config(self) -> Config: ...
-    @property
-    def updates(self) -> tuple[MapUpdate, ...]: ...
-    @property
-    def edge_points(self) -> FloatArray: ...
-    @property
-    def plane_points(self) -> FloatArray: ...
-    @property
-    def map_stats(self) -> Mapping[str, Mapping[str, int]]: ...
-    @property
-    def interrupted(self) -> bool: ...
-    @property
-    def error(self) -> Exception | None: ...
-    @property
-    def imu(self) -> Any: ...
-    @property
-    def loops(self) -> Any: ...
-    @property
-    def trajectory(self) -> Trajectory: ...
-    @property
-    def status_counts(self) -> dict[str, int]: ...
-    @property
-    def faults(self) -> dict[str, int]: ...
+_AXES = ("rx", "ry", "rz", "x", "y", "z")
 
 
 def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
@@ -96,9 +68,8 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     OutputError
         If the file cannot be written.
     """
-    axes = ("rx", "ry", "rz", "x", "y", "z")
     rows, columns = np.triu_indices(6)
-    names = [f"{axes[i]}_{axes[j]}" for i, j in zip(rows, columns, strict=True)]
+    names = [f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
     lines = [",".join(("stamp_s", "status", *names))]
     for update in updates:
         if not update.status.has_pose:
@@ -130,62 +101,51 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
 
     Notes
     -----
-    Keys: ``stamps`` (N,) int64 ns; ``map_T_lidar`` (N, 4, 4); ``status`` and ``messages`` (N,)
-    strings; ``covariances``, ``raw_covariances``, ``own_covariances``, ``shared_covariances`` and
-    ``drift_covariances`` (N, 6, 6), NaN for frames that were not solved; ``follows`` (N,) int64;
-    ``residual_variances`` and ``effective_matches`` (N,); ``information`` (N, 6, 6);
-    ``twists`` (N, 6) rad/s and m/s; ``n_edges``, ``n_planes``, ``n_edge_matches``,
-    ``n_plane_matches``, ``iterations``, ``solver_iterations`` (N,) int64; ``error_before``,
-    ``error_after`` (N,); ``stage_names`` (S,) strings and ``stage_seconds`` (N, S), NaN where a
-    stage did not run; ``sweep_motions`` and ``tilt_priors`` (N,) strings;
-    ``localizability``, ``direction_information`` and ``axis_localizability`` (N, 6) and
-    ``directions`` (N, 6, 6). See
-    :class:`loam_gtsam.types.MapUpdate` for their meaning.
+    docs/outputs.md lists the keys; :class:`loam_gtsam.types.MapUpdate` says what the values mean.
     """
-    count = len(updates)
+    nothing = np.full((6, 6), np.nan)
+    unknown = Uncertainty(nothing, nothing, None, nothing, np.nan, np.nan)
+    parts = [update.uncertainty or unknown for update in updates]
+    follows = [-1 if part.follows is None else part.follows for part in parts]
     names, seconds = stage_seconds(updates)
-    arrays: dict[str, NDArray[Any]] = {
-        "stamps": np.array([u.stamp for u in updates], np.int64),
+    arrays = {
+        "stamps": _column(updates, "stamp", np.int64),
         "map_T_lidar": stack_poses(u.map_T_lidar for u in updates),
-        "status": np.array([str(u.status) for u in updates], np.str_),
-        "messages": np.array([u.message for u in updates], np.str_),
-        "covariances": _stack([u.covariance for u in updates], (count, 6, 6)),
-        "raw_covariances": _stack([u.raw_covariance for u in updates], (count, 6, 6)),
-        "information": _stack([u.information for u in updates], (count, 6, 6)),
-        "twists": _stack([u.twist for u in updates], (count, 6)),
-        "sweep_motions": np.array([str(u.sweep_motion) for u in updates], np.str_),
-        "tilt_priors": np.array([str(u.tilt_prior) for u in updates], np.str_),
-        "localizability": _stack([u.localizability for u in updates], (count, 6)),
-        "directions": _stack([u.directions for u in updates], (count, 6, 6)),
-        "direction_information": _stack([u.direction_information for u in updates], (count, 6)),
-        "axis_localizability": _stack([u.axis_localizability for u in updates], (count, 6)),
+        "status": _column(updates, "status", np.str_),
+        "messages": _column(updates, "message", np.str_),
+        "covariances": _column(updates, "covariance", shape=(6, 6)),
+        "raw_covariances": _column(updates, "raw_covariance", shape=(6, 6)),
+        "twists": _column(updates, "twist", shape=(6,)),
+        "sweep_motions": _column(updates, "sweep_motion", np.str_),
+        "tilt_priors": _column(updates, "tilt_prior", np.str_),
+        "own_covariances": _column(parts, "own", shape=(6, 6)),
+        "shared_covariances": _column(parts, "shared", shape=(6, 6)),
+        "drift_covariances": _column(parts, "drift", shape=(6, 6)),
+        "follows": np.array(follows, np.int64),
+        "residual_variances": _column(parts, "residual_variance"),
+        "effective_matches": _column(parts, "effective_matches"),
         "stage_names": np.array(names, np.str_),
         "stage_seconds": seconds,
     }
-    arrays |= _uncertainty_arrays(updates)
+    for name in ("information", "directions"):
+        arrays[name] = _column(updates, name, shape=(6, 6))
+    for name in ("localizability", "direction_information", "axis_localizability"):
+        arrays[name] = _column(updates, name, shape=(6,))
     for name in ("n_edges", "n_planes", "n_edge_matches", "n_plane_matches",
                  "iterations", "solver_iterations"):  # fmt: skip
-        arrays[name] = np.array([getattr(u, name) for u in updates], np.int64)
+        arrays[name] = _column(updates, name, np.int64)
     for name in ("error_before", "error_after"):
-        arrays[name] = np.array([getattr(u, name) for u in updates], np.float64)
+        arrays[name] = _column(updates, name)
     with atomic_file(path) as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
 
 
-def _uncertainty_arrays(updates: Sequence[MapUpdate]) -> dict[str, NDArray[Any]]:
-    """The parts of the covariances; NaN, and -1 for ``follows``, where there are none."""
-    nothing = np.full((6, 6), np.nan)
-    unknown = Uncertainty(nothing, nothing, None, nothing, np.nan, np.nan)
-    parts = [update.uncertainty or unknown for update in updates]
-    arrays: dict[str, NDArray[Any]] = {
-        f"{name}_covariances": _stack([getattr(part, name) for part in parts], (len(parts), 6, 6))
-        for name in ("own", "shared", "drift")
-    }
-    stamps = [-1 if part.follows is None else part.follows for part in parts]
-    arrays["follows"] = np.array(stamps, np.int64)
-    arrays["residual_variances"] = np.array([part.residual_variance for part in parts], np.float64)
-    arrays["effective_matches"] = np.array([part.effective_matches for part in parts], np.float64)
-    return arrays
+def _column(
+    items: Sequence[object], name: str, kind: type = np.float64, shape: tuple[int, ...] = ()
+) -> NDArray[Any]:
+    """An attribute of N items: N, and the shape of one."""
+    values = [getattr(item, name) for item in items]
+    return np.array(values, kind).reshape(len(items), *shape)
 
 
 def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.floating]) -> None:
@@ -227,7 +187,7 @@ def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.
 
 
 def write_run(
-    result: Run,
+    result: RunResult,
     directory: str | Path,
     *,
     dataset: str = "",
@@ -264,7 +224,7 @@ def write_run(
     write_json(folder / "summary.json", summary)
 
 
-def summarise(result: Run) -> dict[str, Any]:
+def summarise(result: RunResult) -> dict[str, Any]:
     """What ``summary.json`` says about a run; lengths in metres, times in the unit of the name."""
     trajectory = result.trajectory
     seconds = np.nansum(stage_seconds(result.updates)[1], axis=1)
@@ -302,7 +262,7 @@ def _gaps(stamps: IntArray) -> int:
     return int(np.count_nonzero(steps > 1.5 * np.median(steps))) if len(steps) else 0
 
 
-def _axes_part(result: Run) -> dict[str, Any] | None:
+def _axes_part(result: RunResult) -> dict[str, Any] | None:
     """How well the frames fixed each axis of the lidar; None if that was not looked at."""
     counts = np.array([u.axis_localizability for u in result.updates], np.float64).reshape(-1, 6)
     counts = counts[np.isfinite(counts).all(axis=1)]
@@ -315,21 +275,15 @@ def _axes_part(result: Run) -> dict[str, Any] | None:
             "lowest": float(column.min()),
             "weak_frames": int(np.count_nonzero(column < least)),
         }
-        for axis, column in zip(("rx", "ry", "rz", "x", "y", "z"), counts.T, strict=True)
+        for axis, column in zip(_AXES, counts.T, strict=True)
     }
 
 
-def _imu_part(imu: Any) -> dict[str, Any]:
-    """Of a :class:`loam_gtsam.pipeline.ImuSummary`."""
+def _imu_part(imu: ImuSummary) -> dict[str, Any]:
     level, report = imu.level, imu.report
-    return {
-        "samples": report.samples,
+    counted = ("samples", "gaps", "duplicates", "out_of_order", "not_finite", "orientation")
+    return {name: getattr(report, name) for name in counted} | {
         "rate_hz": report.rate,
-        "gaps": report.gaps,
-        "duplicates": report.duplicates,
-        "out_of_order": report.out_of_order,
-        "not_finite": report.not_finite,
-        "orientation": report.orientation,
         "level": None
         if level is None
         else {
@@ -345,7 +299,3 @@ def _imu_part(imu: Any) -> dict[str, Any]:
         "gyro_trusted": imu.gyro_trusted,
         "problems": [*report.problems, *([imu.problem] if imu.problem else [])],
     }
-
-
-def _stack(rows: list[FloatArray], shape: tuple[int, ...]) -> FloatArray:
-    return np.array(rows, np.float64).reshape(shape)

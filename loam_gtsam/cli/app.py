@@ -10,6 +10,7 @@ a shell answer at once.
 from __future__ import annotations
 
 import platform
+import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,9 +42,9 @@ class _Group(TyperGroup):
             typer.echo("stopped; nothing was computed yet", err=True)
             raise typer.Exit(130) from None
         except Exception as error:
-            from loam_gtsam.types import LoamError
-
-            if ctx.meta.get(DEBUG) or not isinstance(error, LoamError):
+            # Without that module none of its errors can have been raised, --help for one is not.
+            types = sys.modules.get("loam_gtsam.types")
+            if ctx.meta.get(DEBUG) or types is None or not isinstance(error, types.LoamError):
                 raise
             typer.secho("error: ", fg=typer.colors.RED, bold=True, err=True, nl=False)
             typer.echo(str(error), err=True)

@@ -105,13 +105,7 @@ class InputOptions:
     ] = None
 
     def dataset(self) -> Dataset:
-        """Open the data set.
-
-        Raises
-        ------
-        DatasetError
-            If the data set cannot be opened.
-        """
+        """Open the data set."""
         from loam_gtsam.datasets import open_dataset
 
         options: dict[str, Any] = dict(
@@ -139,13 +133,7 @@ class SensorOptions:
     ] = None
 
     def changed(self, config: Config) -> Config:
-        """``config`` with ``--sensor``, then with every ``--set`` at once.
-
-        Raises
-        ------
-        ConfigError
-            If there is no such key, or the value is out of bounds.
-        """
+        """``config`` with ``--sensor``, then with every ``--set`` at once."""
         if self.sensor is not None:
             config = config.changed({"sensor.model": self.sensor}, source="--sensor")
         for entry in self.overrides or []:
@@ -170,13 +158,7 @@ class ConfigOptions(SensorOptions):
     ] = None
 
     def settings(self) -> Config:
-        """The preset or the file, then ``--sensor``, then each ``--set`` in turn.
-
-        Raises
-        ------
-        ConfigError
-            If the preset is unknown, the file cannot be read, or a value is wrong.
-        """
+        """The preset or the file, then ``--sensor``, then each ``--set`` in turn."""
         from loam_gtsam.config import load_config, preset
 
         if self.preset is not None and self.config is not None:
@@ -283,13 +265,7 @@ class RunOptions(MappingOptions):
     ] = 60.0
 
     def check(self, path: str) -> None:
-        """Refuse options that contradict each other, or that would replace the input ``path``.
-
-        Raises
-        ------
-        OutputError
-            If the bag would be written over the input.
-        """
+        """Refuse options that contradict each other, or that would replace the input ``path``."""
         from loam_gtsam.types import OutputError
 
         if self.resume and (self.bag is not None or self.rrd is not None):

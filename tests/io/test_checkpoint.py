@@ -18,8 +18,8 @@ from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.closure import ScanLoopCloser
 from loam_gtsam.loops.keyframes import LoopClosure
-from loam_gtsam.pipeline import run
-from loam_gtsam.registration.solvers import POSE_KEY
+from loam_gtsam.pipeline import Pipeline, run
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import DatasetError, OutputError
 
 
@@ -119,6 +119,29 @@ def test_a_run_that_was_stopped_goes_on_to_the_last_bit(case, tmp_path):
     for at in stops:
         assert len(stopped(dataset, config, folder, at, **options()).updates) == at
     assert_same(stopped(dataset, config, folder, None, **options()), whole)
+
+
+class OwnSolver(GtsamSolver):
+    """The solver of a user; it holds objects of GTSAM that no checkpoint can keep."""
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        return super().solve(associate, guess, priors, motion)
+
+
+def test_an_own_solver_is_given_again(tmp_path):
+    def pipeline():
+        return Pipeline(solver=OwnSolver(Config().solver))
+
+    scans = list(open_dataset("sim:room?frames=4&columns=400"))
+    first, again = pipeline(), pipeline()
+    updates = [first.process(scan) for scan in scans[:2]]
+    checkpoint = Checkpoint(tmp_path)
+    checkpoint.begin({}, *first.state())
+    checkpoint.save([scan.stamp for scan in scans[:2]], updates, *first.state())
+    assert len(Checkpoint(tmp_path, resume=True).begin({}, *again.state())[1]) == 2
+    for scan in scans[2:]:
+        poses = [pipeline.process(scan).map_T_lidar.matrix() for pipeline in (first, again)]
+        np.testing.assert_array_equal(*poses)
 
 
 def test_a_map_with_cubes_in_memory_and_on_disk_goes_on_as_it_was(tmp_path):

@@ -33,17 +33,6 @@ def test_tum_poses_survive(tmp_path):
     assert first[1].startswith("# columns:")
 
 
-def test_evo_reads_both_formats(tmp_path):
-    file_interface = pytest.importorskip("evo.tools.file_interface")
-    trajectory = random_trajectory(20)
-    write_tum(tmp_path / "t.tum", trajectory, comments={"data set": "x"})
-    write_kitti(tmp_path / "t.txt", trajectory)
-    tum = file_interface.read_tum_trajectory_file(str(tmp_path / "t.tum"))
-    kitti = file_interface.read_kitti_poses_file(str(tmp_path / "t.txt"))
-    np.testing.assert_allclose(np.array(tum.poses_se3), trajectory.map_T_lidar, atol=1e-8)
-    np.testing.assert_allclose(np.array(kitti.poses_se3), trajectory.map_T_lidar, atol=1e-8)
-
-
 def test_kitti_has_twelve_numbers_a_line(tmp_path):
     trajectory = random_trajectory(3)
     write_kitti(tmp_path / "t.txt", trajectory)

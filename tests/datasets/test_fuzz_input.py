@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import gtsam
+import lzf
 import numpy as np
 import pytest
 from hypothesis import given
@@ -246,10 +248,14 @@ def pcd(kind: str) -> str:
     )
     if kind == "ascii":
         return text + "".join(" ".join(map(str, row)) + "\n" for row in points.tolist())
-    return text + points.tobytes().decode("latin1")
+    body = points.tobytes()
+    if kind == "binary_compressed":
+        packed = lzf.compress(points.T.tobytes(), 2 * points.nbytes)
+        body = struct.pack("<II", len(packed), points.nbytes) + packed
+    return text + body.decode("latin1")
 
 
-PCDS = {kind: pcd(kind) for kind in ("ascii", "binary")}
+PCDS = {kind: pcd(kind) for kind in ("ascii", "binary", "binary_compressed")}
 HUGE = ["2147483648", "99999999999999999999", "-7", "0"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -285,7 +286,11 @@ def test_oxford_spires_as_bags_in_either_layout(tmp_path: Path, kind: str) -> No
     ("broken", "match"),
     [
         (lambda data: data[:2000], r"need \d+ bytes, got \d+; the file is cut off"),
-        (lambda data: data.replace(b"DATA binary", b"DATA binary_compressed"), r"pcl_convert_pcd"),
+        (
+            lambda data: data.replace(b"DATA binary", b"DATA binary_compressed"),
+            r"cut off or damaged",
+        ),
+        (lambda data: data.replace(b"DATA binary", b"DATA zip"), r"PCD with DATA zip; expected"),
         (lambda data: data.replace(b"FIELDS x", b"FIELDS"), r"header cannot be understood"),
         (lambda data: b"ply\n" + data[4000:], r"no PCD file: expected a line DATA"),
         (lambda data: data.replace(b"WIDTH", b"WIDER"), r"header cannot be understood.*WIDTH"),
@@ -302,6 +307,26 @@ def test_a_broken_pcd_file_says_what_is_wrong(tmp_path: Path, broken: Any, match
     with pytest.raises(DatasetError, match=match):
         read_pcd(files[1], 0)
     assert str(files[1]) in second.message
+
+
+def test_a_compressed_pcd_file_is_read_as_the_binary_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    columns = {name: rng.normal(size=500).astype(np.float32) for name in "xyz"}
+    columns |= {"ring": np.arange(500, dtype=np.uint16) // 32, "t": np.linspace(0.0, 0.1, 500)}
+    for data in ("binary", "binary_compressed"):
+        write.write_pcd(tmp_path / f"{data}.pcd", columns, data)
+    plain, packed = (read_pcd(tmp_path / f"{d}.pcd", 5) for d in ("binary", "binary_compressed"))
+    assert packed.fields == plain.fields
+    np.testing.assert_array_equal(packed.data, plain.data)
+
+
+def test_a_compressed_pcd_file_names_the_extra_that_reads_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    write.write_pcd(tmp_path / "a.pcd", {name: np.zeros(4) for name in "xyz"}, "binary_compressed")
+    monkeypatch.setitem(sys.modules, "lzf", None)
+    with pytest.raises(DatasetError, match=r"a.pcd: .*pip install .loam_gtsam\[pcd\]"):
+        read_pcd(tmp_path / "a.pcd", 0)
 
 
 def test_an_ascii_pcd_file_is_read_as_the_binary_one(tmp_path: Path) -> None:

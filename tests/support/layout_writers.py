@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import struct
 from functools import cache
 from pathlib import Path
 
+import lzf
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -124,7 +126,12 @@ def write_pcd(path: Path, columns: dict[str, np.ndarray], data: str = "binary") 
         f"DATA {data}",
     ]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes("\n".join(header).encode() + b"\n" + points.tobytes())
+    body = points.tobytes()
+    if data == "binary_compressed":
+        by_field = b"".join(points[name].tobytes() for name in record.names or ())
+        packed = lzf.compress(by_field, 2 * len(by_field))
+        body = struct.pack("<II", len(packed), len(by_field)) + packed
+    path.write_bytes("\n".join(header).encode() + b"\n" + body)
 
 
 def write_helipr(root: Path, lidar: str = "Ouster") -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -79,7 +80,7 @@ def read_records(path: Path, stamp: int, record: np.dtype[Any]) -> PackedCloud:
 
 
 def read_pcd(path: Path, stamp: int) -> PackedCloud:
-    """A PCD file with ``DATA binary`` or ``DATA ascii``; fields named ``_`` are padding.
+    """A PCD file, ``DATA`` ascii, binary or binary_compressed; fields named ``_`` are padding.
 
     Parameters
     ----------
@@ -88,7 +89,7 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
     Raises
     ------
     DatasetError
-        If it is no such file, or cut off.
+        If it is no such file, or cut off; or compressed, and the package for it is missing.
 
     References
     ----------
@@ -106,10 +107,11 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
         body = _from_text(path, data[start:], record)
     elif kind == "binary":
         body = data[start:]
+    elif kind == "binary_compressed":
+        body = _decompressed(path, data[start:], record, width * height)
     else:
         raise DatasetError(
-            f"{path}: PCD with DATA {kind}; expected binary or ascii. PCL's "
-            f"`pcl_convert_pcd_ascii_binary {path.name} out.pcd 1` converts it"
+            f"{path}: PCD with DATA {kind}; expected ascii, binary or binary_compressed"
         )
     needed = width * height * record.itemsize
     if len(body) < needed:
@@ -199,4 +201,34 @@ def _from_text(path: Path, data: NDArray[np.uint8], record: np.dtype[Any]) -> ND
         rows = np.loadtxt(data.tobytes().decode("ascii").splitlines(), dtype=record, ndmin=1)
     except ValueError as error:
         raise DatasetError(f"{path}: the points cannot be read: {error}") from error
+    return rows.view(np.uint8).reshape(-1)
+
+
+def _decompressed(
+    path: Path, data: NDArray[np.uint8], record: np.dtype[Any], count: int
+) -> NDArray[np.uint8]:
+    """``count`` records from a compressed body, in which each field's values lie together."""
+    try:
+        import lzf
+    except ImportError as error:
+        raise DatasetError(
+            f"{path}: PCD with DATA binary_compressed needs python-neo-lzf: "
+            'pip install "loam_gtsam[pcd]"'
+        ) from error
+    needed = count * record.itemsize
+    compressed, size = np.frombuffer(data[:8].tobytes().ljust(8, b"\0"), "<u4").tolist()
+    columns = b""
+    if size == needed:
+        with suppress(ValueError, MemoryError):
+            columns = lzf.decompress(data[8 : 8 + compressed].tobytes(), size) or b""
+    if len(columns) != needed:
+        raise DatasetError(
+            f"{path}: {count} points of {record.itemsize} bytes cannot be unpacked from "
+            f"{len(data)} bytes; the file is cut off or damaged"
+        )
+    rows = np.empty(count, record)
+    start = 0
+    for name in record.names or ():
+        rows[name] = np.frombuffer(columns, record[name], count, start)
+        start += count * record[name].itemsize
     return rows.view(np.uint8).reshape(-1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from loam_gtsam.studies.contenders import (
 )
 from loam_gtsam.studies.evaluation import (
     absolute_error,
-    distance_travelled,
     interpolate,
     pose_differences,
     relative_error,
@@ -248,45 +248,40 @@ def score(
     lengths : metres, path lengths of the relative error; those that fit the path if None
     """
     solved = [update for update in run.updates if update.status.solved]
-    seconds = np.array([sum(update.timings.values()) for update in run.updates if update.timings])
+    values: dict[str, Any] = {"map_points": run.map_points, "solved": len(solved)}
+    seconds = [sum(update.timings.values()) for update in run.updates if update.timings]
     # The first frame loads code and has no map to match: its time is not that of a usual frame.
-    milliseconds = 1e3 * seconds[1:]
-    result = Scores(map_points=run.map_points, solved=len(solved), problem=run.problem)
-    if len(milliseconds):
-        median, high = np.percentile(milliseconds, (50.0, 95.0))
-        result = replace(result, ms_median=float(median), ms_95=float(high))
+    if len(seconds) > 1:
+        median, high = np.percentile(1e3 * np.array(seconds[1:]), (50.0, 95.0))
+        values |= {"ms_median": float(median), "ms_95": float(high)}
     if run.config is not None and solved:
         matches = [update.n_edge_matches + update.n_plane_matches for update in solved]
-        result = replace(
-            result,
-            iterations=float(np.mean([update.iterations for update in solved])),
-            solver_iterations=float(np.mean([update.solver_iterations for update in solved])),
-            matches=float(np.median(matches)),
-        )
-    if reference is None:
-        return result
+        values |= {
+            "iterations": float(np.mean([update.iterations for update in solved])),
+            "solver_iterations": float(np.mean([update.solver_iterations for update in solved])),
+            "matches": float(np.median(matches)),
+        }
     problems = [run.problem] if run.problem else []
     try:
-        absolute = absolute_error(run.trajectory, reference)
-        there = interpolate(reference, absolute.stamps)
-        result = replace(
-            result,
-            ate_m=absolute.rmse,
-            ate_max_m=absolute.maximum,
-            rotation_deg=absolute.rotation_rmse_deg,
-            path_m=float(distance_travelled(there.map_T_lidar[:, :3, 3])[-1]),
-        )
-        given = None if lengths is None else np.array(lengths, np.float64)
-        relative = relative_error(run.trajectory, reference, given)
-        result = replace(
-            result,
-            rpe_percent=relative.translation_percent,
-            rpe_deg_per_m=relative.rotation_deg_per_m,
-            lengths=tuple(relative.lengths.tolist()),
-        )
+        if reference is not None:
+            absolute = absolute_error(run.trajectory, reference)
+            there = interpolate(reference, absolute.stamps)
+            values |= {
+                "ate_m": absolute.rmse,
+                "ate_max_m": absolute.maximum,
+                "rotation_deg": absolute.rotation_rmse_deg,
+                "path_m": there.path_length,
+            }
+            given = None if lengths is None else np.array(lengths, np.float64)
+            relative = relative_error(run.trajectory, reference, given)
+            values |= {
+                "rpe_percent": relative.translation_percent,
+                "rpe_deg_per_m": relative.rotation_deg_per_m,
+                "lengths": tuple(relative.lengths.tolist()),
+            }
     except InputError as problem:  # no overlap in time, or too short a path
         problems.append(str(problem))
-    return replace(result, problem="; ".join(problems))
+    return Scores(**values, problem="; ".join(problems))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

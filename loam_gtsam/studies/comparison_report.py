@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, config_to_dict
-from loam_gtsam.io.atomic import atomic_file
+from loam_gtsam.io.atomic import write_json, write_text
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.studies.comparison import (
@@ -28,7 +28,7 @@ from loam_gtsam.studies.contenders import SolverRun
 from loam_gtsam.studies.evaluation import absolute_error, align, distance_travelled, interpolate
 from loam_gtsam.studies.report_html import write_report
 from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
-from loam_gtsam.view import plots as visualization
+from loam_gtsam.view import plots
 
 TRUTH_FILE = "truth.tum"
 TABLE_FILES = ("comparison.csv", "comparison.json", "frames.csv")
@@ -163,7 +163,7 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
             for run, scores in results.rows
         ),
     )
-    _write_text(folder / "comparison.json", json.dumps(_summary_json(results), indent=2) + "\n")
+    write_json(folder / "comparison.json", _summary(results))
     _write_csv(folder / "frames.csv", _FRAME_COLUMNS, _frame_rows(results))
     files = list(TABLE_FILES)
     trajectories = [(f"trajectory_{run.name}.tum", run.trajectory) for run in comparison.runs]
@@ -173,23 +173,21 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
         write_tum(folder / name, trajectory)
         files.append(name)
     drawn = _draw(results, folder) if plot else []
-    winners = best_cells(results)
     write_report(
         folder / REPORT_FILE,
         f"Comparison on {comparison.name}",
         results.notes,
         ["solver", *(column.title for column in COLUMNS)],
         [[run.name, *(format_score(s, column) for column in COLUMNS)] for run, s in results.rows],
-        winners,
+        best_cells(results),
         {column.title: column.meaning for column in COLUMNS},
         {PICTURES[name]: folder / name for name in drawn},
-        {run.name: _settings(run) for run in
-         comparison.runs},
-    )  # fmt: skip
+        {run.name: _settings(run) for run in comparison.runs},
+    )
     return [*files, *drawn, REPORT_FILE]
 
 
-def _summary_json(results: ScoredComparison) -> dict[str, Any]:
+def _summary(results: ScoredComparison) -> dict[str, Any]:
     solvers = []
     for run, scores in results.rows:
         difference = results.differences.get(run.name)
@@ -198,7 +196,7 @@ def _summary_json(results: ScoredComparison) -> dict[str, Any]:
                 "name": run.name,
                 "version": run.version,
                 "config": None if run.config is None else config_to_dict(run.config),
-                "scores": {key: _plain(value) for key, value in asdict(scores).items()},
+                "scores": asdict(scores),
                 "stages_ms": _stages(run),
                 "difference_m": difference and median_95_max(difference.metres),
                 "difference_deg": difference and median_95_max(difference.degrees),
@@ -245,20 +243,14 @@ def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> 
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    for row in rows:
-        values = [_plain(value) for value in row]
-        writer.writerow([f"{v:.9g}" if isinstance(v, float) else v for v in values])
-    _write_text(path, text.getvalue())
+    writer.writerows([_csv_field(value) for value in row] for row in rows)
+    write_text(path, text.getvalue())
 
 
-def _write_text(path: Path, text: str) -> None:
-    with atomic_file(path) as file:
-        file.write(text.encode("utf-8"))
-
-
-def _plain(value: Any) -> Any:
-    """NaN, which JSON cannot say, becomes None."""
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _csv_field(value: Any) -> Any:
+    if not isinstance(value, float):
+        return value
+    return f"{value:.9g}" if math.isfinite(value) else ""
 
 
 def _stages(run: SolverRun) -> dict[str, float]:
@@ -294,7 +286,15 @@ def _flat(tree: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
 def _draw(results: ScoredComparison, folder: Path) -> list[str]:
     """Draw the pictures that the comparison has data for; returns the names of the files."""
     comparison = results.comparison
-    aligned, errors = {}, {}
+    first = comparison.runs[0].name
+    drawn: list[str] = []
+
+    def path(name: str) -> Path:
+        drawn.append(name)
+        return folder / name
+
+    aligned: dict[str, Trajectory] = {}
+    errors: dict[str, tuple[NDArray[Any], FloatArray]] = {}
     for run in comparison.runs:
         try:
             found = absolute_error(run.trajectory, comparison.reference)
@@ -303,36 +303,25 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
         aligned[run.name] = _aligned(run.trajectory, comparison.reference, found.stamps)
         there = interpolate(comparison.reference, found.stamps).map_T_lidar[:, :3, 3]
         errors[run.name] = distance_travelled(there), found.translations
-    pictures: dict[str, Callable[[Path], None]] = {}
     if aligned:
-        pictures["trajectories.png"] = lambda path: visualization.plot_trajectories(
-            path, aligned, _within(comparison.truth, aligned.values())
-        )
+        truth = _within(comparison.truth, aligned.values())
+        plots.plot_trajectories(path("trajectories.png"), aligned, truth)
     if errors and comparison.truth is not None:
-        pictures["errors.png"] = lambda path: visualization.plot_curves(
-            path, {"position error [m]": errors}, "distance travelled [m]"
-        )
+        panels = {"position error [m]": errors}
+        plots.plot_curves(path("errors.png"), panels, "distance travelled [m]")
     if results.differences:
+        # The first solver has no curve; its entry keeps the colours those of the other pictures.
+        none: dict[str, tuple[NDArray[Any], FloatArray]] = {first: (np.zeros(0), np.zeros(0))}
+        differences = results.differences.items()
         panels = {
-            f"{label} from {comparison.runs[0].name} [{unit}]": {
-                # The first-named solver has no curve, but keeps its colour.
-                comparison.runs[0].name: (np.zeros(0), np.zeros(0))
-            }
-            | {
-                name: (difference.frames, getattr(difference, key))
-                for name, difference in results.differences.items()
-            }
-            for label, unit, key in (("distance", "m", "metres"), ("angle", "deg", "degrees"))
+            f"distance from {first} [m]": none | {k: (d.frames, d.metres) for k, d in differences},
+            f"angle from {first} [deg]": none | {k: (d.frames, d.degrees) for k, d in differences},
         }
-        pictures["differences.png"] = lambda path: visualization.plot_curves(
-            path, panels, "frame", log=True
-        )
+        plots.plot_curves(path("differences.png"), panels, "frame", log=True)
     stages = {run.name: _stages(run) for run in comparison.runs}
     if any(stages.values()):
-        pictures["stages.png"] = lambda path: visualization.plot_stages(path, stages)
-    for name, draw in pictures.items():
-        draw(folder / name)
-    return list(pictures)
+        plots.plot_stages(path("stages.png"), stages)
+    return drawn
 
 
 def _aligned(trajectory: Trajectory, reference: Trajectory, stamps: IntArray) -> Trajectory:

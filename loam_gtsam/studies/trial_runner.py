@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import logging
 import multiprocessing
 import os
@@ -20,7 +19,7 @@ from concurrent.futures import (
 )
 from contextlib import contextmanager, suppress
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 from loam_gtsam.studies.trials import Row, Trial, empty_row, run_trial, versions
 from loam_gtsam.types import LoamError, MapUpdate, OutputError
@@ -30,8 +29,6 @@ _POLL = 0.2
 _CONNECT_SECONDS = 10
 _DEATHS = 4
 """Number of worker processes that may die of one trial before the trial counts as failed."""
-_ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-"""Environment of workers: the threads of several processes disturb each other's times."""
 
 Stopped = Callable[[], bool]
 """Whether the user has asked to stop."""
@@ -41,19 +38,6 @@ Work = Callable[[Trial], Row]
 
 class ClusterError(LoamError):
     """The scheduler of a cluster cannot be reached, or the connection was lost."""
-
-
-class Workers(Protocol):
-    """Processes that run trials."""
-
-    @property
-    def slots(self) -> int:
-        """Number of trials that can run at the same time."""
-        ...
-
-    def submit(self, work: Work, trial: Trial) -> Future[Row]:
-        """Start a trial; at most ``slots`` trials are under way."""
-        ...
 
 
 def run_here(trials: Sequence[Trial], stopped: Stopped) -> Iterator[Row]:
@@ -76,7 +60,10 @@ def run_here(trials: Sequence[Trial], stopped: Stopped) -> Iterator[Row]:
 
 
 def run_on(
-    workers: Workers, trials: Sequence[Trial], stopped: Stopped, work: Work | None = None
+    workers: LocalWorkers | ClusterWorkers,
+    trials: Sequence[Trial],
+    stopped: Stopped,
+    work: Work | None = None,
 ) -> Iterator[Row]:
     """Run trials on workers; a row comes as soon as its trial is finished.
 
@@ -87,35 +74,29 @@ def run_on(
     ------
     KeyboardInterrupt
         If the user asked to stop; trials under way are lost.
-    ClusterError
-        If the connection to the scheduler of a cluster is lost.
     """
     task = partial(_work_if_same_versions, work or run_trial, versions())
     waiting = deque(trials)
     running: dict[Future[Row], Trial] = {}
     deaths: Counter[str] = Counter()
-    try:
-        while waiting or running:
-            if stopped():
-                raise KeyboardInterrupt
-            # Without any worker, one trial waits at the scheduler for the first one.
-            while waiting and len(running) < max(1, workers.slots):
-                trial = waiting.popleft()
-                running[workers.submit(task, trial)] = trial
-            done, _ = wait(running, timeout=_POLL, return_when=FIRST_COMPLETED)
-            for future in done:
-                trial, error = running.pop(future), future.exception()
-                if isinstance(error, BrokenExecutor):
-                    deaths[trial.id] += 1
-                    if deaths[trial.id] < _DEATHS:
-                        waiting.appendleft(trial)
-                        continue
-                yield future.result() if error is None else _failed(trial, error)
-    except (OSError, CancelledError) as error:
-        raise ClusterError(
-            f"the connection to the scheduler was lost ({error}); finished trials are kept: start "
-            "the scheduler and the study again"
-        ) from error
+    while waiting or running:
+        if stopped():
+            raise KeyboardInterrupt
+        # Without any worker, one trial waits at the scheduler for the first one.
+        while waiting and len(running) < max(1, workers.slots):
+            trial = waiting.popleft()
+            running[workers.submit(task, trial)] = trial
+        done, _ = wait(running, timeout=_POLL, return_when=FIRST_COMPLETED)
+        for future in done:
+            trial, error = running.pop(future), future.exception()
+            if error is None:
+                yield future.result()
+                continue
+            deaths[trial.id] += isinstance(error, BrokenExecutor)
+            if isinstance(error, BrokenExecutor) and deaths[trial.id] < _DEATHS:
+                waiting.appendleft(trial)
+            else:
+                yield empty_row(trial) | {"error": f"{type(error).__name__}: {error}"}
 
 
 def _work_if_same_versions(work: Work, wanted: Mapping[str, str], trial: Trial) -> Row:
@@ -128,18 +109,10 @@ def _work_if_same_versions(work: Work, wanted: Mapping[str, str], trial: Trial) 
     return work(trial)
 
 
-def _failed(trial: Trial, error: BaseException) -> Row:
-    """The row of a trial that no worker could finish."""
-    text = f"{type(error).__name__}: {error}"
-    if isinstance(error, BrokenExecutor):
-        text = f"KilledWorker: the process of the trial died {_DEATHS} times; is memory short?"
-    return empty_row(trial) | {"error": text}
-
-
 # -- processes of this machine -----------------------------------------------------------------
 
 
-class _LocalWorkers:
+class LocalWorkers:
     """Executors of one process each: a process that dies takes no other trial with it."""
 
     def __init__(self, count: int) -> None:
@@ -148,14 +121,19 @@ class _LocalWorkers:
         self.last: dict[ProcessPoolExecutor, Future[Any]] = {}
 
     def submit(self, work: Work, trial: Trial) -> Future[Row]:
-        """See :class:`Workers`."""
+        """Start a trial; at most ``slots`` trials may be under way."""
         idle = (
             executor
             for executor, last in self.last.items()
             if last.done() and not isinstance(last.exception(), BrokenExecutor)
         )
         executor = next(idle, None) or self._start()
-        self.last[executor] = future = executor.submit(work, trial)
+        try:
+            future = executor.submit(work, trial)
+        except BrokenExecutor:  # the process died between two trials
+            del self.last[executor]
+            return self.submit(work, trial)
+        self.last[executor] = future
         return future
 
     def _start(self) -> ProcessPoolExecutor:
@@ -164,23 +142,18 @@ class _LocalWorkers:
         executor = ProcessPoolExecutor(
             1, multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
         )
-        before = {name: os.environ.get(name) for name in _ONE_THREAD}
-        os.environ.update(_ONE_THREAD)
-        try:
-            executor.submit(os.getpid)  # starts the process
-        finally:
-            for name, value in before.items():
-                os.environ.pop(name)
-                if value is not None:
-                    os.environ[name] = value
+        executor.submit(os.getpid)  # starts the process
         self.children |= set(multiprocessing.active_children()) - others
         return executor
 
 
 @contextmanager
-def local_workers(count: int) -> Iterator[Workers]:
+def local_workers(count: int) -> Iterator[LocalWorkers]:
     """Processes of this machine, one trial at a time in each; trials under way end with them."""
-    workers = _LocalWorkers(count)
+    # The threads of several processes disturb each other's times. BLAS reads this at its start.
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    workers = LocalWorkers(count)
     try:
         yield workers
     finally:
@@ -193,7 +166,7 @@ def local_workers(count: int) -> Iterator[Workers]:
 # -- a Dask cluster ----------------------------------------------------------------------------
 
 
-class _ClusterWorkers:
+class ClusterWorkers:
     """The workers of a Dask cluster."""
 
     def __init__(self, client: Any) -> None:
@@ -203,16 +176,16 @@ class _ClusterWorkers:
 
     @property
     def slots(self) -> int:
-        """See :class:`Workers`."""
+        """Number of trials that can run at the same time."""
         return sum(self._client.nthreads().values())
 
     def submit(self, work: Work, trial: Trial) -> Future[Row]:
-        """See :class:`Workers`."""
+        """Start a trial; at most ``slots`` trials should be under way."""
         return self.executor.submit(work, trial)
 
 
 @contextmanager
-def cluster_workers(address: str) -> Iterator[Workers]:
+def cluster_workers(address: str) -> Iterator[ClusterWorkers]:
     """The workers of a running Dask cluster, by the address of its scheduler.
 
     Raises
@@ -220,30 +193,35 @@ def cluster_workers(address: str) -> Iterator[Workers]:
     OutputError
         If Dask is not installed.
     ClusterError
-        If the scheduler cannot be reached.
+        If the scheduler cannot be reached, or the connection is lost.
     """
     try:
-        distributed = importlib.import_module("distributed")
+        from distributed import Client
+        from distributed.comm.addressing import parse_address, parse_host_port
+        from distributed.utils import silence_logging_cmgr
     except ImportError as error:
         raise OutputError(
             f'--scheduler needs Dask ({error}): pip install "loam_gtsam[cluster]"'
         ) from error
-    addressing = importlib.import_module("distributed.comm.addressing")
-    utils = importlib.import_module("distributed.utils")
     # Dask logs a lost connection with a traceback; the errors below say the same.
-    with utils.silence_logging_cmgr(logging.CRITICAL):
+    with silence_logging_cmgr(logging.CRITICAL):
         try:
-            addressing.parse_host_port(addressing.parse_address(address)[1])
-            client = distributed.Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
+            parse_host_port(parse_address(address)[1])
+            client = Client(address, timeout=_CONNECT_SECONDS, set_as_default=False)
         except (OSError, ValueError) as error:
             raise ClusterError(
                 f"--scheduler {address}: cannot reach a Dask scheduler there: {error}; start one "
                 "with: dask scheduler"
             ) from error
         with client:
-            workers = _ClusterWorkers(client)
+            workers = ClusterWorkers(client)
             try:
                 yield workers
+            except (OSError, CancelledError) as error:
+                raise ClusterError(
+                    f"the connection to the scheduler was lost ({error}); finished trials are "
+                    "kept: start the scheduler and the study again"
+                ) from error
             finally:
                 with suppress(OSError, CancelledError):
                     workers.executor.shutdown(wait=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 from rich.console import Console
@@ -16,6 +16,8 @@ from loam_gtsam.cli.console import file_name, progress_bar, stop_requests
 from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.studies.trial_runner import (
+    ClusterWorkers,
+    LocalWorkers,
     cluster_workers,
     local_workers,
     run_here,
@@ -88,6 +90,7 @@ def _rows(
     trials: Sequence[Trial], options: StudyOptions, stopped: Callable[[], bool]
 ) -> Iterator[Iterator[Row]]:
     """The rows of the trials as they are finished, from where the options have them run."""
+    place: AbstractContextManager[LocalWorkers | ClusterWorkers]
     if options.scheduler is not None and trials:
         place = cluster_workers(options.scheduler)
     elif options.workers is not None and trials:

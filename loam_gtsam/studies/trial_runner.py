@@ -131,7 +131,7 @@ class LocalWorkers:
         try:
             future = executor.submit(work, trial)
         except BrokenExecutor:  # the process died between two trials
-            del self.last[executor]
+            self.last.pop(executor, None)
             return self.submit(work, trial)
         self.last[executor] = future
         return future

@@ -26,7 +26,7 @@ from benchmarks.scene_tables import NONE, RECORDED, Row, along, drift, tilt, wri
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
-from loam_gtsam.pipeline import effective_config, imu_buffer
+from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
 from loam_gtsam.studies.contenders import PipelineRunner, SharedSweep, share_sweeps
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, Scan, Trajectory
@@ -154,7 +154,8 @@ class Runs:
             recording.sweeps, imu=imu, truth=recording.truth, sensor=recording.sensor
         )
         config = effective_config(config, dataset)
-        runner = PipelineRunner(variant, config, imu_buffer(dataset, config))
+        pipeline = Pipeline(config, imu=imu_buffer(dataset, config))
+        runner = PipelineRunner(variant, pipeline)
         seconds = []
         for sweep, extraction in self._features(dataset, config):
             # Processor time: the clock on the wall also counts what others do on the machine.

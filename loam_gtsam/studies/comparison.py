@@ -8,7 +8,7 @@ peers get the points and times that these features were extracted from.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from typing import Any
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.pipeline import OnFrame, effective_config, imu_buffer
+from loam_gtsam.pipeline import OnFrame, Pipeline, effective_config, imu_buffer
 from loam_gtsam.studies.contenders import (
     Contender,
     PeerRunner,
@@ -211,10 +211,11 @@ def _make_runners(
         if config is None:
             runners.append(PeerRunner(make_peer(entry.name)))
             continue
-        runner = PipelineRunner(entry.name, config, imu_buffer(dataset, config), guess)
+        imu = imu_buffer(dataset, config)
+        pipeline = Pipeline(config, imu=imu, solver=entry.solver, odometry=guess)
         if shared_guess and guess is None:
-            runner.pipeline.odometry = guess = SharedGuess(runner.pipeline.odometry)
-        runners.append(runner)
+            pipeline.odometry = guess = SharedGuess(pipeline.odometry)
+        runners.append(PipelineRunner(entry.name, pipeline))
     return runners
 
 

@@ -14,10 +14,10 @@ from loam_gtsam.config import PRESETS, Config, load_config
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.frontend.workers import Extraction
-from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import Pipeline, RunResult
 from loam_gtsam.registration.odometry import Guess, Odometry
+from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.studies.peers import PEERS, Peer, TimedPoints
 from loam_gtsam.types import (
     BadSweep,
@@ -46,10 +46,12 @@ class Contender:
     name : of a solver of this package its preset (``gtsam`` is the default preset), of a peer its
         name in :data:`loam_gtsam.studies.peers.PEERS`
     config : of a solver of this package; None for a peer
+    solver : a user's own solver in place of the one that ``config`` names
     """
 
     name: str
     config: Config | None = None
+    solver: ScanSolver | None = None
 
 
 def solver_names() -> tuple[str, ...]:
@@ -260,23 +262,15 @@ class PipelineRunner:
     Parameters
     ----------
     name : of the contender
-    imu : for this pipeline alone, since the buffer learns the bias of the gyro; None does without
-    odometry : see :class:`loam_gtsam.pipeline.Pipeline`
+    pipeline : for this contender alone, and so is its IMU buffer, which learns the gyro's bias
 
     Attributes
     ----------
     updates : one per sweep so far
     """
 
-    def __init__(
-        self,
-        name: str,
-        config: Config,
-        imu: ImuBuffer | None = None,
-        odometry: Odometry | None = None,
-    ) -> None:
-        self.name = name
-        self.pipeline = Pipeline(config, imu=imu, odometry=odometry)
+    def __init__(self, name: str, pipeline: Pipeline) -> None:
+        self.name, self.pipeline = name, pipeline
         self.updates: list[MapUpdate] = []
 
     def register(self, shared: SharedSweep) -> None:

@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from support.trajectories import disturbed, winding
 
 from loam_gtsam.types import FrameStatus, MapUpdate, OutputError, Trajectory
 from loam_gtsam.view import plots as visualization
@@ -162,3 +163,29 @@ def test_without_matplotlib_the_error_says_what_to_install(tmp_path, monkeypatch
     with pytest.raises(OutputError, match=r'pip install "loam_gtsam\[plot\]"'):
         plot_frame(tmp_path / "f.png", frame_view(np.zeros(0)), around())
     assert list(tmp_path.iterdir()) == []
+
+
+def test_pictures_show_every_solver(tmp_path):
+    first, second = visualization._RUN_COLOURS[:2]
+
+    def shows(name: str, colour: str) -> bool:
+        rgb = [int(colour[i : i + 2], 16) / 255.0 for i in (1, 3, 5)]
+        pixels = image.imread(tmp_path / name)[..., :3]
+        return bool((np.abs(pixels - rgb).max(axis=2) < 0.02).sum() > 50)
+
+    paths = {"a": winding(), "b": disturbed(winding(), size=0.3)}
+    visualization.plot_trajectories(tmp_path / "two.png", paths, winding())
+    visualization.plot_trajectories(tmp_path / "one.png", {"a": winding()})
+    assert shows("two.png", first)
+    assert shows("two.png", second)
+    assert shows("two.png", visualization.TRUTH)
+    assert shows("one.png", first)
+    assert not shows("one.png", second)
+    x = np.arange(50)
+    curves = {"a": (x, 1.0 + x), "b": (x, 60.0 - x)}
+    visualization.plot_curves(tmp_path / "c.png", {"y": curves, "z": curves}, "x", log=True)
+    assert shows("c.png", first)
+    assert shows("c.png", second)
+    visualization.plot_stages(tmp_path / "s.png", {"a": {"match": 3.0}, "b": {"other": 2.0}})
+    assert shows("s.png", visualization._STAGE_COLOURS[0])
+    assert shows("s.png", visualization._STAGE_COLOURS[1])

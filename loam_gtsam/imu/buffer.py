@@ -6,10 +6,13 @@ when samples enter. Stamps are subtracted as integers before they become seconds
 
 from __future__ import annotations
 
+from collections import Counter
+
 import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.geometry import as_array, as_stamps, as_vector
 from loam_gtsam.imu.at_rest import RestWindow, find_rest, rest_at_start
 from loam_gtsam.imu.attitude_filter import BLOCK, GravityFilter
 from loam_gtsam.imu.quality import ImuReport, QualityLog
@@ -24,7 +27,7 @@ from loam_gtsam.imu.quaternions import (
     running_product,
 )
 from loam_gtsam.imu.store import SampleStore
-from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, InputError, IntArray
+from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_array
 
 REST_AHEAD = 0.1
 """Seconds after the asked stamp that still count to its rest: one sweep."""
@@ -74,8 +77,9 @@ class ImuBuffer:
         roll, pitch, yaw = np.deg2rad(config.lidar_R_imu_deg)
         self.lidar_R_imu = gtsam.Rot3.RzRyRx(roll, pitch, yaw)
         self._bias = np.zeros(3)
-        self._store = SampleStore()
-        self._quality = QualityLog(config)
+        self._counts: Counter[str] = Counter()
+        self._store = SampleStore(self._counts)
+        self._quality = QualityLog(config, self._counts)
         self._filter = GravityFilter(config)
         self._rest: RestWindow | None = None
         self._start_is_held = True
@@ -89,10 +93,7 @@ class ImuBuffer:
 
     @gyro_bias.setter
     def gyro_bias(self, bias: FloatArray) -> None:
-        bias = np.array(bias, dtype=np.float64)
-        if bias.shape != (3,) or not np.isfinite(bias).all():
-            raise InputError(f"gyro_bias: expected 3 finite numbers in rad/s, got {bias!r}")
-        self._bias = bias
+        self._bias = as_vector(bias, "gyro_bias").copy()
 
     def add(self, samples: ImuSamples) -> None:
         """Put in one or many samples, in any order, overlapping others or not.
@@ -102,19 +103,19 @@ class ImuBuffer:
         InputError
             If an array has the wrong shape or dtype.
         """
-        quality = self._quality
+        counts = self._counts
         stamps, values = _checked(samples)
         finite = (np.abs(values[:, 4:]) < _ABSURD).all(axis=1)  # NaN compares false
         finite &= (stamps >= -MAX_STAMP) & (stamps <= MAX_STAMP)
-        quality.not_finite += len(stamps) - int(finite.sum())
+        counts["not_finite"] += len(stamps) - int(finite.sum())
         stamps, values = stamps[finite], values[finite]
         if len(stamps) == 0:
             return
         quaternions, unnormalised = _normalised(values[:, :4])
         known = ~np.isnan(quaternions[0])
-        quality.unnormalised += unnormalised
-        quality.no_orientation += len(stamps) - int(known.sum())
-        quality.watch_orientation(quaternions[:, known], values[:, 4:7])
+        counts["unnormalised"] += unnormalised
+        counts["no_orientation"] += len(stamps) - int(known.sum())
+        self._quality.watch_orientation(quaternions[:, known], values[:, 4:7])
         lidar_R_imu = self.lidar_R_imu.matrix()
         turned = np.empty_like(values)
         turned[:, :4] = quaternion_product(quaternions, inverse(from_rot3(self.lidar_R_imu))).T
@@ -156,7 +157,7 @@ class ImuBuffer:
     def report(self) -> ImuReport:
         """What came in so far, and what was wrong with it."""
         filtered = self._orientations() is not None
-        return self._quality.report(self._store, self._rest_at_start(), filtered)
+        return self._quality.report(self._store.stamps, self._rest_at_start(), filtered)
 
     def orientation(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar`` (world z up), interpolated between the neighbours.
@@ -206,11 +207,7 @@ class ImuBuffer:
         InputError
             If ``seconds`` is no row of finite numbers.
         """
-        seconds = np.asarray(seconds, dtype=np.float64)
-        if seconds.ndim != 1 or not np.isfinite(seconds).all():
-            raise InputError(
-                f"seconds: expected a (K,) array of finite numbers, got shape {seconds.shape}"
-            )
+        seconds = as_array(seconds, "seconds", ("K",))
         earliest, latest = seconds.min(initial=0.0), seconds.max(initial=0.0)
         first, last = stamp + round(earliest * 1e9), stamp + round(latest * 1e9)
         found = self._rates(first, last, stamp)
@@ -302,25 +299,16 @@ class ImuBuffer:
 
 def _checked(samples: ImuSamples) -> tuple[IntArray, FloatArray]:
     """Stamps (N,) and values (N, 10): quaternion (zero where unknown), gyro, acceleration."""
-    stamps = np.asarray(samples.stamps)
-    if stamps.ndim != 1 or (stamps.dtype.kind not in "iu" and len(stamps)):
-        raise InputError(
-            f"ImuSamples.stamps: expected (N,) integer nanoseconds, got shape {stamps.shape} of "
-            f"{stamps.dtype}; np.round(seconds * 1e9).astype(np.int64) makes them of seconds"
-        )
+    stamps = as_stamps(samples.stamps, "ImuSamples.stamps")
     columns = []
     for name, width in (("orientation", 4), ("gyro", 3), ("acceleration", 3)):
         column = getattr(samples, name)
         if column is None and name == "orientation":
             column = np.zeros((len(stamps), 4))
         column = np.asarray(column)
-        if column.shape != (len(stamps), width) or column.dtype.kind not in "fiu":
-            raise InputError(
-                f"ImuSamples.{name}: expected ({len(stamps)}, {width}) numbers, one row per "
-                f"stamp, got shape {column.shape} of {column.dtype}"
-            )
+        check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
         columns.append(column)
-    return stamps.astype(np.int64), np.hstack(columns).astype(np.float64)
+    return stamps, np.hstack(columns).astype(np.float64)
 
 
 def _normalised(quaternions: FloatArray) -> tuple[FloatArray, int]:

@@ -1,4 +1,4 @@
-"""Whether the configured mounting of the IMU fits the motion that the scans have measured."""
+"""Check of the configured mounting of the IMU against the motion that the scans measured."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 
+from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.types import FloatArray, InputError, IntArray
+from loam_gtsam.types import FloatArray, IntArray
 
 EXTRINSIC_LIMIT = np.deg2rad(5.0)
 """rad from which on a configured rotation is called wrong."""
@@ -19,7 +20,7 @@ EXTRINSIC_FRAMES = 20
 
 
 def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArray) -> str:
-    """Whether another ``lidar_R_imu_deg`` would fit the motion of the scans better.
+    """Say so if another ``lidar_R_imu_deg`` would fit the motion of the scans better.
 
     The rotations from frame to frame by the gyro and by the scans are the same vectors in two sets
     of axes; the rotation between the sets is found in closed form (Wahba's problem by SVD:
@@ -29,7 +30,7 @@ def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArr
     ----------
     buffer : with the configured rotation
     stamps : (N,) nanoseconds
-    map_T_lidar : (N, 4, 4) poses or (N, 3, 3) rotations, from scans alone
+    map_T_lidar : (N, 4, 4) poses, from scans alone
 
     Returns
     -------
@@ -41,17 +42,12 @@ def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArr
     InputError
         If the shapes do not fit.
     """
-    stamps, poses = np.asarray(stamps), np.asarray(map_T_lidar, dtype=np.float64)
-    if stamps.ndim != 1 or poses.shape not in ((len(stamps), 4, 4), (len(stamps), 3, 3)):
-        raise InputError(
-            f"extrinsic_problem: expected (N,) stamps and (N, 4, 4) or (N, 3, 3) poses, got "
-            f"{stamps.shape} and {poses.shape}"
-        )
+    stamps = as_stamps(stamps, "stamps")
+    rotations = as_array(map_T_lidar, "map_T_lidar", (len(stamps), 4, 4))[:, :3, :3]
     turns = [buffer.rotation_between(int(a), int(b)) for a, b in pairwise(stamps)]
     known = np.array([turn is not None for turn in turns], dtype=np.bool_)
     if known.sum() < EXTRINSIC_FRAMES:
         return ""
-    rotations = poses[:, :3, :3]
     relative = np.einsum("nji,njk->nik", rotations[:-1], rotations[1:])[known]
     by_scan = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(matrix)) for matrix in relative])
     by_gyro = np.array([gtsam.Rot3.Logmap(turn) for turn in turns if turn is not None])

@@ -11,7 +11,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.types import FloatArray, ImuSamples, InputError, SweepError
+from loam_gtsam.types import FloatArray, ImuSamples, InputError, SweepError, check_array
 
 STATE = 18
 POSE, VELOCITY, BIASES, GRAVITY = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18)
@@ -61,10 +61,7 @@ def integration_steps(
     """
     stamps = samples.stamps
     for name in ("gyro", "acceleration"):
-        if getattr(samples, name).shape != (len(stamps), 3):
-            raise InputError(
-                f"{name}: expected shape ({len(stamps)}, 3), got {getattr(samples, name).shape}"
-            )
+        check_array(getattr(samples, name), name, (len(stamps), 3), "numbers")
     if stop <= start:
         raise SweepError(f"stamp: expected later than {start}, got {stop}")
     if not len(stamps) or stamps[0] > start or stamps[-1] < stop:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.at_rest import REST_SAMPLES, RestWindow
-from loam_gtsam.imu.store import SampleStore
 from loam_gtsam.types import FloatArray, IntArray
 
 FROZEN_TURN = 0.2
@@ -50,22 +50,32 @@ class ImuReport:
     problems: tuple[str, ...]
 
 
+_FAULTS = {
+    "duplicates": "repeat a stamp: the first of each is kept",
+    "out_of_order": "came late: sorted in",
+    "too_late": "came too late: left out",
+    "not_finite": "hold NaN, infinity or absurd values: left out",
+    "unnormalised": "have a quaternion that is not of unit length: normalised",
+    "no_orientation": "have no orientation: interpolated",
+}
+
+
 class QualityLog:
     """Counts what is wrong with samples, and finds out whether their orientation is one.
 
     Parameters
     ----------
     config : section ``imu``
+    counts : samples by what is wrong with them, in the words of :class:`ImuReport`; "too_late"
+        are those dropped because they are older than what the buffer still holds
 
     Attributes
     ----------
-    not_finite, unnormalised, no_orientation : as in :class:`ImuReport`
     constant : no orientation has differed from the first one so far; also if there was none
     """
 
-    def __init__(self, config: ImuConfig) -> None:
-        self._config = config
-        self.not_finite = self.unnormalised = self.no_orientation = 0
+    def __init__(self, config: ImuConfig, counts: Counter[str]) -> None:
+        self._config, self._counts = config, counts
         self.constant = True
         self._first: FloatArray | None = None
         self._quaternions, self._fastest = 0, 0.0
@@ -92,28 +102,21 @@ class QualityLog:
         self._dropped_gaps += len(gaps)
         self._longest_gap = max(self._longest_gap, int(gaps.max(initial=0)))
 
-    def report(self, store: SampleStore, rest: RestWindow | None, filtered: bool) -> ImuReport:
+    def report(self, stamps: IntArray, rest: RestWindow | None, filtered: bool) -> ImuReport:
         """The report on all samples so far.
 
         Parameters
         ----------
-        store : the samples that are still held
-        rest : the rest at the start of the run, None if it began in motion
+        stamps : (N,) of the samples that are held, nanoseconds
+        rest : the rest at the start of the run, None if the run began in motion
         filtered : whether there is an orientation at all
         """
-        samples = self._dropped + len(store.stamps)
+        samples, counts = self._dropped + len(stamps), self._counts
         source, problems = self._source(samples, rest, filtered)
-        for number, what in (
-            (store.duplicates, "repeat a stamp: the first of each is kept"),
-            (store.out_of_order, "came late: sorted in"),
-            (store.too_late, "came too late: left out"),
-            (self.not_finite, "hold NaN, infinity or absurd values: left out"),
-            (self.unnormalised, "have a quaternion that is not of unit length: normalised"),
-            (self.no_orientation if source == "ahrs" else 0, "have no orientation: interpolated"),
-        ):
-            if number:
-                problems.append(f"IMU: {number} samples {what}")
-        steps, gaps = np.diff(store.stamps), self._gaps(store.stamps)
+        for fault, what in _FAULTS.items():
+            if counts[fault] and (fault != "no_orientation" or source == "ahrs"):
+                problems.append(f"IMU: {counts[fault]} samples {what}")
+        steps, gaps = np.diff(stamps), self._gaps(stamps)
         number = self._dropped_gaps + len(gaps)
         if number:
             longest = max(self._longest_gap, int(gaps.max(initial=0)))
@@ -123,11 +126,11 @@ class QualityLog:
             )
         return ImuReport(
             samples=samples,
-            duplicates=store.duplicates,
-            out_of_order=store.out_of_order,
-            not_finite=self.not_finite,
-            unnormalised=self.unnormalised,
-            no_orientation=self.no_orientation,
+            duplicates=counts["duplicates"],
+            out_of_order=counts["out_of_order"],
+            not_finite=counts["not_finite"],
+            unnormalised=counts["unnormalised"],
+            no_orientation=counts["no_orientation"],
             gaps=number,
             rate=1e9 / float(np.median(steps)) if len(steps) else 0.0,
             orientation=source,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 
 from loam_gtsam.types import FloatArray, IntArray
@@ -10,16 +12,17 @@ from loam_gtsam.types import FloatArray, IntArray
 class SampleStore:
     """Stamps and values of IMU samples, sorted by stamp, one sample for each stamp.
 
+    Parameters
+    ----------
+    counts : "duplicates", "out_of_order" and "too_late" are counted here
+
     Attributes
     ----------
-    duplicates : number of samples dropped because of their stamp; the first to come is kept
-    out_of_order : number of samples older than one that came before them
-    too_late : number of samples dropped because they are older than :meth:`drop` has left
     accepts_from : older samples are dropped, nanoseconds; None accepts all
     """
 
-    def __init__(self) -> None:
-        self.duplicates = self.out_of_order = self.too_late = 0
+    def __init__(self, counts: Counter[str]) -> None:
+        self._counts = counts
         self.accepts_from: int | None = None
         self._newest_arrival = np.iinfo(np.int64).min
         self._waiting: list[tuple[IntArray, FloatArray]] = []
@@ -52,12 +55,12 @@ class SampleStore:
         """Keep samples (N,) and (N, 10), in any order, for the next :meth:`merge`."""
         if self.accepts_from is not None:
             young = stamps >= self.accepts_from
-            self.too_late += len(stamps) - int(young.sum())
+            self._counts["too_late"] += len(stamps) - int(young.sum())
             stamps, values = stamps[young], values[young]
         if len(stamps) == 0:
             return
         newest = np.maximum.accumulate(np.concatenate([[self._newest_arrival], stamps]))
-        self.out_of_order += int((stamps < newest[:-1]).sum())
+        self._counts["out_of_order"] += int((stamps < newest[:-1]).sum())
         self._newest_arrival = int(newest[-1])
         self._waiting.append((stamps, values))
 
@@ -83,7 +86,7 @@ class SampleStore:
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         kept = np.concatenate([[True], stamps[1:] != stamps[:-1]])
-        self.duplicates += len(stamps) - int(kept.sum())
+        self._counts["duplicates"] += len(stamps) - int(kept.sum())
         self._count = at + int(kept.sum())
         if self._count > len(self._room):
             room = 2 * self._count

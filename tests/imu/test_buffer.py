@@ -35,7 +35,7 @@ def test_turn_subtracts_the_bias_and_zero_seconds_turn_nothing():
     assert np.array_equal(plain[0], np.zeros(3))
     assert buffer.rotations_since(int(ns(1.0)), np.zeros(0)).shape == (0, 3)
     for wrong in (np.zeros(2), [0.0, np.nan, 0.0]):
-        with pytest.raises(InputError, match="gyro_bias: expected 3"):
+        with pytest.raises(InputError, match="gyro_bias: expected"):
             buffer.gyro_bias = wrong
 
 
@@ -58,7 +58,7 @@ def test_turn_ends_where_the_data_does():
     assert buffer.rotations_since(last + 200_000_000, np.array([0.0])) is None
     assert ImuBuffer(CONFIG).rotations_since(START, np.array([0.0])) is None
     for wrong in (np.zeros((2, 2)), np.array([np.nan])):
-        with pytest.raises(InputError, match=r"seconds: expected a \(K,\) array"):
+        with pytest.raises(InputError, match="seconds: expected"):
             buffer.rotations_since(last, wrong)
 
 
@@ -265,8 +265,8 @@ def test_samples_that_are_no_numbers_are_left_out():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stamps": np.zeros(5)}, r"stamps: expected \(N,\) integer nanoseconds"),
-        ({"stamps": np.zeros((5, 1), int)}, r"stamps: expected \(N,\) integer nanoseconds"),
+        ({"stamps": np.zeros(5)}, r"stamps: expected \(N,\) integers"),
+        ({"stamps": np.zeros((5, 1), int)}, r"stamps: expected \(N,\) integers"),
         ({"gyro": np.zeros((4, 3))}, r"gyro: expected \(5, 3\) numbers.*got shape \(4, 3\)"),
         ({"acceleration": np.zeros((5, 2))}, r"acceleration: expected \(5, 3\)"),
         ({"orientation": np.zeros((5, 3))}, r"orientation: expected \(5, 4\)"),

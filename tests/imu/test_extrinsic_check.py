@@ -63,7 +63,6 @@ def test_a_good_or_nearly_good_mounting_is_left_alone(walk):
     for degrees, told in (((0, 0, 0), False), ((0, 0, 4), False), ((0, 6, 0), True)):
         buffer = ImuBuffer(CONFIG, as_seen_by(samples, rot(*degrees)))
         assert bool(extrinsic_problem(buffer, stamps, poses)) is told
-        assert bool(extrinsic_problem(buffer, stamps, poses[:, :3, :3])) is told
 
 
 def test_too_little_motion_says_nothing(walk):
@@ -86,11 +85,11 @@ def test_too_little_motion_says_nothing(walk):
             np.tile([0, 0, G], (len(times), 1)),
         )
         yaw = 0.5 * (1.0 - np.cos(0.1 * np.arange(count)))
-        scans = Rotation.from_euler("z", yaw[:, None]) * Rotation.from_rotvec(
-            0.001 * rng.standard_normal((count, 3))
-        )
+        scatter = Rotation.from_rotvec(0.001 * rng.standard_normal((count, 3)))
+        scans = np.tile(np.eye(4), (count, 1, 1))
+        scans[:, :3, :3] = (Rotation.from_euler("z", yaw[:, None]) * scatter).as_matrix()
         planar = ImuBuffer(CONFIG, as_seen_by(even, rot(0, 0, 90)))
-        assert extrinsic_problem(planar, ns(0.1 * np.arange(count)), scans.as_matrix()) == ""
+        assert extrinsic_problem(planar, ns(0.1 * np.arange(count)), scans) == ""
 
 
 def test_lost_tracks_and_gaps_do_not_mislead(walk):
@@ -115,5 +114,5 @@ def test_a_mirrored_gyro_is_no_matter_of_mounting(walk, signs):
 def test_extrinsic_check_wants_as_many_poses_as_stamps(walk):
     samples, stamps, poses = walk
     for wrong in (poses[:-1], poses[:, :3], poses[0]):
-        with pytest.raises(InputError, match=r"expected \(N,\) stamps and"):
+        with pytest.raises(InputError, match=r"map_T_lidar: expected \(80, 4, 4\)"):
             extrinsic_problem(ImuBuffer(CONFIG, samples), stamps, wrong)

@@ -265,8 +265,8 @@ def test_samples_that_are_no_numbers_are_left_out():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"stamps": np.zeros(5)}, r"stamps: expected \(N,\) integers"),
-        ({"stamps": np.zeros((5, 1), int)}, r"stamps: expected \(N,\) integers"),
+        ({"stamps": np.zeros(5)}, r"stamps: expected \(N,\) integer"),
+        ({"stamps": np.zeros((5, 1), int)}, r"stamps: expected \(N,\) integer"),
         ({"gyro": np.zeros((4, 3))}, r"gyro: expected \(5, 3\) numbers.*got shape \(4, 3\)"),
         ({"acceleration": np.zeros((5, 2))}, r"acceleration: expected \(5, 3\)"),
         ({"orientation": np.zeros((5, 3))}, r"orientation: expected \(5, 4\)"),

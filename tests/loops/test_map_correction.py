@@ -8,9 +8,12 @@ import pytest
 from support.worlds import OWN, World, there_and_back, updates
 
 from loam_gtsam.config import Config
+from loam_gtsam.datasets import open_dataset
+from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import Mapper
+from loam_gtsam.pipeline import Pipeline, imu_buffer
 from loam_gtsam.registration.solvers import GtsamSolver
 
 UP = np.array([0.0, 0.0, 3.0])
@@ -37,11 +40,23 @@ class Known:
         return LoopClosure(earlier, later, POSES[earlier].between(POSES[later]), OWN)
 
 
-def driven(first, **pose_graph):
-    """A way out and back, with a mark above each keyframe in the mapper's map."""
+def driven(first, look=False, again=None, **pose_graph):
+    """A way out and back, with a mark above each keyframe in the mapper's map.
+
+    Parameters
+    ----------
+    first : keyframe from which on the closer finds loops
+    look : ask for the map after every frame
+    again : mapper and loops of an earlier drive, which are reset
+    """
     config = settings(**pose_graph)
-    mapper = Mapper(config)
-    loops = LoopMapping(mapper, config, Known(first))
+    if again is None:
+        mapper = Mapper(config)
+        loops = LoopMapping(mapper, config, Known(first))
+    else:
+        mapper, loops, _ = again
+        mapper.reset()
+        loops.reset()
     world, rng = World(0), np.random.default_rng(0)
     closed = []
     for update in updates(POSES, DRIFT):
@@ -49,6 +64,10 @@ def driven(first, **pose_graph):
         closed.append(loops.add(update, features))
         mapper.edge_map.owner = mapper.keyframe
         mapper.edge_map.insert((update.map_T_lidar.translation() + UP)[None])
+        if look:
+            loops.map_points()
+            loops.counts()
+            loops.loop_ends()
     return mapper, loops, closed
 
 
@@ -100,6 +119,89 @@ def test_counts_and_ends_are_those_of_the_graph():
     assert ends.shape == (counts["loops"], 2, 3)
     assert on.all()
     assert np.linalg.norm(ends[:, 0] - ends[:, 1], axis=1).max() < 4.2
+
+
+def assert_same(one, two):
+    """To the last bit: the poses, the mapper's map, and the corrected one."""
+    assert one[2] == two[2]
+    assert one[1].points_moved == two[1].points_moved
+    np.testing.assert_array_equal(one[1].graph.poses(), two[1].graph.poses())
+    for found, wanted in zip(one[:2], two[:2], strict=True):
+        for points, others in zip(found.map_points(), wanted.map_points(), strict=True):
+            np.testing.assert_array_equal(points, others)
+
+
+def test_to_look_at_the_map_changes_nothing():
+    limits = {"follow_distance": 0.1, "follow_angle_deg": 0.3}  # so that something is left to do
+    looked = driven(first=30, look=True, **limits)
+    assert_same(looked, driven(first=30, **limits))
+    corrected = looked[1].map_points()
+    looked[1].correct_map()
+    assert looked[1].points_moved > 0
+    for points, wanted in zip(corrected, looked[1].map_points(), strict=True):
+        np.testing.assert_allclose(points, wanted, atol=1e-12)
+
+
+def test_after_a_reset_all_is_as_in_a_new_one():
+    """The closer of the package has no keyframes of the run before either."""
+    first = driven(first=30)
+    assert_same(driven(first=30, again=first), driven(first=30))
+    assert first[1].graph.keyframes[0].index == 0
+    assert len(first[1].graph) == len(POSES)
+
+
+class Remembering:
+    """A loop closer of one's own, which finds a loop with the keyframe it saw four before."""
+
+    def __init__(self):
+        self.seen = []
+
+    def detect(self, keyframe, history):
+        self.seen.append(keyframe.index)
+        if len(self.seen) < 5:
+            return None
+        earlier = self.seen[-5]
+        off = np.array([1e-4, 0.0, 2e-4, 3e-3, -2e-3, 1e-3])
+        motion = history.pose(earlier).between(history.pose(keyframe.index)).retract(off)
+        return LoopClosure(earlier, keyframe.index, motion, OWN)
+
+    def reset(self):
+        self.seen = []
+
+
+@pytest.mark.parametrize("preintegration", [False, True])
+@pytest.mark.parametrize("begin", ["resumed", "reset"][: 1 + hasattr(Pipeline, "reset")])
+def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, preintegration):
+    """With a loop closer of one's own, and looked at after every frame."""
+    dataset = open_dataset("sim:corridor?frames=16&columns=300&speed=8")
+    config = Config().changed(
+        f"imu.preintegration={str(preintegration).lower()}",
+        "pose_graph.keyframe_distance=0.1",
+        "pose_graph.follow_distance=0.0001",
+        "pose_graph.follow_angle_deg=0.0001",
+    )
+    sweeps = list(dataset)
+
+    def pipeline():
+        imu = imu_buffer(dataset, config)
+        return Pipeline(config, imu=imu, loop_closer=Remembering())
+
+    whole, other = pipeline(), pipeline()
+    for sweep in sweeps[:9]:
+        whole.process(sweep)
+    if begin == "resumed":
+        thaw(freeze(*whole.state()), *other.state())
+        rest = sweeps[9:]
+    else:
+        whole.reset()
+        rest = sweeps
+    expected = [whole.process(sweep).map_T_lidar for sweep in rest]
+    for sweep, pose in zip(rest, expected, strict=True):
+        np.testing.assert_array_equal(other.process(sweep).map_T_lidar.matrix(), pose.matrix())
+        other.map_points()
+    assert sum(whole.loops.graph.active) > 3
+    assert whole.loops.points_moved > 0
+    assert_same((whole.mapper, whole.loops, 0), (other.mapper, other.loops, 0))
 
 
 class Drifting:

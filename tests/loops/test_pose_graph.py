@@ -1,97 +1,30 @@
-"""Pose graphs: keyframes, closed forms, marginals, loops that are right and wrong, batch."""
+"""Pose graphs: keyframes, closed forms, marginals, sessions; reset and resumed ones."""
 
 from dataclasses import replace
-from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import X
+from gtsam.symbol_shorthand import L, X
+from support.pose_graphs import (
+    FRAME,
+    SIGMAS,
+    drifted,
+    filled,
+    frames,
+    off,
+    right_loops,
+    settings,
+    square,
+    wrong_loops,
+)
 
-from loam_gtsam.config import Config
-from loam_gtsam.loops.batch import SavedGraph, optimize_graph
-from loam_gtsam.loops.consistency import LoopConsistency, chi_squared, consistent
-from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
+from loam_gtsam.io.state import freeze, thaw
+from loam_gtsam.loops.batch import optimize_graph
+from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, Uncertainty
-
-SIGMAS = np.repeat([0.002, 0.02], 3)
-FRAME = 10**8
-
-
-def settings(**pose_graph):
-    config = Config()
-    chosen = {"keyframe_distance": 0.5, "walk": 0.0, "turn_walk_deg": 0.0} | pose_graph
-    return config.changed(pose_graph=config.pose_graph.changed(**chosen))
-
-
-def frames(poses, sigmas=SIGMAS):
-    """Solved frames whose relative covariance is that of ``sigmas`` a step."""
-    drift = 1e-8 * np.eye(6)
-    made = []
-    for number, pose in enumerate(poses):
-        if number:
-            to_map = pose.AdjointMap()
-            drift = drift + to_map @ np.diag(sigmas**2) @ to_map.T
-        parts = Uncertainty(np.zeros((6, 6)), np.zeros((6, 6)), None, drift, 1.0, 100.0)
-        made.append(
-            MapUpdate(number * FRAME, pose, FrameStatus.OK, covariance=1e-8 * np.eye(6),
-                      uncertainty=parts)
-        )  # fmt: skip
-    return made
-
-
-def square(side, laps):
-    """Poses 1 m apart around a square, the first ones on its side along x."""
-    poses = [gtsam.Pose3()]
-    for step in range(laps * 4 * side - 1):
-        turn = gtsam.Rot3.Yaw(np.pi / 2.0) if (step + 1) % side == 0 else gtsam.Rot3()
-        poses.append(poses[-1].compose(gtsam.Pose3(turn, np.array([1.0, 0.0, 0.0]))))
-    return poses
-
-
-def drifted(poses, rng, sigmas=SIGMAS):
-    odometry = [poses[0]]
-    for one, two in pairwise(poses):
-        step = one.between(two).retract(sigmas * rng.normal(size=6))
-        odometry.append(odometry[-1].compose(step))
-    return odometry
-
-
-def right_loops(truth, rng, count):
-    lap = len(truth) // 2
-    made = []
-    for a in np.linspace(3, lap - 3, count).astype(int).tolist():
-        seen = truth[a].between(truth[a + lap]).retract(SIGMAS * rng.normal(size=6))
-        made.append(LoopClosure(a, a + lap, seen, np.diag(SIGMAS**2)))
-    return made
-
-
-def wrong_loops(count, size, rng):
-    made = []
-    while len(made) < count:
-        one, two = sorted(rng.choice(size, 2, replace=False).tolist())
-        if two - one > 1:
-            where = gtsam.Pose3(gtsam.Rot3.Yaw(rng.uniform(-3, 3)), rng.normal(0, 2.0, 3))
-            made.append(LoopClosure(one, two, where, np.diag(SIGMAS**2)))
-    return made
-
-
-def filled(poses, **pose_graph):
-    graph = PoseGraph(settings(**pose_graph))
-    for update in frames(poses):
-        graph.add(update)
-    return graph
-
-
-def off(graph, truth):
-    """Metres, root mean square."""
-    positions = graph.poses()[:, :3, 3] - [pose.translation() for pose in truth]
-    return np.sqrt((positions**2).sum(axis=1).mean())
-
-
-# -- keyframes -------------------------------------------------------------------------------------
+from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate
 
 
 def test_a_frame_is_a_keyframe_when_it_is_far_or_has_turned():
@@ -137,9 +70,6 @@ def test_features_are_kept_where_they_are_at_the_stamp():
     assert len(keyframe.edges) == len(keyframe.distinct) == 0
     with pytest.raises(InputError, match="expected those of the stamp 0, got 7"):
         PoseGraph(config).add(update, replace(features, stamp=7))
-
-
-# -- the graph -------------------------------------------------------------------------------------
 
 
 def test_between_factors_have_the_covariance_of_the_motion():
@@ -221,7 +151,7 @@ def test_positions_and_gravity_hold_the_graph():
     tilt = graph.covariance(70)[0, 0]
     for index in range(0, 80, 10):
         graph.add_position(index, np.array(truth[index].translation()), 1e-4 * np.eye(3))
-    assert off(graph, truth) < 0.1 < off(filled(odometry), truth)
+    assert off(graph.poses(), truth) < 0.1 < off(filled(odometry).poses(), truth)
     for index in range(80):
         up = truth[index].rotation().unrotate(np.array([0.0, 0.0, 2.0]))
         graph.add_gravity(index, up, 1e-4)
@@ -262,59 +192,6 @@ def test_marginals_of_a_chain_are_those_of_monte_carlo():
         assert np.mean(nees) == pytest.approx(6.0, abs=4.0 * np.sqrt(12.0 / runs))
 
 
-# -- loops -----------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("seed", [0, 1])
-def test_fifty_wrong_loops_do_not_bend_ten_right_ones(seed):
-    truth = square(25, 2)
-    rng = np.random.default_rng(seed)
-    odometry = drifted(truth, rng)
-    right = right_loops(truth, rng, 10)
-    clean = filled(odometry)
-    for loop in right:
-        assert clean.add_loop(loop)
-    alone = off(clean, truth)
-    assert alone < 0.7 * off(filled(odometry), truth)
-    loops = [*right, *wrong_loops(50, len(truth), rng)]
-    order = rng.permutation(len(loops)).tolist()
-    graph = filled(odometry)
-    for number in order:
-        graph.add_loop(loops[number])
-    assert graph.active == tuple(number < 10 for number in order)
-    assert off(graph, truth) == pytest.approx(alone, rel=0.05)
-    # They are what bends it if they are believed.
-    believed = optimize_graph(graph.saved(), robust=False)
-    assert off_by(believed.poses, truth) > 5.0 * alone
-
-
-def off_by(values, truth):
-    """Metres, root mean square."""
-    errors = [values.atPose3(X(n)).translation() - p.translation() for n, p in enumerate(truth)]
-    return np.sqrt(np.square(errors).sum(axis=1).mean())
-
-
-def test_batch_finds_the_same_loops():
-    truth = square(20, 2)
-    rng = np.random.default_rng(2)
-    odometry = drifted(truth, rng)
-    graph = filled(odometry)
-    loops = [*right_loops(truth, rng, 5), *wrong_loops(15, len(truth), rng)]
-    for number in rng.permutation(len(loops)).tolist():
-        graph.add_loop(loops[number])
-    before, active = graph.poses(), graph.active
-    result = graph.optimize()
-    assert [loop.active for loop in result.loops] == list(active) == list(graph.active)
-    assert sum(active) == 5
-    np.testing.assert_allclose(graph.poses(), before, atol=1e-3)
-    assert result.error_after <= result.error_before
-    # And the run goes on from there.
-    step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0, 0]))
-    goes_on = frames([*odometry, odometry[-1].compose(step)])[-1]
-    assert graph.add(goes_on).index == len(truth)
-    assert graph.pose(len(truth)).equals(graph.pose(len(truth) - 1).compose(step), 1e-6)
-
-
 def test_isam_is_the_batch_solution():
     truth = square(20, 2)
     rng = np.random.default_rng(6)
@@ -325,36 +202,6 @@ def test_isam_is_the_batch_solution():
     batch = np.array([result.poses.atPose3(X(n)).matrix() for n in range(len(graph))])
     np.testing.assert_allclose(graph.poses(), batch, atol=2e-4)
     np.testing.assert_allclose(graph.covariance(70), result.covariance(X(70)), rtol=0.02, atol=1e-9)
-
-
-def test_a_wrong_loop_that_came_first_is_switched_off_later():
-    truth = square(20, 2)
-    rng = np.random.default_rng(9)
-    graph = filled(drifted(truth, rng))
-    n = len(truth)
-    spread = np.diag(np.repeat([0.02, 0.3], 3))
-    shifted = truth[5].between(truth[5 + n // 2]).retract(spread @ rng.choice([-1.0, 1.0], 6))
-    wrong = LoopClosure(5, 5 + n // 2, shifted, np.diag(SIGMAS**2))
-    assert graph.add_loop(wrong)  # nothing contradicts it yet
-    for loop in right_loops(truth, rng, 8):
-        graph.add_loop(loop)
-    assert graph.active == (False, *[True] * 8)
-
-
-def test_chi_squared_is_the_same_before_and_after_the_loop_is_in():
-    truth = square(20, 2)
-    rng = np.random.default_rng(12)
-    graph = filled(drifted(truth, rng), max_chi2=1e9, kernel_width=np.inf)
-    for loop in right_loops(truth, rng, 3):
-        graph.add_loop(loop)
-    extra = right_loops(truth, rng, 7)[3]
-    between, covariance = graph.relative(extra.earlier, extra.later)
-    before = chi_squared(
-        extra.earlier_T_later, extra.covariance, between, covariance, included=False
-    )
-    graph.add_loop(extra)
-    assert graph.chi_squared(3) == pytest.approx(before, rel=0.05)
-    assert before < 40.0
 
 
 def test_bad_loops_are_refused():
@@ -377,127 +224,6 @@ def test_bad_loops_are_refused():
     assert graph.loops == []
     assert not graph.add_loop(replace(good, covariance=1e-6 * np.eye(6)))
     assert graph.active == (False,)
-
-
-# -- a whole graph at once -------------------------------------------------------------------------
-
-
-def test_a_graph_that_nothing_holds_is_held_at_its_first_pose():
-    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
-    graph, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    start = gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([5.0, 0, 0]))
-    step = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 0, 0]))
-    poses.insert(3, start)
-    poses.insert(7, gtsam.Pose3())
-    kernel = gtsam.noiseModel.mEstimator.Huber.Create(1.0)
-    graph.add(gtsam.BetweenFactorPose3(3, 7, step, gtsam.noiseModel.Robust.Create(kernel, noise)))
-    result = optimize_graph(SavedGraph(graph, poses))
-    assert result.poses.atPose3(7).equals(start.compose(step), 1e-6)
-    assert result.loops == ()
-    np.testing.assert_allclose(result.covariance(7)[3:, 3:], 0.01 * np.eye(3), atol=1e-4)
-
-
-def test_graphs_that_cannot_be_solved_are_refused():
-    with pytest.raises(InputError, match="expected poses, got none"):
-        optimize_graph(SavedGraph(gtsam.NonlinearFactorGraph(), gtsam.Values()))
-    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
-    poses = gtsam.Values()
-    for key in range(3):
-        poses.insert(key, gtsam.Pose3())
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(gtsam.BetweenFactorPose3(0, 1, gtsam.Pose3(), noise))
-    with pytest.raises(InputError, match="1 poses, 2 the first, are connected to none"):
-        optimize_graph(SavedGraph(graph, poses))
-    graph.add(gtsam.BetweenFactorPose3(1, 9, gtsam.Pose3(), noise))
-    with pytest.raises(InputError, match="on the key 9, which has no pose"):
-        optimize_graph(SavedGraph(graph, poses))
-
-
-def test_same_input_same_output():
-    def run():
-        truth = square(20, 2)
-        rng = np.random.default_rng(7)
-        graph = filled(drifted(truth, rng))
-        for loop in [*right_loops(truth, rng, 4), *wrong_loops(4, len(truth), rng)]:
-            graph.add_loop(loop)
-        return graph.poses(), graph.covariance(50)
-
-    for one, two in zip(run(), run(), strict=True):
-        np.testing.assert_array_equal(one, two)
-
-
-# -- pairwise consistency --------------------------------------------------------------------------
-
-
-def test_loops_agree_if_their_cycle_closes():
-    truth = square(10, 2)
-    keyframes = filled(truth).keyframes
-    config = settings().pose_graph
-    one, other = (
-        LoopClosure(a, b, truth[a].between(truth[b]), np.diag(SIGMAS**2))
-        for a, b in ((3, 43), (7, 49))
-    )
-    assert consistent(one, other, keyframes, config)
-    assert consistent(other, one, keyframes, config)
-    aside = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.6, 0.0]))
-    off_by = replace(other, earlier_T_later=other.earlier_T_later.compose(aside))
-    assert not consistent(one, off_by, keyframes, config)
-    assert not consistent(off_by, one, keyframes, config)
-    # Both off alike agree with each other.
-    near = replace(one, earlier=4, later=44, earlier_T_later=truth[4].between(truth[44]))
-    shifted = [replace(loop, earlier_T_later=loop.earlier_T_later.compose(aside))
-               for loop in (one, near)]  # fmt: skip
-    assert consistent(*shifted, keyframes, config)
-
-
-def test_the_covariance_of_a_cycle_is_that_of_monte_carlo():
-    """Pairs of right loops over a drifting odometry pass as often as 6 freedoms let them."""
-    truth = square(10, 2)
-    rng = np.random.default_rng(5)
-    limit = 10.64  # exceeded by a tenth
-    config = settings(max_chi2=limit).pose_graph
-    passed = 0
-    for _ in range(200):
-        nothing, none = np.empty((0, 3)), np.empty(0, np.bool_)
-        keyframes = [
-            Keyframe(number, update, float(number), nothing, nothing, none)
-            for number, update in enumerate(frames(drifted(truth, rng)))
-        ]
-        pair = []
-        for a, b in ((3, 43), (9, 51)):
-            seen = truth[a].between(truth[b]).retract(SIGMAS * rng.normal(size=6))
-            pair.append(LoopClosure(a, b, seen, np.diag(SIGMAS**2)))
-        passed += consistent(*pair, keyframes, config)
-    assert 0.83 < passed / 200 < 0.96
-
-
-def test_the_largest_group_that_agrees_is_found():
-    consistency = LoopConsistency(settings().pose_graph, [], [])
-    groups = [{1, 2, 4}, {0, 2}, {0, 1}, set(), {0}]
-    consistency.agreeing = lambda number: groups[number]
-    assert consistency.clique(2) == {0, 1, 2}
-    assert consistency.clique(4) == {0, 4}
-    assert consistency.clique(3) == {3}
-
-
-@pytest.mark.parametrize(("count", "believed"), [(4, False), (10, True)])
-def test_loops_that_agree_are_believed_against_an_odometry_worse_than_it_knows(count, believed):
-    rng = np.random.default_rng(0)
-    truth = square(20, 2)
-    bend = gtsam.Pose3(gtsam.Rot3.Yaw(0.003), np.array([0.01, 0.03, 0.0]))  # 3 % of the way
-    odometry = [truth[0]]
-    for one, two in pairwise(truth):
-        odometry.append(odometry[-1].compose(one.between(two)).compose(bend))
-    graph = filled(odometry, walk=0.02, turn_walk_deg=0.02, believed_loops=6)
-    for loop in right_loops(truth, rng, count):
-        graph.add_loop(loop)
-    assert sum(graph.active) == (count if believed else 0)
-    wrong = wrong_loops(30, len(truth), rng)
-    for loop in wrong:
-        graph.add_loop(loop)
-    assert sum(graph.active[count:]) == 0
-    if believed:
-        assert off(graph, truth) < 0.5 * off(filled(odometry), truth)
 
 
 def test_a_second_session_is_tied_by_loops_alone():
@@ -524,7 +250,7 @@ def test_a_second_session_is_tied_by_loops_alone():
         )
     wrong = gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([5.0, 5.0, 0.0]))
     assert not graph.add_loop(LoopClosure(4, count + 20, wrong, np.diag(SIGMAS**2)))
-    assert off(graph, truth + truth) < 0.2
+    assert off(graph.poses(), truth + truth) < 0.2
     frames_of_second = graph.trajectory(frames(second), session=1)
     np.testing.assert_allclose(frames_of_second.map_T_lidar, graph.poses()[count:], atol=1e-9)
 
@@ -538,3 +264,85 @@ def test_the_map_of_a_graph_is_that_of_its_keyframes():
     edges, planes = graph.map_points()
     np.testing.assert_allclose(edges, [[5, 0, 0], [1, 6, 1]], atol=1e-6)
     assert planes.shape == (4, 3)
+
+
+# -- begun anew, and gone on with ------------------------------------------------------------------
+
+
+def eventful(graph, stop=None):
+    """Go on with a drive: keyframes, loop closures, a landmark, positions, a batch solution.
+
+    Parameters
+    ----------
+    stop : called before each event with its number
+    """
+    truth, rng = square(6, 2), np.random.default_rng(1)
+    updates = frames(drifted(truth, rng))
+    loops = [*right_loops(truth, rng, 5), *wrong_loops(8, len(truth) - 2, rng)]
+    loops = [loop for loop in loops if loop.later < len(truth) - 2]
+    start = gtsam.Values()
+    start.insert(L(0), np.array([3.0, 3.2, 0.9]))
+    post = np.array([3.0, 3.0, 1.0])
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.05)
+    seen = [
+        gtsam.BearingRangeFactor3D(X(k), L(0), truth[k].bearing(post), truth[k].range(post), noise)
+        for k in (2, 20)
+    ]
+    events = [(graph.add, update) for update in updates[:-2]]
+    events += [(graph.add_loop, loop) for loop in loops]
+    events.insert(6, (graph.add_factor, seen[0], start))
+    events.insert(30, (graph.add_factor, seen[1]))
+    events.insert(40, (graph.add_position, 20, truth[20].translation(), 0.01 * np.eye(3)))
+    events.insert(50, (graph.add_gravity, 21, np.array([0.0, 0.0, 1.0]), 0.01))
+    events += [(graph.optimize,), *((graph.add, update) for update in updates[-2:])]
+    events += [(graph.add_loop, wrong_loops(1, len(truth), rng)[0])]
+    return events
+
+
+def play(events):
+    for call, *given in events:
+        call(*given)
+
+
+def assert_same(one, two):
+    """To the last bit."""
+    assert one.active == two.active
+    np.testing.assert_array_equal(one.poses(), two.poses())
+    np.testing.assert_array_equal(one.covariance(len(one) - 1), two.covariance(len(two) - 1))
+    np.testing.assert_array_equal(one.estimate(L(0)), two.estimate(L(0)))
+
+
+def test_a_graph_that_was_reset_is_as_a_new_one():
+    fresh, graph = PoseGraph(settings()), PoseGraph(settings())
+    play(eventful(graph))
+    graph.new_session()
+    graph.add(frames([gtsam.Pose3()])[0])
+    graph.reset()
+    assert (len(graph), graph.loops, graph.active, graph.values.size()) == (0, [], (), 0)
+    play(eventful(graph))
+    play(eventful(fresh))
+    assert_same(graph, fresh)
+    assert graph.saved().factors.at(0).keys() == [X(0)]  # a prior: nothing ties it to what was
+
+
+@pytest.mark.parametrize("at", [8, 45, 55, 63])
+def test_a_resumed_graph_goes_on_to_the_last_bit(at):
+    """With loop closures, factors and variables of one's own, positions, a batch solution."""
+    whole, again = PoseGraph(settings()), PoseGraph(settings())
+    events = eventful(whole)
+    play(events[:at])
+    thaw(freeze({"graph": whole}, {}), {"graph": again}, {})
+    play(events[at:])
+    play(eventful(again)[at:])
+    assert sum(whole.active) == 5
+    assert_same(again, whole)
+
+
+def test_an_optimisation_that_failed_is_not_repeated_when_the_run_goes_on():
+    graph, again = PoseGraph(settings()), PoseGraph(settings())
+    with pytest.raises(InputError, match="expected poses, got none"):
+        graph.optimize()
+    for update in frames(square(3, 1)):
+        graph.add(update)
+    thaw(freeze({"graph": graph}, {}), {"graph": again}, {})
+    np.testing.assert_array_equal(again.poses(), graph.poses())

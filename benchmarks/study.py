@@ -32,7 +32,8 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import make_solver
-from loam_gtsam.registration.association import ScanMatches, associate
+from loam_gtsam.registration.association import associate
+from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers import MotionPrior, Solution, match_rows
 from loam_gtsam.types import BoolArray, FloatArray
 
@@ -230,8 +231,7 @@ class Sweep:
         for kind in kinds:
             config = Config().changed(features=kind)
             moving = MovingSweep(extract_features(scan, config), config)
-            moving.deskew(twist)
-            self.clouds[kind] = Cloud(moving.edges, moving.planes, moving.distinct)
+            self.clouds[kind] = Cloud(*moving.at(twist).points, moving.distinct)
 
 
 class Place:

@@ -22,16 +22,18 @@ from loam_gtsam.imu.quality import ImuReport
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.loops.map_correction import LoopMapping
-from loam_gtsam.mapper import ExtraFactors, Mapper
+from loam_gtsam.mapper import Mapper
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Odometry, make_odometry
 from loam_gtsam.registration.solvers import ScanSolver
+from loam_gtsam.registration.solvers.own_factors import ExtraFactors
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
     Features,
     FeatureSweep,
     FloatArray,
+    FrameStatus,
     InputError,
     MapUpdate,
     Scan,
@@ -123,19 +125,26 @@ class RunResult:
         return dict(Counter(str(u.fault) for u in self.updates if u.fault is not None))
 
 
+_REFUSED = (FrameStatus.BAD_STAMP, FrameStatus.UNUSABLE_SCAN)
+"""Statuses of sweeps from which no later sweep is predicted."""
+
+
 class Pipeline:
     """Feature extraction, odometry guess and mapping, one sweep at a time.
 
     Parameters
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
-    solver : registers a sweep with the map; None makes the solver that the configuration names
-    odometry : predicts the pose of each sweep; None makes the odometry that the configuration names
-    extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
+    solver : see :class:`~loam_gtsam.Mapper`; None takes the configured one
+    odometry : predicts each sweep, see :class:`~loam_gtsam.registration.odometry.Odometry`; None
+        takes the configured one
+    extra_factors : a user's own factors, see :class:`~loam_gtsam.PoseContext`
     loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
 
     Attributes
     ----------
+    mapper : registers the sweeps
+    odometry : predicts them; None leaves it to the mapper (constant velocity, IMU)
     loops : keyframes and loops; None if none are looked for
     """
 
@@ -152,12 +161,22 @@ class Pipeline:
         self.config = config or Config()
         self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=extra_factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
-        self.odometry: Odometry = odometry or make_odometry(self.config.odometry, self.mapper.imu)
+        self.odometry = odometry or make_odometry(self.config.odometry, self.mapper.imu)
         self._last_odom: gtsam.Pose3 | None = None
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.loops: LoopMapping | None = None
         if self.config.loops.enabled or loop_closer is not None:
             self.loops = LoopMapping(self.mapper, self.config, loop_closer)
+
+    def reset(self) -> None:
+        """Forget map, motion, IMU and loops: the next sweep is the first of a new run."""
+        self.mapper.reset()
+        if self.odometry is not None:
+            self.odometry.reset()
+        if self.loops is not None:
+            self.loops.reset()
+        self._last_odom = None
+        self._to_reference = 0
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Register one sweep; what it contains never raises, see the status of the result.
@@ -183,11 +202,17 @@ class Pipeline:
             return self.mapper.skip(stamp, extraction.problem, extraction.fault)
         self._to_reference = features.stamp - sweep.stamp
         started = time.perf_counter()
-        guess = self.odometry.guess(features, last)
+        guess = None if self.odometry is None else self.odometry.guess(features, last)
         guessed = time.perf_counter() - started
-        # The first sweep is where the mapper puts it.
-        pose = None if last is None else guess.map_T_lidar
-        update = self._with_loops(self.mapper.register(features, pose, guess.twist), features)
+        if guess is None:
+            update = self.mapper.register(features)
+        else:
+            # The first sweep is where the mapper puts it.
+            pose = None if last is None else guess.map_T_lidar
+            update = self.mapper.register(features, pose, guess.twist)
+        if self.odometry is not None and update.status not in _REFUSED:
+            self.odometry.remember(features)
+        update = self._with_loops(update, features)
         timings = {"features": extraction.seconds, "odometry": guessed}
         return replace(update, timings=timings | dict(update.timings))
 
@@ -215,7 +240,9 @@ class Pipeline:
     def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """What changes from frame to frame, and what does not, for :mod:`loam_gtsam.io.state`."""
         mapper, loops = self.mapper, self.loops
-        roots = {"pipeline": self, "mapper": mapper, "odometry": self.odometry}
+        roots: dict[str, Any] = {"pipeline": self, "mapper": mapper}
+        if self.odometry is not None:
+            roots["odometry"] = self.odometry
         shared = {"solver": mapper.solver, **_sections("config", self.config)}
         if mapper.extra_factors is not None:
             shared["extra_factors"] = mapper.extra_factors

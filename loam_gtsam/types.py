@@ -11,7 +11,7 @@ Conventions (the same everywhere):
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -407,6 +407,24 @@ class Uncertainty:
     effective_matches: float
 
 
+class Timings(Mapping[str, float]):
+    """Seconds per stage; they cannot be changed."""
+
+    __slots__ = ("_seconds",)
+
+    def __init__(self, seconds: Mapping[str, float]) -> None:
+        self._seconds = dict(seconds)
+
+    def __getitem__(self, stage: str) -> float:
+        return self._seconds[stage]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._seconds)
+
+    def __len__(self) -> int:
+        return len(self._seconds)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.
@@ -475,6 +493,9 @@ class MapUpdate:
     n_not_finite: int = 0
     map_T_middle: gtsam.Pose3 | None = None
     middle_stamp: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "timings", Timings(self.timings))
 
     @property
     def raw_covariance(self) -> FloatArray:

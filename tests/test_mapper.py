@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from support.worlds import room_features
 
-from loam_gtsam import mapper as mapper_module
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import imu_buffer
+from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import Features, FrameStatus, ImuSamples, TiltPrior
 
@@ -122,7 +122,9 @@ def test_a_wrong_twist_hardly_moves_the_middle_of_the_sweep():
 
         class Spy(GtsamSolver):
             def solve(self, associate, guess, priors=(), motion=None, solved=solved):
-                solved["pose"] = (solution := super().solve(associate, guess, priors)).map_T_lidar
+                solved["pose"] = (
+                    solution := super().solve(associate, guess, priors, motion)
+                ).map_T_lidar
                 return solution
 
         mapper.solver = Spy(mapper.config.solver)
@@ -227,7 +229,7 @@ def test_information_is_that_of_the_reference_time():
 
     class Spy(GtsamSolver):
         def solve(self, associate, guess, priors=(), motion=None):
-            seen.append(super().solve(associate, guess, priors))
+            seen.append(super().solve(associate, guess, priors, motion))
             return seen[-1]
 
     mapper.solver = Spy(mapper.config.solver)
@@ -270,13 +272,13 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     for i in range(3):
         mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
     calls = []
-    real = mapper_module.match_features
+    real = frame_matcher.match_features
 
     def count(*args):
         calls.append(1)
         return real(*args)
 
-    monkeypatch.setattr(mapper_module, "match_features", count)
+    monkeypatch.setattr(frame_matcher, "match_features", count)
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))
     update = mapper.register(room_features(truth, SECOND, rng), guess=gtsam.Pose3())
     assert (update.iterations, len(calls)) == (2, searches)

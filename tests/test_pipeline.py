@@ -17,6 +17,7 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import move_points
 from loam_gtsam.imu_prior import roll_pitch
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
+from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
@@ -392,7 +393,7 @@ def test_with_wrong_extrinsics_the_gyro_is_given_up_and_the_run_tracks(shaken, s
     for scan in sweeps[:-1]:
         pipeline.process(scan)
     features = extract_features(sweeps[-1], result.config)
-    guess = pipeline.odometry.guess(features, pipeline.mapper.last)
+    guess = ConstantVelocity(pipeline.mapper.imu).guess(features, pipeline.mapper.last)
     assert guess.map_T_lidar.equals(twisted, 1e-9)
 
 
@@ -490,7 +491,7 @@ def test_a_run_without_own_factors_may_say_so_with_an_empty_list(shaken, sweeps)
             lambda context: [
                 gtsam.GPSFactor(7, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1.0))
             ],
-            rf"context.key, {POSE_KEY}; got GPSFactor on the keys \[7\]",
+            rf"context.key, .*{POSE_KEY}.*; got GPSFactor on the keys \[7\]",
         ),
     ],
 )
@@ -517,8 +518,8 @@ def test_a_faulty_own_factor_is_an_error_and_no_crash(shaken, sweeps, residual, 
 @pytest.mark.parametrize("name", ["loam", "aloam"])
 def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
     config = preset(name).changed(imu=ImuConfig(enabled=False))
-    with pytest.raises(InputError, match=r"priors: .* use solver\.method: gtsam"):
-        run(data_of(shaken, sweeps[:2]), config, extra_factors=lambda _: [tight(np.zeros(3))])
+    with pytest.raises(ConfigError, match=r"extra_factors: .* use solver\.method gtsam"):
+        run(data_of(shaken, sweeps[:1]), config, extra_factors=lambda _: [tight(np.zeros(3))])
 
 
 @pytest.mark.parametrize(("seed", "range_noise", "tracked"), [(1, 0.02, True), (1, 0.0, False),

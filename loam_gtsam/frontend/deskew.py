@@ -1,10 +1,13 @@
-"""A sweep in motion: its features, de-skewed to the middle of the sweep.
+"""De-skewing: the features of a sweep as seen from the middle of that sweep.
 
 Within a frame, poses belong to the *middle* of the sweep: there an error of the motion used for
 the de-skew cancels to first order, while at the start or the end it would shift the whole sweep.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
 
 import gtsam
 import numpy as np
@@ -21,27 +24,28 @@ _DISTINCT = 4.5
 
 
 class MovingSweep:
-    """The voxel-filtered features of a sweep.
+    """The voxel-filtered features of a sweep, each taken at its own time.
 
-    Rotation within the sweep comes from the gyro (or the orientation) of an IMU if there is one
-    that covers the sweep; translation, and without an IMU rotation too, from a constant velocity.
+    :meth:`at` de-skews them for one motion of the sensor. The rotation within the sweep comes from
+    the gyro (or the orientation) of an IMU if there is one that covers the sweep; the translation,
+    and without an IMU the rotation too, from a constant velocity.
 
     Parameters
     ----------
     features : of the sweep
     config : ``deskew`` and the voxel sizes of ``map`` are used
-    imu : None for constant velocity
+    imu : source of the rotation; None for constant velocity
     thin : whether to voxel-filter the points, as for matching
 
     Attributes
     ----------
     reference_stamp : nanoseconds of the moment the frame's pose is handed out for
     stamp : nanoseconds of the middle of the sweep
-    middle : seconds from the one to the other; 0 if the features do not move
+    middle : seconds from the reference time to the middle; 0 if the features do not move
     duration : seconds of the sweep; 0 likewise
-    n_edges, n_planes : how many there are
+    n_edges, n_planes : numbers of features
     distinct : (E,) whether an edge stands out of its ring by more than range noise makes it
-    motion : what the rotation comes from
+    motion : source of the rotation within the sweep
     not_finite : points of the sweep that were NaN or infinite
     """
 
@@ -66,14 +70,12 @@ class MovingSweep:
         self.distinct: BoolArray = (
             np.ones(len(features.edges), np.bool_) if prominence is None else prominence > least
         )
-        self._points = [features.edges, features.planes]
+        self._points = features.edges, features.planes
         times = features.edge_times, features.plane_times
-        self._seconds = [part - self.middle for part in times]
+        self._seconds = times[0] - self.middle, times[1] - self.middle
         self.n_edges, self.n_planes = map(len, self._points)
-        self._twist: FloatArray | None = None
-        self._all: tuple[FloatArray, FloatArray] | None = None
         self.motion = SweepMotion.CONSTANT_VELOCITY if moving else SweepMotion.NONE
-        self._turned: list[FloatArray] | None = None
+        self._turned: tuple[FloatArray, FloatArray] | None = None
         span = np.array([first, 0.0, end]) - self.middle
         if moving and imu is not None and config.deskew.rotation != "constant_velocity":
             moments = np.concatenate([span, *self._seconds])
@@ -89,51 +91,12 @@ class MovingSweep:
                 self._rate = (after - before) / (span[2] - span[0])
                 self._middle_R_reference: FloatArray = Rotation.from_rotvec(reference).as_matrix()
                 split = 3 + self.n_edges
-                parts = turns[3:split], turns[split:]
-                self._turned = [_rotated(*part) for part in zip(self._points, parts, strict=True)]
+                edges, planes = self._points
+                self._turned = _rotated(edges, turns[3:split]), _rotated(planes, turns[split:])
 
-    @property
-    def is_empty(self) -> bool:
-        """Whether there is no feature at all."""
-        return self.n_edges + self.n_planes == 0
-
-    @property
-    def edges(self) -> FloatArray:
-        """(E, 3) metres, seen from the middle of the sweep."""
-        return self._deskewed()[0]
-
-    @property
-    def planes(self) -> FloatArray:
-        """(P, 3) metres, seen from the middle of the sweep."""
-        return self._deskewed()[1]
-
-    def deskew(self, twist: FloatArray) -> None:
-        """Set ``edges`` and ``planes`` for a (6,) body velocity at the reference time."""
-        if self.motion is not SweepMotion.NONE:
-            self._twist, self._all = twist, None
-
-    def some(self, edges: IntArray, planes: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Those of ``edges`` and ``planes`` in some rows."""
-        return self._part(0, edges), self._part(1, planes)
-
-    def _deskewed(self) -> tuple[FloatArray, FloatArray]:
-        if self._all is None:
-            self._all = self._part(0), self._part(1)
-        return self._all
-
-    def _part(self, which: int, rows: IntArray | None = None) -> FloatArray:
-        """Edges (0) or planes (1), de-skewed; all if there are no rows."""
-        twist = self._twist
-        points, seconds = self._points[which], self._seconds[which]
-        if twist is not None and self._turned is not None:
-            points = self._turned[which]
-        if rows is not None:
-            points, seconds = points.take(rows, axis=0), seconds.take(rows)
-        if twist is None:
-            return points
-        if self._turned is None:
-            return move_points(points, twist, seconds)
-        return points + np.outer(seconds, self._middle_R_reference @ twist[3:])
+    def at(self, twist: FloatArray) -> PosedSweep:
+        """The sweep de-skewed for a (6,) body velocity at the reference time, rad/s and m/s."""
+        return PosedSweep(self, twist)
 
     def middle_T_reference(self, twist: FloatArray) -> gtsam.Pose3:
         """The lidar at the reference time seen from the middle of the sweep."""
@@ -143,11 +106,12 @@ class MovingSweep:
         return gtsam.Pose3(gtsam.Rot3(rotation), rotation @ twist[3:] * -self.middle)
 
     def twist_since(self, last: tuple[int, gtsam.Pose3], map_T_middle: gtsam.Pose3) -> FloatArray:
-        """(6,) body velocity at the reference time, from the middle of another sweep to this one's.
+        """(6,) body velocity at the reference time that leads from an earlier sweep to this one.
 
         Parameters
         ----------
-        last : stamp and pose of the middle of an earlier sweep
+        last : stamp, nanoseconds, and pose of the middle of the earlier sweep
+        map_T_middle : pose of the middle of this one
         """
         seconds = (self.stamp - last[0]) * 1e-9
         if self._turned is None:
@@ -168,6 +132,63 @@ class MovingSweep:
         if self._turned is not None:
             velocity = self._middle_R_reference.T @ velocity
         return np.concatenate([rate, velocity])
+
+    def deskewed(
+        self, twist: FloatArray, edge_rows: IntArray | None, plane_rows: IntArray | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Edges and planes seen from the middle of the sweep, (N, 3) metres each.
+
+        Parameters
+        ----------
+        twist : (6,) body velocity at the reference time
+        edge_rows, plane_rows : which features; None for all
+        """
+        return self._part(0, twist, edge_rows), self._part(1, twist, plane_rows)
+
+    def _part(self, which: int, twist: FloatArray, rows: IntArray | None) -> FloatArray:
+        """Edges (0) or planes (1), de-skewed."""
+        points, seconds = self._points[which], self._seconds[which]
+        if self._turned is not None:
+            points = self._turned[which]
+        if rows is not None:
+            points, seconds = points.take(rows, axis=0), seconds.take(rows)
+        if self.motion is SweepMotion.NONE:
+            return points
+        if self._turned is None:
+            return move_points(points, twist, seconds)
+        return points + np.outer(seconds, self._middle_R_reference @ twist[3:])
+
+
+@dataclass(frozen=True, eq=False)
+class PosedSweep:
+    """A sweep de-skewed for one motion: a value, which never changes.
+
+    Attributes
+    ----------
+    sweep : whose features these are
+    twist : (6,) body velocity at the reference time, rad/s and m/s, of the de-skew
+    """
+
+    sweep: MovingSweep
+    twist: FloatArray
+
+    @cached_property
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """All edges (E, 3) and planes (P, 3), metres, seen from the middle of the sweep."""
+        return self.sweep.deskewed(self.twist, None, None)
+
+    def rows(self, edges: IntArray, planes: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Some of the edges and planes, by their rows."""
+        return self.sweep.deskewed(self.twist, edges, planes)
+
+    @cached_property
+    def middle_T_reference(self) -> gtsam.Pose3:
+        """The lidar at the reference time seen from the middle of the sweep."""
+        return self.sweep.middle_T_reference(self.twist)
+
+    def map_T_middle(self, map_T_lidar: gtsam.Pose3) -> gtsam.Pose3:
+        """The pose at the middle of the sweep, from that at its reference time."""
+        return map_T_lidar.compose(self.middle_T_reference.inverse())
 
 
 def _turns_by_orientation(

@@ -22,9 +22,10 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.loops.scan_context import describe, heading_free, unlike
-from loam_gtsam.registration.association import ScanMatches, associate, subset, trial
+from loam_gtsam.registration.association import associate, trial_matching
 from loam_gtsam.registration.degeneracy import localizability
-from loam_gtsam.registration.relocalization import Fit, places, some
+from loam_gtsam.registration.matches import ScanMatches, subset
+from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
 from loam_gtsam.registration.scan_error import SeenGround, scan_error
 from loam_gtsam.registration.solvers import GtsamSolver, Solution
 from loam_gtsam.types import FloatArray, IntArray
@@ -180,13 +181,13 @@ class ScanLoopCloser:
         known = history.pose(candidate).between(history.pose(keyframe.index))
         solution = self._solver.solve(matches_at, known)
         if self._judged(fit(solution)) is not None:
-            matching = trial(whole.matching)
+            matching = trial_matching(whole.matching)
             # The ground is where it was: height zero, and the tilt that the graph says.
             rotation = known.rotation()
             heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
             start = gtsam.Pose3(heading, np.zeros(3))
             held = np.concatenate([cubes.points() for cubes in maps])
-            around = places(some(*features), held, [start], config.search, _STARTS)
+            around = likely_poses(sample_features(*features), held, [start], config.search, _STARTS)
             starts = start, *around
             trials = [self._rough_solver.solve(matches_at, pose) for pose in starts]
             best = max(trials, key=lambda tried: fit(tried).total)

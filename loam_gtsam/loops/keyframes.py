@@ -146,9 +146,9 @@ def make_keyframe(
                 f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
             )
         sweep = MovingSweep(features, config, imu)
-        sweep.deskew(update.twist)
-        to_reference = sweep.middle_T_reference(update.twist).inverse().matrix()
-        edges, planes = (transform(to_reference, part) for part in (sweep.edges, sweep.planes))
+        posed = sweep.at(update.twist)
+        to_reference = posed.middle_T_reference.inverse().matrix()
+        edges, planes = (transform(to_reference, part) for part in posed.points)
         distinct = sweep.distinct
     return Keyframe(index, update, travelled, edges, planes, distinct, session)
 

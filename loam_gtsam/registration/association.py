@@ -1,12 +1,8 @@
-"""Association of features with the map: five nearest neighbours, a line or a plane through them.
-
-The matches are immutable arrays, so that the same ones can be given to different solvers.
-"""
+"""Association of features with the map: five nearest neighbours, a line or a plane through them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, TypeVar
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -14,79 +10,17 @@ import numpy as np
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import cross, fit_lines, fit_planes, moments, transform
+from loam_gtsam.registration.matches import (
+    ChosenRows,
+    EdgeMatches,
+    PlaneMatches,
+    ScanMatches,
+    joined_edges,
+    subset,
+)
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _TINY = 1e-9
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EdgeMatches:
-    """Points matched with lines of the map.
-
-    Attributes
-    ----------
-    points : (M, 3) metres, lidar frame
-    centres, directions : (M, 3) a point on each line and its unit direction, map frame
-    distances : (M,) metres from the line at association
-    sigmas : (M,) standard deviation of the distance, metres
-    weights : (M,) LOAM's s, in (min_weight, 1]
-    indices : (M,) which features these are
-    tilts : (M,) standard deviation of the direction, rad; None: exact
-    distinct : (M,) whether the feature stands out of its ring by more than noise makes it; None:
-        all do
-    """
-
-    points: FloatArray
-    centres: FloatArray
-    directions: FloatArray
-    distances: FloatArray
-    sigmas: FloatArray
-    weights: FloatArray
-    indices: IntArray
-    tilts: FloatArray | None = None
-    distinct: BoolArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class PlaneMatches:
-    """Points matched with planes ``n . q + d = 0`` of the map.
-
-    Attributes
-    ----------
-    points : (M, 3) metres, lidar frame
-    normals, offsets : (M, 3) unit and (M,) metres, map frame
-    distances : (M,) signed metres from the plane at association
-    sigmas : (M,) standard deviation of the distance, metres
-    weights : (M,) LOAM's s, in (min_weight, 1]
-    indices : (M,) which features these are
-    tilts : (M,) standard deviation of the normal in its worst direction, rad; None: exact
-    """
-
-    points: FloatArray
-    normals: FloatArray
-    offsets: FloatArray
-    distances: FloatArray
-    sigmas: FloatArray
-    weights: FloatArray
-    indices: IntArray
-    tilts: FloatArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.points)
-
-
-@dataclass(frozen=True, slots=True)
-class ScanMatches:
-    """All matches of one scan at one pose."""
-
-    edges: EdgeMatches
-    planes: PlaneMatches
-
-    def __len__(self) -> int:
-        return len(self.edges) + len(self.planes)
 
 
 def associate(
@@ -101,35 +35,31 @@ def associate(
     """Match de-skewed features with the cubes around a pose.
 
     Of more than ``max_edges`` and ``max_planes`` features so many are matched, evenly spread over
-    the rows. Features come sorted by voxel, so this spreads them over the sweep.
+    the rows. Features come sorted by voxel, so the matched ones are spread over the sweep.
 
     Parameters
     ----------
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
     map_T_lidar : pose at which to associate
     edge_map, plane_map : the maps
-    distinct : (E,) see :class:`EdgeMatches`; all are if None. They are matched before others, and
-        searched for more widely (``wide_search``) where no line is near and the planes leave a
-        translation open.
+    distinct : (E,) see :class:`EdgeMatches`; all are if None. Distinct edges are matched before
+        others, and searched for more widely (``wide_search``) where no line is near and the planes
+        leave a translation open.
     """
-    edge_rows, plane_rows, known = chosen_rows(len(edges), len(planes), config, distinct)
-    edges, planes = edges.take(edge_rows, axis=0), planes.take(plane_rows, axis=0)
-    found = match_features(edges, planes, map_T_lidar, edge_map, plane_map, config, known)
-    return at_rows(found, edge_rows, plane_rows)
+    rows = chosen_rows(len(edges), len(planes), config, distinct)
+    chosen = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
+    return match_features(*chosen, map_T_lidar, edge_map, plane_map, config, rows)
 
 
 def chosen_rows(
     edges: int, planes: int, config: MatchingConfig, distinct: BoolArray | None = None
-) -> tuple[IntArray, IntArray, BoolArray | None]:
-    """Which of so many edges and planes are matched, and which of those edges are distinct.
-
-    Parameters are those of :func:`associate`. Where all are distinct it is not known which are.
-    """
+) -> ChosenRows:
+    """Choose which of so many edges and planes are matched; see :func:`associate`."""
     if distinct is not None and distinct.all():
         distinct = None
-    edge_rows = spread(edges, config.max_edges, distinct)
+    edge_rows = spread_rows(edges, config.max_edges, distinct)
     known = None if distinct is None else distinct[edge_rows]
-    return edge_rows, spread(planes, config.max_planes), known
+    return ChosenRows(edge_rows, spread_rows(planes, config.max_planes), known)
 
 
 def match_features(
@@ -139,37 +69,40 @@ def match_features(
     edge_map: CubeMap,
     plane_map: CubeMap,
     config: MatchingConfig,
-    distinct: BoolArray | None = None,
+    rows: ChosenRows,
+    reach: float | None = None,
 ) -> ScanMatches:
-    """Match all of the features; parameters are those of :func:`associate`."""
+    """Match chosen features; further parameters are those of :func:`associate`.
+
+    Parameters
+    ----------
+    edges, planes : the features of ``rows``, (E, 3) and (P, 3) metres, lidar frame
+    rows : where these features are among those of the sweep, for ``indices`` of the matches
+    reach : metres to the farthest neighbour; ``config.max_distance`` if None
+    """
     pose = map_T_lidar.matrix()
     edges_map, planes_map = transform(pose, edges), transform(pose, planes)
-    k, limit = config.neighbours, config.max_distance
+    k, limit = config.neighbours, config.max_distance if reach is None else reach
+    distinct = rows.distinct
     around = edge_map.neighbourhood(pose)
     near_edges = edge_map.nearest(edges_map, k, limit, around)
     near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
-    lines = match_lines(edges, edges_map, *near_edges, pose, config)
-    surfaces = match_planes(planes, planes_map, *near_planes, pose, config)
-    if distinct is None:
-        return ScanMatches(lines, surfaces)
-    alone = distinct.copy()
-    alone[lines.indices] = False
-    rows = np.flatnonzero(alone)
-    if config.wide_search > 1.0 and len(rows) and _fixed_by(surfaces) < config.wide_below:
-        # A pole that few beams met has no five points within max_distance.
-        reach = config.wide_search * limit
-        near_edges = edge_map.nearest(edges_map[rows], k, reach, around)
-        wide = config.changed(max_distance=reach)
-        more = match_lines(edges[rows], edges_map[rows], *near_edges, pose, wide)
-        lines = _joined(lines, replace(more, indices=rows[more.indices]))
-    return ScanMatches(replace(lines, distinct=distinct[lines.indices]), surfaces)
-
-
-def at_rows(matches: ScanMatches, edge_rows: IntArray, plane_rows: IntArray) -> ScanMatches:
-    """The same with the rows (E,) and (P,) that the features have among those of the sweep."""
-    e, p = matches.edges, matches.planes
+    lines = match_lines(edges, edges_map, *near_edges, pose, config, limit)
+    surfaces = match_planes(planes, planes_map, *near_planes, pose, config, limit)
+    if distinct is not None:
+        alone = distinct.copy()
+        alone[lines.indices] = False
+        left = np.flatnonzero(alone)
+        if config.wide_search > 1.0 and len(left) and _fixed_by(surfaces) < config.wide_below:
+            # A pole that few beams met has no five points within max_distance.
+            far = config.wide_search * limit
+            near_edges = edge_map.nearest(edges_map[left], k, far, around)
+            more = match_lines(edges[left], edges_map[left], *near_edges, pose, config, far)
+            lines = joined_edges(lines, replace(more, indices=left[more.indices]))
+        lines = replace(lines, distinct=distinct[lines.indices])
     return ScanMatches(
-        replace(e, indices=edge_rows[e.indices]), replace(p, indices=plane_rows[p.indices])
+        replace(lines, indices=rows.edges[lines.indices]),
+        replace(surfaces, indices=rows.planes[surfaces.indices]),
     )
 
 
@@ -185,19 +118,21 @@ def _fixed_by(planes: PlaneMatches) -> float:
     return float(np.linalg.eigvalsh(across)[0])
 
 
-def spread(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
-    """Which of so many to match: all, or ``limit`` evenly; those of ``first`` before others."""
+def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
+    """Rows 0 to ``count``, or ``limit`` of them evenly spread, those of ``first`` before others."""
     if not 0 < limit < count:
         return np.arange(count)
     if first is None:
         return np.arange(limit) * count // limit
     before, after = np.flatnonzero(first), np.flatnonzero(~first)
-    before = before[spread(len(before), limit)]
+    before = before[spread_rows(len(before), limit)]
     left = limit - len(before)
-    return np.sort(np.concatenate([before, after[spread(len(after), left)]])) if left else before
+    return (
+        np.sort(np.concatenate([before, after[spread_rows(len(after), left)]])) if left else before
+    )
 
 
-def trial(config: MatchingConfig) -> MatchingConfig:
+def trial_matching(config: MatchingConfig) -> MatchingConfig:
     """The configuration with few matches, to try a pose quickly."""
 
     def at_most(limit: int, most: int) -> int:
@@ -209,12 +144,9 @@ def trial(config: MatchingConfig) -> MatchingConfig:
     )
 
 
-def moved(matches: ScanMatches, edges: FloatArray, planes: FloatArray) -> ScanMatches:
-    """The same lines and planes for their features de-skewed anew, (M, 3) metres each."""
-    return ScanMatches(replace(matches.edges, points=edges), replace(matches.planes, points=planes))
-
-
-def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig) -> ScanMatches:
+def rematched(
+    matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig
+) -> ScanMatches:
     """The same lines and planes with distances and weights at another pose near by."""
     pose = map_T_lidar.matrix()
     e, p = matches.edges, matches.planes
@@ -232,28 +164,6 @@ def renew(matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig
     keep = weights > config.min_weight
     planes = replace(p, distances=distances, weights=weights)
     return ScanMatches(edges, planes if keep.all() else subset(planes, keep))
-
-
-_Matches = TypeVar("_Matches", EdgeMatches, PlaneMatches)
-
-
-def subset(matches: _Matches, keep: BoolArray) -> _Matches:
-    """Those matches for which a mask is true."""
-    columns = {item.name: getattr(matches, item.name) for item in fields(matches)}
-    chosen: dict[str, Any] = {
-        name: None if column is None else column[keep] for name, column in columns.items()
-    }
-    return type(matches)(**chosen)
-
-
-def _joined(first: EdgeMatches, second: EdgeMatches) -> EdgeMatches:
-    """All matches of both, in the order of the features; ``distinct`` is left out."""
-    columns: dict[str, Any] = {}
-    order = np.argsort(np.concatenate([first.indices, second.indices]), kind="stable")
-    for item in fields(first):
-        parts = getattr(first, item.name), getattr(second, item.name)
-        columns[item.name] = None if parts[0] is None else np.concatenate(parts)[order]
-    return EdgeMatches(**columns)
 
 
 def _line_weights(distances: FloatArray, config: MatchingConfig) -> FloatArray:
@@ -275,6 +185,7 @@ def match_lines(
     squared_distances: FloatArray,
     map_T_lidar: FloatArray,
     config: MatchingConfig,
+    reach: float | None = None,
 ) -> EdgeMatches:
     """Lines through neighbours that form one (LOAM, Section VI; constants in the config).
 
@@ -288,8 +199,10 @@ def match_lines(
     neighbours : (N, k, 3) their nearest map points
     squared_distances : (N, k) m^2, ascending, inf where missing
     map_T_lidar : (4, 4) the pose; the rings go round its z axis
+    reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
-    near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
+    reach = config.max_distance if reach is None else reach
+    near = np.flatnonzero(squared_distances[:, -1] < reach**2)
     here = np.ascontiguousarray(points_map.take(near, axis=0).T)
     centres, directions, eigenvalues = fit_lines(neighbours.take(near, axis=0))
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
@@ -326,6 +239,7 @@ def match_planes(
     squared_distances: FloatArray,
     map_T_lidar: FloatArray,
     config: MatchingConfig,
+    reach: float | None = None,
 ) -> PlaneMatches:
     """Planes through neighbours that form one (LOAM, Section VI; constants in the config).
 
@@ -342,7 +256,8 @@ def match_planes(
     the point from the sensor (as in LIO-SAM), not from the map's origin. ``plane_fit: unit_offset``
     and ``weight_range: map`` give the published forms.
     """
-    near = np.flatnonzero(squared_distances[:, -1] < config.max_distance**2)
+    reach = config.max_distance if reach is None else reach
+    near = np.flatnonzero(squared_distances[:, -1] < reach**2)
     # Axis by axis in memory, like all that follows.
     axes = np.ascontiguousarray(neighbours.take(near, axis=0).transpose(2, 1, 0))
     here = np.ascontiguousarray(points_map.take(near, axis=0).T)
@@ -359,8 +274,8 @@ def match_planes(
     rays = here - map_T_lidar[:3, 3:]
     ranges = _norm(rays)
     is_plane &= np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
-    reach = _norm(here) if config.weight_range == "map" else ranges
-    weights = _plane_weights(distances, reach, config)
+    far = _norm(here) if config.weight_range == "map" else ranges
+    weights = _plane_weights(distances, far, config)
     keep = is_plane & (weights > config.min_weight)
     along = _dot(away, wide)
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)

@@ -15,7 +15,7 @@ import numpy as np
 
 from loam_gtsam.factors import complement_basis
 from loam_gtsam.geometry import cross, cross_matrix
-from loam_gtsam.registration.association import EdgeMatches, ScanMatches, subset
+from loam_gtsam.registration.matches import EdgeMatches, ScanMatches, subset
 from loam_gtsam.types import FloatArray
 
 _CLEAR = 3.0

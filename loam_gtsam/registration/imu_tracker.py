@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import InertialOdometry, Prediction
@@ -22,6 +23,7 @@ from loam_gtsam.imu_prior import (
     tilt_information,
     too_steep,
 )
+from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
 from loam_gtsam.types import FloatArray, SweepError, TiltPrior
 
@@ -171,6 +173,33 @@ class ImuTracker:
         self._disagreements = max(self._disagreements - 1, 0)
         rate = missing / ((now[0] - last[0]) * 1e-9)
         self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
+
+    def add_scan(
+        self, posed: PosedSweep, last: Moment | None, solution: Solution
+    ) -> tuple[Solution, gtsam.Pose3, TiltPrior]:
+        """Learn from a solved sweep, and bring roll and pitch into its pose.
+
+        Parameters
+        ----------
+        posed : the sweep with its final motion
+        last : middle of the last sweep; a predicted pose says nothing about the IMU
+        solution : at the middle of the sweep
+
+        Returns
+        -------
+        The solution, the pose ``map_T_lidar`` at the reference time, and how roll and pitch acted.
+        """
+        stamp, reference_stamp = posed.sweep.stamp, posed.sweep.reference_stamp
+        if last is not None and last.solved:
+            now = stamp, solution.map_T_lidar
+            self.compare_gyro(last[:2], now)
+            self.observe(last[:2], now, solution.scan_information)
+        solution, tilt = self.add_tilt(stamp, solution)
+        pose = solution.map_T_lidar.compose(posed.middle_T_reference)
+        if tilt is TiltPrior.NONE:
+            pose, tilt = self.blend_tilt(reference_stamp, pose)
+        self.find_level(reference_stamp, pose)  # for the frames to come
+        return solution, pose, tilt
 
     def predict(self, stamp: int) -> Prediction | None:
         """Pose, velocity and covariance of a moment by pre-integration; None without prediction.

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.config import OdometryConfig
+from loam_gtsam.config import OdometryConfig, SolverConfig
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import move_points
+from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
+from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
 
@@ -32,13 +35,21 @@ class Odometry(Protocol):
     """Makes the guess for each sweep."""
 
     def guess(self, features: Features, last: MapUpdate | None) -> Guess:
-        """Predict the pose of a sweep.
+        """Predict the pose of a sweep; asking changes nothing.
 
         Parameters
         ----------
         features : of the new sweep
         last : the mapper's result for the sweep before, None at the start
         """
+        ...
+
+    def remember(self, features: Features) -> None:
+        """Take the features of a sweep that the mapper has used."""
+        ...
+
+    def reset(self) -> None:
+        """Forget all sweeps."""
         ...
 
 
@@ -70,6 +81,12 @@ class ConstantVelocity:
         """See :meth:`Odometry.guess`."""
         return self.at(features.stamp, last)
 
+    def remember(self, features: Features) -> None:
+        """See :meth:`Odometry.remember`."""
+
+    def reset(self) -> None:
+        """See :meth:`Odometry.reset`."""
+
     def at(self, stamp: int, last: MapUpdate | None) -> Guess:
         """The guess for a moment, nanoseconds."""
         if last is None:
@@ -84,6 +101,110 @@ class ConstantVelocity:
         return Guess(moved, np.concatenate([last.twist[:3], velocity]))
 
 
+class Moment(NamedTuple):
+    """The middle of a sweep that is done.
+
+    Attributes
+    ----------
+    stamp : nanoseconds
+    map_T_lidar : pose
+    solved : whether the pose was solved for, or given for the first sweep; otherwise it was
+        predicted
+    """
+
+    stamp: int
+    map_T_lidar: gtsam.Pose3
+    solved: bool
+
+    def seconds_to(self, stamp: int) -> float:
+        """Seconds to the middle of a later sweep; sweeps of unlike length may even coincide."""
+        return max((stamp - self.stamp) * 1e-9, _SHORTEST)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """A sweep, de-skewed, and where it is expected.
+
+    Attributes
+    ----------
+    posed : the sweep with the motion that is expected
+    map_T_lidar, map_T_middle : pose at the reference time and at the middle of the sweep
+    motion : what takes over in directions that the scan does not see
+    """
+
+    posed: PosedSweep
+    map_T_lidar: gtsam.Pose3
+    map_T_middle: gtsam.Pose3
+    motion: MotionPrior
+
+
+class InertialPredictor(Turns, Protocol):
+    """The mapper's IMU, as far as predictions need it."""
+
+    def predict(self, stamp: int) -> InertialPrediction | None:
+        """Predict pose, velocity and covariance of a moment; None if that is not to be had."""
+        ...
+
+
+def predict(
+    sweep: MovingSweep,
+    last: MapUpdate | None,
+    moment: Moment | None,
+    imu: InertialPredictor | None,
+    config: SolverConfig,
+    guess: gtsam.Pose3 | None = None,
+    twist: FloatArray | None = None,
+) -> Prediction:
+    """Predict where a sweep is: by pre-integration if there is any, else by constant velocity.
+
+    Parameters
+    ----------
+    last, moment : the update of the last sweep and the middle of it; None for the first sweep
+    imu : tells how the lidar turned or moved meanwhile
+    config : how well a constant velocity is believed
+    guess : ``map_T_lidar`` at the reference time that is used instead of the predicted one
+    twist : (6,) body velocity there that is used likewise
+    """
+    steady = ConstantVelocity(imu).at(sweep.reference_stamp, last)
+    inertial = None if last is None or imu is None else imu.predict(sweep.stamp)
+    if inertial is None:
+        posed = sweep.at(steady.twist if twist is None else np.asarray(twist, np.float64))
+        guess = steady.map_T_lidar if guess is None else guess
+        middle = posed.map_T_middle(guess)
+        information = np.zeros((6, 6))
+        if moment is not None:
+            seconds = moment.seconds_to(sweep.stamp)
+            sigmas = np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
+            information = np.diag((0.5 * seconds**2 * sigmas) ** -2.0)
+        return Prediction(posed, guess, middle, MotionPrior(middle, information))
+    if twist is None:
+        velocity = inertial.map_T_lidar.rotation().matrix().T @ inertial.velocity
+        twist = sweep.twist_at_reference(steady.twist[:3], velocity)
+    posed = sweep.at(np.asarray(twist, np.float64))
+    if guess is None:
+        guess = inertial.map_T_lidar.compose(posed.middle_T_reference)
+    information = np.linalg.inv(inertial.covariance).astype(np.float64)
+    motion = MotionPrior(inertial.map_T_lidar, information)
+    return Prediction(posed, guess, posed.map_T_middle(guess), motion)
+
+
+def twist_to(
+    sweep: MovingSweep, last: Moment | None, map_T_middle: gtsam.Pose3, otherwise: FloatArray
+) -> FloatArray:
+    """(6,) body velocity that leads from the middle of the last sweep to that of this one.
+
+    Parameters
+    ----------
+    otherwise : returned where there is no last sweep, or where its middle is not earlier (sweeps
+        of unlike length)
+    """
+    if last is None or sweep.stamp <= last.stamp:
+        return otherwise
+    return sweep.twist_since(last[:2], map_T_middle)
+
+
+_SHORTEST = 1e-3
+"""Seconds between the middles of two sweeps at least."""
 _REASSOCIATE_EVERY = 5
 """Gauss-Newton iterations per association of the scan-to-scan odometry (LOAM)."""
 _WEIGHT_SLOPE = 1.8
@@ -113,7 +234,7 @@ class ScanToScan:
     def guess(self, features: Features, last: MapUpdate | None) -> Guess:
         """See :meth:`Odometry.guess`."""
         guess = self._start.guess(features, last)
-        previous, self._previous = self._previous, features
+        previous = self._previous
         first, end = features.span
         if previous is None or last is None or end <= first:
             return guess
@@ -121,6 +242,14 @@ class ScanToScan:
         twist = self._solve(features, previous, last.twist, gap)
         start = advance(guess.map_T_lidar, guess.twist, first)
         return Guess(advance(start, twist, -first), twist)
+
+    def remember(self, features: Features) -> None:
+        """See :meth:`Odometry.remember`."""
+        self._previous = features
+
+    def reset(self) -> None:
+        """See :meth:`Odometry.reset`."""
+        self._previous = None
 
     def _solve(
         self, features: Features, previous: Features, twist: FloatArray, gap: float
@@ -242,6 +371,6 @@ def _normalised(vectors: FloatArray) -> tuple[FloatArray, BoolArray]:
     return vectors / np.where(proper, length, 1.0)[:, None], proper
 
 
-def make_odometry(config: OdometryConfig, imu: Turns | None = None) -> Odometry:
-    """The odometry named by the configuration."""
-    return ScanToScan(config, imu) if config.method == "scan_to_scan" else ConstantVelocity(imu)
+def make_odometry(config: OdometryConfig, imu: Turns | None = None) -> Odometry | None:
+    """Make the odometry that the configuration names; None: the mapper predicts by itself."""
+    return ScanToScan(config, imu) if config.method == "scan_to_scan" else None

@@ -9,14 +9,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 from scipy.ndimage import maximum_filter
 
 from loam_gtsam.config import RelocalizationConfig
-from loam_gtsam.registration.association import ScanMatches, spread
+from loam_gtsam.registration.association import spread_rows
+from loam_gtsam.registration.frame_matcher import Frame
+from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.odometry import Moment, Prediction, advance
+from loam_gtsam.registration.report import distance_in_words
+from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, IntArray
 
 _AGREE = 3.0
@@ -33,6 +38,12 @@ _HEIGHT = 10.0
 """Metres above and below the lidar likewise."""
 _SOME = (60, 140)
 """Edge and plane features that are looked at."""
+_START_ROUNDS = 2
+"""Times the first two sweeps are registered anew while their motion becomes known."""
+_PLACES = 6
+"""Places tried at most when a sweep does not fit where it was solved."""
+_CLEARLY = 1.02
+"""Ratio by which another motion within a sweep must fit better than the one before."""
 _APART = (1.5, np.radians(12.0))
 """Metres and rad; nearer trials lead to the same solution."""
 
@@ -66,13 +77,13 @@ class Fit:
         return self.share * self.agreement
 
 
-class Watch:
-    """Tells from the fits of a run whether the next sweep is out of the usual.
+class FitMonitor:
+    """Fits of the last sweeps, against which the next sweep is judged.
 
     Attributes
     ----------
-    lost : sweeps in a row that did not fit
-    last : where the last one was that did
+    lost : number of sweeps in a row that did not fit
+    last : pose of the last sweep that fitted
     """
 
     def __init__(self, config: RelocalizationConfig) -> None:
@@ -145,16 +156,170 @@ class Watch:
         return [predicted, self.last]
 
 
-def some(edges: FloatArray, planes: FloatArray) -> FloatArray:
-    """(N, 3) a few of the features of a sweep, evenly spread, for :func:`places`."""
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The outcome of a search: where the sweep is.
+
+    Attributes
+    ----------
+    solution : pose at the middle of the sweep
+    twist : (6,) body velocity of the de-skew
+    message : a sentence for people if the sweep was moved, else empty
+    """
+
+    solution: Solution
+    twist: FloatArray
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """The outcome of a search that found nothing, and the sentence that says so."""
+
+    message: str
+
+
+def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
+    """Whether a sweep is to be searched for, instead of believing its solve.
+
+    Parameters
+    ----------
+    last_twist : (6,) body velocity of the last sweep; the prediction may be a user's
+    """
+    moment = frame.matcher.last
+    if not monitor.config.enabled or moment is None:
+        return False
+    if monitor.lost or not solution.solved:
+        return monitor.lost > 0
+    seconds = moment.seconds_to(frame.sweep.stamp)
+    expected = advance(moment.map_T_lidar, last_twist, seconds)
+    if monitor.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
+        return True
+    # Matches of a wide search are unlike the usual ones.
+    fit = Fit.of(solution.matches, frame.matcher.offered)
+    return not solution.matches.wide and monitor.misfit(fit)
+
+
+def rebuild_start(
+    first: Prediction, frame: Frame, found: Found, solver: ScanSolver
+) -> tuple[Frame, Found]:
+    """Rebuild the map of the first sweep, now that its motion is known from the second.
+
+    Without this a run that starts in motion keeps a distorted first sweep in its map for ever.
+
+    Parameters
+    ----------
+    first : the first sweep, and where it is
+    frame, found : the second sweep, and the outcome of its solve
+
+    Returns
+    -------
+    Frame and outcome of the second sweep, as seen from the rebuilt map.
+    """
+    pose, maps = first.map_T_lidar, frame.matcher.maps
+    for _ in range(_START_ROUNDS):
+        posed = first.posed.sweep.at(found.twist)
+        middle = posed.map_T_middle(pose)
+        maps.clear()
+        maps.recenter(pose)
+        maps.insert(posed, middle, 0)
+        last = Moment(posed.sweep.stamp, middle, True)
+        frame = replace(frame, matcher=replace(frame.matcher.moving_at(found.twist), last=last))
+        start = found.solution.map_T_lidar
+        again = solver.solve(frame.matcher, start, frame.priors, frame.expected)
+        if not again.solved:
+            break
+        found = replace(found, solution=again, twist=frame.twist_to(again.map_T_lidar))
+    return frame, found
+
+
+def search(
+    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
+) -> Found | Lost:
+    """Search for a sweep that does not fit where it was solved.
+
+    A lidar that was moved between two sweeps did not move like that within them: its velocity is
+    that from before, or none, or, if it was turned on its vehicle, that of the vehicle.
+
+    Parameters
+    ----------
+    solution : of the solve that is in doubt
+    monitor : what is usual, and how many sweeps are lost already
+    """
+    matcher, guess = frame.matcher, frame.matcher.posed.twist
+    usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
+    lost = monitor.lost > 0 or monitor.misfit(before)
+    start: gtsam.Pose3 | None = solution.map_T_lidar
+    moving = frame.twist_to(solution.map_T_lidar)
+    twists = [guess, np.zeros(6) if lost else moving]
+    if lost:
+        start = _place(frame, solution, monitor, solver)
+        if start is not None:
+            twists.append(_turned(guess, start.rotation().between(frame.middle.rotation())))
+    best: tuple[Fit, Solution, FloatArray] | None = None
+    for twist in twists:
+        if start is None:
+            break
+        here = MotionPrior(start, frame.expected.information)
+        found = solver.solve(matcher.moving_at(twist), start, frame.priors, here)
+        fit = Fit.of(found.matches, matcher.offered)
+        if not (found.solved and monitor.fits_again(fit)):
+            continue
+        if best is None or fit.total > _CLEARLY * best[0].total:
+            best = fit, found, twist
+    matcher.clock.lap("relocalize")
+    if best is not None and best[2] is not moving:
+        moved = f"moved by {distance_in_words(frame.middle, best[1].map_T_lidar)}"
+        after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
+        return Found(best[1], best[2], f"relocalised{after}, {moved}" if lost else moved)
+    if not lost:
+        return Found(solution, moving)
+    return Lost(
+        f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
+        f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps"
+    )
+
+
+def _place(
+    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
+) -> gtsam.Pose3 | None:
+    """Where around the prediction a few matches fit best; None if nowhere."""
+    matcher = frame.matcher
+    around = monitor.around(frame.middle)
+    known = [
+        cubes.points(cubes.neighbourhood(pose.matrix()))
+        for pose in around
+        for cubes in (matcher.maps.edges, matcher.maps.planes)
+    ]
+    starts = [solution.map_T_lidar] if solution.solved else []
+    points = sample_features(*matcher.posed.points)
+    starts += likely_poses(points, np.concatenate(known), around, monitor.radius, _PLACES)
+    matcher.clock.lap("relocalize")
+    trial = replace(matcher, refine=False).with_few_matches()
+    best: tuple[float, gtsam.Pose3] | None = None
+    for start in starts:
+        tried = solver.solve(trial, start, frame.priors)
+        total = Fit.of(tried.matches, trial.offered).total
+        if tried.solved and (best is None or total > best[0]):
+            best = total, tried.map_T_lidar
+    return None if best is None else best[1]
+
+
+def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
+    """A (6,) body velocity in the axes of ``a``, if it is given in those of ``b``."""
+    return (a_R_b.matrix() @ twist.reshape(2, 3).T).T.reshape(6)
+
+
+def sample_features(edges: FloatArray, planes: FloatArray) -> FloatArray:
+    """(N, 3) a few of the features of a sweep, evenly spread; metres."""
     parts = [
-        points[spread(len(points), most)]
+        points[spread_rows(len(points), most)]
         for points, most in ((edges, _SOME[0]), (planes, _SOME[1]))
     ]
     return np.concatenate(parts)
 
 
-def places(
+def likely_poses(
     points: FloatArray,
     map_points: FloatArray,
     around: Sequence[gtsam.Pose3],

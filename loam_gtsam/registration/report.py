@@ -1,4 +1,4 @@
-"""What the mapper says about a frame: its update, messages, seconds per stage."""
+"""The mapper's report on a frame: its update, messages, seconds per stage."""
 
 from __future__ import annotations
 
@@ -8,47 +8,47 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 
-from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.registration.odometry import Guess
+from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import FrameStatus, MapUpdate, TiltPrior
 
 
-def report(
-    sweep: MovingSweep,
-    result: Guess,
+def make_update(
+    posed: PosedSweep,
+    map_T_lidar: gtsam.Pose3,
     status: FrameStatus,
     message: str,
-    clock: Clock,
-    solution: Solution | None,
+    solution: Solution | None = None,
     tilt: TiltPrior = TiltPrior.NONE,
 ) -> MapUpdate:
-    """What is known about a frame.
+    """The update of a frame, but for its covariance and its timings.
 
     Parameters
     ----------
-    sweep : with the motion it was de-skewed with
-    result : pose and velocity at the reference time
+    posed : sweep with the motion of the result
+    map_T_lidar : pose at the reference time
     solution : at the middle of the sweep; None if there was no solve
     """
+    sweep = posed.sweep
     update = MapUpdate(
         stamp=sweep.reference_stamp,
-        map_T_lidar=result.map_T_lidar,
+        map_T_lidar=map_T_lidar,
         status=status,
         message=message,
         n_not_finite=sweep.not_finite,
         n_edges=sweep.n_edges,
         n_planes=sweep.n_planes,
-        twist=result.twist,
+        middle_stamp=sweep.stamp,
+        map_T_middle=posed.map_T_middle(map_T_lidar),
+        twist=posed.twist,
         sweep_motion=sweep.motion,
         tilt_prior=tilt,
-        timings=clock.seconds,
     )
     if solution is None:
         return update
     # The solve is about the middle of the sweep; a right perturbation there is, at the reference
     # time, the same one seen through the motion between the two.
-    to_middle = sweep.middle_T_reference(result.twist).AdjointMap()
+    to_middle = posed.middle_T_reference.AdjointMap()
     update = replace(
         update,
         n_edge_matches=len(solution.matches.edges),
@@ -62,7 +62,7 @@ def report(
     seen = solution.localizability
     if seen is None:
         return update
-    seen = seen.seen_from(sweep.middle_T_reference(result.twist).inverse())
+    seen = seen.seen_from(posed.middle_T_reference.inverse())
     return replace(
         update,
         localizability=seen.aligned,
@@ -72,8 +72,21 @@ def report(
     )
 
 
-def named(solution: Solution) -> str:
-    """The weak directions in words: metres and rad in lidar axes."""
+def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
+    """Status and message of a solved frame; ``message`` is what is to be said besides."""
+    status, problem = FrameStatus.OK, ""
+    if not solution.converged:
+        status = FrameStatus.NOT_CONVERGED
+        problem = f"the pose still moved after {solution.iterations} associations"
+    if solution.weak is not None:
+        status = FrameStatus.DEGENERATE
+        weak = weak_directions_in_words(solution)
+        problem = f"the scan does not tell {weak}; the expected motion was kept"
+    return status, "; ".join(filter(None, (message, problem)))
+
+
+def weak_directions_in_words(solution: Solution) -> str:
+    """The weak directions of a solution in words: metres and rad in lidar axes."""
     assert solution.localizability is not None
     names = []
     for direction in solution.localizability.directions[: solution.n_weak]:
@@ -83,8 +96,8 @@ def named(solution: Solution) -> str:
     return " or ".join(names)
 
 
-def way(first: gtsam.Pose3, second: gtsam.Pose3) -> str:
-    """How far it is from one pose to another, in words."""
+def distance_in_words(first: gtsam.Pose3, second: gtsam.Pose3) -> str:
+    """The distance from one pose to another in words: metres and degrees."""
     turn = gtsam.Rot3.Logmap(first.rotation().between(second.rotation()))
     return f"{first.range(second):.2f} m and {np.degrees(np.linalg.norm(turn)):.1f} degrees"
 

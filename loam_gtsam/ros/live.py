@@ -22,8 +22,8 @@ from loam_gtsam.datasets.decode.imu_messages import decode_imu
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
-from loam_gtsam.mapper import ExtraFactors
 from loam_gtsam.pipeline import Observer, Pipeline
+from loam_gtsam.registration.solvers.own_factors import ExtraFactors
 from loam_gtsam.ros.live_imu import LiveImu
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
 from loam_gtsam.ros.live_sweeps import ReadySweep, SweepDecoder, checked_stamp

@@ -17,6 +17,7 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.pipeline import OnFrame, Pipeline, effective_config, imu_buffer
+from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies.contenders import (
     Contender,
     PeerRunner,
@@ -214,7 +215,8 @@ def _make_runners(
         imu = imu_buffer(dataset, config)
         pipeline = Pipeline(config, imu=imu, solver=entry.solver, odometry=guess)
         if shared_guess and guess is None:
-            pipeline.odometry = guess = SharedGuess(pipeline.odometry)
+            steady = ConstantVelocity(pipeline.mapper.imu)
+            pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)
         runners.append(PipelineRunner(entry.name, pipeline))
     return runners
 

@@ -255,6 +255,15 @@ class SharedGuess:
         self._step = None if last is None else (last.map_T_lidar.between(own.map_T_lidar), own)
         return own
 
+    def remember(self, features: Features) -> None:
+        """See :meth:`loam_gtsam.registration.odometry.Odometry.remember`."""
+        self._odometry.remember(features)
+
+    def reset(self) -> None:
+        """See :meth:`loam_gtsam.registration.odometry.Odometry.reset`."""
+        self._odometry.reset()
+        self._features = self._step = None
+
 
 class PipelineRunner:
     """A pipeline of this package as a contender.

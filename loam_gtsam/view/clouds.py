@@ -124,8 +124,5 @@ def _deskewed(
     # As it was for this frame: the gyro may have been given up since.
     turned = update.sweep_motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
     imu = mapper.imu.buffer if turned and mapper.imu is not None else None
-    moving = MovingSweep(points, mapper.config, imu, thin=False)
-    moving.deskew(update.twist)
-    back = moving.middle_T_reference(update.twist).inverse()
-    map_T_middle = update.map_T_lidar.compose(back)
-    return transform(map_T_middle.matrix(), moving.planes)
+    posed = MovingSweep(points, mapper.config, imu, thin=False).at(update.twist)
+    return transform(posed.map_T_middle(update.map_T_lidar).matrix(), posed.points[1])

@@ -80,11 +80,12 @@ def in_order(points):
     return points[np.lexsort(points.T.round(2))]
 
 
-def largest_error(moving, map_points):
+def largest_error(moving, map_points, twist):
     """Metres between the de-skewed plane points and the truth, seen from the middle."""
     middle = pose_at((moving.stamp - START) * 1e-9).inverse().matrix()
     expected = map_points @ middle[:3, :3].T + middle[:3, 3]
-    distances = np.linalg.norm(moving.planes[:, None] - expected[None], axis=2)
+    planes = moving.at(twist).points[1]
+    distances = np.linalg.norm(planes[:, None] - expected[None], axis=2)
     return distances.min(axis=1).max()
 
 
@@ -96,25 +97,33 @@ def test_a_known_motion_is_undone(rotation, reference):
     features, truth = sweep(reference)
     moving = MovingSweep(features, wanted, buffer())
     assert moving.motion is MOTIONS[rotation]
-    assert largest_error(moving, truth) > 1.0
-    moving.deskew(twist_at((moving.reference_stamp - START) * 1e-9))
-    assert largest_error(moving, truth) < LIMITS[rotation]
+    as_measured = MovingSweep(features, config(enabled=False))
+    assert largest_error(as_measured, truth, np.zeros(6)) > 1.0
+    twist = twist_at((moving.reference_stamp - START) * 1e-9)
+    assert largest_error(moving, truth, twist) < LIMITS[rotation]
     again = MovingSweep(features, wanted, buffer())
-    again.deskew(twist_at((moving.reference_stamp - START) * 1e-9))
-    assert again.planes.tobytes() == moving.planes.tobytes()
+    assert again.at(twist).points[1].tobytes() == moving.at(twist).points[1].tobytes()
+
+
+def test_a_posed_sweep_stays_what_it_is():
+    """Another motion of the same sweep is another value."""
+    moving = MovingSweep(sweep()[0], config(), buffer())
+    first = moving.at(twist_at(0.5))
+    before = first.points[1].copy()
+    assert not np.array_equal(moving.at(np.zeros(6)).points[1], before)
+    np.testing.assert_array_equal(first.points[1], before)
+    with pytest.raises(AttributeError):
+        first.twist = np.zeros(6)
 
 
 @pytest.mark.parametrize("rotation", MOTIONS)
-@pytest.mark.parametrize("moved", [False, True])
-def test_some_points_are_de_skewed_as_all_are(rotation, moved):
+def test_some_points_are_de_skewed_as_all_are(rotation):
     moving = MovingSweep(sweep()[0], config(rotation), buffer())
-    if moved:
-        moving.deskew(twist_at((moving.reference_stamp - START) * 1e-9))
+    posed = moving.at(twist_at((moving.reference_stamp - START) * 1e-9))
     rows = np.arange(moving.n_planes)[::7]
-    none = np.empty(0, np.int64)
-    edges, planes = moving.some(none, rows)
+    edges, planes = posed.rows(np.empty(0, np.int64), rows)
     assert edges.shape == (0, 3)
-    np.testing.assert_allclose(planes, moving.planes[rows], atol=1e-12)
+    np.testing.assert_allclose(planes, posed.points[1][rows], atol=1e-12)
 
 
 @pytest.mark.parametrize("rotation", MOTIONS)
@@ -143,8 +152,7 @@ def test_a_bias_of_the_gyro_is_taken_off():
     for bias in (np.zeros(3), np.array([0.05, -0.1, 0.2])):
         imu.gyro_bias = bias
         moving = MovingSweep(features, config(), imu)
-        moving.deskew(twist_at(0.5))
-        errors.append(largest_error(moving, truth))
+        errors.append(largest_error(moving, truth, twist_at(0.5)))
     assert errors[0] > 0.1
     assert errors[1] < LIMITS["auto"]
 
@@ -157,9 +165,7 @@ def without_imu(features, wanted=None):
 
 
 def same(a, b, twist):
-    a.deskew(twist)
-    b.deskew(twist)
-    return np.array_equal(a.planes, b.planes) and np.array_equal(a.edges, b.edges)
+    return all(map(np.array_equal, a.at(twist).points, b.at(twist).points))
 
 
 @pytest.mark.parametrize("rotation", MOTIONS)
@@ -212,8 +218,7 @@ def test_samples_without_an_orientation_are_interpolated_over():
     features, truth = sweep()
     moving = MovingSweep(features, config("orientation"), buffer(samples))
     assert moving.motion is SweepMotion.ORIENTATION
-    moving.deskew(twist_at(0.5))
-    assert largest_error(moving, truth) < 0.05
+    assert largest_error(moving, truth, twist_at(0.5)) < 0.05
 
 
 def test_the_configuration_may_leave_the_imu_out():
@@ -223,7 +228,7 @@ def test_the_configuration_may_leave_the_imu_out():
     twist = np.array([0.2, -0.3, 1.0, 8.0, -2.0, 0.5])
     assert same(moving, without_imu(features), twist)
     expected = move_points(features.planes, twist, features.plane_times - 0.05)
-    assert np.abs(in_order(moving.planes) - in_order(expected)).max() < 1e-9
+    assert np.abs(in_order(moving.at(twist).points[1]) - in_order(expected)).max() < 1e-9
 
 
 def test_without_an_imu_a_screw_motion_is_undone():
@@ -246,17 +251,6 @@ def test_what_does_not_move_is_left_alone(imu):
     for moving in (off, still):
         assert moving.motion is SweepMotion.NONE
         assert moving.stamp == moving.reference_stamp == features.stamp
-        before = moving.planes.copy()
-        moving.deskew(np.ones(6))
-        np.testing.assert_array_equal(moving.planes, before)
+        as_measured = moving.at(np.zeros(6)).points[1]
+        np.testing.assert_array_equal(moving.at(np.ones(6)).points[1], as_measured)
         assert moving.middle_T_reference(np.ones(6)).equals(gtsam.Pose3(), 0.0)
-
-
-def test_a_sweep_without_features_is_empty():
-    none = np.zeros((0, 3))
-    features = replace(Features.from_points(SWEEP, none, none), span=(0.0, 0.1))
-    for imu in (None, buffer()):
-        moving = MovingSweep(features, config(), imu)
-        assert moving.is_empty
-        moving.deskew(np.ones(6))
-    assert not MovingSweep(sweep()[0], config(), buffer()).is_empty

@@ -10,15 +10,14 @@ from loam_gtsam.config import MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.association import (
-    ScanMatches,
     associate,
     match_lines,
     match_planes,
-    moved,
-    renew,
-    spread,
-    trial,
+    rematched,
+    spread_rows,
+    trial_matching,
 )
+from loam_gtsam.registration.matches import ScanMatches
 
 CONFIG = MatchingConfig()
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -273,9 +272,9 @@ def test_a_weight_at_the_limit_is_too_small():
         one(match_planes, above, plane_group(), changed(weight_slope=1.0)),
     )
     assert (len(kept.edges), len(kept.planes)) == (1, 1)
-    renewed = renew(kept, gtsam.Pose3(), config)
+    renewed = rematched(kept, gtsam.Pose3(), config)
     assert (len(renewed.edges), len(renewed.planes)) == (0, 1)
-    renewed = renew(kept, gtsam.Pose3(), changed(weight_slope=1.0, min_weight=0.5))
+    renewed = rematched(kept, gtsam.Pose3(), changed(weight_slope=1.0, min_weight=0.5))
     assert (len(renewed.edges), len(renewed.planes)) == (0, 0)
 
 
@@ -336,7 +335,7 @@ def test_the_range_in_the_weight_is_from_the_sensor_or_from_the_map_origin():
         expected = 1.0 - 0.9 * 0.2 / np.sqrt(reach)
         np.testing.assert_allclose(planes.weights, [expected], atol=1e-9)
         stripped = dataclasses.replace(planes, weights=np.zeros(1))
-        renewed = renew(ScanMatches(edges, stripped), pose, config)
+        renewed = rematched(ScanMatches(edges, stripped), pose, config)
         np.testing.assert_allclose(renewed.planes.weights, [expected], atol=1e-9)
 
 
@@ -543,7 +542,7 @@ def test_at_most_so_many_features_are_matched_at_even_distances(limit, rows):
 ])  # fmt: skip
 def test_those_that_stand_out_are_matched_before_others(limit, rows):
     first = np.isin(np.arange(8), [1, 4, 6])
-    np.testing.assert_array_equal(spread(8, limit, first), list(rows))
+    np.testing.assert_array_equal(spread_rows(8, limit, first), list(rows))
 
 
 def poles(*places, spacing=0.2):
@@ -638,7 +637,7 @@ def test_edges_are_searched_for_widely_where_planes_leave_a_translation_open(
 @pytest.mark.parametrize(("most", "expected"), [(0, (20, 70)), (50, (20, 50)), (10, (10, 10))])
 def test_the_configuration_for_trials_never_matches_more(most, expected):
     config = changed(max_edges=most, max_planes=most, trial_edges=20, trial_planes=70)
-    assert trial(config) == config.changed(max_edges=expected[0], max_planes=expected[1])
+    assert trial_matching(config) == config.changed(max_edges=expected[0], max_planes=expected[1])
 
 
 @pytest.mark.parametrize(("n_map", "found"), [(0, 0), (4, 0), (5, 1)])
@@ -670,7 +669,7 @@ def both():
 
 def test_renewed_matches_keep_their_shapes_and_measure_anew():
     shift = gtsam.Pose3(gtsam.Rot3(), np.array([0.05, -0.02, 0.0]))
-    before, after = both(), renew(both(), shift, CONFIG)
+    before, after = both(), rematched(both(), shift, CONFIG)
     np.testing.assert_array_equal(after.edges.directions, before.edges.directions)
     np.testing.assert_array_equal(after.planes.normals, before.planes.normals)
     np.testing.assert_allclose(after.edges.distances, [np.hypot(0.05, 0.08)], atol=1e-9)
@@ -681,7 +680,7 @@ def test_renewed_matches_keep_their_shapes_and_measure_anew():
 
 
 def test_renewed_at_the_same_pose_nothing_changes():
-    before, after = both(), renew(both(), gtsam.Pose3(), CONFIG)
+    before, after = both(), rematched(both(), gtsam.Pose3(), CONFIG)
     for kind in ("edges", "planes"):
         for field in dataclasses.fields(getattr(before, kind)):
             old, new = (getattr(getattr(each, kind), field.name) for each in (before, after))
@@ -690,30 +689,15 @@ def test_renewed_at_the_same_pose_nothing_changes():
 
 def test_a_renewed_match_that_is_too_far_is_dropped():
     far = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 1.0, 0.0]))
-    after = renew(both(), far, CONFIG)
+    after = rematched(both(), far, CONFIG)
     assert (len(after.edges), len(after.planes)) == (0, 1)
     away = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
-    assert len(renew(both(), away, CONFIG)) == 0
+    assert len(rematched(both(), away, CONFIG)) == 0
 
 
 def test_matches_that_all_stay_are_not_copied():
     near = gtsam.Pose3(gtsam.Rot3(), np.array([0.01, 0.0, 0.0]))
     before = both()
-    after = renew(before, near, CONFIG)
+    after = rematched(before, near, CONFIG)
     assert after.edges.points is before.edges.points
     assert after.planes.points is before.planes.points
-
-
-def test_features_that_were_de_skewed_anew_keep_their_lines_and_planes():
-    held_edges, held_planes = map_of(line_group()), map_of(plane_group())
-    edges = AHEAD + np.outer([9.0, 0.1, 0.2], Y)  # the first meets no line
-    planes = AHEAD + np.outer([0.1, 0.0, 9.0], Y)
-    matches = associate(edges, planes, gtsam.Pose3(), held_edges, held_planes, CONFIG)
-    np.testing.assert_array_equal(matches.edges.indices, [1, 2])
-    np.testing.assert_array_equal(matches.planes.indices, [0, 1])
-    after = moved(matches, edges[1:] + 0.5, planes[:2] - 0.25)
-    np.testing.assert_array_equal(after.edges.points, edges[1:] + 0.5)
-    np.testing.assert_array_equal(after.planes.points, planes[:2] - 0.25)
-    assert after.edges.centres is matches.edges.centres
-    assert after.planes.normals is matches.planes.normals
-    assert (len(after.edges), len(after.planes)) == (2, 2)

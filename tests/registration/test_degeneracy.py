@@ -11,8 +11,8 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config
-from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.degeneracy import localizability, unseen_by_planes
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, MotionPrior
 from loam_gtsam.types import FrameStatus
 

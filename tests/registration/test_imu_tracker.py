@@ -14,8 +14,8 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.level import Level
 from loam_gtsam.imu_prior import roll_pitch, roll_pitch_jacobian, tilt_information
 from loam_gtsam.io.state import freeze
-from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.imu_tracker import ImuTracker
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import ImuSamples, TiltPrior
 

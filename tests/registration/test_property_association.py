@@ -13,7 +13,7 @@ from support.strategies import generators
 
 from loam_gtsam.config import MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.registration.association import associate, moved, renew, spread
+from loam_gtsam.registration.association import associate, rematched, spread_rows
 
 MAP = MapConfig(field_of_view=False)
 EXACT = MatchingConfig(
@@ -168,19 +168,17 @@ def test_renewed_matches_are_the_old_ones_seen_from_the_new_pose(rng: np.random.
     pose = gtsam.Pose3.Expmap(rng.normal(0, 0.02, 6))
     edges, planes = poles[::2], walls[::5]
     found = associate(edges, planes, pose, cubes_of(poles), cubes_of(walls), EXACT)
-    again = renew(found, pose, EXACT)
+    again = rematched(found, pose, EXACT)
     assert len(again) == len(found)
     np.testing.assert_allclose(again.edges.distances, found.edges.distances, atol=1e-7)
     np.testing.assert_allclose(again.planes.distances, found.planes.distances, atol=1e-12)
     step = gtsam.Pose3.Expmap(rng.normal(0, 0.02, 6))
-    after = renew(found, pose.compose(step), EXACT)
+    after = rematched(found, pose.compose(step), EXACT)
     T = pose.compose(step).matrix()
     for match in range(len(after.planes)):
         there = T[:3, :3] @ after.planes.points[match] + T[:3, 3]
         distance = after.planes.normals[match] @ there + after.planes.offsets[match]
         assert after.planes.distances[match] == pytest.approx(distance, abs=1e-12)
-    shifted = moved(found, found.edges.points + 1.0, found.planes.points + 1.0)
-    np.testing.assert_array_equal(shifted.edges.points, found.edges.points + 1.0)
 
 
 @given(count=st.integers(0, 300), limit=st.integers(0, 320), rng=generators())
@@ -188,9 +186,9 @@ def test_what_is_spread_is_sorted_unique_and_prefers_the_first(
     count: int, limit: int, rng: np.random.Generator
 ) -> None:
     first = rng.random(count) < rng.random()
-    for chosen in (spread(count, limit), spread(count, limit, first)):
+    for chosen in (spread_rows(count, limit), spread_rows(count, limit, first)):
         assert len(chosen) == (min(limit, count) if limit else count)
         assert (np.diff(chosen) > 0).all()
         assert len(chosen) == 0 or (chosen[0] >= 0 and chosen[-1] < count)
-    preferred = first[spread(count, limit, first)].sum()
+    preferred = first[spread_rows(count, limit, first)].sum()
     assert preferred == (min(first.sum(), limit) if limit else first.sum())

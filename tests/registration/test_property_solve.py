@@ -20,9 +20,9 @@ from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import Pipeline
-from loam_gtsam.registration.association import ScanMatches, subset
-from loam_gtsam.registration.classical import ALoamSolver, ClassicalSolver
+from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
+from loam_gtsam.registration.solvers.classical import ALoamSolver, ClassicalSolver
 from loam_gtsam.types import Features, Scan
 
 MIRROR = np.diag([1.0, -1.0, 1.0])

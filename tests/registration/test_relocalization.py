@@ -14,8 +14,8 @@ from loam_gtsam.datasets.sim.disturbances import Disturbed, MissingSweeps, Movin
 from loam_gtsam.datasets.sim.kidnapping import Kidnapped
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import Pipeline, run
-from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.relocalization import Fit, Watch, places, some
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.relocalization import Fit, FitMonitor, likely_poses, sample_features
 from loam_gtsam.types import FrameStatus
 
 AT = 22
@@ -84,20 +84,20 @@ def test_a_fit_counts_matches_within_three_sigmas_on_either_side():
 
 
 def test_the_usual_is_the_median_of_what_went_into_the_map():
-    watch = Watch(RelocalizationConfig(memory=3))
-    assert not watch.ready
+    monitor = FitMonitor(RelocalizationConfig(memory=3))
+    assert not monitor.ready
     for share in (0.1, 0.5, 0.6, 0.9):
-        watch.accept(Fit(share, 1.0), gtsam.Pose3())
-    assert watch.ready
-    assert watch.usual == Fit(0.6, 1.0)
+        monitor.accept(Fit(share, 1.0), gtsam.Pose3())
+    assert monitor.ready
+    assert monitor.usual == Fit(0.6, 1.0)
 
 
 @pytest.fixture
-def watch():
-    watch = Watch(RelocalizationConfig(memory=2))
+def monitor():
+    monitor = FitMonitor(RelocalizationConfig(memory=2))
     for _ in range(2):
-        watch.accept(Fit(0.6, 1.0), gtsam.Pose3())
-    return watch
+        monitor.accept(Fit(0.6, 1.0), gtsam.Pose3())
+    return monitor
 
 
 @pytest.mark.parametrize(
@@ -110,16 +110,16 @@ def watch():
         (Fit(0.2, 1.0), True, False),
     ],
 )
-def test_two_thresholds_keep_apart_lost_and_found(watch, fit, misfit, again):
-    assert watch.misfit(fit) is misfit
-    assert watch.fits_again(fit) is again
+def test_two_thresholds_keep_apart_lost_and_found(monitor, fit, misfit, again):
+    assert monitor.misfit(fit) is misfit
+    assert monitor.fits_again(fit) is again
 
 
 def test_nothing_is_unusual_at_the_start():
-    watch = Watch(RelocalizationConfig(memory=2))
-    watch.accept(Fit(0.6, 1.0), gtsam.Pose3())
-    assert not watch.misfit(Fit(0.0, 0.0))
-    assert not watch.jumped(np.full(6, 100.0), 0.1)
+    monitor = FitMonitor(RelocalizationConfig(memory=2))
+    monitor.accept(Fit(0.6, 1.0), gtsam.Pose3())
+    assert not monitor.misfit(Fit(0.0, 0.0))
+    assert not monitor.jumped(np.full(6, 100.0), 0.1)
 
 
 @pytest.mark.parametrize(
@@ -132,24 +132,24 @@ def test_nothing_is_unusual_at_the_start():
         ([0, 0, 0, 5.0, 0, 0], 0.6, False),  # five sweeps are missing
     ],
 )
-def test_a_jump_is_what_no_acceleration_explains(watch, step, seconds, jumped):
-    assert watch.jumped(np.array(step, float), seconds) is jumped
+def test_a_jump_is_what_no_acceleration_explains(monitor, step, seconds, jumped):
+    assert monitor.jumped(np.array(step, float), seconds) is jumped
 
 
 def test_the_search_grows_and_remembers_where_it_fitted_last():
     config = RelocalizationConfig(memory=1, radius=4.0, radius_growth=2.0, max_radius=9.0)
-    watch = Watch(config)
+    monitor = FitMonitor(config)
     here, far = gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), np.array([20.0, 0.0, 0.0]))
-    assert watch.around(far) == [far]
-    watch.accept(Fit(0.6, 1.0), here)
-    assert watch.around(here) == [here]
-    assert watch.around(far) == [far, here]
+    assert monitor.around(far) == [far]
+    monitor.accept(Fit(0.6, 1.0), here)
+    assert monitor.around(here) == [here]
+    assert monitor.around(far) == [far, here]
     radii = []
-    for watch.lost in range(4):
-        radii.append(watch.radius)
+    for monitor.lost in range(4):
+        radii.append(monitor.radius)
     assert radii == [4.0, 6.0, 8.0, 9.0]
-    watch.accept(Fit(0.6, 1.0), here)
-    assert watch.lost == 0
+    monitor.accept(Fit(0.6, 1.0), here)
+    assert monitor.lost == 0
 
 
 # -- where it would fit ----------------------------------------------------------------------------
@@ -172,7 +172,7 @@ def test_the_likeliest_place_is_the_true_one(corner, away, turn):
     step = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.array([*away, 0.0]))
     truth = predicted.compose(step)
     seen = truth.transformTo(corner[::15].T).T
-    found = places(seen, corner, [predicted], radius=8.0, count=4)
+    found = likely_poses(seen, corner, [predicted], radius=8.0, count=4)
     assert 1 <= len(found) <= 4
     error = truth.localCoordinates(found[0])
     assert np.linalg.norm(error[3:]) < 1.0
@@ -187,16 +187,16 @@ def test_several_centres_are_searched(corner):
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([4.0, 3.0, 0.3]))
     seen = truth.transformTo(corner[::15].T).T
     nowhere = gtsam.Pose3(gtsam.Rot3(), np.array([300.0, 0.0, 0.0]))
-    assert places(seen, corner, [nowhere], 3.0, 4) == []
-    found = places(seen, corner, [nowhere, truth], 3.0, 4)
+    assert likely_poses(seen, corner, [nowhere], 3.0, 4) == []
+    found = likely_poses(seen, corner, [nowhere, truth], 3.0, 4)
     assert truth.range(found[0]) < 1.0
 
 
 def test_a_few_points_stand_for_a_sweep():
     edges, planes = np.zeros((1000, 3)), np.ones((50, 3))
-    assert some(edges, planes).sum() == 3 * 50
-    assert 50 < len(some(edges, planes)) < 200
-    assert some(edges[:0], planes[:0]).shape == (0, 3)
+    assert sample_features(edges, planes).sum() == 3 * 50
+    assert 50 < len(sample_features(edges, planes)) < 200
+    assert sample_features(edges[:0], planes[:0]).shape == (0, 3)
 
 
 # -- whole runs ------------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def test_a_kidnapped_lidar_is_found_at_once(kidnapped):
     assert "relocalised, moved by 3." in update.message
     assert "relocalize" in update.timings
     assert errors(result, kidnapped).max() < 0.15
-    # Without the watch it is not: a second map grows beside the first.
+    # Without the monitor it is not: a second map grows beside the first.
     wrong = run(kidnapped, OFF)
     assert all(later.status.solved for later in wrong.updates[1:])
     assert errors(wrong, kidnapped)[AT] > 1.0
@@ -285,7 +285,7 @@ def test_a_reset_starts_a_new_map(calm):
     update = pipeline.process(sweeps[12])
     assert update.status is FrameStatus.FIRST
     assert update.map_T_lidar.equals(gtsam.Pose3(), 1e-12)
-    assert not pipeline.mapper.watch.ready
+    assert not pipeline.mapper.monitor.ready
     assert pipeline.process(sweeps[13]).status.solved
     assert 0 < pipeline.mapper.plane_map.count() < before
 

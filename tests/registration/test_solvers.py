@@ -6,14 +6,14 @@ import pytest
 from support.matches import TRUTH, difference, make_matches
 
 from loam_gtsam.config import SolverConfig
-from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import (
     POSE_KEY,
     GtsamSolver,
     fuse,
     match_rows,
-    within_tolerance,
 )
+from loam_gtsam.registration.solvers.gtsam_solver import within_tolerance
 
 CONFIG = SolverConfig()
 # 2 degrees and 0.2 m

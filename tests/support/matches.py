@@ -3,7 +3,7 @@
 import gtsam
 import numpy as np
 
-from loam_gtsam.registration.association import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 
 TRUTH = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
 

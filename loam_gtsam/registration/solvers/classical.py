@@ -14,8 +14,7 @@ Both re-associate in the outer loop. ``R p + t = q`` with the pose ``map_T_lidar
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import gtsam
 import numpy as np
@@ -24,8 +23,14 @@ from scipy.linalg import qr, solve_triangular
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows, concatenate_rows, line_rows, plane_rows
 from loam_gtsam.geometry import transform
-from loam_gtsam.registration.association import ScanMatches
-from loam_gtsam.registration.solvers import Associate, MotionPrior, Solution
+from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.solvers.base import (
+    Associate,
+    MotionPrior,
+    Optimum,
+    Solution,
+    rematch,
+)
 from loam_gtsam.types import FloatArray, InputError
 
 # LOAM's (rx, ry, rz) are (pitch, yaw, roll) and its (x, y, z) are (left, up, forward): both are the
@@ -39,18 +44,6 @@ _MAX_RADIUS = 1e16
 _DIAGONAL = (1e-6, 1e32)
 _MIN_DECREASE = 1e-3
 """A step is taken if the cost falls by more than this share of what the linear model says."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Optimum:
-    """What an inner solve on fixed matches found."""
-
-    map_T_lidar: gtsam.Pose3
-    step: FloatArray
-    steps: int
-    error_before: float
-    error_after: float
-    information: FloatArray
 
 
 class ClassicalSolver:
@@ -89,7 +82,7 @@ class ClassicalSolver:
         """
         projector: FloatArray | None = None
 
-        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> _Optimum:
+        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Optimum:
             nonlocal projector
             residual, jacobian = loam_rows(matches, pose).residuals(pose)
             a = jacobian @ euler_jacobian(pose)
@@ -103,16 +96,17 @@ class ClassicalSolver:
             step = projector @ _solve_by_qr(normal, -a.T @ residual)
             moved = _add_euler(pose, step)
             after, jacobian = loam_rows(matches, moved).residuals(moved)
-            return _Optimum(
+            return Optimum(
                 moved,
-                step,
+                _is_small(step, self.config),
                 1,
                 0.5 * float(residual @ residual),
                 0.5 * float(after @ after),
                 jacobian.T @ jacobian,
             )
 
-        return _alternate(self.config, associate, guess, priors, optimise, stop=True)
+        _refuse_priors(priors, self.config)
+        return rematch(associate, guess, self.config, optimise)
 
 
 class ALoamSolver:
@@ -147,9 +141,10 @@ class ALoamSolver:
         InputError
             If priors are given.
         """
-        return _alternate(self.config, associate, guess, priors, self._optimise, stop=False)
+        _refuse_priors(priors, self.config)
+        return rematch(associate, guess, self.config, self._optimise, stop=False)
 
-    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3) -> _Optimum:
+    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3) -> Optimum:
         rows, pairs, delta = aloam_rows(matches), len(matches.edges), self.config.huber_delta
         first, steps = pose, 0
         radius, shrink = _START_RADIUS, 2.0
@@ -176,7 +171,8 @@ class ALoamSolver:
                 shrink *= 2.0
         turn = _turn(pose)
         information = turn.T @ normal @ turn
-        return _Optimum(pose, first.localCoordinates(pose), steps, start, cost, information)
+        converged = _is_small(first.localCoordinates(pose), self.config)
+        return Optimum(pose, converged, steps, start, cost, information)
 
 
 def loam_rows(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> MatchRows:
@@ -259,44 +255,12 @@ def degeneracy_projector(
     return projector
 
 
-def _alternate(
-    config: SolverConfig,
-    associate: Associate,
-    guess: gtsam.Pose3,
-    priors: Sequence[gtsam.NonlinearFactor],
-    optimise: Callable[[ScanMatches, gtsam.Pose3], _Optimum],
-    *,
-    stop: bool,
-) -> Solution:
-    """Associate and optimise in turn; ``stop`` ends it once the pose stays."""
+def _refuse_priors(priors: Sequence[gtsam.NonlinearFactor], config: SolverConfig) -> None:
     if len(priors):
         raise InputError(
             f"priors: the {config.method} solver has no place for them, got {len(priors)}; use "
             "solver.method: gtsam"
         )
-    pose, converged, steps, error_before = guess, False, 0, 0.0
-    for iteration in range(1, config.iterations + 1):
-        matches = associate(pose)
-        if len(matches) < config.min_matches:
-            return Solution.unsolved(guess, matches, iteration, steps)
-        optimum = optimise(matches, pose)
-        pose, steps = optimum.map_T_lidar, steps + optimum.steps
-        if iteration == 1:
-            error_before = optimum.error_before
-        converged = _is_small(optimum.step, config)
-        if converged and stop:
-            break
-    return Solution(
-        pose,
-        True,
-        converged,
-        matches,
-        iteration,
-        steps,
-        error_before,
-        optimum.error_after,
-        optimum.information,
-    )
 
 
 def _is_small(step: FloatArray, config: SolverConfig) -> bool:

@@ -1,13 +1,9 @@
-"""Per-frame solvers: from a guess and a way to associate, to a pose.
-
-A solver is anything with :meth:`ScanSolver.solve`; the mapper does not know which one it has.
-"""
+"""The package's own solver: the scan as a factor graph, solved by GTSAM's Levenberg-Marquardt."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import gtsam
 import numpy as np
@@ -21,17 +17,22 @@ from loam_gtsam.factors import (
     plane_rows,
     scan_match_factor,
 )
-from loam_gtsam.registration.association import ScanMatches
 from loam_gtsam.registration.degeneracy import (
     Localizability,
     line_sight,
     localizability,
     unseen_by_planes,
 )
+from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.solvers.base import (
+    POSE_KEY,
+    Associate,
+    MotionPrior,
+    Optimum,
+    Solution,
+    rematch,
+)
 from loam_gtsam.types import BoolArray, FloatArray
-
-POSE_KEY: int = gtsam.symbol("x", 0)
-"""Key of the frame's pose ``map_T_lidar`` in every graph handed to a solver."""
 
 _REDESCENDING = 2.816
 """Width of a Geman-McClure kernel over that of a Huber kernel of the same efficiency on normal
@@ -48,119 +49,6 @@ _FUSE.setAbsoluteErrorTol(0.0)
 
 _CERTAIN = 1e10
 """Information that no factor stands up to: 0.01 mrad and 0.01 mm."""
-
-Associate = Callable[[gtsam.Pose3], ScanMatches]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Solution:
-    """What a solver returns.
-
-    Attributes
-    ----------
-    map_T_lidar : the pose; the guess if ``solved`` is false
-    solved : false when an association gave too few matches
-    converged : the last association moved the pose less than the stop rule
-    matches : of the last association
-    iterations, solver_iterations : associations, and solver steps over all of them
-    error_before, error_after : cost at the guess with the first matches, and at the pose with the
-        last ones
-    information : (6, 6) of matches and priors at the pose
-    localizability : which motions the first matches say something about; None if not looked at
-    weak : (6, 6) projector onto those they say too little about; None if there are none
-    unseen : (6, 6) projector onto those that the planes say too little about, where nothing but
-        ``beacons`` and the expected motion counts; None if there are none
-    beacons : (R,) which rows of the matches count there
-    rows : the matches as the last association weighted them; None if a solver has no such rows
-    """
-
-    map_T_lidar: gtsam.Pose3
-    solved: bool
-    converged: bool
-    matches: ScanMatches
-    iterations: int
-    solver_iterations: int
-    error_before: float
-    error_after: float
-    information: FloatArray
-    localizability: Localizability | None = None
-    weak: FloatArray | None = None
-    unseen: FloatArray | None = None
-    beacons: BoolArray | None = None
-    rows: MatchRows | None = None
-
-    @classmethod
-    def unsolved(
-        cls, guess: gtsam.Pose3, matches: ScanMatches, iterations: int, solver_iterations: int
-    ) -> Solution:
-        """The guess back, after an association gave too few matches."""
-        nothing = np.zeros((6, 6))
-        return cls(guess, False, False, matches, iterations, solver_iterations, 0.0, 0.0, nothing)
-
-    @property
-    def n_weak(self) -> int:
-        """Number of weak directions: the first of ``localizability.directions``."""
-        return 0 if self.weak is None else round(float(np.trace(self.weak)))
-
-    @property
-    def scan_information(self) -> FloatArray:
-        """(6, 6) ``information`` with the weak directions taken out."""
-        if self.weak is None:
-            return self.information
-        keep = np.eye(6) - self.weak
-        kept: FloatArray = keep.T @ self.information @ keep
-        return kept
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class MotionPrior:
-    """Where the pose is expected, for the directions in which a scan does not say it.
-
-    Attributes
-    ----------
-    map_T_lidar : expected pose
-    information : (6, 6) of the expectation, tangent order of the package
-    """
-
-    map_T_lidar: gtsam.Pose3
-    information: FloatArray
-
-    def factor(self, directions: FloatArray | None = None) -> gtsam.NonlinearFactor:
-        """The expectation on :data:`POSE_KEY`.
-
-        Parameters
-        ----------
-        directions : (6, 6) projector onto those in which it acts; all if None
-        """
-        information = self.information
-        if directions is not None:
-            information = directions.T @ information @ directions
-        expected = gtsam.Values()
-        expected.insert(POSE_KEY, self.map_T_lidar)
-        hessian = gtsam.HessianFactor(POSE_KEY, information, np.zeros(6), 0.0)
-        return gtsam.LinearContainerFactor(hessian, expected)
-
-
-class ScanSolver(Protocol):
-    """Solves one frame."""
-
-    def solve(
-        self,
-        associate: Associate,
-        guess: gtsam.Pose3,
-        priors: Sequence[gtsam.NonlinearFactor] = (),
-        motion: MotionPrior | None = None,
-    ) -> Solution:
-        """Find the pose.
-
-        Parameters
-        ----------
-        associate : gives the matches at a pose
-        guess : ``map_T_lidar`` to start from
-        priors : further factors on :data:`POSE_KEY`
-        motion : takes over along weak directions; None: they are not looked for
-        """
-        ...
 
 
 class GtsamSolver:
@@ -185,75 +73,90 @@ class GtsamSolver:
         motion: MotionPrior | None = None,
     ) -> Solution:
         """See :meth:`ScanSolver.solve`."""
-        config = self.config
         expected = motion
-        if motion is not None and config.degeneracy == "project":
+        if motion is not None and self.config.degeneracy == "project":
             expected = replace(motion, information=_CERTAIN * np.eye(6))
-        seen: Localizability | None = None
-        weak: FloatArray | None = None
-        planes: Localizability | None = None
-        pose = guess
-        converged = False
-        steps = 0
-        error_before = error_after = 0.0
-        information = np.zeros((6, 6))
-        unseen: FloatArray | None = None
-        beacons: BoolArray | None = None
-        for iteration in range(1, config.iterations + 1):
-            matches = associate(pose)
-            if len(matches) < config.min_matches:
-                return Solution.unsolved(guess, matches, iteration, steps)
-            if iteration == 1 and motion is not None:
-                seen = localizability(matches, pose)
-                if config.degeneracy != "off":
-                    weak = seen.projector(config.min_aligned)
-                if config.degeneracy == "prior":
-                    planes = unseen_by_planes(matches, pose, seen, config.min_aligned)
-            values = gtsam.Values()
-            values.insert(POSE_KEY, pose)
-            graph = gtsam.NonlinearFactorGraph()
-            rows = match_rows(matches, config.kernel_width, config.kernel)
-            unseen = weak
-            beacons = np.zeros(len(rows.points), np.bool_)
-            if planes is not None:
-                unseen = planes.projector(config.min_aligned)
-                sight = line_sight(matches.edges, pose, planes.weak(config.min_aligned))
-                beacons[: 2 * len(sight)] = np.repeat(sight.any(axis=1), 2)
-            for factor in _scan_factors(rows, values, unseen, beacons):
-                graph.add(factor)
-            if weak is not None and expected is not None:
-                graph.add(expected.factor(weak))
-            for factor in priors:
-                graph.add(factor)
-            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
-            if iteration == 1:
-                error_before = optimizer.error()
-            result = optimizer.optimize()
-            steps += optimizer.iterations()
-            error_after = optimizer.error()
-            moved = result.atPose3(POSE_KEY)
-            step = pose.localCoordinates(moved)
-            pose = moved
-            information = graph.linearize(result).hessian()[0]
-            converged = within_tolerance(step, information, config)
-            if converged:
-                break
-        return Solution(
-            pose,
-            True,
+        sight: _Sight | None = None
+
+        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Optimum:
+            nonlocal sight
+            if sight is None:  # the first matches tell what the scan sees
+                sight = _Sight() if motion is None else _sight_of(matches, pose, self.config)
+            return self._optimise(matches, pose, sight, expected, priors)
+
+        return rematch(associate, guess, self.config, optimise)
+
+    def _optimise(
+        self,
+        matches: ScanMatches,
+        pose: gtsam.Pose3,
+        sight: _Sight,
+        expected: MotionPrior | None,
+        priors: Sequence[gtsam.NonlinearFactor],
+    ) -> Optimum:
+        """The optimum of fixed matches, priors, and the expected motion where it is needed."""
+        config = self.config
+        values = gtsam.Values()
+        values.insert(POSE_KEY, pose)
+        graph = gtsam.NonlinearFactorGraph()
+        rows = match_rows(matches, config.kernel_width, config.kernel)
+        unseen = sight.weak
+        beacons = np.zeros(len(rows.points), np.bool_)
+        if sight.planes is not None:
+            unseen = sight.planes.projector(config.min_aligned)
+            seen = line_sight(matches.edges, pose, sight.planes.weak(config.min_aligned))
+            beacons[: 2 * len(seen)] = np.repeat(seen.any(axis=1), 2)
+        for factor in _scan_factors(rows, values, unseen, beacons):
+            graph.add(factor)
+        if sight.weak is not None and expected is not None:
+            graph.add(expected.factor(sight.weak))
+        for factor in priors:
+            graph.add(factor)
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
+        error_before = optimizer.error()
+        result = optimizer.optimize()
+        steps, error_after = optimizer.iterations(), optimizer.error()
+        moved = result.atPose3(POSE_KEY)
+        information = graph.linearize(result).hessian()[0]
+        converged = within_tolerance(pose.localCoordinates(moved), information, config)
+        return Optimum(
+            moved,
             converged,
-            matches,
-            iteration,
             steps,
             error_before,
             error_after,
             information,
-            seen,
-            weak,
+            sight.scan,
+            sight.weak,
             unseen,
             beacons,
             rows,
         )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Sight:
+    """What the first matches of a frame see.
+
+    Attributes
+    ----------
+    scan, planes : localizability by all matches, and by the planes where they alone see too little
+    weak : (6, 6) projector onto the motions that the scan does not see
+    """
+
+    scan: Localizability | None = None
+    weak: FloatArray | None = None
+    planes: Localizability | None = None
+
+
+def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> _Sight:
+    scan = localizability(matches, pose)
+    weak = planes = None
+    if config.degeneracy != "off":
+        weak = scan.projector(config.min_aligned)
+    if config.degeneracy == "prior":
+        planes = unseen_by_planes(matches, pose, scan, config.min_aligned)
+    return _Sight(scan, weak, planes)
 
 
 def _scan_factors(

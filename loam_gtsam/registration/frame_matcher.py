@@ -1,0 +1,217 @@
+"""The matches of a de-skewed sweep with the cube maps, as a solver asks for them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import Config, MapConfig, MatchingConfig
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
+from loam_gtsam.geometry import transform
+from loam_gtsam.registration.association import (
+    chosen_rows,
+    match_features,
+    rematched,
+    trial_matching,
+)
+from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search
+from loam_gtsam.registration.odometry import Moment, twist_to
+from loam_gtsam.registration.report import Clock
+from loam_gtsam.registration.solvers import Matcher, MotionPrior, ScanSolver, Solution
+from loam_gtsam.types import FloatArray
+
+
+class MapPair:
+    """The map of edges and the map of planes.
+
+    Parameters
+    ----------
+    config : voxel sizes, window, ... of both
+
+    Attributes
+    ----------
+    edges, planes : the maps
+    """
+
+    def __init__(self, config: MapConfig) -> None:
+        self.config = config
+        self.edges = CubeMap(config, config.edge_voxel)
+        self.planes = CubeMap(config, config.plane_voxel)
+        self._thinned: tuple[CubeMap, CubeMap] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return vars(self) | {"_thinned": None}
+
+    def clear(self) -> None:
+        """Forget all points."""
+        self.edges = CubeMap(self.config, self.config.edge_voxel)
+        self.planes = CubeMap(self.config, self.config.plane_voxel)
+        self._thinned = None
+
+    def recenter(self, map_T_lidar: gtsam.Pose3) -> None:
+        """Let the windows follow.
+
+        Raises
+        ------
+        InputError
+            If the pose is not finite, or beyond the voxel grid.
+        """
+        for cubes in (self.edges, self.planes):
+            cubes.recenter(map_T_lidar.translation())
+
+    def insert(self, posed: PosedSweep, map_T_middle: gtsam.Pose3, keyframe: int) -> None:
+        """Add a sweep whose points belong to a keyframe."""
+        for cubes, points in zip((self.edges, self.planes), posed.points, strict=True):
+            cubes.owner = keyframe
+            cubes.insert(transform(map_T_middle.matrix(), points))
+        self._thinned = None
+
+    def counts_around(self, map_T_lidar: gtsam.Pose3) -> tuple[int, int]:
+        """Numbers of edge and plane points in the cubes around a pose."""
+        pose = map_T_lidar.matrix()
+        edges, planes = (
+            cubes.count(cubes.neighbourhood(pose)) for cubes in (self.edges, self.planes)
+        )
+        return edges, planes
+
+    def thinned(self, factor: float) -> tuple[CubeMap, CubeMap]:
+        """Both with voxels larger by a factor, the same at every call; made once a sweep."""
+        if self._thinned is None:
+            self._thinned = self.edges.thinned(factor), self.planes.thinned(factor)
+        return self._thinned
+
+
+@dataclass(frozen=True, eq=False)
+class FrameMatcher(Matcher):
+    """The matches of one sweep, de-skewed for one motion, with the maps as they are.
+
+    Parameters
+    ----------
+    posed : the de-skewed sweep
+    maps : the maps, which must not change while the matcher is in use
+    config : ``solver.min_matches`` is used
+    matching : parameters of the matching
+    rows : features that are matched
+    last : middle of the last sweep, from which :meth:`deskewed` takes the motion
+    refine : whether :meth:`deskewed` changes anything
+    clock : books the time of every call on the stage ``match``
+    """
+
+    posed: PosedSweep
+    maps: MapPair
+    config: Config
+    matching: MatchingConfig
+    rows: ChosenRows
+    last: Moment | None
+    refine: bool
+    clock: Clock
+
+    @property
+    def offered(self) -> int:
+        """Number of features that are matched if all find a match."""
+        return len(self.rows)
+
+    def __call__(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:
+        """Search for the matches at a pose."""
+        self.clock.lap("solve")
+        matches = self._search(map_T_lidar)
+        self.clock.lap("match")
+        return matches
+
+    def again(self, matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> ScanMatches:
+        """The matches at a further pose: those of the last search, if it was near by."""
+        search = matches.search
+        if search is None:
+            return self(map_T_lidar)
+        self.clock.lap("solve")
+        step = search.map_T_lidar.localCoordinates(map_T_lidar)
+        turned, shifted = np.degrees(np.linalg.norm(step[:3])), np.linalg.norm(step[3:])
+        config = self.matching
+        if turned < config.keep_rotation_deg and shifted < config.keep_translation:
+            search = self._brought(search)
+            found = replace(rematched(search.found, map_T_lidar, config), search=search)
+        else:
+            found = self._search(map_T_lidar)
+        self.clock.lap("match")
+        return found
+
+    def deskewed(self, map_T_lidar: gtsam.Pose3) -> FrameMatcher:
+        """The matcher of the sweep de-skewed with the motion that leads to a pose."""
+        if not self.refine:
+            return self
+        sweep = self.posed.sweep
+        twist = twist_to(sweep, self.last, map_T_lidar, self.posed.twist)
+        return replace(self, posed=sweep.at(twist))
+
+    def moving_at(self, twist: FloatArray) -> FrameMatcher:
+        """The matcher of the sweep de-skewed for a (6,) body velocity, and for no other."""
+        return replace(self, posed=self.posed.sweep.at(twist), refine=False)
+
+    def with_few_matches(self) -> FrameMatcher:
+        """The matcher that tries a pose quickly."""
+        matching = trial_matching(self.config.matching)
+        return replace(self, matching=matching, rows=rows_to_match(self.posed.sweep, matching))
+
+    def _brought(self, search: Search) -> Search:
+        """The search with its points de-skewed as those of this matcher."""
+        if search.posed is self.posed:
+            return search
+        e, p = search.found.edges, search.found.planes
+        edges, planes = self.posed.rows(e.indices, p.indices)
+        found = ScanMatches(replace(e, points=edges), replace(p, points=planes))
+        return replace(search, posed=self.posed, found=found)
+
+    def _search(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:
+        features = *self.posed.rows(self.rows.edges, self.rows.planes), map_T_lidar
+        maps, config = (self.maps.edges, self.maps.planes), self.matching
+        matches = match_features(*features, *maps, config, self.rows)
+        wide = len(matches) < self.config.solver.min_matches and config.wide_search > 1.0
+        if wide:
+            # One sweep alone on open ground: five neighbours lie on one ring. Seen more coarsely,
+            # there are others among them.
+            reach = config.wide_search * config.max_distance
+            maps = self.maps.thinned(config.wide_search)
+            matches = match_features(*features, *maps, config, self.rows, reach)
+        return replace(matches, search=Search(map_T_lidar, self.posed, matches, wide))
+
+
+def rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
+    """The features of a sweep that are matched with a configuration."""
+    return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A sweep that is to be solved for.
+
+    Attributes
+    ----------
+    matcher : its matches, de-skewed with the predicted motion
+    middle : predicted pose of the middle of the sweep
+    priors : further factors on that pose
+    expected : motion that takes over in directions which the scan does not see
+    """
+
+    matcher: FrameMatcher
+    middle: gtsam.Pose3
+    priors: Sequence[gtsam.NonlinearFactor]
+    expected: MotionPrior
+
+    @property
+    def sweep(self) -> MovingSweep:
+        """The sweep."""
+        return self.matcher.posed.sweep
+
+    def solve(self, solver: ScanSolver) -> Solution:
+        """The pose at the middle of the sweep, from the predicted one."""
+        return solver.solve(self.matcher, self.middle, self.priors, self.expected)
+
+    def twist_to(self, map_T_middle: gtsam.Pose3) -> FloatArray:
+        """(6,) body velocity that leads from the last sweep to a pose of this one."""
+        matcher = self.matcher
+        return twist_to(self.sweep, matcher.last, map_T_middle, matcher.posed.twist)

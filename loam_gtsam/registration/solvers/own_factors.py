@@ -1,0 +1,92 @@
+"""A user's own factors on the pose of a sweep, made ready for the frame's graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.factors import checked_factor
+from loam_gtsam.registration.solvers.base import POSE_KEY
+from loam_gtsam.types import FloatArray, InputError
+
+LAST_KEY: int = gtsam.symbol("x", 1)
+"""Key of the pose of the last sweep, for factors that join the two."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseContext:
+    """What the mapper knows when it asks for a user's own factors.
+
+    Attributes
+    ----------
+    key : key of the unknown pose ``map_T_lidar`` at the middle of the sweep
+    stamp : nanoseconds of that moment
+    guess : predicted ``map_T_lidar`` of that moment
+    last : stamp, nanoseconds, and pose of the middle of the last sweep
+    last_key : key of that pose, for factors between the two; it is held where it was solved
+    """
+
+    key: int
+    stamp: int
+    guess: gtsam.Pose3
+    last: tuple[int, gtsam.Pose3]
+    last_key: int = LAST_KEY
+
+
+ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
+"""Called once for every sweep that is solved; returns factors on ``context.key``, and on
+``context.last_key`` too if they join the two poses."""
+
+
+def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.NonlinearFactor]:
+    """Ask for a user's factors and make them factors on the one unknown pose.
+
+    Raises
+    ------
+    InputError
+        If the callable returns anything else than GTSAM factors on these keys; GTSAM's own errors
+        name no cause.
+    """
+    factors: object = extra(context)
+    if not isinstance(factors, Sequence):
+        raise InputError(
+            "extra_factors: expected a list of factors, empty if there are none; got "
+            f"{type(factors).__name__}"
+        )
+    ready: list[gtsam.NonlinearFactor] = []
+    for factor in factors:
+        keys = list(factor.keys()) if isinstance(factor, gtsam.NonlinearFactor) else []
+        if keys == [context.key]:
+            ready.append(factor)
+        elif sorted(keys) == sorted([context.key, context.last_key]):
+            ready.append(_with_last_held(factor, context))
+        else:
+            raise InputError(
+                "extra_factors: expected GTSAM factors on context.key, or on context.key and "
+                f"context.last_key ({context.key} and {context.last_key}); got "
+                f"{type(factor).__name__} on the keys {keys}"
+            )
+    return ready
+
+
+def _with_last_held(factor: gtsam.NonlinearFactor, context: PoseContext) -> gtsam.NonlinearFactor:
+    """The factor on the current pose alone, the last one being known.
+
+    Its error and Jacobian are the whitened ones of the factor, robust kernel included.
+    """
+    last = context.last[1]
+    rows = factor.dim()
+
+    def error(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
+        both = gtsam.Values()
+        both.insert(context.key, values.atPose3(POSE_KEY))
+        both.insert(context.last_key, last)
+        linear = factor.linearize(both)
+        jacobian, right = linear.jacobian()
+        first = 6 * list(linear.keys()).index(context.key)
+        return -np.asarray(right), [np.ascontiguousarray(jacobian[:, first : first + 6])]
+
+    return checked_factor(gtsam.noiseModel.Unit.Create(rows), [POSE_KEY], error)

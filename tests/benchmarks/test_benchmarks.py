@@ -28,6 +28,7 @@ from benchmarks import (
     soak,
     soak_faults,
     study,
+    study_figures,
 )
 from benchmarks.cases import Case, CaseResult, PeerResult, judge
 from benchmarks.growth_report import GrowthResult
@@ -148,9 +149,10 @@ def test_scenes_are_run_with_every_solver_and_imu(tmp_path: Path, here: pytest.M
 
 def test_solvers_are_compared_from_wrong_starts(tmp_path: Path, here: pytest.MonkeyPatch) -> None:
     tiny = study.Effort(first=4, targets=1, starts=2, columns=600, mapped=3)
-    for name, value in {"QUICK": tiny, "CHANGES": (study.FIRST,), "METRES": (0.05, 2.0),
+    for name, value in {"QUICK": tiny, "CHANGES": (study_figures.FIRST,), "METRES": (0.05, 2.0),
                         "DEGREES": (1.0,), "SHARES": (0.0, study.SHARE)}.items():  # fmt: skip
-        here.setattr(study, name, value)
+        for module in (study, study_figures):
+            here.setattr(module, name, value, raising=False)
     assert study.main(["--quick", "--output", str(tmp_path)]) == 0
     rows = table(tmp_path / "study/trials.csv")
     small = [

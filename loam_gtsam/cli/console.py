@@ -42,16 +42,8 @@ def file_name(name: str) -> str:
 def output_folder(wanted: Path, known: Sequence[str], *, overwrite: bool) -> Iterator[Path]:
     """Make the folder for results, and remove it if an error leaves it empty.
 
-    Parameters
-    ----------
-    wanted : if it holds earlier results, a new folder beside it is made (``wanted-2``, ...)
-    known : names of files and folders that are earlier results
-    overwrite : take ``wanted`` whatever it holds
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be made, or no file can be written in it.
+    If ``wanted`` holds any of the ``known`` results, a new folder beside it is made (``wanted-2``,
+    ...), unless ``overwrite`` is given.
     """
     if not overwrite and any((wanted / name).exists() for name in known):
         wanted = wanted if wanted.name not in ("", "..") else wanted.resolve()
@@ -68,13 +60,7 @@ def output_folder(wanted: Path, known: Sequence[str], *, overwrite: bool) -> Ite
 
 
 def draws_pictures(asked: bool | None) -> bool:
-    """Whether pictures are drawn; if ``asked`` is None, they are if matplotlib is installed.
-
-    Raises
-    ------
-    OutputError
-        If pictures are asked for and matplotlib is missing.
-    """
+    """Whether pictures are drawn; if ``asked`` is None, they are if matplotlib is installed."""
     if asked and not plots.available():
         raise OutputError('--plot needs matplotlib: pip install "loam_gtsam[plot]"')
     return plots.available() if asked is None else asked

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -45,22 +45,17 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
     """
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
-
-    def add(name: str, annotation: Any, default: Any) -> None:
-        kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(name, kind, default=default, annotation=annotation))
-
     hints = get_type_hints(function, include_extras=True)
     for name, parameter in inspect.signature(function).parameters.items():
-        if not is_dataclass(hints[name]):
-            add(name, hints[name], parameter.default)
-            continue
-        groups[name] = hints[name]
-        types = get_type_hints(hints[name], include_extras=True)
-        for item in fields(hints[name]):
-            default = inspect.Parameter.empty if item.default is MISSING else item.default
-            add(item.name, types[item.name], default)
-    add("debug", _Debug, False)
+        if is_dataclass(hints[name]):
+            groups[name] = hints[name]
+            types = get_type_hints(hints[name], include_extras=True)
+            options = inspect.signature(groups[name]).parameters.values()
+            parameters += [option.replace(annotation=types[option.name]) for option in options]
+        else:
+            parameters.append(parameter.replace(annotation=hints[name]))
+    debug = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False)
+    parameters.append(debug.replace(annotation=_Debug))
 
     def call(*, debug: bool, **values: Any) -> None:
         for name, group in groups.items():

@@ -42,43 +42,53 @@ def summary(
     accuracy: dict[str, Any],
     problems: Sequence[str] = (),
 ) -> Group:
-    """Frames, statuses, accuracy, and the first messages of what was not fine."""
-    table = _table(name)
-    frames = len(result.updates)
-    table.add_row("frames", f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)")
-    statuses = ", ".join(f"{count} {status}" for status, count in result.status_counts.items())
-    table.add_row("status", statuses)
-    if result.faults:
-        faults = ", ".join(f"{count} {fault}" for fault, count in result.faults.items())
-        table.add_row("not used", faults)
-    table.add_row("path", f"{result.trajectory.path_length:.1f} m")
-    table.add_row(
-        "map", f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points"
-    )
-    lost = sum(stats.get("dropped_points", 0) for stats in result.map_stats.values())
-    if lost:
-        table.add_row("map, dropped", f"{lost} points; see map.archive_megabytes, map.archive_dir")
-    if "problem" in accuracy:
-        table.add_row("accuracy", Text(accuracy["problem"]))
-    elif accuracy:
-        error, length = accuracy["ate_rmse_m"], accuracy["compared_length_m"]
-        share = f" ({100.0 * error / length:.3f} % of the path)" if length >= _MIN_PATH else ""
-        text = f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
-        table.add_row("accuracy", text)
-    if result.loops is not None:
-        counts = result.loops.counts()
-        used = f"{counts.pop('on')} of {counts.pop('loops')} found are used"
-        others = [f"{count} {name.replace('_', ' ')}" for name, count in counts.items()]
-        table.add_row("loops", f"{used}; {', '.join(others)}")
-    about_input = [Text(f"  input: {problem}", style="yellow") for problem in problems]
+    """Table of a run: frames, statuses, accuracy, IMU; below it the problems and odd frames.
+
+    Parameters
+    ----------
+    name : of the data set
+    seconds : that the run took
+    accuracy : as in ``summary.json``; empty without truth
+    problems : of the input, in sentences
+    """
+    frames, path = len(result.updates), result.trajectory.path_length
+    rows = {
+        "frames": f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)",
+        "status": _counts(result.status_counts),
+        "not used": _counts(result.faults),
+        "path": f"{path:.1f} m",
+        "map": f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points",
+        "map, dropped": _dropped(result),
+        "accuracy": _accuracy(accuracy),
+        "loops": "" if result.loops is None else _loops(result.loops.counts()),
+    }
+    notes = [f"input: {problem}" for problem in problems]
     if result.imu is not None:
-        for label, value in imu_facts(result.imu).items():
-            table.add_row(label, value)
-        about_input += [Text(f"  {line}", style="yellow") for line in _imu_problems(result.imu)]
-    return Group(table, *about_input, *_notes(result.updates))
+        rows |= _imu_facts(result.imu)
+        notes += _imu_problems(result.imu)
+    notes += _odd_frames(result.updates)
+    return Group(_table(name, rows), *(Text(f"  {note}", style="yellow") for note in notes))
 
 
-def imu_facts(imu: ImuSummary) -> dict[str, str]:
+def _dropped(result: RunResult) -> str:
+    lost = sum(stats.get("dropped_points", 0) for stats in result.map_stats.values())
+    return f"{lost} points; see map.archive_megabytes, map.archive_dir" if lost else ""
+
+
+def _accuracy(accuracy: Mapping[str, Any]) -> str:
+    if "problem" in accuracy or not accuracy:
+        return str(accuracy.get("problem", ""))
+    error, length = accuracy["ate_rmse_m"], accuracy["compared_length_m"]
+    share = f" ({100.0 * error / length:.3f} % of the path)" if length >= _MIN_PATH else ""
+    return f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
+
+
+def _loops(counts: dict[str, int]) -> str:
+    used = f"{counts.pop('on')} of {counts.pop('loops')} found are used"
+    return f"{used}; {_counts({name.replace('_', ' '): n for name, n in counts.items()})}"
+
+
+def _imu_facts(imu: ImuSummary) -> dict[str, str]:
     """Label -> value, of what was made of an IMU."""
     level = imu.level
     if level is None:
@@ -125,14 +135,12 @@ def _imu_problems(imu: ImuSummary) -> list[str]:
     return [*problems, imu.problem] if imu.problem else problems
 
 
-def _notes(updates: Sequence[MapUpdate]) -> list[Text]:
-    odd = [(n, u) for n, u in enumerate(updates) if u.status not in _EXPECTED]
-    notes = [
-        Text(f"  frame {n}: {u.status}: {u.message}", style="yellow") for n, u in odd[:_MESSAGES]
-    ]
-    if len(odd) > _MESSAGES:
-        notes.append(Text(f"  ... and {len(odd) - _MESSAGES} more: 'messages' in run.npz"))
-    return notes
+def _odd_frames(updates: Sequence[MapUpdate]) -> list[str]:
+    """The messages of the first frames that were not fine."""
+    odd = [f"frame {number}: {update.status}: {update.message}"
+           for number, update in enumerate(updates) if update.status not in _EXPECTED]  # fmt: skip
+    more = len(odd) - _MESSAGES
+    return odd[:_MESSAGES] + [f"... and {more} more: 'messages' in run.npz"] * (more > 0)
 
 
 def profile_table(updates: Sequence[MapUpdate]) -> Table:
@@ -155,42 +163,34 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     """What was understood of a data set, and whether it can be run."""
     config = effective_config(config, dataset)
     info = dataset.info()
-    table = _table(info.kind)
-    table.add_row("path", Text(info.path))
-    for label, value in info.facts.items():
-        table.add_row(label, Text(value))
+    rows = {"path": info.path, **info.facts}
     problems = list(info.problems)
     facts: dict[str, str] = {}
-    runnable = False
     for number, sweep in enumerate(itertools.islice(dataset, _TRIED_SWEEPS)):
         try:
-            facts = sweep_facts(sweep, config)
+            facts = {"shown": f"sweep {number}"} | _sweep_facts(sweep, config)
         except SweepError as error:
             problems.append(f"sweep {number}: {error}")
             continue
-        facts = {"shown": f"sweep {number}"} | facts
         problems += _imu_beside(dataset.imu if config.imu.enabled else None, sweep)
-        runnable = True
         break
     if len(dataset) == 0:
         problems.append("no sweeps in it")
-    parts: list[Any] = [table]
     imu = imu_buffer(dataset, config)
     if imu is not None:
         report = imu.report
         orientation = _ORIENTATIONS[report.orientation]
-        used = f"{report.samples} samples at {report.rate:.0f} Hz, orientation {orientation}"
-        table.add_row("IMU, used", used)
+        rows["IMU, used"] = (
+            f"{report.samples} samples at {report.rate:.0f} Hz, orientation {orientation}"
+        )
         problems += report.problems
+    parts: list[Any] = [_table(info.kind, rows)]
     if facts:
-        sweep_table = _table("First usable sweep")
-        for label, value in facts.items():
-            sweep_table.add_row(label, Text(value))
-        parts.append(sweep_table)
+        parts.append(_table("First usable sweep", facts))
     parts += [Text(f"problem: {problem}", style="yellow") for problem in problems]
-    verdict = "can be run" if runnable else "cannot be run: no usable sweep among the first few"
-    parts.append(Text(verdict, style="green" if runnable else "red"))
-    return Group(*parts), runnable
+    verdict = "can be run" if facts else "cannot be run: no usable sweep among the first few"
+    parts.append(Text(verdict, style="green" if facts else "red"))
+    return Group(*parts), bool(facts)
 
 
 def _imu_beside(imu: ImuSamples | None, sweep: Sweep) -> list[str]:
@@ -207,7 +207,7 @@ def _imu_beside(imu: ImuSamples | None, sweep: Sweep) -> list[str]:
     ]
 
 
-def sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:
+def _sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:
     """Label -> value, of one sweep.
 
     Raises
@@ -221,7 +221,7 @@ def sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:
         features = sweep.features
         cloud = "none" if sweep.cloud is None else f"{len(sweep.cloud)} points"
         return {
-            "stamp": _stamp(features.stamp),
+            "stamp": f"{features.stamp} ns",
             "features": f"{len(features.edges)} edge and {len(features.planes)} plane points",
             "full cloud": cloud,
         }
@@ -238,7 +238,7 @@ def _scan_facts(scan: Scan, config: Config) -> dict[str, str]:
     features = extract_features(scan, config)
     not_finite = len(scan.points) - int(finite.sum())
     return {
-        "stamp": _stamp(scan.stamp),
+        "stamp": f"{scan.stamp} ns",
         "points": f"{len(scan.points)}, {not_finite} of them not finite, {len(columns)} usable",
         "range": f"{low:.1f} to {high:.1f} m, median {middle:.1f} m",
         "beams": rings.note,
@@ -247,14 +247,13 @@ def _scan_facts(scan: Scan, config: Config) -> dict[str, str]:
     }
 
 
-def _stamp(stamp: int) -> str:
-    return f"{stamp} ns"
-
-
-def _table(title: str) -> Table:
-    table = Table(
-        title=Text(title, style="bold"), title_justify="left", box=None, show_header=False
-    )
+def _table(title: str, rows: Mapping[str, str]) -> Table:
+    """A table of labels and texts; empty texts are left out."""
+    heading = Text(title, style="bold")
+    table = Table(title=heading, title_justify="left", box=None, show_header=False)
     table.add_column(style="dim", no_wrap=True)
     table.add_column(overflow="fold")
+    for label, text in rows.items():
+        if text:
+            table.add_row(label, Text(text))
     return table

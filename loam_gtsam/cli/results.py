@@ -53,21 +53,7 @@ class Results:
         return Results(run, dataset, _input_info(dataset), accuracy, map_truth)
 
     def write(self, folder: Path, last: LastFrame | None) -> list[str]:
-        """Write all files.
-
-        Parameters
-        ----------
-        last : what the pictures show of the last frame; None draws no pictures
-
-        Returns
-        -------
-        Names of the files.
-
-        Raises
-        ------
-        OutputError
-            If a file cannot be written; files of an earlier run are then as they were.
-        """
+        """Write all files, with pictures if ``last`` is given; returns their names."""
         extra = {"accuracy": self.accuracy or None, "input": asdict(self.info)}
         files = list(RUN_FILES)
         with staged_files(folder, RUN_OUTPUTS, last="summary.json") as new:
@@ -100,17 +86,13 @@ class Results:
 
 
 def write_safely(folder: Path, write: Callable[[Path], list[str]]) -> list[str]:
-    """Write results that took long to compute: if they cannot be written, then elsewhere.
-
-    Parameters
-    ----------
-    folder : where they are wanted
-    write : writes all files into the folder that it is given, and returns their names
+    """Write results that took long to compute; returns the names of the files.
 
     Raises
     ------
     OutputError
-        If they could not be written into ``folder``, naming the temporary folder where they are.
+        If the results could not be written into ``folder``, naming the temporary folder into which
+        they were written instead.
     """
     try:
         return write(folder)
@@ -124,12 +106,7 @@ def write_safely(folder: Path, write: Callable[[Path], list[str]]) -> list[str]:
 
 
 def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:
-    """Whether a folder holds the complete results of a run.
-
-    Parameters
-    ----------
-    config, dataset : of the run
-    total : sweeps of the run
+    """Whether a folder holds the complete results of a run of ``total`` sweeps.
 
     Raises
     ------

@@ -70,7 +70,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
                     on_frame=on_frame,
                     keep_partial=True,
                     observe=observe,
-                    workers=_workers(options, total),
+                    workers=worker_count(options.workers, total),
                     checkpoint=checkpoint,
                 )
             seconds = time.perf_counter() - started
@@ -101,10 +101,10 @@ def _checkpoint(folder: Path, options: RunOptions) -> Checkpoint | None:
     return Checkpoint(folder / CHECKPOINT, seconds=options.checkpoint, resume=options.resume)
 
 
-def _workers(options: RunOptions, sweeps: int) -> int:
-    """Processes for feature extraction: unless asked for, one if it is worth its start."""
-    if options.workers is not None:
-        return options.workers
+def worker_count(asked: int | None, sweeps: int) -> int:
+    """Processes for feature extraction; if ``asked`` is None, one if it is worth its start."""
+    if asked is not None:
+        return asked
     return int(sweeps > _WORTH_A_PROCESS and (os.cpu_count() or 1) > 1)
 
 

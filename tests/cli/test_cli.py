@@ -18,7 +18,6 @@ from typer.testing import Result
 
 from loam_gtsam.cli import run as run_command
 from loam_gtsam.cli.console import stop_requests
-from loam_gtsam.cli.options import RunOptions
 from loam_gtsam.cli.results import ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, config_to_dict, load_config
 from loam_gtsam.datasets.base import DatasetInfo
@@ -114,8 +113,7 @@ def test_a_process_extracts_features_where_it_is_worth_its_start(
     asked, sweeps, cores, expected, monkeypatch
 ):
     monkeypatch.setattr(run_command.os, "cpu_count", lambda: cores)
-    options = RunOptions(workers=asked)
-    assert run_command._workers(options, sweeps) == expected
+    assert run_command.worker_count(asked, sweeps) == expected
 
 
 def test_a_configuration_file_is_used_and_set_wins_over_it():
@@ -281,6 +279,7 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
         (["--set", "solver.iterations=many"], 1, "--set solver.iterations=many"),
         (["--set", "solver.iterations.x=1"], 1, "expected int"),
         (["--set", "solver=1"], 2, "expected SECTION.KEY=VALUE"),
+        (["--set", "min_range=2"], 2, "SECTION.KEY=VALUE, for example sensor.min_range=2"),
         (["--set", "solver.iterations"], 2, "expected KEY=VALUE"),
         (["--set", "solver.iterations={"], 2, "is not a YAML value"),
         (["--set", "imu.gravity=2001-12-00"], 2, "is not a YAML value"),
@@ -462,7 +461,7 @@ def test_an_ignored_signal_stays_ignored(monkeypatch):
         signal.signal(signal.SIGINT, before)
 
 
-# -- the IMU in what is said -----------------------------------------------------------------------
+# -- what is said of the IMU -------------------------------------------------------------------
 
 
 def test_run_says_what_was_made_of_the_imu():
@@ -537,7 +536,7 @@ def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
         assert ("IMU, level unknown: no samples about the first sweep" in said) == told
 
 
-# -- going on ------------------------------------------------------------------------------------
+# -- resume ------------------------------------------------------------------------------------
 
 
 def test_resume_starts_goes_on_and_says_when_all_is_done(opens, scans):
@@ -593,12 +592,6 @@ def test_a_run_that_cannot_start_leaves_no_folder(opens, scans):
     Path("mine").mkdir()
     assert loam("run", "x", "--bag", "there.bag", "--output", "mine").exit_code == 1
     assert Path("mine").is_dir()
-
-
-def test_set_without_a_section_names_one():
-    result = loam("run", "sim:room", "--set", "min_range=2")
-    assert result.exit_code == 2
-    assert "expected SECTION.KEY=VALUE, for example sensor.min_range=2" in result.output
 
 
 def test_no_help_of_a_command_is_cut_off(monkeypatch):

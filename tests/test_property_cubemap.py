@@ -181,6 +181,8 @@ def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
             assert list(around) == reference.neighbourhood(pose)
         elif operation == "nearest":
             queries = position + rng.normal(0.0, 3.0, (6, 3))
+            border = np.round((queries[:3] - 0.5 * CUBE) / CUBE) * CUBE + 0.5 * CUBE
+            queries[:3] = np.where(rng.random((3, 3)) < 0.5, border, queries[:3])
             k, limit = int(rng.integers(1, 7)), float(rng.choice([0.5, 2.0, np.inf]))
             found, squared = cubes.nearest(queries, k, limit, around)
             near = reference.points(list(around))

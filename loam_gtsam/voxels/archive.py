@@ -5,36 +5,40 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loam_gtsam.types import ConfigError, FloatArray
-
-CubeIndex = tuple[int, int, int]
-Owners = NDArray[np.int32]
+from loam_gtsam.voxels.cubes import Cube, CubePoints, Owners, SortedPoints
+from loam_gtsam.voxels.grid import CubeIndex, Grid
 
 _log = logging.getLogger(__name__)
 
 
-class CubePoints(NamedTuple):
-    """Points of a cube, (N, 3) metres, and who owns them, (N,): see :meth:`CubeMap.move`."""
-
-    points: FloatArray
-    owners: Owners
-
-    @property
-    def nbytes(self) -> int:
-        """Of memory."""
-        return self.points.nbytes + self.owners.nbytes
-
-
 class Archive:
-    """Points of cubes outside the window: the newest in memory, older ones on disk or dropped."""
+    """Points of cubes outside the window: the newest in memory, older ones on disk or dropped.
 
-    def __init__(self, megabytes: float, folder: str | None) -> None:
+    Parameters
+    ----------
+    grid : of the map
+    megabytes : memory for points; when it is used up, the oldest cubes go to disk
+    folder : in which a folder of this archive's own is made; None to drop cubes instead
+
+    Attributes
+    ----------
+    dropped_cubes, dropped_points : lost for good
+
+    Raises
+    ------
+    ConfigError
+        If no folder can be made in ``folder``.
+    """
+
+    def __init__(self, grid: Grid, megabytes: float, folder: str | None) -> None:
+        self._grid = grid
         self._megabytes, self._root = megabytes, folder
         self._budget = megabytes * 1e6
         self._bytes = 0
@@ -53,10 +57,9 @@ class Archive:
                 ) from error
 
     def __getstate__(self) -> dict[str, Any]:
-        held = [(index, self.read(index)) for index in self.indices()]
         return {
-            "given": (self._megabytes, self._root),
-            "cubes": [(index, content) for index, content in held if content is not None],
+            "given": (self._grid, self._megabytes, self._root),
+            "cubes": list(self.contents()),
             "in_memory": len(self._memory),
             "dropped": (self.dropped_cubes, self.dropped_points),
         }
@@ -68,30 +71,30 @@ class Archive:
             self._bytes += content.nbytes
             self._spill(index, content)
         for index, content in state["cubes"][:in_memory]:
-            self.store(index, content)
+            self._keep(index, content)
         self.dropped_cubes, self.dropped_points = state["dropped"]
 
     def __len__(self) -> int:
         return len(self._memory) + len(self._disk)
 
-    def __contains__(self, index: CubeIndex) -> bool:
-        return index in self._memory or index in self._disk
+    def copy(self) -> Archive:
+        """An archive of the same cubes, all of them in memory."""
+        copy = Archive(self._grid, np.inf, None)
+        for index, content in self.contents():
+            copy._keep(index, content)
+        return copy
 
     def indices(self) -> list[CubeIndex]:
-        """Of its cubes, oldest first, those in memory before those on disk."""
+        """Cubes in the archive, oldest first, those in memory before those on disk."""
         return [*self._memory, *self._disk]
 
     def count(self) -> int:
-        """Points."""
+        """Points in the archive."""
         return sum(len(held.points) for held in self._memory.values()) + sum(self._disk.values())
 
-    def store(self, index: CubeIndex, content: CubePoints) -> None:
-        """Keep a cube that is not in the archive; makes room by spilling the oldest."""
-        self._memory[index] = content
-        self._bytes += content.nbytes
-        while self._bytes > self._budget:
-            oldest = next(iter(self._memory))
-            self._spill(oldest, self._memory.pop(oldest))
+    def store(self, index: CubeIndex, cube: Cube) -> None:
+        """Keep a cube that is not in the archive; the oldest cubes make room for it."""
+        self._keep(index, cube.content)
 
     def read(self, index: CubeIndex) -> CubePoints | None:
         """Points of an archived cube; None, and the cube counts as dropped, if unreadable."""
@@ -109,17 +112,60 @@ class Archive:
             return None
         return CubePoints(np.array(rows[:, :3], order="C"), rows[:, 3].astype(np.int32))
 
-    def take(self, index: CubeIndex) -> CubePoints | None:
-        """The same, and forget it."""
+    def contents(self) -> Iterator[tuple[CubeIndex, CubePoints]]:
+        """The readable cubes and their points, in the order of :meth:`indices`."""
+        for index in self.indices():
+            content = self.read(index)
+            if content is not None:
+                yield index, content
+
+    def take(self, index: CubeIndex) -> Cube | None:
+        """Take a cube out of the archive; None if it is not there or cannot be read."""
+        if index not in self._memory and index not in self._disk:
+            return None
         content = self.read(index)
         if index in self._memory:
             self._bytes -= self._memory.pop(index).nbytes
         elif index in self._disk:
             del self._disk[index]
             self._path(index).unlink(missing_ok=True)
-        return content
+        return None if content is None else Cube.of(content, self._grid)
+
+    def take_out(self, owners: Owners) -> list[CubePoints]:
+        """Remove the points of some owners from the archived cubes, and return them."""
+        taken = []
+        for index, content in self.contents():
+            if np.isin(content.owners, owners).any():
+                cube = self.take(index) or Cube()
+                taken.append(cube.take_out(owners))
+                self.store(index, cube)
+        return taken
+
+    def settle(self, points: FloatArray, owners: Owners) -> None:
+        """Add points to archived cubes where their voxels are free.
+
+        Parameters
+        ----------
+        points : (N, 3) metres, within the limit of the grid
+        owners : (N,)
+        """
+        if len(points) == 0:
+            return
+        new = SortedPoints.of(points, owners, self._grid.cells(points.T), self._grid)
+        for index, part in zip(new.cubes, new.firsts(), strict=True):
+            cube = self.take(index) or Cube()
+            cube.settle(part)
+            self.store(index, cube)
+
+    def _keep(self, index: CubeIndex, content: CubePoints) -> None:
+        self._memory[index] = content
+        self._bytes += content.nbytes
+        while self._bytes > self._budget:
+            oldest = next(iter(self._memory))
+            self._spill(oldest, self._memory.pop(oldest))
 
     def _spill(self, index: CubeIndex, content: CubePoints) -> None:
+        """Write a cube to disk; without a folder it is lost."""
         points = content.points
         self._bytes -= content.nbytes
         if self._folder is None:

@@ -1,0 +1,215 @@
+"""One cube of a map: its points, at most one a voxel, and the owner of each point."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.geometry import find_in_sorted
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
+from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
+from loam_gtsam.voxels.key_table import KeyTable
+
+Owners = NDArray[np.int32]
+
+NO_POINTS: FloatArray = np.empty((0, 3))
+_NO_KEYS: IntArray = np.empty(0, np.int64)
+_NO_OWNERS: Owners = np.empty(0, np.int32)
+
+
+class CubePoints(NamedTuple):
+    """Points of a cube, (N, 3) metres, and the numbers of their owners, (N,).
+
+    All points of one owner are moved together (:meth:`loam_gtsam.cubemap.CubeMap.move`).
+    """
+
+    points: FloatArray
+    owners: Owners
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of memory."""
+        return self.points.nbytes + self.owners.nbytes
+
+
+class VoxelPoints(NamedTuple):
+    """One point for each of V voxels, in ascending order of the keys of the voxels."""
+
+    keys: IntArray
+    points: FloatArray
+    owners: Owners
+
+
+class VoxelSums(NamedTuple):
+    """Sums over the points of each of V voxels, in ascending order of the keys of the voxels.
+
+    Attributes
+    ----------
+    keys, owners : (V,)
+    sums, lows, highs : (V, 3) sum, minimum and maximum of the coordinates, metres
+    counts : (V,) number of points
+    """
+
+    keys: IntArray
+    owners: Owners
+    sums: FloatArray
+    lows: FloatArray
+    highs: FloatArray
+    counts: FloatArray
+
+
+class Cube:
+    """Points of a cube in the order of their voxels, at most one a voxel."""
+
+    __slots__ = ("_table",)
+
+    def __init__(self) -> None:
+        self._table = KeyTable(_NO_KEYS, NO_POINTS, _NO_OWNERS)
+
+    @classmethod
+    def of(cls, content: CubePoints, grid: Grid) -> Cube:
+        """A cube that holds these points, of which no two are in one voxel."""
+        keys = grid.keys(content.points)
+        order = np.argsort(keys, kind="stable")
+        cube = cls()
+        cube._table = KeyTable(keys[order], content.points[order], content.owners[order])
+        return cube
+
+    def __len__(self) -> int:
+        return len(self._table)
+
+    @property
+    def points(self) -> FloatArray:
+        """(N, 3) metres, in the order of their voxels."""
+        points: FloatArray = self._table.columns[1]
+        return points
+
+    def copy(self) -> Cube:
+        """A cube of the same points, which changes on its own."""
+        cube = Cube()
+        cube._table = KeyTable(*(column.copy() for column in self._table.columns))
+        return cube
+
+    @property
+    def content(self) -> CubePoints:
+        """All that is kept of the cube in an archive."""
+        return CubePoints(*self._table.columns[1:])
+
+    def settle(self, new: VoxelPoints) -> FloatArray:
+        """Add the points whose voxels are free, and return them."""
+        added = self._table.add(*new)
+        return new.points if len(added) == len(new.keys) else new.points.take(added, axis=0)
+
+    def average(self, new: VoxelSums) -> None:
+        """Put into each voxel the mean of its point, if it has one, and the new ones.
+
+        A voxel that has a point keeps the owner of that point. The arrays of ``new`` are changed.
+        """
+        self._table.merge()
+        keys, held, _ = self._table.columns
+        at, taken = find_in_sorted(keys, new.keys)
+        old = held[at[taken]]
+        new.sums[taken] += old
+        new.counts[taken] += 1.0
+        new.lows[taken] = np.minimum(new.lows[taken], old)
+        new.highs[taken] = np.maximum(new.highs[taken], old)
+        # Rounding may put a mean just outside its points, and so into another voxel or cube.
+        means = np.clip(new.sums / new.counts[:, None], new.lows, new.highs)
+        held[at[taken]] = means[taken]
+        free = np.flatnonzero(~taken)
+        self._table.append(*(column.take(free, axis=0) for column in (new.keys, means, new.owners)))
+
+    def take_out(self, owners: Owners) -> CubePoints:
+        """Remove the points of some owners, and return them."""
+        columns = self._table.columns
+        out = np.isin(columns[2], owners)
+        if not out.any():
+            return CubePoints(NO_POINTS, _NO_OWNERS)
+        gone, kept = (
+            [column.take(rows, axis=0) for column in columns]
+            for rows in (np.flatnonzero(out), np.flatnonzero(~out))
+        )
+        self._table = KeyTable(*kept)
+        return CubePoints(*gone[1:])
+
+
+class SortedPoints(NamedTuple):
+    """New points in the order of their cubes, and within a cube in the order of their voxels.
+
+    Attributes
+    ----------
+    points : (N, 3) metres
+    keys, owners : (V,) key of each voxel, and owner of its first point
+    starts : (V,) the point with which each voxel begins
+    cubes : the C cubes
+    parts : the voxels of each cube
+    """
+
+    points: FloatArray
+    keys: IntArray
+    owners: Owners
+    starts: IntArray
+    cubes: list[CubeIndex]
+    parts: list[slice]
+
+    @classmethod
+    def of(cls, points: FloatArray, owners: Owners, cells: FloatArray, grid: Grid) -> SortedPoints:
+        """Sort points; points of one voxel stay in the order in which they are given.
+
+        Parameters
+        ----------
+        points : (N, 3) metres, N > 0
+        owners : (N,)
+        cells : (3, N) indices of the cubes of the points
+        grid : of the voxels
+        """
+        low = cells.min(axis=1, keepdims=True)
+        steps = (cells - low).astype(np.int64)
+        box = tuple((steps.max(axis=1) + 1).tolist())
+        numbers = np.ravel_multi_index(tuple(steps), box)
+        keys = grid.keys(points)
+        order = np.lexsort((keys, numbers))  # stable
+        keys, numbers = keys[order], numbers[order]
+        starts = _run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))
+        numbers = numbers[starts]
+        heads = _run_starts(numbers[1:] != numbers[:-1])
+        ends = zip(heads.tolist(), np.append(heads[1:], len(numbers)).tolist(), strict=True)
+        return cls(
+            points.take(order, axis=0),  # several times faster than an index on rows
+            keys[starts],
+            owners[order[starts]],
+            starts,
+            [cube_index(cell) for cell in (np.unravel_index(numbers[heads], box) + low).T],
+            [slice(*part) for part in ends],
+        )
+
+    def firsts(self) -> Iterator[VoxelPoints]:
+        """The first point of each voxel, cube by cube."""
+        firsts = self.points.take(self.starts, axis=0)
+        for part in self.parts:
+            yield VoxelPoints(self.keys[part], firsts[part], self.owners[part])
+
+    def sums(self) -> Iterator[VoxelSums]:
+        """Sums over the points of each voxel, cube by cube."""
+        sums, lows, highs = (
+            how.reduceat(self.points, self.starts, axis=0)
+            for how in (np.add, np.minimum, np.maximum)
+        )
+        counts = np.diff(np.append(self.starts, len(self.points))).astype(np.float64)
+        for part in self.parts:
+            yield VoxelSums(
+                self.keys[part],
+                self.owners[part],
+                sums[part],
+                lows[part],
+                highs[part],
+                counts[part],
+            )
+
+
+def _run_starts(changes: BoolArray) -> IntArray:
+    """Where the runs of a non-empty sequence begin, from ``sequence[1:] != sequence[:-1]``."""
+    return np.flatnonzero(np.concatenate(([True], changes)))

@@ -1,0 +1,217 @@
+"""Cubes that left the window: they come back bit by bit, or their loss is counted."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from loam_gtsam.config import MapConfig
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.geometry import voxel_keys
+from loam_gtsam.io.state import freeze, thaw
+from loam_gtsam.types import ConfigError
+
+SMALL = MapConfig(
+    cube_size=4.0, window=(5, 5, 3), window_margin=1, neighbourhood=(3, 3, 3), field_of_view=False
+)
+
+
+def moved_by(x):
+    move = np.eye(4)
+    move[0, 3] = x
+    return move
+
+
+@pytest.mark.parametrize("megabytes", [10.0, 0.0])
+@pytest.mark.parametrize("insertion", ["centroid", "settled"])
+def test_round_trip_is_bit_identical(tmp_path: Path, megabytes: float, insertion: str) -> None:
+    """A map that was archived in between goes on exactly as one that was not."""
+    rng = np.random.default_rng(1)
+    config = SMALL.changed(
+        archive_dir=str(tmp_path), archive_megabytes=megabytes, insertion=insertion
+    )
+    travelled, stayed = CubeMap(config, 0.5), CubeMap(config, 0.5)
+    first, second = rng.normal(0.0, 3.0, (2, 800, 3))
+    for cube_map in (travelled, stayed):
+        cube_map.insert(first)
+    evicted = travelled.recenter(np.array([1e3, 0.0, 0.0]))
+    files = sorted(tmp_path.glob("cubes_*/*"))
+    assert len(files) == (evicted if megabytes == 0.0 else 0)
+    assert all(file.suffix == ".npy" for file in files)
+    assert len(stayed.points()) > 100
+    np.testing.assert_array_equal(travelled.points(archived=True), stayed.points())
+    assert travelled.stats.archived_points == stayed.count()  # in memory or on disk
+    travelled.recenter(np.zeros(3))  # comes from +x: its window starts one cube farther on
+    stayed.recenter(np.array([8.0, 0.0, 0.0]))
+    assert travelled.window == stayed.window == ((-1, -2, -1), (3, 2, 1))
+    for cube_map in (travelled, stayed):
+        cube_map.insert(second)
+    np.testing.assert_array_equal(travelled.points(), stayed.points())
+    cubes = stayed.neighbourhood(np.eye(4))
+    for got, want in zip(
+        travelled.nearest(first, 5, 2.0, cubes), stayed.nearest(first, 5, 2.0, cubes), strict=True
+    ):
+        np.testing.assert_array_equal(got, want)
+    left = len(list(tmp_path.glob("cubes_*/*")))
+    assert left == (travelled.stats.archived + stayed.stats.archived if megabytes == 0.0 else 0)
+
+
+def test_two_maps_share_an_archive_folder(tmp_path: Path) -> None:
+    config = SMALL.changed(archive_dir=str(tmp_path / "new" / "folder"), archive_megabytes=0.0)
+    maps = [CubeMap(config, 0.5) for _ in range(2)]
+    for shift, cube_map in enumerate(maps):
+        cube_map.insert(np.array([[0.1 * shift, 0.0, 0.0]]))
+        cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    for shift, cube_map in enumerate(maps):
+        cube_map.recenter(np.zeros(3))
+        np.testing.assert_array_equal(cube_map.points(), [[0.1 * shift, 0.0, 0.0]])
+
+
+def test_budget_drops_the_oldest_counts_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
+    """Each stop leaves one cube of 7 points, 168 bytes; two of them fit into 400 bytes."""
+    cube_map = CubeMap(SMALL.changed(archive_megabytes=400e-6), 0.5)
+    heap = np.arange(-1.5, 1.6, 0.5)[:, None] * np.ones(3)
+    with caplog.at_level(logging.WARNING, logger="loam_gtsam.cubemap"):
+        for stop in range(5):
+            position = np.array([100.0 * stop, 0.0, 0.0])
+            cube_map.recenter(position)
+            cube_map.insert(position + heap)
+            dropped = max(0, stop - 2)
+            stats = cube_map.stats
+            assert (stats.evicted, stats.archived) == (stop, min(stop, 2))
+            assert (stats.dropped_cubes, stats.dropped_points) == (dropped, 7 * dropped)
+    assert len(caplog.records) == 1
+    assert "archive_megabytes" in caplog.text
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    assert cube_map.stats.restored == 0
+    cube_map.recenter(np.array([300.0, 0.0, 0.0]))
+    assert cube_map.stats.restored == 1
+    assert cube_map.count() == 7
+
+
+def test_restoring_goes_before_dropping() -> None:
+    """A cube that comes back is not pushed out by one that leaves in the same step."""
+    cube_map = CubeMap(SMALL.changed(archive_megabytes=30e-6), 0.5)
+    cube_map.insert(np.zeros((1, 3)))
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    cube_map.insert(np.array([[100.0, 0.0, 0.0]]))
+    cube_map.recenter(np.zeros(3))
+    assert (cube_map.stats.restored, cube_map.stats.dropped_cubes) == (1, 0)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda file: file.unlink(),
+        lambda file: file.write_bytes(file.read_bytes()[:-5]),
+        lambda file: np.save(file, np.zeros((1, 2))),
+    ],
+)
+def test_unreadable_archive_is_counted(
+    tmp_path: Path, damage: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+) -> None:
+    cube_map = CubeMap(SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+    cube_map.insert(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 4.0, 0.0]]))
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    damage(next(tmp_path.glob("cubes_*/cube_0_0_0.npy")))
+    cube_map.recenter(np.zeros(3))
+    stats = cube_map.stats
+    assert (stats.dropped_cubes, stats.dropped_points, stats.restored) == (1, 2, 1)
+    assert "cannot read" in caplog.text
+    assert stats.archived == 0
+
+
+def test_archive_that_cannot_be_written_is_counted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    cube_map = CubeMap(SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+    cube_map.insert(np.zeros((1, 3)))
+    next(tmp_path.glob("cubes_*")).rmdir()
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    assert (cube_map.stats.dropped_cubes, cube_map.stats.archived) == (1, 0)
+    assert "cannot write" in caplog.text
+
+
+def test_bad_archive_dir(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"map\.archive_dir"):
+        CubeMap(MapConfig(archive_dir=str(tmp_path / "file")), 0.4)
+
+
+@pytest.mark.parametrize("megabytes", [100.0, 0.0])
+def test_moved_points_join_those_of_a_cube_in_the_archive(tmp_path, megabytes):
+    """Of the moved ones too a voxel keeps one, and those that were there stay."""
+    config = SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=megabytes)
+    cubes = CubeMap(config, 0.5)
+    there = np.array([[100.1, 0.1, 0.1], [100.6, 0.1, 0.1], [101.1, 0.1, 0.1]])
+    cubes.recenter(there[0])
+    cubes.insert(there)
+    cubes.recenter(np.zeros(3))
+    cubes.owner = 1
+    here = np.array([[0.1, 0.1, 0.1], [0.6, 0.6, 0.6], [1.6, 0.6, 0.4], [1.6, 0.6, 0.6]])
+    cubes.insert(here)
+    # The last two come to lie in one voxel, the second in that of a point that was there.
+    turned = moved_by(100.0)
+    turned[2, 2], turned[1, 1] = -1.0, -1.0
+    turned[1:3, 3] = 0.7, 0.65
+    arrived = here @ turned[:3, :3].T + turned[:3, 3]
+    assert cubes.move({1: turned}) == 4
+    assert cubes.count() == 0
+    union = np.concatenate([there, arrived])
+    _, first = np.unique(voxel_keys(union, 0.5), return_index=True)
+    assert sorted(first) == [0, 1, 2, 3, 5]
+    np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=1e-12)
+    cubes.recenter(np.array([100.0, 0.0, 0.0]))
+    assert cubes.count() == 5
+    # They can move on, each with its owner.
+    assert cubes.move({1: moved_by(-100.0)}) == 2
+    np.testing.assert_allclose(cubes.points(), there, atol=1e-12)
+
+
+def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path):
+    cubes = CubeMap(SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+    for owner, x in enumerate((0.0, 100.0, 200.0, 300.0)):
+        cubes.recenter(np.array([x, 0.0, 0.0]))
+        cubes.owner = owner
+        cubes.insert(np.array([[x, 0.0, 0.0]]))
+    files = [next(tmp_path.glob(f"cubes_*/cube_{number}_0_0.npy")) for number in (0, 25, 50)]
+    before = [file.stat().st_ino for file in files]
+    damaged = files[2].read_bytes()[:-5]
+    files[2].write_bytes(damaged)
+    assert cubes.move({1: moved_by(0.7), 2: moved_by(0.7)}) == 1
+    assert files[0].stat().st_ino == before[0]
+    np.testing.assert_allclose(np.load(files[1])[:, 0], [100.7])
+    assert (cubes.stats.dropped_cubes, cubes.stats.dropped_points) == (1, 1)
+    np.testing.assert_allclose(cubes.points(archived=True)[:, 0], [0.0, 100.7, 300.0])
+
+
+@pytest.mark.parametrize("insertion", ["centroid", "settled"])
+@pytest.mark.parametrize("megabytes", [100.0, 1e-3, 0.0])
+def test_a_restored_map_goes_on_with_the_archive_it_had(
+    tmp_path: Path, megabytes: float, insertion: str
+) -> None:
+    """In memory, part of it on disk, or all of it."""
+    rng = np.random.default_rng(2)
+    config = SMALL.changed(
+        archive_dir=str(tmp_path), archive_megabytes=megabytes, insertion=insertion
+    )
+    going, resumed = CubeMap(config, 0.5), CubeMap(config, 0.5)
+    for stop in range(4):
+        going.recenter(np.array([20.0 * stop, 0.0, 0.0]))
+        going.owner = stop
+        going.insert(rng.normal((20.0 * stop, 0.0, 0.0), 3.0, (100, 3)))
+    thaw(freeze({"map": going}, {"config": config}), {"map": resumed}, {"config": config})
+    assert resumed.stats == going.stats
+    moved = {1: moved_by(7.0), 3: moved_by(-30.0)}
+    extra = rng.normal(0.0, 3.0, (100, 3))
+    for cube_map in (going, resumed):
+        assert cube_map.move(moved) > 100
+        cube_map.recenter(np.zeros(3))
+        cube_map.insert(extra)
+    assert resumed.stats == going.stats
+    assert going.stats.restored > 0
+    np.testing.assert_array_equal(resumed.points(archived=True), going.points(archived=True))

@@ -87,6 +87,10 @@ class Cube:
         points: FloatArray = self._table.columns[1]
         return points
 
+    def merge(self) -> None:
+        """Put new points in their places among the others, for those who ask for points often."""
+        self._table.merge()
+
     def copy(self) -> Cube:
         """A cube of the same points, which changes on its own."""
         cube = Cube()
@@ -108,7 +112,6 @@ class Cube:
 
         A voxel that has a point keeps the owner of that point. The arrays of ``new`` are changed.
         """
-        self._table.merge()
         keys, held, _ = self._table.columns
         at, taken = find_in_sorted(keys, new.keys)
         old = held[at[taken]]
@@ -121,6 +124,7 @@ class Cube:
         held[at[taken]] = means[taken]
         free = np.flatnonzero(~taken)
         self._table.append(*(column.take(free, axis=0) for column in (new.keys, means, new.owners)))
+        self._table.merge()  # the next call changes points in place
 
     def take_out(self, owners: Owners) -> CubePoints:
         """Remove the points of some owners, and return them."""

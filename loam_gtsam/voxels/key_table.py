@@ -83,6 +83,8 @@ class KeyTable:
 
     def merge(self) -> None:
         """Put the new rows in their places among the others."""
+        if not self.n_waiting:
+            return
         self._merged = self.columns
         self._waiting = tuple(column[:0] for column in self._merged)
 

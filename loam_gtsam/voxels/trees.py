@@ -130,6 +130,8 @@ class TreeCache:
         else:
             trees = None
         if trees is None or trees.is_stale:
+            for index in chosen:
+                cubes[index].merge()
             trees = CubeTrees(chosen, [cubes[index].points for index in sorted(chosen)])
         self._kept = [*self._kept[1 - _KEPT :], trees]
         return trees

@@ -1,13 +1,13 @@
-"""A pipeline of evalio, to run this package beside others on evalio's data sets.
+"""The pipeline for evalio, which runs this package beside other systems on evalio's data sets.
 
 ::
 
     export EVALIO_CUSTOM=loam_gtsam.studies.evalio_pipeline
     evalio run -p loam_gtsam -d newer_college_2021/quad_easy
 
-(evalio's own ``-M loam_gtsam.studies.evalio_pipeline`` does with a file of experiments; its 0.6.1
-checks the names after ``-p`` before it looks into the module.) Needs evalio, ``pip install
-"loam_gtsam[evalio]"``, and is therefore imported by nothing else here.
+With a file of experiments, evalio's option ``-M loam_gtsam.studies.evalio_pipeline`` does the same
+(evalio 0.6.1 checks the names after ``-p`` before it looks into the module). This module needs
+evalio, ``pip install "loam_gtsam[evalio]"``, and no other module imports it.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ except ModuleNotFoundError as error:
     ) from error
 
 _PRESET = "preset"
-_PATIENCE = 2
-"""Sweeps that may wait for the IMU."""
+_LONGEST_QUEUE = 2
+"""Number of sweeps that may wait for samples of the IMU."""
 
 
 class LoamGtsam(EvalioPipeline):
@@ -53,10 +53,10 @@ class LoamGtsam(EvalioPipeline):
 
     Notes
     -----
-    evalio stamps a sweep with its start and may hand it out before the IMU samples taken during it.
-    A sweep therefore waits for the first sample after its end, but no longer than for two more
-    sweeps. As evalio does not tell a pipeline that a sequence is over, the last two sweeps may
-    stay without a pose.
+    evalio stamps a sweep with its start and may hand the sweep out before the IMU samples of the
+    same time. A sweep therefore waits for the first sample after its end, but no longer than until
+    two more sweeps have come. evalio does not tell a pipeline that a sequence is over: the last two
+    sweeps may stay without a pose.
     """
 
     def __init__(self) -> None:
@@ -74,7 +74,7 @@ class LoamGtsam(EvalioPipeline):
 
     @staticmethod
     def name() -> str:
-        """Of the pipeline."""
+        """Name of the pipeline."""
         return "loam_gtsam"
 
     @staticmethod
@@ -86,7 +86,7 @@ class LoamGtsam(EvalioPipeline):
     def default_params() -> dict[str, bool | int | float | str]:
         """Every scalar of the configuration as ``section.name``, and ``preset``.
 
-        What differs from these defaults is set on top of the preset.
+        A parameter that differs from these defaults is set on top of the preset.
         """
         params: dict[str, bool | int | float | str] = {_PRESET: "default"}
         for section, values in config_to_dict(Config()).items():
@@ -98,12 +98,12 @@ class LoamGtsam(EvalioPipeline):
     def set_params(
         self, params: Mapping[str, bool | int | float | str]
     ) -> dict[str, bool | int | float | str]:
-        """Take parameters; returns those that are unknown."""
+        """Set parameters; returns the parameters that are unknown."""
         self._params |= {key: value for key, value in params.items() if key in self._params}
         return {key: value for key, value in params.items() if key not in self._params}
 
     def set_lidar_params(self, params: LidarParams) -> None:
-        """Range limits and the duration of a sweep."""
+        """Take the range limits and the duration of a sweep."""
         self._period = 1.0 / params.rate
         self._implied |= {
             "min_range": params.min_range,
@@ -112,7 +112,7 @@ class LoamGtsam(EvalioPipeline):
         }
 
     def set_imu_params(self, params: ImuParams) -> None:
-        """Noise and gravity, which matter for pre-integration only."""
+        """Take noise and gravity, which only pre-integration uses."""
         known = {
             "imu.gravity": float(np.linalg.norm(params.gravity)),
             "imu.gyro_noise": params.gyro,
@@ -123,17 +123,17 @@ class LoamGtsam(EvalioPipeline):
         self._implied |= {key: value for key, value in known.items() if value > 0.0}
 
     def set_imu_T_lidar(self, T: SE3) -> None:
-        """Extrinsics."""
+        """Take the extrinsic pose of the lidar in the frame of the IMU."""
         self._lidar_T_imu = gtsam.Pose3(T.to_mat()).inverse()
         self._implied |= implied_by(self._lidar_T_imu.matrix())
 
     def set_visualizing(self, visualize: Set[Any] | None) -> None:
-        """Only then are features handed out."""
+        """Hand out features from now on if anything is shown."""
         super().set_visualizing(visualize)
         self._shows = bool(visualize)
 
     def initialize(self) -> None:
-        """Build the pipeline from what was set."""
+        """Build the pipeline from the parameters."""
         default = self.default_params()
         sections: dict[str, Any] = {_PRESET: self._params[_PRESET]}
         for key, value in self._params.items():
@@ -145,7 +145,7 @@ class LoamGtsam(EvalioPipeline):
         self._pipeline = Pipeline(config, imu=self._buffer)
 
     def add_imu(self, mm: ImuMeasurement) -> None:
-        """Keep a sample; sweeps that waited for it are mapped."""
+        """Keep a sample, and map the sweeps that waited for this sample."""
         if self._buffer is None:
             return
         self._samples.append(mm)
@@ -154,7 +154,7 @@ class LoamGtsam(EvalioPipeline):
         self._map_waiting()
 
     def add_lidar(self, mm: LidarMeasurement) -> None:
-        """Map a sweep, now or when the IMU covers it."""
+        """Map a sweep, now or as soon as the samples of the IMU reach its end."""
         self._waiting.append(mm)
         self._map_waiting()
 
@@ -166,12 +166,14 @@ class LoamGtsam(EvalioPipeline):
         return {"edges": _as_points(edges), "planes": _as_points(planes)}
 
     def _covered(self, sweep: LidarMeasurement) -> bool:
-        """Whether there are samples up to the end of a sweep, or none at all."""
+        """Whether the IMU has samples up to the end of a sweep, or has no samples at all."""
         end = sweep.stamp.to_nsec() + round(self._period * 1e9)
         return self._newest is None or self._newest >= end
 
     def _map_waiting(self) -> None:
-        while self._waiting and (len(self._waiting) > _PATIENCE or self._covered(self._waiting[0])):
+        while self._waiting and (
+            len(self._waiting) > _LONGEST_QUEUE or self._covered(self._waiting[0])
+        ):
             self._map(self._waiting.pop(0))
 
     def _map(self, sweep: LidarMeasurement) -> None:

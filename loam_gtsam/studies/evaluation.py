@@ -1,4 +1,7 @@
-"""Trajectory errors. Positions are compared as evo does; for orientations see AbsoluteError."""
+"""Trajectory errors, absolute and relative.
+
+Positions are compared as evo compares them; orientations see :class:`AbsoluteError`.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +28,10 @@ class AbsoluteError:
     Attributes
     ----------
     rmse, median, maximum : metres, of the positions after alignment
-    rotation_rmse_deg : degrees, of the orientations after the rotation that fits *them* best. The
-        one that fits the positions would not do: on a nearly straight path it leaves the roll
-        about the path to the noise of the positions.
-    translations : (N,) metres per pose
+    rotation_rmse_deg : degrees, of the orientations after the rotation that fits the *orientations*
+        best. The rotation that fits the positions is no substitute: on a nearly straight path the
+        noise of the positions decides its roll about the path.
+    translations : (N,) metres, error of each pose
     stamps : (N,) nanoseconds of the poses that were compared
     """
 
@@ -43,14 +46,14 @@ class AbsoluteError:
 def align(
     estimate: FloatArray, reference: FloatArray, rotation: FloatArray | None = None
 ) -> FloatArray:
-    """Rigid transform ``reference_T_estimate`` (4, 4) that best maps (N, 3) positions on others.
+    """Rigid transform ``reference_T_estimate`` (4, 4) that best maps positions to a reference.
 
     Parameters
     ----------
     estimate, reference : (N, 3) metres
-    rotation : (3, 3) decides what the positions leave open: the roll about the line if they lie on
-        one, everything if they do not move. :func:`align_rotations` is a good one; identity if
-        None.
+    rotation : (3, 3) decides what the positions leave open: the roll about a line if all positions
+        lie on a line, the whole rotation if the positions do not move. :func:`align_rotations`
+        gives a good one; identity if None
 
     References
     ----------
@@ -70,10 +73,10 @@ def align(
 
 
 def align_rotations(estimate: FloatArray, reference: FloatArray) -> FloatArray:
-    """Rotation ``reference_R_estimate`` (3, 3) that best maps (N, 3, 3) orientations on others.
+    """Rotation ``reference_R_estimate`` (3, 3) that best maps orientations to a reference.
 
-    The chordal mean of ``reference estimate^T``: it minimises the sum of squared Frobenius norms
-    of ``reference - R estimate``.
+    The rotation is the chordal mean of ``reference estimate^T``: it minimises the sum of squared
+    Frobenius norms of ``reference - R estimate``.
 
     References
     ----------
@@ -90,7 +93,7 @@ def _nearest_rotation(matrix: FloatArray) -> FloatArray:
 
 
 def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
-    """Poses at other times: linear in position, spherical linear in orientation.
+    """Poses of a trajectory at other times: linear in position, spherical linear in orientation.
 
     Raises
     ------
@@ -118,12 +121,14 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
 def absolute_error(
     estimate: Trajectory, reference: Trajectory, *, aligned: bool = True
 ) -> AbsoluteError:
-    """ATE over the poses whose stamps lie inside the reference, which is interpolated.
+    """Absolute error (ATE) of the poses whose stamps lie inside the reference.
+
+    The reference is interpolated at the stamps of the estimate.
 
     Parameters
     ----------
     aligned : fit positions by a rigid transform (SE(3), :func:`align`) and orientations by a
-        rotation (:func:`align_rotations`) first; else compare as they are
+        rotation (:func:`align_rotations`) first; else the poses are compared as they are
 
     Raises
     ------
@@ -149,7 +154,7 @@ def absolute_error(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RelativeError:
-    """Relative pose error (RPE) over path lengths, as KITTI's odometry benchmark has it.
+    """Relative pose error (RPE) over path lengths, as in KITTI's odometry benchmark.
 
     Attributes
     ----------
@@ -169,7 +174,7 @@ class RelativeError:
 
 
 def path_lengths(path: float) -> FloatArray:
-    """Lengths over which relative errors are taken on a path of so many metres.
+    """Lengths in metres over which relative errors are taken on a path of ``path`` metres.
 
     Eight multiples u, 2 u, ... 8 u, where u is the largest of 0.1, 0.2, 0.5, 1, ... 100 m with
     16 u <= ``path``: from every pose of the first half the longest is still possible. From 1600 m
@@ -192,7 +197,9 @@ def path_lengths(path: float) -> FloatArray:
 def relative_error(
     estimate: Trajectory, reference: Trajectory, lengths: FloatArray | None = None
 ) -> RelativeError:
-    """RPE over the poses whose stamps lie inside the reference, which is interpolated.
+    """Relative error (RPE) of the poses whose stamps lie inside the reference.
+
+    The reference is interpolated at the stamps of the estimate.
 
     Parameters
     ----------
@@ -247,11 +254,11 @@ def relative_error(
 def pose_differences(
     estimate: Trajectory, reference: Trajectory
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """How far two trajectories are apart, pose by pose, both seen from the first common moment.
+    """Distances between two trajectories, pose by pose, both seen from their first common moment.
 
     Parameters
     ----------
-    estimate, reference : the reference is interpolated at the stamps of the other
+    estimate, reference : the reference is interpolated at the stamps of the estimate
 
     Returns
     -------
@@ -270,7 +277,7 @@ def pose_differences(
 
 
 def distance_travelled(positions: FloatArray) -> FloatArray:
-    """(N,) metres from the start along (N, 3) positions."""
+    """Distances (N,) in metres from the start along positions (N, 3)."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     travelled: FloatArray = np.concatenate(([0.0], np.cumsum(steps)))[: len(positions)]
     return travelled
@@ -279,7 +286,7 @@ def distance_travelled(positions: FloatArray) -> FloatArray:
 def _common(
     caller: str, estimate: Trajectory, reference: Trajectory
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Stamps and poses of the estimate inside the reference's time span, and the reference's."""
+    """Stamps and poses of the estimate inside the reference's time span, and reference poses."""
     _check_stamps(caller, reference)
     inside = (estimate.stamps >= reference.stamps[0]) & (estimate.stamps <= reference.stamps[-1])
     if inside.sum() < 3:
@@ -292,7 +299,7 @@ def _common(
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:
-    """(N,) degrees of (N, 3, 3) rotations."""
+    """Angles (N,) in degrees of rotations (N, 3, 3)."""
     if not len(rotations):
         return np.zeros(0)
     angles: FloatArray = np.degrees(Rotation.from_matrix(rotations).magnitude())
@@ -300,7 +307,7 @@ def _angles_deg(rotations: FloatArray) -> FloatArray:
 
 
 def _check_stamps(caller: str, trajectory: Trajectory) -> None:
-    """Raise InputError unless there is something to interpolate between."""
+    """Raise InputError unless the trajectory can be interpolated."""
     if len(trajectory) < 2:
         raise InputError(
             f"{caller}: expected 2 or more poses to interpolate between, got {len(trajectory)}"

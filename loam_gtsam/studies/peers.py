@@ -1,7 +1,7 @@
-"""Other systems on the same sweeps, through their own Python packages: all of them optional.
+"""Peers: other registration systems, run through their own Python packages, all of them optional.
 
-Every peer runs with its own defaults and gets the raw points and their times. What is set
-differently, and which moment of the sweep its pose belongs to, stands with its class.
+Every peer runs with its own defaults and gets the raw points and their times. The docstring of a
+peer says which settings are not its defaults, and which moment of the sweep its pose belongs to.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ class PeerError(LoamError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimedPoints:
-    """The usable points of a sweep, for systems that want arrays.
+    """The usable points of a sweep as arrays.
 
     Attributes
     ----------
     points : (N, 3) float64, metres, lidar frame at each point's own time
-    times : (N,) seconds from the stamp: those of the data, else from the azimuth as ours
+    times : (N,) seconds from the stamp, from the data or else from the azimuth of the points
     span : (first, last) seconds from the stamp covered by the sweep
     """
 
@@ -41,7 +41,14 @@ class TimedPoints:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PeerPose:
-    """A pose (4, 4) in the peer's own map, when it is valid (nanoseconds), what it took."""
+    """The pose of a sweep in the map of a peer.
+
+    Attributes
+    ----------
+    stamp : nanoseconds, the moment that the pose belongs to
+    map_T_lidar : (4, 4)
+    seconds : time that the registration took
+    """
 
     stamp: int
     map_T_lidar: FloatArray
@@ -49,15 +56,15 @@ class PeerPose:
 
 
 class Peer(ABC):
-    """Another system, one sweep at a time.
+    """Another system, which registers one sweep at a time.
 
     Attributes
     ----------
-    name : as on the command line
-    package : its distribution, what pip installs
-    module : what is imported
-    alone : its instances share state within a process; only one may run at a time
-    poses : so far
+    name : of the peer on the command line
+    package : name of the package for pip
+    module : name of the package for ``import``
+    alone : whether instances in one process share state, so that only one may run at a time
+    poses : of all sweeps so far
     """
 
     name: str
@@ -69,11 +76,11 @@ class Peer(ABC):
         self.poses: list[PeerPose] = []
 
     def register(self, stamp: int, sweep: TimedPoints) -> PeerPose:
-        """Register a sweep; only the registration itself is timed.
+        """Register a sweep and measure the time of the registration itself.
 
         Parameters
         ----------
-        stamp : nanoseconds, what the times of the sweep count from
+        stamp : nanoseconds from which the times of the points count
 
         Raises
         ------
@@ -88,18 +95,18 @@ class Peer(ABC):
 
     @property
     def trajectory(self) -> Trajectory:
-        """One pose per sweep, at the moment it belongs to."""
+        """One pose per sweep, stamped with the moment that it belongs to."""
         poses = np.array([pose.map_T_lidar for pose in self.poses]).reshape(-1, 4, 4)
         return Trajectory(np.array([pose.stamp for pose in self.poses], np.int64), poses)
 
     @property
     @abstractmethod
     def map_points(self) -> int:
-        """Points of its map at this moment (voxels, if it keeps distributions)."""
+        """Number of points in the present map, or of voxels if the peer keeps distributions."""
 
     @abstractmethod
     def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
-        """Pose (4, 4), and the moment it belongs to in seconds from the stamp."""
+        """Pose (4, 4) of a sweep, and the moment of the pose in seconds from the stamp."""
 
     def _check_times(self, times: FloatArray) -> None:
         if len(times) == 0 or times.min() >= times.max():
@@ -112,12 +119,13 @@ class KissIcp(Peer):
     Notes
     -----
     Version 1.3 de-skews to the time of the *last* point (a point at the end of the sweep is left
-    where it was), so its pose belongs there and is compared with the truth of that moment. Without
-    de-skew a pose fits the sweep as a whole best at its middle. It uses all cores.
+    where it was), so the pose belongs to that time and is compared with the truth of that time.
+    Without de-skew a pose fits the whole sweep best at the middle of the sweep. KISS-ICP uses all
+    cores.
 
     Parameters
     ----------
-    deskew : use its own de-skew, as by default
+    deskew : use the de-skew of KISS-ICP, which is its default
     """
 
     name, package, module = "kiss-icp", "kiss-icp", "kiss_icp"
@@ -138,14 +146,14 @@ class KissIcp(Peer):
 
     def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
         if self.deskew:
-            self._check_times(sweep.times)  # it would end the process
+            self._check_times(sweep.times)  # equal times would end the process
         self._icp.register_frame(sweep.points, sweep.times)
         moment = float(sweep.times.max()) if self.deskew else sum(sweep.span) / 2.0
         return np.array(self._icp.last_pose), moment
 
 
 class KissIcpNoDeskew(KissIcp):
-    """KISS-ICP on the sweeps as they are: better where its constant velocity fits badly."""
+    """KISS-ICP without de-skew: better where the motion is far from a constant velocity."""
 
     name = "kiss-icp-no-deskew"
 
@@ -158,14 +166,14 @@ class GenzIcp(Peer):
 
     Notes
     -----
-    Its de-skew is off by default, for data that are de-skewed already; it is on here. Version 0.3
-    takes times from 0 to 1 and de-skews to 0.5, so that its pose belongs to the middle, as it does
-    without de-skew. Two instances that take turns in one process disturb each other: on 40 sweeps
-    of KITTI the ATE of each changed several times over with the other beside it.
+    The de-skew of GenZ-ICP is off by default, for data that are de-skewed already; here it is on.
+    Version 0.3 takes times from 0 to 1 and de-skews to 0.5, so that the pose belongs to the middle
+    of the sweep, as it does without de-skew. Two instances that take turns in one process disturb
+    each other: on 40 sweeps of KITTI the ATE of each became several times larger or smaller.
 
     Parameters
     ----------
-    deskew : use its own de-skew
+    deskew : use the de-skew of GenZ-ICP
     """
 
     name, package, module = "genz-icp", "genz-icp", "genz_icp"
@@ -195,7 +203,7 @@ class GenzIcp(Peer):
 
 
 class GenzIcpNoDeskew(GenzIcp):
-    """GenZ-ICP on the sweeps as they are, its own default."""
+    """GenZ-ICP without de-skew, which is its default."""
 
     name = "genz-icp-no-deskew"
 
@@ -208,10 +216,10 @@ class SmallGicp(Peer):
 
     Notes
     -----
-    small_gicp is a registration library. What makes an odometry of it is the usual and simple:
-    points are de-skewed to the middle of the sweep by the motion between its last two poses, which
-    also is the guess; a solved sweep is added to the map. The sizes are the defaults of its
-    own functions and examples: 0.25 m downsampling, 1 m voxels. One thread, its default.
+    small_gicp is a registration library; this class adds a simple odometry. The motion between the
+    last two poses de-skews the points to the middle of the sweep and predicts the pose; each
+    registered sweep is added to the map. The sizes are the defaults of small_gicp's functions and
+    examples: downsampling to 0.25 m, voxels of 1 m. It uses one thread, which is its default.
     """
 
     name, package, module = "small-gicp", "small_gicp", "small_gicp"
@@ -251,7 +259,7 @@ class SmallGicp(Peer):
 PEERS: dict[str, type[Peer]] = {
     peer.name: peer for peer in (KissIcp, KissIcpNoDeskew, SmallGicp, GenzIcp, GenzIcpNoDeskew)
 }
-"""By the name on the command line."""
+"""Every peer by its name on the command line."""
 
 
 def make_peer(name: str) -> Peer:
@@ -260,7 +268,7 @@ def make_peer(name: str) -> Peer:
     Raises
     ------
     PeerError
-        If there is no such peer, or it is not installed.
+        If no peer has this name, or the peer is not installed.
     """
     if name not in PEERS:
         raise PeerError(f"unknown peer {name!r} (known: {', '.join(sorted(PEERS))})")

@@ -1,4 +1,4 @@
-"""A comparison as one HTML file: text, tables and pictures, nothing to load from elsewhere."""
+"""The report of a comparison: one HTML file with text, tables and pictures in it."""
 
 from __future__ import annotations
 
@@ -53,16 +53,16 @@ def write_report(
     pictures: Mapping[str, Path],
     facts: Mapping[str, str],
 ) -> None:
-    """Write the page. All texts are plain; they are escaped here.
+    """Write the report; all texts are plain texts, which this function escapes.
 
     Parameters
     ----------
-    intro : paragraphs
-    header, rows : the table of scores
-    best : (row, column) of the cells to stress
-    definitions : what a column means, by its name
-    pictures : caption -> PNG file, put into the page
-    facts : what was run and with which settings
+    intro : paragraphs at the top
+    header, rows : of the table of scores
+    best : (row, column) of the cells in bold type
+    definitions : column name -> meaning of the column
+    pictures : caption -> PNG file, which is embedded in the page
+    facts : solver -> version and settings
 
     Raises
     ------

@@ -23,14 +23,14 @@ _CONFIG = ("solver", "set")
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """A specification that was read.
+    """The specification of a parameter study.
 
     Attributes
     ----------
-    name : of its file
-    text : of its file
+    name : of the file, without its ending
+    text : content of the file
     trials : sequences x configurations x seeds, in this order
-    metrics : to be shown at the end
+    metrics : columns of the table that are shown at the end
     """
 
     name: str
@@ -49,7 +49,7 @@ class _Sequence:
 
 
 def load_spec(path: str | Path) -> Spec:
-    """Read a specification; paths in it are relative to its folder.
+    """Read a specification; the paths in the file are relative to the folder of the file.
 
     Raises
     ------
@@ -97,14 +97,14 @@ def load_spec(path: str | Path) -> Spec:
 
 
 def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequence:
-    """A path, or a mapping with one."""
+    """A sequence from a path, or from a mapping with the key ``path``."""
     entries = {"path": value} if isinstance(value, str) else _mapping(where, value, _SEQUENCE)
     path = entries.get("path")
     if not isinstance(path, str) or not path:
         raise ConfigError(f"{where}: expected a path, or a mapping with the key 'path'")
     if not _is_world(path):
-        # Absolute, for the same relative path under another folder is other data. Links stay, for
-        # a worker on another machine may have them lead elsewhere.
+        # Absolute: the same relative path under another folder is other data. Symbolic links stay:
+        # on another machine they may lead to another place.
         path = os.path.abspath(folder / Path(path).expanduser())
     return _Sequence(
         path=path,
@@ -116,7 +116,7 @@ def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequ
 
 
 def _config(where: str, value: Any, folder: Path) -> Contender:
-    """The name of a solver, or a mapping with one and with changes."""
+    """A contender from the name of a solver, or from a mapping with name and changes."""
     entries = {"solver": value} if isinstance(value, str) else _mapping(where, value, _CONFIG)
     solver = entries.get("solver", "gtsam")
     if not isinstance(solver, str):
@@ -136,7 +136,7 @@ def _config(where: str, value: Any, folder: Path) -> Contender:
 
 
 def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
-    """``config`` with each ``section.key`` set in turn."""
+    """``config`` with new values of the keys ``section.key``."""
     for key in changes:
         if "." not in key:
             raise ConfigError(f"{where}: expected SECTION.KEY: VALUE, got {key!r}")
@@ -144,7 +144,7 @@ def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
 
 
 def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[int]:
-    """The seeds, once it is clear that they can be used."""
+    """The seeds, checked against the sequences that use them."""
     if value is None:
         return []
     if (
@@ -163,12 +163,14 @@ def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[i
         )
     for sequence in worlds:
         if _own_seed(sequence) is not None:
-            raise ConfigError(f"{sequence.where}: has a seed of its own; take it or 'seeds' away")
+            raise ConfigError(
+                f"{sequence.where}: has a seed of its own; remove it, or remove 'seeds'"
+            )
     return value
 
 
 def _seeds_of(sequence: _Sequence, seeds: list[int]) -> list[int | None]:
-    """Those of the specification, else its own one, else the loader's default."""
+    """The seeds of a sequence: of the specification, else of its address, else 0."""
     if not _is_world(sequence.path):
         return [None]
     own = _own_seed(sequence)
@@ -176,7 +178,7 @@ def _seeds_of(sequence: _Sequence, seeds: list[int]) -> list[int | None]:
 
 
 def _own_seed(sequence: _Sequence) -> int | None:
-    """The seed in the address or among the options of a built-in world, if there is one."""
+    """The seed in the address or among the options of a built-in world; None without one."""
     query = dict(parse_qsl(sequence.path.partition("?")[2]))
     seed = sequence.options.get("seed", query.get("seed"))
     try:
@@ -204,7 +206,7 @@ def _count(where: str, value: Any) -> int | None:
 
 
 def _named(where: str, value: Any) -> dict[str, Any]:
-    """A mapping that is not empty."""
+    """``value``, checked to be a mapping that is not empty."""
     if not value:
         raise ConfigError(f"{where}: expected at least one, as NAME: VALUE")
     return _mapping(where, value)

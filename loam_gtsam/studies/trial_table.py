@@ -1,7 +1,7 @@
-"""The results of a sweep over parameters: one small file a finished trial, one table of all.
+"""The results of a parameter study: one small file per finished trial, and one table of all trials.
 
-A trial's file is written as soon as the trial ends, so that an interrupted sweep can be resumed;
-the table is a Parquet file made of them.
+The file of a trial is written as soon as the trial ends, so that an interrupted study can go on.
+The table is a Parquet file that is made of the files of the trials.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from loam_gtsam.types import OutputError
 TABLE_FILE = "results.parquet"
 TRIALS_FOLDER = "trials"
 _LABELS = ("sequence", "config")
-"""Columns that the specification decides, not the run."""
+"""Columns whose values come from the specification and not from the run."""
 
 
 class TrialStore:
@@ -28,14 +28,14 @@ class TrialStore:
 
     Parameters
     ----------
-    folder : of the results; the trials are in ``trials/`` below it
+    folder : of the results; the files of the trials are in its folder ``trials``
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / TRIALS_FOLDER
 
     def save(self, row: Row) -> None:
-        """Keep a finished trial.
+        """Write the file of a finished trial.
 
         Raises
         ------
@@ -46,9 +46,9 @@ class TrialStore:
             file.write((json.dumps(row, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
     def load(self, trial: Trial) -> Row | None:
-        """The row of a trial if it was finished by the versions that are installed here.
+        """The row of a trial if the installed versions have finished it; else None.
 
-        A file that cannot be read counts as none: the trial runs again.
+        The row of a file that cannot be read is None as well: the trial runs again.
         """
         try:
             row = json.loads(self._file(trial.id).read_text(encoding="utf-8"))
@@ -58,7 +58,7 @@ class TrialStore:
             return None
         if any(row[name] != value for name, value in versions().items()):
             return None
-        # What it is called is up to the specification of today.
+        # The names in the specification may have changed since the trial ran.
         label = empty_row(trial)
         return row | {name: label[name] for name in _LABELS}
 
@@ -67,7 +67,7 @@ class TrialStore:
 
 
 def write_table(path: Path, rows: Iterable[Row], spec: Spec) -> None:
-    """Write the table; the specification and all configurations are in the file's metadata.
+    """Write the table, with the specification and all configurations in its metadata.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def write_table(path: Path, rows: Iterable[Row], spec: Spec) -> None:
 
 
 def read_table(path: Path) -> tuple[list[Row], Mapping[str, Any]]:
-    """The rows of a table, and its full configurations by ``config_hash``.
+    """The rows of a table, and the full configurations by their ``config_hash``.
 
     Raises
     ------

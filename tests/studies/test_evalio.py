@@ -62,11 +62,11 @@ def estimates(pipeline: LoamGtsam, data: object = ROOM) -> Trajectory:
 
 
 def test_evalio_s_command_line_runs_it_and_its_poses_are_those_of_the_imu(tmp_path: Path) -> None:
-    folder = Path(__file__).parent
-    paths = [str(folder), str(folder.parent), os.environ.get("PYTHONPATH", "")]
+    tests = Path(__file__).resolve().parents[1]
+    paths = [str(tests.parent), str(tests), os.environ.get("PYTHONPATH", "")]
     command = [sys.executable, "-c", "from evalio.cli import app; app()"]
     options = ["run", "-p", "loam_gtsam", "-d", "simulated_room/shaken", "-o", str(tmp_path)]
-    modules = {"EVALIO_CUSTOM": "loam_gtsam.studies.evalio_pipeline,evalio_room"}
+    modules = {"EVALIO_CUSTOM": "loam_gtsam.studies.evalio_pipeline,support.evalio_room"}
     done = subprocess.run(
         command + options,
         env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)} | modules,

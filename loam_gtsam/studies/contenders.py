@@ -128,7 +128,7 @@ class SolverRun:
 
     @property
     def used(self) -> tuple[int, ...]:
-        """Numbers of the frames with a pose; a predicted pose counts for a solver of ours."""
+        """Numbers of the frames with a pose; of this package's solvers also predicted poses."""
         if self.config is None:
             wanted = [update.status is FrameStatus.OK for update in self.updates]
         else:

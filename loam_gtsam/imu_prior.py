@@ -23,9 +23,9 @@ for the gravity direction."""
 _FLOOR = 1e-12
 """Share of the largest eigenvalue that stands for no information at all."""
 _ROUNDS = 20
-"""Rounds to correct the target: 3 for a pull of 1 mrad, 6 for 0.5 rad."""
+"""Largest number of rounds that correct the target: 3 do for a pull of 1 mrad, 6 for 0.5 rad."""
 _EXACT = 1e-12
-"""Rad, by which the corrected mean may miss the blend's."""
+"""rad by which the corrected mean may miss that of the blend."""
 
 
 def roll_pitch(rotation: gtsam.Rot3) -> FloatArray:

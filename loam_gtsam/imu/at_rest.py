@@ -1,4 +1,4 @@
-"""Whether a stretch of IMU samples is at rest, and what it then says about gyro and gravity."""
+"""Detection of rest in IMU samples, and what a rest says about gyro and gravity."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from loam_gtsam.imu.quaternions import as_rot3
 from loam_gtsam.types import FloatArray, IntArray
 
 REST_LEAST = 0.1
-"""Seconds a still window must span at least."""
+"""Seconds that samples at rest must span at least."""
 REST_SAMPLES = 10
-"""Samples a still window must have at least."""
+"""Number of samples that a rest must have at least."""
 REST_GYRO = 0.02
 """rad/s, scatter per axis at rest: several times the noise of consumer MEMS gyros at 200 Hz."""
 REST_ACCELERATION = 0.15
 """m/s^2, scatter per axis at rest: above an idling engine, below any driving (VINS-Mono takes
 0.25 for "enough excitation" of a hand-held start)."""
 REST_DRIFT = 4.0
-"""Standard deviations by which the means of the two halves of a still window may differ. What the
-scatter does not show, this does: a platform that begins to move."""
+"""Standard deviations by which the means of the two halves of a rest may differ. It shows what the
+scatter does not: a platform that begins to move."""
 REST_DRIFT_FLOOR = (5e-4, 0.01)
 """rad/s and m/s^2, allowed on top: noise is not quite white."""
 REST_TURN = 0.05
@@ -38,10 +38,10 @@ class RestWindow:
 
     Attributes
     ----------
-    first, last : stamps, nanoseconds
-    samples : number
-    gyro : (3,) mean, rad/s: the bias of the gyro
-    acceleration : (3,) mean, m/s^2: points up
+    first, last : stamps of the first and the last sample, nanoseconds
+    samples : number of samples
+    gyro : (3,) mean rate, rad/s: the bias of the gyro
+    acceleration : (3,) mean acceleration, m/s^2: it points up
     world_R_lidar : mean orientation, None if there is none
     """
 
@@ -69,9 +69,9 @@ def find_rest(
     acceleration: FloatArray,
     quaternions: FloatArray | None = None,
 ) -> RestWindow | None:
-    """These samples, if they are at rest.
+    """The rest that these samples make; None if they are not at rest.
 
-    At rest is: gyro and acceleration scatter little (:data:`REST_GYRO`,
+    At rest means: gyro and acceleration scatter little (:data:`REST_GYRO`,
     :data:`REST_ACCELERATION`) and do not drift (:data:`REST_DRIFT`), the mean rate is a possible
     bias (:data:`REST_TURN`), the mean acceleration is gravity (:data:`REST_GRAVITY`), and there
     are enough samples without a gap (:data:`REST_LEAST`, :data:`REST_SAMPLES`).

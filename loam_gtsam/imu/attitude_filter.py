@@ -1,4 +1,4 @@
-"""Orientation of an IMU that measures none: heading from the gyro, up from the accelerometer."""
+"""Orientation for an IMU without its own: heading from the gyro, up from the accelerometer."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ depend on how the samples came in."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilterState:
-    """What the gravity filter knows at one sample.
+    """State of the gravity filter at one sample.
 
     Attributes
     ----------
-    stamp : of the sample, nanoseconds
-    rate : (3,) rad/s at it, bias included
+    stamp : stamp of the sample, nanoseconds
+    rate : (3,) rate of the sample, rad/s, bias included
     world_R_body : (4, 1) quaternion
     force : (3,) filtered acceleration in the world, m/s^2
-    bias : (3,) rad/s, of the gyro
-    hold : up to this stamp the force is not touched, nanoseconds
-    since : the force has been averaged since here, nanoseconds
+    bias : (3,) bias of the gyro, rad/s
+    hold : stamp up to which the force stays as it is, nanoseconds
+    since : stamp from which on the force has been averaged, nanoseconds
     """
 
     stamp: int
@@ -106,12 +106,12 @@ def filter_block(
 
 
 class GravityFilter:
-    """:func:`filter_block` over a stream that grows, and that may change behind a place.
+    """Gravity filter over a stream that grows at its end, by :func:`filter_block`.
 
-    It starts from the rest at the start of the stream if there is one: its mean rate is the bias
-    of the gyro, its mean acceleration counts as if seen for a whole time constant. Else the bias
-    is zero, and what the first ``still_seconds`` have in common is a weak start. The heading
-    starts at zero.
+    The filter starts from the rest at the start of the stream if there is one: the mean rate of the
+    rest is the bias of the gyro, its mean acceleration counts as if seen for a whole time constant.
+    Else the bias is zero, and the mean acceleration of the first ``still_seconds`` is a weak start.
+    The heading starts at zero.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class GravityFilter:
 
     def __init__(self, config: ImuConfig) -> None:
         self._config = config
-        # States before each block, and how many samples are done.
+        # States before each block, and the number of samples that are filtered.
         self._states: list[FilterState] = []
         self._done = 0
         self._start_end = 0
@@ -146,7 +146,7 @@ class GravityFilter:
     def orientations(
         self, stamps: IntArray, gyro: FloatArray, acceleration: FloatArray
     ) -> FloatArray | None:
-        """(N, 4) quaternions x y z w of all samples; only those not done before cost time.
+        """(N, 4) quaternions x y z w of all samples; those filtered before cost no time.
 
         Parameters
         ----------

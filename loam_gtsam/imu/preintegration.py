@@ -294,11 +294,8 @@ class InertialOdometry:
         known = _pose_covariance(self._to_lidar, pose_sigma)
         free = velocity_sigma**2 * np.eye(3)
         state = replace(self.state, stamp=stamp, covariance=covariance)
-        map_T_imu, velocity = (
-            map_T_lidar.compose(self._lidar_T_imu),
-            as_vector(velocity, "velocity"),
-        )
-        self._start(_start_state(state, map_T_imu, velocity, known, free))
+        map_T_imu = map_T_lidar.compose(self._lidar_T_imu)
+        self._start(_start_state(state, map_T_imu, as_vector(velocity, "velocity"), known, free))
 
     def _start(self, state: InertialState) -> None:
         try:

@@ -1,4 +1,4 @@
-"""What the pre-integrated motion of :mod:`loam_gtsam.imu.preintegration` is made of.
+"""Parts of the pre-integrated motion of :mod:`loam_gtsam.imu.preintegration`.
 
 The state of a frame has 18 numbers: pose (6, GTSAM's order), velocity, bias of the accelerometer,
 bias of the gyro, gravity. Pose and velocity are those of the IMU, in the map; see
@@ -41,14 +41,14 @@ def samples_between(samples: ImuSamples, start: int, stop: int) -> ImuSamples:
 def integration_steps(
     samples: ImuSamples, start: int, stop: int, max_gap: float
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Pieces of constant rate between the samples, from ``start`` to ``stop`` exactly.
+    """Integration steps of constant rate between the samples, from ``start`` to ``stop`` exactly.
 
-    Samples are joined by straight lines; a piece has the mean of its two ends.
+    Samples are joined by straight lines; a step has the mean of its two ends.
 
     Returns
     -------
-    seconds : (M,) lengths of the pieces
-    gyro, acceleration : (M, 3) of the pieces
+    seconds : (M,) lengths of the steps
+    gyro, acceleration : (M, 3) of the steps
     rate : (3,) gyro at ``stop``
 
     Raises

@@ -78,10 +78,8 @@ class WindowFrame:
     ----------
     before : state of the frame before, from which this one is predicted
     stamp : nanoseconds
-    samples : IMU samples between the two
-    scan : pose, root and offset of
-        :func:`~loam_gtsam.imu.preintegration_factors.information_root`; None if the scan says
-        nothing
+    samples : IMU samples between the two frames
+    scan : pose, root and offset for :func:`scan_factor`; None if the scan says nothing
     """
 
     before: InertialState
@@ -93,13 +91,7 @@ class WindowFrame:
 def predict_state(
     config: ImuConfig, last: InertialState, number: int, stamp: int, samples: ImuSamples
 ) -> tuple[InertialState, gtsam.NonlinearFactor, FloatArray]:
-    """State of the next frame from the last one and the samples between them.
-
-    Parameters
-    ----------
-    number : of the last frame; that of the next one is one more
-    stamp : nanoseconds of the next frame
-    samples : see :func:`~loam_gtsam.imu.preintegration_factors.integration_steps`
+    """State of frame ``number + 1``, at ``stamp``, from the last one and the samples between them.
 
     Returns
     -------
@@ -109,10 +101,8 @@ def predict_state(
 
     Raises
     ------
-    InputError
-        If an array of the samples has the wrong shape.
-    SweepError
-        If the samples do not cover the time between, or are absurd.
+    InputError, SweepError
+        As :func:`integration_steps`; the latter also if the samples are absurd.
     """
     steps, gyro, acceleration, rate = integration_steps(samples, last.stamp, stamp, config.max_gap)
     # GTSAM takes the attitude at the beginning of a piece for all of it. In the middle the
@@ -193,15 +183,7 @@ class Window:
     def append(
         self, frame: WindowFrame, predicted: InertialState, imu_factor: gtsam.NonlinearFactor
     ) -> InertialState:
-        """Add a frame, and solve if there is more than its prediction.
-
-        Parameters
-        ----------
-        predicted, imu_factor : from :func:`predict_state`
-
-        Returns
-        -------
-        The state of the frame.
+        """Add a frame with what :func:`predict_state` said of it, solve, and return its state.
 
         Raises
         ------

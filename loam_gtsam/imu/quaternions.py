@@ -1,4 +1,4 @@
-"""Many rotations at once, and what angular rates add up to.
+"""Many rotations at once, and the rotations that angular rates add up to.
 
 Quaternions are x y z w, component first: (4, N), so that every operation is one pass over
 contiguous memory. Nothing walks the samples one by one; products of many rotations are taken by

@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
-
 MAX_STAMP = 1 << 62
 """Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
 _FARTHEST = 1e5
@@ -57,10 +56,9 @@ def check_array(
 
     Parameters
     ----------
-    value, name : what is checked, and what it is called in ``name: expected (N, 3) floats, got
-        shape (7, 4) of float32``
+    value, name : the value, and its name in ``name: expected (N, 3) floats, got shape (7, 4) ...``
     shape : of the array; a letter stands for any length, as in ``("N", 3)``
-    numbers : what they are; only integers, or only floats, if it says so
+    numbers : for the message; only integers, or only floats, if it says so
     """
     kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
     got = type(value).__name__
@@ -106,10 +104,7 @@ class SweepFault(StrEnum):
 class SweepError(LoamError):
     """One sweep cannot be used; the mapper turns it into a frame status and goes on.
 
-    Parameters
-    ----------
-    message : a sentence
-    fault : what is wrong, where the sweep itself is
+    ``fault`` says what is wrong with the sweep; None if something else is.
     """
 
     def __init__(self, message: str, fault: SweepFault | None = None) -> None:
@@ -175,10 +170,8 @@ class Features:
     sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
         (used by scan-to-scan odometry).
     span : (first, last) seconds from ``stamp`` covered by the sweep.
-    edge_prominence : (E,) metres by which each edge stands out of its ring, scaled so that range
-        noise alone gives it the standard deviation of the noise
-        (:func:`loam_gtsam.frontend.curvature.prominence`). None if unknown: all edges then count
-        as real ones.
+    edge_prominence : (E,) metres by which an edge stands out of its ring, as noisy as one range
+        (:func:`loam_gtsam.frontend.curvature.prominence`); None if unknown: all edges are real
     not_finite : points of the sweep that were NaN or infinite
     voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
         point each (:func:`loam_gtsam.frontend.features.thinned`); None if they hold all points.
@@ -261,7 +254,7 @@ class BadSweep:
 
 
 Sweep = Scan | FeatureSweep | BadSweep
-"""What a data set yields: a measured sweep, one with features, or one that could not be read."""
+"""What a data set yields."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -336,8 +329,8 @@ class FrameStatus(StrEnum):
     FEW_MATCHES = "few_matches"
     """Too few matches: the guess is the pose and the sweep is not inserted."""
     LOST = "lost"
-    """The sweep does not fit the map where it was solved, nor anywhere around; the pose is
-    predicted, the sweep is not inserted, and the search goes on with the next one."""
+    """The sweep fits the map neither where it was solved nor around: the pose is predicted, the
+    sweep is not inserted, and the next sweep is searched for again."""
     UNUSABLE_SCAN = "unusable_scan"
     """The sweep has no usable points or features; the pose is predicted."""
     BAD_STAMP = "bad_stamp"
@@ -350,7 +343,7 @@ class FrameStatus(StrEnum):
 
     @property
     def has_pose(self) -> bool:
-        """Whether the frame has a pose of its own time; a frame with a bad stamp has none."""
+        """Whether the frame has a pose of its own time: all but those with a bad stamp."""
         return self is not FrameStatus.BAD_STAMP
 
     @property
@@ -440,12 +433,11 @@ class MapUpdate:
     solver_iterations : Levenberg-Marquardt iterations, over all associations
     error_before, error_after : cost (half the weighted, whitened squared residuals plus priors)
         at the guess and at the solution, each with its own matches
-    information : (6, 6) at the solution: scan matches and priors, tangent order of the package.
-        Zero when the frame was not solved.
+    information : (6, 6) of scan matches and priors at the solution; zero if not solved
     covariance : (6, 6) of the pose in the map, calibrated: the error of this frame and what the map
-        has drifted since its start; tangent order of the package. For the motion between two frames
-        see :func:`loam_gtsam.relative_covariance`. NaN when the frame was not solved.
-    uncertainty : the parts of it; None when the frame was not solved
+        has drifted since its start; NaN if not solved. For the motion between two frames see
+        :func:`loam_gtsam.relative_covariance`.
+    uncertainty : the parts of the covariance; None if not solved
     twist : (6,) body velocity at ``stamp`` (rad/s, m/s) used for the de-skew of the sweep; where
         an IMU gives the rotation within the sweep, its mean
     sweep_motion : where that rotation came from
@@ -455,15 +447,13 @@ class MapUpdate:
     directions : (6, 6) rows, tangent vectors that move the matched points by 1 m; NaN likewise
     direction_information : (6,) 1 / m^2, of the matches along each of them, noise included; NaN
         likewise
-    axis_localizability : (6,) how many matches fix each axis of the lidar (rx, ry, rz, x, y, z) if
-        the other five are left free; at least 1; below ``solver.min_aligned`` do not rely on it.
-        NaN likewise
+    axis_localizability : (6,) how many matches, at least 1, fix each axis of the lidar (rx, ry, rz,
+        x, y, z) if the others are free; unreliable below ``solver.min_aligned``; NaN likewise
     timings : seconds per stage
     fault : what was wrong with the sweep, if the status is ``UNUSABLE_SCAN`` or ``BAD_STAMP``
     n_not_finite : points of the sweep that were NaN or infinite, if it was used
-    map_T_middle : pose at the middle of the sweep, the moment at which matches are made and to
-        which priors and own factors belong; None if nothing was matched
-    middle_stamp : nanoseconds of that moment; 0 if nothing was matched
+    map_T_middle, middle_stamp : pose and nanoseconds of the middle of the sweep, to which matches,
+        priors and own factors belong; None and 0 if nothing was matched
     """
 
     stamp: int
@@ -499,11 +489,11 @@ class MapUpdate:
 
     @property
     def raw_covariance(self) -> FloatArray:
-        """(6, 6) inverse of ``information``; NaN when the frame was not solved or is singular.
+        """(6, 6) inverse of ``information``; NaN if the frame was not solved or is singular.
 
-        It takes every match as independent and the map as exact; ``covariance`` does not. From the
-        classical solvers (``solver.method`` loam or aloam), whose rows count as measured
-        to 1 m, it is to be multiplied by the variance of a residual in m^2.
+        Unlike ``covariance`` it takes every match as independent and the map as exact. Multiply
+        that of a classical solver (``solver.method`` loam or aloam) by the variance of a residual
+        in m^2: its rows count as measured to 1 m.
         """
         if self.status.solved:
             with suppress(np.linalg.LinAlgError):

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
+from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.base import Dataset as Dataset
 from loam_gtsam.datasets.base import DatasetInfo as DatasetInfo
 from loam_gtsam.datasets.known.layouts import known_loader
@@ -153,7 +154,7 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
 
     with closing(open_bag(path)) as reader:
         topics = set(reader.topics)
-    plain = set(inspect.signature(BagDataset).parameters) & set(options)
+    plain = BagOptions.__annotations__.keys() & options.keys()
     if "axes" in options or (topics.issuperset(REQUIRED) and not plain):
         return _construct(LoamTopicsDataset, path, options)
     return _construct(BagDataset, path, options)
@@ -191,6 +192,8 @@ def _number_or_text(value: str) -> int | float | str:
 
 def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> Dataset:
     known = list(inspect.signature(loader).parameters)[1:]
+    if "options" in known:
+        known[known.index("options") :] = BagOptions.__annotations__
     unknown = [key for key in options if key not in known]
     if unknown:
         raise DatasetError(

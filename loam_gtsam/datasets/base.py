@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypedDict, runtime_checkable
 
 from loam_gtsam.types import (
     BadSweep,
@@ -35,6 +35,26 @@ class DatasetInfo:
     path: str
     facts: dict[str, str] = field(default_factory=dict)
     problems: list[str] = field(default_factory=list)
+
+
+class BagOptions(TypedDict, total=False):
+    """Keyword arguments of every loader of bags with ``PointCloud2`` sweeps; all may be left out.
+
+    Attributes
+    ----------
+    topic : of the sweeps; None takes the topic of the known data set, else the PointCloud2 topic
+        with the most messages
+    imu_topic : None takes the topic of the known data set, else the Imu topic with the most
+        messages, if there is one
+    time_field, time_unit, stamp_is : see
+        :func:`loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
+    """
+
+    topic: str | None
+    imu_topic: str | None
+    time_field: str | None
+    time_unit: str | None
+    stamp_is: str | None
 
 
 @runtime_checkable

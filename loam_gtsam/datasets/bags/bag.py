@@ -7,7 +7,7 @@ from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from loam_gtsam.datasets.bags.bag_reader import (
     read_messages,
     topic_types,
 )
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import BagOptions, DatasetInfo
 from loam_gtsam.datasets.decode.imu_messages import decode_imu
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
 from loam_gtsam.datasets.decode.pointcloud2 import (
@@ -47,11 +47,9 @@ class BagDataset:
     Parameters
     ----------
     path : ROS 1 ``.bag``, ROS 2 bag folder, or a single ``.mcap`` / ``.db3``
-    topic : of the sweeps; None takes the PointCloud2 topic with the most messages
-    imu_topic : None takes the Imu topic with the most messages, if there is one
-    time_field, time_unit, stamp_is : see
-        :func:`loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
     parts : the bags of a recording that was split; ``path`` then only names them
+    options : ``topic``, ``imu_topic``, ``time_field``, ``time_unit``, ``stamp_is``: see
+        :class:`~loam_gtsam.datasets.base.BagOptions`
 
     Raises
     ------
@@ -61,22 +59,22 @@ class BagDataset:
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        topic: str | None = None,
-        imu_topic: str | None = None,
-        time_field: str | None = None,
-        time_unit: str | None = None,
-        stamp_is: str | None = None,
-        parts: Sequence[Path] = (),
+        self, path: str | Path, *, parts: Sequence[Path] = (), **options: Unpack[BagOptions]
     ) -> None:
+        if unknown := options.keys() - BagOptions.__annotations__.keys():
+            raise TypeError(f"unexpected keyword arguments: {', '.join(sorted(unknown))}")
+        topic, imu_topic = options.get("topic"), options.get("imu_topic")
+        time_unit, stamp_is = options.get("time_unit"), options.get("stamp_is")
         check_time_options(time_unit, stamp_is)
         self._path = Path(path)
         self._parts = tuple(parts)
         self.name = self._path.stem
         self.sensor: Mapping[str, Any] = {}
-        self._options = {"time_field": time_field, "time_unit": time_unit, "stamp_is": stamp_is}
+        self._options = {
+            "time_field": options.get("time_field"),
+            "time_unit": time_unit,
+            "stamp_is": stamp_is,
+        }
         self._problems: list[str] = []
         with closing(open_bag(self._path, self._parts)) as reader:
             topics = topic_types(reader)

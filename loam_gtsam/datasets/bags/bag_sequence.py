@@ -7,11 +7,11 @@ from contextlib import closing
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 from loam_gtsam.datasets.bags.bag import BagDataset
 from loam_gtsam.datasets.bags.bag_reader import open_bag
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import BagOptions, DatasetInfo
 from loam_gtsam.datasets.decode.extrinsics import at_lidar, describe_extrinsics, implied_by
 from loam_gtsam.datasets.decode.tables import (
     in_order,
@@ -51,7 +51,7 @@ class BagSequence(BagDataset):
     parts : the bags
     rig : of the data set
     truth : file of the reference poses, or None
-    others : as for :class:`~loam_gtsam.datasets.BagDataset`; topics default to the rig's
+    options : see :class:`~loam_gtsam.datasets.base.BagOptions`; topics default to the rig's
     """
 
     def __init__(
@@ -60,24 +60,15 @@ class BagSequence(BagDataset):
         parts: Sequence[Path],
         rig: Rig,
         truth: Path | None,
-        *,
-        topic: str | None,
-        imu_topic: str | None,
-        time_field: str | None,
-        time_unit: str | None,
-        stamp_is: str | None,
+        **options: Unpack[BagOptions],
     ) -> None:
         with closing(open_bag(path, parts)) as reader:
             known = set(reader.topics)
-        super().__init__(
-            path,
-            topic=topic or (rig.topic if rig.topic in known else None),
-            imu_topic=imu_topic or (rig.imu_topic if rig.imu_topic in known else None),
-            time_field=time_field,
-            time_unit=time_unit,
-            stamp_is=stamp_is,
-            parts=parts,
-        )
+        if not options.get("topic") and rig.topic in known:
+            options["topic"] = rig.topic
+        if not options.get("imu_topic") and rig.imu_topic in known:
+            options["imu_topic"] = rig.imu_topic
+        super().__init__(path, parts=parts, **options)
         self._rig, self._truth_file = rig, truth
         self.name = path.resolve().name if path.is_dir() else path.stem
         if self.imu_topic == rig.imu_topic:

@@ -6,11 +6,13 @@ import re
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
+from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.decode.extrinsics import pose, rigid
 from loam_gtsam.datasets.decode.packed_points import firing_by_firing, read_pcd
 from loam_gtsam.datasets.known.layouts import (
@@ -63,8 +65,7 @@ class NewerCollegeBags(BagSequence):
         one after the other. Reference poses are looked for there, in ``ground_truth/`` and
         in ``ground_truth/tum_format/``, also one folder up.
     sequence : which, if the folder holds several, e.g. ``quad-easy``
-    topic, imu_topic, time_field, time_unit, stamp_is : as for
-        :class:`~loam_gtsam.datasets.BagDataset`
+    options : see :class:`~loam_gtsam.datasets.base.BagOptions`
 
     Raises
     ------
@@ -78,15 +79,7 @@ class NewerCollegeBags(BagSequence):
     """
 
     def __init__(
-        self,
-        path: str | Path,
-        *,
-        sequence: str | None = None,
-        topic: str | None = None,
-        imu_topic: str | None = None,
-        time_field: str | None = None,
-        time_unit: str | None = None,
-        stamp_is: str | None = None,
+        self, path: str | Path, *, sequence: str | None = None, **options: Unpack[BagOptions]
     ) -> None:
         root = Path(path)
         name, parts = _choose(root, sequence)
@@ -95,11 +88,7 @@ class NewerCollegeBags(BagSequence):
             parts,
             RIG_2020 if name == "rooster" else RIG_2021,
             _truth_file(parts[0].parent, name),
-            topic=topic,
-            imu_topic=imu_topic,
-            time_field=time_field,
-            time_unit=time_unit,
-            stamp_is=stamp_is,
+            **options,
         )
 
 

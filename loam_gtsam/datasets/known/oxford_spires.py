@@ -5,10 +5,12 @@ from __future__ import annotations
 import re
 from functools import cached_property
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
 from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
+from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.decode.extrinsics import implied_by, pose
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import clean_imu, read_table
@@ -49,8 +51,7 @@ class OxfordSpiresBags(BagSequence):
     ----------
     path : holds ``gt-tum.txt`` or ``processed/trajectory/gt-tum.txt``, and the bags in itself, in
         ``raw/rosbag/`` or in ``raw/ros2bag/``, which are read one after the other
-    topic, imu_topic, time_field, time_unit, stamp_is : as for
-        :class:`~loam_gtsam.datasets.BagDataset`
+    options : see :class:`~loam_gtsam.datasets.base.BagOptions`
 
     References
     ----------
@@ -58,31 +59,12 @@ class OxfordSpiresBags(BagSequence):
     https://dynamic.robots.ox.ac.uk/datasets/oxford-spires.
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        topic: str | None = None,
-        imu_topic: str | None = None,
-        time_field: str | None = None,
-        time_unit: str | None = None,
-        stamp_is: str | None = None,
-    ) -> None:
+    def __init__(self, path: str | Path, **options: Unpack[BagOptions]) -> None:
         root = Path(path)
         parts = spires_bags(root)
         if not parts:
             raise DatasetError(f"{root}: no bags of an Oxford Spires sequence")
-        super().__init__(
-            root,
-            parts,
-            RIG,
-            spires_truth(root),
-            topic=topic,
-            imu_topic=imu_topic,
-            time_field=time_field,
-            time_unit=time_unit,
-            stamp_is=stamp_is,
-        )
+        super().__init__(root, parts, RIG, spires_truth(root), **options)
 
 
 class OxfordSpiresClouds(PackedFiles):

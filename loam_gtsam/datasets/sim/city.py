@@ -56,64 +56,81 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
         return points_at(way, np.linspace(0.0, length, int(length / spacing) + 1))
 
     path = along(_STEP)
-    taken = cKDTree(path)
     rng = np.random.default_rng([seed, 0, _STREAM])
     ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
-    boxes: list[list[float]] = []
-    cylinders: list[list[float]] = []
-    crowns: list[list[float]] = []
-    houses: list[FloatArray] = []
-
-    def free(box: list[float], margin: float) -> bool:
-        """Whether a box keeps away from the way."""
-        x, y, _, half_x, half_y, _, yaw = box
-        u, v = np.meshgrid(np.linspace(-half_x, half_x, 7), np.linspace(-half_y, half_y, 7))
-        cosine, sine = np.cos(yaw), np.sin(yaw)
-        outline = np.stack([x + cosine * u - sine * v, y + sine * u + cosine * v], axis=-1)
-        return bool(taken.query(outline.reshape(-1, 2))[0].min() > margin)
-
-    def apart(place: FloatArray, metres: float) -> bool:
-        return not houses or float(np.linalg.norm(np.array(houses) - place, axis=1).min()) > metres
-
+    roadside = _Roadside(path, rng)
     s = 6.0
     while s < length - 6.0:
         a, b = path[int((s - 4.0) / _STEP)], path[min(int((s + 4.0) / _STEP), len(path) - 1)]
         for left in (True, False):
-            kerb = Kerb(a, b, left, ground)
-            middle = 0.5 * kerb.length
-            width, setback = float(rng.uniform(8.0, 13.0)), float(rng.uniform(8.0, 12.5))
-            top, chance = float(rng.uniform(5.0, 16.0)), float(rng.random())
-            house = kerb.box(
-                middle - 0.5 * width, middle + 0.5 * width, setback, setback + 10.0, -DEEP, top
-            )
-            place = np.array(house[:2])
-            if free(house, _CLEAR) and apart(place, 9.0):
-                houses.append(place)
-                boxes.append(house)
-                for _ in range(int(rng.integers(1, 4))):  # porches, bays and pilasters
-                    at, out = float(rng.uniform(-0.4, 0.35)) * width, float(rng.uniform(0.25, 0.9))
-                    wide = float(rng.uniform(0.6, 2.2))
-                    low, high = ((-DEEP, top), (-DEEP, 2.6), (1.0, 4.5))[rng.integers(3)]
-                    boxes.append(
-                        kerb.box(middle + at, middle + at + wide, setback - out, setback, low, high)
-                    )
-            x, y, z = kerb.place(middle, float(rng.uniform(5.8, 7.0)))
-            post = [x, y, 0.0, 0.3, 0.3, 1.0, 0.0]
-            if chance < 0.5 and free(post, _KERB):
-                cylinders.append([x, y, float(rng.uniform(0.1, 0.22)), z - DEEP, z + 5.0])
-                if chance < 0.25:
-                    size = float(rng.uniform(1.2, 1.9))
-                    crowns.append([x, y, z + 3.2 + size, size, size, size])
-            car = kerb.box(middle - 2.1, middle + 2.1, 4.2, 6.0, 0.25, 1.3)
-            if 0.3 < chance < 0.6 and free(car, _KERB):
-                boxes.append(car)
+            roadside.build(Kerb(a, b, left, ground))
         s += float(rng.uniform(9.0, 13.0))
     return Scene(
         name="city",
-        solids=grown(boxes, cylinders, crowns, ground),
+        solids=grown(roadside.boxes, roadside.cylinders, roadside.crowns, ground),
         waypoints=along(_SPACING),
         closed=False,
         speed=10.0,
         height=1.8,
         sway=CAR,
     )
+
+
+class _Roadside:
+    """What stands beside a way, and nowhere on it.
+
+    Attributes
+    ----------
+    boxes, cylinders, crowns : rows as :class:`~loam_gtsam.datasets.sim.raycast.Solids` has them
+    """
+
+    def __init__(self, path: FloatArray, rng: np.random.Generator) -> None:
+        self._path, self._rng = cKDTree(path), rng
+        self._houses: list[FloatArray] = []
+        self.boxes: list[list[float]] = []
+        self.cylinders: list[list[float]] = []
+        self.crowns: list[list[float]] = []
+
+    def build(self, kerb: Kerb) -> None:
+        """A house, a post or tree, and a parked car along a kerb, as far as there is room."""
+        width, setback, top = (self._between(*r) for r in ((8.0, 13.0), (8.0, 12.5), (5.0, 16.0)))
+        chance = float(self._rng.random())
+        middle = 0.5 * kerb.length
+        self._add_house(kerb, middle, width, setback, top)
+        x, y, z = kerb.place(middle, self._between(5.8, 7.0))
+        if chance < 0.5 and self._is_free([x, y, 0.0, 0.3, 0.3, 1.0, 0.0], _KERB):
+            self.cylinders.append([x, y, self._between(0.1, 0.22), z - DEEP, z + 5.0])
+            if chance < 0.25:
+                size = self._between(1.2, 1.9)
+                self.crowns.append([x, y, z + 3.2 + size, size, size, size])
+        car = kerb.box(middle - 2.1, middle + 2.1, 4.2, 6.0, 0.25, 1.3)
+        if 0.3 < chance < 0.6 and self._is_free(car, _KERB):
+            self.boxes.append(car)
+
+    def _add_house(
+        self, kerb: Kerb, middle: float, width: float, setback: float, top: float
+    ) -> None:
+        half = 0.5 * width
+        house = kerb.box(middle - half, middle + half, setback, setback + 10.0, -DEEP, top)
+        place = np.array(house[:2])
+        near = [np.linalg.norm(other - place) for other in self._houses]
+        if not self._is_free(house, _CLEAR) or min(near, default=np.inf) <= 9.0:
+            return
+        self._houses.append(place)
+        self.boxes.append(house)
+        for _ in range(int(self._rng.integers(1, 4))):  # porches, bays and pilasters
+            at, out = self._between(-0.4, 0.35) * width, self._between(0.25, 0.9)
+            end = middle + at + self._between(0.6, 2.2)
+            low, high = ((-DEEP, top), (-DEEP, 2.6), (1.0, 4.5))[self._rng.integers(3)]
+            self.boxes.append(kerb.box(middle + at, end, setback - out, setback, low, high))
+
+    def _is_free(self, box: list[float], margin: float) -> bool:
+        """Whether a box keeps away from the way."""
+        x, y, _, half_x, half_y, _, yaw = box
+        u, v = np.meshgrid(np.linspace(-half_x, half_x, 7), np.linspace(-half_y, half_y, 7))
+        cosine, sine = np.cos(yaw), np.sin(yaw)
+        outline = np.stack([x + cosine * u - sine * v, y + sine * u + cosine * v], axis=-1)
+        return bool(self._path.query(outline.reshape(-1, 2))[0].min() > margin)
+
+    def _between(self, low: float, high: float) -> float:
+        return float(self._rng.uniform(low, high))

@@ -6,7 +6,6 @@ simulated one to any place.
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -17,13 +16,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
-from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.types import (
     BadSweep,
     BoolArray,
     FeatureSweep,
-    FloatArray,
     ImuSamples,
     InputError,
     IntArray,
@@ -135,9 +132,7 @@ class Kidnapped:
         lidar_T_moved = np.eye(4)
         lidar_T_moved[:3, :3] = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         lidar_T_moved[:3, 3] = move
-        self._moved = copy.copy(world)  # its cached truth and IMU are not touched below
-        vars(self._moved).pop("imu", None)
-        self._moved._motion = _Moved(world._motion, lidar_T_moved)
+        self._moved = world.seen_from(lidar_T_moved)
         self._change = f"at sweep {number} by {move} m and {turn_deg:g} degrees"
 
     def __len__(self) -> int:
@@ -178,24 +173,6 @@ class Kidnapped:
         """That of the drive, with the change of place."""
         info = self._world.info()
         return replace(info, facts=info.facts | {"kidnapped": self._change})
-
-
-class _Moved(Motion):
-    """A motion seen from a place that rides along.
-
-    Parameters
-    ----------
-    lidar_T_moved : (4, 4) that place
-    """
-
-    def __init__(self, motion: Motion, lidar_T_moved: FloatArray) -> None:
-        vars(self).update(vars(motion))  # no need to fit the path again
-        self._lidar_T_moved = lidar_T_moved
-
-    def world_T_lidar(self, times: FloatArray) -> FloatArray:
-        """See :meth:`Motion.world_T_lidar`."""
-        poses: FloatArray = super().world_T_lidar(times) @ self._lidar_T_moved
-        return poses
 
 
 def _earlier(sweep: Sweep, nanoseconds: int) -> Scan | BadSweep:

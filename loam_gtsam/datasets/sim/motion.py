@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
@@ -45,6 +47,8 @@ class Motion:
     ----------
     duration : seconds to the end of an open path, or once round a closed one
     """
+
+    _lidar_T_moved: FloatArray | None = None
 
     def __init__(self, scene: Scene, speed: float) -> None:
         self._scene = scene
@@ -102,7 +106,13 @@ class Motion:
         poses[:, :3, :3] = _rotations(roll, pitch, yaw)
         poses[:, :3, 3] = np.stack([x, y, z], axis=1)
         poses[:, 3, 3] = 1.0
-        return poses
+        return poses if self._lidar_T_moved is None else poses @ self._lidar_T_moved
+
+    def seen_from(self, lidar_T_moved: FloatArray) -> Motion:
+        """The same motion, of a lidar mounted at another place of the platform, (4, 4)."""
+        other = copy.copy(self)
+        other._lidar_T_moved = lidar_T_moved
+        return other
 
     def inertial(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """What a perfect IMU at the lidar's origin, with the lidar's axes, measures.

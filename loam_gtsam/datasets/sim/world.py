@@ -7,6 +7,7 @@ distortion and :attr:`SimulatedWorld.truth` has no error. Sweeps are independent
 
 from __future__ import annotations
 
+import copy
 import math
 from collections.abc import Iterator, Mapping
 from functools import cached_property
@@ -67,6 +68,8 @@ SENSORS: dict[str, tuple[FloatArray, int]] = {
 
 _EPOCH = 1_700_000_000_000_000_000
 """Nanoseconds of the first sweep: as large as real stamps are, which floats cannot hold."""
+_SPIN = {"rings": "field", "times": "field", "spin": "clockwise", "start_azimuth_deg": 180.0}
+"""What all sensors have in common."""
 _MIN_RANGE = 0.5
 """Metres."""
 _IMU_PERIOD = 5_000_000
@@ -144,26 +147,24 @@ class SimulatedWorld:
             raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
-        for label, number in (("seed", seed), ("frames", frames), ("columns", columns)):
-            if number is not None and not isinstance(number, (int, np.integer)):
-                raise ConfigError(f"{label}: expected a whole number, got {number!r}")
-        _at_least("seed", seed, 0)
+        _whole_at_least("seed", seed, 0)
+        _whole_at_least("frames", frames, 1)
+        _whole_at_least("columns", columns, 8)
         self.scene = _BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
-        for label, value, least in (
-            ("range_noise", range_noise, 0.0),
-            ("foliage_noise", foliage_noise, 0.0),
-            ("rate", rate, 0.1),
-            ("speed", speed, 0.01),
-            ("columns", self._columns, 8),
-            ("max_range", max_range, _MIN_RANGE),
-            ("imu_noise", imu_noise, 0.0),
-            ("gyro_noise", gyro_noise, 0.0),
-            ("acceleration_noise", acceleration_noise, 0.0),
-        ):
-            _at_least(label, value, least)
+        for label, value in {
+            "range_noise": range_noise,
+            "foliage_noise": foliage_noise,
+            "imu_noise": imu_noise,
+            "gyro_noise": gyro_noise,
+            "acceleration_noise": acceleration_noise,
+        }.items():
+            _at_least(label, value, 0.0)
+        _at_least("rate", rate, 0.1)
+        _at_least("speed", speed, 0.01)
+        _at_least("max_range", max_range, _MIN_RANGE)
         if not 0.0 <= dropout < 1.0:
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
         self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
@@ -174,25 +175,10 @@ class SimulatedWorld:
         self._motion = Motion(self.scene, speed)
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"
-        self.sensor: Mapping[str, Any] = {
-            "model": sensor,
-            "rings": "field",
-            "times": "field",
-            "spin": "clockwise",
-            "start_azimuth_deg": 180.0,
-            "period": 1.0 / rate,
-        }
-        turn = np.arange(self._columns) / self._columns
-        azimuth = np.pi - 2.0 * np.pi * turn[:, None]
-        elevation = np.deg2rad(elevations)[None, :]
-        self._times = turn / rate
-        self._beams = np.stack(
-            [
-                np.cos(azimuth) * np.cos(elevation),
-                np.sin(azimuth) * np.cos(elevation),
-                np.broadcast_to(np.sin(elevation), (self._columns, len(elevations))),
-            ]
-        )
+        self.sensor: Mapping[str, Any] = _SPIN | {"model": sensor, "period": 1.0 / rate}
+        turns = np.arange(self._columns) / self._columns
+        self._times = turns / rate
+        self._beams = _beam_directions(turns, elevations)
         self.world_T_start: FloatArray = self._motion.world_T_lidar(np.zeros(1))[0]
 
     def __len__(self) -> int:
@@ -232,6 +218,17 @@ class SimulatedWorld:
             rings=ring.astype(np.int32),
             span=(0.0, 1.0 / self._rate),
         )
+
+    def seen_from(self, lidar_T_moved: FloatArray) -> SimulatedWorld:
+        """The same drive, of a lidar mounted at another place of the platform, (4, 4).
+
+        Poses stay relative to the start of this drive.
+        """
+        other = copy.copy(self)
+        for cached in ("truth", "imu"):
+            other.__dict__.pop(cached, None)
+        other._motion = self._motion.seen_from(lidar_T_moved)
+        return other
 
     @cached_property
     def truth(self) -> Trajectory:
@@ -301,7 +298,6 @@ class SimulatedWorld:
         available = math.floor(self._motion.duration * self._rate)
         once = available + round(2.0 * self._rate) if self.scene.closed else available
         count = frames if frames is not None else self.scene.frames or once
-        _at_least("frames", count, 1)
         if not self.scene.closed and count > available:
             raise ConfigError(
                 f"frames: the path of {self.scene.name!r} ends after {available} sweeps at this "
@@ -310,9 +306,28 @@ class SimulatedWorld:
         return count
 
 
+def _beam_directions(turns: FloatArray, elevations_deg: FloatArray) -> FloatArray:
+    """(3, columns, beams) unit vectors, clockwise from straight behind."""
+    azimuth = np.pi - 2.0 * np.pi * turns[:, None]
+    elevation = np.deg2rad(elevations_deg)[None, :]
+    return np.stack(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.broadcast_to(np.sin(elevation), (len(turns), len(elevations_deg))),
+        ]
+    )
+
+
 def _seconds(stamps: IntArray) -> FloatArray:
     """Since the first sweep; the difference is taken in integers."""
     return (stamps - _EPOCH).astype(np.float64) * 1e-9
+
+
+def _whole_at_least(name: str, value: int | None, least: int) -> None:
+    if value is not None and not isinstance(value, (int, np.integer)):
+        raise ConfigError(f"{name}: expected a whole number, got {value!r}")
+    _at_least(name, least if value is None else value, least)
 
 
 def _at_least(name: str, value: float, least: float) -> None:

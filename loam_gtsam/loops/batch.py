@@ -13,6 +13,8 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from loam_gtsam.config import PoseGraphConfig
 from loam_gtsam.loops.consistency import chi_squared, loop_to_switch, relative_pose_covariance
@@ -156,37 +158,31 @@ def optimize_graph(
 
 
 def _check(saved: SavedGraph) -> None:
-    """Refuse a graph whose factors leave a variable without a pose or a connection."""
-    keys = list(saved.poses.keys())
+    """Refuse a graph whose factors leave a variable without a value or a connection."""
+    keys = sorted(saved.poses.keys())
     if not keys:
         raise InputError("graph: expected poses, got none")
     name = gtsam.DefaultKeyFormatter
-    groups = {key: key for key in keys}
+    rank = {key: place for place, key in enumerate(keys)}
+    pairs: list[tuple[int, int]] = []
     held: list[int] = []
-
-    def group(key: int) -> int:
-        while groups[key] != key:
-            groups[key] = groups[groups[key]]
-            key = groups[key]
-        return key
-
     for place in range(saved.factors.size()):
         connected: list[int] = saved.factors.at(place).keys()
-        missing = [key for key in connected if key not in groups]
+        missing = [key for key in connected if key not in rank]
         if missing:
             raise InputError(
                 f"graph: factor {place} is on the key {name(missing[0])}, which has no pose"
             )
-        if len(connected) == 1:
-            held += connected
-        for key in connected[1:]:
-            groups[group(key)] = group(connected[0])
-    reached = {group(key) for key in held or saved.keys[:1]}
-    loose = [key for key in groups if group(key) not in reached]
-    if loose:
+        held += [rank[key] for key in connected if len(connected) == 1]
+        pairs += [(rank[connected[0]], rank[key]) for key in connected[1:]]
+    ends = np.array(pairs, np.int64).reshape(-1, 2).T
+    links = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(len(keys), len(keys)))
+    group = connected_components(links, directed=False)[1]
+    loose = np.flatnonzero(~np.isin(group, group[held or [rank[saved.keys[0]]]]))
+    if len(loose):
         raise InputError(
-            f"graph: {len(loose)} poses, {name(min(loose))} the first, are connected to none that "
-            "is held; leave them out, or add the factors that connect them"
+            f"graph: {len(loose)} poses, {name(keys[loose[0]])} the first, are connected to none "
+            "that is held; leave them out, or add the factors that connect them"
         )
 
 

@@ -1,8 +1,9 @@
-"""Finding loops: where the sensor may have been before, and whether what it sees there fits.
+"""Loop closers: they find earlier keyframes at the same place, and the motion in between.
 
-A loop closer is anything with :meth:`LoopCloser.detect`. The one of this package looks for
-keyframes that are near enough for what is known of the drift and that look alike, and registers the
-new keyframe against the features of those around the old one, with the factor graph of the mapper.
+A loop closer is any object with the method :meth:`LoopCloser.detect`. The loop closer of this
+package looks for keyframes that are near enough, given the drift, and that look alike. It registers
+the new keyframe with the factor graph of the mapper, against the features of the keyframes around
+the old one.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
-from loam_gtsam.loops.scan_context import describe, heading_free, unlike
+from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
 from loam_gtsam.registration.association import associate, trial_matching
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ScanMatches, subset
@@ -31,65 +32,70 @@ from loam_gtsam.registration.solvers import GtsamSolver, Solution
 from loam_gtsam.types import FloatArray, IntArray
 
 _ALIKE = 10
-"""Keyframes with the most similar heading-free descriptors that are compared in full."""
+"""Number of keyframes with the most similar heading-free keys that are compared in full."""
 _NEAR = (0.03, 0.2)
-"""Metres and degrees: a step of a trial that is smaller ends it."""
+"""Metres and degrees: a smaller step ends a trial."""
 _STARTS = 3
-"""Poses from the search around a candidate from which a few matches are tried."""
+"""Number of poses from the search around a candidate at which a trial starts."""
 
 _LEVEL = 0.7
-"""Cosine between a normal and up from which a plane is level: slopes are no landmarks."""
+"""Cosine between the normal of a plane and up, above which the plane is level; slopes are."""
 
 
 class LoopCloser(Protocol):
-    """Finds loops."""
+    """An object that finds loop closures.
+
+    A loop closer that remembers keyframes should have a method ``reset()``, too.
+    """
 
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
-        """Look whether a new keyframe was seen before.
+        """Look for an earlier keyframe at the place of a new one.
+
+        The method is called once for each keyframe, in order.
 
         Parameters
         ----------
-        keyframe : the newest of ``history``; to be called once for each, in order
-        history : all keyframes so far, to look at and not to change
+        keyframe : newest keyframe of ``history``
+        history : pose graph with all keyframes so far, which must not be changed
 
         Returns
         -------
-        A loop with ``later`` being the keyframe; None if there is none.
+        A loop closure whose ``later`` is the number of the keyframe; None if there is none.
         """
         ...
 
 
 class Rejection(StrEnum):
-    """Why there is no loop."""
+    """The reason why a keyframe or a candidate gave no loop closure."""
 
     NO_FEATURES = "no_features"
-    """The keyframe has no features to be looked for with."""
+    """The keyframe has no features."""
     TOO_RECENT = "too_recent"
-    """No keyframe is far enough back on the way."""
+    """No keyframe is far enough back, in metres travelled."""
     OUT_OF_REACH = "out_of_reach"
-    """All of those are too far away, however uncertain the poses are."""
+    """All earlier keyframes are too far away, even if the poses are as wrong as they may be."""
     UNLIKE = "unlike"
-    """The candidate looks different."""
+    """The descriptor of the candidate is too different."""
     FEW_MATCHES = "few_matches"
-    """Verification: too few matches to solve for the motion."""
+    """The registration has too few matches to solve for the motion."""
     LITTLE_OVERLAP = "little_overlap"
-    """Verification: too few of the features find a match."""
+    """The registration matches too few of the features."""
     DISAGREES = "disagrees"
-    """Verification: the matches do not lie where they should."""
+    """The registration leaves too many of its matches far apart."""
     DEGENERATE = "degenerate"
-    """Verification: the features do not fix the motion in some direction, as along a corridor."""
+    """The registration leaves a direction free, as along a corridor."""
 
 
 @dataclass(slots=True)
 class LoopStatistics:
-    """What became of the keyframes and candidates.
+    """Counts of what a loop closer did with keyframes and candidates.
 
     Attributes
     ----------
-    keyframes : that were looked at
-    candidates : keyframes that were verified, or compared and rejected
-    verified : loops that were returned
-    rejected : how many keyframes or candidates for which reason
+    keyframes : number of keyframes for which loop closures were looked for
+    candidates : number of earlier keyframes that were registered, or rejected by their descriptor
+    verified : number of loop closures that were returned
+    rejected : number of keyframes and candidates by the reason of their rejection
     """
 
     keyframes: int = 0
@@ -99,7 +105,7 @@ class LoopStatistics:
 
 
 class ScanLoopCloser:
-    """Finds loops of one pose graph by position, descriptor and registration.
+    """Finds loop closures of one pose graph by position, descriptor and registration.
 
     Parameters
     ----------
@@ -107,14 +113,14 @@ class ScanLoopCloser:
 
     Attributes
     ----------
-    statistics : of this closer so far
+    statistics : counts since the beginning or the last :meth:`reset`
     """
 
     def __init__(self, config: Config | None = None) -> None:
         self._whole = config or Config()
         self.config = self._whole.loops
         self._solver = GtsamSolver(self._whole.solver)
-        # Of a trial it is enough to be near; what follows it goes the rest of the way.
+        # A trial only has to come near: a full registration follows the best one.
         self._rough_solver = GtsamSolver(
             self._whole.solver.changed(
                 translation_tolerance=_NEAR[0],
@@ -158,12 +164,16 @@ class ScanLoopCloser:
     def verify(
         self, keyframe: Keyframe, candidate: int, history: PoseGraph, turn: float = 0.0
     ) -> LoopClosure | Rejection:
-        """Register a keyframe against the features of the keyframes around another one.
+        """Register a keyframe against the features of the keyframes around a candidate.
 
         Parameters
         ----------
-        candidate : number of the other one
-        turn : rad about z that the lidar is thought to be turned against the candidate's
+        candidate : number of an earlier keyframe
+        turn : rad about z by which the lidar is turned against the candidate, as far as known
+
+        Returns
+        -------
+        The loop closure, or the reason why the registration is not believed.
         """
         whole, config = self._whole, self.config
         maps = self._submap(keyframe, candidate, history)
@@ -208,11 +218,11 @@ class ScanLoopCloser:
     # -- inside --------------------------------------------------------------------------------
 
     def _describe(self, history: PoseGraph) -> None:
-        """Descriptor and standard deviation of the position of keyframes that have none yet."""
+        """Compute descriptor and standard deviation of the position of new keyframes."""
         for keyframe in history.keyframes[len(self._descriptors) :]:
             points = np.concatenate([keyframe.edges, keyframe.planes])
-            self._descriptors.append(describe(points, self.config))
-            # Loops make poses surer, so what is kept of an old one is no underestimate.
+            self._descriptors.append(scan_context(points, self.config))
+            # Later loop closures make a pose surer: the standard deviation now is an upper bound.
             spread = np.linalg.eigvalsh(history.covariance(keyframe.index)[3:, 3:])[-1]
             self._spreads.append(float(np.sqrt(max(spread, 0.0))))
 
@@ -220,7 +230,7 @@ class ScanLoopCloser:
         self.statistics.rejected[reason] += 1
 
     def _near(self, keyframe: Keyframe, history: PoseGraph) -> IntArray | Rejection:
-        """Keyframes that may be at the same place."""
+        """Numbers of the keyframes that may be at the same place."""
         config = self.config
         travelled = keyframe.travelled - np.array([other.travelled for other in history.keyframes])
         old = np.flatnonzero(travelled >= config.min_way)
@@ -228,7 +238,7 @@ class ScanLoopCloser:
             return Rejection.TOO_RECENT
         spreads = np.array(self._spreads)[old] + self._spreads[keyframe.index]
         gate = config.gate + config.gate_sigmas * spreads
-        gate += config.gate_drift * _untied(keyframe, history)[old]
+        gate += config.gate_drift * _odometry_distance(keyframe, history)[old]
         positions = history.poses()[:, :3, 3]
         away = np.linalg.norm(positions[old] - positions[keyframe.index], axis=1)
         near = old[away <= gate]
@@ -237,15 +247,15 @@ class ScanLoopCloser:
     def _alike(self, index: int, near: IntArray) -> list[tuple[int, float]]:
         """The candidates that look most alike, and how the lidar is turned against each."""
         own = self._descriptors[index]
-        tree = cKDTree([heading_free(self._descriptors[other]) for other in near.tolist()])
-        _, found = tree.query(heading_free(own), k=min(_ALIKE, len(near)))
+        tree = cKDTree([heading_free_key(self._descriptors[other]) for other in near.tolist()])
+        _, found = tree.query(heading_free_key(own), k=min(_ALIKE, len(near)))
         compared = [
-            (*unlike(self._descriptors[other], own), other)
+            (*compare_descriptors(self._descriptors[other], own), other)
             for other in near[np.sort(np.atleast_1d(found))].tolist()
         ]
         chosen: list[tuple[int, float]] = []
         for distance, turn, other in sorted(compared):
-            # Neighbours share a submap, and so a verdict.
+            # Neighbours share a submap, so one of them is enough.
             apart = all(abs(other - taken) > self.config.neighbours for taken, _ in chosen)
             if not apart or len(chosen) == self.config.tries:
                 continue
@@ -275,12 +285,12 @@ class ScanLoopCloser:
         poses = [here.between(history.pose(other.index)).matrix() for other in chosen]
         kinds = [other.edges for other in chosen], [other.planes for other in chosen]
         for cubes, parts in zip(maps, kinds, strict=True):
-            moved = [transform(pose, part) for pose, part in zip(poses, parts, strict=True)]
-            cubes.insert(np.concatenate(moved))
+            points = [transform(pose, part) for pose, part in zip(poses, parts, strict=True)]
+            cubes.insert(np.concatenate(points))
         return maps
 
     def _judged(self, fit: Fit) -> Rejection | None:
-        """What is wrong with a registration; None if it is to be believed."""
+        """The reason to reject a registration; None if it is believed."""
         if fit.share < self.config.min_share:
             return Rejection.LITTLE_OVERLAP
         return Rejection.DISAGREES if fit.agreement < self.config.min_agreement else None
@@ -288,10 +298,10 @@ class ScanLoopCloser:
     def _covariance(
         self, solution: Solution, earlier: Keyframe, later: Keyframe
     ) -> FloatArray | None:
-        """(6, 6) of the loop; None if the registration leaves a direction free.
+        """(6, 6) covariance of a loop closure; None if the registration leaves a direction free.
 
-        The submap lies where the candidate and its neighbours are in the map, each off by an error
-        of its own; and what the motion within the sweep did to the keyframe's features is in its.
+        The own errors of both keyframes are added to the error of the registration: that of the
+        candidate displaces the submap, that of the new keyframe comes from de-skewing its features.
         """
         seen = localizability(solution.matches, solution.map_T_lidar)
         if seen.aligned[0] < self.config.min_aligned:
@@ -310,23 +320,23 @@ class ScanLoopCloser:
 
 
 def standing_fit(matches: ScanMatches, offered: int) -> Fit:
-    """How well what stands up fits: edges, and planes that are not level.
+    """Fit of the edges and of the planes that are not level.
 
-    Level ground fits everywhere at any heading, and where there is much of it, nearly all matches
-    of a wrong registration agree.
+    Level ground fits everywhere at any heading: where there is much of it, nearly all matches of a
+    wrong registration agree.
 
     Parameters
     ----------
-    matches : in a frame with z up, roughly
-    offered : features that were to be matched
+    matches : matches in a frame whose z axis points up, roughly
+    offered : number of features that could have been matched
     """
     standing = np.abs(matches.planes.normals[:, 2]) < _LEVEL
     level = int(np.count_nonzero(~standing))
     return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)
 
 
-def _untied(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
-    """(N,) metres along which the odometry alone leads to each keyframe: straight, or by a loop."""
+def _odometry_distance(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
+    """(N,) metres of odometry to each keyframe: straight back, or by way of one active loop."""
     travelled = np.array([other.travelled for other in history.keyframes])
     gone = keyframe.travelled - travelled
     for loop, on in zip(history.loops, history.active, strict=True):
@@ -337,6 +347,6 @@ def _untied(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
 
 
 def _heading(rotation: gtsam.Rot3) -> float:
-    """Rad about z."""
+    """Heading of a rotation, rad about z."""
     matrix = rotation.matrix()
     return float(np.arctan2(matrix[1, 0], matrix[0, 0]))

@@ -1,8 +1,9 @@
-"""A descriptor of what a place looks like from one sweep, whatever the heading.
+"""Scan Context: a descriptor of a place that can be compared at any heading.
 
-Scan Context (Kim and Kim, Scan Context: Egocentric Spatial Descriptor for Place Recognition within
-3D Point Cloud Map, IROS 2018), of features instead of all points: the height of the highest point
-in each cell of a polar grid. A turn of the lidar shifts its columns; their means do not change.
+The descriptor (Kim and Kim, Scan Context: Egocentric Spatial Descriptor for Place Recognition
+within 3D Point Cloud Map, IROS 2018) holds the height of the highest point in each cell of a polar
+grid around the lidar; here, of features instead of all points. A turn of the lidar shifts the
+columns of the grid and does not change the means of its rows.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from loam_gtsam.geometry import as_points
 from loam_gtsam.types import FloatArray, InputError
 
 _BELOW = 3.0
-"""Metres below the lidar from which heights count; lower points count as there."""
+"""Heights count from a level that is so many metres below the lidar; lower points count as 0."""
 _HIGHEST = 20.0
-"""Metres likewise; what is higher says how far a beam goes up more than what stands there."""
+"""Largest height in metres: what is higher depends on the opening angle of the lidar."""
 
 
-def describe(points: FloatArray, config: LoopConfig) -> FloatArray:
-    """Heights in a polar grid around the lidar.
+def scan_context(points: FloatArray, config: LoopConfig) -> FloatArray:
+    """Scan Context descriptor: heights in a polar grid around the lidar.
 
     Parameters
     ----------
@@ -46,14 +47,14 @@ def describe(points: FloatArray, config: LoopConfig) -> FloatArray:
     return grid.reshape(rings, sectors)
 
 
-def heading_free(descriptor: FloatArray) -> FloatArray:
-    """(rings,) what does not change with the heading, for a search tree."""
+def heading_free_key(descriptor: FloatArray) -> FloatArray:
+    """(rings,) means of the rows, which do not change with the heading, for a search tree."""
     means: FloatArray = descriptor.mean(axis=1)
     return means
 
 
-def unlike(one: FloatArray, other: FloatArray) -> tuple[float, float]:
-    """How unlike two descriptors are at the heading at which they are most alike.
+def compare_descriptors(one: FloatArray, other: FloatArray) -> tuple[float, float]:
+    """Distance of two descriptors at the heading at which they are most alike.
 
     Parameters
     ----------
@@ -61,8 +62,8 @@ def unlike(one: FloatArray, other: FloatArray) -> tuple[float, float]:
 
     Returns
     -------
-    distance : 0 for equal ones, 1 for those that have nothing in common: one less the mean cosine
-        of the columns that both fill
+    distance : one less the mean cosine of the columns that both fill: 0 for equal descriptors, 1
+        for descriptors without anything in common
     turn : rad about z by which the lidar of ``other`` is turned against that of ``one``
     """
     if one.shape != other.shape:
@@ -72,7 +73,7 @@ def unlike(one: FloatArray, other: FloatArray) -> tuple[float, float]:
     filled = [np.any(grid > 0.0, axis=0, keepdims=True).astype(np.float64) for grid in (one, other)]
     both = _correlated(*filled)
     cosines = _correlated(_columns(one), _columns(other))
-    # Few columns that happen to agree are no likeness.
+    # A few columns that happen to agree must not count as a likeness.
     counts = np.maximum(both, 0.5 * min(float(part.sum()) for part in filled))
     likeness = np.divide(cosines, counts, out=np.zeros(sectors), where=counts > 0.5)
     shift = int(likeness.argmax())
@@ -81,7 +82,7 @@ def unlike(one: FloatArray, other: FloatArray) -> tuple[float, float]:
 
 
 def _columns(grid: FloatArray) -> FloatArray:
-    """Columns of length one; empty ones stay."""
+    """Columns scaled to length one; empty ones stay empty."""
     lengths = np.linalg.norm(grid, axis=0)
     unit: FloatArray = np.divide(grid, lengths, out=np.zeros_like(grid), where=lengths > 0.0)
     return unit

@@ -11,7 +11,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.workers import extract
-from loam_gtsam.loops.closure import Rejection, ScanLoopCloser, _untied
+from loam_gtsam.loops.closure import Rejection, ScanLoopCloser, _odometry_distance
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 
@@ -229,10 +229,12 @@ def test_what_loops_have_tied_is_looked_for_less_far():
     ):
         graph.add(update)
     last = graph.keyframes[-1]
-    np.testing.assert_allclose(_untied(last, graph), 78.0 - 2.0 * np.arange(40), atol=1e-6)
+    np.testing.assert_allclose(
+        _odometry_distance(last, graph), 78.0 - 2.0 * np.arange(40), atol=1e-6
+    )
     loop = LoopClosure(3, 35, graph.pose(3).between(graph.pose(35)), OWN)
     assert graph.add_loop(loop)
-    tied = _untied(last, graph)
+    tied = _odometry_distance(last, graph)
     assert tied[3] == pytest.approx(8.0)  # from the end of the loop to the last
     assert tied[0] == pytest.approx(8.0 + 6.0)
     assert tied[37] == pytest.approx(4.0)

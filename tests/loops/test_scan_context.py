@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from loam_gtsam.config import LoopConfig
-from loam_gtsam.loops.scan_context import describe, heading_free, unlike
+from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
 from loam_gtsam.types import InputError
 
 
@@ -33,53 +33,55 @@ def test_a_cell_has_the_height_of_its_highest_point():
     expected[0, 0] = 5.0  # 2 m above the lidar, which stands for 3
     expected[2, 2] = 4.0
     expected[1, 1] = 20.0  # the highest that counts
-    np.testing.assert_array_equal(describe(points, config), expected)
+    np.testing.assert_array_equal(scan_context(points, config), expected)
 
 
 @pytest.mark.parametrize("sectors", [7, -13, 30])
 def test_a_turn_is_found_and_changes_nothing_else(sectors):
     config = LoopConfig()
     angle = 2.0 * np.pi * sectors / config.sectors
-    one = describe(posts(1), config)
+    one = scan_context(posts(1), config)
     # Not on the border of a sector, where rounding decides.
-    other = describe(turned(posts(1), angle), config)
-    distance, turn = unlike(one, other)
+    other = scan_context(turned(posts(1), angle), config)
+    distance, turn = compare_descriptors(one, other)
     assert abs((turn - angle + np.pi) % (2.0 * np.pi) - np.pi) < 1e-9
     assert distance < 0.05
-    np.testing.assert_allclose(heading_free(one), heading_free(other), atol=0.2)
+    np.testing.assert_allclose(heading_free_key(one), heading_free_key(other), atol=0.2)
 
 
-def test_other_places_are_unlike():
+def test_other_places_are_compare_descriptors():
     config = LoopConfig()
-    one = describe(posts(1), config)
-    assert unlike(one, one) == (pytest.approx(0.0, abs=1e-12), 0.0)
-    near = describe(posts(1) - [1.0, 0.5, 0.0], config)
-    others = [unlike(one, describe(posts(seed), config))[0] for seed in range(2, 8)]
-    assert unlike(one, near)[0] < min(others)
+    one = scan_context(posts(1), config)
+    assert compare_descriptors(one, one) == (pytest.approx(0.0, abs=1e-12), 0.0)
+    near = scan_context(posts(1) - [1.0, 0.5, 0.0], config)
+    others = [
+        compare_descriptors(one, scan_context(posts(seed), config))[0] for seed in range(2, 8)
+    ]
+    assert compare_descriptors(one, near)[0] < min(others)
     assert min(others) > 0.4
 
 
 def test_empty_places_are_like_nothing():
     config = LoopConfig()
-    empty = describe(np.zeros((0, 3)), config)
-    assert unlike(empty, empty)[0] == 1.0
-    assert unlike(empty, describe(posts(1), config))[0] == 1.0
+    empty = scan_context(np.zeros((0, 3)), config)
+    assert compare_descriptors(empty, empty)[0] == 1.0
+    assert compare_descriptors(empty, scan_context(posts(1), config))[0] == 1.0
 
 
 def test_a_few_columns_that_agree_are_no_likeness():
     config = LoopConfig()
-    one = describe(posts(1), config)
+    one = scan_context(posts(1), config)
     some = np.zeros_like(one)
     some[:, :6] = one[:, :6]
-    other = describe(posts(2), config)
+    other = scan_context(posts(2), config)
     other[:, :6] = one[:, :6]
     other[:, 6:40] = 0.0
-    assert unlike(some, one)[0] < 0.05  # all that it has agrees
-    assert unlike(other, one)[0] > 0.3
+    assert compare_descriptors(some, one)[0] < 0.05  # all that it has agrees
+    assert compare_descriptors(other, one)[0] > 0.3
 
 
 def test_wrong_shapes_are_refused():
     with pytest.raises(InputError, match=r"points: expected \(N, 3\)"):
-        describe(np.zeros((4, 2)), LoopConfig())
+        scan_context(np.zeros((4, 2)), LoopConfig())
     with pytest.raises(InputError, match="expected equal shapes"):
-        unlike(np.zeros((20, 60)), np.zeros((20, 30)))
+        compare_descriptors(np.zeros((20, 60)), np.zeros((20, 30)))

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.list_dataset import ListDataset
 
-from loam_gtsam.config import Config, preset
+from loam_gtsam.config import Config, MapConfig, preset
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.io.checkpoint import Checkpoint
@@ -21,10 +21,6 @@ from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import DatasetError, OutputError
-
-
-def changed(config=None, **sections):
-    return (config or Config()).changed(sections)
 
 
 def assert_same(one, two):
@@ -79,21 +75,21 @@ def held_near_the_start(context):
     return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)]
 
 
-LOOPS = changed(loops={"enabled": True, "min_way": 6.0}, pose_graph={"keyframe_distance": 1.0})
-DENSE = changed(pose_graph={"keyframe_distance": 0.5})
+LOOPS = Config().changed("loops.enabled=true", "loops.min_way=6", "pose_graph.keyframe_distance=1")
+DENSE = Config().changed("pose_graph.keyframe_distance=0.5")
 CASES = {
     "plain": ("street_loop?frames=8", Config(), [1, 2, 5]),
     "imu in the graph": (
         "corridor?frames=16",
-        changed(imu={"preintegration": True, "lag": 5}),
+        Config().changed("imu.preintegration=true", "imu.lag=5"),
         [3, 11],
     ),
-    "scan to scan": ("trees?frames=6", changed(odometry={"method": "scan_to_scan"}), [4]),
+    "scan to scan": ("trees?frames=6", Config().changed("odometry.method=scan_to_scan"), [4]),
     "classical": ("room?frames=8", preset("aloam"), [4]),
     "loops": ("room?frames=60&columns=400&speed=3", LOOPS, [20, 52]),
     "loops and imu in the graph": (
         "room?frames=12&columns=400&speed=3",
-        changed(LOOPS, imu={"preintegration": True}),
+        LOOPS.changed("imu.preintegration=true"),
         [7],
     ),
     "own closer": ("room?frames=40&columns=400&speed=4", DENSE, [12, 33]),
@@ -145,8 +141,9 @@ def test_an_own_solver_is_given_again(tmp_path):
 
 
 def test_a_map_with_cubes_in_memory_and_on_disk_goes_on_as_it_was(tmp_path):
-    places = {"archive_megabytes": 0.01, "archive_dir": str(tmp_path)}
-    config = changed(map=places | {"window": (3, 3, 3), "window_margin": 0}).map
+    config = MapConfig(
+        archive_megabytes=0.01, archive_dir=str(tmp_path), window=(3, 3, 3), window_margin=0
+    )
     rng = np.random.default_rng(0)
 
     def drive(cubes, start, end, rng):
@@ -259,7 +256,7 @@ def test_another_configuration_is_told(tmp_path):
     dataset = open_dataset("sim:room?frames=3")
     stopped(dataset, Config(), tmp_path / "checkpoint", 2)
     with pytest.raises(OutputError, match="another run: its configuration"):
-        stopped(dataset, changed(solver={"iterations": 7}), tmp_path / "checkpoint", None)
+        stopped(dataset, Config().changed("solver.iterations=7"), tmp_path / "checkpoint", None)
     with pytest.raises(OutputError, match="another run: its data set was room"):
         stopped(open_dataset("sim:trees?frames=3"), Config(), tmp_path / "checkpoint", None)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from support.trajectories import random_trajectory
+from support.trajectories import winding
 
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.io.trajectories import write_kitti, write_tum
@@ -23,7 +23,7 @@ def test_tum_stamps_survive_to_the_nanosecond(tmp_path_factory, stamps):
 
 
 def test_tum_poses_survive(tmp_path):
-    trajectory = random_trajectory(50)
+    trajectory = winding(50, step=30.0)
     write_tum(tmp_path / "t.tum", trajectory, comments={"made by": "a\ntest"})
     again = read_tum(tmp_path / "t.tum")
     np.testing.assert_array_equal(again.stamps, trajectory.stamps)
@@ -34,7 +34,7 @@ def test_tum_poses_survive(tmp_path):
 
 
 def test_kitti_has_twelve_numbers_a_line(tmp_path):
-    trajectory = random_trajectory(3)
+    trajectory = winding(3)
     write_kitti(tmp_path / "t.txt", trajectory)
     rows = np.loadtxt(tmp_path / "t.txt")
     np.testing.assert_allclose(rows, trajectory.map_T_lidar[:, :3].reshape(3, 12), rtol=1e-11)

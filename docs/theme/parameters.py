@@ -7,6 +7,7 @@ from typing import Any
 from mkdocs.structure.files import File, Files
 
 from loam_gtsam import Config, preset
+from loam_gtsam.config import meaning
 
 _INTRO = """# Parameters
 
@@ -25,17 +26,17 @@ def text() -> str:
     """The page as Markdown."""
     parts = [_INTRO]
     default = Config()
-    for name, section in Config.parameters().items():
+    for name, section in Config.model_fields.items():
         values = getattr(default, name)
-        parts.append(f"## {name}\n\n{section.description.capitalize()}.\n")
+        parts.append(f"## {name}\n\n{meaning(section)}\n")
         parts.append("| key | default | `loam` | `aloam` | meaning |\n|---|---|---|---|---|")
-        for key, parameter in values.parameters().items():
+        for key, field in type(values).model_fields.items():
             own = getattr(values, key)
             others = (getattr(getattr(preset(p), name), key) for p in ("loam", "aloam"))
             columns = ["" if other == own else shown(other) for other in others]
-            meaning = parameter.meaning.replace("|", "\\|")
+            explained = meaning(field).replace("|", "\\|")
             parts.append(
-                f"| `{name}.{key}` | {shown(own)} | {columns[0]} | {columns[1]} | {meaning} |"
+                f"| `{name}.{key}` | {shown(own)} | {columns[0]} | {columns[1]} | {explained} |"
             )
         parts.append("")
     return "\n".join(parts)

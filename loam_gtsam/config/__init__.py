@@ -6,7 +6,7 @@ returns a named one; :meth:`Config.changed` and :meth:`Section.changed` change v
 :func:`dump_config` writes YAML with the meaning of every key as a comment.
 """
 
-from loam_gtsam.config.base import Parameter, Section
+from loam_gtsam.config.base import Section, meaning
 from loam_gtsam.config.files import (
     config_from_dict,
     config_to_dict,
@@ -35,7 +35,6 @@ __all__ = [
     "MapConfig",
     "MatchingConfig",
     "OdometryConfig",
-    "Parameter",
     "PoseGraphConfig",
     "RelocalizationConfig",
     "Section",
@@ -45,6 +44,7 @@ __all__ = [
     "config_to_dict",
     "dump_config",
     "load_config",
+    "meaning",
     "parse_config",
     "preset",
 ]

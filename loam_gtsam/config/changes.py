@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 from ruamel.yaml import YAML
 from ruamel.yaml.scalarbool import ScalarBoolean
 
-from loam_gtsam.config.base import RefusedError, Section, nearest, shown
+from loam_gtsam.config.base import RefusedError, Section, shown
 from loam_gtsam.types import ConfigError
 
 AnySection = TypeVar("AnySection", bound=Section)
@@ -33,28 +33,22 @@ def override(
     ConfigError
         Naming the key, its place, what was expected and what came.
     """
-    known = type(section).model_fields
     values: dict[str, Any] = {}
+    keys: dict[str, Any] = {}
     for key, value in data.items():
-        path = (*above, key)
-        if key not in known:
-            name = ".".join(path) if isinstance(key, str) else shown(key)
-            raise ConfigError(f"{where(path)}unknown key {shown(name)}{nearest(key, known)}")
-        current = getattr(section, key)
-        if not isinstance(current, Section):
-            values[key] = _plain(value)
-        elif isinstance(value, Mapping):
-            values[key] = override(current, value, where, path)
+        name = key if isinstance(key, str) else shown(key)
+        current = vars(section).get(name)
+        if isinstance(current, Section) and isinstance(value, Mapping):
+            values[name] = override(current, value, where, (*above, name))
         else:
-            raise ConfigError(
-                f"{where(path)}{'.'.join(path)} is a section, expected a mapping, "
-                f"got {shown(value)}"
-            )
+            values[name] = _plain(value)
+        keys[name] = key
     try:
-        return section.changed(**values)
+        return Section.changed(section, **values)
     except RefusedError as error:
-        path = (*above, next(key for key in error.keys if key in data))
-        raise ConfigError(f"{where(path)}{'.'.join(path)}: {error.reason}") from None
+        name = next(key for key in error.keys if key in keys)
+        full = ".".join((*above, name))
+        raise ConfigError(f"{where((*above, keys[name]))}{full}: {error.reason}") from None
 
 
 def _plain(value: Any) -> Any:
@@ -81,19 +75,10 @@ def with_changes(
         If a text is no key with a YAML value, or as from :func:`override`.
     """
     tree: dict[str, Any] = {}
-    texts: dict[tuple[Any, ...], str] = {}
+    where = f"{source}: " if source else ""
     for change in changes:
-        if isinstance(change, str):
-            key, value = _assignment(change, source)
-            texts[tuple(key.split("."))] = change
-            change = {key: value}
-        _merge(tree, change)
-
-    def where(path: tuple[Any, ...]) -> str:
-        place = f"{source} {texts.get(path, '')}".strip()
-        return f"{place}: " if place else ""
-
-    return override(section, tree, where)
+        _merge(tree, _assignment(change, where) if isinstance(change, str) else change)
+    return override(section, tree, lambda _: where)
 
 
 def _merge(tree: dict[str, Any], change: Mapping[str, Any]) -> None:
@@ -110,12 +95,11 @@ def _merge(tree: dict[str, Any], change: Mapping[str, Any]) -> None:
             tree[name] = value
 
 
-def _assignment(text: str, source: str) -> tuple[str, Any]:
+def _assignment(text: str, where: str) -> dict[str, Any]:
     key, separator, value = text.partition("=")
-    where = f"{source} {text}".strip()
     if not separator or not key.strip():
-        raise ConfigError(f"{where}: expected SECTION.KEY=VALUE")
+        raise ConfigError(f"{where}expected SECTION.KEY=VALUE, got {text!r}")
     try:
-        return key.strip(), YAML(typ="safe", pure=True).load(value)
+        return {key.strip(): YAML(typ="safe", pure=True).load(value)}
     except Exception as error:  # a day 32 is a ValueError, deep nesting a RecursionError
-        raise ConfigError(f"{where}: {value!r} is not a YAML value") from error
+        raise ConfigError(f"{where}{text}: {value!r} is not a YAML value") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -10,10 +11,12 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from loam_gtsam.config.base import Section, nearest, shown
+from loam_gtsam.config.base import Section, meaning, nearest, shown
 from loam_gtsam.config.changes import override
 from loam_gtsam.config.tree import PRESETS, Config
 from loam_gtsam.types import ConfigError
+
+_WIDTH = 100
 
 
 def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:
@@ -84,7 +87,7 @@ def parse_config(text: str, source: str = "config") -> Config:
 def dump_config(config: Config) -> str:
     """YAML text in which every key is explained by a comment."""
     yaml = YAML()
-    yaml.width = 100
+    yaml.width = _WIDTH
     out = io.StringIO()
     yaml.dump(_commented(config, 0), out)
     return out.getvalue()
@@ -92,7 +95,7 @@ def dump_config(config: Config) -> str:
 
 def _commented(section: Section, indent: int) -> CommentedMap:
     result = CommentedMap()
-    for name, parameter in section.parameters().items():
+    for name, field in type(section).model_fields.items():
         value = getattr(section, name)
         if isinstance(value, Section):
             value = _commented(value, indent + 2)
@@ -100,8 +103,6 @@ def _commented(section: Section, indent: int) -> CommentedMap:
             value = CommentedSeq(value)
             value.fa.set_flow_style()
         result[name] = value
-        text = parameter.meaning
-        if parameter.choices:
-            text += "; one of: " + ", ".join(parameter.choices)
+        text = textwrap.fill(meaning(field), _WIDTH - indent - 2, break_on_hyphens=False)
         result.yaml_set_comment_before_after_key(name, before=text, indent=indent)
     return result

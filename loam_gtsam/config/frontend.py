@@ -8,138 +8,107 @@ from loam_gtsam.config.base import Section, parameter
 
 
 class SensorConfig(Section):
-    """What the sweep looks like, where the data does not say it itself."""
+    """The properties of the lidar and of its sweeps that the data itself does not tell."""
 
     in_order = (("min_range", "max_range"),)
 
     model: Literal["auto", "vlp16", "hdl32", "hdl64", "os1-16", "os1-32", "os1-64", "os1-128"] = (
-        parameter("auto", "elevation table for rings from elevation; auto detects it from the data")
+        parameter("auto")
     )
-    rings: Literal["auto", "field", "rows", "elevation"] = parameter(
-        "auto", "where beam numbers come from; auto tries the three in this order"
-    )
-    times: Literal["auto", "field", "azimuth", "none"] = parameter(
-        "auto", "where per-point times come from; none runs without de-skew"
-    )
-    spin: Literal["auto", "clockwise", "counterclockwise"] = parameter(
-        "auto", "sense of rotation seen from above, for times from azimuth"
-    )
-    start_azimuth_deg: float = parameter(
-        180.0,
-        "azimuth (from x towards y) at which a sweep starts",
-        unit="degrees",
-        low=-360.0,
-        high=360.0,
-    )
-    period: float = parameter(
-        0.1, "duration of a sweep, for times from azimuth", unit="s", low=1e-4
-    )
-    stamp: Literal["auto", "start", "middle", "end"] = parameter(
-        "auto",
-        "which moment of the sweep its stamp is, for times from azimuth; auto is what the data "
-        "set's layout implies (KITTI: middle), else start",
-    )
-    min_range: float = parameter(
-        0.5, "nearer points are dropped", unit="m", source="A-LOAM uses 0.3 to 5", low=0.0
-    )
-    max_range: float = parameter(120.0, "farther points are dropped", unit="m", low=0.0)
+    """The model of the lidar selects the table of beam elevations for rings from elevations; auto
+    detects the model from the data."""
+    rings: Literal["auto", "field", "rows", "elevation"] = parameter("auto")
+    """Ring numbers of the points come from a field of the cloud, from its rows or from the
+    elevations of the points; auto tries the three in this order."""
+    times: Literal["auto", "field", "azimuth", "none"] = parameter("auto")
+    """Times of the points come from a field of the cloud or from the azimuths of the points; auto
+    tries the two in this order, and none maps the sweeps without de-skewing."""
+    spin: Literal["auto", "clockwise", "counterclockwise"] = parameter("auto")
+    """The lidar rotates in this sense, seen from above; it is used for times from azimuths."""
+    start_azimuth_deg: float = parameter(180.0, unit="degrees", low=-360.0, high=360.0)
+    """A sweep starts at this azimuth, counted from x towards y."""
+    period: float = parameter(0.1, unit="s", low=1e-4)
+    """A sweep lasts this long; the duration is used for times from azimuths."""
+    stamp: Literal["auto", "start", "middle", "end"] = parameter("auto")
+    """The stamp of a sweep is this moment of it, for times from azimuths; auto takes what the
+    layout of the data set implies (KITTI: middle), else the start."""
+    min_range: float = parameter(0.5, unit="m", source="A-LOAM uses 0.3 to 5", low=0.0)
+    """Points nearer to the lidar than this are dropped."""
+    max_range: float = parameter(120.0, unit="m", low=0.0)
+    """Points farther from the lidar than this are dropped."""
 
 
 class FeatureConfig(Section):
-    """Scan registration: which points become edge and plane features."""
+    """Scan registration: the choice of edge and plane features among the points of a sweep."""
 
     in_order = (("sharp_per_sector", "edges_per_sector"),)
 
-    sectors: int = parameter(6, "sectors per ring", source="LOAM", low=1)
-    half_window: int = parameter(
-        5, "neighbours on either side in the curvature", source="LOAM", low=1
-    )
-    edge_curvature: float = parameter(
-        0.1, "least curvature |sum of differences|^2 of an edge", unit="m^2", source="LOAM", low=0.0
-    )
+    sectors: int = parameter(6, source="LOAM", low=1)
+    """Every ring is divided into this many sectors, which each give their own features."""
+    half_window: int = parameter(5, source="LOAM", low=1)
+    """The curvature at a point takes this many neighbours on either side of it in its ring."""
+    edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
+    """An edge point needs at least this curvature, the squared norm of the sum of differences."""
     range_noise: float = parameter(
-        0.02,
-        "standard deviation of the sensor's ranges: a plane point must lie where its ring scatters "
-        "about a smooth surface by less than four times this, which foliage does not; 0 turns the "
-        "test off",
-        unit="m",
-        source="LOAM takes all points that are not edges",
-        low=0.0,
+        0.02, unit="m", source="LOAM takes all points that are not edges", low=0.0
     )
+    """The ranges of the sensor have this standard deviation. A plane point is taken only where its
+    ring scatters about a smooth surface by less than four times this value, which foliage does
+    not; 0 turns the test off."""
     post_depth: float = parameter(
-        0.5,
-        "a run of a ring too short for the curvature (a pole, a trunk) is an edge where it stands "
-        "before what is on both sides of it by more than this; 0: no such edges",
-        unit="m",
-        source="LOAM takes what its curvature finds",
-        low=0.0,
+        0.5, unit="m", source="LOAM takes only what its curvature finds", low=0.0
     )
-    post_width: float = parameter(0.5, "and is narrower than this", unit="m", low=0.0)
-    plane_curvature: float = parameter(
-        0.1, "largest curvature of a plane point", unit="m^2", source="LOAM", low=0.0
-    )
-    sharp_per_sector: int = parameter(2, "sharp edges a sector", source="LOAM", low=0)
-    edges_per_sector: int = parameter(20, "edges a sector", source="LOAM", low=0)
-    flat_per_sector: int = parameter(4, "flat plane points a sector", source="LOAM", low=0)
-    max_gap: float = parameter(
-        0.05,
-        "squared distance between neighbours at which suppression stops",
-        unit="m^2",
-        source="LOAM",
-        low=0.0,
-    )
-    occlusion_gap: float = parameter(
-        0.1,
-        "squared distance between neighbours that may be an occlusion",
-        unit="m^2",
-        source="LOAM",
-        low=0.0,
-    )
-    occlusion_ratio: float = parameter(
-        0.1,
-        "the two are on one ray if their scaled distance over range is below this",
-        source="LOAM",
-        low=0.0,
-    )
-    grazing_ratio: float = parameter(
-        0.0002,
-        "a point is grazing if both squared gaps exceed this times its squared range",
-        source="LOAM",
-        low=0.0,
-    )
-    plane_voxel: float = parameter(
-        0.2, "voxel for the plane points of one ring", unit="m", source="LOAM", low=0.0
-    )
+    """A pole, a run of a ring too short for the curvature, is an edge where it stands in front of
+    what is on both sides of it by more than this; 0 turns the search for poles off."""
+    post_width: float = parameter(0.5, unit="m", low=0.0)
+    """A run of a ring counts as a pole only if it is narrower than this."""
+    plane_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
+    """A plane point has at most this curvature."""
+    sharp_per_sector: int = parameter(2, source="LOAM", low=0)
+    """At most this many edge points of a sector count as sharp; scan-to-scan odometry uses them."""
+    edges_per_sector: int = parameter(20, source="LOAM", low=0)
+    """At most this many edge points are taken from a sector, the sharp ones included."""
+    flat_per_sector: int = parameter(4, source="LOAM", low=0)
+    """At most this many plane points of a sector count as flat; scan-to-scan odometry uses them."""
+    max_gap: float = parameter(0.05, unit="m^2", source="LOAM", low=0.0)
+    """The suppression of points beside a chosen one stops at a gap with a squared width above
+    this."""
+    occlusion_gap: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
+    """Two neighbours with a squared distance above this may be the rim of an occlusion."""
+    occlusion_ratio: float = parameter(0.1, source="LOAM", low=0.0)
+    """Two neighbours are on one ray if their distance, scaled to one range and divided by the
+    range, is below this."""
+    grazing_ratio: float = parameter(0.0002, source="LOAM", low=0.0)
+    """A beam grazes the surface if both squared gaps beside its point exceed this times the squared
+    range of the point."""
+    plane_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
+    """The plane points of one ring are thinned to one per voxel of this size."""
 
 
 class DeskewConfig(Section):
-    """Removal of the motion distortion."""
+    """De-skewing: the removal of the motion distortion from a sweep."""
 
-    enabled: bool = parameter(True, "de-skew with the guess, and again with the solution")
-    refine: bool = parameter(
-        True,
-        "de-skew again with the solution, and register the first two sweeps anew when their motion "
-        "is known; false de-skews once, with the guess",
-        source="LOAM de-skews once",
-    )
-    rotation: Literal["auto", "orientation", "constant_velocity"] = parameter(
-        "auto",
-        "rotation within a sweep: auto takes the gyro of an IMU if it covers the sweep, else a "
-        "constant velocity; orientation takes the IMU's attitude instead of its gyro",
-    )
-    reference: Literal["start", "middle", "end", "stamp"] = parameter(
-        "start", "the moment of the sweep the pose belongs to"
-    )
+    enabled: bool = parameter(True)
+    """Sweeps are de-skewed with the predicted motion, and again with the solution."""
+    refine: bool = parameter(True, source="LOAM de-skews once")
+    """Sweeps are de-skewed again with the solution, and the first two are registered anew when
+    their motion is known; false de-skews once, with the prediction."""
+    rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
+    """The rotation within a sweep comes from here: auto takes the gyro of an IMU where it covers
+    the sweep, else a constant velocity; orientation takes the attitude of the IMU in place of its
+    gyro."""
+    reference: Literal["start", "middle", "end", "stamp"] = parameter("start")
+    """The pose of a sweep is that of the lidar at this moment of the sweep."""
 
 
 class OdometryConfig(Section):
-    """The guess the mapper starts from."""
+    """The prediction of the motion, from which the mapper starts."""
 
-    method: Literal["constant_velocity", "scan_to_scan"] = parameter(
-        "constant_velocity", "where the guess comes from"
-    )
-    iterations: int = parameter(25, "scan-to-scan iterations", source="LOAM", low=1)
-    max_distance: float = parameter(
-        5.0, "scan-to-scan match distance", unit="m", source="LOAM", low=0
-    )
-    ring_gap: int = parameter(2, "rings searched above and below", source="LOAM", low=1)
+    method: Literal["constant_velocity", "scan_to_scan"] = parameter("constant_velocity")
+    """The predicted motion repeats the last one, or comes from scan-to-scan registration."""
+    iterations: int = parameter(25, source="LOAM", low=1)
+    """Scan-to-scan registration takes at most this many iterations."""
+    max_distance: float = parameter(5.0, unit="m", source="LOAM", low=0)
+    """Scan-to-scan registration matches no points farther apart than this."""
+    ring_gap: int = parameter(2, source="LOAM", low=1)
+    """Scan-to-scan registration searches this many rings above and below the ring of a match."""

@@ -1,4 +1,4 @@
-"""The map of cubes, and what happens to sweeps that do not fit it."""
+"""The map of cubes, and sweeps that do not fit it."""
 
 from __future__ import annotations
 
@@ -8,48 +8,36 @@ from loam_gtsam.config.base import Count, Section, parameter
 
 
 class MapConfig(Section):
-    """The cube map."""
+    """The map of edge and plane points, in cubes of which those in a window are in memory."""
 
     in_order = (("edge_voxel", "cube_size"), ("plane_voxel", "cube_size"))
 
-    cube_size: float = parameter(50.0, "edge length of a cube", unit="m", source="LOAM", low=1.0)
-    window: tuple[Count, Count, Count] = parameter(
-        (21, 21, 11), "cubes kept in memory along x, y, z", source="LOAM"
-    )
-    window_margin: int = parameter(
-        3,
-        "the window shifts when the sensor's cube is this near its edge",
-        unit="cubes",
-        source="LOAM",
-        low=0,
-    )
-    neighbourhood: tuple[Count, Count, Count] = parameter(
-        (5, 5, 5), "cubes around the sensor's that are matched against", source="LOAM"
-    )
-    field_of_view: bool = parameter(
-        True, "match only cubes with a corner 30 to 150 degrees off the up axis", source="LOAM"
-    )
-    edge_voxel: float = parameter(0.2, "voxel of the edge map", unit="m", source="LOAM", low=0.01)
-    plane_voxel: float = parameter(0.4, "voxel of the plane map", unit="m", source="LOAM", low=0.01)
-    insertion: Literal["settled", "centroid"] = parameter(
-        "settled",
-        "centroid re-filters a cube with its new points as LOAM does; settled keeps the first "
-        "point of a voxel",
-    )
-    archive_megabytes: float = parameter(
-        512.0,
-        "memory for cubes that left the window; beyond it the oldest go to archive_dir, "
-        "or are dropped and counted if that is not set",
-        unit="MB",
-        low=0.0,
-    )
-    archive_dir: str | None = parameter(
-        None, "folder for archived cubes; null keeps them in memory"
-    )
+    cube_size: float = parameter(50.0, unit="m", source="LOAM", low=1.0)
+    """Every cube of the map has this edge length."""
+    window: tuple[Count, Count, Count] = parameter((21, 21, 11), source="LOAM")
+    """The window holds this many cubes along x, y and z."""
+    window_margin: int = parameter(3, unit="cubes", source="LOAM", low=0)
+    """The window shifts when the cube of the sensor is this near the edge of the window."""
+    neighbourhood: tuple[Count, Count, Count] = parameter((5, 5, 5), source="LOAM")
+    """A sweep is matched with this many cubes around the sensor, along x, y and z."""
+    field_of_view: bool = parameter(True, source="LOAM")
+    """A sweep is matched only with cubes that have a corner 30 to 150 degrees off the up axis."""
+    edge_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.01)
+    """The edge map keeps one point per voxel of this size."""
+    plane_voxel: float = parameter(0.4, unit="m", source="LOAM", low=0.01)
+    """The plane map keeps one point per voxel of this size."""
+    insertion: Literal["settled", "centroid"] = parameter("settled")
+    """New points enter a cube in this way: settled keeps the first point of a voxel; centroid
+    filters the cube again with its new points, as LOAM does."""
+    archive_megabytes: float = parameter(512.0, unit="MB", low=0.0)
+    """Cubes that left the window take at most this much memory. Beyond it, the oldest go to
+    archive_dir, or are dropped and counted if archive_dir is not set."""
+    archive_dir: str | None = parameter(None)
+    """Archived cubes go to this folder; null keeps them in memory."""
 
 
 class RelocalizationConfig(Section):
-    """When a sweep counts as lost, and where its place is searched for."""
+    """The test whether a sweep is lost, and the search for its place."""
 
     in_order = (
         ("min_agreement", "found_agreement"),
@@ -57,46 +45,35 @@ class RelocalizationConfig(Section):
         ("radius", "max_radius"),
     )
 
-    enabled: bool = parameter(
-        True,
-        "watch whether sweeps fit the map as the ones before did; false believes every solve",
-        source="LOAM believes",
-    )
-    memory: int = parameter(
-        10, "sweeps before, whose median is what is usual; as many must come first", low=1
-    )
+    enabled: bool = parameter(True, source="LOAM believes every solve")
+    """Every sweep is tested, and is lost if it fits the map less well than the sweeps before it;
+    false believes every solve."""
+    memory: int = parameter(10, low=1)
+    """The usual shares are medians over this many earlier sweeps; no sweep is lost before them."""
     min_agreement: float = parameter(
-        0.8,
-        "lost if the share of matches within three standard deviations is below this times the "
-        "usual one",
-        source="at least 0.88 in the built-in scenes and KITTI, at most 0.75 when kidnapped",
-        low=0.0,
-        high=1.0,
-    )
-    min_share: float = parameter(
-        0.4,
-        "or if the share of features that are matched and agree is below this times the usual one",
-        low=0.0,
-        high=1.0,
-    )
-    found_agreement: float = parameter(
-        0.9, "found again if the first is above this times the usual one", low=0.0, high=1.0
-    )
-    found_share: float = parameter(0.6, "and the second above this", low=0.0, high=1.0)
-    max_acceleration: float = parameter(
-        60.0,
-        "a pose farther from the predicted one than this explains is a jump: it goes without "
-        "motion, and the velocity from before stays",
-        unit="m/s^2",
-        low=0.0,
-    )
-    max_turn_acceleration: float = parameter(
-        60.0, "the same for the rotation", unit="rad/s^2", low=0.0
-    )
-    radius: float = parameter(
-        10.0, "around the prediction that is searched at first", unit="m", low=0.0
-    )
-    radius_growth: float = parameter(
-        1.0, "by which the radius grows with every lost sweep", unit="m", low=0.0
-    )
-    max_radius: float = parameter(30.0, "and its limit", unit="m", low=0.0, high=100.0)
+        0.8, source="at least 0.88 was seen in the built-in scenes and KITTI, at most 0.75 when "
+        "kidnapped", low=0.0, high=1.0,
+    )  # fmt: skip
+    """A sweep is lost if the share of its matches within three standard deviations is below this
+    times the usual share."""
+    min_share: float = parameter(0.4, low=0.0, high=1.0)
+    """A sweep is lost as well if the share of its features that are matched and agree is below this
+    times the usual share."""
+    found_agreement: float = parameter(0.9, low=0.0, high=1.0)
+    """A lost sweep is found again only if the share of its matches within three standard deviations
+    is at least this times the usual share."""
+    found_share: float = parameter(0.6, low=0.0, high=1.0)
+    """A lost sweep is found again only if the share of its features that are matched and agree is
+    at least this times the usual share."""
+    max_acceleration: float = parameter(60.0, unit="m/s^2", low=0.0)
+    """A pose is a jump if it is farther from the predicted one than this acceleration explains. It
+    is handed out without a motion, and the velocity from before stays."""
+    max_turn_acceleration: float = parameter(60.0, unit="rad/s^2", low=0.0)
+    """A pose is a jump as well if its rotation differs from the predicted one by more than this
+    angular acceleration explains."""
+    radius: float = parameter(10.0, unit="m", low=0.0)
+    """The search begins within this radius about the predicted pose."""
+    radius_growth: float = parameter(1.0, unit="m", low=0.0)
+    """The radius of the search grows by this with every lost sweep."""
+    max_radius: float = parameter(30.0, unit="m", low=0.0, high=100.0)
+    """The radius of the search does not grow beyond this."""

@@ -7,7 +7,7 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
-from loam_gtsam.config.base import Section, nearest, out_of_order, parameter
+from loam_gtsam.config.base import Section, nearest, out_of_order
 from loam_gtsam.config.changes import with_changes
 from loam_gtsam.config.frontend import DeskewConfig, FeatureConfig, OdometryConfig, SensorConfig
 from loam_gtsam.config.imu import ImuConfig
@@ -21,22 +21,20 @@ from loam_gtsam.types import ConfigError
 class Config(Section):
     """The whole configuration."""
 
-    sensor: SensorConfig = parameter(SensorConfig(), "the sweep, where the data does not say it")
-    features: FeatureConfig = parameter(FeatureConfig(), "edge and plane features")
-    deskew: DeskewConfig = parameter(DeskewConfig(), "motion distortion")
-    odometry: OdometryConfig = parameter(OdometryConfig(), "the guess")
-    map: MapConfig = parameter(MapConfig(), "the cube map")
-    matching: MatchingConfig = parameter(MatchingConfig(), "association with the map")
-    solver: SolverConfig = parameter(SolverConfig(), "the per-frame solve")
-    imu: ImuConfig = parameter(ImuConfig(), "roll, pitch and rotation from an IMU")
-    relocalization: RelocalizationConfig = parameter(
-        RelocalizationConfig(), "sweeps that do not fit the map"
-    )
-    covariance: CovarianceConfig = parameter(CovarianceConfig(), "calibrated covariances")
-    pose_graph: PoseGraphConfig = parameter(PoseGraphConfig(), "keyframes and their graph")
-    loops: LoopConfig = parameter(LoopConfig(), "how loops are found and verified")
-    bag: BagConfig = parameter(BagConfig(), "what is written into a bag, or published")
-    live: LiveConfig = parameter(LiveConfig(), "queues of a live run")
+    sensor: SensorConfig = SensorConfig()
+    features: FeatureConfig = FeatureConfig()
+    deskew: DeskewConfig = DeskewConfig()
+    odometry: OdometryConfig = OdometryConfig()
+    map: MapConfig = MapConfig()
+    matching: MatchingConfig = MatchingConfig()
+    solver: SolverConfig = SolverConfig()
+    imu: ImuConfig = ImuConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
+    covariance: CovarianceConfig = CovarianceConfig()
+    pose_graph: PoseGraphConfig = PoseGraphConfig()
+    loops: LoopConfig = LoopConfig()
+    bag: BagConfig = BagConfig()
+    live: LiveConfig = LiveConfig()
 
     @model_validator(mode="after")
     def _check_matches(self) -> Self:

@@ -108,11 +108,13 @@ def test_no_parameter_is_missing_that_comes_from_the_originals_or_differs_in_a_p
     missing = []
     for section in SECTIONS:
         default = getattr(Config(), section)
-        for name, parameter in default.parameters().items():
+        for name, field in type(default).model_fields.items():
             key = f"{section}.{name}"
             own = value_of(key, Config())
             theirs = [value_of(key, preset(name)) for name in ("loam", "aloam")]
-            concerns = "LOAM" in parameter.source or any(value != own for value in theirs)
+            concerns = "LOAM" in field.json_schema_extra["source"] or any(
+                value != own for value in theirs
+            )
             if concerns and f"| `{key}` |" not in page:
                 missing.append(key)
     assert missing == []

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any, get_args
 
 import numpy as np
 from hypothesis import settings
 from hypothesis import strategies as st
+from pydantic.fields import FieldInfo
 
-from loam_gtsam.config import Config, Parameter, Section
+from loam_gtsam.config import Config, Section
+from loam_gtsam.config.base import Finite
 from loam_gtsam.types import ImuSamples, Scan
 
 WILD = [np.nan, np.inf, -np.inf, 0.0, -0.0, 1e-30, 1e30, 3e38, -3e38, 121.0, 1e6]
@@ -145,42 +147,29 @@ def configs(**fixed: Any) -> st.SearchStrategy[Config]:
     Sections in ``fixed`` are taken as they are.
     """
     sections = {
-        name: st.just(fixed[name]) if name in fixed else _section(item.kind)
-        for name, item in Config.parameters().items()
+        name: st.just(fixed[name]) if name in fixed else _section(type(item.default))
+        for name, item in Config.model_fields.items()
     }
     return st.builds(Config, **sections)
 
 
 def _section(section: type[Section]) -> st.SearchStrategy[Section]:
     values = {
-        name: st.just(item.default) | _value(item) for name, item in section.parameters().items()
+        name: st.just(field.default) | _value(field) for name, field in section.model_fields.items()
     }
     return st.fixed_dictionaries(values).map(lambda found: section(**_in_order(section, found)))
 
 
 def _in_order(section: type[Section], values: dict[str, Any]) -> dict[str, Any]:
-    lower = {one: min(values[one], values[two]) for one, two in section.in_order}
-    return values | lower
+    return values | {one: min(values[one], values[two]) for one, two in section.in_order}
 
 
-def _value(item: Parameter) -> st.SearchStrategy[Any]:
-    single: st.SearchStrategy[Any]
-    if item.choices:
-        single = st.sampled_from(item.choices)
-    elif item.kind is bool:
-        single = st.booleans()
-    elif item.kind is int:
-        least = -(2**63) + 1 if item.low is None else int(item.low)
-        single = st.integers(least, 2**63 - 1 if item.high is None else int(item.high))
-    elif item.kind is float:
-        infinite = not item.size  # entries of tuples are finite
-        single = st.floats(item.low, item.high, allow_nan=False, allow_infinity=infinite)
-    else:
-        assert item.kind is str, f"a strategy for {item} is missing"
-        single = st.text(max_size=20)
-    if item.size:
-        return st.tuples(*[single] * item.size)
-    return st.none() | single if item.optional else single
+def _value(field: FieldInfo) -> st.SearchStrategy[Any]:
+    if isinstance(field.default, tuple):
+        finite = st.floats(allow_nan=False, allow_infinity=False)
+        entries = get_args(field.annotation)
+        return st.tuples(*(finite if e is Finite else st.from_type(e) for e in entries))
+    return st.from_type(Annotated[field.annotation, *field.metadata, ""])  # type: ignore[misc]
 
 
 Step = tuple[str, float, int, int]

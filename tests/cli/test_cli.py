@@ -276,7 +276,7 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
     ("arguments", "code", "message"),
     [
         (["--set", "solver.iteratons=3"], 1, "did you mean 'iterations'"),
-        (["--set", "solver.iterations=many"], 1, "--set solver.iterations=many"),
+        (["--set", "solver.iterations=many"], 1, "--set: solver.iterations: expected int"),
         (["--set", "solver.iterations.x=1"], 1, "expected int"),
         (["--set", "solver=1"], 2, "expected SECTION.KEY=VALUE"),
         (["--set", "min_range=2"], 2, "SECTION.KEY=VALUE, for example sensor.min_range=2"),
@@ -342,7 +342,7 @@ def test_inspect_fails_on_what_cannot_be_run(opens, items, problem):
 def test_config_prints_and_writes_what_can_be_loaded():
     result = loam("config")
     assert result.exit_code == 0
-    assert "# edge length of a cube [m] (LOAM)" in result.output
+    assert "# Every cube of the map has this edge length. Unit: m. Source: LOAM." in result.output
     assert loam("config", "--output", "c.yaml").exit_code == 0
     assert Path("c.yaml").read_text() == result.output
     assert config_to_dict(load_config("c.yaml")) == config_to_dict(Config())

@@ -101,7 +101,10 @@ GTSAM = "configs: {c: gtsam}\n"
         (ROOM + "configs: {1: gtsam}", "expected names as keys, got 1"),
         (GTSAM + "sequences: {a: {frames: 3}}", "sequences.a: expected a path"),
         (GTSAM + "sequences: {a: {path: x, frames: 0}}", "sequences.a.frames: expected"),
-        (GTSAM + "sequences: {a: {path: x, set: {map.windw: 0}}}", "sequences.a.set: unknown key"),
+        (
+            GTSAM + "sequences: {a: {path: x, set: {map.windw: 0}}}",
+            "sequences.a.set: map.windw: unknown key",
+        ),
         (GTSAM + "sequences: {a: 'sim:room?seed=x'}", "sequences.a: seed: expected an integer"),
         (ROOM + GTSAM + "seeds: 3", "seeds: expected a list"),
         (ROOM + GTSAM + "seeds: [1, 1]", "seeds: expected a list of different"),

@@ -150,7 +150,14 @@ def configs(**fixed: Any) -> st.SearchStrategy[Config]:
         name: st.just(fixed[name]) if name in fixed else _section(type(item.default))
         for name, item in Config.model_fields.items()
     }
-    return st.builds(Config, **sections)
+    return st.fixed_dictionaries(sections).map(_config)
+
+
+def _config(sections: dict[str, Any]) -> Config:
+    matching, solver = sections["matching"], sections["solver"]
+    if 0 < matching.max_edges + matching.max_planes < solver.min_matches:
+        sections["matching"] = matching.changed(max_planes=0)  # no limit
+    return Config(**sections)
 
 
 def _section(section: type[Section]) -> st.SearchStrategy[Section]:

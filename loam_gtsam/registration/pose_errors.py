@@ -1,9 +1,9 @@
-"""How wrong a pose may be: covariances of poses in the map, and of the motion between two.
+"""How wrong a pose may be: covariances of poses in the map, and of the motion between two poses.
 
-The inverse of the information takes every match as independent, its standard deviation as right,
-the motion within a sweep as known and the map as exact. Here the residuals themselves tell the
-scatter, matches close together count as one, and what a constant velocity misses and the drift of
-the map are added. Equations: docs/maths/covariance.md.
+The inverse of the information takes every match as independent, the standard deviation of a match
+as right, the motion within a sweep as known and the map as exact. Here the scatter is taken from
+the residuals themselves, matches close together count as one, and two errors are added: what a
+constant velocity misses, and the drift of the map. Equations: docs/maths/covariance.md.
 """
 
 from __future__ import annotations
@@ -13,19 +13,36 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, CovarianceConfig
 from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.geometry import symmetric
-from loam_gtsam.registration.scan_error import SeenGround, scan_error
-from loam_gtsam.registration.solvers import Solution
-from loam_gtsam.types import FloatArray, InputError, MapUpdate, SweepMotion, Uncertainty
+from loam_gtsam.geometry import symmetric, transform, voxel_keys
+from loam_gtsam.registration.solvers import Solution, match_rows
+from loam_gtsam.types import (
+    BoolArray,
+    FloatArray,
+    InputError,
+    IntArray,
+    MapUpdate,
+    SweepMotion,
+    Uncertainty,
+)
+from loam_gtsam.voxels.key_table import KeyTable
+
+_PRIOR_CELLS = 6.0
+"""Weight, in cells, of the scatter of all residuals beside that of the cells: with fewer than six
+cells the scores alone do not span the six directions."""
+_LEAST_VARIANCE = 1e-6
+"""Least variance of whitened residuals: a covariance must not vanish on data without noise."""
+_REMEMBERED = 500_000
+"""Cells of one generation of :class:`SeenGround`: 4 MB."""
+_NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     """Covariance of ``earlier.map_T_lidar.between(later.map_T_lidar)``.
 
-    What a factor between two poses needs: the own errors of both frames and what the map drifted
-    between them. The drift before is common to both and cancels.
+    A factor between two poses needs this covariance. It holds the own errors of both frames and
+    the drift of the map between them. The drift before is common to both poses and cancels.
 
     Parameters
     ----------
@@ -39,7 +56,7 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     Raises
     ------
     InputError
-        If a frame was not solved, or they are not in the order of time.
+        If a frame was not solved, or ``later`` is not later than ``earlier``.
     """
     parts = []
     for name, update in (("earlier", earlier), ("later", later)):
@@ -70,10 +87,11 @@ class _Middle:
 
     Attributes
     ----------
+    stamp, map_T_lidar : nanoseconds and pose of the middle
     covariance : (6, 6) of the scan's own error
-    kept : (6,) share of it in the pose at the reference time
-    to_reference : (6, 6) adjoint
-    reference_stamp : nanoseconds
+    kept : (6,) share of the scan's own error in the pose at the reference time
+    to_reference : (6, 6) adjoint from the middle to the reference time
+    reference_stamp : nanoseconds of the reference time
     """
 
     stamp: int
@@ -89,7 +107,8 @@ class PoseErrors:
 
     Parameters
     ----------
-    config : ``covariance``, and what tells the weights of the matches and the gyro's noise
+    config : ``covariance`` is used, and from ``solver`` and ``imu`` the weights of the matches and
+        the noise of the gyro
     """
 
     def __init__(self, config: Config) -> None:
@@ -111,7 +130,7 @@ class PoseErrors:
         Parameters
         ----------
         update : of the frame
-        sweep : its features, with the motion of the solution
+        sweep : features of the frame, with the motion of the solution
         solution : of the solve, at the middle of the sweep
         """
         first = self._seen.is_empty
@@ -129,7 +148,7 @@ class PoseErrors:
         middle = solution.map_T_lidar
         to_reference = update.map_T_lidar.between(middle).AdjointMap()
         to_map = middle.AdjointMap()
-        # At the first solve all ground is new, and none goes for it: half of what a change makes.
+        # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self.config.drift if first else self.config.drift
         self._drift = self._drift + to_map @ (factor * scan.renewed) @ to_map.T
         own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
@@ -149,7 +168,7 @@ class PoseErrors:
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
     def cut(self) -> None:
-        """The frames to come do not follow those before: their clock is another."""
+        """Start anew in time: the next frame is on another clock than the frames before."""
         self._last = None
 
     def _own(
@@ -160,13 +179,13 @@ class PoseErrors:
         covariance: FloatArray,
         to_reference: FloatArray,
     ) -> tuple[FloatArray, FloatArray, _Middle]:
-        """The frame's own error at the reference time, and what it shares with the last one's.
+        """The frame's own error at the reference time, and what it shares with the last frame's.
 
-        The reference is reached from the middle by the velocity since the last middle, and so has
-        a share in the errors of both.
+        The pose at the reference time follows from the pose at the middle of the sweep by the
+        velocity since the middle of the last sweep, and so has a share in the errors of both.
         """
         last = self._last
-        if last is not None and sweep.stamp <= last.stamp:  # sweeps of unlike length
+        if last is not None and sweep.stamp <= last.stamp:  # sweeps of different length
             last = None
         seconds = np.inf if last is None else (sweep.stamp - last.stamp) * 1e-9
         share = np.full(6, sweep.middle / seconds)
@@ -181,8 +200,8 @@ class PoseErrors:
             own = own + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
             self._motion.add(last, sweep.stamp, middle, covariance)
-        # Half the acceleration times this is the distance from a line through the last two middles
-        # to the reference time, and from the middle to the mean over the sweep.
+        # The acceleration times this is the distance of an arc from its chord: at the reference
+        # time, between the last two middles, and in the mean over the sweep.
         bend = sweep.duration**2 / 24.0
         if np.isfinite(seconds):
             bend += 0.5 * sweep.middle * (seconds - sweep.middle)
@@ -214,15 +233,159 @@ class _Acceleration:
     def add(
         self, last: _Middle, stamp: int, map_T_lidar: gtsam.Pose3, covariance: FloatArray
     ) -> None:
-        """Account for the motion from one middle to the next."""
+        """Take in the motion from the middle of the last sweep to that of this one."""
         seconds = (stamp - last.stamp) * 1e-9
         velocity = gtsam.Pose3.Logmap(last.map_T_lidar.between(map_T_lidar)) / seconds
         before, self._last = self._last, (stamp, velocity)
         if before is None or before[0] != last.stamp:
             return
-        # Errors of three poses are in a second difference, with weights 1, -2, 1.
+        # A second difference has the errors of three poses, with weights 1, -2, 1.
         noise = 6.0 * np.diag(covariance) / seconds**4
         self._count += 1
         gain = max(1.0 / self._count, 1.0 / self._window)
         squared = ((velocity - before[1]) / seconds) ** 2
         self._mean = self._mean + gain * (squared - noise - self._mean)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanError:
+    """The error of one solved frame, from its matches; all about the middle of the sweep.
+
+    Attributes
+    ----------
+    covariance : (6, 6) of the pose if the map were exact
+    renewed : (6, 6) part of ``covariance`` that stems from ground matched for the first time, and
+        from weak directions, along which only the expected motion ties the pose to the map
+    user : (6, 6) share of the pose that factors beside the scan decide
+    residual_variance, effective_matches : see :class:`loam_gtsam.types.Uncertainty`
+    """
+
+    covariance: FloatArray
+    renewed: FloatArray
+    user: FloatArray
+    residual_variance: float
+    effective_matches: float
+
+
+class SeenGround:
+    """Cells of the map that have been matched; cells not matched for long are forgotten.
+
+    Parameters
+    ----------
+    size : edge length of a cell, metres
+    remembered : cells of a generation. When the younger generation is full, it becomes the older
+        one, and the older one is forgotten: if the sensor comes back to it, it counts as new.
+    """
+
+    def __init__(self, size: float, remembered: int = _REMEMBERED) -> None:
+        self._size = size
+        self._remembered = remembered
+        self._younger, self._older = KeyTable(_NO_KEYS), KeyTable(_NO_KEYS)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has been matched yet."""
+        return len(self._younger) + len(self._older) == 0
+
+    def cells(self, points_map: FloatArray) -> tuple[IntArray, BoolArray]:
+        """Number of the cell of each point (N,), and which of the C cells are new; remembers them.
+
+        Parameters
+        ----------
+        points_map : (N, 3) metres
+        """
+        keys, numbers = np.unique(voxel_keys(points_map, self._size), return_inverse=True)
+        added = self._younger.add(keys)
+        new = np.zeros(len(keys), np.bool_)
+        new[added] = ~self._older.holds(keys[added])
+        if len(self._younger) > self._remembered:
+            self._younger, self._older = KeyTable(_NO_KEYS), self._younger
+        return numbers, new
+
+
+def scan_error(
+    solution: Solution,
+    kernel_width: float,
+    seen: SeenGround,
+    config: CovarianceConfig,
+    *,
+    kernel: str = "huber",
+    with_priors: bool = True,
+) -> ScanError | None:
+    """The error of one solved frame from its residuals; None if its information is singular.
+
+    The sandwich ``B S B`` of robust statistics, with B the inverse information and S the scatter of
+    the scores ``J^T r``, summed over cells of the map before they are squared: matches in one cell
+    share map points, and their errors (Liang and Zeger, Biometrika 73, 1986; White, Econometrica
+    48, 1980).
+
+    Parameters
+    ----------
+    solution : of the solver
+    kernel_width, kernel : of the solver, for the weights of the matches if the solution has no rows
+    seen : ground matched so far; the cells of this frame are added
+    config : ``match_cell`` is used
+    with_priors : whether ``solution.information`` counts priors beside the matches
+    """
+    pose = solution.map_T_lidar
+    rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
+    residuals, jacobian = rows.residuals(pose)
+    if solution.unseen is not None:
+        assert solution.beacons is not None
+        without = jacobian @ (np.eye(6) - solution.unseen)
+        jacobian = np.where(solution.beacons[:, None], jacobian, without)
+    points = transform(pose.matrix(), rows.points)
+    scores = jacobian * residuals[:, None]
+    by_ground, new = seen.cells(points)
+    fresh = _sums(scores, by_ground, len(new))[new]
+    _, by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)
+    cells = by_cell.max(initial=-1) + 1
+    scatter = _sums(scores, by_cell, cells)
+    information: FloatArray = jacobian.T @ jacobian
+    variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
+    variance = max(variance, _LEAST_VARIANCE)
+    meat: FloatArray = cells * scatter.T @ scatter + _PRIOR_CELLS * variance * information
+    meat = meat / (cells + _PRIOR_CELLS)
+    renewed: FloatArray = fresh.T @ fresh
+    inflation = float(np.trace(_solve(information, meat))) / 6.0
+    effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
+
+    priors = user = np.zeros((6, 6))
+    total = information
+    if with_priors:
+        total = solution.information
+        priors = user = _positive(total - information)
+    try:
+        bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
+    except np.linalg.LinAlgError:
+        return None
+    if solution.weak is not None:
+        # Along weak directions the prior is the expected motion, which starts at the last pose.
+        renewed = renewed + solution.weak.T @ priors @ solution.weak
+        keep = np.eye(6) - solution.weak
+        user = keep.T @ user @ keep
+    return ScanError(
+        covariance=symmetric(bread @ (meat + priors) @ bread),
+        renewed=symmetric(bread @ renewed @ bread),
+        user=bread @ user,
+        residual_variance=variance,
+        effective_matches=effective,
+    )
+
+
+def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:
+    """(count, C) sums of the rows (N, C) that have the same number."""
+    columns = [np.bincount(numbers, column, minlength=count) for column in rows.T]
+    return np.stack(columns, axis=1)
+
+
+def _solve(information: FloatArray, right: FloatArray) -> FloatArray:
+    """Least squares: the matches alone may leave a direction free."""
+    return np.linalg.lstsq(information, right, rcond=None)[0].astype(np.float64, copy=False)
+
+
+def _positive(matrix: FloatArray) -> FloatArray:
+    """The nearest positive semi-definite matrix; what is left of rounding becomes zero."""
+    eigenvalues, vectors = np.linalg.eigh(symmetric(matrix))
+    nearest: FloatArray = ((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T).astype(np.float64)
+    return nearest

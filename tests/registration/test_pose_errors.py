@@ -12,8 +12,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration import pose_errors as covariance_module
-from loam_gtsam.registration.pose_errors import PoseErrors, relative_covariance
-from loam_gtsam.registration.scan_error import ScanError
+from loam_gtsam.registration.pose_errors import PoseErrors, ScanError, relative_covariance
 from loam_gtsam.registration.solvers import POSE_KEY, Solution
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 

@@ -229,3 +229,12 @@ def xyz(count: int = N, dtype: str = "f4") -> dict[str, np.ndarray]:
     rng = np.random.default_rng(1)
     points = rng.uniform(-20, 20, (count, 3)).astype(dtype)
     return {"x": points[:, 0], "y": points[:, 1], "z": points[:, 2]}
+
+
+def write_sweeps(folder: Path, count: int = 3) -> Path:
+    """A folder of ``.bin`` files of 50 points each."""
+    folder.mkdir(parents=True)
+    for i in range(count):
+        values = np.column_stack([sweep_points(i, 50), np.ones(50)]).astype("<f4")
+        values.tofile(folder / f"{i:06d}.bin")
+    return folder

@@ -1,0 +1,220 @@
+"""Bags of sweeps: what is read, what is chosen, what damage does."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Writer1
+from support.bags import (
+    KINDS,
+    LATENCY,
+    ROS1,
+    START,
+    cloud,
+    imu,
+    store_of,
+    sweep_points,
+    sweeps,
+    write_bag,
+)
+
+from loam_gtsam.datasets import (
+    BagDataset,
+    Dataset,
+    open_dataset,
+)
+from loam_gtsam.datasets.bags.bag import POINT_CLOUD
+from loam_gtsam.datasets.bags.bag_reader import choose_topic
+from loam_gtsam.types import (
+    BadSweep,
+    DatasetError,
+    LoamError,
+    Scan,
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_bag_round_trip(tmp_path: Path, kind: str) -> None:
+    store = store_of(kind)
+    recording = sweeps(kind)
+    recording += [
+        ("/imu", START + i * 5_000_000, imu(store, START + i * 5_000_000)) for i in range(9)
+    ]
+    recording.sort(key=lambda entry: entry[1])
+    dataset = open_dataset(write_bag(tmp_path / "run", kind, recording))
+    assert isinstance(dataset, BagDataset)
+    assert isinstance(dataset, Dataset)
+    assert len(dataset) == 4
+    scans = list(dataset)
+    for index, scan in enumerate(scans):
+        assert isinstance(scan, Scan)
+        assert scan.stamp == START + index * 100_000_000  # the header's, not the receive time
+        np.testing.assert_array_equal(scan.points, sweep_points(index))
+        assert scan.times is not None
+        np.testing.assert_allclose(scan.times, np.linspace(0, 0.1, 300), atol=1e-8)
+        np.testing.assert_array_equal(scan.rings, np.arange(300) % 16)
+    for scan, again in zip(scans, dataset, strict=True):
+        assert isinstance(again, Scan)
+        np.testing.assert_array_equal(scan.points, again.points)
+    samples = dataset.imu
+    assert samples is not None
+    assert samples.orientation is not None
+    np.testing.assert_array_equal(samples.stamps, START + np.arange(9) * 5_000_000)
+    np.testing.assert_allclose(samples.gyro[0], [0.1, 0.2, 0.3])
+    info = dataset.info()
+    assert info.facts["rate"] == "10.00 Hz"
+    assert info.facts["rings"] == "field, 16 beams (0 .. 15)"
+    assert info.facts["point times"].startswith("field 'time' in s, relative to the stamp")
+    assert info.facts["IMU"] == "9 samples, 200.00 Hz, with orientation"
+    assert info.problems == []
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_single_ros2_file(tmp_path: Path, kind: str) -> None:
+    folder = write_bag(tmp_path / "run", kind, sweeps(kind))
+    file = next(folder.glob("*.db3" if kind == "sqlite3" else "*.mcap"))
+    alone = file.rename(tmp_path / file.name)
+    scans = list(open_dataset(alone))
+    assert [type(scan) for scan in scans] == [Scan] * 4
+
+
+def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
+    recording = [*sweeps("ros1", 2, "/a"), *sweeps("ros1", 3, "/b")]
+    recording.append(("/imu", START, imu(ROS1, START)))
+    path = write_bag(tmp_path / "run", "ros1", recording)
+    dataset = BagDataset(path)
+    assert dataset.topic == "/b"
+    assert len(dataset) == 3
+    assert any("/a: 2, /b: 3); took /b" in text for text in dataset.info().problems)
+    assert len(BagDataset(path, topic="/a")) == 2
+    listing = r"/a \(sensor_msgs/msg/PointCloud2, 2\)"
+    with pytest.raises(DatasetError, match=rf"no topic '/c'; the bag has: {listing}"):
+        BagDataset(path, topic="/c")
+    with pytest.raises(DatasetError, match="'/imu' is sensor_msgs/msg/Imu, expected"):
+        BagDataset(path, topic="/imu")
+    with pytest.raises(DatasetError, match="no topic '/no'"):
+        BagDataset(path, imu_topic="/no")
+
+
+def test_bag_without_sweeps(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "run", "ros1", [("/imu", START, imu(ROS1, START))])
+    with pytest.raises(DatasetError, match=r"no topic of type .*PointCloud2; the bag has: /imu"):
+        open_dataset(path)
+
+
+def test_imu_without_orientation(tmp_path: Path) -> None:
+    recording = sweeps("ros1")
+    recording += [("/imu", START + i, imu(ROS1, START + i, unknown=True)) for i in range(3)]
+    dataset = BagDataset(write_bag(tmp_path / "run", "ros1", recording))
+    assert dataset.imu is not None
+    assert dataset.imu.orientation is None
+    assert any("no orientation" in text for text in dataset.info().problems)
+
+
+def test_bag_without_times_says_so(tmp_path: Path) -> None:
+    recording = [("/p", START, cloud(ROS1, START, sweep_points(0)))]
+    dataset = BagDataset(write_bag(tmp_path / "run", "ros1", recording))
+    assert any("no per-point time" in text for text in dataset.info().problems)
+    assert [scan.times for scan in dataset if isinstance(scan, Scan)] == [None]
+
+
+def test_bag_whose_times_fit_nothing(tmp_path: Path) -> None:
+    recording = [("/p", START, cloud(ROS1, START, sweep_points(0), time=np.zeros(300)))]
+    path = write_bag(tmp_path / "run", "ros1", recording)
+    with pytest.raises(DatasetError, match=r"run.bag, topic /p: .*fit no unit"):
+        open_dataset(path)
+    assert len(list(open_dataset(path, time_field="none"))) == 1
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_undecodable_messages_are_bad_sweeps(tmp_path: Path, kind: str) -> None:
+    recording = sweeps(kind, 5)
+    store = store_of(kind)
+    stamp = START + 200_000_000
+    without_x = cloud(store, stamp, sweep_points(2))
+    without_x.fields = without_x.fields[1:]
+    recording[2] = ("/points", stamp + LATENCY, without_x)
+    recording[3] = ("/points", START + 300_000_000 + LATENCY, b"\x00\x01\x00\x00garbage" * 3)
+    dataset = open_dataset(write_bag(tmp_path / "run", kind, recording))
+    got = list(dataset)
+    assert [type(sweep) for sweep in got] == [Scan, Scan, BadSweep, BadSweep, Scan]
+    assert isinstance(got[2], BadSweep)
+    assert isinstance(got[3], BadSweep)
+    assert "no field x" in got[2].message
+    assert "/points" in got[3].message
+    # receive times are led back to the clock of the stamps
+    assert [sweep.stamp for sweep in got[2:4]] == [stamp, START + 300_000_000]  # type: ignore[union-attr]
+
+
+def test_truncated_bags_cannot_be_opened(tmp_path: Path) -> None:
+    path = write_bag(tmp_path / "run", "ros1", sweeps("ros1"))
+    data = path.read_bytes()
+    for size in (0, 5, 100, len(data) // 2, len(data) - 30):
+        path.write_bytes(data[:size])
+        with pytest.raises(DatasetError, match=r"run.bag: cannot open the bag.*reindex"):
+            open_dataset(path)
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_truncated_ros2_never_escapes_loam_error(tmp_path: Path, kind: str) -> None:
+    folder = write_bag(tmp_path / "run", kind, sweeps(kind, 20))
+    file = next(folder.glob("*.db3" if kind == "sqlite3" else "*.mcap"))
+    data = file.read_bytes()
+    refused = 0
+    for size in (0, 10, len(data) // 3, len(data) - 100):
+        file.write_bytes(data[:size])
+        try:
+            got = list(open_dataset(folder))
+        except LoamError:
+            refused += 1
+        else:
+            assert isinstance(got[-1], BadSweep)
+    assert refused >= 2
+
+
+def test_damage_inside_keeps_what_came_before(tmp_path: Path) -> None:
+    path = tmp_path / "run.bag"
+    writer = Writer1(path)
+    writer.set_compression(Writer1.CompressionFormat.BZ2)
+    writer.chunk_threshold = 1  # a chunk per message
+    with writer:
+        connection = writer.add_connection("/p", "sensor_msgs/msg/PointCloud2", typestore=ROS1)
+        for _, received, message in sweeps("ros1", 6):
+            raw = ROS1.serialize_ros1(message, message.__msgtype__)
+            writer.write(connection, received, raw)
+    data = bytearray(path.read_bytes())
+    starts = [i for i in range(len(data)) if data[i : i + 4] == b"BZh9"]
+    assert len(starts) == 6
+    data[starts[4] + 4 : starts[4] + 200] = bytes(196)
+    path.write_bytes(data)
+    dataset = BagDataset(path)
+    got = list(dataset)
+    assert [type(sweep) for sweep in got] == [Scan] * 4 + [BadSweep]
+    assert isinstance(got[4], BadSweep)
+    assert "the rest is lost" in got[4].message
+    assert got[4].stamp == START + 400_000_000  # when the next sweep was due
+    list(dataset)
+    assert sum("the rest is lost" in text for text in dataset.info().problems) == 1
+
+
+def test_clouds_in_the_map_are_no_sweeps_while_there_are_others(tmp_path: Path) -> None:
+    mapped = sweeps("ros1", 3, "/velodyne_cloud_registered")
+    both = write_bag(tmp_path / "both", "ros1", [*mapped, *sweeps("ros1", 2, "/velodyne_points")])
+    assert BagDataset(both).topic == "/velodyne_points"
+    alone = BagDataset(write_bag(tmp_path / "alone", "ros1", mapped))
+    assert any("do not map them again" in text for text in alone.info().problems)
+
+
+def test_a_bag_of_packets_says_what_they_need(tmp_path: Path) -> None:
+    recording = [("/imu", START, imu(ROS1, START))]
+    path = write_bag(tmp_path / "run", "ros1", recording)
+    with pytest.raises(DatasetError, match=r"no topic of type .*PointCloud2; .*Imu, 1\)$"):
+        BagDataset(path)
+    topics = {"/scan": ("sensor_msgs/msg/LaserScan", 3)}
+    with pytest.raises(DatasetError, match=r"LaserScan, 3\)$"):
+        choose_topic(path, topics, POINT_CLOUD, None, [])
+    topics = {"/packets": ("velodyne_msgs/msg/VelodyneScan", 3)}
+    with pytest.raises(DatasetError, match="raw packets become PointCloud2 with the driver"):
+        choose_topic(path, topics, POINT_CLOUD, None, [])

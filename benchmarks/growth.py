@@ -110,7 +110,7 @@ def measure(drive: Drive) -> GrowthResult:
                 memory()[0],
             )
     while_mapping = memory()[1]
-    maps = pipeline.mapper.edge_map, pipeline.mapper.plane_map
+    maps = pipeline.mapper.maps.edges, pipeline.mapper.maps.planes
     whole = pipeline.mapper.map_points()
     poses = np.array([update.map_T_lidar.matrix() for update in updates])
     found = Trajectory(np.array([update.stamp for update in updates], np.int64), poses)
@@ -131,7 +131,7 @@ def measure(drive: Drive) -> GrowthResult:
 
 def _map_size(pipeline: Pipeline, update: MapUpdate) -> tuple[int, int, int, int]:
     """Cubes and points in the window, points around the sensor, points in the archive."""
-    maps = pipeline.mapper.edge_map, pipeline.mapper.plane_map
+    maps = pipeline.mapper.maps.edges, pipeline.mapper.maps.planes
     stats = [cubes.stats for cubes in maps]
     pose = update.map_T_lidar.matrix()
     return (

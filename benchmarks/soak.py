@@ -149,7 +149,7 @@ def soak(scene: str, frames: int, seed: int = 0) -> SoakResult:
             continue
         updates.append(replace(update, **_NOTHING))
         numbers.append(number)
-        maps = pipeline.mapper.edge_map.stats, pipeline.mapper.plane_map.stats
+        maps = pipeline.mapper.maps.edges.stats, pipeline.mapper.maps.planes.stats
         points = sum(each.points + each.archived_points for each in maps)
         rows.append((memory()[0], points, drive.expected.injected.total()))
     solved = np.array([update.status.solved for update in updates])

@@ -6,18 +6,16 @@ Within a frame, poses belong to the middle of the sweep (see
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
-import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair, rows_to_match
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
@@ -31,7 +29,12 @@ from loam_gtsam.registration.relocalization import (
     rebuild_start,
     search,
 )
-from loam_gtsam.registration.report import Clock, make_update, status_of
+from loam_gtsam.registration.report import (
+    Clock,
+    make_update,
+    problem_of,
+    status_of,
+)
 from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors, PoseContext, own_factors
 from loam_gtsam.registration.stamp_check import StampCheck
@@ -83,7 +86,7 @@ class Mapper:
     imu : what the mapper makes of the IMU; None without one
     monitor : tells whether sweeps fit the map
     maps : the map of edges and that of planes
-    keyframe : to which the points of the frames to come belong, see :meth:`move_map`
+    keyframe : number of the keyframe to which the points of the next frames belong
 
     Raises
     ------
@@ -174,7 +177,7 @@ class Mapper:
         if self.last is None:
             self._first = predicted if self.config.deskew.refine else None
             update = self._insert(predicted, FrameStatus.FIRST, "the map starts here", clock)
-        elif sparse := self._too_sparse(predicted):
+        elif sparse := not self.monitor.lost and self.maps.too_sparse(predicted, self.config):
             self._first = None
             update = self._insert(predicted, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
@@ -184,13 +187,10 @@ class Mapper:
             outcome: Found | Lost = Found(solution, frame.twist_to(solution.map_T_lidar))
             if doubtful(frame, solution, self.monitor, self.last.twist):
                 outcome = search(frame, solution, self.monitor, self.solver)
-            if isinstance(outcome, Lost) or not outcome.solution.solved:
-                update = self._without_pose(frame, predicted, solution, outcome)
-            else:
-                if self._first is not None:
-                    first, self._first = self._first, None
-                    frame, outcome = rebuild_start(first, frame, outcome, self.solver)
+            if isinstance(outcome, Found) and outcome.solution.solved:
                 update = self._with_pose(frame, outcome, clock)
+            else:
+                update = self._without_pose(frame, solution, outcome)
         self.last = replace(update, timings=clock.seconds)
         return self.last
 
@@ -199,56 +199,15 @@ class Mapper:
     ) -> MapUpdate:
         """Account for a sweep that cannot be used: the pose is predicted, the map unchanged.
 
-        Parameters
-        ----------
-        stamp : nanoseconds
-        message, fault : why
-
-        Returns
-        -------
-        MapUpdate
-            With status ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp cannot be used either.
+        The status is ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp, nanoseconds, cannot be used
+        either; ``message`` and ``fault`` say why.
         """
         self.registered = None
         return self._refused(stamp) or self._unused(stamp, message, fault)
 
-    def map_points(
-        self, moves: Mapping[int, FloatArray] | None = None
-    ) -> tuple[FloatArray, FloatArray]:
-        """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres.
-
-        Parameters
-        ----------
-        moves : what :meth:`move_map` would do to the points first; the map does not change
-        """
-        if moves:
-            return self.edge_map.moved_points(moves), self.plane_map.moved_points(moves)
-        return self.edge_map.points(archived=True), self.plane_map.points(archived=True)
-
-    @property
-    def edge_map(self) -> CubeMap:
-        """The map of edges."""
-        return self.maps.edges
-
-    @property
-    def plane_map(self) -> CubeMap:
-        """The map of planes."""
-        return self.maps.planes
-
-    def move_map(self, moves: Mapping[int, FloatArray]) -> int:
-        """Move map points with the keyframes they belong to, after a loop closure.
-
-        The mapper's own pose stays; keep the newest keyframes where they are.
-
-        Parameters
-        ----------
-        moves : (4, 4) rigid transforms in the frame of the map, by keyframe
-
-        Returns
-        -------
-        Points moved.
-        """
-        return sum(cubes.move(moves) for cubes in (self.edge_map, self.plane_map))
+    def map_points(self) -> tuple[FloatArray, FloatArray]:
+        """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
+        return self.maps.points()
 
     # -- the steps of a frame ----------------------------------------------------------------
 
@@ -257,14 +216,8 @@ class Mapper:
         refused = self._refused(features.stamp)
         if refused is not None:
             return refused
-        points = features.edges, features.planes, features.edge_times, features.plane_times
-        if not all(np.isfinite(part).all() for part in points):
-            message = "features of the sweep are NaN or infinite"
-            return self._unused(features.stamp, message, SweepFault.NOT_FINITE)
-        if not len(features.edges) + len(features.planes):
-            message = "the sweep has no features"
-            return self._unused(features.stamp, message, SweepFault.NO_FEATURES)
-        return None
+        problem = problem_of(features)
+        return None if problem is None else self._unused(features.stamp, *problem)
 
     def _refused(self, stamp: int) -> MapUpdate | None:
         """The update of a sweep whose stamp cannot be used; None if it can."""
@@ -277,80 +230,40 @@ class Mapper:
             if self._moment is not None:
                 self._moment = self._moment._replace(stamp=self._moment.stamp + refusal.clock_step)
             self._errors.cut()
-        return MapUpdate(
-            stamp,
-            last.map_T_lidar,
-            FrameStatus.BAD_STAMP,
-            refusal.message,
-            twist=last.twist,
-            fault=refusal.fault,
-        )
+        bad, message, fault = FrameStatus.BAD_STAMP, refusal.message, refusal.fault
+        return MapUpdate(stamp, last.map_T_lidar, bad, message, twist=last.twist, fault=fault)
 
     def _unused(self, stamp: int, message: str, fault: SweepFault | None) -> MapUpdate:
         """The update of a sweep that says nothing: the pose is predicted."""
-        last, status = self.last, FrameStatus.UNUSABLE_SCAN
-        if last is None:
-            return MapUpdate(stamp, gtsam.Pose3(), status, message, fault=fault)
-        guess = ConstantVelocity(self.imu).at(stamp, last)
-        self.last = MapUpdate(
-            stamp, guess.map_T_lidar, status, message, twist=guess.twist, fault=fault
-        )
-        return self.last
-
-    def _too_sparse(self, predicted: Prediction) -> str:
-        """Why there is too little map around to solve in; empty if there is enough."""
-        edges, planes = self.maps.counts_around(predicted.map_T_middle)
-        config = self.config.solver
-        enough = edges >= config.min_map_edges and planes >= config.min_map_planes
-        if enough or self.monitor.lost:
-            return ""
-        return (
-            f"the local map has {edges} edge and {planes} plane points; at least "
-            f"{config.min_map_edges} and {config.min_map_planes} are needed"
-        )
+        guess, unusable = ConstantVelocity(self.imu).at(stamp, self.last), FrameStatus.UNUSABLE_SCAN
+        pose, twist = guess.map_T_lidar, guess.twist
+        update = MapUpdate(stamp, pose, unusable, message, twist=twist, fault=fault)
+        if self.last is not None:
+            self.last = update
+        return update
 
     def _frame(
         self, predicted: Prediction, priors: Sequence[gtsam.NonlinearFactor], clock: Clock
     ) -> Frame:
-        """What the solve starts from."""
-        sweep, middle = predicted.posed.sweep, predicted.map_T_middle
-        factors = [*priors]
+        """What the solve starts from: matches, the caller's factors, the IMU's and the user's."""
+        stamp, factors = predicted.posed.sweep.stamp, [*priors]
         if self.imu is not None:
-            factors += self.imu.factors(sweep.stamp)
+            factors += self.imu.factors(stamp)
         if self.extra_factors is not None and self._moment is not None:
-            context = PoseContext(POSE_KEY, sweep.stamp, middle, self._moment[:2])
+            context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
             factors += own_factors(self.extra_factors, context)
-        matching, refine = self.config.matching, self.config.deskew.refine and self._first is None
-        matcher = FrameMatcher(
-            predicted.posed,
-            self.maps,
-            self.config,
-            matching,
-            rows_to_match(sweep, matching),
-            self._moment,
-            refine,
-            clock,
+        # The first sweep's motion is that of the second: both are de-skewed anew together.
+        refine = self.config.deskew.refine and self._first is None
+        matcher = FrameMatcher.of(
+            predicted.posed, self.maps, self.config, self._moment, clock, refine=refine
         )
-        return Frame(matcher, middle, factors, predicted.motion)
-
-    def _without_pose(
-        self, frame: Frame, predicted: Prediction, solution: Solution, outcome: Found | Lost
-    ) -> MapUpdate:
-        """The update of a sweep that is lost, or that matches too little: the map is unchanged."""
-        self._moment = Moment(frame.sweep.stamp, frame.middle, False)
-        posed, pose = predicted.posed, predicted.map_T_lidar
-        if isinstance(outcome, Lost):
-            self.monitor.lost += 1
-            nothing = Solution.unsolved(frame.middle, solution.matches, solution.iterations, 0)
-            return make_update(posed, pose, FrameStatus.LOST, outcome.message, nothing)
-        # Once may be chance; a sweep that has plenty to match is searched for the next time.
-        least, found = self.config.solver.min_matches, outcome.solution
-        self.monitor.lost += frame.matcher.offered >= 2 * least
-        message = f"{len(found.matches)} matches; {least} are needed"
-        return make_update(posed, pose, FrameStatus.FEW_MATCHES, message, found)
+        return Frame(matcher, predicted, factors)
 
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
+        if self._first is not None:
+            first, self._first = self._first, None
+            frame, found = rebuild_start(first, frame, found, self.solver)
         solution = found.solution
         if not solution.matches.wide:
             fit = Fit.of(solution.matches, frame.matcher.offered)
@@ -360,12 +273,31 @@ class Mapper:
             pose = solution.map_T_lidar.compose(posed.middle_T_reference)
         else:
             solution, pose, tilt = self.imu.add_scan(posed, frame.matcher.last, solution)
+        result = Prediction(posed, pose, posed.map_T_middle(pose), frame.predicted.motion)
         status, message = status_of(solution, found.message)
-        result = Prediction(posed, pose, posed.map_T_middle(pose), frame.expected)
         update = self._insert(result, status, message, clock, solution, tilt)
         update = self._errors.calibrated(update, frame.sweep, solution)
         clock.lap("covariance")
         return update
+
+    def _without_pose(self, frame: Frame, solution: Solution, outcome: Found | Lost) -> MapUpdate:
+        """The update of a sweep that is lost, or that matches too little: the map is unchanged."""
+        self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
+        least = self.config.solver.min_matches
+        if isinstance(outcome, Lost):
+            self.monitor.lost += 1
+            status, message = FrameStatus.LOST, outcome.message
+            guess, tried = frame.predicted.map_T_middle, solution.iterations
+            solution = Solution.unsolved(guess, solution.matches, tried, 0)
+        else:
+            # Once may be chance; a sweep that has plenty to match is searched for the next time.
+            self.monitor.lost += frame.matcher.offered >= 2 * least
+            solution = outcome.solution
+            status = FrameStatus.FEW_MATCHES
+            message = f"{len(solution.matches)} matches; {least} are needed"
+        return make_update(
+            frame.predicted.posed, frame.predicted.map_T_lidar, status, message, solution
+        )
 
     def _insert(
         self,
@@ -379,9 +311,8 @@ class Mapper:
         """Add the sweep to the map; its update."""
         clock.lap("solve")
         posed, middle = result.posed, result.map_T_middle
-        solved = solution is not None or status is FrameStatus.FIRST
         self.maps.insert(posed, middle, self.keyframe)
-        self._moment = Moment(posed.sweep.stamp, middle, solved)
+        self._moment = Moment(posed.sweep.stamp, middle, status is not FrameStatus.SPARSE_MAP)
         matches = None if solution is None else solution.matches
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")

@@ -274,7 +274,7 @@ class Pipeline:
             plane_points=planes,
             map_stats={
                 name: {item.name: getattr(cubes.stats, item.name) for item in fields(cubes.stats)}
-                for name, cubes in (("edges", mapper.edge_map), ("planes", mapper.plane_map))
+                for name, cubes in (("edges", mapper.maps.edges), ("planes", mapper.maps.planes))
             },
             interrupted=interrupted,
             error=error,

@@ -151,14 +151,14 @@ def test_a_run_that_starts_in_motion_rebuilds_its_first_sweep():
 
 
 def test_duplicate_and_earlier_stamps_are_skipped(mapped, rng):
-    before, points = mapped.last, mapped.plane_map.count()
+    before, points = mapped.last, mapped.maps.planes.count()
     for stamp in (before.stamp, before.stamp - 1, 0):
         update = mapped.register(room_features(gtsam.Pose3(), stamp, rng))
         assert update.status is FrameStatus.BAD_STAMP
         assert str(before.stamp) in update.message
         assert update.map_T_lidar.equals(before.map_T_lidar, 0.0)
     assert mapped.last is before
-    assert mapped.plane_map.count() == points
+    assert mapped.maps.planes.count() == points
     assert mapped.register(room_features(gtsam.Pose3(), before.stamp + 1, rng)).status.solved
 
 
@@ -167,11 +167,11 @@ def test_no_features_predict_the_pose_and_leave_the_map(rng):
     for i in range(4):
         pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * i, 0.0, 0.0]))
         mapper.register(room_features(pose, i * SECOND // 10, rng), guess=pose)
-    points = mapper.plane_map.count()
+    points = mapper.maps.planes.count()
     empty = Features.from_points(4 * SECOND // 10, np.zeros((0, 3)), np.zeros((0, 3)))
     update = mapper.register(empty)
     assert update.status is FrameStatus.UNUSABLE_SCAN
-    assert mapper.plane_map.count() == points
+    assert mapper.maps.planes.count() == points
     expected = mapper.last.map_T_lidar.translation()
     np.testing.assert_allclose(expected, [0.4, 0.0, 0.0], atol=0.02)
 
@@ -189,12 +189,12 @@ def test_sparse_map_inserts_at_the_guess(rng):
 
 
 def test_few_matches_keep_the_guess_and_do_not_insert(mapped, rng):
-    points = mapped.plane_map.count()
+    points = mapped.maps.planes.count()
     far = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([30.0, 10.0, 0.0]))
     update = mapped.register(room_features(gtsam.Pose3(), SECOND, rng), guess=far)
     assert update.status is FrameStatus.FEW_MATCHES
     assert update.map_T_lidar.equals(far, 1e-9)
-    assert mapped.plane_map.count() == points
+    assert mapped.maps.planes.count() == points
     assert not update.information.any()
     # and the run goes on
     back = mapped.register(room_features(gtsam.Pose3(), 2 * SECOND, rng), guess=gtsam.Pose3())
@@ -295,7 +295,7 @@ def test_cubes_left_behind_are_evicted_counted_and_kept(rng):
         update = mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng), guess=pose)
         assert update.status in (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
         total += update.n_planes
-    stats = mapper.plane_map.stats
+    stats = mapper.maps.planes.stats
     assert stats.evicted >= 7
     assert stats.archived == stats.evicted - stats.restored
     assert stats.dropped_points == 0
@@ -305,7 +305,7 @@ def test_cubes_left_behind_are_evicted_counted_and_kept(rng):
         room_features(gtsam.Pose3(), 2 * SECOND, rng), guess=gtsam.Pose3.Expmap(np.full(6, 0.01))
     )
     assert home.status.solved
-    assert mapper.plane_map.stats.restored > 0
+    assert mapper.maps.planes.stats.restored > 0
     assert np.abs(home.map_T_lidar.logmap(gtsam.Pose3())).max() < 5e-3
 
 

@@ -104,7 +104,7 @@ class LoopMapping:
         """
         there = self._misplaced(metres, degrees)
         if there:
-            self.points_moved += self._mapper.move_map(self._moves(there))
+            self.points_moved += self._mapper.maps.move(self._moves(there))
         for index, pose in there.items():
             self._placed[index] = pose
 
@@ -152,5 +152,5 @@ class LoopMapping:
         All keyframes count where the graph has them; the mapper's own map does not change.
         """
         pose = self.map_T_odom.matrix()
-        edges, planes = self._mapper.map_points(self._moves(self._misplaced(0.0, 0.0)))
+        edges, planes = self._mapper.maps.points(self._moves(self._misplaced(0.0, 0.0)))
         return transform(pose, edges), transform(pose, planes)

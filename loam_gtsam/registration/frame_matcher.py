@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,9 +20,9 @@ from loam_gtsam.registration.association import (
     trial_matching,
 )
 from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search
-from loam_gtsam.registration.odometry import Moment, twist_to
+from loam_gtsam.registration.odometry import Moment, Prediction, twist_to
 from loam_gtsam.registration.report import Clock
-from loam_gtsam.registration.solvers import Matcher, MotionPrior, ScanSolver, Solution
+from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
 from loam_gtsam.types import FloatArray
 
 
@@ -71,13 +71,45 @@ class MapPair:
             cubes.insert(transform(map_T_middle.matrix(), points))
         self._thinned = None
 
-    def counts_around(self, map_T_lidar: gtsam.Pose3) -> tuple[int, int]:
-        """Numbers of edge and plane points in the cubes around a pose."""
-        pose = map_T_lidar.matrix()
+    def too_sparse(self, predicted: Prediction, config: Config) -> str:
+        """Why there are too few points around a sweep to solve in; empty if there are enough."""
+        pose, solver = predicted.map_T_middle.matrix(), config.solver
         edges, planes = (
             cubes.count(cubes.neighbourhood(pose)) for cubes in (self.edges, self.planes)
         )
-        return edges, planes
+        if edges >= solver.min_map_edges and planes >= solver.min_map_planes:
+            return ""
+        return (
+            f"the local map has {edges} edge and {planes} plane points; at least "
+            f"{solver.min_map_edges} and {solver.min_map_planes} are needed"
+        )
+
+    def points(
+        self, moves: Mapping[int, FloatArray] | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """All edge and plane points, archived ones included, (E, 3) and (P, 3) metres.
+
+        Parameters
+        ----------
+        moves : where :meth:`move` would bring the points first; the map does not change
+        """
+        if moves:
+            return self.edges.moved_points(moves), self.planes.moved_points(moves)
+        return self.edges.points(archived=True), self.planes.points(archived=True)
+
+    def move(self, moves: Mapping[int, FloatArray]) -> int:
+        """Move points with the keyframes they belong to, after a loop closure.
+
+        Parameters
+        ----------
+        moves : (4, 4) rigid transforms in the frame of the map, by number of the keyframe
+
+        Returns
+        -------
+        Number of points moved.
+        """
+        self._thinned = None
+        return self.edges.move(moves) + self.planes.move(moves)
 
     def thinned(self, factor: float) -> tuple[CubeMap, CubeMap]:
         """Both with voxels larger by a factor, the same at every call; made once a sweep."""
@@ -110,6 +142,21 @@ class FrameMatcher(Matcher):
     last: Moment | None
     refine: bool
     clock: Clock
+
+    @classmethod
+    def of(
+        cls,
+        posed: PosedSweep,
+        maps: MapPair,
+        config: Config,
+        last: Moment | None,
+        clock: Clock,
+        *,
+        refine: bool,
+    ) -> FrameMatcher:
+        """The matcher with the configured matching."""
+        rows = _rows_to_match(posed.sweep, config.matching)
+        return cls(posed, maps, config, config.matching, rows, last, refine, clock)
 
     @property
     def offered(self) -> int:
@@ -155,7 +202,7 @@ class FrameMatcher(Matcher):
     def with_few_matches(self) -> FrameMatcher:
         """The matcher that tries a pose quickly."""
         matching = trial_matching(self.config.matching)
-        return replace(self, matching=matching, rows=rows_to_match(self.posed.sweep, matching))
+        return replace(self, matching=matching, rows=_rows_to_match(self.posed.sweep, matching))
 
     def _brought(self, search: Search) -> Search:
         """The search with its points de-skewed as those of this matcher."""
@@ -180,7 +227,7 @@ class FrameMatcher(Matcher):
         return replace(matches, search=Search(map_T_lidar, self.posed, matches, wide))
 
 
-def rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
+def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
     """The features of a sweep that are matched with a configuration."""
     return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct)
 
@@ -192,15 +239,13 @@ class Frame:
     Attributes
     ----------
     matcher : its matches, de-skewed with the predicted motion
-    middle : predicted pose of the middle of the sweep
-    priors : further factors on that pose
-    expected : motion that takes over in directions which the scan does not see
+    predicted : where the sweep is expected
+    priors : further factors on the pose at the middle of the sweep
     """
 
     matcher: FrameMatcher
-    middle: gtsam.Pose3
+    predicted: Prediction
     priors: Sequence[gtsam.NonlinearFactor]
-    expected: MotionPrior
 
     @property
     def sweep(self) -> MovingSweep:
@@ -209,7 +254,8 @@ class Frame:
 
     def solve(self, solver: ScanSolver) -> Solution:
         """The pose at the middle of the sweep, from the predicted one."""
-        return solver.solve(self.matcher, self.middle, self.priors, self.expected)
+        start = self.predicted.map_T_middle
+        return solver.solve(self.matcher, start, self.priors, self.predicted.motion)
 
     def twist_to(self, map_T_middle: gtsam.Pose3) -> FloatArray:
         """(6,) body velocity that leads from the last sweep to a pose of this one."""

@@ -226,7 +226,7 @@ def rebuild_start(
         last = Moment(posed.sweep.stamp, middle, True)
         frame = replace(frame, matcher=replace(frame.matcher.moving_at(found.twist), last=last))
         start = found.solution.map_T_lidar
-        again = solver.solve(frame.matcher, start, frame.priors, frame.expected)
+        again = solver.solve(frame.matcher, start, frame.priors, frame.predicted.motion)
         if not again.solved:
             break
         found = replace(found, solution=again, twist=frame.twist_to(again.map_T_lidar))
@@ -255,12 +255,14 @@ def search(
     if lost:
         start = _place(frame, solution, monitor, solver)
         if start is not None:
-            twists.append(_turned(guess, start.rotation().between(frame.middle.rotation())))
+            twists.append(
+                _turned(guess, start.rotation().between(frame.predicted.map_T_middle.rotation()))
+            )
     best: tuple[Fit, Solution, FloatArray] | None = None
     for twist in twists:
         if start is None:
             break
-        here = MotionPrior(start, frame.expected.information)
+        here = MotionPrior(start, frame.predicted.motion.information)
         found = solver.solve(matcher.moving_at(twist), start, frame.priors, here)
         fit = Fit.of(found.matches, matcher.offered)
         if not (found.solved and monitor.fits_again(fit)):
@@ -269,7 +271,7 @@ def search(
             best = fit, found, twist
     matcher.clock.lap("relocalize")
     if best is not None and best[2] is not moving:
-        moved = f"moved by {distance_in_words(frame.middle, best[1].map_T_lidar)}"
+        moved = f"moved by {distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)}"
         after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
         return Found(best[1], best[2], f"relocalised{after}, {moved}" if lost else moved)
     if not lost:
@@ -285,7 +287,7 @@ def _place(
 ) -> gtsam.Pose3 | None:
     """Where around the prediction a few matches fit best; None if nowhere."""
     matcher = frame.matcher
-    around = monitor.around(frame.middle)
+    around = monitor.around(frame.predicted.map_T_middle)
     known = [
         cubes.points(cubes.neighbourhood(pose.matrix()))
         for pose in around

@@ -10,7 +10,13 @@ import numpy as np
 
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.solvers import Solution
-from loam_gtsam.types import FrameStatus, MapUpdate, TiltPrior
+from loam_gtsam.types import (
+    Features,
+    FrameStatus,
+    MapUpdate,
+    SweepFault,
+    TiltPrior,
+)
 
 
 def make_update(
@@ -70,6 +76,16 @@ def make_update(
         direction_information=seen.information,
         axis_localizability=seen.axes(),
     )
+
+
+def problem_of(features: Features) -> tuple[str, SweepFault] | None:
+    """Why features cannot be used, as a sentence and typed; None if they can."""
+    points = features.edges, features.planes, features.edge_times, features.plane_times
+    if not all(np.isfinite(part).all() for part in points):
+        return "features of the sweep are NaN or infinite", SweepFault.NOT_FINITE
+    if not len(features.edges) + len(features.planes):
+        return "the sweep has no features", SweepFault.NO_FEATURES
+    return None
 
 
 def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:

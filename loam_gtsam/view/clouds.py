@@ -96,7 +96,7 @@ def surrounding_cloud(update: MapUpdate, mapper: Mapper) -> FloatArray:
     """
     pose = update.map_T_lidar.matrix()
     parts = []
-    for intensity, cubes in enumerate((mapper.edge_map, mapper.plane_map)):
+    for intensity, cubes in enumerate((mapper.maps.edges, mapper.maps.planes)):
         points = cubes.points(cubes.neighbourhood(pose))
         parts.append(np.column_stack([points, np.full(len(points), float(intensity))]))
     return np.concatenate(parts)

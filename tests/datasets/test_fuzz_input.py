@@ -391,7 +391,7 @@ def test_a_map_may_start_far_from_its_origin(metres: float) -> None:
         features = extract_features(sweep, Config())
         update = mapper.register(features, start if number == 0 else None)
         assert update.status.solved == (number > 0), update.message
-    assert mapper.edge_map.stats.outside == 0
+    assert mapper.maps.edges.stats.outside == 0
     assert abs(mapper.map_points()[1][:, 2].mean() - metres) < 10.0
 
 

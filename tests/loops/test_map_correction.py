@@ -62,8 +62,8 @@ def driven(first, look=False, again=None, **pose_graph):
     for update in updates(POSES, DRIFT):
         features = world.seen(gtsam.Pose3(), update.stamp, rng)
         closed.append(loops.add(update, features))
-        mapper.edge_map.owner = mapper.keyframe
-        mapper.edge_map.insert((update.map_T_lidar.translation() + UP)[None])
+        mapper.maps.edges.owner = mapper.keyframe
+        mapper.maps.edges.insert((update.map_T_lidar.translation() + UP)[None])
         if look:
             loops.map_points()
             loops.counts()

@@ -256,7 +256,7 @@ def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
     updates = []
     for sweep in kidnapped:
         updates.append(pipeline.process(sweep))
-        sizes.append(pipeline.mapper.plane_map.count())
+        sizes.append(pipeline.mapper.maps.planes.count())
     lost = [n for n, update in enumerate(updates) if update.status is FrameStatus.LOST]
     assert lost
     assert lost == list(range(AT, AT + len(lost)))
@@ -279,15 +279,15 @@ def test_a_reset_starts_a_new_map(calm):
     sweeps = list(calm)
     for sweep in sweeps[:12]:
         pipeline.process(sweep)
-    before = pipeline.mapper.plane_map.count()
+    before = pipeline.mapper.maps.planes.count()
     pipeline.mapper.reset()
-    assert pipeline.mapper.plane_map.count() == 0
+    assert pipeline.mapper.maps.planes.count() == 0
     update = pipeline.process(sweeps[12])
     assert update.status is FrameStatus.FIRST
     assert update.map_T_lidar.equals(gtsam.Pose3(), 1e-12)
     assert not pipeline.mapper.monitor.ready
     assert pipeline.process(sweeps[13]).status.solved
-    assert 0 < pipeline.mapper.plane_map.count() < before
+    assert 0 < pipeline.mapper.maps.planes.count() < before
 
 
 def test_few_matches_twice_in_a_row_start_a_search(calm):

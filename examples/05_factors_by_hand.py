@@ -28,7 +28,12 @@ first, second = (extract_features(scan, mapper.config) for scan in world)
 mapper.register(first)
 guess = gtsam.Pose3()
 m = associate(
-    second.edges, second.planes, guess, mapper.maps.edges, mapper.maps.planes, mapper.config.matching
+    second.edges,
+    second.planes,
+    guess,
+    mapper.maps.edges,
+    mapper.maps.planes,
+    mapper.config.matching,
 )
 start, optima = gtsam.Values(), []
 start.insert(KEY, guess)

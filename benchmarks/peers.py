@@ -43,8 +43,8 @@ class KissIcp(peers.KissIcp):
     """KISS-ICP, given the sweeps as a variant says."""
 
     def __init__(self, variant: KissVariant = KissVariant()) -> None:
-        super().__init__(deskew=variant.deskew)
-        self.variant = variant
+        self.variant, self.deskew = variant, variant.deskew
+        super().__init__()
 
     def register(self, stamp: int, sweep: TimedPoints) -> PeerPose:
         """See :meth:`loam_gtsam.studies.peers.Peer.register`."""

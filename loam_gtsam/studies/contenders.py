@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,9 +10,8 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import PRESETS, Config, load_config
-from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
-from loam_gtsam.frontend.workers import Extraction
+from loam_gtsam.frontend.workers import Extraction, extract
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import Pipeline, RunResult
 from loam_gtsam.registration.odometry import Guess, Odometry
@@ -185,6 +183,8 @@ def share_sweeps(
     InputError
         If points are wanted, and the data set has features instead of points.
     """
+    # All features, as for this odometry: each pipeline thins them to the voxels of its own map.
+    unthinned = config.changed("odometry.method=scan_to_scan")
     for sweep in sweeps:
         if isinstance(sweep, FeatureSweep) and points:
             raise InputError("peers need the points of raw sweeps; this data set has features only")
@@ -196,7 +196,7 @@ def share_sweeps(
                 except SweepError as error:
                     shared = replace(shared, problem=str(error))
             if features:
-                shared = replace(shared, extraction=_extract_all(sweep, config))
+                shared = replace(shared, extraction=extract(sweep, unthinned))
         yield shared
 
 
@@ -212,17 +212,6 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
     timing = assign_times(columns, assign_rings(columns, config.sensor), config)
     points = np.ascontiguousarray(columns.xyz.T, dtype=np.float64)
     return TimedPoints(points, np.asarray(timing.times, np.float64), timing.span)
-
-
-def _extract_all(scan: Scan, config: Config) -> Extraction:
-    """All features of a sweep: each pipeline thins them to the voxels of its own map."""
-    started = time.perf_counter()
-    features, problem, fault = None, "", None
-    try:
-        features = extract_features(scan, config)
-    except SweepError as error:
-        problem, fault = str(error), error.fault
-    return Extraction(features, problem, time.perf_counter() - started, fault)
 
 
 # -- runners ---------------------------------------------------------------------------------------

@@ -108,12 +108,36 @@ class Peer(ABC):
     def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
         """Pose (4, 4) of a sweep, and the moment of the pose in seconds from the stamp."""
 
+
+class _IcpPeer(Peer):
+    """A peer of the KISS-ICP family.
+
+    Attributes
+    ----------
+    deskew : whether the peer de-skews the sweeps
+    """
+
+    deskew: bool = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._icp = self._make_icp()
+
+    @abstractmethod
+    def _make_icp(self) -> Any:
+        """The system itself, with its settings."""
+
+    @property
+    def map_points(self) -> int:
+        """See :attr:`Peer.map_points`."""
+        return len(self._icp.local_map.point_cloud())
+
     def _check_times(self, times: FloatArray) -> None:
         if len(times) == 0 or times.min() >= times.max():
             raise InputError(f"{self.name}: expected points of different times to de-skew with")
 
 
-class KissIcp(Peer):
+class KissIcp(_IcpPeer):
     """KISS-ICP (Vizzo et al., RA-L 2023).
 
     Notes
@@ -122,27 +146,16 @@ class KissIcp(Peer):
     where it was), so the pose belongs to that time and is compared with the truth of that time.
     Without de-skew a pose fits the whole sweep best at the middle of the sweep. KISS-ICP uses all
     cores.
-
-    Parameters
-    ----------
-    deskew : use the de-skew of KISS-ICP, which is its default
     """
 
     name, package, module = "kiss-icp", "kiss-icp", "kiss_icp"
 
-    def __init__(self, deskew: bool = True) -> None:
-        super().__init__()
+    def _make_icp(self) -> Any:
         settings = _module(self, "config").KISSConfig()
-        settings.data.deskew = deskew
+        settings.data.deskew = self.deskew
         if settings.mapping.voxel_size is None:  # as its own load_config does
             settings.mapping.voxel_size = settings.data.max_range / 100.0
-        self.deskew = deskew
-        self._icp = _module(self, "kiss_icp").KissICP(settings)
-
-    @property
-    def map_points(self) -> int:
-        """See :attr:`Peer.map_points`."""
-        return len(self._icp.local_map.point_cloud())
+        return _module(self, "kiss_icp").KissICP(settings)
 
     def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
         if self.deskew:
@@ -155,13 +168,10 @@ class KissIcp(Peer):
 class KissIcpNoDeskew(KissIcp):
     """KISS-ICP without de-skew: better where the motion is far from a constant velocity."""
 
-    name = "kiss-icp-no-deskew"
-
-    def __init__(self) -> None:
-        super().__init__(deskew=False)
+    name, deskew = "kiss-icp-no-deskew", False
 
 
-class GenzIcp(Peer):
+class GenzIcp(_IcpPeer):
     """GenZ-ICP (Lee et al., RA-L 2025).
 
     Notes
@@ -170,26 +180,15 @@ class GenzIcp(Peer):
     Version 0.3 takes times from 0 to 1 and de-skews to 0.5, so that the pose belongs to the middle
     of the sweep, as it does without de-skew. Two instances that take turns in one process disturb
     each other: on 40 sweeps of KITTI the ATE of each became several times larger or smaller.
-
-    Parameters
-    ----------
-    deskew : use the de-skew of GenZ-ICP
     """
 
     name, package, module = "genz-icp", "genz-icp", "genz_icp"
     alone = True
 
-    def __init__(self, deskew: bool = True) -> None:
-        super().__init__()
+    def _make_icp(self) -> Any:
         settings = _module(self, "config").GenZConfig()
-        settings.data.deskew = deskew
-        self.deskew = deskew
-        self._icp = _module(self, "genz_icp").GenZICP(settings)
-
-    @property
-    def map_points(self) -> int:
-        """See :attr:`Peer.map_points`."""
-        return len(self._icp.local_map.point_cloud())
+        settings.data.deskew = self.deskew
+        return _module(self, "genz_icp").GenZICP(settings)
 
     def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
         times = sweep.times
@@ -205,10 +204,7 @@ class GenzIcp(Peer):
 class GenzIcpNoDeskew(GenzIcp):
     """GenZ-ICP without de-skew, which is its default."""
 
-    name = "genz-icp-no-deskew"
-
-    def __init__(self) -> None:
-        super().__init__(deskew=False)
+    name, deskew = "genz-icp-no-deskew", False
 
 
 class SmallGicp(Peer):

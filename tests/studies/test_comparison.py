@@ -11,6 +11,7 @@ from support.contenders import FakePeer, Sweeps
 from support.trajectories import winding
 
 from loam_gtsam.config import PRESETS, Config, config_from_dict
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import make_solver
 from loam_gtsam.pipeline import run
 from loam_gtsam.studies import contenders
@@ -83,8 +84,8 @@ def test_what_one_learns_of_the_gyro_is_not_told_to_the_next(sweeps, world):
 
 def test_features_are_extracted_once_for_all(dataset, monkeypatch):
     calls = []
-    real = contenders.extract_features
-    monkeypatch.setattr(contenders, "extract_features", lambda *a: (calls.append(a), real(*a))[1])
+    real = contenders.extract
+    monkeypatch.setattr(contenders, "extract", lambda *a: (calls.append(a), real(*a))[1])
     result = compare_solvers(dataset, [Contender(n, Config()) for n in ("one", "two")])
     assert len(calls) == FRAMES
     np.testing.assert_array_equal(poses(result.runs[0]), poses(result.runs[1]))
@@ -219,7 +220,7 @@ def test_recorded_features_are_for_ours_only(sweeps, fake):
     config = Config()
     recorded = []
     for number, scan in enumerate(sweeps[:3]):
-        features = contenders.extract_features(scan, config)
+        features = extract_features(scan, config)
         odom = gtsam.Pose3(gtsam.Rot3(), [0.1 * number, 0.0, 0.0])
         recorded.append(FeatureSweep(features, odom))
     data = Sweeps(recorded)

@@ -65,6 +65,9 @@ def test_imports_go_down_the_floors_and_never_in_circles() -> None:
     assert lint_imports(config_filename=config, no_cache=True, no_logo=True) == 0
 
 
+NAMED_TUPLE = ("_replace", "_asdict", "_fields")
+
+
 def is_private(name: str) -> bool:
     return name.startswith("_") and not name.endswith("__")
 
@@ -95,7 +98,7 @@ def intrusions(node: ast.AST, own: frozenset[str] = frozenset()) -> Iterator[tup
         yield from ((alias.name, node.lineno) for alias in node.names if is_private(alias.name))
     if isinstance(node, ast.Attribute) and is_private(node.attr) and node.attr not in own:
         owner = ast.unparse(node.value)
-        if owner not in ("self", "cls", "super()", "os"):
+        if owner not in ("self", "cls", "super()", "os") and node.attr not in NAMED_TUPLE:
             yield f"{owner}.{node.attr}", node.lineno
     for child in ast.iter_child_nodes(node):
         yield from intrusions(child, own)

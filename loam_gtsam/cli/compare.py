@@ -18,10 +18,10 @@ from loam_gtsam.cli.console import (
     output_folder,
     print_written,
     stop_requests,
+    write_results,
 )
 from loam_gtsam.cli.options import CompareOptions
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.io.atomic import staged_files
 from loam_gtsam.studies.comparison import compare_solvers
 from loam_gtsam.studies.comparison_report import (
     ACCURACY_COLUMNS,
@@ -72,8 +72,9 @@ def execute(
         results = ScoredComparison.of(comparison, shared_guess)
         # Files of an earlier comparison, also those of solvers that did not run this time.
         left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
-        with staged_files(folder, left, last=REPORT_FILE) as new:
-            files = write_comparison(results, new, plot)
+        files = write_results(
+            folder, left, REPORT_FILE, lambda new: write_comparison(results, new, plot)
+        )
     if not options.quiet:
         console = Console()
         console.print(_summary(results, seconds))

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +25,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.io.atomic import make_folder, staged_files
 from loam_gtsam.pipeline import OnFrame
 from loam_gtsam.types import MapUpdate, OutputError
 from loam_gtsam.view import plots
@@ -57,6 +58,34 @@ def output_folder(wanted: Path, known: Sequence[str], *, overwrite: bool) -> Ite
             with suppress(OSError):  # it is not empty, or was not made
                 wanted.rmdir()
         raise
+
+
+def write_results(
+    folder: Path, known: Sequence[str], last: str, write: Callable[[Path], list[str]]
+) -> list[str]:
+    """Replace earlier results by new ones, which took long to compute; returns their names.
+
+    Parameters
+    ----------
+    folder, known, last : see :func:`loam_gtsam.io.atomic.staged_files`
+    write : writes all files into the folder that it is given, and returns their names
+
+    Raises
+    ------
+    OutputError
+        If the results could not be written into ``folder``, naming the temporary folder into which
+        they were written instead.
+    """
+    try:
+        with staged_files(folder, known, last) as new:
+            return write(new)
+    except OutputError as problem:
+        try:
+            there = Path(tempfile.mkdtemp(prefix=f"loam_gtsam_{folder.name}_"))
+            write(there)
+        except (OSError, OutputError):
+            raise problem from None
+        raise OutputError(f"{problem}. The results were written to {there} instead") from problem
 
 
 def draws_pictures(asked: bool | None) -> bool:

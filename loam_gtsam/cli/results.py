@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import json
-import tempfile
-from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
-from loam_gtsam.io.atomic import staged_files
 from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
@@ -56,17 +53,16 @@ class Results:
         """Write all files, with pictures if ``last`` is given; returns their names."""
         extra = {"accuracy": self.accuracy or None, "input": asdict(self.info)}
         files = list(RUN_FILES)
-        with staged_files(folder, RUN_OUTPUTS, last="summary.json") as new:
-            write_run(self.run, new, dataset=_described(self.info), extra=extra)
-            if self.dataset.truth is not None:
-                write_tum(new / TRUTH_FILE, self.dataset.truth)
-                files.append(TRUTH_FILE)
-            if self.run.loops is not None:
-                write_tum(new / LOOP_FILES[0], self.run.odometry, comments={"frame": "odom"})
-                write_graph(new / LOOP_FILES[1], self.run.loops.graph.saved())
-                files.extend(LOOP_FILES)
-            if last is not None:
-                files.extend(self._draw(new, last))
+        write_run(self.run, folder, dataset=_described(self.info), extra=extra)
+        if self.dataset.truth is not None:
+            write_tum(folder / TRUTH_FILE, self.dataset.truth)
+            files.append(TRUTH_FILE)
+        if self.run.loops is not None:
+            write_tum(folder / LOOP_FILES[0], self.run.odometry, comments={"frame": "odom"})
+            write_graph(folder / LOOP_FILES[1], self.run.loops.graph.saved())
+            files.extend(LOOP_FILES)
+        if last is not None:
+            files.extend(self._draw(folder, last))
         return files
 
     def _draw(self, folder: Path, last: LastFrame) -> list[str]:
@@ -83,26 +79,6 @@ class Results:
             plots.plot_errors(folder / ERROR_PLOT, error.stamps, error.translations)
             files.append(ERROR_PLOT)
         return files
-
-
-def write_safely(folder: Path, write: Callable[[Path], list[str]]) -> list[str]:
-    """Write results that took long to compute; returns the names of the files.
-
-    Raises
-    ------
-    OutputError
-        If the results could not be written into ``folder``, naming the temporary folder into which
-        they were written instead.
-    """
-    try:
-        return write(folder)
-    except OutputError as problem:
-        try:
-            there = Path(tempfile.mkdtemp(prefix=f"loam_gtsam_{folder.name}_"))
-            write(there)
-        except (OSError, OutputError):
-            raise problem from None
-        raise OutputError(f"{problem}. The results were written to {there} instead") from problem
 
 
 def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:

@@ -19,10 +19,11 @@ from loam_gtsam.cli.console import (
     print_plain,
     print_written,
     stop_requests,
+    write_results,
 )
 from loam_gtsam.cli.options import RunOptions
 from loam_gtsam.cli.report import profile_table, summary
-from loam_gtsam.cli.results import RUN_OUTPUTS, Results, is_complete, write_safely
+from loam_gtsam.cli.results import RUN_OUTPUTS, Results, is_complete
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.checkpoint import Checkpoint
@@ -80,7 +81,12 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
                     "loam-gtsam inspect"
                 )
             results = Results.of(result, dataset)
-            files = write_safely(folder, lambda there: results.write(there, last if plot else None))
+            files = write_results(
+                folder,
+                RUN_OUTPUTS,
+                "summary.json",
+                lambda new: results.write(new, last if plot else None),
+            )
             if checkpoint is not None and not result.interrupted and result.error is None:
                 checkpoint.remove()
     if not options.quiet:

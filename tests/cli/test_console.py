@@ -2,7 +2,7 @@
 
 import pytest
 
-from loam_gtsam.cli.results import write_safely
+from loam_gtsam.cli.console import write_results
 from loam_gtsam.types import OutputError
 
 
@@ -19,8 +19,21 @@ def test_results_that_cannot_be_written_go_elsewhere(tmp_path):
         (there / "results").write_text("all of it")
         return ["results"]
 
+    (tmp_path / "wanted").mkdir()
     with pytest.raises(OutputError, match=r"disk full. The results were written to .*instead"):
-        write_safely(tmp_path / "wanted", write)
+        write_results(tmp_path / "wanted", ["results"], "results", write)
+    written = [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")]
+    assert written == ["all of it"]
+
+
+def test_results_that_cannot_be_moved_to_their_places_go_elsewhere(tmp_path):
+    def write(there):
+        (there / "results").write_text("all of it")
+        return ["results"]
+
+    (tmp_path / "wanted" / "results").mkdir(parents=True)  # a folder in the place of the file
+    with pytest.raises(OutputError, match=r"cannot write there.* written to .* instead"):
+        write_results(tmp_path / "wanted", [], "results", write)
     written = [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")]
     assert written == ["all of it"]
 
@@ -30,4 +43,4 @@ def test_if_nothing_can_be_written_the_first_problem_is_told(tmp_path):
         raise OutputError("disk full")
 
     with pytest.raises(OutputError, match=r"^disk full$"):
-        write_safely(tmp_path / "wanted", write)
+        write_results(tmp_path, [], "results", write)

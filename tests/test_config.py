@@ -235,7 +235,7 @@ def test_a_constructor_refuses_too():
         SolverConfig(iteration=5)
 
 
-PAIRS = [(owner, *pair) for owner in {owner for owner, *_ in FIELDS} for pair in owner.in_order]
+PAIRS = [(owner, *pair) for owner in dict.fromkeys(f[0] for f in FIELDS) for pair in owner.in_order]
 
 
 @pytest.mark.parametrize(("owner", "lower", "upper"), PAIRS, ids=name_of)
@@ -278,6 +278,8 @@ def test_values_change_by_text_mapping_or_section_all_at_once():
     assert config.imu == ImuConfig().changed(enabled=False)
     assert config.matching == Config().matching
     assert Config().changed() == Config()
+    most = Config().changed("solver.min_matches=2600", matching=MatchingConfig(max_planes=2100))
+    assert most.solver.min_matches == most.matching.max_edges + most.matching.max_planes
 
 
 @pytest.mark.parametrize(
@@ -290,6 +292,7 @@ def test_values_change_by_text_mapping_or_section_all_at_once():
         ("solver=5", ("solver: expected a mapping, for it is a section, got 5",)),
         ("solver.iterations", ("test: expected SECTION.KEY=VALUE, got 'solver.iterations'",)),
         ("solver.iterations=[", ("'[' is not a YAML value",)),
+        ({"solver": SolverConfig, "imu": 3}, ("solver: expected a mapping",)),
     ],
 )
 def test_a_wrong_change_is_refused_as_a_wrong_file_is(change, words):

@@ -46,9 +46,11 @@ def override(
     try:
         return Section.changed(section, **values)
     except RefusedError as error:
-        name = next(key for key in error.keys if key in keys)
+        name = next((key for key in error.keys if key in keys), error.keys[0])
         full = ".".join((*above, name))
-        raise ConfigError(f"{where((*above, keys[name]))}{full}: {error.reason}") from None
+        raise ConfigError(
+            f"{where((*above, keys.get(name, name)))}{full}: {error.reason}"
+        ) from None
 
 
 def _plain(value: Any) -> Any:

@@ -44,7 +44,9 @@ class Config(Section):
             raise out_of_order(("matching", "solver"), "solver.min_matches", sought, least, most)
         return self
 
-    def changed(self, *changes: str | Mapping[str, Any], source: str = "", **sections: Any) -> Self:
+    def changed(
+        self, /, *changes: str | Mapping[str, Any], source: str = "", **sections: Any
+    ) -> Self:
         """A copy with other values: all are changed at once, then checked.
 
         Parameters
@@ -64,8 +66,7 @@ class Config(Section):
         >>> Config().changed("solver.iterations=5", "imu.enabled=false").solver.iterations
         5
         """
-        changed = with_changes(self, changes, source) if changes else self
-        return super(Config, changed).changed(**sections) if sections else changed
+        return with_changes(self.model_copy(update=sections), changes, source)
 
 
 _CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0, post_depth=0.0)

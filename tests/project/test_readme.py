@@ -80,7 +80,15 @@ def test_what_the_documentation_imports_is_there_and_public(page: Path) -> None:
             assert hasattr(found, name) or importlib.import_module(f"{module}.{name}")
 
 
-EXECUTED = ("README", "quickstart", "own_factor", "own_loop_closer", "own_sensor", "bags_out")
+EXECUTED = (
+    "README",
+    "quickstart",
+    "loops",
+    "own_factor",
+    "own_loop_closer",
+    "own_sensor",
+    "bags_out",
+)
 CODE = [
     pytest.param(code, id=f"{page.stem}-{number}")
     for page in PAGES

@@ -73,15 +73,6 @@ def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, names):
         assert motions == {"gyro" if name == "gtsam" else "constant_velocity"}
 
 
-def test_what_one_learns_of_the_gyro_is_not_told_to_the_next(sweeps, world):
-    dataset = Sweeps(sweeps, world.truth)
-    dataset.imu = world.imu
-    runs = compare_solvers(dataset, [Contender(name, Config()) for name in "ab"]).runs
-    np.testing.assert_array_equal(poses(runs[0]), poses(runs[1]))
-    for one, other in zip(runs[0].updates, runs[1].updates, strict=True):
-        np.testing.assert_array_equal(one.twist, other.twist)
-
-
 def test_features_are_extracted_once_for_all(dataset, monkeypatch):
     calls = []
     real = contenders.extract

@@ -52,14 +52,6 @@ def test_align_does_not_mirror():
     assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("flat", [(1, 1, 0), (0, 1, 1)])
-def test_align_recovers_a_rotation_from_a_plane(flat):
-    rng = np.random.default_rng(2)
-    truth, points = pose(rng), rng.normal(size=(30, 3)) * flat
-    found = align(points, points @ truth[:3, :3].T + truth[:3, 3])
-    np.testing.assert_allclose(found, truth, atol=1e-11)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_on_a_line_the_roll_comes_from_the_offered_rotation(seed):
     rng = np.random.default_rng(seed)
@@ -163,16 +155,6 @@ def test_known_offsets_give_known_numbers():
     assert error.median == pytest.approx(0.15)
     assert error.maximum == pytest.approx(0.4)
     assert error.rotation_rmse_deg == pytest.approx(1.0)
-
-
-def test_white_noise_gives_its_own_size():
-    truth = winding(2000, seed=5)
-    rng = np.random.default_rng(6)
-    poses = truth.map_T_lidar.copy()
-    poses[:, :3, 3] += rng.normal(0, 0.05, (2000, 3))
-    assert absolute_error(changed(truth, poses), truth).rmse == pytest.approx(
-        0.05 * np.sqrt(3), rel=0.05
-    )
 
 
 def test_the_reference_is_interpolated_and_what_lies_outside_is_left_out():

@@ -65,19 +65,13 @@ def test_a_stop_between_two_trials_starts_no_other(monkeypatch):
         list(trial_runner.run_here([trial_of()], lambda: True))
 
 
-@pytest.mark.parametrize("where", ["local", "cluster"])
-def test_the_death_of_a_worker_in_the_middle_changes_no_number(where, request, tmp_path):
+def test_the_death_of_a_worker_in_the_middle_changes_no_number(tmp_path):
     trials = load_spec(write_spec(tmp_path, SPEC)).trials
     here = list(trial_runner.run_here(trials, never))
     flag = tmp_path / "died"
     work = partial(dies, trials[1].id, str(flag))
-    if where == "local":
-        workers = trial_runner.local_workers(2)
-    else:
-        address = request.getfixturevalue("cluster").scheduler_address
-        workers = trial_runner.cluster_workers(address)
-    with workers as pool:
-        rows = list(trial_runner.run_on(pool, trials, never, work))
+    with trial_runner.local_workers(2) as workers:
+        rows = list(trial_runner.run_on(workers, trials, never, work))
     assert flag.exists()
     assert in_order(trials, rows) == repeatable(here)
     assert all(row["error"] is None for row in rows)

@@ -127,7 +127,7 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
 
 
 def _suggestion(path: Path) -> str:
-    """What to open instead of a folder without sweeps."""
+    """A sentence on what to open instead of a folder without sweeps."""
     inside: list[str] = []
     for folder, names, files in islice(os.walk(path), _LOOKED_AT):
         names.sort()

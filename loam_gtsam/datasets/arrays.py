@@ -94,16 +94,16 @@ class ArrayDataset:
 
     @property
     def imu(self) -> ImuSamples | None:
-        """As given."""
+        """IMU as given."""
         return self._imu
 
     @property
     def truth(self) -> Trajectory | None:
-        """As given."""
+        """Reference poses as given."""
         return self._truth
 
     def info(self) -> DatasetInfo:
-        """What was given."""
+        """Description of the arrays."""
         info = DatasetInfo("arrays", self.name, {"sweeps": str(len(self))})
         stamps = np.array([scan.stamp for scan in self._scans], dtype=np.int64)
         describe_stamps(stamps, info.facts, info.problems)

@@ -1,4 +1,4 @@
-"""What a data set is to the rest of the package."""
+"""The interface of a data set, and what loaders have in common."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from loam_gtsam.types import (
 
 @dataclass(slots=True)
 class DatasetInfo:
-    """What a loader understood of its input, for people.
+    """Description of a data set for people: what its loader understood.
 
     Attributes
     ----------
@@ -71,7 +71,7 @@ class Dataset(Protocol):
     def __iter__(self) -> Iterator[Sweep]: ...
 
     def info(self) -> DatasetInfo:
-        """What was understood; may read the first sweeps, never the whole data."""
+        """Description of the data set; may read the first sweeps, never the whole data."""
         ...
 
     @property

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config, config_from_dict, config_to_dict
-from loam_gtsam.datasets.decode.extrinsics import implied_by
+from loam_gtsam.datasets.decode.extrinsics import extrinsic_settings
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.version import installed_version
@@ -125,7 +125,7 @@ class LoamGtsam(EvalioPipeline):
     def set_imu_T_lidar(self, T: SE3) -> None:
         """Take the extrinsic pose of the lidar in the frame of the IMU."""
         self._lidar_T_imu = gtsam.Pose3(T.to_mat()).inverse()
-        self._implied |= implied_by(self._lidar_T_imu.matrix())
+        self._implied |= extrinsic_settings(self._lidar_T_imu.matrix())
 
     def set_visualizing(self, visualize: Set[Any] | None) -> None:
         """Hand out features from now on if anything is shown."""

@@ -119,7 +119,7 @@ class BagDataset:
         return None
 
     def info(self) -> DatasetInfo:
-        """What was understood; reads the first sweeps and the IMU topic."""
+        """Description of the bag; reads the first sweeps and the IMU topic."""
         imu = self.imu  # first: it may find problems
         facts = dict(self._facts)
         if self.imu_topic is not None:

@@ -164,7 +164,7 @@ def read_messages(
 
 
 def bag_kind(path: Path) -> str:
-    """What to call the file for people."""
+    """Name of the kind of file, e.g. ``ROS 1 bag``."""
     return {".bag": "ROS 1 bag", ".mcap": "MCAP file"}.get(path.suffix, "ROS 2 bag")
 
 

@@ -12,26 +12,30 @@ from typing import Any, Unpack
 from loam_gtsam.datasets.bags.bag import BagDataset
 from loam_gtsam.datasets.bags.bag_reader import open_bag
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo
-from loam_gtsam.datasets.decode.extrinsics import at_lidar, describe_extrinsics, implied_by
+from loam_gtsam.datasets.decode.extrinsics import (
+    describe_extrinsics,
+    extrinsic_settings,
+    moved_to_lidar,
+)
 from loam_gtsam.datasets.decode.tables import (
-    in_order,
     read_lines,
     read_pose_table,
+    sorted_trajectory,
 )
 from loam_gtsam.types import DatasetError, FloatArray, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
 class Rig:
-    """What is known of the sensors of a data set.
+    """Sensors of a data set: topics and extrinsics.
 
     Attributes
     ----------
-    kind : for people
-    topic, imu_topic : in its bags
-    body_T_lidar : the frame of the reference poses
+    kind : name of the data set
+    topic, imu_topic : of the sweeps and of the IMU in its bags
+    body_T_lidar : pose of the lidar in the frame of the reference poses
     lidar_T_imu : extrinsics
-    source : of the extrinsics, for people
+    source : where the extrinsics are from, as text
     """
 
     kind: str
@@ -72,7 +76,7 @@ class BagSequence(BagDataset):
         self._rig, self._truth_file = rig, truth
         self.name = path.resolve().name if path.is_dir() else path.stem
         if self.imu_topic == rig.imu_topic:
-            self.sensor: Mapping[str, Any] = implied_by(rig.lidar_T_imu)
+            self.sensor: Mapping[str, Any] = extrinsic_settings(rig.lidar_T_imu)
         elif self.imu_topic is not None:
             self._problems.append(
                 f"IMU: not the {rig.imu_topic} of {rig.kind}, so its rotation to the lidar is "
@@ -87,7 +91,7 @@ class BagSequence(BagDataset):
         return read_poses(self._truth_file, self._rig.body_T_lidar, self._problems)
 
     def info(self) -> DatasetInfo:
-        """As of a bag, with the parts, extrinsics and reference poses."""
+        """Description of the bags, with their extrinsics and reference poses."""
         truth = self.truth  # first: it may find problems
         info = super().info()
         info.kind = f"{self._rig.kind}, {info.kind}"
@@ -100,7 +104,7 @@ class BagSequence(BagDataset):
 
 
 def describe_truth(truth: Trajectory | None, path: Path | None) -> str:
-    """For people."""
+    """Number and file of the reference poses as text."""
     return "none" if truth is None or path is None else f"{len(truth)} ({path.name})"
 
 
@@ -119,4 +123,4 @@ def read_poses(path: Path, body_T_lidar: FloatArray, problems: list[str]) -> Tra
         stamps, poses = read_pose_table(path, "t x y z qx qy qz qw", None)
     if len(stamps) == 0:
         raise DatasetError(f"{path}: no poses")
-    return at_lidar(in_order(stamps, poses, path.name, problems), body_T_lidar)
+    return moved_to_lidar(sorted_trajectory(stamps, poses, path.name, problems), body_T_lidar)

@@ -111,12 +111,12 @@ class LoamTopicsDataset:
 
     @property
     def imu(self) -> ImuSamples | None:
-        """None: LOAM's front end has used the IMU already."""
+        """Always None: the front end of LOAM has used the IMU already."""
         return None
 
     @property
     def truth(self) -> Trajectory | None:
-        """None: see ``recorded`` for LOAM's own result."""
+        """Always None: the result of LOAM itself is ``recorded``."""
         return None
 
     @cached_property
@@ -140,7 +140,7 @@ class LoamTopicsDataset:
         )
 
     def info(self) -> DatasetInfo:
-        """What was understood; reads LOAM's own poses if they are there."""
+        """Description of the bag; reads the recorded poses of LOAM if there are any."""
         facts = {"sweeps": f"up to {len(self)}", "axes": self.axes}
         facts["topics"] = ", ".join(f"{topic} ({self._types[topic][1]})" for topic in self._topics)
         problems: list[str] = []

@@ -1,4 +1,4 @@
-"""Where the sensors of a data set sit relative to each other."""
+"""Extrinsics: where the sensors of a data set sit relative to each other."""
 
 from __future__ import annotations
 
@@ -11,25 +11,20 @@ from scipy.spatial.transform import Rotation
 from loam_gtsam.types import FloatArray, Trajectory
 
 
-def rigid(rotation: Rotation, translation: Sequence[float] | FloatArray) -> FloatArray:
-    """(4, 4) transform."""
+def rigid_transform(rotation: Rotation, translation: Sequence[float] | FloatArray) -> FloatArray:
+    """(4, 4) transform of a rotation and a translation in metres."""
     matrix = np.eye(4)
     matrix[:3, :3] = rotation.as_matrix()
     matrix[:3, 3] = translation
     return matrix
 
 
-def pose(numbers: Sequence[float]) -> FloatArray:
-    """(4, 4) transform of ``x y z qx qy qz qw``."""
-    return rigid(Rotation.from_quat(numbers[3:]), numbers[:3])
-
-
-def at_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
-    """Poses of the lidar where those of another frame of the same body are given."""
+def moved_to_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
+    """Poses of the lidar, from those of another frame of the same body."""
     return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
 
 
-def implied_by(lidar_T_imu: FloatArray) -> Mapping[str, Any]:
+def extrinsic_settings(lidar_T_imu: FloatArray) -> Mapping[str, Any]:
     """The extrinsics as entries of :attr:`loam_gtsam.Dataset.sensor`."""
     angles = Rotation.from_matrix(lidar_T_imu[:3, :3]).as_euler("xyz", degrees=True)
     return {
@@ -39,7 +34,7 @@ def implied_by(lidar_T_imu: FloatArray) -> Mapping[str, Any]:
 
 
 def describe_extrinsics(sensor: Mapping[str, Any], source: str) -> str:
-    """For people."""
+    """Angles and position of the extrinsics as text, with their source."""
     roll, pitch, yaw = sensor["imu.lidar_R_imu_deg"]
     x, y, z = sensor["imu.lidar_t_imu"]
     return (

@@ -19,7 +19,7 @@ _PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DA
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """As in a ROS 2 header."""
+    """Stamp as in a ROS 2 header."""
 
     sec: int
     nanosec: int
@@ -27,14 +27,14 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True)
 class Header:
-    """As in ROS 2."""
+    """Header as in ROS 2."""
 
     stamp: Stamp
 
 
 @dataclass(frozen=True, slots=True)
 class Field:
-    """As ``sensor_msgs/PointField``."""
+    """Description of a field, as ``sensor_msgs/PointField``."""
 
     name: str
     offset: int
@@ -44,7 +44,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PackedCloud:
-    """What :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_with_times` needs of a message."""
+    """Cloud with what :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_with_times` needs."""
 
     header: Header
     height: int
@@ -123,7 +123,7 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
 
 
 def firing_by_firing(cloud: PackedCloud, beams: int, columns: int, source: str) -> PackedCloud:
-    """The same points as a range image, which they are in if the beams of a firing lie together.
+    """Cloud as a range image, for points that come firing by firing.
 
     Raises
     ------
@@ -166,7 +166,7 @@ def _packed(
 
 
 def _pcd_header(path: Path, data: NDArray[np.uint8]) -> tuple[dict[str, list[str]], int]:
-    """Its lines by their first word, and where the points begin."""
+    """Lines of the header by their first word, and the byte at which the points begin."""
     header: dict[str, list[str]] = {}
     start = 0
     text = data[:4096].tobytes()

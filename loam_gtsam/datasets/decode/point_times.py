@@ -1,4 +1,4 @@
-"""What the per-point times of a driver mean: their unit, their clock, and where the stamp sits.
+"""Meaning of the per-point times of a driver: unit, clock, and moment of the stamp.
 
 Drivers agree on nothing here: Velodyne writes seconds from the stamp, Ouster nanoseconds,
 Hesai and Robosense absolute seconds, Livox absolute nanoseconds. The numbers themselves tell the

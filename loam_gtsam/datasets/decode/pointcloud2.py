@@ -22,7 +22,7 @@ NO_TIMES = "none"
 """Value of ``time_field`` that ignores a time field on purpose."""
 
 _WILD_RING = 2.0**31
-"""No beam number; larger ones, which no integer holds, count as this."""
+"""Bound of beam numbers; larger floats, which no integer holds, are clipped to it."""
 
 # sensor_msgs/PointField: INT8 = 1 ... FLOAT64 = 8
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -86,7 +86,7 @@ def decode_with_times(
     stamp_is: str | None = None,
     decision: TimeDecision | None = None,
 ) -> Decoded:
-    """As :func:`decode_pointcloud2`, with the account of the times.
+    """Decode one PointCloud2 message and tell how its times were read.
 
     ``decision`` is the one of an earlier sweep: a whole run then reads its times in one way, also
     where a sweep has too few points to tell.

@@ -1,4 +1,4 @@
-"""Small text files of numbers, and what their stamps tell."""
+"""Small text files of numbers, IMU samples, and the stamps of both."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STANDARD_GRAVITY = 9.80665
 _ABSURD = 1e6
 """rad/s and m/s^2 that no IMU measures."""
 UNIT_TOLERANCE = 0.1
-"""By which the length of a quaternion may differ from one for it to be an orientation."""
+"""Limit by which the length of a quaternion may differ from one for it to be an orientation."""
 
 _Row = TypeVar("_Row")
 
@@ -175,7 +175,9 @@ def _stamp(clock: str, cells: list[str]) -> int:
     return nanoseconds
 
 
-def in_order(stamps: IntArray, poses: FloatArray, source: str, problems: list[str]) -> Trajectory:
+def sorted_trajectory(
+    stamps: IntArray, poses: FloatArray, source: str, problems: list[str]
+) -> Trajectory:
     """Reference poses by time, each time once; what had to be put right goes to ``problems``."""
     order = np.argsort(stamps, kind="stable")
     if (np.diff(stamps) < 0).any():
@@ -227,7 +229,7 @@ def is_in_g(acceleration: FloatArray) -> bool:
 
 
 def describe_imu(samples: ImuSamples) -> str:
-    """Count and rate for people."""
+    """Count and rate of IMU samples as text."""
     orientation = "with" if samples.orientation is not None else "without"
     return (
         f"{len(samples.stamps)} samples, {describe_rate(samples.stamps)}, {orientation} orientation"
@@ -235,7 +237,7 @@ def describe_imu(samples: ImuSamples) -> str:
 
 
 def describe_rate(stamps: IntArray) -> str:
-    """Median rate for people."""
+    """Median rate as text."""
     steps = np.diff(stamps)
     median = float(np.median(steps)) if len(steps) else 0.0
     return f"{1e9 / median:.2f} Hz" if median > 0.0 else "unknown rate"

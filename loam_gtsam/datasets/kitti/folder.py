@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
-from loam_gtsam.datasets.decode.extrinsics import describe_extrinsics, implied_by
+from loam_gtsam.datasets.decode.extrinsics import describe_extrinsics, extrinsic_settings
 from loam_gtsam.datasets.decode.point_times import TimeDecision, apply_times, decide_times
 from loam_gtsam.datasets.decode.tables import (
     clean_imu,
@@ -106,7 +106,7 @@ class KittiDataset(SweepFiles):
 
     @cached_property
     def imu(self) -> ImuSamples | None:
-        """From ``imu.csv`` or ``oxts/``, or None."""
+        """The IMU of ``imu.csv`` or ``oxts/``, or None."""
         path = self._root / "imu.csv"
         if path.is_file():
             table = read_table(path, "t qx qy qz qw wx wy wz ax ay az", ",")
@@ -117,7 +117,7 @@ class KittiDataset(SweepFiles):
 
     @cached_property
     def truth(self) -> Trajectory | None:
-        """From ``gt.tum``, the odometry benchmark's poses or ``oxts/``, or None."""
+        """Poses of ``gt.tum``, of the odometry benchmark or of ``oxts/``, or None."""
         path = self._root / "gt.tum"
         if path.is_file():
             return read_tum(path)
@@ -128,7 +128,7 @@ class KittiDataset(SweepFiles):
         return oxts_truth(*self._oxts, self._lidar_T_imu, self._problems)
 
     def info(self) -> DatasetInfo:
-        """What was understood; reads no sweep."""
+        """Description of the folder; reads no sweep."""
         imu = self.imu  # first: it may find problems
         info = DatasetInfo("KITTI folder", str(self._path), {"sweeps": str(len(self))})
         describe_stamps(self.stamps, info.facts, info.problems)
@@ -160,7 +160,7 @@ class KittiDataset(SweepFiles):
             period = turn_seconds(self._root, self._files, self.stamps, self._problems)
             sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
         if self._lidar_T_imu is not None and not (self._root / "imu.csv").is_file():
-            sensor.update(implied_by(self._lidar_T_imu))
+            sensor.update(extrinsic_settings(self._lidar_T_imu))
         return sensor
 
     def _read(self, file: Path, stamp: int) -> Scan:
@@ -186,7 +186,7 @@ class KittiDataset(SweepFiles):
         return values
 
     def _decide_times(self) -> TimeDecision:
-        """From the first sweep that has times; a missing file is a bad sweep, not the end."""
+        """How times are read, by the first sweep that has times; a missing file is a bad sweep."""
         message = ""
         for file, stamp in zip(self._files, self.stamps.tolist(), strict=True):
             try:

@@ -13,8 +13,13 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.decode.extrinsics import at_lidar
-from loam_gtsam.datasets.decode.tables import clean_imu, describe_rate, in_order, read_lines
+from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
+from loam_gtsam.datasets.decode.tables import (
+    clean_imu,
+    describe_rate,
+    read_lines,
+    sorted_trajectory,
+)
 from loam_gtsam.datasets.kitti.times import read_dates
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.geometry import inverse_pose
@@ -89,11 +94,13 @@ def oxts_truth(
     poses[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + values[:, _LATITUDE]) / 2.0))
     poses[:, 2, 3] = values[:, _ALTITUDE]
     poses[:, :3, 3] -= poses[0, :3, 3].copy()
-    return at_lidar(in_order(stamps, poses, "oxts", problems), inverse_pose(lidar_T_imu))
+    return moved_to_lidar(
+        sorted_trajectory(stamps, poses, "oxts", problems), inverse_pose(lidar_T_imu)
+    )
 
 
 def lidar_T_imu_of(root: Path) -> FloatArray | None:
-    """From ``calib_imu_to_velo.txt`` in the drive or, as distributed, in the folder of its day."""
+    """Extrinsics of ``calib_imu_to_velo.txt``, in the drive or in the folder of its day."""
     path = first_existing(root, ["calib_imu_to_velo.txt", "../calib_imu_to_velo.txt"])
     if path is None:
         return None

@@ -95,7 +95,7 @@ def read_dates(path: Path) -> IntArray:
 
 
 def _of_files(listed: IntArray, files: Sequence[Path]) -> IntArray:
-    """Of the stamps of a drive those of its files: some drives lack a few sweeps."""
+    """Stamps of the files of a drive, of all its listed ones: some drives lack a few sweeps."""
     numbers = [int(file.stem) if file.stem.isdecimal() else -1 for file in files]
     if len(listed) > len(numbers) and min(numbers) >= 0 and max(numbers) < len(listed):
         return listed[numbers]

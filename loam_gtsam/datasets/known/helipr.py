@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from loam_gtsam.datasets.decode.extrinsics import implied_by
+from loam_gtsam.datasets.decode.extrinsics import extrinsic_settings
 from loam_gtsam.datasets.decode.packed_points import read_records
-from loam_gtsam.datasets.decode.tables import in_order, read_pose_table
+from loam_gtsam.datasets.decode.tables import read_pose_table, sorted_trajectory
 from loam_gtsam.datasets.known.layouts import HELIPR_OTHERS, first_existing, helipr_truth
 from loam_gtsam.datasets.known.stamped_files import PackedFiles, missing_files
 from loam_gtsam.datasets.known.xsens import read_xsens
@@ -51,7 +51,7 @@ IMU_T_LIDAR = {
         ]
     ),
 }
-"""From the data set's Pointcloud-Toolbox (``transformINStoLiDAR.py``)."""
+"""Extrinsics of the data set's Pointcloud-Toolbox (``transformINStoLiDAR.py``)."""
 
 
 class HeLiPRDataset(PackedFiles):
@@ -100,14 +100,14 @@ class HeLiPRDataset(PackedFiles):
             stamp_is=stamp_is,
         )
         self._root = root
-        self.sensor = implied_by(inverse_pose(IMU_T_LIDAR[self._lidar]))
+        self.sensor = extrinsic_settings(inverse_pose(IMU_T_LIDAR[self._lidar]))
         self._extrinsics_source = "HeLiPR-Pointcloud-Toolbox"
         listing = first_existing(root, ["stamp.csv"])
         self._problems += missing_files(listing, self._lidar.lower(), self.stamps)
 
     @cached_property
     def imu(self) -> ImuSamples | None:
-        """From ``xsens_imu.csv``, or None."""
+        """The IMU of ``xsens_imu.csv``, or None."""
         path = first_existing(self._root, ["Inertial_data/xsens_imu.csv", "xsens_imu.csv"])
         return None if path is None else read_xsens(path, self._problems)
 
@@ -118,7 +118,7 @@ class HeLiPRDataset(PackedFiles):
         if path is None:
             return None
         stamps, poses = read_pose_table(path, "ns x y z qx qy qz qw", None)
-        return in_order(stamps, poses, path.name, self._problems)
+        return sorted_trajectory(stamps, poses, path.name, self._problems)
 
 
 def _lidar_folder(root: Path, lidar: str | None) -> Path:

@@ -1,4 +1,4 @@
-"""Which known data set a bag or folder belongs to, told by names alone."""
+"""File and folder names by which known data sets are told."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pathlib import Path
 from loam_gtsam.types import DatasetError
 
 MULRAN_FOLDERS = ("Ouster", "sensor_data/Ouster")
-"""Where the sweeps of MulRan lie."""
+"""Folders in which the sweeps of MulRan lie."""
 HELIPR_LIDARS = ("Ouster", "Velodyne")
-"""Those of HeLiPR that sweep rings."""
+"""Lidars of HeLiPR that sweep rings."""
 HELIPR_OTHERS = ("Avia", "Aeva")
 NEWER_COLLEGE_SCANS = "raw_format/ouster_scan"
 SPIRES_CLOUDS = "raw/lidar-clouds"

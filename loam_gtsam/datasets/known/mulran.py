@@ -9,11 +9,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.decode.extrinsics import at_lidar, implied_by, rigid
+from loam_gtsam.datasets.decode.extrinsics import (
+    extrinsic_settings,
+    moved_to_lidar,
+    rigid_transform,
+)
 from loam_gtsam.datasets.decode.packed_points import firing_by_firing, read_records
 from loam_gtsam.datasets.decode.point_times import check_time_options
 from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2
-from loam_gtsam.datasets.decode.tables import in_order, read_table
+from loam_gtsam.datasets.decode.tables import read_table, sorted_trajectory
 from loam_gtsam.datasets.known.layouts import MULRAN_FOLDERS, first_existing
 from loam_gtsam.datasets.known.stamped_files import StampedFiles, missing_files
 from loam_gtsam.datasets.known.xsens import read_xsens
@@ -24,11 +28,11 @@ BEAMS, COLUMNS = 64, 1024
 so)."""
 PERIOD = 0.1
 """Seconds of a turn at 10 Hz."""
-BASE_T_LIDAR = rigid(
+BASE_T_LIDAR = rigid_transform(
     Rotation.from_euler("xyz", [0.0001, 0.0003, 179.6654], degrees=True), [1.7042, -0.021, 1.8047]
 )
 """``calib_base2ouster.txt`` of the data set, as KISS-ICP, MOLA and mulran2bag quote it."""
-LIDAR_T_IMU = rigid(Rotation.from_euler("z", 180.0, degrees=True), [1.77, 0.0, -0.05])
+LIDAR_T_IMU = rigid_transform(Rotation.from_euler("z", 180.0, degrees=True), [1.77, 0.0, -0.05])
 """``params_mulran.yaml`` of SC-LIO-SAM, by an author of the data set, which itself states none."""
 
 _RECORD = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
@@ -72,7 +76,7 @@ class MulRanDataset(StampedFiles):
             )
         super().__init__(root, "MulRan sequence", folder, "*.bin", int)
         self._root, self._beside = root, folder.parent
-        self.sensor = implied_by(LIDAR_T_IMU)
+        self.sensor = extrinsic_settings(LIDAR_T_IMU)
         self._extrinsics_source = "SC-LIO-SAM's configuration"
         self._moment = stamp_is or "start"
         if stamp_is is None:
@@ -87,13 +91,13 @@ class MulRanDataset(StampedFiles):
 
     @cached_property
     def imu(self) -> ImuSamples | None:
-        """From ``xsens_imu.csv``, or None."""
+        """The IMU of ``xsens_imu.csv``, or None."""
         path = first_existing(self._beside, ["xsens_imu.csv"])
         return None if path is None else read_xsens(path, self._problems)
 
     @cached_property
     def truth(self) -> Trajectory | None:
-        """From ``global_pose.csv``, moved from the car's base to the lidar, or None."""
+        """Poses of ``global_pose.csv``, moved from the car's base to the lidar, or None."""
         path = self._root / "global_pose.csv"
         if not path.is_file():
             return None
@@ -105,7 +109,9 @@ class MulRanDataset(StampedFiles):
         bad = np.flatnonzero((np.abs(error) > 1e-3).any(axis=(1, 2)))
         if len(bad):
             raise DatasetError(f"{path}: row {bad[0] + 1} does not hold a rotation matrix")
-        return at_lidar(in_order(stamps, poses, path.name, self._problems), BASE_T_LIDAR)
+        return moved_to_lidar(
+            sorted_trajectory(stamps, poses, path.name, self._problems), BASE_T_LIDAR
+        )
 
     def _read(self, file: Path, stamp: int) -> Scan:
         cloud = firing_by_firing(read_records(file, stamp, _RECORD), BEAMS, COLUMNS, str(file))

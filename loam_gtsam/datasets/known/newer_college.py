@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
 from loam_gtsam.datasets.base import BagOptions
-from loam_gtsam.datasets.decode.extrinsics import pose, rigid
+from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.datasets.decode.packed_points import firing_by_firing, read_pcd
+from loam_gtsam.datasets.decode.tables import pose_matrix
 from loam_gtsam.datasets.known.layouts import (
     NEWER_COLLEGE_SCANS,
     first_existing,
@@ -25,15 +26,17 @@ from loam_gtsam.datasets.known.stamped_files import PackedFiles
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
 
-_SENSOR_T_LIDAR = rigid(Rotation.from_euler("z", 180.0, degrees=True), [0.0, 0.0, 0.03618])
-_SENSOR_T_IMU = rigid(Rotation.identity(), [0.006253, -0.011775, 0.007645])
+_SENSOR_T_LIDAR = rigid_transform(
+    Rotation.from_euler("z", 180.0, degrees=True), [0.0, 0.0, 0.03618]
+)
+_SENSOR_T_IMU = rigid_transform(Rotation.identity(), [0.006253, -0.011775, 0.007645])
 """Ouster's manual of the OS1, coordinate frames."""
 
 RIG_2020 = Rig(
     kind="Newer College 2020",
     topic="/os1_cloud_node/points",
     imu_topic="/os1_cloud_node/imu",
-    body_T_lidar=pose([-0.084, -0.025, 0.050, 0.0, 0.0, 0.924, 0.383]),
+    body_T_lidar=pose_matrix([-0.084, -0.025, 0.050, 0.0, 0.0, 0.924, 0.383]),
     lidar_T_imu=inverse_pose(_SENSOR_T_LIDAR) @ _SENSOR_T_IMU,
     source="Ouster's manual",
 )
@@ -44,9 +47,9 @@ RIG_2021 = Rig(
     kind="Newer College 2021",
     topic="/os_cloud_node/points",
     imu_topic="/os_cloud_node/imu",
-    body_T_lidar=pose([0.001, 0.0, 0.091, 0.0, 0.0, 0.0, 1.0]),
+    body_T_lidar=pose_matrix([0.001, 0.0, 0.091, 0.0, 0.0, 0.0, 1.0]),
     lidar_T_imu=inverse_pose(
-        pose([0.013801, -0.012207, -0.01514, 0.0032925, -0.004627, -0.0024302, 0.99998])
+        pose_matrix([0.013801, -0.012207, -0.01514, 0.0032925, -0.004627, -0.0024302, 0.99998])
     ),
     source="the data set's calibration, as evalio quotes it",
 )
@@ -125,7 +128,7 @@ class NewerCollegeClouds(PackedFiles):
 
     @property
     def imu(self) -> ImuSamples | None:
-        """None: the bags have one."""
+        """Always None: only the bags have an IMU."""
         return None
 
     @cached_property
@@ -143,7 +146,7 @@ class NewerCollegeClouds(PackedFiles):
 
 
 def _cloud_stamp(stem: str) -> int:
-    """Of ``cloud_1583836591_182590976``."""
+    """Nanoseconds of ``cloud_1583836591_182590976``."""
     match = re.fullmatch(r"cloud_(\d+)_(\d{1,9})", stem)
     if match is None:
         raise ValueError(f"{stem} is not cloud_SECONDS_NANOSECONDS")

@@ -11,21 +11,21 @@ import numpy as np
 
 from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
 from loam_gtsam.datasets.base import BagOptions
-from loam_gtsam.datasets.decode.extrinsics import implied_by, pose
+from loam_gtsam.datasets.decode.extrinsics import extrinsic_settings
 from loam_gtsam.datasets.decode.packed_points import read_pcd
-from loam_gtsam.datasets.decode.tables import clean_imu, read_table
+from loam_gtsam.datasets.decode.tables import clean_imu, pose_matrix, read_table
 from loam_gtsam.datasets.known.layouts import SPIRES_CLOUDS, spires_bags, spires_truth
 from loam_gtsam.datasets.known.stamped_files import PackedFiles
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
 
-_CAMERA_T_LIDAR = pose(
+_CAMERA_T_LIDAR = pose_matrix(
     [
         *(0.00035060884033447846, -0.079574053851818, -0.053826061545697405),
         *(0.5034725628949727, 0.5003337192107279, -0.4947539264483171, 0.5013981452864594),
     ]
 )
-_CAMERA_T_IMU = pose(
+_CAMERA_T_IMU = pose_matrix(
     [
         *(-0.0008544600980918986, 0.005115741648037186, -0.06898747851173177),
         *(0.0042909719518877815, -0.7085293318962699, 0.705668106144218, 0.0005453193252705428),
@@ -35,7 +35,7 @@ RIG = Rig(
     kind="Oxford Spires",
     topic="/hesai/pandar",
     imu_topic="/alphasense_driver_ros/imu",
-    body_T_lidar=pose([0.0, 0.0, 0.124, 0.0, 0.0, 1.0, 0.0]),
+    body_T_lidar=pose_matrix([0.0, 0.0, 0.124, 0.0, 0.0, 1.0, 0.0]),
     lidar_T_imu=inverse_pose(_CAMERA_T_LIDAR) @ _CAMERA_T_IMU,
     source="sensor.yaml of the data set's tools",
 )
@@ -91,12 +91,12 @@ class OxfordSpiresClouds(PackedFiles):
             time_unit=time_unit,
             stamp_is=stamp_is,
         )
-        self.sensor = implied_by(RIG.lidar_T_imu)
+        self.sensor = extrinsic_settings(RIG.lidar_T_imu)
         self._extrinsics_source = RIG.source
 
     @cached_property
     def imu(self) -> ImuSamples | None:
-        """From ``raw/imu.csv``, or None."""
+        """The IMU of ``raw/imu.csv``, or None."""
         path = self._path / "raw" / "imu.csv"
         if not path.is_file():
             return None
@@ -113,7 +113,7 @@ class OxfordSpiresClouds(PackedFiles):
 
 
 def _cloud_stamp(stem: str) -> int:
-    """Of ``1710338090.123456789`` or ``cloud_1710338090_123456789``."""
+    """Nanoseconds of ``1710338090.123456789`` or ``cloud_1710338090_123456789``."""
     match = re.fullmatch(r"(?:cloud_)?(\d+)[._](\d{9})", stem)
     if match is None:
         raise ValueError(f"{stem} is not SECONDS.NANOSECONDS")

@@ -1,4 +1,4 @@
-"""What data sets with one file per sweep, named by its stamp, have in common."""
+"""Data sets with one file per sweep, named by the stamp of the sweep."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class StampedFiles(SweepFiles):
     Parameters
     ----------
     path : as the user gave it
-    kind : for people
+    kind : name of the data set
     folder : of the files
     pattern : of their names
     stamp_of : nanoseconds of a file, from its name without suffix; raises ValueError
@@ -83,10 +83,10 @@ class StampedFiles(SweepFiles):
 
     @abstractmethod
     def _sweep_facts(self) -> dict[str, str]:
-        """What is to be said about the points."""
+        """Label and text of the facts about the points."""
 
     def info(self) -> DatasetInfo:
-        """What was understood; reads the first sweeps, the IMU and the reference poses."""
+        """Description of the files; reads the first sweeps, the IMU and the reference poses."""
         imu, truth = self.imu, self.truth  # first: they may find problems
         info = DatasetInfo(self._kind, str(self._path), {"sweeps": str(len(self))})
         describe_stamps(self.stamps, info.facts, info.problems)

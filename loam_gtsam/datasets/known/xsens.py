@@ -58,9 +58,10 @@ def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
 
 
 def _gyro_columns(stamps: IntArray, values: FloatArray) -> str | None:
-    """Which three columns are the gyro: those whose mean is nearest to how the orientation turns.
+    """Name of the three columns that are the gyro: their mean is nearest to the turn rate.
 
-    Over a window, for the noise of the orientation counts less the longer it is.
+    The turn rate is that of the orientation over a window: the noise of the orientation counts less
+    the longer the window is.
     """
     order = np.argsort(stamps, kind="stable")
     seconds = (stamps[order] - stamps[order[0]]) * 1e-9 if len(order) else np.zeros(0)

@@ -7,11 +7,18 @@ from itertools import pairwise
 
 import numpy as np
 
-from loam_gtsam.datasets.sim.scenes import CAR, Kerb, Scene, points_at, rolling, streets
+from loam_gtsam.datasets.sim.scenes import (
+    CAR,
+    Kerb,
+    Scene,
+    build_streets,
+    points_along,
+    rolling_ground,
+)
 from loam_gtsam.types import ConfigError, FloatArray
 
 _STREAM = 8
-"""Of random numbers; other scenes have lower ones."""
+"""Number of the stream of random numbers; other scenes have lower ones."""
 _EAST, _ACROSS = (150.0, 380.0), (90.0, 200.0)
 """Metres of the streets that lead east and of those that lead north or south."""
 _RADIUS = 16.0
@@ -42,7 +49,7 @@ def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
     if not _SHORTEST <= metres < np.inf:
         raise ConfigError(f"metres: expected at least {_SHORTEST:g}, got {metres!r}")
     rng = np.random.default_rng([seed, 0, _STREAM])
-    ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
+    ground = rolling_ground(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
     corners = _corners(rng, metres)
     steps = np.diff(corners, axis=0)
     turns = np.sign(steps[:-1, 0] * steps[1:, 1] - steps[:-1, 1] * steps[1:, 0])
@@ -55,7 +62,7 @@ def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
             sides.append((rng, kerb, side == turns[number], side == turns[number + 1]))
     return Scene(
         name="avenue",
-        solids=streets(sides, ground),
+        solids=build_streets(sides, ground),
         waypoints=_way(corners, metres),
         closed=False,
         speed=10.0,
@@ -89,4 +96,4 @@ def _way(corners: FloatArray, metres: float) -> FloatArray:
     for corner, before, after in zip(corners[1:-1], along, along[1:], strict=False):
         centre = corner + _RADIUS * (after - before)
         pieces.append(centre + _RADIUS * (np.sin(angle) * before - np.cos(angle) * after))
-    return points_at(np.vstack(pieces), np.linspace(0.0, metres, int(metres / _SPACING) + 1))
+    return points_along(np.vstack(pieces), np.linspace(0.0, metres, int(metres / _SPACING) + 1))

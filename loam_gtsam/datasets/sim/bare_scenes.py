@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from loam_gtsam.datasets.sim.raycast import Solids
-from loam_gtsam.datasets.sim.scenes import CAR, DEEP, Scene, box, rolling
+from loam_gtsam.datasets.sim.scenes import CAR, DEEP, Scene, box, rolling_ground
 from loam_gtsam.types import FloatArray
 
 _POLES = 25
@@ -60,7 +60,7 @@ def build_tunnel(seed: int) -> Scene:
 def build_sparse_terrain(seed: int) -> Scene:
     """25 thin poles within 15 m of a winding way of 300 m over gently undulating ground."""
     rng = np.random.default_rng([seed, 0, 6])
-    ground = rolling(rng, (0.6, 0.25, 0.08), (75.0, 33.0, 14.0))
+    ground = rolling_ground(rng, (0.6, 0.25, 0.08), (75.0, 33.0, 14.0))
     along = np.arange(0.0, _TERRAIN, 8.0)
 
     def across(x: FloatArray) -> FloatArray:

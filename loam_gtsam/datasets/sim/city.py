@@ -10,16 +10,16 @@ from loam_gtsam.datasets.sim.scenes import (
     DEEP,
     Kerb,
     Scene,
-    chord,
-    grown,
-    points_at,
-    rolling,
+    distances_along,
+    points_along,
+    rolling_ground,
+    solids_with_foliage,
 )
 from loam_gtsam.geometry import as_array
 from loam_gtsam.types import FloatArray, InputError
 
 _STREAM = 9
-"""Of random numbers; other scenes have lower ones."""
+"""Number of the stream of random numbers; other scenes have lower ones."""
 _STEP = 1.0
 """Metres between the points at which the way is looked at."""
 _SPACING = 8.0
@@ -27,7 +27,7 @@ _SPACING = 8.0
 _CLEAR = 5.0
 """Metres that houses keep from the way at least."""
 _KERB = 2.8
-"""Metres that cars, posts and trees do."""
+"""Metres that cars, posts and trees keep from the way at least."""
 
 
 def build_city(way: FloatArray, seed: int = 0) -> Scene:
@@ -46,18 +46,18 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
         If there are no two points 100 m apart along the way.
     """
     way = as_array(way, "way", ("N", 2))
-    distances = chord(way)
+    distances = distances_along(way)
     length = float(distances[-1])
     if not len(way) or length < 100.0:
         raise InputError("way: expected one of 100 m or more; give more points of it")
     way = way[np.concatenate([[True], np.diff(distances) > 0.0])]  # without stops
 
     def along(spacing: float) -> FloatArray:
-        return points_at(way, np.linspace(0.0, length, int(length / spacing) + 1))
+        return points_along(way, np.linspace(0.0, length, int(length / spacing) + 1))
 
     path = along(_STEP)
     rng = np.random.default_rng([seed, 0, _STREAM])
-    ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
+    ground = rolling_ground(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
     roadside = _Roadside(path, rng)
     s = 6.0
     while s < length - 6.0:
@@ -67,7 +67,7 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
         s += float(rng.uniform(9.0, 13.0))
     return Scene(
         name="city",
-        solids=grown(roadside.boxes, roadside.cylinders, roadside.crowns, ground),
+        solids=solids_with_foliage(roadside.boxes, roadside.cylinders, roadside.crowns, ground),
         waypoints=along(_SPACING),
         closed=False,
         speed=10.0,
@@ -77,7 +77,7 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
 
 
 class _Roadside:
-    """What stands beside a way, and nowhere on it.
+    """Things that stand beside a way, and nowhere on it.
 
     Attributes
     ----------

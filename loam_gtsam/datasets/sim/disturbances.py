@@ -35,7 +35,7 @@ _CALIBRATIONS = 16
 
 
 class Disturbance:
-    """What happens to the sweeps of a data set; this one does nothing."""
+    """Change of the sweeps of a data set; this base class changes nothing."""
 
     def keeps(self, number: int) -> bool:
         """Whether the sweep of that number (from 0) arrives at all."""
@@ -162,7 +162,7 @@ class MovingObjects(Disturbance):
             )
 
     def covering(self, share: float, scan: Scan) -> MovingObjects:
-        """The same with boxes so long that they hide a share of a sweep's points, averaged in time.
+        """Moving objects so long that they hide a share of a sweep's points, averaged in time.
 
         Raises
         ------
@@ -234,7 +234,7 @@ class MovingObjects(Disturbance):
 def _between(
     coordinate: FloatArray, low: float | FloatArray, high: float | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where rays from the origin are between two planes, in shares of their length."""
+    """Shares of the length of rays from the origin at which they are between two planes."""
     first, second = low / coordinate, high / coordinate
     return np.minimum(first, second), np.maximum(first, second)
 
@@ -278,16 +278,16 @@ class Disturbed:
 
     @property
     def imu(self) -> ImuSamples | None:
-        """That of the data set."""
+        """IMU of the data set."""
         return self._dataset.imu
 
     @property
     def truth(self) -> Trajectory | None:
-        """That of the data set, missing sweeps included."""
+        """Reference poses of the data set, those of missing sweeps included."""
         return self._dataset.truth
 
     def info(self) -> DatasetInfo:
-        """That of the data set, with what disturbs it."""
+        """Description of the data set, with what disturbs it."""
         info = self._dataset.info()
         facts = info.facts | {"disturbed by": ", ".join(map(str, self._disturbances)) or "nothing"}
         return replace(info, facts=facts)

@@ -70,7 +70,7 @@ class SkippedAhead:
 
     @property
     def imu(self) -> ImuSamples | None:
-        """With the same stretch cut out."""
+        """The IMU with the same stretch cut out."""
         imu = self._dataset.imu
         if imu is None:
             return None
@@ -80,7 +80,7 @@ class SkippedAhead:
 
     @property
     def truth(self) -> Trajectory | None:
-        """With the same stretch cut out: it jumps."""
+        """Poses with the same stretch cut out: they jump."""
         truth = self._dataset.truth
         if truth is None:
             return None
@@ -93,7 +93,7 @@ class SkippedAhead:
         return keep, stamps[keep] - later
 
     def info(self) -> DatasetInfo:
-        """That of the data set, with the cut."""
+        """Description of the data set, with the cut."""
         info = self._dataset.info()
         cut = f"{self._count} sweeps from {self._first}"
         return replace(info, facts=info.facts | {"cut out": cut})
@@ -156,7 +156,7 @@ class Kidnapped:
 
     @cached_property
     def imu(self) -> ImuSamples:
-        """What an IMU measures that is moved along with the lidar, but does not feel the jump."""
+        """IMU that is moved along with the lidar, but does not feel the jump."""
         before, after = self._world.imu, self._moved.imu
         assert before.orientation is not None
         assert after.orientation is not None
@@ -170,7 +170,7 @@ class Kidnapped:
         return ImuSamples(before.stamps, *columns)
 
     def info(self) -> DatasetInfo:
-        """That of the drive, with the change of place."""
+        """Description of the drive, with the change of place."""
         info = self._world.info()
         return replace(info, facts=info.facts | {"kidnapped": self._change})
 

@@ -115,7 +115,7 @@ class Motion:
         return other
 
     def inertial(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """What a perfect IMU at the lidar's origin, with the lidar's axes, measures.
+        """Measurements of a perfect IMU at the lidar's origin, with the lidar's axes.
 
         Returns
         -------

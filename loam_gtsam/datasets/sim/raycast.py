@@ -19,7 +19,7 @@ _EPSILON = 1e-12
 _TOUCH = 1e-7
 """Metres above the ground that count as on it."""
 _GROUND_STEPS = 100
-"""A bound, not a typical number (ten); only rays that skim crests need many."""
+"""Most steps of a ray; ten are typical, only rays that skim crests need many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,7 +47,7 @@ class Ground:
 
     @property
     def top(self) -> float:
-        """No crest is higher, metres."""
+        """Bound of the height of the highest crest, metres."""
         return self.level + float(np.abs(self.waves[:, 0]).sum())
 
     def height(self, x: FloatArray, y: FloatArray) -> FloatArray:
@@ -165,7 +165,7 @@ def cast_rays(
 
 
 def _slab(offset: FloatArray, direction: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:
-    """Where rays enter and leave ``|coordinate| < half``."""
+    """Distances at which rays enter and leave ``|coordinate| < half``."""
     inverse = 1.0 / direction
     middle = -offset * inverse
     reach = half * np.abs(inverse)
@@ -273,7 +273,7 @@ class _View:
         return self._columns(middle + low, middle + high, distance)
 
     def facing_discs(self, centres: FloatArray, radii: FloatArray) -> Iterator[tuple[int, slice]]:
-        """The same for upright round things."""
+        """(index, columns) of the upright round things in reach."""
         offset = centres - self.middle
         distance = np.linalg.norm(offset, axis=1)
         radii = radii + self.stray

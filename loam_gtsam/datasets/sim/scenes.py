@@ -85,7 +85,7 @@ def build_street_loop(seed: int) -> Scene:
     """
     rng = np.random.default_rng([seed, 0, 2])
     half_x, half_y = 105.0, 55.0
-    ground = rolling(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
+    ground = rolling_ground(rng, (0.5, 0.35, 0.2), (150.0, 90.0, 60.0))
     corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (half_x, half_y)
     sides = (
         (rng, Kerb(corner, following, inside, ground), inside, inside)
@@ -94,7 +94,7 @@ def build_street_loop(seed: int) -> Scene:
     )
     return Scene(
         name="street_loop",
-        solids=streets(sides, ground),
+        solids=build_streets(sides, ground),
         waypoints=_rounded_rectangle(half_x, half_y, radius=16.0, wander=0.6),
         closed=True,
         speed=10.0,
@@ -106,7 +106,7 @@ def build_street_loop(seed: int) -> Scene:
 def build_trees(seed: int) -> Scene:
     """Open woodland on slopes: trunks, crowns, rocks, no wall anywhere."""
     rng = np.random.default_rng([seed, 0, 3])
-    ground = rolling(rng, (1.8, 0.9, 0.2, 0.05), (80.0, 47.0, 16.0, 5.0))
+    ground = rolling_ground(rng, (1.8, 0.9, 0.2, 0.05), (80.0, 47.0, 16.0, 5.0))
     angle = np.linspace(0.0, 2.0 * np.pi, 40, endpoint=False)
     radius = 42.0 + 7.0 * np.sin(2.0 * angle + 0.5) + 4.0 * np.sin(3.0 * angle)
     path = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
@@ -191,7 +191,7 @@ def build_slopes(seed: int) -> Scene:
         [amplitude, number, 0.0, phase],
         [-amplitude / 9.0, 3.0 * number, 0.0, 3.0 * phase],
     ]
-    ground = Ground(np.vstack([waves, rolling(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
+    ground = Ground(np.vstack([waves, rolling_ground(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
     bends = np.array(
         [[0, 0], [80, 14], [175, -6], [265, 16], [350, 0], [400, -4]], dtype=np.float64
     )
@@ -276,7 +276,7 @@ class Kerb:
         return [x, y, z + 0.5 * (low + top), *half, self._yaw]
 
 
-def streets(
+def build_streets(
     sides: Iterable[tuple[np.random.Generator, Kerb, bool, bool]], ground: Ground
 ) -> Solids:
     """Houses, cars, lamp posts and trees along sides of streets.
@@ -295,10 +295,10 @@ def streets(
         boxes += cars
         cylinders += posts
         crowns += trees
-    return grown(boxes, cylinders, crowns, ground)
+    return solids_with_foliage(boxes, cylinders, crowns, ground)
 
 
-def grown(
+def solids_with_foliage(
     boxes: list[list[float]],
     cylinders: list[list[float]],
     crowns: list[list[float]],
@@ -382,7 +382,7 @@ def box(x0: float, x1: float, y0: float, y1: float, z0: float, z1: float) -> lis
     return [*centre, 0.5 * abs(x1 - x0), 0.5 * abs(y1 - y0), 0.5 * abs(z1 - z0), 0.0]
 
 
-def rolling(
+def rolling_ground(
     rng: np.random.Generator, amplitudes: tuple[float, ...], wavelengths: tuple[float, ...]
 ) -> Ground:
     """One wave each, in random directions."""
@@ -394,16 +394,16 @@ def rolling(
     )
 
 
-def chord(way: FloatArray) -> FloatArray:
+def distances_along(way: FloatArray) -> FloatArray:
     """(N,) metres from the first of (N, 2) points to each, along straight lines between them."""
     steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
     distances: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
     return distances
 
 
-def points_at(way: FloatArray, metres: FloatArray) -> FloatArray:
+def points_along(way: FloatArray, metres: FloatArray) -> FloatArray:
     """(M, 2) points so far along a way of (N, 2) points, of which no two in a row are the same."""
-    distances = chord(way)
+    distances = distances_along(way)
     return np.stack([np.interp(metres, distances, way[:, k]) for k in (0, 1)], axis=1)
 
 
@@ -417,9 +417,9 @@ def _rounded_rectangle(half_x: float, half_y: float, radius: float, wander: floa
         pieces.append(centre + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
     rough = np.vstack([*pieces, pieces[0]])
     # Fill the straights, then let the driver wander a little within the lane.
-    length = chord(rough)[-1]
+    length = distances_along(rough)[-1]
     step = np.linspace(0.0, length, int(length / 8.0), endpoint=False)
-    way = points_at(rough, step)
+    way = points_along(rough, step)
     swing = wander * np.sin(2.0 * np.pi * 7.0 * step / length)
     tangent = np.roll(way, -1, axis=0) - np.roll(way, 1, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)

@@ -69,7 +69,7 @@ SENSORS: dict[str, tuple[FloatArray, int]] = {
 _EPOCH = 1_700_000_000_000_000_000
 """Nanoseconds of the first sweep: as large as real stamps are, which floats cannot hold."""
 _SPIN = {"rings": "field", "times": "field", "spin": "clockwise", "start_azimuth_deg": 180.0}
-"""What all sensors have in common."""
+"""Settings that all sensors have in common."""
 _MIN_RANGE = 0.5
 """Metres."""
 _IMU_PERIOD = 5_000_000
@@ -320,7 +320,7 @@ def _beam_directions(turns: FloatArray, elevations_deg: FloatArray) -> FloatArra
 
 
 def _seconds(stamps: IntArray) -> FloatArray:
-    """Since the first sweep; the difference is taken in integers."""
+    """Seconds since the first sweep; the difference is taken in integers."""
     return (stamps - _EPOCH).astype(np.float64) * 1e-9
 
 

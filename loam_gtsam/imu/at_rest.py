@@ -9,7 +9,8 @@ import numpy as np
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.quaternions import as_rot3
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.imu.store import rows_of
+from loam_gtsam.types import FloatArray, ImuSamples
 
 REST_LEAST = 0.1
 """Seconds that samples at rest must span at least."""
@@ -62,13 +63,7 @@ class RestWindow:
         return float(np.arctan2(away, up @ self.acceleration))
 
 
-def find_rest(
-    config: ImuConfig,
-    stamps: IntArray,
-    gyro: FloatArray,
-    acceleration: FloatArray,
-    quaternions: FloatArray | None = None,
-) -> RestWindow | None:
+def find_rest(config: ImuConfig, samples: ImuSamples) -> RestWindow | None:
     """The rest that these samples make; None if they are not at rest.
 
     At rest means: gyro and acceleration scatter little (:data:`REST_GYRO`,
@@ -79,10 +74,9 @@ def find_rest(
     Parameters
     ----------
     config : section ``imu``
-    stamps : (N,) nanoseconds, ascending
-    gyro, acceleration : (N, 3) rad/s and m/s^2, lidar axes
-    quaternions : (N, 4) x y z w of ``world_R_lidar``, NaN where unknown
+    samples : in order of time, in lidar axes, the orientation NaN where unknown
     """
+    stamps, gyro, acceleration = samples.stamps, samples.gyro, samples.acceleration
     if len(stamps) < REST_SAMPLES or stamps[-1] - stamps[0] < REST_LEAST * 1e9:
         return None
     mean_gyro, mean_acceleration = gyro.mean(axis=0), acceleration.mean(axis=0)
@@ -99,8 +93,8 @@ def find_rest(
     ):
         return None
     world_R_lidar = None
-    if quaternions is not None:
-        known = quaternions[np.isfinite(quaternions[:, 0])]
+    if samples.orientation is not None:
+        known = samples.orientation[np.isfinite(samples.orientation[:, 0])]
         if len(known):
             # q and -q are one rotation: bring all to one side before they are averaged.
             mean = np.where(known @ known[0] < 0.0, -1.0, 1.0) @ known
@@ -115,24 +109,18 @@ def find_rest(
     )
 
 
-def rest_at_start(
-    config: ImuConfig,
-    stamps: IntArray,
-    gyro: FloatArray,
-    acceleration: FloatArray,
-    quaternions: FloatArray | None = None,
-) -> RestWindow | None:
-    """The first ``still_seconds`` of a stream, or a half or a quarter of them, if at rest.
+def rest_at_start(config: ImuConfig, samples: ImuSamples) -> RestWindow | None:
+    """The rest in the first ``still_seconds`` of a stream, or in a half or a quarter of them.
 
     Parameters are those of :func:`find_rest`, at least one sample.
     """
+    stamps = samples.stamps
     for share in (1.0, 0.5, 0.25):
         end = int(stamps[0]) + round(share * config.still_seconds * 1e9)
-        part = slice(0, int(np.searchsorted(stamps, end, side="right")))
-        among = None if quaternions is None else quaternions[part]
-        window = find_rest(config, stamps[part], gyro[part], acceleration[part], among)
-        if window is not None:
-            return window
+        first = slice(0, int(np.searchsorted(stamps, end, side="right")))
+        rest = find_rest(config, rows_of(samples, first))
+        if rest is not None:
+            return rest
     return None
 
 

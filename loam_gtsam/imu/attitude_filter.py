@@ -19,7 +19,7 @@ from loam_gtsam.imu.quaternions import (
     running_filter,
     running_product,
 )
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import FloatArray, ImuSamples, IntArray
 
 BLOCK = 512
 """Samples taken at once. Blocks begin at fixed places of the stream, so that the result does not
@@ -143,24 +143,22 @@ class GravityFilter:
         self._room = self._room[count:].copy()
         self._start_dropped = True
 
-    def orientations(
-        self, stamps: IntArray, gyro: FloatArray, acceleration: FloatArray
-    ) -> FloatArray | None:
+    def orientations(self, samples: ImuSamples) -> FloatArray | None:
         """(N, 4) quaternions x y z w of all samples; those filtered before cost no time.
 
         Parameters
         ----------
-        stamps : (N,) nanoseconds, ascending, at least one
-        gyro, acceleration : (N, 3) rad/s and m/s^2, lidar axes
+        samples : (N,) at least one, in order of time, in lidar axes
 
         Returns
         -------
         ``world_R_lidar``, or None if the acceleration at the start is not gravity. A view, valid
         until the next call.
         """
+        stamps, gyro, acceleration = samples.stamps, samples.gyro, samples.acceleration
         count = len(stamps)
         if not self._states:
-            start = None if self._start_dropped else self._start(stamps, gyro, acceleration)
+            start = None if self._start_dropped else self._start(samples)
             if start is None:
                 return None
             self._states.append(start)
@@ -184,13 +182,11 @@ class GravityFilter:
                 self._states.append(state)
         return self._room[:count]
 
-    def _start(
-        self, stamps: IntArray, gyro: FloatArray, acceleration: FloatArray
-    ) -> FilterState | None:
+    def _start(self, samples: ImuSamples) -> FilterState | None:
         """The state before the first sample; None if the acceleration is not gravity."""
-        config = self._config
+        config, stamps, gyro = self._config, samples.stamps, samples.gyro
         self._start_end = int(stamps[0]) + round(config.still_seconds * 1e9)
-        rest = rest_at_start(config, stamps, gyro, acceleration)
+        rest = rest_at_start(config, samples)
         if rest is not None:
             bias, force, hold = rest.gyro, rest.acceleration, rest.last
             learnt = config.filter_seconds
@@ -198,7 +194,7 @@ class GravityFilter:
             part = slice(0, int(np.searchsorted(stamps, self._start_end, side="right")))
             steps = rotation_steps((stamps[part] - stamps[0]) * 1e-9, gyro[part].T)
             turned = np.column_stack([[0.0, 0.0, 0.0, 1.0], running_product(exponential(steps))])
-            force = rotate(turned, acceleration[part].T).mean(axis=1)
+            force = rotate(turned, samples.acceleration[part].T).mean(axis=1)
             bias, hold, learnt = np.zeros(3), int(stamps[part][-1]), config.still_seconds
         weight = float(np.linalg.norm(force))
         if not 0.5 * config.gravity < weight < 1.5 * config.gravity:

@@ -143,7 +143,7 @@ class ImuBuffer:
             return
         self._rest, self._start_is_held = self._rest_at_start(), False
         if self._quality.constant:  # then the filter is in use, or may be later
-            self._filtered()
+            self._filter.orientations(store.samples)
             self._filter.drop(count)
         self._quality.drop(store.stamps[: count + 1])
         store.drop(count)
@@ -155,7 +155,7 @@ class ImuBuffer:
 
     @property
     def report(self) -> ImuReport:
-        """What came in so far, and what was wrong with it."""
+        """Numbers of all samples so far, and what was wrong with them."""
         filtered = self._orientations() is not None
         return self._quality.report(self._store.stamps, self._rest_at_start(), filtered)
 
@@ -189,7 +189,7 @@ class ImuBuffer:
         return before.slerp((stamp - int(stamps[i])) / step, as_rot3(quaternions[j]))
 
     def rotations_since(self, stamp: int, seconds: FloatArray) -> FloatArray | None:
-        """How the lidar has turned since ``stamp``, from the gyro.
+        """Rotation vectors of the lidar since ``stamp``, from the gyro.
 
         Parameters
         ----------
@@ -234,25 +234,22 @@ class ImuBuffer:
 
         The orientation is that of :meth:`orientation`, NaN where unknown.
         """
-        quaternions, store = self._orientations(), self._store
-        part = slice(*np.searchsorted(store.stamps, [first, last + 1]))
+        quaternions, samples = self._orientations(), self._store.samples
+        part = slice(*np.searchsorted(samples.stamps, [first, last + 1]))
         return ImuSamples(
-            stamps=store.stamps[part].copy(),
+            stamps=samples.stamps[part].copy(),
             orientation=None if quaternions is None else quaternions[part].copy(),
-            gyro=store.gyro[part].copy(),
-            acceleration=store.acceleration[part].copy(),
+            gyro=samples.gyro[part].copy(),
+            acceleration=samples.acceleration[part].copy(),
         )
 
     def rest_at(self, stamp: int) -> RestWindow | None:
-        """The samples of the last ``still_seconds``, and 0.1 s more, if the lidar is at rest.
+        """The rest from ``still_seconds`` before ``stamp`` to 0.1 s after it; None if none.
 
-        What at rest means is said at :func:`loam_gtsam.imu.at_rest.find_rest`.
+        :func:`loam_gtsam.imu.at_rest.find_rest` says what rest means.
         """
         first = stamp - round(self._config.still_seconds * 1e9)
-        samples = self.samples_between(first, stamp + round(REST_AHEAD * 1e9))
-        return find_rest(
-            self._config, samples.stamps, samples.gyro, samples.acceleration, samples.orientation
-        )
+        return find_rest(self._config, self.samples_between(first, stamp + round(REST_AHEAD * 1e9)))
 
     def _merge(self) -> None:
         """Sort in what was added since the last question."""
@@ -273,28 +270,22 @@ class ImuBuffer:
         inside = stamps[low : high + 1]
         if (np.diff(inside) > self._gap).any():
             return None
-        rates = self._store.gyro[low : high + 1] - self._bias
+        rates = self._store.samples.gyro[low : high + 1] - self._bias
         return (inside - origin).astype(np.float64) * 1e-9, rates.T
 
     def _rest_at_start(self) -> RestWindow | None:
         """The rest at the start of all samples, dropped ones included."""
-        store = self._store
-        if not self._start_is_held or len(store.stamps) == 0:
+        if not self._start_is_held or len(self._store.stamps) == 0:
             return self._rest
-        return rest_at_start(
-            self._config, store.stamps, store.gyro, store.acceleration, store.values[:, :4]
-        )
+        return rest_at_start(self._config, self._store.samples)
 
     def _orientations(self) -> FloatArray | None:
         """(N, 4) quaternions of ``world_R_lidar``, NaN where unknown; None if all are."""
         self._merge()
         if len(self._store.stamps) == 0:
             return None
-        return self._store.values[:, :4] if self._quality.measured else self._filtered()
-
-    def _filtered(self) -> FloatArray | None:
-        store = self._store
-        return self._filter.orientations(store.stamps, store.gyro, store.acceleration)
+        samples = self._store.samples
+        return samples.orientation if self._quality.measured else self._filter.orientations(samples)
 
 
 def _checked(samples: ImuSamples) -> tuple[IntArray, FloatArray]:

@@ -33,9 +33,9 @@ def samples_between(samples: ImuSamples, start: int, stop: int) -> ImuSamples:
     """Gyro and acceleration from ``start`` to ``stop`` and one sample on either side, copied."""
     stamps = samples.stamps
     first, last = np.searchsorted(stamps, start, "right"), np.searchsorted(stamps, stop)
-    part = slice(int(first) - 1, int(last) + 1)
-    gyro, acceleration = samples.gyro[part].copy(), samples.acceleration[part].copy()
-    return ImuSamples(stamps[part].copy(), None, gyro, acceleration)
+    rows = slice(int(first) - 1, int(last) + 1)
+    gyro, acceleration = samples.gyro[rows].copy(), samples.acceleration[rows].copy()
+    return ImuSamples(stamps[rows].copy(), None, gyro, acceleration)
 
 
 def integration_steps(

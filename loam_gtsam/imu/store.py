@@ -6,7 +6,15 @@ from collections import Counter
 
 import numpy as np
 
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import FloatArray, ImuSamples, IntArray
+
+
+def rows_of(samples: ImuSamples, rows: slice) -> ImuSamples:
+    """The samples in some rows, as views."""
+    orientation = None if samples.orientation is None else samples.orientation[rows]
+    return ImuSamples(
+        samples.stamps[rows], orientation, samples.gyro[rows], samples.acceleration[rows]
+    )
 
 
 class SampleStore:
@@ -37,22 +45,19 @@ class SampleStore:
         return self._room_stamps[: self._count]
 
     @property
-    def values(self) -> FloatArray:
-        """(N, 10) quaternion x y z w, gyro (3), acceleration (3); a view like ``stamps``."""
-        return self._room[: self._count]
-
-    @property
-    def gyro(self) -> FloatArray:
-        """(N, 3) rad/s; a view."""
-        return self.values[:, 4:7]
-
-    @property
-    def acceleration(self) -> FloatArray:
-        """(N, 3) m/s^2; a view."""
-        return self.values[:, 7:]
+    def samples(self) -> ImuSamples:
+        """All samples; views like ``stamps``."""
+        values = self._room[: self._count]
+        return ImuSamples(self.stamps, values[:, :4], values[:, 4:7], values[:, 7:])
 
     def add(self, stamps: IntArray, values: FloatArray) -> None:
-        """Keep samples (N,) and (N, 10), in any order, for the next :meth:`merge`."""
+        """Keep samples for the next :meth:`merge`.
+
+        Parameters
+        ----------
+        stamps : (N,) nanoseconds, in any order
+        values : (N, 10) quaternion x y z w (NaN where unknown), gyro, acceleration
+        """
         if self.accepts_from is not None:
             young = stamps >= self.accepts_from
             self._counts["too_late"] += len(stamps) - int(young.sum())
@@ -82,7 +87,7 @@ class SampleStore:
         at = int(np.searchsorted(self.stamps, earliest))
         # The old samples first: of equal stamps a stable sort then keeps the first to come.
         stamps = np.concatenate([self.stamps[at:], stamps])
-        values = np.concatenate([self.values[at:], values])
+        values = np.concatenate([self._room[at : self._count], values])
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
         kept = np.concatenate([[True], stamps[1:] != stamps[:-1]])
@@ -98,6 +103,7 @@ class SampleStore:
 
     def drop(self, count: int) -> None:
         """Drop the ``count`` oldest samples, fewer than all, and from now on every older one."""
-        self._room_stamps, self._room = self.stamps[count:].copy(), self.values[count:].copy()
+        held = slice(count, self._count)
+        self._room_stamps, self._room = self._room_stamps[held].copy(), self._room[held].copy()
         self._count -= count
         self.accepts_from = int(self._room_stamps[0])

@@ -54,7 +54,7 @@ ABOUT_X = np.array([1.0, 0.0, 0.0])
     ],
 )
 def test_rest_is_told_from_motion(samples, rest):
-    found = find_rest(CONFIG, samples.stamps, samples.gyro, samples.acceleration)
+    found = find_rest(CONFIG, samples)
     assert (found is not None) is rest
 
 
@@ -63,7 +63,7 @@ def test_rest_at_start_takes_what_there_is_before_the_motion():
     for begins, expected in ((100, 100), (60, 51), (30, 26), (10, None)):
         gyro = late.gyro.copy()
         gyro[begins:] += 0.3
-        found = rest_at_start(CONFIG, late.stamps, gyro, late.acceleration)
+        found = rest_at_start(CONFIG, dataclasses.replace(late, gyro=gyro))
         assert (found.samples if found else None) == expected
 
 

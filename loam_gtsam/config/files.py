@@ -103,6 +103,7 @@ def _commented(section: Section, indent: int) -> CommentedMap:
             value = CommentedSeq(value)
             value.fa.set_flow_style()
         result[name] = value
-        text = textwrap.fill(meaning(field), _WIDTH - indent - 2, break_on_hyphens=False)
+        text = meaning(field).replace(": ", ":\xa0")  # a label stays with what it labels
+        text = textwrap.fill(text, _WIDTH - indent - 2, break_on_hyphens=False).replace("\xa0", " ")
         result.yaml_set_comment_before_after_key(name, before=text, indent=indent)
     return result

@@ -13,10 +13,11 @@ class PoseGraphConfig(Section):
     keyframe_angle_deg: float = parameter(30.0, unit="degrees", low=0.0)
     """A frame is a keyframe as well if it is turned by at least this against the last keyframe."""
     walk: float = parameter(0.02, unit="m/sqrt(m)", low=0.0)
-    """The odometry drifts by more than its covariances know. The position drifts as a random walk:
-    this times the square root of the distance travelled between two keyframes."""
+    """The odometry drifts by more than its covariances know, like a random walk. The standard
+    deviation of the position grows by this times the square root of the distance travelled."""
     turn_walk_deg: float = parameter(0.02, unit="degrees/sqrt(m)", low=0.0)
-    """The rotation drifts as a random walk, too: this times the square root of the distance."""
+    """The standard deviation of the rotation grows by this times the square root of the distance
+    travelled, for the same reason as that of the position (walk)."""
     max_chi2: float = parameter(
         40.0, source="one of 10,000 right loops exceeds 28, if all covariances "
         "are exact", low=0.0,
@@ -49,10 +50,10 @@ class LoopConfig(Section):
     """A candidate lies within a gate about the keyframe. The radius of the gate is the sum of three
     parts, of which this is the constant one."""
     gate_sigmas: float = parameter(3.0, low=0.0)
-    """The gate has a second part: this many standard deviations of the two positions."""
+    """The second part of the gate is this many standard deviations of the two positions."""
     gate_drift: float = parameter(0.02, low=0.0)
-    """The gate has a third part, for drift that the covariances do not know: this share of the
-    distance travelled between the two keyframes."""
+    """The third part of the gate is this share of the distance travelled between the two keyframes,
+    for drift that the covariances do not know."""
     rings: int = parameter(20, source="Scan Context", low=1)
     """The place descriptor has this many rings."""
     sectors: int = parameter(60, source="Scan Context", low=4)

@@ -121,7 +121,7 @@ class Section(BaseModel):
             return (key,), f"expected {len(choices)} values, got {given}"
         if error.get("ctx", {}).get("le") == _LARGEST:
             return (key,), "the number is too large"
-        expected = _EXPECTED.get(kind, error["msg"]).format(**error.get("ctx", {}))
+        expected = _EXPECTED.get(kind, "a valid value").format(**error.get("ctx", {}))
         return (key,), f"expected {expected}, got {given}"
 
     @model_validator(mode="after")

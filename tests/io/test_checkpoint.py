@@ -9,6 +9,7 @@ from dataclasses import fields
 import gtsam
 import numpy as np
 import pytest
+from support.cli import loam
 from support.list_dataset import ListDataset
 
 from loam_gtsam.config import Config, MapConfig, preset
@@ -313,7 +314,7 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
 
 # -- from the command line ----------------------------------------------------------------------
 
-COMMAND = (sys.executable, "-m", "loam_gtsam.cli", "run", "sim:room?frames=60", "--no-plot")
+RUN = ("run", "sim:room?frames=40&columns=900", "--no-plot", "--output")
 
 
 def arrays(folder):
@@ -323,16 +324,20 @@ def arrays(folder):
 
 def test_killed_again_and_again_a_run_comes_to_the_same_end(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    subprocess.run([*COMMAND, "--output", whole], check=True, capture_output=True)
-    again = [*COMMAND, "--output", killed, "--resume", "--checkpoint", "0.05"]
-    for wanted in (10, 35):
-        process = subprocess.Popen(again, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    assert loam(*RUN, whole).exit_code == 0
+    again = [*RUN, killed, "--resume", "--checkpoint", "0.05"]
+    for wanted in (10, 25):
+        process = subprocess.Popen(
+            [sys.executable, "-m", "loam_gtsam.cli", *again],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
         while process.poll() is None and not reached(killed, wanted):
             time.sleep(0.01)
         process.send_signal(signal.SIGKILL)
         assert process.wait() == -signal.SIGKILL
         assert not (killed / "summary.json").exists()
-    subprocess.run(again, check=True, capture_output=True)
+    assert loam(*again).exit_code == 0
     assert not (killed / "checkpoint").exists()
     for name, array in arrays(whole).items():
         np.testing.assert_array_equal(arrays(killed)[name], array, name)

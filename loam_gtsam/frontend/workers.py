@@ -1,21 +1,19 @@
-"""Feature extraction of the next sweeps in processes of their own, while one is being solved."""
+"""Worker processes, which extract the features of the next sweeps while one is being solved."""
 
 from __future__ import annotations
 
 import ctypes
 import logging
+import pickle
 import signal
 import time
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from itertools import cycle
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnContext
-from multiprocessing.reduction import ForkingPickler
-from queue import SimpleQueue
-from threading import Thread
 from typing import Any
 
 from loam_gtsam.config import Config
@@ -23,20 +21,27 @@ from loam_gtsam.frontend.features import extract_features, thinned
 from loam_gtsam.types import Features, Scan, Sweep, SweepError, SweepFault
 
 _AHEAD = 2
-"""Sweeps read ahead of the current one, a process: one at work and one that waits for it."""
+"""Sweeps read ahead per process: one that is worked on, and one that waits for the process."""
 _IN_FLIGHT = _AHEAD + 1
-"""Sweeps that a process was sent and has not answered for, at most."""
-_SLOT = 1 << 21
-"""Bytes of memory for each: 170,000 points."""
+"""Sweeps at most that a process was sent and has not answered."""
+_SLOT = 1 << 23
+"""Bytes of memory for each sweep in flight: 350,000 points with times and rings."""
 _PATIENCE = 5.0
-"""Seconds that a process is given to end: it may be at work."""
+"""Seconds that a process is given to end, for it may be at work."""
 
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Extraction:
-    """Features of a sweep, or why there are none, and the seconds it took to find out."""
+    """Features of a sweep, or why there are none.
+
+    Attributes
+    ----------
+    features : None if the sweep cannot be used
+    problem, fault : why not, as a sentence and typed
+    seconds : time that the extraction took
+    """
 
     features: Features | None
     problem: str
@@ -45,13 +50,16 @@ class Extraction:
 
 
 def extract(scan: Scan, config: Config) -> Extraction:
-    """Extract features here and now; what a sweep contains never raises."""
+    """Extract the features of a sweep in this process; no content of a sweep raises an error.
+
+    With ``odometry.method: constant_velocity`` the features are thinned to the voxels of the map,
+    as the mapper would do it, so that less is handed over. ``scan_to_scan`` needs all of them.
+    """
     started = time.perf_counter()
     features, problem, fault = None, "", None
     try:
         features = extract_features(scan, config)
         if config.odometry.method == "constant_velocity":
-            # The mapper would do it, and so less is handed over. Scan to scan needs them all.
             features = thinned(features, config.map)
     except SweepError as error:
         problem, fault = str(error), error.fault
@@ -64,29 +72,31 @@ def extract_ahead(
     """Each sweep with its features, extracted by processes that are a few sweeps ahead.
 
     The features are the same at any number of processes. An error of ``sweeps`` is raised after
-    the sweeps before it. If a process dies, the work is done here.
+    the sweeps before it.
 
     Parameters
     ----------
     sweeps : each with a number of the caller's, which is handed on
-    config : for the features
-    workers : processes; with 0 nothing is extracted, and no sweep read ahead
+    config : of the run
+    workers : processes; with 0 nothing is extracted, and no sweep is read ahead
 
     Yields
     ------
     sweep, number, extraction
-        The last is None for sweeps that are no scans, and without processes.
+        The extraction is None if the caller is to extract the features: without processes, if a
+        process died, or if a sweep is too large to be handed over. It is None, too, for sweeps
+        that are no scans.
     """
     if workers == 0:
         for sweep, number in sweeps:
             yield sweep, number, None
         return
     source = iter(sweeps)
-    waiting: deque[tuple[Sweep, float, _Extractor | None]] = deque()
+    waiting: deque[tuple[Sweep, float, _Worker | None]] = deque()
     error: Exception | None = None
     more = True
     with ExitStack() as stack:
-        idle = deque(stack.enter_context(_Extractor(config)) for _ in range(workers))
+        team = cycle([stack.enter_context(_Worker(config)) for _ in range(workers)])
         while True:
             while more and len(waiting) <= _AHEAD * workers:
                 try:
@@ -96,40 +106,39 @@ def extract_ahead(
                 except Exception as caught:
                     error, more = caught, False
                 else:
-                    extractor = None
+                    worker = None
                     if isinstance(sweep, Scan):
-                        extractor = idle[0]
-                        extractor.send(sweep)
-                        idle.rotate(-1)
-                    waiting.append((sweep, number, extractor))
+                        worker = next(team)
+                        if not worker.send(sweep):
+                            worker = None
+                    waiting.append((sweep, number, worker))
             if not waiting:
                 break
-            sweep, number, extractor = waiting.popleft()
-            yield sweep, number, None if extractor is None else extractor.receive()
+            sweep, number, worker = waiting.popleft()
+            yield sweep, number, None if worker is None else worker.receive()
     if error is not None:
         raise error
 
 
-class _Extractor:
-    """A process that extracts features of sweeps in the order in which they are sent.
+class _Worker:
+    """A process that extracts the features of sweeps in the order in which they are sent.
 
-    Sweeps and features are handed over when they are sent and received. A pool of
-    ``concurrent.futures`` does it in threads of its own, which interrupt the solve, and through
-    pipes: with 16 beams that took 2 of the 15 ms of a frame.
+    Sweeps and features change processes in shared memory; the pipe only says how many bytes there
+    are. Through the pipe itself, whose every part wakes the other process, or with the threads of
+    a pool of ``concurrent.futures``, it took 2 of the 15 ms of a frame with 16 beams.
     """
 
     def __init__(self, config: Config) -> None:
-        # Spawned, for a forked child of a process with threads may hang.
-        context = get_context("spawn")
+        context = get_context("spawn")  # a forked child of a process with threads may hang
         self._pipe, far = context.Pipe()
-        self._there, self._back = _Shared(context), _Shared(context)
-        ways = self._there, self._back
-        self._process = context.Process(target=_serve, args=(far, *ways, config), daemon=True)
+        memory = context.RawArray(ctypes.c_byte, _IN_FLIGHT * _SLOT)
+        self._outgoing, self._incoming = _slots(memory), _slots(memory)
+        self._process = context.Process(target=_serve, args=(far, memory, config), daemon=True)
         self._process.start()
-        far.close()  # or its end would not be seen
+        far.close()  # otherwise the death of the process would not close the pipe
         self._alive = True
 
-    def __enter__(self) -> _Extractor:
+    def __enter__(self) -> _Worker:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -137,17 +146,22 @@ class _Extractor:
         self._process.join(_PATIENCE)
         self._process.kill()
 
-    def send(self, scan: Scan) -> None:
-        """Have a sweep worked on; nothing happens if the process is dead."""
-        if self._alive:
-            with self._watched():
-                self._there.send(self._pipe, scan)
+    def send(self, scan: Scan) -> bool:
+        """Have a sweep worked on; False if the sweep is too large, or the process is dead."""
+        data = pickle.dumps(scan)
+        if not self._alive or len(data) > _SLOT:
+            return False
+        with self._watched():
+            next(self._outgoing)[: len(data)] = data
+            self._pipe.send(len(data))
+        return True
 
     def receive(self) -> Extraction | None:
-        """What was found in the first sweep not received yet; None if the process is dead."""
+        """The features of the first sweep not received yet; None if the process cannot say."""
         if self._alive:
             with self._watched():
-                extraction: Extraction = self._back.receive(self._pipe)
+                slot, size = next(self._incoming), self._pipe.recv()
+                extraction: Extraction | None = pickle.loads(slot[:size])
                 return extraction
         return None
 
@@ -160,62 +174,19 @@ class _Extractor:
             _log.warning("a process for feature extraction died; the features are extracted here")
 
 
-class _Shared:
-    """One way of a pipe, by way of memory that both processes have.
-
-    Sweeps are too much for a pipe: they go through it in parts, and every part wakes the other
-    process. What does not fit the memory goes through all the same.
-    """
-
-    def __init__(self, context: SpawnContext) -> None:
-        self._memory = context.RawArray(ctypes.c_byte, _IN_FLIGHT * _SLOT)
-        self._sent = 0
-
-    def send(self, pipe: Connection, value: Scan | Extraction) -> None:
-        data = ForkingPickler.dumps(value)  # as the pipe does it
-        if len(data) > _SLOT:
-            pipe.send(value)
-            return
-        start = self._sent % _IN_FLIGHT * _SLOT
-        self._sent += 1
-        place = slice(start, start + len(data))
-        self._bytes[place] = data
-        pipe.send(place)
-
-    def receive(self, pipe: Connection) -> Any:
-        value = pipe.recv()
-        return ForkingPickler.loads(self._bytes[value]) if isinstance(value, slice) else value
-
-    @property
-    def _bytes(self) -> memoryview:
-        return memoryview(self._memory).cast("B")
+def _slots(memory: Any) -> Iterator[memoryview]:
+    """The parts of the shared memory, one after the other, over and over."""
+    view = memoryview(memory).cast("B")
+    return cycle([view[start : start + _SLOT] for start in range(0, len(view), _SLOT)])
 
 
-# -- in the process --------------------------------------------------------------------------
-
-
-def _serve(pipe: Connection, there: _Shared, back: _Shared, config: Config) -> None:
-    """Extract features of what comes out of a pipe, until its other end is closed."""
+def _serve(pipe: Connection, memory: Any, config: Config) -> None:
+    """In the process: answer each sweep with its features, until the caller closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the caller to handle
-    scans: SimpleQueue[Scan | None] = SimpleQueue()
-    found: SimpleQueue[Extraction] = SimpleQueue()
-    # Neither the caller nor this process waits for the other to put down what it is at.
-    Thread(target=_take_in, args=(pipe, there, scans), daemon=True).start()
-    Thread(target=_hand_out, args=(pipe, back, found), daemon=True).start()
-    while (scan := scans.get()) is not None:
-        found.put(extract(scan, config))
-
-
-def _take_in(pipe: Connection, there: _Shared, scans: SimpleQueue[Scan | None]) -> None:
-    while True:
-        try:
-            scans.put(there.receive(pipe))
-        except Exception:  # closed, or in the middle of a sweep
-            scans.put(None)
-            return
-
-
-def _hand_out(pipe: Connection, back: _Shared, found: SimpleQueue[Extraction]) -> None:
-    with suppress(OSError):  # closed
-        while True:
-            back.send(pipe, found.get())
+    with suppress(EOFError, OSError):
+        for slot in _slots(memory):
+            answer = pickle.dumps(extract(pickle.loads(slot[: pipe.recv()]), config))
+            if len(answer) > _SLOT:
+                answer = pickle.dumps(None)
+            slot[: len(answer)] = answer
+            pipe.send(len(answer))

@@ -26,8 +26,9 @@ from benchmarks.scene_tables import NONE, RECORDED, Row, along, drift, tilt, wri
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
+from loam_gtsam.frontend.workers import Extraction
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer
-from loam_gtsam.studies.contenders import PipelineRunner, SharedSweep, share_sweeps
+from loam_gtsam.studies.contenders import extract_for_all
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, Scan, Trajectory
 
@@ -144,7 +145,7 @@ class Runs:
 
     def __init__(self, place: Place, recording: Recording) -> None:
         self.place, self.recording = place, recording
-        self._prepared: dict[Any, list[tuple[SharedSweep, float]]] = {}
+        self._prepared: dict[Any, list[tuple[Extraction | None, float]]] = {}
 
     def run(self, table: str, variant: str, config: Config, noise: float = np.nan) -> Row:
         """One run, with the IMU of that noise if the configuration uses one."""
@@ -155,14 +156,14 @@ class Runs:
         )
         config = effective_config(config, dataset)
         pipeline = Pipeline(config, imu=imu_buffer(dataset, config))
-        runner = PipelineRunner(variant, pipeline)
-        seconds = []
-        for sweep, extraction in self._features(dataset, config):
+        updates, seconds = [], []
+        prepared = self._features(dataset, config)
+        for sweep, (extraction, spent) in zip(dataset, prepared, strict=True):
             # Processor time: the clock on the wall also counts what others do on the machine.
             started = time.process_time()
-            runner.register(sweep)
-            seconds.append(extraction + time.process_time() - started)
-        found = runner.result(len(dataset))
+            updates.append(pipeline.process(sweep, extraction))
+            seconds.append(spent + time.process_time() - started)
+        found = pipeline.result(updates)
         error = absolute_error(found.trajectory, recording.truth)
         poses = found.trajectory.map_T_lidar
         if imu is None or not config.imu.level:
@@ -189,15 +190,17 @@ class Runs:
             ms=1e3 * float(np.median(seconds[1:])),
         )
 
-    def _features(self, dataset: ArrayDataset, config: Config) -> list[tuple[SharedSweep, float]]:
+    def _features(
+        self, dataset: ArrayDataset, config: Config
+    ) -> list[tuple[Extraction | None, float]]:
         """Features of all sweeps, and the processor time each took."""
         key = config.sensor, config.features, config.deskew.enabled, config.deskew.reference
         if key not in self._prepared:
             own = self._prepared[key] = []
-            started = time.process_time()
-            for sweep in share_sweeps(dataset, config, features=True, points=False):
-                own.append((sweep, time.process_time() - started))
+            for sweep in dataset:
                 started = time.process_time()
+                extraction = extract_for_all(sweep, config)
+                own.append((extraction, time.process_time() - started))
         return self._prepared[key]
 
 

@@ -24,7 +24,7 @@ from loam_gtsam.studies.contenders import (
     PipelineRunner,
     SharedGuess,
     SolverRun,
-    share_sweeps,
+    extract_for_all,
 )
 from loam_gtsam.studies.evaluation import (
     absolute_error,
@@ -145,20 +145,15 @@ def compare_solvers(
     _check_names(contenders)
     configs, notes = _common_configs(contenders, dataset)
     runners = _make_runners(contenders, configs, dataset, shared_guess)
-    ours = [config for config in configs if config is not None]
-    sweeps = share_sweeps(
-        islice(dataset, max_frames),
-        ours[0] if ours else effective_config(Config(), dataset),
-        features=bool(ours),
-        points=len(ours) < len(configs),
-    )
+    first = next((config for config in configs if config is not None), None)
     error: Exception | None = None
     interrupted = False
     done = 0
     try:
-        for shared in sweeps:
+        for sweep in islice(dataset, max_frames):
+            extraction = None if first is None else extract_for_all(sweep, first)
             for runner in runners:
-                runner.register(shared)
+                runner.register(sweep, extraction)
             done += 1
             if on_frame is not None:
                 on_frame(done - 1, runners[0].updates[-1])
@@ -208,9 +203,11 @@ def _make_runners(
     """A runner for each contender, in their order."""
     runners: list[PipelineRunner | PeerRunner] = []
     guess: SharedGuess | None = None
+    first = next((config for config in configs if config is not None), None)
+    common = first or effective_config(Config(), dataset)
     for entry, config in zip(contenders, configs, strict=True):
         if config is None:
-            runners.append(PeerRunner(make_peer(entry.name)))
+            runners.append(PeerRunner(make_peer(entry.name), common))
             continue
         imu = imu_buffer(dataset, config)
         pipeline = Pipeline(config, imu=imu, solver=entry.solver, odometry=guess)

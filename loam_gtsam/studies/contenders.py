@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -140,64 +139,18 @@ class SolverRun:
         return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
 
-# -- sweeps that all contenders share --------------------------------------------------------------
+# -- runners ---------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SharedSweep:
-    """One sweep as all contenders take it.
+def extract_for_all(sweep: Sweep, config: Config) -> Extraction | None:
+    """The features of a sweep for several pipelines; None if the sweep has no points.
 
-    Attributes
-    ----------
-    sweep : as the data set gives it
-    extraction : the features of a :class:`~loam_gtsam.types.Scan`, for pipelines of this package
-    points : the points of the sweep, for peers
-    problem : why there are no points
+    No feature is left out, as if for scan-to-scan odometry: each pipeline thins the features to the
+    voxels of its own map.
     """
-
-    sweep: Sweep
-    extraction: Extraction | None = None
-    points: TimedPoints | None = None
-    problem: str = ""
-
-    @property
-    def stamp(self) -> int:
-        """Nanoseconds."""
-        sweep = self.sweep
-        return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
-
-
-def share_sweeps(
-    sweeps: Iterable[Sweep], config: Config, *, features: bool, points: bool
-) -> Iterator[SharedSweep]:
-    """Prepare each sweep once for all contenders.
-
-    Parameters
-    ----------
-    config : decides the features and the points
-    features : extract features, for pipelines of this package
-    points : take the points with their times, for peers
-
-    Raises
-    ------
-    InputError
-        If points are wanted, and the data set has features instead of points.
-    """
-    # All features, as for this odometry: each pipeline thins them to the voxels of its own map.
-    unthinned = config.changed("odometry.method=scan_to_scan")
-    for sweep in sweeps:
-        if isinstance(sweep, FeatureSweep) and points:
-            raise InputError("peers need the points of raw sweeps; this data set has features only")
-        shared = SharedSweep(sweep, problem=sweep.message if isinstance(sweep, BadSweep) else "")
-        if isinstance(sweep, Scan):
-            if points:
-                try:
-                    shared = replace(shared, points=timed_points(sweep, config))
-                except SweepError as error:
-                    shared = replace(shared, problem=str(error))
-            if features:
-                shared = replace(shared, extraction=extract(sweep, unthinned))
-        yield shared
+    if not isinstance(sweep, Scan):
+        return None
+    return extract(sweep, config.changed({"odometry.method": "scan_to_scan"}))
 
 
 def timed_points(scan: Scan, config: Config) -> TimedPoints:
@@ -212,9 +165,6 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
     timing = assign_times(columns, assign_rings(columns, config.sensor), config)
     points = np.ascontiguousarray(columns.xyz.T, dtype=np.float64)
     return TimedPoints(points, np.asarray(timing.times, np.float64), timing.span)
-
-
-# -- runners ---------------------------------------------------------------------------------------
 
 
 class SharedGuess:
@@ -271,9 +221,9 @@ class PipelineRunner:
         self.name, self.pipeline = name, pipeline
         self.updates: list[MapUpdate] = []
 
-    def register(self, shared: SharedSweep) -> None:
-        """Register a sweep."""
-        self.updates.append(self.pipeline.process(shared.sweep, shared.extraction))
+    def register(self, sweep: Sweep, extraction: Extraction | None = None) -> None:
+        """Register a sweep, with features that were extracted before if there are any."""
+        self.updates.append(self.pipeline.process(sweep, extraction))
 
     def result(self, frames: int) -> SolverRun:
         """The run over the first ``frames`` sweeps."""
@@ -283,36 +233,52 @@ class PipelineRunner:
 class PeerRunner:
     """A peer as a contender; if the peer fails, the other contenders go on without it.
 
+    Parameters
+    ----------
+    config : decides which points of a sweep are used, and their times
+
     Attributes
     ----------
     updates : one per sweep so far
     problem : what ended the peer early, else ""
     """
 
-    def __init__(self, peer: Peer) -> None:
-        self.peer = peer
+    def __init__(self, peer: Peer, config: Config) -> None:
+        self.peer, self.config = peer, config
         self.updates: list[MapUpdate] = []
         self.problem = ""
         self._last_stamp: int | None = None
 
-    def register(self, shared: SharedSweep) -> None:
-        """Register a sweep; the peer predicts its guess by itself."""
-        self.updates.append(self._update(shared.stamp, shared))
+    def register(self, sweep: Sweep, extraction: Extraction | None = None) -> None:
+        """Register a sweep; a peer takes the points and not the features.
 
-    def _update(self, stamp: int, shared: SharedSweep) -> MapUpdate:
-        nowhere = gtsam.Pose3()
-        if self.problem or shared.points is None:
-            message = self.problem or shared.problem
-            return MapUpdate(stamp, nowhere, FrameStatus.UNUSABLE_SCAN, message)
-        if self._last_stamp is not None and stamp <= self._last_stamp:
-            return MapUpdate(stamp, nowhere, FrameStatus.BAD_STAMP)
+        Raises
+        ------
+        InputError
+            If the sweep has features instead of points.
+        """
+        if isinstance(sweep, FeatureSweep):
+            raise InputError("peers need the points of raw sweeps; this data set has features only")
+        self.updates.append(self._update(sweep))
+
+    def _update(self, sweep: Scan | BadSweep) -> MapUpdate:
+        unused = MapUpdate(sweep.stamp, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN, self.problem)
+        if self.problem:
+            return unused
+        if isinstance(sweep, BadSweep):
+            return replace(unused, message=sweep.message)
         try:
-            registered = self.peer.register(stamp, shared.points)
+            points = timed_points(sweep, self.config)
+        except SweepError as error:
+            return replace(unused, message=str(error))
+        if self._last_stamp is not None and sweep.stamp <= self._last_stamp:
+            return replace(unused, status=FrameStatus.BAD_STAMP)
+        try:
+            registered = self.peer.register(sweep.stamp, points)
         except Exception as error:  # foreign code: it may raise anything
-            number = len(self.updates)
-            self.problem = f"ended at frame {number}: {type(error).__name__}: {error}"
-            return MapUpdate(stamp, nowhere, FrameStatus.UNUSABLE_SCAN, self.problem)
-        self._last_stamp = stamp
+            self.problem = f"ended at frame {len(self.updates)}: {type(error).__name__}: {error}"
+            return replace(unused, message=self.problem)
+        self._last_stamp = sweep.stamp
         return MapUpdate(
             stamp=registered.stamp,
             map_T_lidar=gtsam.Pose3(registered.map_T_lidar),

@@ -24,7 +24,7 @@ from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import OnFrame, effective_config, run
 from loam_gtsam.studies.comparison import score
-from loam_gtsam.studies.contenders import PeerRunner, SolverRun, share_sweeps
+from loam_gtsam.studies.contenders import PeerRunner, SolverRun
 from loam_gtsam.studies.evaluation import pose_differences
 from loam_gtsam.studies.peers import make_peer
 from loam_gtsam.types import FrameStatus, LoamError, Trajectory
@@ -186,11 +186,9 @@ def _run_pipeline(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> S
 
 def _run_peer(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
     assert trial.peer is not None
-    runner = PeerRunner(make_peer(trial.peer))
-    config = effective_config(trial.config, dataset)
-    sweeps = share_sweeps(islice(dataset, trial.frames), config, features=False, points=True)
-    for number, shared in enumerate(sweeps):
-        runner.register(shared)
+    runner = PeerRunner(make_peer(trial.peer), effective_config(trial.config, dataset))
+    for number, sweep in enumerate(islice(dataset, trial.frames)):
+        runner.register(sweep)
         if on_frame is not None:
             on_frame(number, runner.updates[-1])
     return runner.result(len(runner.updates))

@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.imu import rot3
 from support.jacobians import numerical
 
 from loam_gtsam.imu_prior import (
@@ -25,11 +26,6 @@ from loam_gtsam.registration.solvers import POSE_KEY, fuse
 FLAT = gtsam.Rot3()
 WEIGHTS = (0.0005, 0.002, 0.05, 0.5)
 START = 1_700_000_000_000_000_000
-
-
-def rot(roll, pitch, yaw):
-    """Rz Ry Rx, degrees."""
-    return gtsam.Rot3.RzRyRx(*np.radians([roll, pitch, yaw]))
 
 
 def scan_information(rng, count=200):
@@ -78,7 +74,8 @@ def whitened(factor, pose):
 
 
 @pytest.mark.parametrize(
-    "rotation", [FLAT, rot(1e-4, 0, 0), rot(20, -35, 100), rot(-179.9, 60, 3), rot(120, 84, -90)]
+    "rotation",
+    [FLAT, rot3(1e-4, 0, 0), rot3(20, -35, 100), rot3(-179.9, 60, 3), rot3(120, 84, -90)],
 )
 def test_the_jacobian_of_roll_and_pitch_is_the_numerical_one(rotation):
     pose = gtsam.Pose3(rotation, np.array([5.0, -3.0, 1.0]))
@@ -129,9 +126,9 @@ def test_the_gravity_factor_is_free_of_yaw_and_position(tilt):
 
 
 def test_too_steep_is_85_degrees_of_any_of_them():
-    assert not too_steep(rot(170, 84.9, 10), rot(0, -84.9, 0))
-    assert too_steep(rot(0, 85.1, 0))
-    assert too_steep(rot(0, 0, 0), rot(10, -85.1, 0))
+    assert not too_steep(rot3(170, 84.9, 10), rot3(0, -84.9, 0))
+    assert too_steep(rot3(0, 85.1, 0))
+    assert too_steep(rot3(0, 0, 0), rot3(10, -85.1, 0))
     assert np.degrees(STEEPEST_PITCH) == pytest.approx(85.0)
 
 
@@ -168,8 +165,8 @@ def test_the_blend_happens_about_up_and_not_about_the_axis_of_the_map():
 @pytest.mark.parametrize("weight", [0.002, 0.5])
 def test_roll_is_taken_the_short_way_round(own, imu, weight):
     """Upside down: 179.9 and -179.9 degrees are 0.2 degrees apart, and their mean is not 0."""
-    pose = gtsam.Pose3(rot(own, 20, 50), np.zeros(3))
-    measured = rot(imu, 20, 0)
+    pose = gtsam.Pose3(rot3(own, 20, 50), np.zeros(3))
+    measured = rot3(imu, 20, 0)
     expected = own + weight * ((imu - own + 180.0) % 360.0 - 180.0)
     blended = blend(pose, measured, weight, FLAT)
     by_factor = fused(pose, scan_information(np.random.default_rng(0)), measured, weight)
@@ -182,7 +179,7 @@ def test_roll_is_taken_the_short_way_round(own, imu, weight):
 @pytest.mark.parametrize("half", [91.0, 120.0, 134.0])
 def test_roll_is_taken_the_short_way_round_from_far_off(half, side):
     """Two rolls on either side of upside down, ``360 - 2 half`` degrees apart."""
-    own, imu = rot(side * half, 0, 0), rot(-side * half, 0, 0)
+    own, imu = rot3(side * half, 0, 0), rot3(-side * half, 0, 0)
     apart = side * (360.0 - 2.0 * half)
     roll, _ = blended_angles(own, imu, 0.25)
     assert np.degrees(roll) == pytest.approx(side * half + 0.25 * apart, abs=1e-9)
@@ -209,7 +206,7 @@ def test_the_blend_of_the_direction_turns_up_by_its_share_of_the_way():
 
 
 def test_the_blend_of_equal_directions_is_the_pose_itself():
-    pose = gtsam.Pose3(rot(0, 90, 20), np.ones(3))
+    pose = gtsam.Pose3(rot3(0, 90, 20), np.ones(3))
     measured = gtsam.Rot3.Yaw(1.0).compose(pose.rotation())
     found = blend_direction(pose, measured, 0.5, np.array([0.0, 0.0, 1.0]))
     assert found.equals(pose, 1e-12)
@@ -269,7 +266,7 @@ def test_yaw_and_position_go_where_the_correlations_of_the_scan_take_them(weight
 def test_without_correlations_yaw_and_position_stay():
     information = np.diag([3e5, 2e5, 1e5, 1e4, 2e4, 3e4])
     pose = gtsam.Pose3(FLAT, np.array([4.0, 5.0, 6.0]))
-    found = fused(pose, information, rot(0.5, -0.8, 70), 0.3)
+    found = fused(pose, information, rot3(0.5, -0.8, 70), 0.3)
     np.testing.assert_allclose(found.translation(), pose.translation(), atol=1e-9)
     assert abs(found.rotation().yaw()) < 1e-4  # of second order in the pull
     np.testing.assert_allclose(np.degrees(roll_pitch(found.rotation())), [0.15, -0.24], atol=1e-6)
@@ -282,7 +279,7 @@ def test_the_diagonal_of_the_information_gives_another_weight():
     for _ in range(20):
         _, pose, information, measured = random_case(rng, 1e-3)
         pose = gtsam.Pose3(FLAT, pose.translation())
-        measured = rot(0.05, 0.0, 0.0)
+        measured = rot3(0.05, 0.0, 0.0)
         found = fused(pose, information, measured, 0.002, information_of_tilt=information[:2, :2])
         weights.append(found.rotation().roll() / measured.roll())
     assert np.abs(np.array(weights) / 0.002 - 1.0).min() > 1e-4
@@ -295,7 +292,7 @@ def test_a_fixed_sigma_gives_any_weight():
     for scale in (0.1, 10.0):
         information = scale * scan_information(np.random.default_rng(0))
         pose = gtsam.Pose3()
-        found = fused(pose, information, rot(0.05, 0, 0), 0.5, information_of_tilt=1e5 * np.eye(2))
+        found = fused(pose, information, rot3(0.05, 0, 0), 0.5, information_of_tilt=1e5 * np.eye(2))
         weights.append(np.degrees(found.rotation().roll()) / 0.05)
     assert weights[0] > 20.0 * weights[1]
 
@@ -307,13 +304,13 @@ def test_no_weight_is_no_move():
 
 def test_a_pull_too_far_for_the_correction_leaves_the_target_at_the_imu():
     information = scan_information(np.random.default_rng(7))
-    near = equivalent_prior(FLAT, information, rot(0, 60, 0), 0.5)
+    near = equivalent_prior(FLAT, information, rot3(0, 60, 0), 0.5)
     assert abs(near.roll_pitch[1] - np.radians(60.0)) > 1e-5
     # Past 85 degrees, and no end in 20 rounds.
     for own, measured in (
-        (rot(0, 0, 0), rot(12, 86, 0)),
-        (rot(10, 84, 0), rot(12, 86, 0)),
-        (rot(0, 30, 0), rot(160, 30, 0)),
+        (rot3(0, 0, 0), rot3(12, 86, 0)),
+        (rot3(10, 84, 0), rot3(12, 86, 0)),
+        (rot3(0, 30, 0), rot3(160, 30, 0)),
     ):
         far = equivalent_prior(own, np.eye(6), measured, 0.99)
         np.testing.assert_allclose(far.roll_pitch, roll_pitch(measured), rtol=0, atol=1e-12)
@@ -362,8 +359,8 @@ def test_a_scan_that_says_nothing_at_all_is_no_error():
 def test_the_modes_meet_where_they_take_turns(side):
     """Just below 85 degrees angles are blended, just above directions. Up moves alike."""
     up = np.array([0.0, 0.0, 1.0])
-    pose = gtsam.Pose3(rot(30, side * 84.99, 100), np.zeros(3))
-    measured = rot(32, side * 84.9, 0)
+    pose = gtsam.Pose3(rot3(30, side * 84.99, 100), np.zeros(3))
+    measured = rot3(32, side * 84.9, 0)
     between = np.arccos(pose.rotation().matrix()[2] @ measured.matrix()[2])
     by_angles = blend(pose, measured, 0.05, FLAT).rotation()
     by_direction = blend_direction(pose, measured, 0.05, up).rotation()
@@ -376,8 +373,8 @@ def test_the_modes_meet_where_they_take_turns(side):
 
 @pytest.mark.parametrize("pitch", [90.0, -90.0, 89.999])
 def test_directions_are_finite_where_angles_are_not(pitch):
-    pose = gtsam.Pose3(rot(0, pitch, 30), np.ones(3))
-    measured = rot(40, np.sign(pitch) * 88.0, 0)
+    pose = gtsam.Pose3(rot3(0, pitch, 30), np.ones(3))
+    measured = rot3(40, np.sign(pitch) * 88.0, 0)
     blended = blend_direction(pose, measured, 0.002, np.array([0.0, 0.0, 1.0]))
     turned = gtsam.Rot3.Logmap(pose.rotation().between(blended.rotation()))
     between = np.arccos(pose.rotation().matrix()[2] @ measured.matrix()[2])

@@ -5,32 +5,15 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
-from support.imu import START, part, rot
+from support.imu import START, part, rot3, turning
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.level import find_level
-from loam_gtsam.types import ImuSamples
 
 
-def rot3(*degrees):
-    return gtsam.Rot3(rot(*degrees).as_matrix())
-
-
-def samples_of(level_R_lidar, rate=(0.0, 0.0, 0.0), noise=0.0, seconds=2.0):
-    """A lidar that has ``level_R_lidar`` one second after START and turns evenly; 200 Hz."""
-    times = np.arange(round(200 * seconds)) / 200.0
-    rng = np.random.default_rng(0)
-    turns = Rotation.from_rotvec(np.outer(times - 1.0, rate))
-    attitude = Rotation.from_matrix(level_R_lidar.matrix()) * turns
-    seen = attitude * Rotation.from_rotvec(noise * rng.normal(size=(len(times), 3)))
-    return ImuSamples(
-        START + np.round(times * 1e9).astype(np.int64),
-        seen.as_quat(),
-        np.tile(np.array(rate, np.float64), (len(times), 1)),
-        attitude.inv().apply([0.0, 0.0, 9.81]),
-    )
+def samples_of(level_R_lidar, rate=(0.0, 0.0, 0.0), noise=0.0):
+    return turning(level_R_lidar, rate, at=1.0, seconds=2.0, noise=noise)
 
 
 def level_of(samples, config=None, pose=None, levelled=False):

@@ -7,7 +7,8 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.imu import START, part
+from support.imu import START, part, rot3, turning
+from support.matches import make_matches
 
 from loam_gtsam.config import ImuConfig, SolverConfig
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -15,7 +16,6 @@ from loam_gtsam.imu.level import Level
 from loam_gtsam.imu_prior import roll_pitch, roll_pitch_jacobian, tilt_information
 from loam_gtsam.io.state import freeze
 from loam_gtsam.registration.imu_tracker import ImuTracker
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import ImuSamples, TiltPrior
 
@@ -24,67 +24,18 @@ FRAME = 100_000_000
 SOLVER = GtsamSolver(SolverConfig(rotation_tolerance_deg=1e-9, translation_tolerance=1e-9))
 
 
-def rot(roll, pitch, yaw):
-    """Rz Ry Rx, degrees."""
-    return gtsam.Rot3.RzRyRx(*np.radians([roll, pitch, yaw]))
-
-
-def seen_by_imu(world_R_lidar, *, seconds=1.0, rate=(0.0, 0.0, 0.0), bias=(0.0, 0.0, 0.0)):
-    """Samples at 200 Hz of a lidar that is at ``world_R_lidar`` at NOW and turns evenly."""
-    stamps = START + 5_000_000 * np.arange(round(200 * seconds))
-    turns = Rotation.from_rotvec(np.outer((stamps - NOW) * 1e-9, rate))
-    attitude = Rotation.from_matrix(world_R_lidar.matrix()) * turns
-    gyro = np.tile(np.add(rate, bias), (len(stamps), 1))
-    return ImuSamples(stamps, attitude.as_quat(), gyro, attitude.inv().apply([0.0, 0.0, 9.81]))
-
-
 def tracker_for(measured, level_R_map=None, **config):
     """A tracker that knows up in the map; ``measured`` is the IMU's rotation or its samples."""
-    samples = seen_by_imu(measured) if isinstance(measured, gtsam.Rot3) else measured
+    samples = turning(measured) if isinstance(measured, gtsam.Rot3) else measured
     config = ImuConfig(**config)
     tracker = ImuTracker(config, ImuBuffer(config, samples))
     tracker.level = Level(level_R_map or gtsam.Rot3(), 0.0, 0.0, 1, "still")
     return tracker
 
 
-def scene(rng, map_T_lidar, n_edges=40, n_planes=250):
-    """Matches of a room with poles, seen from a pose, with 2 cm of noise."""
-    matrix = map_T_lidar.matrix()
-    sides = np.array([9.0, 6.0, 2.5])
-    inside = rng.uniform(-1, 1, (n_planes, 3)) * sides
-    axis = rng.integers(0, 3, n_planes)
-    rows = np.arange(n_planes)
-    inside[rows, axis] = np.sign(inside[rows, axis]) * sides[axis]
-    normals = np.eye(3)[axis] @ matrix[:3, :3].T
-    poles = np.column_stack([rng.uniform(-8, 8, (n_edges, 2)), rng.uniform(-2, 2, n_edges)])
-    directions = np.tile(matrix[:3, 2], (n_edges, 1))
-
-    def there(points):
-        noise = 0.02 * rng.normal(size=points.shape)
-        return points @ matrix[:3, :3].T + matrix[:3, 3] + noise
-
-    def matched(kind, points, **columns):
-        count = len(points)
-        columns |= {
-            "points": points,
-            "sigmas": rng.uniform(0.02, 0.06, count),
-            "weights": rng.uniform(0.3, 1.0, count),
-            "indices": np.arange(count),
-        }
-        none = np.zeros(count)
-        return kind(
-            **{item.name: columns.get(item.name, none) for item in dataclasses.fields(kind)}
-        )
-
-    offsets = -np.einsum("ij,ij->i", normals, there(inside))
-    return ScanMatches(
-        matched(EdgeMatches, poles, centres=there(poles), directions=directions),
-        matched(PlaneMatches, inside, normals=normals, offsets=offsets),
-    )
-
-
 def solve(rng, map_T_lidar, factors=()):
-    matches = scene(rng, map_T_lidar)
+    seed = int(rng.integers(1 << 30))
+    matches = make_matches(map_T_lidar, 40, 250, noise=0.02, seed=seed)
     return SOLVER.solve(lambda pose: matches, map_T_lidar, factors)
 
 
@@ -108,9 +59,9 @@ def test_scan_and_imu_meet_at_the_mean_of_the_blend(weight):
     for _ in range(12):
         tilt = rng.uniform(-60, 60, 2)
         level_R_map = gtsam.Rot3.Expmap(0.3 * rng.normal(size=3))
-        level_R_lidar = rot(*tilt, rng.uniform(-180, 180))
+        level_R_lidar = rot3(*tilt, rng.uniform(-180, 180))
         truth = gtsam.Pose3(level_R_map.inverse().compose(level_R_lidar), rng.normal(0, 30, 3))
-        measured = rot(*(tilt + rng.uniform(-1, 1, 2)), rng.uniform(-180, 180))
+        measured = rot3(*(tilt + rng.uniform(-1, 1, 2)), rng.uniform(-180, 180))
         tracker = tracker_for(measured, level_R_map, prior="equivalent", weight=weight)
         solution = solve(rng, truth)
         found, tilt_prior = tracker.add_tilt(NOW, solution)
@@ -124,7 +75,7 @@ def test_scan_and_imu_meet_at_the_mean_of_the_blend(weight):
 
 def test_the_information_grows_by_that_of_the_prior():
     solution = solve(np.random.default_rng(2), gtsam.Pose3())
-    found, _ = tracker_for(rot(0.01, -0.02, 0), weight=0.2).add_tilt(NOW, solution)
+    found, _ = tracker_for(rot3(0.01, -0.02, 0), weight=0.2).add_tilt(NOW, solution)
     jacobian = roll_pitch_jacobian(solution.map_T_lidar.rotation())
     knows = tilt_information(solution.information, solution.map_T_lidar.rotation())
     expected = solution.information + 0.25 * jacobian.T @ knows @ jacobian
@@ -150,7 +101,7 @@ def vague(sigma_deg):
 )
 def test_gravity_takes_over_where_the_scan_knows_less_than_the_imu(sigma_deg, tilt, share):
     """The worked example of docs/maths/imu_prior.md."""
-    tracker = tracker_for(rot(0.1, 0, 0), sigma_deg=0.5, weight=0.002)
+    tracker = tracker_for(rot3(0.1, 0, 0), sigma_deg=0.5, weight=0.002)
     solution = with_information(gtsam.Pose3(), vague(sigma_deg))
     found, by = tracker.add_tilt(NOW, solution)
     assert by is tilt
@@ -164,7 +115,7 @@ def test_gravity_takes_over_where_the_scan_knows_less_than_the_imu(sigma_deg, ti
 def test_what_only_the_expected_motion_says_about_the_tilt_does_not_count():
     """Roll is in the information, but it is a direction that the solver found to be weak."""
     solution = with_information(gtsam.Pose3(), 1e6 * np.eye(6))
-    tracker = tracker_for(rot(0.1, 0, 0))
+    tracker = tracker_for(rot3(0.1, 0, 0))
     assert tracker.add_tilt(NOW, solution)[1] is TiltPrior.EQUIVALENT
     blind = dataclasses.replace(solution, weak=np.diag([1.0, 0, 0, 0, 0, 0]))
     assert tracker.add_tilt(NOW, blind)[1] is TiltPrior.GRAVITY
@@ -176,7 +127,7 @@ def test_a_scan_that_says_nothing_about_the_tilt_gets_it_from_gravity():
     """A wall straight ahead fixes pitch and yaw, and a roll about its normal not at all."""
     information = np.diag([0.0, 1e6, 1e6, 1e6, 0.0, 0.0])
     solution = with_information(gtsam.Pose3(), information)
-    found, tilt = tracker_for(rot(3, 0, 0)).add_tilt(NOW, solution)
+    found, tilt = tracker_for(rot3(3, 0, 0)).add_tilt(NOW, solution)
     assert tilt is TiltPrior.GRAVITY
     assert np.isfinite(found.information).all()
     np.testing.assert_allclose(
@@ -191,10 +142,10 @@ def test_a_scan_that_says_nothing_about_the_tilt_gets_it_from_gravity():
 @pytest.mark.parametrize("sigma_deg", [0.02, 0.1, 1.0])
 def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
     rng = np.random.default_rng(3)
-    measured = rot(0.02, -0.03, 0)
+    measured = rot3(0.02, -0.03, 0)
     tracker = tracker_for(measured, prior="sigma", sigma_deg=sigma_deg)
     seed = int(rng.integers(1000))
-    truth = gtsam.Pose3(rot(0, 0, 40), np.array([10.0, 0.0, 0.0]))
+    truth = gtsam.Pose3(rot3(0, 0, 40), np.array([10.0, 0.0, 0.0]))
     alone = solve(np.random.default_rng(seed), truth)
     factors = tracker.factors(NOW)
     assert len(factors) == 1
@@ -214,15 +165,15 @@ def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
 
 def test_only_sigma_is_a_factor_of_the_solve():
     for prior in ("off", "blend", "equivalent"):
-        assert tracker_for(rot(1, 0, 0), prior=prior).factors(NOW) == ()
-    assert len(tracker_for(rot(1, 0, 0), prior="sigma").factors(NOW)) == 1
+        assert tracker_for(rot3(1, 0, 0), prior=prior).factors(NOW) == ()
+    assert len(tracker_for(rot3(1, 0, 0), prior="sigma").factors(NOW)) == 1
 
 
 # -- off and blend ---------------------------------------------------------------------------------
 
 
 def test_off_leaves_the_pose():
-    tracker = tracker_for(rot(5, 0, 0), prior="off")
+    tracker = tracker_for(rot3(5, 0, 0), prior="off")
     solution = solve(np.random.default_rng(4), gtsam.Pose3())
     assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
     pose, tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)
@@ -231,8 +182,8 @@ def test_off_leaves_the_pose():
 
 
 def test_blend_is_done_after_the_solve():
-    level_R_map = rot(-4, 3, 10)
-    tracker = tracker_for(rot(5, -2, 0), level_R_map, prior="blend", weight=0.1)
+    level_R_map = rot3(-4, 3, 10)
+    tracker = tracker_for(rot3(5, -2, 0), level_R_map, prior="blend", weight=0.1)
     solution = solve(np.random.default_rng(5), gtsam.Pose3(level_R_map.inverse(), np.ones(3)))
     assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
     pose, tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)
@@ -249,7 +200,7 @@ def test_blend_is_done_after_the_solve():
 def test_the_tilt_of_a_frame_is_the_mean_over_its_sweep(seconds, least, most):
     """Samples of 10 mrad of noise, on a platform that turns: the gyro brings them together."""
     rng = np.random.default_rng(4)
-    samples = seen_by_imu(rot(3.0, -2.0, 40.0), rate=(0.3, -0.2, 0.8))
+    samples = turning(rot3(3.0, -2.0, 40.0), rate=(0.3, -0.2, 0.8))
     noise = Rotation.from_rotvec(0.01 * rng.normal(size=(len(samples.stamps), 3)))
     noisy = (Rotation.from_quat(samples.orientation) * noise).as_quat()
     noisy = dataclasses.replace(samples, orientation=noisy)
@@ -269,8 +220,8 @@ def test_the_tilt_of_a_frame_is_the_mean_over_its_sweep(seconds, least, most):
 @pytest.mark.parametrize("pitch", [90.0, -90.0, 85.01, -85.01])
 @pytest.mark.parametrize("prior", ["equivalent", "blend"])
 def test_near_a_pitch_of_90_degrees_the_gravity_direction_takes_over(pitch, prior):
-    tracker = tracker_for(rot(20, pitch, 0), prior=prior, weight=0.1)
-    pose = gtsam.Pose3(rot(22, np.sign(pitch) * 89.0, 50), np.ones(3))
+    tracker = tracker_for(rot3(20, pitch, 0), prior=prior, weight=0.1)
+    pose = gtsam.Pose3(rot3(22, np.sign(pitch) * 89.0, 50), np.ones(3))
     solution = solve(np.random.default_rng(6), pose)
     if prior == "equivalent":
         found, tilt = tracker.add_tilt(NOW, solution)
@@ -293,17 +244,17 @@ def test_near_a_pitch_of_90_degrees_the_gravity_direction_takes_over(pitch, prio
 @pytest.mark.parametrize("steep", ["pose", "imu"])
 def test_a_steep_pitch_counts_however_well_the_scan_knows_it(steep):
     pitches = (85.2, 84.0) if steep == "pose" else (84.0, 85.2)
-    pose = gtsam.Pose3(rot(20, pitches[0], 50), np.ones(3))
+    pose = gtsam.Pose3(rot3(20, pitches[0], 50), np.ones(3))
     solution = with_information(pose, 1e9 * np.eye(6))
-    assert tracker_for(rot(20, pitches[1], 0)).add_tilt(NOW, solution)[1] is TiltPrior.GRAVITY
-    below = dataclasses.replace(solution, map_T_lidar=gtsam.Pose3(rot(20, 84.0, 50), np.ones(3)))
-    assert tracker_for(rot(20, 84.0, 0)).add_tilt(NOW, below)[1] is TiltPrior.EQUIVALENT
+    assert tracker_for(rot3(20, pitches[1], 0)).add_tilt(NOW, solution)[1] is TiltPrior.GRAVITY
+    below = dataclasses.replace(solution, map_T_lidar=gtsam.Pose3(rot3(20, 84.0, 50), np.ones(3)))
+    assert tracker_for(rot3(20, 84.0, 0)).add_tilt(NOW, below)[1] is TiltPrior.EQUIVALENT
 
 
 @pytest.mark.parametrize("prior", ["equivalent", "blend"])
 def test_below_85_degrees_it_is_the_mode_itself(prior):
-    tracker = tracker_for(rot(20, 84.0, 0), prior=prior)
-    solution = solve(np.random.default_rng(6), gtsam.Pose3(rot(20, 84.5, 50), np.ones(3)))
+    tracker = tracker_for(rot3(20, 84.0, 0), prior=prior)
+    solution = solve(np.random.default_rng(6), gtsam.Pose3(rot3(20, 84.5, 50), np.ones(3)))
     tilt = tracker.add_tilt(NOW, solution)[1]
     if prior == "blend":
         tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)[1]
@@ -315,8 +266,8 @@ def test_nothing_jumps_where_the_modes_take_turns():
     information = 1e6 * np.eye(6)
     turned = []
     for pitch in (84.9, 84.99, 85.01, 85.1):
-        measured = rot(10.2, pitch - 0.2, 0)
-        solution = with_information(gtsam.Pose3(rot(10, pitch, 30), np.zeros(3)), information)
+        measured = rot3(10.2, pitch - 0.2, 0)
+        solution = with_information(gtsam.Pose3(rot3(10, pitch, 30), np.zeros(3)), information)
         found, _ = tracker_for(measured).add_tilt(NOW, solution)
         turned.append(solution.map_T_lidar.localCoordinates(found.map_T_lidar)[:3])
     steps = np.linalg.norm(np.diff(turned, axis=0), axis=1)
@@ -329,7 +280,7 @@ def test_nothing_jumps_where_the_modes_take_turns():
 @pytest.mark.parametrize("prior", ["equivalent", "blend", "sigma"])
 @pytest.mark.parametrize("gap", [0.09, 0.11])
 def test_in_a_gap_the_prior_is_dropped(prior, gap):
-    samples = seen_by_imu(rot(1, 0, 0))
+    samples = turning(rot3(1, 0, 0))
     away = np.abs(samples.stamps - NOW) * 1e-9
     tracker = tracker_for(part(samples, away >= 0.5 * gap - 0.001), prior=prior, max_gap=0.1)
     solution = solve(np.random.default_rng(7), gtsam.Pose3())
@@ -345,7 +296,7 @@ def test_in_a_gap_the_prior_is_dropped(prior, gap):
 
 
 def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_it():
-    samples = seen_by_imu(rot(4, 3, 0), seconds=2.0)
+    samples = turning(rot3(4, 3, 0), seconds=2.0)
     late = part(samples, samples.stamps >= NOW + FRAME)
     config = ImuConfig()
     tracker = ImuTracker(config, ImuBuffer(config, late))
@@ -358,7 +309,7 @@ def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_
     found = roll_pitch(tracker.level.level_R_map.compose(solution.map_T_lidar.rotation()))
     np.testing.assert_allclose(np.degrees(found), [4, 3], atol=1e-6)
     level = tracker.level
-    tracker.find_level(NOW + 3 * FRAME, gtsam.Pose3(rot(0, 20, 0), np.zeros(3)))
+    tracker.find_level(NOW + 3 * FRAME, gtsam.Pose3(rot3(0, 20, 0), np.zeros(3)))
     assert tracker.level is level  # once is for all
     assert tracker.add_tilt(NOW + 3 * FRAME, solution)[1] is TiltPrior.EQUIVALENT
 
@@ -368,9 +319,9 @@ def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_
 
 @pytest.mark.parametrize("tilt", [(4, -3), (180, 0), (-100, 60), (20, 90), (0, -90)])
 def test_the_first_pose_is_level_at_the_origin(tilt):
-    attitude = rot(*tilt, 77)
+    attitude = rot3(*tilt, 77)
     config = ImuConfig()
-    pose = ImuTracker(config, ImuBuffer(config, seen_by_imu(attitude))).first_pose(NOW)
+    pose = ImuTracker(config, ImuBuffer(config, turning(attitude))).first_pose(NOW)
     np.testing.assert_allclose(pose.rotation().matrix()[2], attitude.matrix()[2], atol=1e-9)
     np.testing.assert_array_equal(pose.translation(), np.zeros(3))
     if abs(tilt[1]) < 90:
@@ -378,10 +329,10 @@ def test_the_first_pose_is_level_at_the_origin(tilt):
 
 
 @pytest.mark.parametrize("level", [True, False])
-@pytest.mark.parametrize("given", [None, gtsam.Pose3(rot(30, 10, 90), np.ones(3))])
+@pytest.mark.parametrize("given", [None, gtsam.Pose3(rot3(30, 10, 90), np.ones(3))])
 def test_a_map_that_is_not_levelled_knows_up_too(level, given):
     """With a start of the user's own, that one counts."""
-    samples = seen_by_imu(rot(4, -3, 77))
+    samples = turning(rot3(4, -3, 77))
     config = ImuConfig(level=level)
     tracker = ImuTracker(config, ImuBuffer(config, samples))
     pose = tracker.first_pose(NOW, given)
@@ -395,7 +346,7 @@ def test_a_map_that_is_not_levelled_knows_up_too(level, given):
 
 @pytest.mark.parametrize(("rate", "bias"), [(0.0, 0.01), (0.3, 0.0)])
 def test_a_rest_at_the_start_gives_the_bias_of_the_gyro(rate, bias):
-    samples = seen_by_imu(rot(0, 0, 0), rate=(0, 0, rate), bias=(0, 0, bias))
+    samples = turning(rot3(0, 0, 0), rate=(0, 0, rate), bias=(0, 0, bias))
     config = ImuConfig()
     tracker = ImuTracker(config, ImuBuffer(config, samples))
     tracker.first_pose(NOW)
@@ -416,7 +367,7 @@ def frames(rate, count):
 
 def turning_tracker(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):
     config = ImuConfig()
-    samples = seen_by_imu(rot(0, 0, 0), seconds=seconds, rate=rate, bias=bias)
+    samples = turning(rot3(0, 0, 0), seconds=seconds, rate=rate, bias=bias)
     return ImuTracker(config, ImuBuffer(config, samples))
 
 
@@ -459,7 +410,7 @@ def test_how_much_gyro_and_scan_may_differ(degrees, agrees):
         by_scan = np.radians([0.0, 0.0, turn])
         config = ImuConfig()
         off = by_scan + np.radians([0.0, 0.0, degrees + 0.5 * turn])
-        samples = seen_by_imu(rot(0, 0, 0), seconds=3.0, rate=tuple(off / 0.1))
+        samples = turning(rot3(0, 0, 0), seconds=3.0, rate=tuple(off / 0.1))
         tracker = ImuTracker(config, ImuBuffer(config, samples))
         poses = frames(by_scan / 0.1, 6)
         for last, now in pairwise(poses):
@@ -482,7 +433,7 @@ def test_frames_that_cannot_be_compared_teach_nothing():
 
 
 def test_factors_are_on_the_pose_of_the_frame():
-    (factor,) = tracker_for(rot(1, 0, 0), prior="sigma").factors(NOW)
+    (factor,) = tracker_for(rot3(1, 0, 0), prior="sigma").factors(NOW)
     assert list(factor.keys()) == [POSE_KEY]
 
 
@@ -577,7 +528,7 @@ def test_an_imu_that_measures_nonsense_makes_no_prediction_and_ends_no_run(absur
 def test_after_a_reset_the_tracker_is_a_new_one_to_the_last_bit():
     """Level, bias, distrust and pre-integration are forgotten."""
     rate, bias = (0.0, 0.0, 0.8), (0.02, -0.01, 0.015)
-    samples = seen_by_imu(rot(3, -2, 0), seconds=3.0, rate=rate, bias=bias)
+    samples = turning(rot3(3, -2, 0), seconds=3.0, rate=rate, bias=bias)
     config = ImuConfig(preintegration=True)
 
     def run(tracker):
@@ -620,7 +571,7 @@ def test_the_state_of_a_run_with_pre_integration_does_not_grow():
 def test_samples_fed_live_and_forgotten_lead_to_the_same(preintegration, monkeypatch):
     monkeypatch.setattr("loam_gtsam.imu.buffer.MEMORY", 1.0)
     rate, config = (0.0, 0.1, 0.5), ImuConfig(preintegration=preintegration, prior="blend")
-    samples = seen_by_imu(rot(3, -2, 0), seconds=12.0, rate=rate, bias=(0.02, -0.01, 0.015))
+    samples = turning(rot3(3, -2, 0), seconds=12.0, rate=rate, bias=(0.02, -0.01, 0.015))
     at_once = ImuTracker(config, ImuBuffer(config, samples))
     live = ImuTracker(config, ImuBuffer(config))
     poses = frames(rate, 100)

@@ -88,3 +88,25 @@ def angle(a, b):
 def rot(*degrees):
     """Rz Ry Rx from roll, pitch, yaw."""
     return Rotation.from_euler("ZYX", degrees[::-1], degrees=True)
+
+
+def rot3(*degrees):
+    """The rotation of :func:`rot` as GTSAM has it."""
+    return gtsam.Rot3(rot(*degrees).as_matrix())
+
+
+def turning(world_R_lidar, rate=(0.0, 0.0, 0.0), *, at=0.5, seconds=1.0, bias=0.0, noise=0.0):
+    """Samples at 200 Hz of a lidar that turns evenly, at ``world_R_lidar`` after ``at`` seconds.
+
+    ``bias`` is added to the gyro, ``noise`` (rad) is that of the orientation.
+    """
+    times = np.arange(round(200 * seconds)) / 200.0
+    attitude = Rotation.from_matrix(world_R_lidar.matrix())
+    attitude = attitude * Rotation.from_rotvec(np.outer(times - at, rate))
+    scatter = noise * np.random.default_rng(0).normal(size=(len(times), 3))
+    return ImuSamples(
+        ns(times),
+        (attitude * Rotation.from_rotvec(scatter)).as_quat(),
+        np.tile(np.add(rate, bias), (len(times), 1)),
+        attitude.inv().apply([0.0, 0.0, G]),
+    )

@@ -368,7 +368,7 @@ def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:
     normals = np.ascontiguousarray(rows.normals.T) * rows.scales
     offsets = rows.offsets * rows.scales
     across = normals @ normals.T
-    # Where no plane fixes it the anchor stays near the origin.
+    # Where no plane fixes the anchor it stays near the origin.
     held = across + (_RIDGE * np.trace(across)) * np.eye(3)
     anchor: FloatArray = np.linalg.solve(held, -normals @ offsets).astype(np.float64, copy=False)
     matrix = np.empty((13, len(offsets)))

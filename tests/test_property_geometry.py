@@ -6,7 +6,6 @@ from typing import Any
 
 import gtsam
 import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.strategies import generators
@@ -224,11 +223,3 @@ def test_voxel_filter_forgets_the_order_and_is_done_after_one_pass(
     shifted = voxel_filter(points + whole, size)
     if len(shifted) == len(once):
         np.testing.assert_allclose(shifted, once + whole, rtol=0, atol=1e-9 * (100 * size + 100))
-
-
-@pytest.mark.parametrize("size", [0.1, 0.4])
-def test_a_filtered_cloud_stays_inside_the_hull_of_each_voxel(size: float) -> None:
-    points = np.random.default_rng(1).uniform(-5, 5, (2000, 3))
-    found = voxel_filter(points, size)
-    cells = np.unique(np.floor(points / size), axis=0)
-    assert ((found >= cells * size - 1e-12) & (found <= (cells + 1) * size + 1e-12)).all()

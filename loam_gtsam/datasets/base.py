@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, TypedDict, runtime_checkable
 
@@ -83,6 +83,37 @@ class Dataset(Protocol):
     def truth(self) -> Trajectory | None:
         """Reference poses if the data comes with them."""
         ...
+
+
+class ChangedDataset:
+    """A data set made of another one, whose sweeps, IMU or reference poses subclasses change.
+
+    Parameters
+    ----------
+    dataset : the other one
+    change : what was done to it, for its name
+    """
+
+    def __init__(self, dataset: Dataset, change: str) -> None:
+        self._dataset = dataset
+        self.name = f"{dataset.name} {change}"
+        self.sensor: Mapping[str, Any] = dataset.sensor
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """IMU of the other data set."""
+        return self._dataset.imu
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """Reference poses of the other data set, those of missing sweeps included."""
+        return self._dataset.truth
+
+    def _info(self, **facts: str) -> DatasetInfo:
+        """Description of the other data set, with facts about the change."""
+        info = self._dataset.info()
+        more = {label.replace("_", " "): text for label, text in facts.items()}
+        return replace(info, facts=info.facts | more)
 
 
 class SweepFiles(ABC):

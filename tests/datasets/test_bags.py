@@ -96,6 +96,8 @@ def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
         BagDataset(path, topic="/imu")
     with pytest.raises(DatasetError, match="no topic '/no'"):
         BagDataset(path, imu_topic="/no")
+    with pytest.raises(TypeError, match="unexpected keyword arguments: colour"):
+        BagDataset(path, colour="red")
 
 
 def test_bag_without_sweeps(tmp_path: Path) -> None:

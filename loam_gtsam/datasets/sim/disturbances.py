@@ -9,23 +9,20 @@ put somewhere else see :mod:`loam_gtsam.datasets.sim.kidnapping`.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
-from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.datasets.base import ChangedDataset, Dataset, DatasetInfo
 from loam_gtsam.types import (
     BoolArray,
     ConfigError,
     FeatureSweep,
     FloatArray,
-    ImuSamples,
     InputError,
     Scan,
     Sweep,
-    Trajectory,
 )
 
 _REACH = 60.0
@@ -239,7 +236,7 @@ def _between(
     return np.minimum(first, second), np.maximum(first, second)
 
 
-class Disturbed:
+class Disturbed(ChangedDataset):
     """A data set whose sweeps are disturbed, one disturbance after the other.
 
     Parameters
@@ -254,10 +251,8 @@ class Disturbed:
     """
 
     def __init__(self, dataset: Dataset, disturbances: Sequence[Disturbance]) -> None:
-        self._dataset = dataset
+        super().__init__(dataset, "disturbed")
         self._disturbances = tuple(disturbances)
-        self.name = f"{dataset.name} disturbed"
-        self.sensor: Mapping[str, Any] = dataset.sensor
 
     def __len__(self) -> int:
         return sum(self._keeps(number) for number in range(len(self._dataset)))
@@ -276,21 +271,9 @@ class Disturbed:
     def _keeps(self, number: int) -> bool:
         return all(disturbance.keeps(number) for disturbance in self._disturbances)
 
-    @property
-    def imu(self) -> ImuSamples | None:
-        """IMU of the data set."""
-        return self._dataset.imu
-
-    @property
-    def truth(self) -> Trajectory | None:
-        """Reference poses of the data set, those of missing sweeps included."""
-        return self._dataset.truth
-
     def info(self) -> DatasetInfo:
         """Description of the data set, with what disturbs it."""
-        info = self._dataset.info()
-        facts = info.facts | {"disturbed by": ", ".join(map(str, self._disturbances)) or "nothing"}
-        return replace(info, facts=facts)
+        return self._info(disturbed_by=", ".join(map(str, self._disturbances)) or "nothing")
 
 
 def _check_share(share: float) -> None:

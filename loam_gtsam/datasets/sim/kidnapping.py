@@ -7,15 +7,14 @@ simulated one to any place.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.datasets.base import ChangedDataset, Dataset, DatasetInfo
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.types import (
     BadSweep,
@@ -30,7 +29,7 @@ from loam_gtsam.types import (
 )
 
 
-class SkippedAhead:
+class SkippedAhead(ChangedDataset):
     """A drive out of which some sweeps were cut, and the gap in time closed: a kidnapped lidar.
 
     Works on any data; the lidar jumps to where it really went, at the speed it had there.
@@ -52,9 +51,8 @@ class SkippedAhead:
                 f"SkippedAhead: expected sweeps within 1 to {len(dataset) - 2} to cut out, got "
                 f"{count} from {first}"
             )
-        self._dataset, self._first, self._count = dataset, first, count
-        self.name = f"{dataset.name} skipped ahead"
-        self.sensor: Mapping[str, Any] = dataset.sensor
+        super().__init__(dataset, "skipped ahead")
+        self._first, self._count = first, count
         until = list(itertools.islice(dataset, first + count + 1))
         self._begin, self._end = (_earlier(sweep, 0).stamp for sweep in (until[first], until[-1]))
 
@@ -94,12 +92,10 @@ class SkippedAhead:
 
     def info(self) -> DatasetInfo:
         """Description of the data set, with the cut."""
-        info = self._dataset.info()
-        cut = f"{self._count} sweeps from {self._first}"
-        return replace(info, facts=info.facts | {"cut out": cut})
+        return self._info(cut_out=f"{self._count} sweeps from {self._first}")
 
 
-class Kidnapped:
+class Kidnapped(ChangedDataset):
     """A simulated drive in which the lidar is put somewhere else between two sweeps.
 
     From then on it rides along in its new place, seen from where it would have been.
@@ -126,9 +122,8 @@ class Kidnapped:
     ) -> None:
         if not 0 < number < len(world):
             raise InputError(f"Kidnapped: expected a sweep in 1 to {len(world) - 1}, got {number}")
+        super().__init__(world, "kidnapped")
         self._world, self._number = world, number
-        self.name = f"{world.name} kidnapped"
-        self.sensor: Mapping[str, Any] = world.sensor
         lidar_T_moved = np.eye(4)
         lidar_T_moved[:3, :3] = Rotation.from_euler("z", turn_deg, degrees=True).as_matrix()
         lidar_T_moved[:3, 3] = move
@@ -171,8 +166,7 @@ class Kidnapped:
 
     def info(self) -> DatasetInfo:
         """Description of the drive, with the change of place."""
-        info = self._world.info()
-        return replace(info, facts=info.facts | {"kidnapped": self._change})
+        return self._info(kidnapped=self._change)
 
 
 def _earlier(sweep: Sweep, nanoseconds: int) -> Scan | BadSweep:

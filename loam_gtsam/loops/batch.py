@@ -228,20 +228,19 @@ class _Problem:
         self, graph: gtsam.NonlinearFactorGraph, poses: gtsam.Values, active: BoolArray
     ) -> FloatArray:
         """(L,) squared distance of each loop closure from what all the others say."""
-        distances = np.empty(len(self.loops))
-        marginals = gtsam.Marginals(graph, poses) if self.loops else None
-        for number, (place, on) in enumerate(zip(self.loops, active.tolist(), strict=True)):
+        if not self.loops:
+            return np.empty(0)
+        marginals = gtsam.Marginals(graph, poses)
+        distances = []
+        for place, on in zip(self.loops, active.tolist(), strict=True):
             factor: Any = _without_kernel(self.saved.factors.at(place))
             first, second = factor.keys()
             between = poses.atPose3(first).between(poses.atPose3(second))
-            assert marginals is not None
             joint = marginals.jointMarginalCovariance([first, second])
-            covariance = relative_pose_covariance(between, joint, first, second)
+            known = between, relative_pose_covariance(between, joint, first, second)
             noise = factor.noiseModel().covariance()
-            distances[number] = chi_squared(
-                factor.measured(), noise, between, covariance, included=on
-            )
-        return distances
+            distances.append(chi_squared(factor.measured(), noise, *known, included=on))
+        return np.array(distances)
 
     def inliers(self) -> BoolArray:
         """Which loop closures graduated non-convexity finds right, all other factors being right.

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
@@ -81,49 +81,20 @@ def loop_to_switch(active: BoolArray, distances: FloatArray, max_chi2: float) ->
     return best if not active[best] and distances[best] <= max_chi2 else None
 
 
-class LoopConsistency:
-    """Which loop closures of a graph are pairwise consistent.
+def consistent_set(number: int, agreeing: Callable[[int], set[int]]) -> set[int]:
+    """Loop closures that agree pairwise, a given one among them: as many as greedy search finds.
 
     Parameters
     ----------
-    config : ``max_chi2``, ``walk`` and ``turn_walk_deg`` are used
-    loops, keyframes : the lists of the graph, which grow with it
+    number : number of the given loop closure
+    agreeing : gives the numbers of the other loop closures that agree with one
     """
-
-    def __init__(
-        self, config: PoseGraphConfig, loops: Sequence[LoopClosure], keyframes: Sequence[Keyframe]
-    ) -> None:
-        self.config = config
-        self._loops = loops
-        self._keyframes = keyframes
-        # One byte for each pair, a row for each loop closure: 0 unknown, 1 inconsistent, 2 not.
-        self._compared: list[bytearray] = []
-
-    def agreeing(self, number: int) -> set[int]:
-        """Numbers of the other loop closures that agree with one; each pair is compared once."""
-        return {n for n in range(len(self._loops)) if n != number and self._agree(n, number)}
-
-    def clique(self, number: int) -> set[int]:
-        """Numbers of loop closures that agree pairwise, the given one among them.
-
-        The set is as large as greedy search finds it.
-        """
-        agreeing = {other: self.agreeing(other) for other in self.agreeing(number)}
-        chosen = {number}
-        for other in sorted(agreeing, key=lambda n: (-len(agreeing[n]), n)):
-            if chosen <= agreeing[other]:
-                chosen.add(other)
-        return chosen
-
-    def _agree(self, one: int, two: int) -> bool:
-        first, second = min(one, two), max(one, two)
-        while len(self._compared) <= second:
-            self._compared.append(bytearray(len(self._compared)))
-        row = self._compared[second]
-        if not row[first]:
-            loops = self._loops[second], self._loops[first]
-            row[first] = 1 + consistent(*loops, self._keyframes, self.config)
-        return row[first] == 2
+    others = {other: agreeing(other) for other in agreeing(number)}
+    chosen = {number}
+    for other in sorted(others, key=lambda n: (-len(others[n]), n)):
+        if chosen <= others[other]:
+            chosen.add(other)
+    return chosen
 
 
 def consistent(

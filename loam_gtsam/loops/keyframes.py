@@ -116,21 +116,13 @@ def is_pose(values: gtsam.Values, key: int) -> bool:
     return True
 
 
-def make_keyframe(
-    index: int,
-    update: MapUpdate,
-    features: Features | None,
-    config: Config,
-    imu: ImuBuffer | None,
-    *,
-    travelled: float,
-    session: int,
-) -> Keyframe:
-    """A keyframe with the features of its sweep, de-skewed to the stamp.
+def keyframe_points(
+    update: MapUpdate, features: Features | None, config: Config, imu: ImuBuffer | None
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """``edges``, ``planes`` and ``distinct`` of a :class:`Keyframe`; empty without features.
 
     Parameters
     ----------
-    features : none leave the keyframe without points
     config : ``deskew`` and the voxels of ``map`` are used
     imu : source of the rotation within the sweep; None for constant velocity
 
@@ -139,18 +131,17 @@ def make_keyframe(
     InputError
         If the features are those of another stamp.
     """
-    edges, planes, distinct = np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.bool_)
-    if features is not None:
-        if features.stamp != update.stamp:
-            raise InputError(
-                f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
-            )
-        sweep = MovingSweep(features, config, imu)
-        posed = sweep.at(update.twist)
-        to_reference = posed.middle_T_reference.inverse().matrix()
-        edges, planes = (transform(to_reference, part) for part in posed.points)
-        distinct = sweep.distinct
-    return Keyframe(index, update, travelled, edges, planes, distinct, session)
+    if features is None:
+        return np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.bool_)
+    if features.stamp != update.stamp:
+        raise InputError(
+            f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
+        )
+    sweep = MovingSweep(features, config, imu)
+    posed = sweep.at(update.twist)
+    to_reference = posed.middle_T_reference.inverse().matrix()
+    edges, planes = (transform(to_reference, part) for part in posed.points)
+    return edges, planes, sweep.distinct
 
 
 def interpolate_trajectory(

@@ -14,7 +14,12 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.loops.consistency import LoopConsistency, chi_squared, loop_to_switch
+from loam_gtsam.loops.consistency import (
+    chi_squared,
+    consistent,
+    consistent_set,
+    loop_to_switch,
+)
 from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key
 
@@ -29,8 +34,8 @@ class LoopSelection:
 
     Parameters
     ----------
-    config : ``max_chi2``, ``believed_loops``, ``kernel_width``, and what
-        :class:`~loam_gtsam.loops.consistency.LoopConsistency` uses
+    config : ``max_chi2``, ``believed_loops``, ``kernel_width``, ``walk`` and ``turn_walk_deg`` are
+        used
     graph : the graph, in which the loop closures are switched
     keyframes : the list of the graph, which grows
     loops : those that are in the graph; :meth:`add` appends the new one
@@ -44,8 +49,9 @@ class LoopSelection:
         loops: list[LoopClosure],
     ) -> None:
         self.config = config
-        self._graph, self._loops = graph, loops
-        self._consistency = LoopConsistency(config, loops, keyframes)
+        self._graph, self._keyframes, self._loops = graph, keyframes, loops
+        # One byte for each pair, a row for each loop closure: 0 unknown, 1 inconsistent, 2 not.
+        self._compared: list[bytearray] = []
 
     def add(self, loop: LoopClosure) -> bool:
         """Add a loop closure, and switch off those that contradict the rest of the graph.
@@ -68,11 +74,11 @@ class LoopSelection:
             self._graph.switch(number, True)
             self._settle(sorted(set(range(number)) - on))
             return self._graph.is_active(number)
-        agrees = on <= self._consistency.agreeing(number)
+        agrees = on <= self._agreeing(number)
         if agrees and distance <= self.config.max_chi2:
             self._graph.switch(number, True)
         else:
-            most = self._consistency.clique(number)
+            most = consistent_set(number, self._agreeing)
             # The others were the wrong ones, or the odometry is worse than its covariance says.
             if len(most) > max(len(on), self.config.believed_loops - 1 if agrees else 0):
                 for other in sorted(on - most):
@@ -89,6 +95,21 @@ class LoopSelection:
         between, covariance = self._graph.relative(pose_key(loop.earlier), pose_key(loop.later))
         on = self._graph.is_active(number)
         return chi_squared(loop.earlier_T_later, loop.covariance, between, covariance, included=on)
+
+    def _agreeing(self, number: int) -> set[int]:
+        """Numbers of the other loop closures that are consistent with one."""
+        return {n for n in range(len(self._loops)) if n != number and self._agree(n, number)}
+
+    def _agree(self, one: int, two: int) -> bool:
+        """Whether two loop closures are consistent; each pair is compared once."""
+        first, second = min(one, two), max(one, two)
+        while len(self._compared) <= second:
+            self._compared.append(bytearray(len(self._compared)))
+        row = self._compared[second]
+        if not row[first]:
+            loops = self._loops[second], self._loops[first]
+            row[first] = 1 + consistent(*loops, self._keyframes, self.config)
+        return row[first] == 2
 
     def _settle(self, numbers: Sequence[int]) -> None:
         """Switch some of the loop closures one by one until all agree with their tests."""

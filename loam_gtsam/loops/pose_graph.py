@@ -26,7 +26,7 @@ from loam_gtsam.loops.keyframes import (
     LoopClosure,
     direction,
     interpolate_trajectory,
-    make_keyframe,
+    keyframe_points,
     noise_model,
     odometry_between,
     pose_key,
@@ -121,16 +121,10 @@ class PoseGraph:
             config = self.config
             if moved < config.keyframe_distance and turned < config.keyframe_angle_deg:
                 return None
-        keyframe = make_keyframe(
-            len(self),
-            update,
-            features,
-            self._whole,
-            self.imu,
-            travelled=float(np.linalg.norm(motion.translation()))
-            + (0.0 if last is None else last.travelled),
-            session=self._session,
-        )
+        travelled = float(np.linalg.norm(motion.translation()))
+        travelled += 0.0 if last is None else last.travelled
+        points = keyframe_points(update, features, self._whole, self.imu)
+        keyframe = Keyframe(len(self), update, travelled, *points, self._session)
         self._append(keyframe, last)
         return keyframe
 
@@ -168,15 +162,6 @@ class PoseGraph:
         InputError
             If something is of a wrong type or not finite, a key is unknown or taken, or the new
             variables are not determined. The graph is then as it was before.
-
-        Examples
-        --------
-        >>> landmark = gtsam.symbol("l", 0)  # doctest: +SKIP
-        >>> seen = gtsam.BearingRangeFactor3D(
-        ...     gtsam.symbol("x", 4), landmark, bearing, 12.5, noise)  # doctest: +SKIP
-        >>> start = gtsam.Values()  # doctest: +SKIP
-        >>> start.insert(landmark, np.array([10.0, 7.0, 1.0]))  # doctest: +SKIP
-        >>> graph.add_factor(seen, start)  # doctest: +SKIP
         """
         self._graph.add(*checked_factors(factor, values, self._graph.values))
 

@@ -7,7 +7,12 @@ import numpy as np
 import pytest
 from support.pose_graphs import SIGMAS, drifted, filled, frames, right_loops, settings, square
 
-from loam_gtsam.loops.consistency import LoopConsistency, chi_squared, consistent, loop_to_switch
+from loam_gtsam.loops.consistency import (
+    chi_squared,
+    consistent,
+    consistent_set,
+    loop_to_switch,
+)
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
 
 
@@ -70,12 +75,10 @@ def test_the_covariance_of_a_cycle_is_that_of_monte_carlo():
 
 
 def test_the_largest_group_that_agrees_is_found():
-    consistency = LoopConsistency(settings().pose_graph, [], [])
     groups = [{1, 2, 4}, {0, 2}, {0, 1}, set(), {0}]
-    consistency.agreeing = lambda number: groups[number]
-    assert consistency.clique(2) == {0, 1, 2}
-    assert consistency.clique(4) == {0, 4}
-    assert consistency.clique(3) == {3}
+    assert consistent_set(2, groups.__getitem__) == {0, 1, 2}
+    assert consistent_set(4, groups.__getitem__) == {0, 4}
+    assert consistent_set(3, groups.__getitem__) == {3}
 
 
 @pytest.mark.parametrize(

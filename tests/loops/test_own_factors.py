@@ -11,7 +11,6 @@ from loam_gtsam.cli.app import app
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.io.state import freeze
 from loam_gtsam.loops.files import read_graph, write_graph
-from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.types import InputError, OutputError
 
 POST = np.array([4.0, 3.0, 1.0])
@@ -206,9 +205,3 @@ def test_a_motion_between_keyframes_of_ones_own_is_no_loop():
         graph.add_loop(loop)
     result = graph.optimize()
     assert [loop.active for loop in result.loops] == [False, False, True, True]
-
-
-def test_a_factor_needs_a_keyframe_or_a_variable():
-    graph = PoseGraph()
-    with pytest.raises(InputError, match="no variable has the keys x0"):
-        graph.add_factor(gtsam.GPSFactor(X(0), POST, NOISE))

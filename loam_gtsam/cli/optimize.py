@@ -1,4 +1,4 @@
-"""One saved pose graph from the command line: read, optimise, write, report."""
+"""The command ``optimize``: read a saved pose graph, optimise it, write it, print a table."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from loam_gtsam.cli.console import print_plain
 from loam_gtsam.cli.options import OptimizeOptions
 from loam_gtsam.config import Config
 from loam_gtsam.io.trajectories import write_tum
@@ -14,11 +15,11 @@ from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
 from loam_gtsam.types import DatasetError, OutputError, Trajectory
 
 _LISTED = 10
-"""Loops that are switched off and listed."""
+"""Loops that are switched off: how many of them are listed at most."""
 
 
 def execute(options: OptimizeOptions) -> int:
-    """Optimise a file; returns the exit code.
+    """Optimise a pose graph; returns the exit code.
 
     Raises
     ------
@@ -43,9 +44,8 @@ def execute(options: OptimizeOptions) -> int:
         raise DatasetError(
             f"{path}: has no stamps for some poses, which --trajectory needs; leave it out"
         )
-    max_chi2 = options.max_chi2
-    if max_chi2 is None:
-        max_chi2 = Config().pose_graph.max_chi2
+    default = Config().pose_graph.max_chi2
+    max_chi2 = default if options.max_chi2 is None else options.max_chi2
     result = optimize_graph(saved, robust=options.robust, max_chi2=max_chi2)
     stamps = {key: saved.stamps[key] for key in keys if key in saved.stamps}
     write_graph(target, SavedGraph(result.factors, result.poses, stamps))
@@ -56,8 +56,7 @@ def execute(options: OptimizeOptions) -> int:
     if not options.quiet:
         console = Console()
         console.print(_table(saved, result, keys))
-        names = ", ".join(str(file) for file in written)
-        console.print(f"Written to {names}", markup=False, soft_wrap=True)
+        print_plain(console, f"Written to {', '.join(map(str, written))}")
     return 0
 
 

@@ -598,6 +598,29 @@ def test_no_help_of_a_command_is_cut_off(monkeypatch):
     assert "..." not in loam("--help").output.partition("Commands:")[2]
 
 
+_HELP = """
+import sys, types
+package = types.ModuleType("loam_gtsam")  # what its own __init__ imports is another matter
+package.__path__ = [sys.argv.pop()]
+sys.modules["loam_gtsam"] = package
+from loam_gtsam.cli import main
+try:
+    main()
+finally:
+    print([name for name in ("gtsam", "numpy", "scipy") if name in sys.modules])
+"""
+
+
+@pytest.mark.parametrize("command", ["run", "compare", "study", "optimize"])
+def test_the_help_of_a_command_imports_neither_gtsam_nor_scipy(command):
+    package = Path(__file__).parents[2] / "loam_gtsam"
+    done = subprocess.run(
+        [sys.executable, "-c", _HELP, command, "--help", package], capture_output=True, text=True
+    )
+    assert "--quiet" in done.stdout
+    assert done.stdout.splitlines()[-1] == "[]", done.stderr
+
+
 def test_sweep_is_the_old_name_of_study_and_says_so():
     old, new = (loam(name, "missing.yaml") for name in ("sweep", "study"))
     assert old.exit_code == new.exit_code == 1

@@ -411,3 +411,78 @@ def test_a_user_may_hand_priors_and_own_factors_together(mapped, rng):
     mapped.extra_factors = lambda context: [low]
     update = mapped.register(room_features(gtsam.Pose3(), SECOND, rng), priors=[high])
     np.testing.assert_allclose(update.map_T_lidar.translation()[2], 0.03, atol=1e-3)
+
+
+# -- values and states -----------------------------------------------------------------------------
+
+
+def with_preintegration(world, count):
+    """A mapper with pre-integration after some sweeps, and the features of the next one."""
+    config = Config().changed("imu.preintegration=true")
+    mapper = Mapper(config, imu=imu_buffer(world, config))
+    for number in range(count):
+        mapper.register(extract_features(world[number], config))
+    assert mapper.last.status is FrameStatus.OK
+    return mapper, extract_features(world[count], config)
+
+
+def test_a_guess_is_used_under_pre_integration():
+    """Solves that start 5 m apart do not start at the same pose."""
+    world = SimulatedWorld("room", frames=12, columns=450)
+    starts = []
+
+    class Spy(GtsamSolver):
+        def solve(self, associate, guess, priors=(), motion=None):
+            starts.append(guess)
+            return super().solve(associate, guess, priors, motion)
+
+    for away in (0.0, 5.0):
+        mapper, features = with_preintegration(world, 10)
+        expected = mapper.last.map_T_lidar
+        mapper.solver = Spy(mapper.config.solver)
+        guess = expected.compose(gtsam.Pose3(gtsam.Rot3(), np.array([away, 0.0, 0.0])))
+        starts.clear()
+        mapper.register(features, guess=guess)
+        assert starts[0].range(guess) < 0.1  # from the reference time to the middle
+
+
+def test_a_predicted_pose_teaches_nothing_about_the_gyro():
+    """After a sweep with too few matches, the next solved one leaves the bias alone."""
+    world = SimulatedWorld("room", frames=12, columns=450)
+    mapper, features = with_preintegration(world, 10)
+    few = replace(
+        features,
+        edges=features.edges[:5],
+        edge_times=features.edge_times[:5],
+        edge_rings=features.edge_rings[:5],
+        edge_prominence=None,
+        planes=features.planes[:20],
+        plane_times=features.plane_times[:20],
+        plane_rings=features.plane_rings[:20],
+        voxel_sizes=None,
+    )
+    assert mapper.register(few).status is FrameStatus.FEW_MATCHES
+    before = mapper.imu.buffer.gyro_bias.copy()
+    mapper.register(extract_features(world[11], mapper.config))
+    assert np.array_equal(mapper.imu.buffer.gyro_bias, before)
+
+
+def test_what_is_said_about_a_frame_cannot_be_changed(mapped, rng):
+    update = mapped.register(room_features(gtsam.Pose3(), 2 * SECOND, rng))
+    assert set(update.timings) >= {"prepare", "match", "solve", "insert", "covariance"}
+    with pytest.raises(TypeError):
+        update.timings["solve"] = 0.0
+    before = dict(update.timings)
+    mapped.register(room_features(gtsam.Pose3(), 2 * SECOND + SECOND // 10, rng))
+    assert dict(update.timings) == before
+
+
+def test_the_pose_of_the_middle_is_handed_out_too():
+    world = SimulatedWorld("street_loop", frames=4, columns=450)
+    mapper = Mapper()
+    for number in range(4):
+        update = mapper.register(extract_features(world[number], mapper.config))
+        half = update.middle_stamp - update.stamp
+        assert half == pytest.approx(0.05e9, abs=1e6)
+        moved = gtsam.Pose3.Expmap(update.twist * half * 1e-9)
+        assert update.map_T_middle.equals(update.map_T_lidar.compose(moved), 1e-9)

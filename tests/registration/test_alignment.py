@@ -1,0 +1,79 @@
+"""Two clouds aligned in one call: closed forms, what they do not fix, what is refused."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.registration.alignment import align
+from loam_gtsam.types import InputError
+
+TRUTH = gtsam.Pose3(gtsam.Rot3.Ypr(0.05, -0.02, 0.03), np.array([0.4, -0.3, 0.1]))
+
+
+def walls(rng, *, ends=True, noise=0.01, count=6000):
+    """Points on floor, ceiling and sides of a hall of 24 x 12 x 5 m, with or without its ends."""
+    size = np.array([12.0, 6.0, 2.5])
+    axes = rng.integers(0 if ends else 1, 3, count)
+    points = rng.uniform(-1.0, 1.0, (count, 3)) * size
+    rows = np.arange(count)
+    points[rows, axes] = np.where(points[rows, axes] < 0.0, -1.0, 1.0) * size[axes]
+    return points + rng.normal(0.0, noise, (count, 3))
+
+
+def seen_from(pose, points):
+    return points @ pose.rotation().matrix() + pose.inverse().translation()
+
+
+def test_a_known_pose_is_found_within_what_is_told():
+    rng = np.random.default_rng(0)
+    found = align(seen_from(TRUTH, walls(rng)), walls(rng))
+    error = found.target_T_source.localCoordinates(TRUTH)
+    assert found.solved
+    assert found.converged
+    assert found.weak is None
+    assert found.overlap > 0.7
+    assert np.abs(error).max() < 2e-3
+    assert error @ np.linalg.solve(found.covariance, error) / 6.0 < 4.0
+
+
+def test_a_guess_brings_clouds_together_that_are_far_apart():
+    rng = np.random.default_rng(1)
+    away = gtsam.Pose3(gtsam.Rot3.Yaw(2.0), np.array([5.0, 1.0, 0.0]))
+    source, target = seen_from(away, walls(rng)), walls(rng)
+    assert not align(source, target).target_T_source.equals(away, 0.1)
+    found = align(source, target, away.compose(TRUTH))
+    assert found.target_T_source.equals(away, 5e-3)
+
+
+def test_what_the_clouds_do_not_fix_is_said():
+    """Along a hall without ends the pose stays at the guess, and its covariance says so."""
+    rng = np.random.default_rng(2)
+    found = align(seen_from(TRUTH, walls(rng, ends=False)), walls(rng, ends=False))
+    assert found.weak is not None
+    along = found.target_T_source.rotation().matrix().T[:, 0]
+    assert np.linalg.norm(found.weak[3:, 3:] @ along) > 0.9
+    assert along @ found.covariance[3:, 3:] @ along > 1.0
+    aside = np.linalg.eigvalsh(found.covariance[3:, 3:])[:2]
+    assert np.sqrt(aside).max() < 0.01
+
+
+def test_clouds_that_do_not_meet_are_not_solved():
+    rng = np.random.default_rng(3)
+    guess = gtsam.Pose3(gtsam.Rot3(), np.array([70.0, 0.0, 0.0]))
+    found = align(walls(rng), walls(rng), guess)
+    assert not found.solved
+    assert found.target_T_source.equals(guess, 0.0)
+    assert np.isnan(found.covariance).all()
+
+
+@pytest.mark.parametrize(
+    ("source", "says"),
+    [
+        (np.zeros((5, 2)), r"source: expected \(N, 3\)"),
+        (np.full((99, 3), np.nan), "source: .*finite"),
+        (np.zeros((49, 3)), "source: expected at least 50 points, got 49"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(source, says):
+    with pytest.raises(InputError, match=says):
+        align(source, np.zeros((99, 3)))

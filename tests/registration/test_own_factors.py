@@ -1,0 +1,118 @@
+"""A user's own factors: on the pose of a sweep, and between it and the last one."""
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.factors import checked_factor
+from loam_gtsam.mapper import Mapper
+from loam_gtsam.registration.solvers import POSE_KEY
+from loam_gtsam.registration.solvers.own_factors import LAST_KEY, PoseContext, own_factors
+from loam_gtsam.types import Features, InputError
+
+LAST = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.2, 0.1), np.array([3.0, -1.0, 0.5]))
+MOVED = gtsam.Pose3(gtsam.Rot3.Ypr(0.1, 0.05, -0.02), np.array([1.0, 0.2, -0.1]))
+SIGMAS = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+NOISE = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
+CONTEXT = PoseContext(POSE_KEY, 0, LAST, (0, LAST))
+
+
+def between(noise=NOISE, *, turned=False):
+    if turned:
+        return gtsam.BetweenFactorPose3(POSE_KEY, LAST_KEY, MOVED.inverse(), noise)
+    return gtsam.BetweenFactorPose3(LAST_KEY, POSE_KEY, MOVED, noise)
+
+
+def own_between(noise=NOISE):
+    """The same as a factor written in Python."""
+
+    def error(values):
+        last, pose = values.atPose3(LAST_KEY), values.atPose3(POSE_KEY)
+        off = MOVED.between(last.between(pose))
+        by_pose = gtsam.Pose3.LogmapDerivative(off)
+        by_last = -by_pose @ pose.between(last).AdjointMap()
+        return gtsam.Pose3.Logmap(off), [by_last, by_pose]
+
+    return checked_factor(noise, [LAST_KEY, POSE_KEY], error)
+
+
+def hall_features(pose, stamp, rng):
+    """Floor, ceiling and both sides of a hall without ends, and the lines where they meet."""
+    planes = rng.uniform(-1.0, 1.0, (6000, 3)) * [20.0, 4.0, 2.0]
+    axes, rows = rng.integers(1, 3, 6000), np.arange(6000)
+    planes[rows, axes] = np.sign(planes[rows, axes]) * np.array([20.0, 4.0, 2.0])[axes]
+    edges = np.sign(rng.uniform(-1.0, 1.0, (300, 3))) * [0.0, 4.0, 2.0]
+    edges[:, 0] = rng.uniform(-20.0, 20.0, 300)
+    local = pose.inverse()
+    return Features.from_points(stamp, *(local.transformFrom(p.T).T for p in (edges, planes)))
+
+
+def at(pose):
+    values = gtsam.Values()
+    values.insert(POSE_KEY, pose)
+    return values
+
+
+@pytest.mark.parametrize("make", [between, lambda: between(turned=True), own_between])
+@pytest.mark.parametrize("step", [np.zeros(6), np.full(6, 0.01), np.full(6, 0.4)])
+def test_with_the_last_pose_held_a_factor_is_a_prior(make, step):
+    """Error and information are those of a prior at the last pose moved by the increment."""
+    (factor,) = own_factors(lambda context: [make()], CONTEXT)
+    assert list(factor.keys()) == [POSE_KEY]
+    pose = LAST.compose(MOVED).retract(step)
+    both = at(pose)
+    both.insert(LAST_KEY, LAST)
+    assert factor.error(at(pose)) == pytest.approx(make().error(both), rel=1e-9, abs=1e-12)
+    numerical = np.empty((6, 6))
+    for column, small in enumerate(1e-6 * np.eye(6)):
+        ahead, back = (at(pose.retract(sign * small)) for sign in (1.0, -1.0))
+        rows = [-np.asarray(factor.linearize(values).jacobian()[1]) for values in (ahead, back)]
+        numerical[:, column] = (rows[0] - rows[1]) / 2e-6
+    np.testing.assert_allclose(factor.linearize(at(pose)).jacobian()[0], numerical, atol=1e-4)
+
+
+def test_a_robust_kernel_still_lets_go_of_what_is_wrong():
+    huber = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.0), NOISE)
+    far = LAST.compose(MOVED).retract(np.array([0, 0, 0, 10.0, 0, 0]))
+    (factor,) = own_factors(lambda context: [between(huber)], CONTEXT)
+    (firm,) = own_factors(lambda context: [between()], CONTEXT)
+    pulls = []
+    for one in (factor, firm):
+        jacobian, right = one.linearize(at(far)).jacobian()
+        pulls.append(np.linalg.norm(jacobian.T @ right))
+    assert pulls[0] < 0.02 * pulls[1]
+
+
+def test_wheels_hold_the_pose_along_a_hall_without_ends():
+    """Nothing but a between-factor knows how far the sweep moved along."""
+    rng = np.random.default_rng(1)
+
+    def wheels(context):
+        moved = gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.0, 0.0]))
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)
+        return [gtsam.BetweenFactorPose3(context.last_key, context.key, moved, noise)]
+
+    found = []
+    for extra in (None, wheels):
+        mapper = Mapper(extra_factors=extra)
+        for number in range(6):
+            pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.3 * number, 0.0, 0.0]))
+            features = hall_features(pose, number * 10**8, rng)
+            update = mapper.register(features, guess=gtsam.Pose3())
+        found.append(update.map_T_lidar.x())
+    assert found[0] < 0.75
+    assert found[1] == pytest.approx(1.5, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("factors", "says"),
+    [
+        (None, "expected a list of factors.*got NoneType"),
+        (["barometer"], r"got str on the keys \[\]"),
+        ([gtsam.GPSFactor(7, np.zeros(3), gtsam.noiseModel.Unit.Create(3))], r"on the keys \[7\]"),
+        ([gtsam.GPSFactor(LAST_KEY, np.zeros(3), gtsam.noiseModel.Unit.Create(3))], "context.key"),
+    ],
+)
+def test_what_is_no_factor_of_the_frame_is_an_error(factors, says):
+    with pytest.raises(InputError, match=f"extra_factors: .*{says}"):
+        own_factors(lambda context: factors, CONTEXT)

@@ -1,0 +1,171 @@
+"""Features together: every way to run, reset, looked at or split over workers, to the last bit."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.io.state import freeze
+from loam_gtsam.loops.closure import ScanLoopCloser
+from loam_gtsam.pipeline import Pipeline, imu_buffer, run
+from loam_gtsam.registration.odometry import Guess
+from loam_gtsam.registration.solvers import GtsamSolver
+from loam_gtsam.types import FrameStatus
+
+FRAMES = 24
+CLOSE = ("loops.enabled=true", "pose_graph.keyframe_distance=0.2", "loops.min_way=1.0")
+
+
+def gps(context):
+    """A position at the prediction, as a receiver would measure it."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.5)
+    return [gtsam.GPSFactor(context.key, context.guess.translation(), noise)]
+
+
+def wheels(context):
+    """A motion since the last sweep, as an odometer would measure it."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.2)
+    moved = context.last[1].between(context.guess)
+    return [gtsam.BetweenFactorPose3(context.last_key, context.key, moved, noise)]
+
+
+class Curious(GtsamSolver):
+    """A solver of a user's own that asks for matches more often than it needs."""
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        for _ in range(3):
+            associate(guess)
+        return super().solve(associate, guess, priors, motion)
+
+
+class Steady:
+    """An odometry of a user's own: the last pose again."""
+
+    def guess(self, features, last):
+        pose = gtsam.Pose3() if last is None else last.map_T_lidar
+        return Guess(pose, np.zeros(6))
+
+    def remember(self, features):
+        pass
+
+    def reset(self):
+        pass
+
+
+MODES = {
+    "plain": ((), {}),
+    "pre-integration": (("imu.preintegration=true",), {}),
+    "scan to scan": (("odometry.method=scan_to_scan",), {}),
+    "loops": (CLOSE, {}),
+    "loops, pre-integration": ((*CLOSE, "imu.preintegration=true"), {}),
+    "own factors": ((), {"extra_factors": gps}),
+    "own factors between sweeps": ((), {"extra_factors": wheels}),
+    "own closer": (CLOSE, {"loop_closer": ScanLoopCloser}),
+    "own solver": ((), {"solver": Curious}),
+    "own odometry, pre-integration": (("imu.preintegration=true",), {"odometry": Steady}),
+    "classical": (("solver.method=loam", "imu.prior=off"), {}),
+}
+
+
+@pytest.fixture(scope="module")
+def world():
+    return SimulatedWorld("room", frames=FRAMES, columns=450, seed=3)
+
+
+@pytest.fixture(scope="module")
+def sweeps(world):
+    return list(world)
+
+
+@pytest.fixture(params=MODES)
+def make(request, world):
+    """Makes a new pipeline of the mode."""
+    changes, parts = MODES[request.param]
+    config = Config().changed(*changes, {"sensor.model": "vlp16"})
+
+    def pipeline():
+        own = dict(parts)
+        if "loop_closer" in own:
+            own["loop_closer"] = own["loop_closer"](config)
+        if "solver" in own:
+            own["solver"] = own["solver"](config.solver)
+        if "odometry" in own:
+            own["odometry"] = own["odometry"]()
+        return Pipeline(config, imu=imu_buffer(world, config), **own)
+
+    return pipeline
+
+
+def outcome(pipeline, sweeps):
+    """All numbers that a run hands out, as bytes."""
+    updates = [pipeline.process(sweep) for sweep in sweeps]
+    result = pipeline.result(updates)
+    arrays = [result.trajectory.map_T_lidar, result.edge_points, result.plane_points]
+    arrays += [np.stack([update.covariance for update in updates])]
+    return [array.tobytes() for array in arrays], [str(update.status) for update in updates]
+
+
+def test_a_reset_pipeline_is_a_new_one(make, sweeps):
+    expected = outcome(make(), sweeps)
+    used = make()
+    for sweep in sweeps[9:17]:
+        used.process(sweep)
+    used.reset()
+    assert outcome(used, sweeps) == expected
+
+
+def test_looking_changes_nothing(make, sweeps):
+    """State by state, in the middle of a run, and in what comes after."""
+    pipeline, updates = make(), []
+    for count, sweep in enumerate(sweeps):
+        updates.append(pipeline.process(sweep))
+        if count % 6 == 5:
+            before = state_of(pipeline)
+            pipeline.map_points()
+            pipeline.result(updates)
+            if pipeline.loops is not None:
+                pipeline.loops.counts()
+                pipeline.loops.loop_ends()
+                pipeline.loops.map_points()
+            assert state_of(pipeline) == before
+    poses = np.stack([update.covariance for update in updates])
+    assert poses.tobytes() == outcome(make(), sweeps)[0][-1]
+
+
+def state_of(pipeline):
+    return {name: array.tobytes() for name, array in freeze(*pipeline.state()).items()}
+
+
+@pytest.mark.parametrize("mode", ["plain", "loops, pre-integration", "scan to scan"])
+def test_workers_change_nothing(mode, world):
+    config = Config().changed(*MODES[mode][0])
+    here, there = (run(world, config, max_frames=8, workers=count) for count in (0, 1))
+    assert np.array_equal(here.trajectory.map_T_lidar, there.trajectory.map_T_lidar)
+    assert np.array_equal(here.plane_points, there.plane_points)
+
+
+def test_asking_for_matches_again_changes_nothing(world, sweeps):
+    """The matches of a pose are a pure function of that pose."""
+    config = Config()
+    expected = outcome(Pipeline(config, imu=imu_buffer(world, config)), sweeps)
+    curious = Pipeline(config, imu=imu_buffer(world, config), solver=Curious(config.solver))
+    assert outcome(curious, sweeps) == expected
+
+
+def test_a_refused_sweep_is_not_remembered(world, sweeps):
+    """Of a sweep whose stamp is an hour ahead, the next guess knows nothing."""
+    config = Config().changed("odometry.method=scan_to_scan", "imu.enabled=false")
+    expected = outcome(Pipeline(config), sweeps[:8])
+    pipeline, statuses = Pipeline(config), []
+    updates = []
+    for count, sweep in enumerate(sweeps[:8]):
+        updates.append(pipeline.process(sweep))
+        if count == 4:
+            ahead = replace(sweeps[20], stamp=sweep.stamp + 3600 * 10**9)
+            statuses.append(pipeline.process(ahead).status)
+    assert statuses == [FrameStatus.BAD_STAMP]
+    poses = np.stack([update.map_T_lidar.matrix() for update in updates])
+    assert poses.tobytes() == expected[0][0]

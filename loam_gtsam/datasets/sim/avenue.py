@@ -8,7 +8,6 @@ from itertools import pairwise
 import numpy as np
 
 from loam_gtsam.datasets.sim.scenes import (
-    CAR,
     Kerb,
     Scene,
     build_streets,
@@ -64,10 +63,6 @@ def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
         name="avenue",
         solids=build_streets(sides, ground),
         waypoints=_way(corners, metres),
-        closed=False,
-        speed=10.0,
-        height=1.8,
-        sway=CAR,
     )
 
 

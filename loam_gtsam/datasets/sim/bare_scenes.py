@@ -18,7 +18,7 @@ _TERRAIN = 300.0
 def build_open_field(seed: int) -> Scene:
     """Flat ground and nothing else: x, y and yaw show in no beam."""
     del seed  # nothing here is random
-    return _along_x("open_field", Solids(), 200.0, wander=2.0, speed=5.0, height=1.8, sway=CAR)
+    return _along_x("open_field", Solids(), 200.0, wander=2.0)
 
 
 def build_single_plane(seed: int) -> Scene:
@@ -42,7 +42,6 @@ def build_single_pole(seed: int) -> Scene:
         closed=True,
         speed=2.0,
         height=1.5,
-        sway=CAR,
         frames=250,
     )
 
@@ -54,7 +53,7 @@ def build_tunnel(seed: int) -> Scene:
     del seed
     solids = Solids(tubes=np.array([[0.0, 0.0, 3.0, 0.0, 3.0]]))
     sway = (0.005, 0.006, 0.006, 0.004)
-    return _along_x("tunnel", solids, 200.0, wander=0.25, speed=5.0, height=1.8, sway=sway)
+    return _along_x("tunnel", solids, 200.0, wander=0.25, sway=sway)
 
 
 def build_sparse_terrain(seed: int) -> Scene:
@@ -76,7 +75,6 @@ def build_sparse_terrain(seed: int) -> Scene:
         name="sparse_terrain",
         solids=Solids(cylinders=np.column_stack([x, y, radius, z - DEEP, top]), ground=ground),
         waypoints=np.stack([along, across(along)], axis=1),
-        closed=False,
         speed=5.0,
         height=1.5,
         sway=(0.01, 0.01, 0.01, 0.003),
@@ -97,9 +95,9 @@ def _along_x(
     solids: Solids,
     length: float,
     wander: float,
-    speed: float,
-    height: float,
-    sway: tuple[float, float, float, float],
+    speed: float = 5.0,
+    height: float = 1.8,
+    sway: tuple[float, float, float, float] = CAR,
 ) -> Scene:
     """A way along x that winds a little."""
     along = np.arange(0.0, length + 8.0, 8.0)
@@ -107,7 +105,6 @@ def _along_x(
         name=name,
         solids=solids,
         waypoints=np.stack([along, wander * np.sin(along / 13.0)], axis=1),
-        closed=False,
         speed=speed,
         height=height,
         sway=sway,

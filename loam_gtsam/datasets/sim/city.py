@@ -6,7 +6,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.datasets.sim.scenes import (
-    CAR,
     DEEP,
     Kerb,
     Scene,
@@ -69,10 +68,6 @@ def build_city(way: FloatArray, seed: int = 0) -> Scene:
         name="city",
         solids=solids_with_foliage(roadside.boxes, roadside.cylinders, roadside.crowns, ground),
         waypoints=along(_SPACING),
-        closed=False,
-        speed=10.0,
-        height=1.8,
-        sway=CAR,
     )
 
 

@@ -24,7 +24,7 @@ class Scene:
 
     Attributes
     ----------
-    name : for people
+    name : shown in descriptions
     solids : what the beams hit
     waypoints : (W, 2) x y on the smooth path of the sensor
     closed : whether the path returns to its first way point, to be driven round and round
@@ -37,10 +37,10 @@ class Scene:
     name: str
     solids: Solids
     waypoints: FloatArray
-    closed: bool
-    speed: float
-    height: float
-    sway: tuple[float, float, float, float]
+    closed: bool = False
+    speed: float = 10.0
+    height: float = 1.8
+    sway: tuple[float, float, float, float] = CAR
     frames: int | None = None
 
 
@@ -97,9 +97,6 @@ def build_street_loop(seed: int) -> Scene:
         solids=build_streets(sides, ground),
         waypoints=_rounded_rectangle(half_x, half_y, radius=16.0, wander=0.6),
         closed=True,
-        speed=10.0,
-        height=1.8,
-        sway=CAR,
     )
 
 
@@ -227,10 +224,7 @@ def build_slopes(seed: int) -> Scene:
             ground,
         ),
         waypoints=np.stack([along, gaussian_filter1d(across, 2.0, mode="nearest")], axis=1),
-        closed=False,
         speed=8.0,
-        height=1.8,
-        sway=CAR,
     )
 
 
@@ -369,7 +363,6 @@ def _in_corridor(name: str, solids: Solids) -> Scene:
         name=name,
         solids=solids,
         waypoints=np.stack([along, 0.25 * np.sin(along / 13.0)], axis=1),
-        closed=False,
         speed=5.0,
         height=1.1,
         sway=(0.005, 0.006, 0.006, 0.004),

@@ -193,7 +193,7 @@ class CubeMap:
         owners = np.array(sorted(moves), np.int32)
         taken = [cube.take_out(owners) for cube in self._cubes.values()]
         taken += self._archive.take_out(owners)
-        self._trees.clear()
+        self._trees = TreeCache()
         count = 0
         for owner in owners.tolist():
             parts = [part.points[part.owners == owner] for part in taken]
@@ -206,7 +206,7 @@ class CubeMap:
         """Points of the whole map as they would be after :meth:`move`; the map does not change."""
         copy = CubeMap(self._config.changed(archive_dir=None), self._grid.voxel_size)
         copy._window = self._window
-        copy._cubes = {index: cube.copy() for index, cube in self._cubes.items()}
+        copy._cubes = {i: Cube.of(cube.content, self._grid) for i, cube in self._cubes.items()}
         copy._archive = self._archive.copy()
         copy.move(moves)
         return copy.points(archived=True)

@@ -1,8 +1,8 @@
-"""What a sweep looks like: which ring and when each point was measured, in firing order.
+"""Organised sweeps: the beam and the time of each point, and the points in firing order.
 
-LOAM's features live on the order in which one beam met the world, so everything that follows
-works on an :class:`OrganisedSweep`: ring after ring, each in firing order. How rings and times
-were found is part of the result (``method``, ``note``), for people to check.
+LOAM's features need the order in which one beam met the world. So feature extraction works on an
+:class:`OrganisedSweep`: ring after ring, each in firing order. How rings and times were found is
+part of the result (``method``, ``note``), for people to check.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ MIN_POINTS = 11
 """One window of LOAM's curvature: a point and five neighbours on either side."""
 
 _MAX_SPAN = 2.0
-"""Seconds. No spinning sensor in use turns slower than 0.5 Hz; more means wrong units."""
+"""Seconds of a sweep: no spinning sensor in use turns slower than 0.5 Hz; more is a wrong unit."""
 
 _MAX_OFFSET = 10.0
-"""Seconds between a stamp and its sweep: a pose that far from its sweep would be extrapolated."""
+"""Seconds between a stamp and its sweep: beyond that, the pose would be an extrapolation."""
 
 _MAX_OUTLIERS = 0.01
 """Fraction of points that may carry a nonsense time and be dropped."""
@@ -363,17 +363,17 @@ def _seam_turns(fraction: FloatArray, same_ring: BoolArray) -> FloatArray:
 
 
 def organise(scan: Scan, config: Config) -> OrganisedSweep:
-    """Rings, times, and the points ring after ring in firing order.
+    """The points of a sweep, ring after ring in firing order, with rings and times.
 
     Parameters
     ----------
-    scan : not de-skewed
+    scan : one sweep, not de-skewed
     config : ``sensor`` and ``deskew.enabled`` are used
 
     Raises
     ------
     SweepError
-        If too few points are usable, or rings or times cannot be had.
+        If too few points are usable, or rings or times cannot be found.
     """
     columns = usable_columns(scan, config)
     rings = assign_rings(columns, config.sensor)

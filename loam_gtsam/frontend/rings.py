@@ -1,4 +1,4 @@
-"""Where beam numbers come from: a field, the order of the points, or their elevation."""
+"""Beam numbers of points: from a field, from the order of the points, or from their elevation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from loam_gtsam.types import FloatArray
 
 MAX_RINGS = 256
-"""More rings than any spinning sensor has: the field is not a beam number."""
+"""Above this number of rings, which no spinning sensor has, a field holds no beam numbers."""
 
 ELEVATIONS: dict[str, FloatArray] = {
     # Velodyne VLP-16 user manual, table of laser angles.
@@ -74,8 +74,8 @@ def _assignment(rings: NDArray[np.integer], count: int, method: str, note: str) 
 def rings_from_labels(labels: NDArray[np.integer], xyz: NDArray[np.float32]) -> RingAssignment:
     """Number the rings of a ring field by their mean elevation, lowest first.
 
-    The HDL-64's laser numbers, for one, do not follow elevation, and scan-to-scan odometry looks
-    for neighbours in adjacent rings.
+    Scan-to-scan odometry looks for neighbours in adjacent rings, but numbers in a field need not
+    follow elevation: those of the HDL-64 do not.
     """
     low, high = int(labels.min()), int(labels.max())
     if high - low < 65536:

@@ -1,9 +1,10 @@
-"""Which motions a scan says something about, and what to do about the others.
+"""Degenerate directions: the motions of the sensor about which the matches of a scan say nothing.
 
-The information of a scan is never singular: the normals of five noisy points are wrong by some
-degrees, and a thousand of them on the bare walls of a corridor seem to say how far along it one is.
-Since the map points that they come from are matched anew at every pose, they say nothing. What
-tells such information from real one is the noise that the normals themselves have.
+The information matrix of a scan is never singular. A normal that is fitted to five noisy points is
+wrong by some degrees, and a thousand such normals on the bare walls of a corridor seem to fix the
+position along the corridor. They do not, since the map points behind them are matched anew at every
+pose. The noise of the normals tells this false information from the real one.
+Equations: docs/maths/degeneracy.md.
 """
 
 from __future__ import annotations
@@ -19,13 +20,13 @@ from loam_gtsam.registration.matches import EdgeMatches, ScanMatches, subset
 from loam_gtsam.types import FloatArray
 
 _CLEAR = 3.0
-"""Standard deviations of a normal by which a displacement must be off its surface to be seen."""
+"""Standard deviations of a normal by which a displacement must leave its surface to be seen."""
 
 _MOVED = 0.1
-"""Part of the root mean square displacement that a match must have to count in full: the points of
-a pole say nothing about a turn about that pole, whatever the direction of their few millimetres."""
+"""Share of the root mean square displacement by which a point must move to count in full: points on
+a pole move by millimetres in a turn about the pole, and say nothing about this turn."""
 _HELD = 0.5
-"""Part of the least number of matches that lines must be for planes to be left out beside them."""
+"""Share of ``min_aligned`` that the lines must reach on their own before planes are left out."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -36,12 +37,12 @@ class Localizability:
     ----------
     directions : (6, 6) rows, tangent vectors at the pose (rad, m), each scaled to move the matched
         points by 1 m (root mean square)
-    aligned : (6,) matches that fix each of them, counted as if the normals pointed that way: the
-        sum of squared cosines between normal and displacement, over the matches that see it at all
-    information : (6,) of the scan along each of them, 1 / m^2, what noise makes of it included
-    displacement : (6, 6) form whose value for a motion is the mean squared displacement of the
-        matched points, m^2
-    by_planes : (6,) those of ``aligned`` that are planes
+    aligned : (6,) number of matches that fix each direction: the sum of squared cosines between
+        normal and displacement, over the matches that see the motion at all
+    information : (6,) information of the scan along each direction, 1 / m^2, noise included
+    displacement : (6, 6) quadratic form: the mean squared displacement of the matched points by a
+        motion, m^2
+    by_planes : (6,) the part of ``aligned`` that comes from planes
     """
 
     directions: FloatArray
@@ -51,7 +52,7 @@ class Localizability:
     by_planes: FloatArray
 
     def seen_from(self, a_T_b: gtsam.Pose3) -> Localizability:
-        """The same about frame ``a``, if this is about frame ``b``, which moves with it."""
+        """The localizability about frame ``a``, of that about frame ``b``, fixed to each other."""
         to_a, to_b = a_T_b.AdjointMap(), a_T_b.inverse().AdjointMap()
         form: FloatArray = to_b.T @ self.displacement @ to_b
         return replace(self, directions=self.directions @ to_a.T, displacement=form)
@@ -59,10 +60,10 @@ class Localizability:
     def axes(self) -> FloatArray:
         """(6,) aligned matches that fix rx, ry, rz, x, y, z, with the other five left free.
 
-        The directions and their counts a make the form ``(sum v v^T / a)^-1``. Of that the Schur
-        complement of an axis is taken, and scaled to a motion along the axis that displaces the
-        matched points by 1 m. A direction counts at least one match, or an axis that is off it by
-        a fraction of a degree would have none either.
+        The directions v and their counts a make the form ``(sum v v^T / a)^-1``. The result is the
+        Schur complement of each axis in this form, for a motion along the axis that displaces the
+        matched points by 1 m. A direction counts at least one match. Otherwise an axis a fraction
+        of a degree off a direction without matches would have none either.
         """
         spread = (self.directions**2 / np.maximum(self.aligned, 1.0)[:, None]).sum(axis=0)
         counts: FloatArray = 1.0 / (spread * np.diagonal(self.displacement))
@@ -84,12 +85,12 @@ class Localizability:
 
 
 def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizability:
-    """Find the directions in which information stands out least from what noise makes of it.
+    """Find the directions along which the information stands out least from that of noise alone.
 
     With u the displacement of a point by a motion, n the normal and s its standard deviation in
     rad, a match contributes ``(n . u)^2`` to the information, of which ``s^2 |u|^2`` is noise. The
     directions are the generalised eigenvectors of the two sums. Matches with
-    ``|n . u| > 3 s |u|`` see the motion. A line counts as two planes, if it is distinct.
+    ``|n . u| > 3 s |u|`` see the motion. A distinct line counts as two planes, others not at all.
 
     Parameters
     ----------
@@ -126,21 +127,21 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
 def unseen_by_planes(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, seen: Localizability, least: float
 ) -> Localizability | None:
-    """How well the planes alone fix the pose, if there are motions to be left to the lines.
+    """How well the planes alone fix the pose, if some motions are to be left to the lines.
 
-    The few lines of poles say truly how far the pose is off. A thousand planes of rough ground do
-    not, but noise makes them hold it where it was, and together they outweigh the poles.
+    On rough ground the few lines of poles show how far the pose is off. The thousand planes of the
+    ground do not show it: by noise they hold the pose where it was, and they outweigh the poles.
 
     Parameters
     ----------
     matches : of the scan
     map_T_lidar : the pose at which they were made
     seen : how well planes and lines together fix it
-    least : see :meth:`Localizability.weak`
+    least : matches below which a direction is weak, see :meth:`Localizability.weak`
 
     Returns
     -------
-    None if planes see all motions, or nothing sees a motion but they and they do so well enough.
+    None if planes alone fix all directions, or do so with lines that see too little on their own.
     """
     if seen.by_planes.min() >= least:
         return None
@@ -155,7 +156,7 @@ def unseen_by_planes(
 
 
 def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatArray) -> FloatArray:
-    """(E, W) how far each line sees the motions: what it counts in ``Localizability.aligned``.
+    """(E, W) what each line counts, for each motion, in ``Localizability.aligned``.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Which stamps of sweeps can be used: one clock that goes forward, and what is wrong otherwise."""
+"""Check of the stamps of sweeps: they must come from one clock that goes forward."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ from dataclasses import dataclass
 from loam_gtsam.types import SweepFault
 
 LARGEST_STEP = 10.0
-"""Seconds from one sweep to the next beyond which the stamp is doubted: 1 m/s^2 leads 50 m away
-from where a constant velocity does. A sensor that is slower may take ten of its own steps."""
+"""Seconds from one sweep to the next above which the stamp is doubted: in 10 s an acceleration of
+1 m/s^2 leads 50 m off the prediction. A slower sensor may take ten times its own interval."""
 IN_A_ROW = 5
-"""Sweeps that must agree among themselves for the clock to count as set, not a stamp as wrong."""
+"""Doubted sweeps in a row whose stamps must agree for the clock to count as set."""
 _STEPS = 10
+"""Intervals of the sensor that a step may take where they are longer than ``LARGEST_STEP``."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why the stamp of a sweep is not used.
+    """Why a sweep is not used, because of its stamp.
 
     Attributes
     ----------
-    fault, message : the same, typed and as a sentence
-    clock_step : nanoseconds by which the clock was found to be set ahead with this sweep, else 0:
-        from the next one on it is the clock
+    fault, message : the reason, typed and as a sentence
+    clock_step : nanoseconds by which the clock was set ahead, if this sweep shows it, else 0. The
+        next sweep is checked against the new clock.
     """
 
     fault: SweepFault
@@ -31,21 +32,21 @@ class Refusal:
 
 
 class StampCheck:
-    """Holds each stamp against the last one that was used.
+    """Compares each stamp with the last one that was used.
 
-    A stamp must be later, and by no more than :data:`LARGEST_STEP`. A sweep beyond that is not
-    used; a wrong stamp costs one sweep. If :data:`IN_A_ROW` of them follow each other, the clock
-    was set, as it is when a computer that booted without one gets the time: ahead, the run goes on
-    as if no time had passed; back, it cannot, as stamps in trajectories and graphs ascend, and this
-    is said.
+    A stamp must be later than the last one, by at most :data:`LARGEST_STEP`; other sweeps are not
+    used. So one wrong stamp costs one sweep. :data:`IN_A_ROW` such sweeps whose stamps agree show
+    that the clock was set, as when a computer gets the time after it has booted. If the clock was
+    set ahead, the run goes on as if no time had passed. If it was set back, the run cannot go on,
+    since the stamps of trajectories and graphs ascend, and the refusal says so.
     """
 
     def __init__(self) -> None:
         self._step = 0
-        self._doubted: tuple[int, int, int] | None = None  # first and newest stamp, and how many
+        self._doubted: tuple[int, int, int] | None = None  # first and newest stamp, and count
 
     def refuse(self, stamp: int, last: int) -> Refusal | None:
-        """Why a sweep cannot be used; None if it can, which is then taken as done.
+        """Why a sweep cannot be used; None if it can be, and then the sweep counts as used.
 
         Parameters
         ----------
@@ -74,7 +75,7 @@ class StampCheck:
         if agree < IN_A_ROW:
             message = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
             return Refusal(SweepFault.STAMP_AHEAD, message)
-        # As if the first of them had come when it was due.
+        # As if the first of the doubted sweeps had come one interval after the last one used.
         ahead = first - self._step - last
         self._doubted = None
         return Refusal(
@@ -85,7 +86,7 @@ class StampCheck:
         )
 
     def _agreeing(self, stamp: int, largest: int) -> tuple[int, int]:
-        """First stamp and number of the doubted sweeps in a row on one clock, with this one."""
+        """First stamp and number of the doubted sweeps in a row that agree, this one included."""
         first, newest, count = self._doubted or (stamp, stamp, 1)
         if 0 < stamp - newest <= largest:
             count += 1

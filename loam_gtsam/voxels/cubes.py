@@ -14,6 +14,7 @@ from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
 from loam_gtsam.voxels.key_table import KeyTable
 
 Owners = NDArray[np.int32]
+"""Numbers that points carry: points of one number can be moved together."""
 
 NO_POINTS: FloatArray = np.empty((0, 3))
 _NO_KEYS: IntArray = np.empty(0, np.int64)
@@ -21,10 +22,7 @@ _NO_OWNERS: Owners = np.empty(0, np.int32)
 
 
 class CubePoints(NamedTuple):
-    """Points of a cube, (N, 3) metres, and the numbers of their owners, (N,).
-
-    All points of one owner are moved together (:meth:`loam_gtsam.cubemap.CubeMap.move`).
-    """
+    """Points of a cube, (N, 3) metres, and the owners of the points, (N,)."""
 
     points: FloatArray
     owners: Owners
@@ -35,23 +33,12 @@ class CubePoints(NamedTuple):
         return self.points.nbytes + self.owners.nbytes
 
 
-class VoxelPoints(NamedTuple):
-    """One point for each of V voxels, in ascending order of the keys of the voxels."""
-
-    keys: IntArray
-    points: FloatArray
-    owners: Owners
+VoxelPoints = tuple[IntArray, FloatArray, Owners]
+"""Ascending keys (V,) of voxels, a point (V, 3) of each, and the owners (V,) of the points."""
 
 
 class VoxelSums(NamedTuple):
-    """Sums over the points of each of V voxels, in ascending order of the keys of the voxels.
-
-    Attributes
-    ----------
-    keys, owners : (V,)
-    sums, lows, highs : (V, 3) sum, minimum and maximum of the coordinates, metres
-    counts : (V,) number of points
-    """
+    """Sums (V, 3), bounds (V, 3) and counts (V,) of the points of voxels, by ascending key (V,)."""
 
     keys: IntArray
     owners: Owners
@@ -91,12 +78,6 @@ class Cube:
         """Put new points in their places among the others, for those who ask for points often."""
         self._table.merge()
 
-    def copy(self) -> Cube:
-        """A cube of the same points, which changes on its own."""
-        cube = Cube()
-        cube._table = KeyTable(*(column.copy() for column in self._table.columns))
-        return cube
-
     @property
     def content(self) -> CubePoints:
         """All that is kept of the cube in an archive."""
@@ -104,8 +85,7 @@ class Cube:
 
     def settle(self, new: VoxelPoints) -> FloatArray:
         """Add the points whose voxels are free, and return them."""
-        added = self._table.add(*new)
-        return new.points if len(added) == len(new.keys) else new.points.take(added, axis=0)
+        return new[1].take(self._table.add(*new), axis=0)
 
     def average(self, new: VoxelSums) -> None:
         """Put into each voxel the mean of its point, if it has one, and the new ones.
@@ -194,7 +174,7 @@ class SortedPoints(NamedTuple):
         """The first point of each voxel, cube by cube."""
         firsts = self.points.take(self.starts, axis=0)
         for part in self.parts:
-            yield VoxelPoints(self.keys[part], firsts[part], self.owners[part])
+            yield self.keys[part], firsts[part], self.owners[part]
 
     def sums(self) -> Iterator[VoxelSums]:
         """Sums over the points of each voxel, cube by cube."""

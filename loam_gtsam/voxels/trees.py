@@ -145,10 +145,6 @@ class TreeCache:
         """Drop the trees that hold points of any of these cubes, in which points have changed."""
         self._kept = [trees for trees in self._kept if trees.cubes.isdisjoint(cubes)]
 
-    def clear(self) -> None:
-        """Drop all trees."""
-        self._kept = []
-
 
 def _nearest_of_both(
     points: FloatArray, squared: FloatArray, more_points: FloatArray, more_squared: FloatArray

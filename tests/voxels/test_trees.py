@@ -94,8 +94,6 @@ def test_only_trees_of_changed_cubes_are_forgotten() -> None:
     cubes.trees.forget([MIDDLE, LEFT])
     assert cubes.over(RIGHT) is kept
     assert cubes.over(MIDDLE) is not changed
-    cubes.trees.clear()
-    assert cubes.over(RIGHT) is not kept
 
 
 @pytest.mark.parametrize("insertion", ["centroid", "settled"])

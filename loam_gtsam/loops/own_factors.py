@@ -1,21 +1,147 @@
-"""Checks of a user's own factors and variables before GTSAM sees them.
+"""Factors and variables of a user's own in a pose graph.
 
-GTSAM ends the process, or leaves iSAM2 broken, on some of what is refused here.
+They are checked before GTSAM sees them: GTSAM ends the process, or leaves iSAM2 broken, on some of
+what is refused here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.loops.keyframes import is_pose_key
-from loam_gtsam.types import InputError
+from loam_gtsam.geometry import as_vector
+from loam_gtsam.loops.incremental import IncrementalGraph
+from loam_gtsam.loops.keyframes import Keyframe, direction, is_pose_key, noise_model, pose_key
+from loam_gtsam.types import FloatArray, InputError
 
 _UNDETERMINED = 1e-9
 """Smallest singular value of new variables, columns scaled to length one, that counts."""
+
+
+class FactorGraph:
+    """Poses of keyframes and variables of a user's own, and factors on them.
+
+    Attributes
+    ----------
+    keyframes : keyframe ``i`` has the pose with the key ``gtsam.symbol("x", i)``
+    """
+
+    keyframes: list[Keyframe]
+    _graph: IncrementalGraph
+
+    def add_factor(
+        self,
+        factor: gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph,
+        values: gtsam.Values | None = None,
+    ) -> None:
+        """Add any factor of GTSAM on poses of keyframes and on variables of your own.
+
+        The factor is believed: it is no loop closure that could be switched off. A CustomFactor may
+        be added as well, best one of :func:`loam_gtsam.factors.checked_factor`; GTSAM can neither
+        copy nor serialise it, so the graph can then be optimised, but not be written to a file
+        (:func:`~loam_gtsam.loops.files.write_graph`) or to a checkpoint, both of which raise
+        OutputError.
+
+        Parameters
+        ----------
+        factor : a factor, or several that are to be added together; ``gtsam.symbol("x", i)`` is the
+            key of the pose ``map_T_lidar`` of keyframe ``i``
+        values : start values of variables of your own (landmarks, biases, extrinsics) that are not
+            in the graph yet; any letter but ``x`` may be in their keys. :meth:`estimate` tells
+            their values.
+
+        Raises
+        ------
+        InputError
+            If something is of a wrong type or not finite, a key is unknown or taken, or the new
+            variables are not determined. The graph is then as it was before.
+        """
+        self._graph.add(*checked_factors(factor, values, self._graph.values))
+
+    def add_position(self, index: int, position: FloatArray, covariance: FloatArray) -> None:
+        """Add a measured position of a keyframe, as from GPS.
+
+        Parameters
+        ----------
+        index : number of the keyframe
+        position : (3,) metres, in the frame of the map
+        covariance : (3, 3) m^2
+
+        Raises
+        ------
+        InputError
+            If there is no such keyframe, or the covariance is not positive definite.
+        """
+        where, noise = as_vector(position, "position"), noise_model(covariance, 3)
+        self.add_factor(gtsam.GPSFactor(self._key(index), where, noise))
+
+    def add_gravity(
+        self, index: int, up_lidar: FloatArray, sigma: float, up_map: Sequence[float] = (0, 0, 1)
+    ) -> None:
+        """Add the direction of gravity at a keyframe: its roll and pitch, not its yaw.
+
+        Parameters
+        ----------
+        index : number of the keyframe
+        up_lidar : (3,) the upward direction in the lidar's axes; any length
+        sigma : standard deviation, rad
+        up_map : (3,) the upward direction in the map's axes
+
+        Raises
+        ------
+        InputError
+            If there is no such keyframe, or a direction has no length.
+        """
+        here, there = direction("up_lidar", up_lidar), direction("up_map", up_map)
+        if not sigma > 0.0:
+            raise InputError(f"sigma: expected rad above 0, got {sigma!r}")
+        noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
+        self.add_factor(gtsam.AttitudeFactorPose3(self._key(index), there, noise, here))
+
+    def pose(self, index: int) -> gtsam.Pose3:
+        """``map_T_lidar`` of a keyframe."""
+        return self._graph.values.atPose3(self._key(index))
+
+    def covariance(self, index: int) -> FloatArray:
+        """(6, 6) marginal covariance of a keyframe's pose in the map."""
+        return self._graph.covariance(self._key(index))
+
+    def relative(self, earlier: int, later: int) -> tuple[gtsam.Pose3, FloatArray]:
+        """``earlier_T_later`` of two keyframes and its (6, 6) covariance."""
+        first, second = self._key(earlier), self._key(later)
+        if earlier == later:
+            return gtsam.Pose3(), np.zeros((6, 6))
+        return self._graph.relative(first, second)
+
+    @property
+    def values(self) -> gtsam.Values:
+        """Estimates of all variables, a copy: poses of keyframes and variables of your own."""
+        return gtsam.Values(self._graph.values)
+
+    def estimate(self, key: int) -> Any:
+        """Estimate of a variable of :meth:`add_factor`, in the type in which it was added.
+
+        Raises
+        ------
+        InputError
+            If there is no variable of that key.
+        """
+        return value_at(self._graph.values, key)
+
+    def estimate_covariance(self, key: int) -> FloatArray:
+        """(d, d) marginal covariance of a variable of :meth:`add_factor`, in its tangent space."""
+        self.estimate(key)
+        return self._graph.covariance(key)
+
+    def _key(self, index: int) -> int:
+        """Key of the pose of a keyframe that there is."""
+        count = len(self.keyframes)
+        if not 0 <= index < count:
+            raise InputError(f"keyframe: expected one of the {count} there are, got {index}")
+        return pose_key(index)
 
 
 def checked_factors(

@@ -17,22 +17,20 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.geometry import as_vector, transform
+from loam_gtsam.geometry import transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import (
     Keyframe,
     LoopClosure,
-    direction,
     interpolate_trajectory,
     keyframe_points,
     noise_model,
     odometry_between,
-    pose_key,
 )
 from loam_gtsam.loops.loop_selection import LoopSelection
-from loam_gtsam.loops.own_factors import checked_factors, value_at
+from loam_gtsam.loops.own_factors import FactorGraph
 from loam_gtsam.types import (
     Features,
     FloatArray,
@@ -46,7 +44,7 @@ _ANYWHERE = np.repeat([np.pi, 100.0], 3)
 """rad and m: standard deviations of the first pose of another run."""
 
 
-class PoseGraph:
+class PoseGraph(FactorGraph):
     """Keyframes, factors on their poses, and the poses that fit the factors best.
 
     Parameters
@@ -77,9 +75,7 @@ class PoseGraph:
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self._session: int
-        self.keyframes: list[Keyframe]
         self.loops: list[LoopClosure]
-        self._graph: IncrementalGraph
         self._session, self.keyframes, self.loops, self._graph = state
         self._selection = LoopSelection(self.config, self._graph, self.keyframes, self.loops)
 
@@ -136,75 +132,6 @@ class PoseGraph:
         if self.keyframes and self.keyframes[-1].session == self._session:
             self._session += 1
 
-    def add_factor(
-        self,
-        factor: gtsam.NonlinearFactor | gtsam.NonlinearFactorGraph,
-        values: gtsam.Values | None = None,
-    ) -> None:
-        """Add any factor of GTSAM on poses of keyframes and on variables of your own.
-
-        The factor is believed: it is no loop closure that could be switched off. A CustomFactor may
-        be added as well, best one of :func:`loam_gtsam.factors.checked_factor`; GTSAM can neither
-        copy nor serialise it, so the graph can then be optimised, but not be written to a file
-        (:func:`~loam_gtsam.loops.files.write_graph`) or to a checkpoint, both of which raise
-        OutputError.
-
-        Parameters
-        ----------
-        factor : a factor, or several that are to be added together; ``gtsam.symbol("x", i)`` is the
-            key of the pose ``map_T_lidar`` of keyframe ``i``
-        values : start values of variables of your own (landmarks, biases, extrinsics) that are not
-            in the graph yet; any letter but ``x`` may be in their keys. :meth:`estimate` tells
-            their values.
-
-        Raises
-        ------
-        InputError
-            If something is of a wrong type or not finite, a key is unknown or taken, or the new
-            variables are not determined. The graph is then as it was before.
-        """
-        self._graph.add(*checked_factors(factor, values, self._graph.values))
-
-    def add_position(self, index: int, position: FloatArray, covariance: FloatArray) -> None:
-        """Add a measured position of a keyframe, as from GPS.
-
-        Parameters
-        ----------
-        index : number of the keyframe
-        position : (3,) metres, in the frame of the map
-        covariance : (3, 3) m^2
-
-        Raises
-        ------
-        InputError
-            If there is no such keyframe, or the covariance is not positive definite.
-        """
-        where, noise = as_vector(position, "position"), noise_model(covariance, 3)
-        self.add_factor(gtsam.GPSFactor(self._key(index), where, noise))
-
-    def add_gravity(
-        self, index: int, up_lidar: FloatArray, sigma: float, up_map: Sequence[float] = (0, 0, 1)
-    ) -> None:
-        """Add the direction of gravity at a keyframe: its roll and pitch, not its yaw.
-
-        Parameters
-        ----------
-        index : number of the keyframe
-        up_lidar : (3,) the upward direction in the lidar's axes; any length
-        sigma : standard deviation, rad
-        up_map : (3,) the upward direction in the map's axes
-
-        Raises
-        ------
-        InputError
-            If there is no such keyframe, or a direction has no length.
-        """
-        here, there = direction("up_lidar", up_lidar), direction("up_map", up_map)
-        if not sigma > 0.0:
-            raise InputError(f"sigma: expected rad above 0, got {sigma!r}")
-        noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-        self.add_factor(gtsam.AttitudeFactorPose3(self._key(index), there, noise, here))
-
     def add_loop(self, loop: LoopClosure) -> bool:
         """Add a loop closure; those that contradict the rest of the graph are switched off.
 
@@ -233,44 +160,9 @@ class PoseGraph:
 
     # -- what comes out ------------------------------------------------------------------------
 
-    def pose(self, index: int) -> gtsam.Pose3:
-        """``map_T_lidar`` of a keyframe."""
-        return self._graph.values.atPose3(self._key(index))
-
     def poses(self) -> FloatArray:
         """(N, 4, 4) ``map_T_lidar`` of all keyframes."""
         return stack_poses(self.pose(index) for index in range(len(self)))
-
-    def covariance(self, index: int) -> FloatArray:
-        """(6, 6) marginal covariance of a keyframe's pose in the map."""
-        return self._graph.covariance(self._key(index))
-
-    def relative(self, earlier: int, later: int) -> tuple[gtsam.Pose3, FloatArray]:
-        """``earlier_T_later`` of two keyframes and its (6, 6) covariance."""
-        first, second = self._key(earlier), self._key(later)
-        if earlier == later:
-            return gtsam.Pose3(), np.zeros((6, 6))
-        return self._graph.relative(first, second)
-
-    @property
-    def values(self) -> gtsam.Values:
-        """Estimates of all variables, a copy: poses of keyframes and variables of your own."""
-        return gtsam.Values(self._graph.values)
-
-    def estimate(self, key: int) -> Any:
-        """Estimate of a variable of :meth:`add_factor`, in the type in which it was added.
-
-        Raises
-        ------
-        InputError
-            If there is no variable of that key.
-        """
-        return value_at(self._graph.values, key)
-
-    def estimate_covariance(self, key: int) -> FloatArray:
-        """(d, d) marginal covariance of a variable of :meth:`add_factor`, in its tangent space."""
-        self.estimate(key)
-        return self._graph.covariance(key)
 
     @property
     def correction(self) -> gtsam.Pose3:
@@ -350,9 +242,3 @@ class PoseGraph:
         values.insert(keyframe.key, pose)
         self._graph.add(factors, values, settle=False)
         self.keyframes.append(keyframe)
-
-    def _key(self, index: int) -> int:
-        """Key of the pose of a keyframe that there is."""
-        if not 0 <= index < len(self):
-            raise InputError(f"keyframe: expected one of the {len(self)} there are, got {index}")
-        return pose_key(index)

@@ -1,7 +1,7 @@
-"""A loop closer of your own: the nearest old keyframe, registered by the package.
+"""A loop closer of your own: it takes the nearest old keyframe, which the package registers.
 
-A loop closer is anything with a ``detect``. This one looks at nothing but positions; put your own
-place recognition in its stead. The odometry is made to drift, so that there is something to close.
+A loop closer is any object with a method ``detect``. This loop closer looks at positions only; put
+your own place recognition there. The odometry is made to drift, so that there is a loop to close.
 """
 
 from dataclasses import replace
@@ -30,13 +30,13 @@ config = Config().changed(
 
 
 class NearestKeyframe:
-    """Closes the loop with the keyframe that is nearest, of those 8 m or more back on the way."""
+    """Closes the loop with the nearest of the keyframes 8 m or more back on the way."""
 
     def __init__(self) -> None:
         self.registration = ScanLoopCloser(config)
 
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
-        """Look for it."""
+        """Register the keyframe against the nearest old one."""
         old = [
             other.index for other in history.keyframes if keyframe.travelled - other.travelled > 8.0
         ]

@@ -1,7 +1,8 @@
 """Two drives through the same place become one map.
 
-Each was mapped on its own and knows nothing of the other: here one began in another corner of the
-room, looking elsewhere. Loops between them are found as within one run, and tie them together.
+Each drive was mapped on its own: here the second drive began in another corner of the room, with
+another heading. Loop closures between the drives are found as within one run, and tie the drives
+together.
 """
 
 import gtsam

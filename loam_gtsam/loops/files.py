@@ -20,13 +20,13 @@ from loam_gtsam.loops.keyframes import is_pose, pose_key, pose_number
 from loam_gtsam.types import DatasetError, FloatArray, InputError, OutputError
 
 G2O_SUFFIX, GTSAM_SUFFIXES = ".g2o", (".graph", ".values", ".stamps")
-"""Of the files that are read and written; the second format takes three side by side."""
+"""Suffixes of the files; GTSAM's format takes three files side by side."""
 
 _POSE, _EDGE, _FIX, _STAMP = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX", "# stamp_ns"
 _NUMBERS = {_POSE: 8, _EDGE: 30, _FIX: 1}
 _UPPER = np.triu_indices(6)
 _SWAP = np.array([3, 4, 5, 0, 1, 2])
-"""g2o has translation first."""
+"""Order of the axes: g2o has translation first, GTSAM rotation."""
 _FIXED_SIGMA = 1e-4
 _NUMBERS_END = 1 << 56
 """Keys from here on are those of ``gtsam.symbol``, smaller ones numbers of poses."""
@@ -35,8 +35,8 @@ _NUMBERS_END = 1 << 56
 def write_graph(path: str | Path, saved: SavedGraph) -> None:
     """Write a graph: ``NAME.g2o``, or ``NAME.graph``, ``.values`` and ``.stamps`` for GTSAM.
 
-    g2o has no priors, positions and directions of gravity: they are left out, a comment tells how
-    many, and the first pose is marked as fixed. Stamps go into comments.
+    g2o holds poses and the motions between them only: other factors and variables are left out, a
+    comment tells how many factors, and the first pose is marked as fixed. Stamps go into comments.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def write_graph(path: str | Path, saved: SavedGraph) -> None:
 
 
 def read_graph(path: str | Path) -> SavedGraph:
-    """Read what :func:`write_graph` wrote, or another system's g2o file of 3D poses.
+    """Read a graph that :func:`write_graph` wrote, or another system's g2o file of 3D poses.
 
     Raises
     ------
@@ -256,7 +256,7 @@ def _read_gtsam(path: Path) -> SavedGraph:
     for key in poses.keys():  # noqa: SIM118 (no mapping)
         if key < _NUMBERS_END and not is_pose(poses, key):
             raise DatasetError(f"{path}: expected poses only, the variable {key} is none")
-    # Some texts of other things are read without an error, as nothing.
+    # GTSAM reads the text of some other objects without an error, as an empty graph.
     known = set(poses.keys())
     for place in range(graph.size()):
         if not known.issuperset(graph.at(place).keys()):
@@ -277,7 +277,7 @@ def _read_gtsam(path: Path) -> SavedGraph:
 def _renamed(
     factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, rename: Callable[[int], int]
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """The same with other keys, as ``rename`` gives them, of poses."""
+    """A copy of factors and values in which ``rename`` gives the keys of the poses."""
     graph, renamed = gtsam.NonlinearFactorGraph(), gtsam.Values(values)
     for key in values.keys():  # noqa: SIM118 (no mapping)
         if rename(key) != key:

@@ -8,10 +8,9 @@ import pytest
 from support.list_dataset import ListDataset
 
 from loam_gtsam import Config, SimulatedWorld, run
-from loam_gtsam.config import OdometryConfig
 from loam_gtsam.frontend.features import extract_features, thinned
 from loam_gtsam.frontend.workers import extract, extract_ahead
-from loam_gtsam.types import BadSweep, DatasetError, FrameStatus, Scan
+from loam_gtsam.types import BadSweep, DatasetError, Features, FrameStatus, Scan
 
 pytestmark = pytest.mark.filterwarnings("error")
 
@@ -117,9 +116,27 @@ def test_without_processes_nothing_is_read_ahead(sweeps):
     assert len(list(source)) == len(sweeps) - 1
 
 
+@pytest.mark.parametrize(
+    "changes",
+    [
+        ("odometry.method=scan_to_scan", "deskew.reference=end"),
+        ("sensor.times=azimuth", "features.plane_voxel=0.0", "map.edge_voxel=0.1"),
+        ("deskew.enabled=false", "features.post_depth=0.0", "features.range_noise=0.0"),
+    ],
+)
+def test_processes_hand_over_every_bit_of_the_features(sweeps, changes):
+    config = Config().changed(*changes)
+    for sweep, _, found in extract_ahead(numbered(sweeps[:3]), config, 2):
+        here = extract(sweep, config).features
+        for name in Features.__slots__:
+            one, other = getattr(here, name), getattr(found.features, name)
+            assert np.array_equal(one, other), name
+            assert type(one) is type(other)
+
+
 @pytest.mark.parametrize(("method", "thin"), [("constant_velocity", True), ("scan_to_scan", False)])
 def test_features_are_thinned_where_nobody_needs_them_all(sweeps, method, thin):
-    config = Config().changed(odometry=OdometryConfig(method=method))
+    config = Config().changed(f"odometry.method={method}")
     whole = extract_features(sweeps[0], config)
     found = extract(sweeps[0], config).features
     assert (len(found.planes) < len(whole.planes)) is thin

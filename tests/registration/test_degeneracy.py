@@ -30,16 +30,9 @@ def surfaces(points, normals, tilt=0.05, noise=0.0, seed=0):
     rotation = POSE.rotation().matrix()
     there = points @ rotation.T + POSE.translation()
     turned = wrong @ rotation.T
-    return PlaneMatches(
-        points,
-        turned,
-        -np.einsum("ij,ij->i", turned, there),
-        np.zeros(count),
-        np.full(count, 0.03),
-        np.ones(count),
-        np.arange(count),
-        np.full(count, tilt),
-    )
+    offsets, ones = -np.einsum("ij,ij->i", turned, there), np.ones(count)
+    rest = 0 * ones, 0.03 * ones, ones, np.arange(count), tilt * ones
+    return PlaneMatches(points, turned, offsets, *rest)
 
 
 def room(sides=((1, 6.0), (2, 2.0)), count=400, extent=(15.0, 6.0, 2.0), seed=0):
@@ -120,19 +113,9 @@ def poles(count, distinct):
     rotation = POSE.rotation().matrix()
     up = np.tile(rotation[:, 2], (len(points), 1))
     there = points @ rotation.T + POSE.translation()
-    n = len(points)
-    ones = np.ones(n)
-    return EdgeMatches(
-        points,
-        there,
-        up,
-        0 * ones,
-        0.05 * ones,
-        ones,
-        np.arange(n),
-        0.02 * ones,
-        distinct * ones > 0,
-    )
+    ones = np.ones(len(points))
+    rest = 0 * ones, 0.05 * ones, ones, np.arange(len(points)), 0.02 * ones, distinct * ones > 0
+    return EdgeMatches(points, there, up, *rest)
 
 
 @pytest.mark.parametrize(("distinct", "weak"), [(True, 0), (False, 3)])

@@ -20,6 +20,14 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.errors import ConfigError as ConfigError
+from loam_gtsam.errors import DatasetError as DatasetError
+from loam_gtsam.errors import InputError as InputError
+from loam_gtsam.errors import LoamError as LoamError
+from loam_gtsam.errors import OutputError as OutputError
+from loam_gtsam.errors import SweepError as SweepError
+from loam_gtsam.errors import SweepFault as SweepFault
+
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
@@ -27,26 +35,6 @@ MAX_STAMP = 1 << 62
 """Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
 _FARTHEST = 1e5
 """Metres, of a feature; far beyond any lidar, and within the grid of voxels."""
-
-
-class LoamError(Exception):
-    """Base of every error this package raises on purpose."""
-
-
-class ConfigError(LoamError, ValueError):
-    """A configuration has an unknown key, a wrong type or a value out of range."""
-
-
-class InputError(LoamError, ValueError):
-    """An array handed to the library has the wrong shape, dtype or content."""
-
-
-class DatasetError(LoamError):
-    """A file, folder, topic or field could not be read or understood."""
-
-
-class OutputError(LoamError):
-    """A file or a picture could not be written."""
 
 
 def check_array(
@@ -69,47 +57,6 @@ def check_array(
         got = f"shape {value.shape} of {value.dtype}"
     wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
     raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
-
-
-class SweepFault(StrEnum):
-    """What was wrong with a sweep that was not used."""
-
-    UNREADABLE = "unreadable"
-    """The file or message could not be read."""
-    EMPTY = "empty"
-    """The sweep has no points at all."""
-    NOT_FINITE = "not_finite"
-    """Too few points are finite numbers, or some features are not."""
-    TOO_FEW_POINTS = "too_few_points"
-    """Too few points, or too few within range."""
-    BAD_TIMES = "bad_times"
-    """The times of the points are missing, or no seconds within one sweep."""
-    BAD_RINGS = "bad_rings"
-    """The beams cannot be told apart."""
-    NO_FEATURES = "no_features"
-    DUPLICATE_STAMP = "duplicate_stamp"
-    """The stamp is that of the sweep before (:mod:`loam_gtsam.registration.stamp_check`)."""
-    LATE = "late"
-    """A later sweep was used already."""
-    STAMP_BACK = "stamp_back"
-    """The stamp is so much earlier than that of the last sweep used that it must be wrong."""
-    STAMP_AHEAD = "stamp_ahead"
-    """The stamp is so much later than that of the last sweep used that it is doubted."""
-    CLOCK_SET_BACK = "clock_set_back"
-    """Several sweeps in a row are earlier than the last one used; only a reset helps."""
-    CLOCK_SET_AHEAD = "clock_set_ahead"
-    """Several sweeps in a row are far ahead; from the next one on their clock is followed."""
-
-
-class SweepError(LoamError):
-    """One sweep cannot be used; the mapper turns it into a frame status and goes on.
-
-    ``fault`` says what is wrong with the sweep; None if something else is.
-    """
-
-    def __init__(self, message: str, fault: SweepFault | None = None) -> None:
-        super().__init__(message)
-        self.fault = fault
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -170,7 +117,8 @@ class Features:
     sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
         (used by scan-to-scan odometry).
     span : (first, last) seconds from ``stamp`` covered by the sweep.
-    edge_prominence : (E,) metres by which an edge stands out of its ring, as noisy as one range
+    edge_prominence : (E,) metres by which an edge stands out of its ring, scaled so that range
+        noise alone gives it the standard deviation of the noise
         (:func:`loam_gtsam.frontend.curvature.prominence`); None if unknown: all edges are real
     not_finite : points of the sweep that were NaN or infinite
     voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one

@@ -5,7 +5,8 @@ Use your own front end, your own guess or your own solver by replacing one of th
 
 import numpy as np
 
-from loam_gtsam import Config, ConstantVelocity, Mapper, SimulatedWorld, extract_features
+from loam_gtsam import Config, Mapper, SimulatedWorld, extract_features
+from loam_gtsam.registration.odometry import ConstantVelocity
 
 world = SimulatedWorld("room", sensor="hdl32", frames=6)
 config = Config().changed("matching.max_distance=0.8")  # any parameter

@@ -10,7 +10,8 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X  # the key of pose i is X(i), in a file the number i
 
-from loam_gtsam import SavedGraph, optimize_graph, read_graph, write_graph
+from loam_gtsam import optimize_graph, read_graph, write_graph
+from loam_gtsam.loops.batch import SavedGraph
 
 rng = np.random.default_rng(0)
 sigmas = np.repeat([0.002, 0.02], 3)  # rad and m, of a step and of a loop

@@ -17,8 +17,10 @@ import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
 
-from loam_gtsam import Config, CubeMap, ScanMatches, SimulatedWorld, associate, extract_features
+from loam_gtsam import Config, SimulatedWorld, associate, extract_features
+from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import move_points, transform, voxel_filter
+from loam_gtsam.registration.matches import ScanMatches
 
 OUTPUT = Path(__file__).resolve().parents[1] / "images" / "ring_locking.png"
 FRAME = 40

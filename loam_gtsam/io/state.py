@@ -173,7 +173,7 @@ class _Writer:
             pass
         raise TypeError(
             f"{name} cannot be in a checkpoint; if its attributes say all about it, mark the class "
-            "with loam_gtsam.checkpointed, else leave it out of what __getstate__ gives"
+            "with loam_gtsam.io.state.checkpointed, else leave it out of what __getstate__ gives"
         )
 
     def _array(self, array: NDArray[Any]) -> int:

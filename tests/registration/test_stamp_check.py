@@ -11,12 +11,12 @@ import pytest
 from rich.console import Console
 from support.list_dataset import ListDataset
 
-from loam_gtsam import Checkpoint, Features, FeatureSweep, Mapper, MapUpdate, SweepFault
+from loam_gtsam import Checkpoint, Features, FeatureSweep, Mapper, MapUpdate
 from loam_gtsam.cli.report import summary
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.stamp_check import IN_A_ROW, StampCheck
-from loam_gtsam.types import BadSweep, FrameStatus, Scan
+from loam_gtsam.types import BadSweep, FrameStatus, Scan, SweepFault
 
 TENTH = 10**8
 SECOND = 10**9

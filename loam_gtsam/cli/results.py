@@ -13,7 +13,12 @@ from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.pipeline import RunResult, effective_config
-from loam_gtsam.studies.evaluation import absolute_error, align, align_rotations, interpolate
+from loam_gtsam.studies.evaluation import (
+    absolute_error,
+    align_positions,
+    align_rotations,
+    interpolate,
+)
 from loam_gtsam.types import LoamError, OutputError, Trajectory
 from loam_gtsam.view import frame_plot, plots
 from loam_gtsam.view.observers import LastFrame
@@ -119,7 +124,7 @@ def _compare_with_truth(
     inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
     here = trajectory.map_T_lidar[inside]
     turn = align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
-    map_T_truth = align(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
+    map_T_truth = align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
     accuracy = {
         "ate_rmse_m": error.rmse,
         "ate_max_m": error.maximum,

@@ -25,7 +25,12 @@ from loam_gtsam.studies.comparison import (
     score_all,
 )
 from loam_gtsam.studies.contenders import SolverRun
-from loam_gtsam.studies.evaluation import absolute_error, align, distance_travelled, interpolate
+from loam_gtsam.studies.evaluation import (
+    absolute_error,
+    align_positions,
+    distance_travelled,
+    interpolate,
+)
 from loam_gtsam.studies.report_html import write_report
 from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
 from loam_gtsam.view import plots
@@ -328,7 +333,7 @@ def _aligned(trajectory: Trajectory, reference: Trajectory, stamps: IntArray) ->
     """The trajectory in the frame of the reference, fitted over the poses at ``stamps``."""
     inside = np.isin(trajectory.stamps, stamps)
     there = interpolate(reference, stamps).map_T_lidar[:, :3, 3]
-    reference_T_map = align(trajectory.map_T_lidar[inside][:, :3, 3], there)
+    reference_T_map = align_positions(trajectory.map_T_lidar[inside][:, :3, 3], there)
     return Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
 
 

@@ -43,7 +43,7 @@ class AbsoluteError:
     stamps: IntArray
 
 
-def align(
+def align_positions(
     estimate: FloatArray, reference: FloatArray, rotation: FloatArray | None = None
 ) -> FloatArray:
     """Rigid transform ``reference_T_estimate`` (4, 4) that best maps positions to a reference.
@@ -127,8 +127,8 @@ def absolute_error(
 
     Parameters
     ----------
-    aligned : fit positions by a rigid transform (SE(3), :func:`align`) and orientations by a
-        rotation (:func:`align_rotations`) first; else the poses are compared as they are
+    aligned : fit positions by a rigid transform (SE(3), :func:`align_positions`) and orientations
+        by a rotation (:func:`align_rotations`) first; else the poses are compared as they are
 
     Raises
     ------
@@ -139,7 +139,7 @@ def absolute_error(
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
     if aligned:
         rotations = align_rotations(rotations, truth[:, :3, :3]) @ rotations
-        positions = transform(align(positions, truth[:, :3, 3]), positions)
+        positions = transform(align_positions(positions, truth[:, :3, 3]), positions)
     errors = np.linalg.norm(positions - truth[:, :3, 3], axis=1)
     difference = np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations
     return AbsoluteError(

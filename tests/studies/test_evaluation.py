@@ -7,7 +7,7 @@ from support.trajectories import disturbed, moved, straight, winding
 
 from loam_gtsam.studies.evaluation import (
     absolute_error,
-    align,
+    align_positions,
     align_rotations,
     interpolate,
     path_lengths,
@@ -38,17 +38,17 @@ def changed(trajectory, poses):
 def test_align_recovers_a_rigid_transform(seed):
     rng = np.random.default_rng(seed)
     truth, points = pose(rng, 3.0), rng.normal(size=(30, 3)) * [50, 10, 1]
-    found = align(points, points @ truth[:3, :3].T + truth[:3, 3])
+    found = align_positions(points, points @ truth[:3, :3].T + truth[:3, 3])
     np.testing.assert_allclose(found, truth, atol=1e-11)
     # The positions decide alone, whatever is offered for what they leave open.
     np.testing.assert_array_equal(
-        align(points, points @ truth[:3, :3].T + truth[:3, 3], rotation(1, 2, 3)), found
+        align_positions(points, points @ truth[:3, :3].T + truth[:3, 3], rotation(1, 2, 3)), found
     )
 
 
 def test_align_does_not_mirror():
     points = np.random.default_rng(1).normal(size=(20, 3))
-    found = align(points, points * [1, 1, -1])
+    found = align_positions(points, points * [1, 1, -1])
     assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
 
 
@@ -59,8 +59,8 @@ def test_on_a_line_the_roll_comes_from_the_offered_rotation(seed):
     line = np.linspace(0, 300, 40)[:, None] * [0.6, 0.8, 0.0]
     line += [100.0, 0, 3]
     moved = line @ truth[:3, :3].T + truth[:3, 3]
-    np.testing.assert_allclose(align(line, moved, truth[:3, :3]), truth, atol=1e-5)
-    anyhow = align(line, moved)
+    np.testing.assert_allclose(align_positions(line, moved, truth[:3, :3]), truth, atol=1e-5)
+    anyhow = align_positions(line, moved)
     np.testing.assert_allclose(anyhow[:3, :3] @ anyhow[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(anyhow[:3, :3]) == pytest.approx(1.0)
     np.testing.assert_allclose(line @ anyhow[:3, :3].T + anyhow[:3, 3], moved, atol=1e-5)
@@ -68,8 +68,8 @@ def test_on_a_line_the_roll_comes_from_the_offered_rotation(seed):
 
 def test_without_motion_the_rotation_is_the_offered_one():
     still, there = np.zeros((5, 3)), np.tile([1.0, 2, 3], (5, 1))
-    np.testing.assert_allclose(align(still, there)[:3, :3], np.eye(3), atol=1e-15)
-    found = align(still, there, rotation(0.1, 0.2, 0.3))
+    np.testing.assert_allclose(align_positions(still, there)[:3, :3], np.eye(3), atol=1e-15)
+    found = align_positions(still, there, rotation(0.1, 0.2, 0.3))
     np.testing.assert_allclose(found[:3, :3], rotation(0.1, 0.2, 0.3), atol=1e-12)
     np.testing.assert_allclose(found[:3, 3], [1, 2, 3], atol=1e-15)
 

@@ -63,9 +63,7 @@ def unsafe_in(tree: ast.AST) -> Iterator[tuple[str, int]]:
 @pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: path.stem)
 def test_no_code_comes_with_data(path: Path) -> None:
     found = list(unsafe_in(ast.parse(path.read_text(encoding="utf-8"))))
-    if (
-        path.name == "workers.py"
-    ):  # values go to its own processes and back, as multiprocessing has it
+    if path.name == "workers.py":  # it exchanges values with processes of its own only
         found = [what for what in found if what[0] != "pickle"]
     assert not found, f"{path.name}: {found}; data must not be able to run code"
 

@@ -1,7 +1,7 @@
 """Own factors on every sweep: a flat floor, and the distance that wheels have measured.
 
-The floor is a residual of one's own in ``checked_factor``, the wheels a prior at the last pose,
-moved by their increment.
+The floor is a residual of one's own in ``checked_factor``, the wheels a between-factor that joins
+the pose with that of the last sweep.
 """
 
 from collections.abc import Sequence
@@ -37,21 +37,19 @@ def floor(context: PoseContext) -> gtsam.NonlinearFactor:
     return checked_factor(noise, [context.key], residual)
 
 
-def wheels(context: PoseContext) -> list[gtsam.NonlinearFactor]:
-    """The last pose, moved by what the wheels have turned since; they slip by 1 %."""
-    if context.last is None:
-        return []
-    stamp, pose = context.last
+def wheels(context: PoseContext) -> gtsam.NonlinearFactor:
+    """What the wheels have turned since the last sweep; they slip by 1 %."""
+    stamp, _ = context.last
     a, b = world.truth_at(np.array([stamp, context.stamp])).map_T_lidar
     step = gtsam.Pose3(np.linalg.inv(a) @ b)
     step = gtsam.Pose3(step.rotation(), 1.01 * step.translation())
     noise = gtsam.noiseModel.Diagonal.Sigmas(WHEELS)
-    return [gtsam.PriorFactorPose3(context.key, pose.compose(step), noise)]
+    return gtsam.BetweenFactorPose3(context.last_key, context.key, step, noise)
 
 
 def both(context: PoseContext) -> Sequence[gtsam.NonlinearFactor]:
     """As many factors as there are sensors."""
-    return [floor(context), *wheels(context)]
+    return [floor(context), wheels(context)]
 
 
 errors = {}

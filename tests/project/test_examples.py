@@ -86,8 +86,6 @@ def ground_and_wheels(names: Names, output: str) -> None:
         for axis in np.eye(6)
     ]
     np.testing.assert_allclose(jacobian, np.transpose(numerical), atol=1e-4)
-    free = names["wheels"](PoseContext(POSE_KEY, 0, pose, None))
-    assert free == []  # nothing to count from at the first sweep
 
 
 def imu_in_a_corridor(names: Names, output: str) -> None:

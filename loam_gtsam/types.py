@@ -122,7 +122,8 @@ class Features:
         (:func:`loam_gtsam.frontend.curvature.prominence`); None if unknown: all edges are real
     not_finite : points of the sweep that were NaN or infinite
     voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
-        point each (:func:`loam_gtsam.frontend.features.thinned`); None if they hold all points.
+        point each (:func:`loam_gtsam.frontend.features.thinned`). None if they hold all points, or
+        points that were moved since.
     """
 
     stamp: int

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ctypes
 import logging
-import pickle
 import signal
 import time
 from collections import deque
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from itertools import cycle
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from loam_gtsam.config import Config
@@ -148,7 +148,7 @@ class _Worker:
 
     def send(self, scan: Scan) -> bool:
         """Have a sweep worked on; False if the sweep is too large, or the process is dead."""
-        data = pickle.dumps(scan)
+        data = ForkingPickler.dumps(scan)
         if not self._alive or len(data) > _SLOT:
             return False
         with self._watched():
@@ -161,7 +161,7 @@ class _Worker:
         if self._alive:
             with self._watched():
                 slot, size = next(self._incoming), self._pipe.recv()
-                extraction: Extraction | None = pickle.loads(slot[:size])
+                extraction: Extraction | None = ForkingPickler.loads(slot[:size])
                 return extraction
         return None
 
@@ -185,8 +185,10 @@ def _serve(pipe: Connection, memory: Any, config: Config) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the caller to handle
     with suppress(EOFError, OSError):
         for slot in _slots(memory):
-            answer = pickle.dumps(extract(pickle.loads(slot[: pipe.recv()]), config))
+            answer = ForkingPickler.dumps(
+                extract(ForkingPickler.loads(slot[: pipe.recv()]), config)
+            )
             if len(answer) > _SLOT:
-                answer = pickle.dumps(None)
+                answer = ForkingPickler.dumps(None)
             slot[: len(answer)] = answer
             pipe.send(len(answer))

@@ -1,7 +1,7 @@
 """De-skewing: the features of a sweep as seen from the middle of that sweep.
 
-Within a frame, poses belong to the *middle* of the sweep: there an error of the motion used for
-the de-skew cancels to first order, while at the start or the end it would shift the whole sweep.
+At the *middle* of the sweep an error of the motion cancels to first order; at the start or the end
+the same error would shift the whole sweep.
 """
 
 from __future__ import annotations
@@ -20,33 +20,34 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, SweepMotion
 
 _DISTINCT = 4.5
-"""Standard deviations of range noise by which a distinct edge stands out of its ring."""
+"""Prominence of a distinct edge in its ring, in standard deviations of range noise."""
 
 
 class MovingSweep:
-    """The voxel-filtered features of a sweep, each taken at its own time.
+    """The voxel-filtered features of a sweep as measured, each from its own position of the lidar.
 
-    :meth:`at` de-skews them for one motion of the sensor. The rotation within the sweep comes from
-    the gyro (or the orientation) of an IMU if there is one that covers the sweep; the translation,
-    and without an IMU the rotation too, from a constant velocity.
+    The rotation within the sweep comes from the gyro (or the orientation) of an IMU if the IMU
+    covers the sweep. The translation, and without an IMU the rotation too, comes from a constant
+    velocity, for which :meth:`at` de-skews the features.
 
     Parameters
     ----------
-    features : of the sweep
-    config : ``deskew`` and the voxel sizes of ``map`` are used
+    features : features of the sweep
+    config : ``deskew``, ``features.range_noise``, ``imu.max_gap`` and the voxel sizes of ``map``
+        are used
     imu : source of the rotation; None for constant velocity
     thin : whether to voxel-filter the points, as for matching
 
     Attributes
     ----------
-    reference_stamp : nanoseconds of the moment the frame's pose is handed out for
+    reference_stamp : nanoseconds, for which the pose of the frame is reported
     stamp : nanoseconds of the middle of the sweep
-    middle : seconds from the reference time to the middle; 0 if the features do not move
-    duration : seconds of the sweep; 0 likewise
+    middle : seconds from the reference time to the middle; 0 without de-skewing
+    duration : seconds of the sweep; 0 without de-skewing
     n_edges, n_planes : numbers of features
-    distinct : (E,) whether an edge stands out of its ring by more than range noise makes it
+    distinct : (E,) whether an edge stands out of its ring by more than range noise
     motion : source of the rotation within the sweep
-    not_finite : points of the sweep that were NaN or infinite
+    not_finite : number of points of the sweep that were NaN or infinite
     """
 
     def __init__(
@@ -99,19 +100,19 @@ class MovingSweep:
         return PosedSweep(self, twist)
 
     def middle_T_reference(self, twist: FloatArray) -> gtsam.Pose3:
-        """The lidar at the reference time seen from the middle of the sweep."""
+        """The pose of the lidar at the reference time, seen from the middle of the sweep."""
         if self._turned is None:
             return gtsam.Pose3.Expmap(-twist * self.middle)
         rotation = self._middle_R_reference
         return gtsam.Pose3(gtsam.Rot3(rotation), rotation @ twist[3:] * -self.middle)
 
     def twist_since(self, last: tuple[int, gtsam.Pose3], map_T_middle: gtsam.Pose3) -> FloatArray:
-        """(6,) body velocity at the reference time that leads from an earlier sweep to this one.
+        """(6,) body velocity at the reference time, from the poses of two sweeps.
 
         Parameters
         ----------
-        last : stamp, nanoseconds, and pose of the middle of the earlier sweep
-        map_T_middle : pose of the middle of this one
+        last : stamp, nanoseconds, and pose of the middle of an earlier sweep
+        map_T_middle : pose of the middle of this sweep
         """
         seconds = (self.stamp - last[0]) * 1e-9
         if self._turned is None:
@@ -127,29 +128,30 @@ class MovingSweep:
         Parameters
         ----------
         rate : (3,) rad/s
-        velocity : (3,) m/s at the middle of the sweep, in the lidar's axes there
+        velocity : (3,) m/s at the middle of the sweep, in the axes of the lidar at the middle
         """
         if self._turned is not None:
             velocity = self._middle_R_reference.T @ velocity
         return np.concatenate([rate, velocity])
 
     def deskewed(
-        self, twist: FloatArray, edge_rows: IntArray | None, plane_rows: IntArray | None
+        self,
+        twist: FloatArray,
+        edge_rows: IntArray | None = None,
+        plane_rows: IntArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Edges and planes seen from the middle of the sweep, (N, 3) metres each.
 
         Parameters
         ----------
         twist : (6,) body velocity at the reference time
-        edge_rows, plane_rows : which features; None for all
+        edge_rows, plane_rows : rows of the wanted features; None for all
         """
         return self._part(0, twist, edge_rows), self._part(1, twist, plane_rows)
 
     def _part(self, which: int, twist: FloatArray, rows: IntArray | None) -> FloatArray:
         """Edges (0) or planes (1), de-skewed."""
-        points, seconds = self._points[which], self._seconds[which]
-        if self._turned is not None:
-            points = self._turned[which]
+        points, seconds = (self._turned or self._points)[which], self._seconds[which]
         if rows is not None:
             points, seconds = points.take(rows, axis=0), seconds.take(rows)
         if self.motion is SweepMotion.NONE:
@@ -161,12 +163,12 @@ class MovingSweep:
 
 @dataclass(frozen=True, eq=False)
 class PosedSweep:
-    """A sweep de-skewed for one motion: a value, which never changes.
+    """A sweep that is de-skewed for one motion: an immutable value.
 
     Attributes
     ----------
-    sweep : whose features these are
-    twist : (6,) body velocity at the reference time, rad/s and m/s, of the de-skew
+    sweep : the sweep with its features as measured
+    twist : (6,) body velocity at the reference time, rad/s and m/s
     """
 
     sweep: MovingSweep
@@ -175,26 +177,26 @@ class PosedSweep:
     @cached_property
     def points(self) -> tuple[FloatArray, FloatArray]:
         """All edges (E, 3) and planes (P, 3), metres, seen from the middle of the sweep."""
-        return self.sweep.deskewed(self.twist, None, None)
+        return self.sweep.deskewed(self.twist)
 
     def rows(self, edges: IntArray, planes: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Some of the edges and planes, by their rows."""
+        """Chosen edges and planes, by their rows, seen from the middle of the sweep."""
         return self.sweep.deskewed(self.twist, edges, planes)
 
     @cached_property
     def middle_T_reference(self) -> gtsam.Pose3:
-        """The lidar at the reference time seen from the middle of the sweep."""
+        """The pose of the lidar at the reference time, seen from the middle of the sweep."""
         return self.sweep.middle_T_reference(self.twist)
 
     def map_T_middle(self, map_T_lidar: gtsam.Pose3) -> gtsam.Pose3:
-        """The pose at the middle of the sweep, from that at its reference time."""
+        """The pose at the middle of the sweep, from the pose at the reference time."""
         return map_T_lidar.compose(self.middle_T_reference.inverse())
 
 
 def _turns_by_orientation(
     imu: ImuBuffer, stamp: int, moments: FloatArray, max_gap: float
 ) -> FloatArray | None:
-    """As :meth:`ImuBuffer.rotations_since`, interpolated between the IMU's orientations."""
+    """Rotation vectors as of :meth:`ImuBuffer.rotations_since`, from the IMU's orientations."""
     first, end = moments.min(), moments.max()
     begins, ends = (stamp + round(float(seconds) * 1e9) for seconds in (first, end))
     samples = imu.samples_between(begins, ends)
@@ -213,7 +215,7 @@ def _turns_by_orientation(
 
 
 def _rotated(points: FloatArray, turns: FloatArray) -> FloatArray:
-    """Each point turned by its own rotation vector (Rodrigues' formula)."""
+    """Points, each turned by its own rotation vector (Rodrigues' formula)."""
     axis, point = turns.T.copy(), points.T.copy()  # component arrays are several times faster
     angle = np.maximum(np.sqrt((axis * axis).sum(axis=0)), 1e-12)
     across = cross(axis, point)

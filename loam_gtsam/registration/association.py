@@ -1,4 +1,4 @@
-"""Association of features with the map: five nearest neighbours, a line or a plane through them."""
+"""Association: matches of features with lines and planes through their neighbours in the map."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ def associate(
 ) -> ScanMatches:
     """Match de-skewed features with the cubes around a pose.
 
-    Of more than ``max_edges`` and ``max_planes`` features so many are matched, evenly spread over
-    the rows. Features come sorted by voxel, so the matched ones are spread over the sweep.
+    At most ``max_edges`` and ``max_planes`` features are matched, evenly spread over the rows.
+    Features are sorted by voxel, so that the matched ones are spread over the sweep.
 
     Parameters
     ----------
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
-    map_T_lidar : pose at which to associate
+    map_T_lidar : pose of the association
     edge_map, plane_map : the maps
-    distinct : (E,) see :class:`EdgeMatches`; all are if None. Distinct edges are matched before
-        others, and searched for more widely (``wide_search``) where no line is near and the planes
-        leave a translation open.
+    distinct : (E,) mask of :class:`EdgeMatches`; None if all edges are distinct. Distinct edges are
+        matched before other edges. A distinct edge without a line near by is searched for more
+        widely (``wide_search``) if the planes leave a translation open.
     """
     rows = chosen_rows(len(edges), len(planes), config, distinct)
     chosen = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
@@ -54,7 +54,7 @@ def associate(
 def chosen_rows(
     edges: int, planes: int, config: MatchingConfig, distinct: BoolArray | None = None
 ) -> ChosenRows:
-    """Choose which of so many edges and planes are matched; see :func:`associate`."""
+    """Choose the features that are matched, from their numbers; see :func:`associate`."""
     if distinct is not None and distinct.all():
         distinct = None
     edge_rows = spread_rows(edges, config.max_edges, distinct)
@@ -76,8 +76,8 @@ def match_features(
 
     Parameters
     ----------
-    edges, planes : the features of ``rows``, (E, 3) and (P, 3) metres, lidar frame
-    rows : where these features are among those of the sweep, for ``indices`` of the matches
+    edges, planes : the chosen features, (E, 3) and (P, 3) metres, lidar frame
+    rows : rows of these features in the sweep
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
     pose = map_T_lidar.matrix()
@@ -107,19 +107,18 @@ def match_features(
 
 
 def _fixed_by(planes: PlaneMatches) -> float:
-    """Planes across the translation that they fix least, less what noise makes of their normals.
+    """The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviation of a normal.
 
-    The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviations of the normals.
-    Planes that fix three translations face three ways, and with that they fix the turns.
+    Planes that fix three translations face three ways, and then they fix the rotation as well.
     """
     tilts = planes.tilts
-    assert tilts is not None  # match_planes tells them
+    assert tilts is not None  # match_planes sets the tilts
     across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
     return float(np.linalg.eigvalsh(across)[0])
 
 
 def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
-    """Rows 0 to ``count``, or ``limit`` of them evenly spread, those of ``first`` before others."""
+    """At most ``limit`` of ``count`` rows, evenly spread; those of ``first`` before others."""
     if not 0 < limit < count:
         return np.arange(count)
     if first is None:
@@ -133,7 +132,7 @@ def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntAr
 
 
 def trial_matching(config: MatchingConfig) -> MatchingConfig:
-    """The configuration with few matches, to try a pose quickly."""
+    """The configuration for few matches, with which a pose is tried quickly."""
 
     def at_most(limit: int, most: int) -> int:
         return min(limit, most) if most else limit
@@ -147,7 +146,7 @@ def trial_matching(config: MatchingConfig) -> MatchingConfig:
 def rematched(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig
 ) -> ScanMatches:
-    """The same lines and planes with distances and weights at another pose near by."""
+    """The matches with the same lines and planes, and with distances and weights at another pose."""
     pose = map_T_lidar.matrix()
     e, p = matches.edges, matches.planes
     away = (transform(pose, e.points) - e.centres).T
@@ -187,18 +186,18 @@ def match_lines(
     config: MatchingConfig,
     reach: float | None = None,
 ) -> EdgeMatches:
-    """Lines through neighbours that form one (LOAM, Section VI; constants in the config).
+    """Lines through the neighbours of edge features (LOAM, Section VI; constants in the config).
 
-    An edge is found as a break along its ring, so its line crosses the ring. Neighbours that lie
-    along the ring are not an edge but the trace of one beam on rough ground or foliage, which
-    moves with the sensor: such lines are rejected, or they would hold the pose where it was.
+    An edge is a break along its ring, so that its line crosses the ring. Neighbours along a ring
+    are not an edge but the trace of one beam on rough ground or foliage. That trace moves with the
+    sensor and would hold the pose at the last one; such lines are rejected.
 
     Parameters
     ----------
-    points, points_map : (N, 3) features in the lidar and in the map frame
+    points, points_map : (N, 3) features in the lidar frame and in the map frame
     neighbours : (N, k, 3) their nearest map points
     squared_distances : (N, k) m^2, ascending, inf where missing
-    map_T_lidar : (4, 4) the pose; the rings go round its z axis
+    map_T_lidar : (4, 4) pose; its z axis is the axis of the rings
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
     reach = config.max_distance if reach is None else reach
@@ -215,21 +214,10 @@ def match_lines(
     keep = is_line & (weights > config.min_weight)
     # A line in space has four parameters, two for each of the directions across it.
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
-    k = neighbours.shape[1]
-    scatter = _scatter(eigenvalues[1], 2, k, config)
-    sigmas = _sigmas(scatter, leverage, k, config)
-    tilts = np.sqrt(scatter / (k * np.maximum(eigenvalues[2], _TINY)))
-    indices = near[keep]
-    return EdgeMatches(
-        points[indices],
-        centres.T[keep],
-        directions.T[keep],
-        distances[keep],
-        sigmas[keep],
-        weights[keep],
-        indices,
-        tilts[keep],
-    )
+    fit = eigenvalues[1], eigenvalues[2], leverage
+    sigmas, tilts = _deviations(*fit, 2, neighbours.shape[1], config)
+    columns = (part[keep] for part in (distances, sigmas, weights, near, tilts))
+    return EdgeMatches(points[near[keep]], centres.T[keep], directions.T[keep], *columns)
 
 
 def match_planes(
@@ -241,24 +229,22 @@ def match_planes(
     config: MatchingConfig,
     reach: float | None = None,
 ) -> PlaneMatches:
-    """Planes through neighbours that form one (LOAM, Section VI; constants in the config).
+    """Planes through the neighbours of plane features (LOAM, Section VI; constants in the config).
 
     Scattered returns of one beam (foliage, grass) lie in the surface that the beam sweeps. A plane
-    through them is no surface of the world but that of the scan, and holds the pose where it was;
-    it shows by containing the viewing ray, and is rejected.
-
-    Parameters are those of :func:`match_lines`.
+    through such returns contains the viewing ray, moves with the sensor, and would hold the pose at
+    the last one; such planes are rejected. Parameters are those of :func:`match_lines`.
 
     Notes
     -----
     Two deliberate deviations from the published code: the plane is fitted about the centroid, so
-    that a plane through the map's origin is no special case, and the range in the weight is that of
-    the point from the sensor (as in LIO-SAM), not from the map's origin. ``plane_fit: unit_offset``
-    and ``weight_range: map`` give the published forms.
+    that a plane through the map's origin is no special case, and the range in the weight is the
+    distance of the point from the sensor (as in LIO-SAM), not from the map's origin.
+    ``plane_fit: unit_offset`` and ``weight_range: map`` give the published forms.
     """
     reach = config.max_distance if reach is None else reach
     near = np.flatnonzero(squared_distances[:, -1] < reach**2)
-    # Axis by axis in memory, like all that follows.
+    # Memory order is axis by axis, as in all of the following arrays.
     axes = np.ascontiguousarray(neighbours.take(near, axis=0).transpose(2, 1, 0))
     here = np.ascontiguousarray(points_map.take(near, axis=0).T)
     group = axes.transpose(2, 1, 0)
@@ -281,31 +267,19 @@ def match_planes(
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
-    k = neighbours.shape[1]
-    scatter = _scatter(eigenvalues[0], 3, k, config)
-    sigmas = _sigmas(scatter, leverage, k, config)
-    tilts = np.sqrt(scatter / (k * np.maximum(eigenvalues[1], _TINY)))
-    indices = near[keep]
-    return PlaneMatches(
-        points[indices],
-        normals.T[keep],
-        offsets[keep],
-        distances[keep],
-        sigmas[keep],
-        weights[keep],
-        indices,
-        tilts[keep],
-    )
+    fit = eigenvalues[0], eigenvalues[1], leverage
+    sigmas, tilts = _deviations(*fit, 3, neighbours.shape[1], config)
+    columns = (part[keep] for part in (offsets, distances, sigmas, weights, near, tilts))
+    return PlaneMatches(points[near[keep]], normals.T[keep], *columns)
 
 
 def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Planes by the least squares A n = -1 of LOAM and A-LOAM; unit normals (3, N), offsets (N,).
 
     With mean m and covariance C of the points the solution is ``n = -a / (det C + m . a)`` with
-    ``a = adj(C) m`` (Sherman and Morrison on ``A^T A = k (C + m m^T)``): no inverse, and nothing
-    is lost where the points lie exactly in a plane. Where ``a`` vanishes (they lie in a plane
-    through the map origin, or on one line) there is no such plane; the offset is then infinite,
-    which fails the plane test.
+    ``a = adj(C) m`` (Sherman and Morrison on ``A^T A = k (C + m m^T)``), which needs no inverse.
+    Where ``a`` vanishes (the points lie in a plane through the map's origin, or on one line) there
+    is no such plane; the offset is then infinite and fails the plane test.
     """
     means, (xx, yy, zz, xy, yz, xz) = moments(neighbours)
     rows = (
@@ -336,40 +310,32 @@ def _norm(vectors: FloatArray) -> FloatArray:
     return length
 
 
-def _scatter(
-    roughness: FloatArray, parameters: int, neighbours: int, config: MatchingConfig
-) -> FloatArray:
-    """(M,) variance of a map point across its line or plane, m^2, at least that of a point.
+def _deviations(
+    roughness: FloatArray,
+    spread: FloatArray,
+    leverage: FloatArray,
+    parameters: int,
+    neighbours: int,
+    config: MatchingConfig,
+) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations (M,) of the distance of a new point, m, and of the tilt of the fit, rad.
+
+    The variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)`` (Draper and Smith,
+    Applied Regression Analysis, 3rd ed., section 3.1), is large where the point lies far to a side
+    in which the neighbours are narrow, as across the rings of a sparse sensor.
 
     Parameters
     ----------
     roughness : (M,) mean squared distance of the neighbours across the line or plane, m^2
-    parameters : of the fit, per direction across it
+    spread : (M,) variance of the neighbours along the line, or along the plane's narrow side, m^2
+    leverage : (M,) squared distance from the centre in units of the neighbours' variances
+    parameters : number of parameters of the fit, per direction across the line or plane
+    neighbours : k
     """
     least = config.point_sigma**2
-    if not config.fit_uncertainty:
-        return np.full(len(roughness), least)
-    freedom = max(neighbours - parameters, 1)
-    return np.maximum(roughness * neighbours / freedom, least)
-
-
-def _sigmas(
-    scatter: FloatArray, leverage: FloatArray, neighbours: int, config: MatchingConfig
-) -> FloatArray:
-    """Standard deviation of the distance of a new point from a fitted line or plane.
-
-    The variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)`` (Draper and Smith,
-    Applied Regression Analysis, 3rd ed., section 3.1): large where the neighbours span a direction
-    badly and the point lies off to that side, as across the rings of a sparse sensor, and where
-    they scatter.
-
-    Parameters
-    ----------
-    scatter : (M,) s^2, see :func:`_scatter`
-    leverage : (M,) squared distance from the centre in units of the neighbours' own variances
-    """
-    variance = scatter
+    scatter, variance = np.full((2, len(roughness)), least)
     if config.fit_uncertainty:
+        freedom = max(neighbours - parameters, 1)
+        scatter = np.maximum(roughness * neighbours / freedom, least)
         variance = scatter * (1.0 + (1.0 + leverage) / neighbours)
-    sigmas: FloatArray = np.sqrt(variance)
-    return sigmas
+    return np.sqrt(variance), np.sqrt(scatter / (neighbours * np.maximum(spread, _TINY)))

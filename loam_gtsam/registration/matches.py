@@ -1,11 +1,8 @@
-"""Matches of a scan with the map: values that association makes and solvers take.
-
-Matches are immutable arrays, so that the same ones can be given to different solvers.
-"""
+"""Matches of a sweep with the map: immutable arrays, made by association and used by solvers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, TypeVar
 
 import gtsam
@@ -17,19 +14,19 @@ from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeMatches:
-    """Points matched with lines of the map.
+    """Edge features, each matched with a line of the map.
 
     Attributes
     ----------
     points : (M, 3) metres, lidar frame
-    centres, directions : (M, 3) a point on each line and its unit direction, map frame
-    distances : (M,) metres from the line at association
+    centres, directions : (M, 3) a point of each line, metres, and its unit direction, map frame
+    distances : (M,) metres from the line at the pose of the association
     sigmas : (M,) standard deviation of the distance, metres
     weights : (M,) LOAM's s, in (min_weight, 1]
-    indices : (M,) which features these are
-    tilts : (M,) standard deviation of the direction, rad; None: exact
-    distinct : (M,) whether the feature stands out of its ring by more than noise makes it; None:
-        all do
+    indices : (M,) rows of the features among the edges of the sweep
+    tilts : (M,) standard deviation of the direction, rad; None for exact directions
+    distinct : (M,) whether the feature stands out of its ring by more than range noise; None if all
+        features do
     """
 
     points: FloatArray
@@ -48,17 +45,15 @@ class EdgeMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PlaneMatches:
-    """Points matched with planes ``n . q + d = 0`` of the map.
+    """Plane features, each matched with a plane ``n . q + d = 0`` of the map.
+
+    Attributes that are not listed are those of :class:`EdgeMatches`.
 
     Attributes
     ----------
-    points : (M, 3) metres, lidar frame
     normals, offsets : (M, 3) unit and (M,) metres, map frame
-    distances : (M,) signed metres from the plane at association
-    sigmas : (M,) standard deviation of the distance, metres
-    weights : (M,) LOAM's s, in (min_weight, 1]
-    indices : (M,) which features these are
-    tilts : (M,) standard deviation of the normal in its worst direction, rad; None: exact
+    distances : (M,) signed metres from the plane at the pose of the association
+    tilts : (M,) standard deviation of the normal in its worst direction, rad
     """
 
     points: FloatArray
@@ -76,12 +71,12 @@ class PlaneMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanMatches:
-    """All matches of one scan at one pose.
+    """All matches of one sweep at one pose.
 
     Attributes
     ----------
     edges, planes : the matches
-    search : the neighbour search that found them; None for matches made otherwise
+    search : neighbour search that found the matches; None for matches without a search
     """
 
     edges: EdgeMatches
@@ -99,14 +94,14 @@ class ScanMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """A search for neighbours, whose lines and planes may serve at other poses near by.
+    """A search for neighbours, whose lines and planes may be kept at other poses near by.
 
     Attributes
     ----------
     map_T_lidar : pose of the search
-    posed : de-skewed sweep, whose points were searched for
-    found : all matches there
-    wide : whether the map was thinned and the reach enlarged, for want of matches
+    posed : de-skewed sweep whose points were searched for
+    found : all matches at that pose
+    wide : whether the map was thinned and the reach enlarged, because there were too few matches
     """
 
     map_T_lidar: gtsam.Pose3
@@ -121,8 +116,8 @@ class ChosenRows:
 
     Attributes
     ----------
-    edges, planes : rows of the sweep's edges and planes
-    distinct : which of those edges are distinct; None where all are
+    edges, planes : rows of the features among the edges and the planes of the sweep
+    distinct : mask of the distinct ones among ``edges``; None if all are distinct
     """
 
     edges: IntArray
@@ -137,16 +132,14 @@ _Matches = TypeVar("_Matches", EdgeMatches, PlaneMatches)
 
 
 def subset(matches: _Matches, keep: BoolArray) -> _Matches:
-    """Those matches for which a mask is true."""
+    """The matches for which a mask is true."""
     columns = {item.name: getattr(matches, item.name) for item in fields(matches)}
-    chosen: dict[str, Any] = {
-        name: None if column is None else column[keep] for name, column in columns.items()
-    }
-    return type(matches)(**chosen)
+    kept: dict[str, Any] = {n: column[keep] for n, column in columns.items() if column is not None}
+    return replace(matches, **kept)
 
 
 def joined_edges(first: EdgeMatches, second: EdgeMatches) -> EdgeMatches:
-    """All matches of both, in the order of the features; ``distinct`` is left out."""
+    """All matches of both, in the order of the features, without ``distinct``."""
     columns: dict[str, Any] = {}
     order = np.argsort(np.concatenate([first.indices, second.indices]), kind="stable")
     for item in fields(first):

@@ -1,4 +1,4 @@
-"""The guess the mapper starts from: constant velocity, scan to scan, or recorded odometry."""
+"""The predicted pose of a sweep: by constant velocity, from scan to scan, or by an IMU."""
 
 from __future__ import annotations
 
@@ -16,6 +16,22 @@ from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
+_LONGEST = 10.0
+"""Seconds for which a motion is extrapolated at most; after a longer gap, or with a wrong stamp,
+the extrapolated pose would be anywhere."""
+_SHORTEST = 1e-3
+"""Least seconds between the middles of two sweeps."""
+_REASSOCIATE_EVERY = 5
+"""Gauss-Newton iterations per association of the scan-to-scan odometry (LOAM)."""
+_WEIGHT_SLOPE = 1.8
+"""Weight 1 - 1.8 |d| after the first association of the scan-to-scan odometry (LOAM)."""
+_MIN_MATCHES = 10
+"""Least matches of the scan-to-scan odometry; with fewer the twist stays (LOAM)."""
+_CONVERGED = 1e-5
+"""Change of the motion over a sweep, rad and m, below which the scan-to-scan odometry stops."""
+_RING_SPACING = 1e4
+"""Metres between rings in the four-dimensional search; more than the width of any sweep."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guess:
@@ -23,8 +39,8 @@ class Guess:
 
     Attributes
     ----------
-    map_T_lidar : pose
-    twist : (6,) body velocity, rad/s and m/s
+    map_T_lidar : pose at the reference time
+    twist : (6,) body velocity at the reference time, rad/s and m/s
     """
 
     map_T_lidar: gtsam.Pose3
@@ -32,30 +48,25 @@ class Guess:
 
 
 class Odometry(Protocol):
-    """Makes the guess for each sweep."""
+    """A method that predicts the pose of each sweep."""
 
     def guess(self, features: Features, last: MapUpdate | None) -> Guess:
-        """Predict the pose of a sweep; asking changes nothing.
+        """Predict the pose of a sweep, without any change of the odometry.
 
         Parameters
         ----------
-        features : of the new sweep
-        last : the mapper's result for the sweep before, None at the start
+        features : features of the new sweep
+        last : result of the mapper for the last sweep, None at the start
         """
         ...
 
     def remember(self, features: Features) -> None:
-        """Take the features of a sweep that the mapper has used."""
-        ...
+        """Store the features of a sweep that the mapper has used."""
+        return
 
     def reset(self) -> None:
         """Forget all sweeps."""
-        ...
-
-
-_LONGEST = 10.0
-"""Seconds for which a motion is taken to go on; where a lidar is after a longer gap, nothing says,
-and a wrong stamp must not take it to the end of the world."""
+        return
 
 
 def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsam.Pose3:
@@ -64,15 +75,15 @@ def advance(map_T_lidar: gtsam.Pose3, twist: FloatArray, seconds: float) -> gtsa
 
 
 class Turns(Protocol):
-    """Tells how the lidar turned: an :class:`~loam_gtsam.imu.ImuBuffer` or the mapper's IMU."""
+    """A source of rotations: an :class:`~loam_gtsam.imu.ImuBuffer` or the IMU of the mapper."""
 
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
-        """``first_R_second`` of two stamps, None if unknown."""
+        """The rotation ``first_R_second`` between two stamps, None if unknown."""
         ...
 
 
-class ConstantVelocity:
-    """The motion of the last sweep goes on; an IMU tells how the lidar turned meanwhile."""
+class ConstantVelocity(Odometry):
+    """Prediction with the velocity of the last sweep, and with the rotation of an IMU if known."""
 
     def __init__(self, imu: Turns | None = None) -> None:
         self.imu = imu
@@ -81,35 +92,27 @@ class ConstantVelocity:
         """See :meth:`Odometry.guess`."""
         return self.at(features.stamp, last)
 
-    def remember(self, features: Features) -> None:
-        """See :meth:`Odometry.remember`."""
-
-    def reset(self) -> None:
-        """See :meth:`Odometry.reset`."""
-
     def at(self, stamp: int, last: MapUpdate | None) -> Guess:
-        """The guess for a moment, nanoseconds."""
+        """The guess for a stamp, nanoseconds."""
         if last is None:
             return Guess(gtsam.Pose3(), np.zeros(6))
         seconds = min((stamp - last.stamp) * 1e-9, _LONGEST)
         turned = None if self.imu is None else self.imu.rotation_between(last.stamp, stamp)
         if turned is None:
             return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)
-        # With the rotation known it is the velocity in the map that stays, not that of the body.
+        # With a known rotation, the velocity in the map is constant, not the body velocity.
         moved = last.map_T_lidar.compose(gtsam.Pose3(turned, last.twist[3:] * seconds))
         velocity = turned.matrix().T @ last.twist[3:]
         return Guess(moved, np.concatenate([last.twist[:3], velocity]))
 
 
 class Moment(NamedTuple):
-    """The middle of a sweep that is done.
+    """The middle of a registered sweep.
 
     Attributes
     ----------
-    stamp : nanoseconds
-    map_T_lidar : pose
-    solved : whether the pose was solved for, or given for the first sweep; otherwise it was
-        predicted
+    stamp, map_T_lidar : nanoseconds and pose of the middle
+    solved : whether the pose was solved, or given for the first sweep; else it was predicted
     """
 
     stamp: int
@@ -117,19 +120,22 @@ class Moment(NamedTuple):
     solved: bool
 
     def seconds_to(self, stamp: int) -> float:
-        """Seconds to the middle of a later sweep; sweeps of unlike length may even coincide."""
+        """Seconds to the middle of a later sweep, at least :data:`_SHORTEST`.
+
+        The middles of two sweeps of different length may coincide.
+        """
         return max((stamp - self.stamp) * 1e-9, _SHORTEST)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """A sweep, de-skewed, and where it is expected.
+    """The predicted pose of a sweep.
 
     Attributes
     ----------
-    posed : the sweep with the motion that is expected
+    posed : the sweep, de-skewed with the predicted motion
     map_T_lidar, map_T_middle : pose at the reference time and at the middle of the sweep
-    motion : what takes over in directions that the scan does not see
+    motion : the expected pose at the middle, for directions that the scan does not fix
     """
 
     posed: PosedSweep
@@ -139,10 +145,10 @@ class Prediction:
 
 
 class InertialPredictor(Turns, Protocol):
-    """The mapper's IMU, as far as predictions need it."""
+    """The part of the mapper's IMU that predictions need."""
 
     def predict(self, stamp: int) -> InertialPrediction | None:
-        """Predict pose, velocity and covariance of a moment; None if that is not to be had."""
+        """The pose, velocity and covariance by pre-integration; None if not available."""
         ...
 
 
@@ -155,15 +161,15 @@ def predict(
     guess: gtsam.Pose3 | None = None,
     twist: FloatArray | None = None,
 ) -> Prediction:
-    """Predict where a sweep is: by pre-integration if there is any, else by constant velocity.
+    """Predict the pose of a sweep: by pre-integration if available, else by constant velocity.
 
     Parameters
     ----------
-    last, moment : the update of the last sweep and the middle of it; None for the first sweep
-    imu : tells how the lidar turned or moved meanwhile
-    config : how well a constant velocity is believed
-    guess : ``map_T_lidar`` at the reference time that is used instead of the predicted one
-    twist : (6,) body velocity there that is used likewise
+    last, moment : update and middle of the last sweep; None for the first sweep
+    imu : source of the rotation, or of the motion by pre-integration
+    config : ``turn_sigma`` and ``acceleration_sigma`` are the uncertainty of a constant velocity
+    guess : ``map_T_lidar`` at the reference time, which replaces the predicted pose
+    twist : (6,) body velocity at the reference time, which replaces the predicted velocity
     """
     steady = ConstantVelocity(imu).at(sweep.reference_stamp, last)
     inertial = None if last is None or imu is None else imu.predict(sweep.stamp)
@@ -191,39 +197,25 @@ def predict(
 def twist_to(
     sweep: MovingSweep, last: Moment | None, map_T_middle: gtsam.Pose3, otherwise: FloatArray
 ) -> FloatArray:
-    """(6,) body velocity that leads from the middle of the last sweep to that of this one.
+    """(6,) body velocity between the middles of the last sweep and of this sweep.
 
     Parameters
     ----------
-    otherwise : returned where there is no last sweep, or where its middle is not earlier (sweeps
-        of unlike length)
+    otherwise : result if there is no last sweep, or if the middle of the last sweep is not earlier
+        (sweeps of different length)
     """
     if last is None or sweep.stamp <= last.stamp:
         return otherwise
     return sweep.twist_since(last[:2], map_T_middle)
 
 
-_SHORTEST = 1e-3
-"""Seconds between the middles of two sweeps at least."""
-_REASSOCIATE_EVERY = 5
-"""Gauss-Newton iterations per association of the scan-to-scan odometry (LOAM)."""
-_WEIGHT_SLOPE = 1.8
-"""Weight 1 - 1.8 |d| after the first association of the scan-to-scan odometry (LOAM)."""
-_MIN_MATCHES = 10
-"""Fewer matches leave the constant-velocity twist (LOAM)."""
-_CONVERGED = 1e-5
-"""Stop when the motion over the sweep changes less than this (rad and m)."""
-_RING_SPACING = 1e4
-"""Metres between rings in the four-dimensional search; more than any sweep is wide."""
+class ScanToScan(Odometry):
+    """LOAM's odometry: the motion within a sweep from matches with the last sweep.
 
-
-class ScanToScan:
-    """LOAM's odometry: the motion within a sweep from matches with the sweep before.
-
-    The sweep before, de-skewed with its solved motion, is moved to the start of the new one. Sharp
-    points of the new one are matched with lines through edge points of two neighbouring rings, flat
-    ones with planes through three plane points of two rings; the unknown is the constant body
-    velocity over the sweep (Zhang and Singh, LOAM, RSS 2014, Section V).
+    The last sweep, de-skewed with its solved motion, is moved to the start of the new sweep. Sharp
+    points of the new sweep are matched with lines through edge points of two neighbouring rings,
+    flat points with planes through three plane points of two rings. The unknown is the constant
+    body velocity over the sweep (Zhang and Singh, LOAM, RSS 2014, Section V).
     """
 
     def __init__(self, config: OdometryConfig, imu: Turns | None = None) -> None:
@@ -254,7 +246,7 @@ class ScanToScan:
     def _solve(
         self, features: Features, previous: Features, twist: FloatArray, gap: float
     ) -> FloatArray:
-        """The twist that lays the sharp and flat points on the sweep before."""
+        """The twist that aligns the sharp and flat points with the last sweep."""
         limit, rings = self.config.max_distance, self.config.ring_gap
         first, end = features.span
         edges = _RingSearch(
@@ -294,9 +286,9 @@ class ScanToScan:
 
 
 class _RingSearch:
-    """Nearest neighbours among the points of a sweep, in any ring or in given rings.
+    """Lines and planes through the points of a sweep that are nearest to a query.
 
-    The second tree is four-dimensional: rings lie so far apart along the fourth axis that the
+    The second tree is four-dimensional: rings are so far apart along the fourth axis that the
     nearest neighbour of (x, y, z, ring) is the nearest point of exactly that ring.
     """
 
@@ -308,69 +300,55 @@ class _RingSearch:
     def lines(
         self, queries: FloatArray, limit: float, gap: int
     ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Which queries have a line; a point on it and its unit direction."""
-        index, first = self._nearest(queries, limit)
-        second = self._in_other_rings(queries[index], self.rings[first], limit, gap)
-        found = second >= 0
-        centres = self.points[first[found]]
-        directions, proper = _normalised(self.points[second[found]] - centres)
-        return index[found][proper], centres[proper], directions[proper]
+        """Rows of the queries that have a line; a point of the line and its unit direction."""
+        index, first, other = self._pairs(queries, limit, gap)
+        centres = self.points[first]
+        directions, proper = _normalised(self.points[other] - centres)
+        return index[proper], centres[proper], directions[proper]
 
     def planes(
         self, queries: FloatArray, limit: float, gap: int
     ) -> tuple[IntArray, FloatArray, FloatArray]:
-        """Which queries have a plane ``n . q + d = 0``; its unit normal and offset."""
-        index, first = self._nearest(queries, limit)
-        ring = self.rings[first]
-        other = self._in_other_rings(queries[index], ring, limit, gap)
-        pairs = self._in_ring(queries[index], ring, limit, 2)
-        same = np.where(pairs[:, 0] == first, pairs[:, 1], pairs[:, 0])
-        found = (other >= 0) & (same >= 0)
+        """Rows of the queries that have a plane ``n . q + d = 0``; its unit normal and offset."""
+        index, first, other = self._pairs(queries, limit, gap)
+        two = self._in_ring(queries[index], self.rings[first], limit, 2)
+        same = np.where(two[:, 0] == first, two[:, 1], two[:, 0])
+        found = same >= 0
         a, b, c = (self.points[ids[found]] for ids in (first, same, other))
         normals, proper = _normalised(np.cross(b - a, c - a))
         normals = normals[proper]
         return index[found][proper], normals, -np.einsum("ij,ij->i", normals, a[proper])
 
-    def _nearest(self, queries: FloatArray, limit: float) -> tuple[IntArray, IntArray]:
-        """Indices of the queries with a neighbour, and of that neighbour."""
-        if not len(self.points) or not len(queries):
-            return np.zeros(0, np.int64), np.zeros(0, np.int64)
-        _, nearest = self._tree.query(queries, distance_upper_bound=limit)
-        index = np.flatnonzero(nearest < len(self.points))
-        return index, nearest[index]
+    def _pairs(
+        self, queries: FloatArray, limit: float, gap: int
+    ) -> tuple[IntArray, IntArray, IntArray]:
+        """Rows of queries, their nearest points, and the nearest of at most ``gap`` rings away."""
+        _, first = self._tree.query(queries, distance_upper_bound=limit)
+        index = np.flatnonzero(first < len(self.points))
+        first, queries = first[index], queries[index]
+        steps = [step for step in range(-gap, gap + 1) if step]
+        rings = self.rings[first]
+        candidates = np.hstack([self._in_ring(queries, rings + step, limit, 1) for step in steps])
+        away = self.points[candidates] - queries[:, None, :]
+        squared = np.where(candidates < 0, np.inf, np.einsum("nki,nki->nk", away, away))
+        other = candidates[np.arange(len(queries)), squared.argmin(axis=1)]
+        found = other >= 0
+        return index[found], first[found], other[found]
 
     def _in_ring(self, queries: FloatArray, rings: IntArray, limit: float, k: int) -> IntArray:
         """(N, k) nearest points of the given rings, -1 where missing."""
-        if not len(self.points) or not len(queries):
-            return np.full((len(queries), k), -1)
         query = np.column_stack([queries, rings * _RING_SPACING])
         _, nearest = self._ring_tree.query(query, k=range(1, k + 1), distance_upper_bound=limit)
         return np.where(nearest < len(self.points), nearest, -1)
 
-    def _in_other_rings(
-        self, queries: FloatArray, rings: IntArray, limit: float, gap: int
-    ) -> IntArray:
-        """(N,) nearest point of a ring up to ``gap`` away from the given one, -1 if none."""
-        steps = [step for step in range(-gap, gap + 1) if step]
-        candidates = np.column_stack(
-            [self._in_ring(queries, rings + step, limit, 1) for step in steps]
-        )
-        missing = candidates < 0
-        if not len(self.points):
-            return candidates[:, 0]
-        away = self.points[candidates] - queries[:, None, :]
-        squared = np.where(missing, np.inf, np.einsum("nki,nki->nk", away, away))
-        nearest: IntArray = candidates[np.arange(len(queries)), squared.argmin(axis=1)]
-        return nearest
-
 
 def _normalised(vectors: FloatArray) -> tuple[FloatArray, BoolArray]:
-    """Unit vectors, and which were long enough to have a direction."""
+    """Unit vectors, and a mask of the vectors that are long enough to have a direction."""
     length = np.linalg.norm(vectors, axis=1)
     proper = length > 1e-6
     return vectors / np.where(proper, length, 1.0)[:, None], proper
 
 
 def make_odometry(config: OdometryConfig, imu: Turns | None = None) -> Odometry | None:
-    """Make the odometry that the configuration names; None: the mapper predicts by itself."""
+    """Make the odometry that the configuration names; None if the mapper predicts by itself."""
     return ScanToScan(config, imu) if config.method == "scan_to_scan" else None

@@ -1,8 +1,8 @@
-"""Whether a sweep still fits the map, and if not, where it would.
+"""Relocalisation: detection of sweeps that do not fit the map, and the search for their pose.
 
-A solve always gives some pose. That it is the wrong one shows in its matches: planes and lines of
-the map that lie near, but not where the sweep has its own. What is usual differs from place to
-place (grass, people, a bare hall), so each sweep is held against the ones before it.
+A solve always returns some pose. A wrong pose shows in its matches, which disagree with the lines
+and planes of the map. The usual share of agreement differs from place to place (grass, people, a
+bare hall), so that each sweep is compared with the sweeps before it.
 """
 
 from __future__ import annotations
@@ -27,34 +27,34 @@ from loam_gtsam.types import FloatArray, IntArray
 _AGREE = 3.0
 """Standard deviations within which a match agrees with the pose: 99.7 % of normal noise."""
 _CELL = 0.5
-"""Metres; half the distance of a match, so that the neighbouring cells are those in its reach."""
+"""Size of a search cell, metres: half the reach of a match, which is then the neighbouring cell."""
 _SPACING = 2
-"""Cells from one trial position to the next: 1 m, out of which a solve finds its way."""
+"""Cells between trial positions: 1 m, from which a solve converges."""
 _TURN = np.radians(5.0)
-"""From one trial heading to the next: half of it moves what is 15 m away by little over a cell."""
+"""Angle between trial headings: half of it moves a point at 15 m by little more than a cell."""
 _REACH = 40.0
-"""Metres; what is farther away is not looked at."""
+"""Largest horizontal distance of a point that is scored, metres."""
 _HEIGHT = 10.0
-"""Metres above and below the lidar likewise."""
-_SOME = (60, 140)
-"""Edge and plane features that are looked at."""
+"""Largest height above or below the lidar of a point that is scored, metres."""
+_SAMPLE = (60, 140)
+"""Number of edge and plane features that are scored."""
 _START_ROUNDS = 2
-"""Times the first two sweeps are registered anew while their motion becomes known."""
+"""Number of times the first two sweeps are registered anew while their motion becomes known."""
 _PLACES = 6
-"""Places tried at most when a sweep does not fit where it was solved."""
+"""Largest number of places that are tried for a sweep that does not fit the map."""
 _CLEARLY = 1.02
-"""Ratio by which another motion within a sweep must fit better than the one before."""
+"""Ratio by which another motion within a sweep must fit better than the motion before."""
 _APART = (1.5, np.radians(12.0))
-"""Metres and rad; nearer trials lead to the same solution."""
+"""Metres and rad below which two trial poses lead to the same solution."""
 
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """How well a sweep fits the map at a pose.
+    """A measure of how well a sweep fits the map at a pose.
 
     Attributes
     ----------
-    share : of the features that were matched
+    share : matched share of the features
     agreement : share of the matches within three of their standard deviations
     """
 
@@ -63,7 +63,7 @@ class Fit:
 
     @classmethod
     def of(cls, matches: ScanMatches, offered: int) -> Fit:
-        """The fit of the last association of a solve, which had so many features to match."""
+        """The fit of matches, from the number of features that were offered for matching."""
         if not len(matches):
             return cls(0.0, 0.0)
         e, p = matches.edges, matches.planes
@@ -73,7 +73,7 @@ class Fit:
 
     @property
     def total(self) -> float:
-        """Share of the features that were matched and agree."""
+        """Share of the features whose matches agree."""
         return self.share * self.agreement
 
 
@@ -94,25 +94,25 @@ class FitMonitor:
 
     @property
     def ready(self) -> bool:
-        """Whether enough is known of what is usual; a run must begin with that many good sweeps."""
+        """Whether ``memory`` sweeps are accepted; before that, no sweep counts as a misfit."""
         return len(self._past) == self.config.memory
 
     @property
     def usual(self) -> Fit:
-        """Medians over the last sweeps that went into the map."""
+        """Medians over the last accepted sweeps."""
         past = np.array([(fit.share, fit.agreement) for fit in self._past])
         share, agreement = np.median(past, axis=0).tolist() if len(past) else (0.0, 0.0)
         return Fit(share, agreement)
 
     def accept(self, fit: Fit, map_T_lidar: gtsam.Pose3) -> None:
-        """A sweep went into the map."""
+        """Add the fit of a sweep that went into the map."""
         self.lost, self.last = 0, map_T_lidar
         self._past.append(fit)
 
     def misfit(self, fit: Fit) -> bool:
-        """Whether a sweep contradicts the map, or hardly anything of it is matched any more.
+        """Whether a sweep contradicts the map, or hardly any of its features has a match.
 
-        A share that sinks by less says nothing: it may be new ground.
+        A moderately low share is no misfit, because the ground may be new.
         """
         usual, config = self.usual, self.config
         return self.ready and (
@@ -121,7 +121,7 @@ class FitMonitor:
         )
 
     def fits_again(self, fit: Fit) -> bool:
-        """Whether a pose that was searched for is to be believed: a stricter test."""
+        """Whether a pose found by a search is accepted, by a stricter test than :meth:`misfit`."""
         usual, config = self.usual, self.config
         return (
             fit.agreement >= config.found_agreement * usual.agreement
@@ -129,12 +129,12 @@ class FitMonitor:
         )
 
     def jumped(self, step: FloatArray, seconds: float) -> bool:
-        """Whether no acceleration of a vehicle or a hand explains the way from the prediction.
+        """Whether a pose is farther from its prediction than any acceleration explains.
 
         Parameters
         ----------
-        step : (6,) from the predicted pose to the solved one, rad and m
-        seconds : since the last sweep
+        step : (6,) tangent from the predicted pose to the solved pose, rad and m
+        seconds : time since the last sweep
         """
         reach = 0.5 * seconds**2
         config = self.config
@@ -145,12 +145,12 @@ class FitMonitor:
 
     @property
     def radius(self) -> float:
-        """Metres around the prediction in which to search, more with every sweep."""
+        """Search radius around the prediction, metres; grows with every lost sweep."""
         config = self.config
         return min(config.radius + config.radius_growth * self.lost, config.max_radius)
 
     def around(self, predicted: gtsam.Pose3) -> list[gtsam.Pose3]:
-        """Where to search: around the prediction, and where the last sweep was that did fit."""
+        """Centres of the search: the prediction, and the pose of the last sweep that fitted."""
         if self.last is None or predicted.range(self.last) < self.radius:
             return [predicted]
         return [predicted, self.last]
@@ -158,13 +158,13 @@ class FitMonitor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """The outcome of a search: where the sweep is.
+    """The outcome of a search that found the pose of the sweep.
 
     Attributes
     ----------
-    solution : pose at the middle of the sweep
-    twist : (6,) body velocity of the de-skew
-    message : a sentence for people if the sweep was moved, else empty
+    solution : solution at the middle of the sweep
+    twist : (6,) body velocity with which the sweep was de-skewed
+    message : sentence for the user if the search moved the sweep, else empty
     """
 
     solution: Solution
@@ -174,17 +174,17 @@ class Found:
 
 @dataclass(frozen=True, slots=True)
 class Lost:
-    """The outcome of a search that found nothing, and the sentence that says so."""
+    """The outcome of a search that found nothing, with a sentence for the user."""
 
     message: str
 
 
 def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
-    """Whether a sweep is to be searched for, instead of believing its solve.
+    """Whether the solution of a sweep is doubtful, so that the sweep must be searched for.
 
     Parameters
     ----------
-    last_twist : (6,) body velocity of the last sweep; the prediction may be a user's
+    last_twist : (6,) body velocity of the last sweep; the predicted pose may be a user's guess
     """
     moment = frame.matcher.last
     if not monitor.config.enabled or moment is None:
@@ -195,7 +195,7 @@ def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: 
     expected = advance(moment.map_T_lidar, last_twist, seconds)
     if monitor.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
         return True
-    # Matches of a wide search are unlike the usual ones.
+    # The fit of a wide search cannot be compared with the usual fit.
     fit = Fit.of(solution.matches, frame.matcher.offered)
     return not solution.matches.wide and monitor.misfit(fit)
 
@@ -203,18 +203,18 @@ def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: 
 def rebuild_start(
     first: Prediction, frame: Frame, found: Found, solver: ScanSolver
 ) -> tuple[Frame, Found]:
-    """Rebuild the map of the first sweep, now that its motion is known from the second.
+    """Rebuild the map of the first sweep with the motion that is known from the second sweep.
 
-    Without this a run that starts in motion keeps a distorted first sweep in its map for ever.
+    Otherwise the map of a run that starts in motion would always hold a distorted first sweep.
 
     Parameters
     ----------
-    first : the first sweep, and where it is
+    first : the first sweep and its pose
     frame, found : the second sweep, and the outcome of its solve
 
     Returns
     -------
-    Frame and outcome of the second sweep, as seen from the rebuilt map.
+    Frame and outcome of the second sweep in the rebuilt map.
     """
     pose, maps = first.map_T_lidar, frame.matcher.maps
     for _ in range(_START_ROUNDS):
@@ -236,15 +236,16 @@ def rebuild_start(
 def search(
     frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
 ) -> Found | Lost:
-    """Search for a sweep that does not fit where it was solved.
+    """Search for the pose of a sweep whose solution is doubtful.
 
-    A lidar that was moved between two sweeps did not move like that within them: its velocity is
-    that from before, or none, or, if it was turned on its vehicle, that of the vehicle.
+    The motion of a lidar that was carried away between two sweeps says nothing about the motion
+    within the sweeps. Three velocities are tried: the predicted one, rest, and the predicted one in
+    axes that were turned on the vehicle.
 
     Parameters
     ----------
-    solution : of the solve that is in doubt
-    monitor : what is usual, and how many sweeps are lost already
+    solution : the doubtful solution
+    monitor : the usual fit and the number of lost sweeps
     """
     matcher, guess = frame.matcher, frame.matcher.posed.twist
     usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
@@ -285,7 +286,7 @@ def search(
 def _place(
     frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
 ) -> gtsam.Pose3 | None:
-    """Where around the prediction a few matches fit best; None if nowhere."""
+    """The pose around the prediction at which a few matches fit best; None if there is none."""
     matcher = frame.matcher
     around = monitor.around(frame.predicted.map_T_middle)
     known = [
@@ -308,15 +309,15 @@ def _place(
 
 
 def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
-    """A (6,) body velocity in the axes of ``a``, if it is given in those of ``b``."""
+    """A (6,) body velocity in the axes of ``a``, from the axes of ``b``."""
     return (a_R_b.matrix() @ twist.reshape(2, 3).T).T.reshape(6)
 
 
 def sample_features(edges: FloatArray, planes: FloatArray) -> FloatArray:
-    """(N, 3) a few of the features of a sweep, evenly spread; metres."""
+    """(N, 3) a few evenly spread features of a sweep, metres."""
     parts = [
         points[spread_rows(len(points), most)]
-        for points, most in ((edges, _SOME[0]), (planes, _SOME[1]))
+        for points, most in zip((edges, planes), _SAMPLE, strict=True)
     ]
     return np.concatenate(parts)
 
@@ -330,29 +331,26 @@ def likely_poses(
 ) -> list[gtsam.Pose3]:
     """Poses from which a sweep may have been taken, the likeliest first.
 
-    Trial poses lie on a grid of 1 m and 5 degrees, all round, at the height and the tilt of the
-    poses they are around. Their score is the number of points that fall into cells with map points
-    in them, those in a cell beside such a cell counting half (the likelihood field of Thrun,
-    Burgard and Fox, Probabilistic Robotics, section 6.4, in its simplest form).
+    Trial poses lie on a grid of 1 m and 5 degrees around each centre, with the height and the tilt
+    of the centre. The score of a trial pose is the number of points in cells that hold map points;
+    a point in a cell beside such a cell counts half (the likelihood field of Thrun, Burgard and
+    Fox, Probabilistic Robotics, section 6.4, in its simplest form).
 
     Parameters
     ----------
-    points : (N, 3) of the sweep, metres, lidar frame; a few hundred
+    points : (N, 3) a few hundred points of the sweep, metres, lidar frame
     map_points : (M, 3) metres, map frame
-    around : ``map_T_lidar`` to search around
-    radius : metres around each
-    count : of poses to return at most
+    around : centres of the search, ``map_T_lidar``
+    radius : metres around each centre
+    count : largest number of poses
 
     Returns
     -------
     Poses more than 1.5 m or 12 degrees apart from each other.
     """
-    tried: list[tuple[FloatArray, FloatArray, gtsam.Pose3]] = []
-    for pose in around:
-        tried.append((*_scores(points, map_points, pose, radius), pose))
-    scores = np.concatenate([scored for scored, _, _ in tried])
-    moves = np.concatenate([moved for _, moved, _ in tried])
-    owner = np.repeat(np.arange(len(tried)), [len(scored) for scored, _, _ in tried])
+    tried = [_scores(points, map_points, pose, radius) for pose in around]
+    scores, moves = (np.concatenate(parts) for parts in zip(*tried, strict=True))
+    owner = np.repeat(np.arange(len(tried)), [len(scored) for scored, _ in tried])
     best: list[gtsam.Pose3] = []
     origins = np.array([pose.translation() for pose in around])
     at = moves[:, :2] + origins[owner, :2]
@@ -371,7 +369,7 @@ def likely_poses(
 def _scores(
     points: FloatArray, map_points: FloatArray, map_T_lidar: gtsam.Pose3, radius: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Scores (T,) of trials and (T, 3) how far they are away along x and y, m, and turned, rad."""
+    """Scores (T,) of trial poses, and their offsets (T, 3): x and y in metres, yaw in rad."""
     steps = int(radius / (_SPACING * _CELL))
     size = 2 * (int(np.ceil((_REACH + radius) / _CELL)) + 2)
     shape = (size, size, 2 * (int(_HEIGHT / _CELL) + 1))
@@ -401,6 +399,6 @@ def _scores(
 
 
 def _cells(points: FloatArray, shape: tuple[int, int, int]) -> IntArray:
-    """Cells of points counted from the middle of the field."""
+    """Cells of points, counted from the middle of the field."""
     cells: IntArray = np.floor(points / _CELL).astype(np.int64) + np.array(shape) // 2
     return cells

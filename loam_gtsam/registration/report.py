@@ -1,4 +1,4 @@
-"""The mapper's report on a frame: its update, messages, seconds per stage."""
+"""The update of a frame: its values, its messages, and the seconds per stage."""
 
 from __future__ import annotations
 
@@ -10,13 +10,7 @@ import numpy as np
 
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.solvers import Solution
-from loam_gtsam.types import (
-    Features,
-    FrameStatus,
-    MapUpdate,
-    SweepFault,
-    TiltPrior,
-)
+from loam_gtsam.types import Features, FrameStatus, MapUpdate, SweepFault, TiltPrior
 
 
 def make_update(
@@ -27,13 +21,13 @@ def make_update(
     solution: Solution | None = None,
     tilt: TiltPrior = TiltPrior.NONE,
 ) -> MapUpdate:
-    """The update of a frame, but for its covariance and its timings.
+    """The update of a frame, without covariance and timings.
 
     Parameters
     ----------
-    posed : sweep with the motion of the result
+    posed : the sweep, de-skewed with the final motion
     map_T_lidar : pose at the reference time
-    solution : at the middle of the sweep; None if there was no solve
+    solution : solution at the middle of the sweep; None if there was no solve
     """
     sweep = posed.sweep
     update = MapUpdate(
@@ -52,8 +46,7 @@ def make_update(
     )
     if solution is None:
         return update
-    # The solve is about the middle of the sweep; a right perturbation there is, at the reference
-    # time, the same one seen through the motion between the two.
+    # The solution belongs to the middle of the sweep, the update to the reference time.
     to_middle = posed.middle_T_reference.AdjointMap()
     update = replace(
         update,
@@ -79,7 +72,7 @@ def make_update(
 
 
 def problem_of(features: Features) -> tuple[str, SweepFault] | None:
-    """Why features cannot be used, as a sentence and typed; None if they can."""
+    """The reason why features cannot be used, as a sentence and as a fault; None if usable."""
     points = features.edges, features.planes, features.edge_times, features.plane_times
     if not all(np.isfinite(part).all() for part in points):
         return "features of the sweep are NaN or infinite", SweepFault.NOT_FINITE
@@ -89,7 +82,7 @@ def problem_of(features: Features) -> tuple[str, SweepFault] | None:
 
 
 def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
-    """Status and message of a solved frame; ``message`` is what is to be said besides."""
+    """Status and message of a solved frame; the message begins with ``message``."""
     status, problem = FrameStatus.OK, ""
     if not solution.converged:
         status = FrameStatus.NOT_CONVERGED
@@ -102,31 +95,31 @@ def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
 
 
 def weak_directions_in_words(solution: Solution) -> str:
-    """The weak directions of a solution in words: metres and rad in lidar axes."""
+    """The degenerate directions of a solution in words: metres and rad in lidar axes."""
     assert solution.localizability is not None
     names = []
     for direction in solution.localizability.directions[: solution.n_weak]:
-        unit = direction / direction[np.abs(direction).argmax()]  # its sign means nothing
+        unit = direction / direction[np.abs(direction).argmax()]  # the sign is arbitrary
         parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
         names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
     return " or ".join(names)
 
 
 def distance_in_words(first: gtsam.Pose3, second: gtsam.Pose3) -> str:
-    """The distance from one pose to another in words: metres and degrees."""
+    """The distance between two poses in words: metres and degrees."""
     turn = gtsam.Rot3.Logmap(first.rotation().between(second.rotation()))
     return f"{first.range(second):.2f} m and {np.degrees(np.linalg.norm(turn)):.1f} degrees"
 
 
 class Clock:
-    """Adds up seconds per stage."""
+    """A stopwatch that adds up the seconds of each stage."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._since = time.perf_counter()
 
     def lap(self, stage: str) -> None:
-        """Book the time since the last lap on a stage."""
+        """Add the time since the last lap to a stage."""
         now = time.perf_counter()
         self.seconds[stage] = self.seconds.get(stage, 0.0) + now - self._since
         self._since = now

@@ -1,4 +1,4 @@
-"""Check of the stamps of sweeps: they must come from one clock that goes forward."""
+"""Check that the stamps of sweeps come from one clock that goes forward."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass
 from loam_gtsam.types import SweepFault
 
 LARGEST_STEP = 10.0
-"""Seconds from one sweep to the next above which the stamp is doubted: in 10 s an acceleration of
-1 m/s^2 leads 50 m off the prediction. A slower sensor may take ten times its own interval."""
+"""Seconds between two sweeps above which a stamp is doubted: in 10 s an acceleration of 1 m/s^2
+leads 50 m away from the prediction. For a slow sensor the limit is ten of its own intervals."""
 IN_A_ROW = 5
-"""Doubted sweeps in a row whose stamps must agree for the clock to count as set."""
+"""Number of consecutive doubted sweeps with consistent stamps that shows that the clock was set."""
 _STEPS = 10
-"""Intervals of the sensor that a step may take where they are longer than ``LARGEST_STEP``."""
+"""Intervals of the sensor between two sweeps above which a stamp is doubted."""
 
 
 @dataclass(frozen=True, slots=True)
 class Refusal:
-    """Why a sweep is not used, because of its stamp.
+    """The reason why a sweep is not used because of its stamp.
 
     Attributes
     ----------
-    fault, message : the reason, typed and as a sentence
+    fault, message : the reason as a value and as a sentence
     clock_step : nanoseconds by which the clock was set ahead, if this sweep shows it, else 0. The
-        next sweep is checked against the new clock.
+        next sweep must be checked against the new clock.
     """
 
     fault: SweepFault
@@ -32,13 +32,13 @@ class Refusal:
 
 
 class StampCheck:
-    """Compares each stamp with the last one that was used.
+    """Comparison of each stamp with the stamp of the last sweep that was used.
 
-    A stamp must be later than the last one, by at most :data:`LARGEST_STEP`; other sweeps are not
-    used. So one wrong stamp costs one sweep. :data:`IN_A_ROW` such sweeps whose stamps agree show
-    that the clock was set, as when a computer gets the time after it has booted. If the clock was
-    set ahead, the run goes on as if no time had passed. If it was set back, the run cannot go on,
-    since the stamps of trajectories and graphs ascend, and the refusal says so.
+    A stamp must be later than the last one, by at most :data:`LARGEST_STEP`; otherwise the sweep is
+    not used, so that one wrong stamp costs one sweep. :data:`IN_A_ROW` such sweeps with consistent
+    stamps show that the clock was set, for instance after the computer booted. If the clock was set
+    ahead, the run continues as if no time had passed. If the clock was set back, the run cannot
+    continue, because the stamps of trajectories and graphs ascend; the refusal then says so.
     """
 
     def __init__(self) -> None:
@@ -46,11 +46,11 @@ class StampCheck:
         self._doubted: tuple[int, int, int] | None = None  # first and newest stamp, and count
 
     def refuse(self, stamp: int, last: int) -> Refusal | None:
-        """Why a sweep cannot be used; None if it can be, and then the sweep counts as used.
+        """The reason why a sweep cannot be used; None for a sweep that counts as used from now on.
 
         Parameters
         ----------
-        stamp, last : nanoseconds, of this sweep and of the last one used
+        stamp, last : nanoseconds, of this sweep and of the last sweep that was used
         """
         step = stamp - last
         largest = max(round(LARGEST_STEP * 1e9), _STEPS * self._step)
@@ -75,7 +75,7 @@ class StampCheck:
         if agree < IN_A_ROW:
             message = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
             return Refusal(SweepFault.STAMP_AHEAD, message)
-        # As if the first of the doubted sweeps had come one interval after the last one used.
+        # The first doubted sweep is taken to be one interval later than the last used sweep.
         ahead = first - self._step - last
         self._doubted = None
         return Refusal(
@@ -86,7 +86,7 @@ class StampCheck:
         )
 
     def _agreeing(self, stamp: int, largest: int) -> tuple[int, int]:
-        """First stamp and number of the doubted sweeps in a row that agree, this one included."""
+        """First stamp and number of the consistent doubted sweeps, this sweep included."""
         first, newest, count = self._doubted or (stamp, stamp, 1)
         if 0 < stamp - newest <= largest:
             count += 1

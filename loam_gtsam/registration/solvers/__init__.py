@@ -1,6 +1,6 @@
-"""Per-frame solvers: from a guess and a way to associate, to a pose.
+"""Solvers of one frame: each turns a guess and an association into a pose.
 
-A solver is anything with :meth:`ScanSolver.solve`; the mapper does not know which one it has.
+A solver is any object with the method :meth:`ScanSolver.solve`.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ from loam_gtsam.registration.solvers.base import POSE_KEY as POSE_KEY
 from loam_gtsam.registration.solvers.base import Associate as Associate
 from loam_gtsam.registration.solvers.base import Matcher as Matcher
 from loam_gtsam.registration.solvers.base import MotionPrior as MotionPrior
-from loam_gtsam.registration.solvers.base import Optimum as Optimum
 from loam_gtsam.registration.solvers.base import ScanSolver as ScanSolver
 from loam_gtsam.registration.solvers.base import Solution as Solution
 from loam_gtsam.registration.solvers.base import rematch as rematch
@@ -23,9 +22,6 @@ from loam_gtsam.registration.solvers.gtsam_solver import match_rows as match_row
 
 def make_solver(config: SolverConfig) -> ScanSolver:
     """Make the solver that ``config.method`` names."""
-    solvers: dict[str, type[GtsamSolver | ClassicalSolver | ALoamSolver]] = {
-        "gtsam": GtsamSolver,
-        "loam": ClassicalSolver,
-        "aloam": ALoamSolver,
-    }
-    return solvers[config.method](config)
+    if config.method == "gtsam":
+        return GtsamSolver(config)
+    return ClassicalSolver(config) if config.method == "loam" else ALoamSolver(config)

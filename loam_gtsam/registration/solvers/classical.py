@@ -1,20 +1,19 @@
 """The classical solvers: LOAM's hand solve and A-LOAM's robust least squares, in numpy.
 
-They take and return what :class:`~loam_gtsam.registration.solvers.GtsamSolver` does, so that the
-same matches can be given to all three. Two differences of meaning:
+Both have the interface of :class:`~loam_gtsam.registration.solvers.GtsamSolver`, so that the same
+matches can be given to all three. Two results differ in meaning:
 
-* Rows count as measured to 1 m: the matches' standard deviations are not used, as in the
-  originals, and ``Solution.information`` is that of these rows. Divided by the variance of a
-  residual in m^2 it compares with that of ``GtsamSolver``.
-* There is no place for priors; giving one is an error. A motion prior is not used:
-  :class:`ClassicalSolver` has LOAM's own projector.
-
-Both re-associate in the outer loop. ``R p + t = q`` with the pose ``map_T_lidar = (R, t)``.
+* As in the originals, rows have a standard deviation of 1 m. ``Solution.information`` is the
+  information of these rows; divide it by the variance of a residual, m^2, to compare it with the
+  information of ``GtsamSolver``.
+* Priors are refused with an error. The motion prior is not used: :class:`ClassicalSolver` has
+  LOAM's own projector.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
@@ -27,14 +26,13 @@ from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers.base import (
     Associate,
     MotionPrior,
-    Optimum,
     Solution,
     rematch,
 )
 from loam_gtsam.types import FloatArray, InputError
 
-# LOAM's (rx, ry, rz) are (pitch, yaw, roll) and its (x, y, z) are (left, up, forward): both are the
-# lidar's (x, y, z) components in this order.
+# LOAM's (rx, ry, rz) are (pitch, yaw, roll), and LOAM's (x, y, z) are (left, up, forward): the
+# lidar's components in this order.
 _LOAM_ORDER = [1, 2, 0]
 
 # Levenberg-Marquardt as in Ceres with default options, which A-LOAM uses
@@ -43,25 +41,13 @@ _START_RADIUS = 1e4
 _MAX_RADIUS = 1e16
 _DIAGONAL = (1e-6, 1e32)
 _MIN_DECREASE = 1e-3
-"""A step is taken if the cost falls by more than this share of what the linear model says."""
+"""A step is taken if the cost falls by more than this share of the predicted fall."""
 
 
-class ClassicalSolver:
-    """LOAM's hand solve: one Gauss-Newton step on Euler angles per association.
+class _SolverWithoutPriors(ABC):
+    """The interface of both classical solvers: an error for priors, then the rematch loop."""
 
-    The unknowns are LOAM's (rx, ry, rz, x, y, z) with ``R = Ry(ry) Rx(rx) Rz(rz)`` in its
-    camera-like axes (x left, y up, z forward), singular at a pitch of 90 degrees. Every match is
-    one row, multiplied by its weight s; ``A^T A x = A^T b`` is solved by QR. Directions whose
-    eigenvalue of ``A^T A`` at the first association is below ``config.degeneracy_threshold`` are
-    projected out of every step (Zhang, Kaess and Singh, On Degeneracy of Optimization-based State
-    Estimation Problems, ICRA 2016).
-
-    Notes
-    -----
-    Where the published code gets fewer than ``config.min_matches`` matches it makes no step and
-    adds the sweep to the map anyway; here the guess comes back as not solved, as from the other
-    solvers. On a line itself, where the published code divides by zero, a match adds nothing.
-    """
+    _stop = True
 
     def __init__(self, config: SolverConfig) -> None:
         self.config = config
@@ -80,36 +66,58 @@ class ClassicalSolver:
         InputError
             If priors are given.
         """
-        projector: FloatArray | None = None
+        if len(priors):
+            raise InputError(
+                f"priors: the {self.config.method} solver has no place for them, got "
+                f"{len(priors)}; use solver.method: gtsam"
+            )
+        return rematch(associate, guess, self.config, self._optimiser(), stop=self._stop)
 
-        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Optimum:
+    @abstractmethod
+    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
+        """The optimisation of one frame on fixed matches."""
+
+
+class ClassicalSolver(_SolverWithoutPriors):
+    """LOAM's hand solve: one Gauss-Newton step on Euler angles per association.
+
+    The unknowns are LOAM's (rx, ry, rz, x, y, z) with ``R = Ry(ry) Rx(rx) Rz(rz)`` in camera-like
+    axes (x left, y up, z forward), which is singular at a pitch of 90 degrees. Every match is one
+    row, multiplied by its weight s; ``A^T A x = A^T b`` is solved by QR. Directions with an
+    eigenvalue of ``A^T A`` below ``config.degeneracy_threshold`` at the first association are
+    projected out of every step (Zhang, Kaess and Singh, On Degeneracy of Optimization-based State
+    Estimation Problems, ICRA 2016).
+
+    Notes
+    -----
+    With fewer than ``config.min_matches`` matches the published code makes no step and adds the
+    sweep to the map; here the guess is returned as not solved, as by the other solvers. For a point
+    exactly on its line the published code divides by zero; here such a match adds nothing.
+    """
+
+    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
+        projector: FloatArray | None = None
+        threshold = self.config.degeneracy_threshold
+        published = self.config.degeneracy_projector == "published"
+
+        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Solution:
             nonlocal projector
             residual, jacobian = loam_rows(matches, pose).residuals(pose)
             a = jacobian @ euler_jacobian(pose)
             normal = a.T @ a
             if projector is None:
-                projector = degeneracy_projector(
-                    normal,
-                    self.config.degeneracy_threshold,
-                    published=self.config.degeneracy_projector == "published",
-                )
+                projector = degeneracy_projector(normal, threshold, published=published)
             step = projector @ _solve_by_qr(normal, -a.T @ residual)
             moved = _add_euler(pose, step)
             after, jacobian = loam_rows(matches, moved).residuals(moved)
-            return Optimum(
-                moved,
-                _is_small(step, self.config),
-                1,
-                0.5 * float(residual @ residual),
-                0.5 * float(after @ after),
-                jacobian.T @ jacobian,
-            )
+            costs = 0.5 * float(residual @ residual), 0.5 * float(after @ after)
+            small = _is_small(step, self.config)
+            return Solution(moved, True, small, matches, 1, 1, *costs, jacobian.T @ jacobian)
 
-        _refuse_priors(priors, self.config)
-        return rematch(associate, guess, self.config, optimise)
+        return optimise
 
 
-class ALoamSolver:
+class ALoamSolver(_SolverWithoutPriors):
     """A-LOAM's solve: per association, a robust least squares over rotation and translation.
 
     Levenberg-Marquardt with Ceres' damping, at most ``config.inner_iterations`` steps, on the
@@ -120,31 +128,16 @@ class ALoamSolver:
     Notes
     -----
     A-LOAM's edge residual is the cross product ``(q - a) x (q - b) / |a - b|`` with a, b on the
-    line: the offset from the line turned by 90 degrees about it, so the two rows of
+    line: the offset from the line turned by 90 degrees about the line. The two rows of
     :func:`loam_gtsam.factors.line_rows` give the same norms and the same normal equations.
     """
 
-    def __init__(self, config: SolverConfig) -> None:
-        self.config = config
+    _stop = False
 
-    def solve(
-        self,
-        associate: Associate,
-        guess: gtsam.Pose3,
-        priors: Sequence[gtsam.NonlinearFactor] = (),
-        motion: MotionPrior | None = None,
-    ) -> Solution:
-        """See :meth:`loam_gtsam.registration.solvers.ScanSolver.solve`.
+    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
+        return self._optimise
 
-        Raises
-        ------
-        InputError
-            If priors are given.
-        """
-        _refuse_priors(priors, self.config)
-        return rematch(associate, guess, self.config, self._optimise, stop=False)
-
-    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3) -> Optimum:
+    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3) -> Solution:
         rows, pairs, delta = aloam_rows(matches), len(matches.edges), self.config.huber_delta
         first, steps = pose, 0
         radius, shrink = _START_RADIUS, 2.0
@@ -160,7 +153,7 @@ class ALoamSolver:
             new_cost, new_normal, new_gradient = _robust(rows, pairs, delta, moved)
             change = cost - new_cost
             if abs(change) <= self.config.cost_tolerance * cost:
-                settled = True  # and, as in Ceres, this last small step is not taken
+                settled = True  # as in Ceres, the last small step is not taken
             elif expected > 0.0 and change > _MIN_DECREASE * expected:
                 quality = 2.0 * change / expected - 1.0
                 radius = min(radius / max(1.0 / 3.0, 1.0 - quality**3), _MAX_RADIUS)
@@ -171,27 +164,17 @@ class ALoamSolver:
                 shrink *= 2.0
         turn = _turn(pose)
         information = turn.T @ normal @ turn
-        converged = _is_small(first.localCoordinates(pose), self.config)
-        return Optimum(pose, converged, steps, start, cost, information)
+        small = _is_small(first.localCoordinates(pose), self.config)
+        return Solution(pose, True, small, matches, 1, steps, start, cost, information)
 
 
 def loam_rows(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> MatchRows:
-    """LOAM's rows at a pose, one per match: the distance from the line or the plane, times s.
+    """LOAM's rows at a pose, one per match, edges first: the distance in metres, times s.
 
-    The row of an edge is that of the plane through the line which faces the point, so its residual
-    is the distance and its derivative the gradient of the distance. It knows nothing of the
-    curvature of the distance around the line: with edges, LOAM's Gauss-Newton step differs from
-    that of the two-row form, though the cost and its gradient are the same.
-
-    Parameters
-    ----------
-    matches : M in all
-    map_T_lidar : pose at which the edges' rows are taken
-
-    Returns
-    -------
-    MatchRows
-        M rows in metres, edges first.
+    The row of an edge is the row of the plane that holds the line and faces the point: the residual
+    is the distance, the derivative its gradient. Such a row leaves out the curvature of the
+    distance around the line. With edges, LOAM's Gauss-Newton step therefore differs from the step
+    of the two-row form, though cost and gradient are the same.
     """
     e, p = matches.edges, matches.planes
     away = transform(map_T_lidar.matrix(), e.points) - e.centres
@@ -208,7 +191,7 @@ def loam_rows(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> MatchRows:
 
 
 def aloam_rows(matches: ScanMatches) -> MatchRows:
-    """A-LOAM's rows: two per edge, one per plane, in metres, times the match's weight."""
+    """A-LOAM's rows, metres: two per edge, then one per plane, times the weight of the match."""
     e, p = matches.edges, matches.planes
     return concatenate_rows(
         [
@@ -221,8 +204,7 @@ def aloam_rows(matches: ScanMatches) -> MatchRows:
 def euler_jacobian(map_T_lidar: gtsam.Pose3) -> FloatArray:
     """(6, 6) derivative of the package's tangent vector by LOAM's (rx, ry, rz, x, y, z).
 
-    From ``R = Rz(yaw) Ry(pitch) Rx(roll)`` in lidar axes, which is LOAM's
-    ``Ry(ry) Rx(rx) Rz(rz)`` in its own.
+    ``R = Rz(yaw) Ry(pitch) Rx(roll)`` in lidar axes is ``Ry(ry) Rx(rx) Rz(rz)`` in LOAM's axes.
     """
     roll, pitch, _ = map_T_lidar.rotation().rpy()
     sr, cr, sp, cp = np.sin(roll), np.cos(roll), np.sin(pitch), np.cos(pitch)
@@ -236,18 +218,16 @@ def euler_jacobian(map_T_lidar: gtsam.Pose3) -> FloatArray:
 def degeneracy_projector(
     normal: FloatArray, threshold: float, *, published: bool = False
 ) -> FloatArray:
-    """(6, 6) matrix that takes a step out of the directions with eigenvalues below a threshold.
+    """(6, 6) matrix that removes from a step the directions of small eigenvalues.
+
+    Zhang, Kaess and Singh (ICRA 2016), eq. 15: ``V_f^-1 V_u`` with eigenvectors as rows.
 
     Parameters
     ----------
     normal : (6, 6) A^T A
-    threshold : in the units of ``normal``
-    published : as the published Eigen port does it: it keeps eigenvectors in columns but zeroes
-        rows, and so mixes all directions
-
-    Notes
-    -----
-    Zhang, Kaess and Singh (ICRA 2016), eq. 15: ``V_f^-1 V_u`` with eigenvectors as rows.
+    threshold : least eigenvalue of a direction that is kept, in the units of ``normal``
+    published : whether to repeat the error of the published Eigen port, which holds eigenvectors
+        in columns but sets rows to zero, and so mixes all directions
     """
     values, columns = np.linalg.eigh(normal)
     vectors = columns if published else columns.T
@@ -255,23 +235,15 @@ def degeneracy_projector(
     return projector
 
 
-def _refuse_priors(priors: Sequence[gtsam.NonlinearFactor], config: SolverConfig) -> None:
-    if len(priors):
-        raise InputError(
-            f"priors: the {config.method} solver has no place for them, got {len(priors)}; use "
-            "solver.method: gtsam"
-        )
-
-
 def _is_small(step: FloatArray, config: SolverConfig) -> bool:
-    """LOAM's stop rule on (6,) rotation and translation, and nothing else."""
+    """LOAM's stop rule on a (6,) step, rad and m."""
     rotation, translation = np.linalg.norm(step[:3]), np.linalg.norm(step[3:])
     limit = np.radians(config.rotation_tolerance_deg)
     return bool(rotation < limit and translation < config.translation_tolerance)
 
 
 def _solve_by_qr(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve by QR with column pivoting, as Eigen does; a dependent column gets no step."""
+    """The step by QR with column pivoting, as in Eigen; 0 for a dependent column."""
     q, r, order = qr(normal, pivoting=True)
     diagonal = np.abs(r.diagonal())
     rank = int(np.count_nonzero(diagonal > len(r) * np.finfo(np.float64).eps * diagonal[0]))
@@ -281,7 +253,7 @@ def _solve_by_qr(normal: FloatArray, right: FloatArray) -> FloatArray:
 
 
 def _add_euler(map_T_lidar: gtsam.Pose3, step: FloatArray) -> gtsam.Pose3:
-    """Add a step in LOAM's (rx, ry, rz, x, y, z) to the angles and the position."""
+    """The pose after a step in LOAM's (rx, ry, rz, x, y, z)."""
     angles, position = map_T_lidar.rotation().rpy(), np.array(map_T_lidar.translation())
     angles[_LOAM_ORDER] += step[:3]
     position[_LOAM_ORDER] += step[3:]
@@ -289,7 +261,7 @@ def _add_euler(map_T_lidar: gtsam.Pose3, step: FloatArray) -> gtsam.Pose3:
 
 
 def _add_global(map_T_lidar: gtsam.Pose3, step: FloatArray) -> gtsam.Pose3:
-    """Turn about the map's axes and shift along them, as Ceres' quaternion does."""
+    """The pose after a turn about the map's axes and a shift along them, as in Ceres."""
     turned = gtsam.Rot3.Expmap(step[:3]).compose(map_T_lidar.rotation())
     return gtsam.Pose3(turned, map_T_lidar.translation() + step[3:])
 
@@ -306,8 +278,8 @@ def _robust(
 ) -> tuple[float, FloatArray, FloatArray]:
     """Huber cost, J^T W J (6, 6) and J^T W r (6,) for steps along the map's axes.
 
-    The first ``2 * pairs`` rows belong together in twos. W is the derivative of the loss (Triggs et
-    al., Bundle Adjustment, 2000, without the second-order term, as in Ceres for Huber).
+    Each edge has two of the first ``2 * pairs`` rows, and one common weight. W is the derivative of
+    the loss (Triggs et al., Bundle Adjustment, 2000, without the second-order term, as in Ceres).
     """
     residual, jacobian = rows.residuals(map_T_lidar)
     squared = residual * residual

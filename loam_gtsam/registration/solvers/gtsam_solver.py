@@ -1,4 +1,4 @@
-"""The package's own solver: the scan as a factor graph, solved by GTSAM's Levenberg-Marquardt."""
+"""The default solver: a factor graph of one frame, solved by GTSAM's Levenberg-Marquardt."""
 
 from __future__ import annotations
 
@@ -28,18 +28,17 @@ from loam_gtsam.registration.solvers.base import (
     POSE_KEY,
     Associate,
     MotionPrior,
-    Optimum,
     Solution,
     rematch,
 )
 from loam_gtsam.types import BoolArray, FloatArray
 
 _REDESCENDING = 2.816
-"""Width of a Geman-McClure kernel over that of a Huber kernel of the same efficiency on normal
-noise: 3.787 and 1.345 at 95 %."""
+"""Width of a Geman-McClure kernel over the width of a Huber kernel with the same efficiency on
+normal noise: 3.787 and 1.345 at 95 %."""
 
 _TO_SIGMA = 1.4826
-"""Median absolute deviation to standard deviation, for a normal distribution."""
+"""Standard deviation over median absolute deviation of a normal distribution."""
 
 _FUSE = gtsam.LevenbergMarquardtParams()
 _FUSE.setVerbosityLM("SILENT")
@@ -48,14 +47,14 @@ _FUSE.setRelativeErrorTol(1e-14)
 _FUSE.setAbsoluteErrorTol(0.0)
 
 _CERTAIN = 1e10
-"""Information that no factor stands up to: 0.01 mrad and 0.01 mm."""
+"""Information that outweighs every other factor: 0.01 mrad and 0.01 mm."""
 
 
 class GtsamSolver:
-    """Levenberg-Marquardt on a factor graph, re-associated until the pose stays.
+    """Levenberg-Marquardt on a factor graph, which is made anew with every association.
 
-    Each association makes one scan-match factor (weights frozen: iteratively re-weighted least
-    squares); priors are ordinary factors beside it.
+    Each association makes one scan-match factor whose weights are fixed (iteratively re-weighted
+    least squares). Priors are ordinary factors beside that factor.
     """
 
     def __init__(self, config: SolverConfig) -> None:
@@ -78,9 +77,9 @@ class GtsamSolver:
             expected = replace(motion, information=_CERTAIN * np.eye(6))
         sight: _Sight | None = None
 
-        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Optimum:
+        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Solution:
             nonlocal sight
-            if sight is None:  # the first matches tell what the scan sees
+            if sight is None:  # the first matches decide which directions are degenerate
                 sight = _Sight() if motion is None else _sight_of(matches, pose, self.config)
             return self._optimise(matches, pose, sight, expected, priors)
 
@@ -93,8 +92,8 @@ class GtsamSolver:
         sight: _Sight,
         expected: MotionPrior | None,
         priors: Sequence[gtsam.NonlinearFactor],
-    ) -> Optimum:
-        """The optimum of fixed matches, priors, and the expected motion where it is needed."""
+    ) -> Solution:
+        """The optimum of fixed matches, of priors, and of the expected motion where needed."""
         config = self.config
         values = gtsam.Values()
         values.insert(POSE_KEY, pose)
@@ -113,35 +112,21 @@ class GtsamSolver:
         for factor in priors:
             graph.add(factor)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
-        error_before = optimizer.error()
-        result = optimizer.optimize()
-        steps, error_after = optimizer.iterations(), optimizer.error()
-        moved = result.atPose3(POSE_KEY)
-        information = graph.linearize(result).hessian()[0]
-        converged = within_tolerance(pose.localCoordinates(moved), information, config)
-        return Optimum(
-            moved,
-            converged,
-            steps,
-            error_before,
-            error_after,
-            information,
-            sight.scan,
-            sight.weak,
-            unseen,
-            beacons,
-            rows,
-        )
+        before = optimizer.error()
+        moved = optimizer.optimize().atPose3(POSE_KEY)
+        after, steps = optimizer.error(), optimizer.iterations()
+        information = graph.linearize(optimizer.values()).hessian()[0]
+        small = within_tolerance(pose.localCoordinates(moved), information, config)
+        seen = sight.scan, sight.weak, unseen, beacons, rows
+        return Solution(moved, True, small, matches, 1, steps, before, after, information, *seen)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """What the first matches of a frame see.
+    """Localizability by the first matches of a frame: all of them, and the planes alone.
 
-    Attributes
-    ----------
-    scan, planes : localizability by all matches, and by the planes where they alone see too little
-    weak : (6, 6) projector onto the motions that the scan does not see
+    ``weak`` is the projector onto the degenerate directions. ``planes`` is None where the planes
+    fix all that the scan fixes.
     """
 
     scan: Localizability | None = None
@@ -162,7 +147,7 @@ def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> 
 def _scan_factors(
     rows: MatchRows, values: gtsam.Values, unseen: FloatArray | None, beacons: BoolArray
 ) -> Iterator[gtsam.NonlinearFactor]:
-    """The scan; of unseen directions, only what the beacons say about them."""
+    """The factors of a scan; along unseen directions only the beacons count."""
     if unseen is None:
         yield scan_match_factor(POSE_KEY, rows)
         return
@@ -175,7 +160,7 @@ def _scan_factors(
 def _without(
     scan: gtsam.NonlinearFactor, values: gtsam.Values, weak: FloatArray
 ) -> gtsam.NonlinearFactor:
-    """The scan's factor, linearised, with what it claims about weak directions taken out."""
+    """The factor of a scan, linearised, without its information on weak directions."""
     linear = scan.linearize(values)
     information, column = linear.information(), linear.augmentedInformation()[:, -1]
     right, squared = column[:-1], float(column[-1])
@@ -189,24 +174,23 @@ def fuse(
     information: FloatArray,
     factors: Sequence[gtsam.NonlinearFactor],
 ) -> tuple[gtsam.Pose3, FloatArray]:
-    """Bring factors that come after the solve together with its solution.
+    """Fuse a solution with further factors on the same pose.
 
     Parameters
     ----------
-    map_T_lidar, information : the solution and its (6, 6) information, which may be singular: a
-        quadratic cost about the solution
+    map_T_lidar, information : the solved pose and its (6, 6) information, which may be singular
     factors : on :data:`POSE_KEY`
 
     Returns
     -------
     pose, information : the optimum of all, and its (6, 6) information
     """
-    # A root by eigenvalues, for the information may be singular.
+    # No Cholesky root: the information may be singular.
     eigenvalues, vectors = np.linalg.eigh(information)
     root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * vectors.T
 
     def solved(at: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
-        # Not a PriorFactorPose3, whose Jacobian is that of no displacement.
+        # PriorFactorPose3 would leave out the derivative of the logarithm.
         moved = map_T_lidar.between(at.atPose3(POSE_KEY))
         return root @ gtsam.Pose3.Logmap(moved), [root @ gtsam.Pose3.LogmapDerivative(moved)]
 
@@ -221,10 +205,11 @@ def fuse(
 
 
 def within_tolerance(step: FloatArray, information: FloatArray, config: SolverConfig) -> bool:
-    """Whether a (6,) step is small enough to stop: LOAM's rule, or small for what is known.
+    """Whether a step is small enough to stop: by LOAM's rule, or against the standard deviation.
 
-    In a direction that the scan hardly fixes, re-association goes to and fro by more than LOAM's
-    half millimetre for ever. Such steps are far below the standard deviation in that direction.
+    In a direction that the scan hardly fixes, every association moves the pose back and forth by
+    more than LOAM's half millimetre, and the iteration would never stop. Such steps are far below
+    the standard deviation in that direction.
 
     Parameters
     ----------
@@ -238,7 +223,7 @@ def within_tolerance(step: FloatArray, information: FloatArray, config: SolverCo
 
 
 def _kept(units: FloatArray, width: float, kernel: str) -> FloatArray:
-    """By what a kernel of a Huber width scales rows, for their whitened distances."""
+    """Factors by which a kernel scales rows, from the whitened distances of the rows."""
     if kernel == "geman_mcclure":
         scales: FloatArray = 1.0 / (1.0 + (units / (_REDESCENDING * width)) ** 2)
         return scales
@@ -253,8 +238,8 @@ def match_rows(
 
     Parameters
     ----------
-    kernel_width : of a Huber kernel, in units of the scatter of the whitened distances; infinite
-        for none
+    kernel_width : width of the Huber kernel, in units of the scatter of the whitened distances;
+        infinite for no kernel
     kernel : "huber", or "geman_mcclure" with the same efficiency on normal noise
 
     Notes
@@ -262,10 +247,9 @@ def match_rows(
     The kernel is applied as iteratively re-weighted least squares: a row whose whitened distance u
     exceeds ``k s`` is scaled by ``sqrt(k s / u)`` (Huber, Robust Statistics, 1981). The unit s is
     ``max(1, 1.4826 median(u))``: far from the optimum all distances are large, and a fixed unit
-    would silence them all. Kernels that fall off faster (Cauchy) lose the pose in foliage, where
-    many matches agree on a wrong one; that of Geman and McClure (1985), which scales by
-    ``1 / (1 + (u / c s)^2)``, did not so far, and stands up to passing objects better. As the unit
-    shrinks with the distances from one association to the next, it tightens by itself.
+    would scale all rows down. The Cauchy kernel loses the pose in foliage, where many matches
+    agree on a wrong pose. The kernel of Geman and McClure (1985), ``1 / (1 + (u / c s)^2)``, does
+    not, and rejects passing objects better than the Huber kernel.
     """
     e, p = matches.edges, matches.planes
     edge_units, plane_units = e.distances / e.sigmas, np.abs(p.distances) / p.sigmas

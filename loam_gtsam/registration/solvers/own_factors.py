@@ -1,4 +1,4 @@
-"""A user's own factors on the pose of a sweep, made ready for the frame's graph."""
+"""A user's own factors on the pose of a sweep."""
 
 from __future__ import annotations
 
@@ -13,20 +13,21 @@ from loam_gtsam.registration.solvers.base import POSE_KEY
 from loam_gtsam.types import FloatArray, InputError
 
 LAST_KEY: int = gtsam.symbol("x", 1)
-"""Key of the pose of the last sweep, for factors that join the two."""
+"""Key of the pose of the last sweep, for factors between the last sweep and the current one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseContext:
-    """What the mapper knows when it asks for a user's own factors.
+    """The frame for which the mapper asks a user's own factors.
 
     Attributes
     ----------
     key : key of the unknown pose ``map_T_lidar`` at the middle of the sweep
-    stamp : nanoseconds of that moment
-    guess : predicted ``map_T_lidar`` of that moment
+    stamp : nanoseconds, of the middle of the sweep
+    guess : predicted ``map_T_lidar`` at the middle of the sweep
     last : stamp, nanoseconds, and pose of the middle of the last sweep
-    last_key : key of that pose, for factors between the two; it is held where it was solved
+    last_key : key of the pose in ``last``, for factors between the two sweeps; that pose is known
+        and does not change
     """
 
     key: int
@@ -37,18 +38,18 @@ class PoseContext:
 
 
 ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
-"""Called once for every sweep that is solved; returns factors on ``context.key``, and on
-``context.last_key`` too if they join the two poses."""
+"""A function that returns factors on ``context.key``, or on ``context.key`` and
+``context.last_key``; the mapper calls the function once for every sweep that is solved."""
 
 
 def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.NonlinearFactor]:
-    """Ask for a user's factors and make them factors on the one unknown pose.
+    """Ask for a user's factors, and turn them into factors on the unknown pose alone.
 
     Raises
     ------
     InputError
-        If the callable returns anything else than GTSAM factors on these keys; GTSAM's own errors
-        name no cause.
+        If the callable returns anything but a sequence of GTSAM factors on these keys; GTSAM's own
+        errors name no cause.
     """
     factors: object = extra(context)
     if not isinstance(factors, Sequence):
@@ -73,20 +74,15 @@ def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.Nonline
 
 
 def _with_last_held(factor: gtsam.NonlinearFactor, context: PoseContext) -> gtsam.NonlinearFactor:
-    """The factor on the current pose alone, the last one being known.
-
-    Its error and Jacobian are the whitened ones of the factor, robust kernel included.
-    """
-    last = context.last[1]
-    rows = factor.dim()
+    """The whitened factor, robust kernel included, with the last pose held at its value."""
 
     def error(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
         both = gtsam.Values()
         both.insert(context.key, values.atPose3(POSE_KEY))
-        both.insert(context.last_key, last)
+        both.insert(context.last_key, context.last[1])
         linear = factor.linearize(both)
         jacobian, right = linear.jacobian()
         first = 6 * list(linear.keys()).index(context.key)
         return -np.asarray(right), [np.ascontiguousarray(jacobian[:, first : first + 6])]
 
-    return checked_factor(gtsam.noiseModel.Unit.Create(rows), [POSE_KEY], error)
+    return checked_factor(gtsam.noiseModel.Unit.Create(factor.dim()), [POSE_KEY], error)

@@ -146,7 +146,7 @@ def trial_matching(config: MatchingConfig) -> MatchingConfig:
 def rematched(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig
 ) -> ScanMatches:
-    """The matches with the same lines and planes, and with distances and weights at another pose."""
+    """At most ``limit`` of ``count`` rows, evenly spread; rows of ``first`` before others."""
     pose = map_T_lidar.matrix()
     e, p = matches.edges, matches.planes
     away = (transform(pose, e.points) - e.centres).T

@@ -117,8 +117,8 @@ class GtsamSolver:
         after, steps = optimizer.error(), optimizer.iterations()
         information = graph.linearize(optimizer.values()).hessian()[0]
         small = within_tolerance(pose.localCoordinates(moved), information, config)
-        seen = sight.scan, sight.weak, unseen, beacons, rows
-        return Solution(moved, True, small, matches, 1, steps, before, after, information, *seen)
+        sights = sight.scan, sight.weak, unseen, beacons, rows
+        return Solution(moved, True, small, matches, 1, steps, before, after, information, *sights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

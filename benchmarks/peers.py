@@ -11,8 +11,8 @@ import numpy as np
 from loam_gtsam.datasets.kitti.folder import raise_elevation
 from loam_gtsam.studies import peers
 from loam_gtsam.studies.contenders import timed_points as timed_points
-from loam_gtsam.studies.peers import PeerPose, TimedPoints
-from loam_gtsam.types import FloatArray
+from loam_gtsam.studies.peers import TimedPoints
+from loam_gtsam.types import FloatArray, MapUpdate
 
 
 def load(module: str) -> Any | None:
@@ -46,7 +46,7 @@ class KissIcp(peers.KissIcp):
         self.variant, self.deskew = variant, variant.deskew
         super().__init__()
 
-    def register(self, stamp: int, sweep: TimedPoints) -> PeerPose:
+    def register(self, stamp: int, sweep: TimedPoints) -> MapUpdate:
         """See :meth:`loam_gtsam.studies.peers.Peer.register`."""
         if self.variant.elevation_deg:
             angle = float(np.radians(self.variant.elevation_deg))
@@ -57,7 +57,7 @@ class KissIcp(peers.KissIcp):
     @property
     def seconds(self) -> list[float]:
         """What each registration took."""
-        return [pose.seconds for pose in self.poses]
+        return [sum(update.timings.values()) for update in self.updates]
 
 
 def gicp_step(

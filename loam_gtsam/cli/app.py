@@ -135,7 +135,7 @@ def compare(*, source: InputOptions, sensor: SensorOptions, options: CompareOpti
     contenders = []
     for entry in map(find_contender, names):
         contenders.append(Contender(entry.name, entry.config and sensor.changed(entry.config)))
-    raise typer.Exit(execute(source.dataset(), contenders, options.shared_guess, options))
+    raise typer.Exit(execute(source.dataset(), contenders, options))
 
 
 _Spec = Annotated[

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console, Group
 from rich.table import Table
@@ -31,18 +30,16 @@ from loam_gtsam.studies.comparison_report import (
     TABLE_FILES,
     TRUTH_FILE,
     ScoredComparison,
-    best_cells,
-    format_score,
-    median_95_max,
+    difference_table,
+    score_table,
     write_comparison,
 )
 from loam_gtsam.studies.contenders import Contender
+from loam_gtsam.studies.report_html import TextTable
 from loam_gtsam.types import DatasetError
 
 
-def execute(
-    dataset: Dataset, contenders: Sequence[Contender], shared_guess: bool, options: CompareOptions
-) -> int:
+def execute(dataset: Dataset, contenders: Sequence[Contender], options: CompareOptions) -> int:
     """Compare the solvers, write the results and print the tables; returns the exit code.
 
     Raises
@@ -65,11 +62,11 @@ def execute(
                 dataset,
                 contenders,
                 max_frames=options.frames,
-                shared_guess=shared_guess,
+                shared_guess=options.shared_guess,
                 on_frame=on_frame,
             )
         seconds = time.perf_counter() - started
-        results = ScoredComparison.of(comparison, shared_guess)
+        results = ScoredComparison.of(comparison)
         # Files of an earlier comparison, also those of solvers that did not run this time.
         left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
         files = write_results(
@@ -93,35 +90,22 @@ def execute(
 
 
 def _summary(results: ScoredComparison, seconds: float) -> Group:
-    title = Text(f"{results.comparison.name}  ({seconds:.1f} s)", style="bold")
-    winners = best_cells(results)
+    first = results.comparison.runs[0].name
     # Two tables, accuracy and cost: one table would not fit a terminal of 80 columns.
-    parts: list[Any] = []
-    for heading, columns in (
-        (title, range(ACCURACY_COLUMNS)),
-        (None, range(ACCURACY_COLUMNS, len(COLUMNS))),
-    ):
-        table = Table("solver", title=heading, title_justify="left", box=None)
-        for index in columns:
-            table.add_column(Text(COLUMNS[index].title), justify="right")
-        for number, (run, scores) in enumerate(results.rows):
-            cells = [
-                Text(
-                    format_score(scores, COLUMNS[index]),
-                    style="bold green" if (number, index + 1) in winners else "",
-                )
-                for index in columns
-            ]
-            table.add_row(Text(run.name), *cells)
-        parts.append(table)
+    accuracy = score_table(results, COLUMNS[:ACCURACY_COLUMNS])
+    cost = score_table(results, COLUMNS[ACCURACY_COLUMNS:])
+    tables = [_table(accuracy, f"{results.comparison.name}  ({seconds:.1f} s)"), _table(cost)]
     if results.differences:
-        header = Text(f"Difference from {results.comparison.runs[0].name}", style="bold")
-        apart = Table("solver", title=header, title_justify="left", box=None)
-        for name in ("median [mm]", "95 %", "max", "median [deg]", "95 %", "max"):
-            apart.add_column(Text(name), justify="right")
-        for name, difference in results.differences.items():
-            numbers = [f"{1e3 * v:.2f}" for v in median_95_max(difference.metres)]
-            numbers += [f"{v:.4f}" for v in median_95_max(difference.degrees)]
-            apart.add_row(Text(name), *numbers)
-        parts.append(apart)
-    return Group(*parts, *(Text(f"  {note}", style="dim") for note in results.notes))
+        tables.append(_table(difference_table(results), f"Difference from {first}"))
+    return Group(*tables, *(Text(f"  {note}", style="dim") for note in results.notes))
+
+
+def _table(table: TextTable, title: str | None = None) -> Table:
+    heading = None if title is None else Text(title, style="bold")
+    shown = Table(table.header[0], title=heading, title_justify="left", box=None)
+    for name in table.header[1:]:
+        shown.add_column(Text(name), justify="right")
+    for number, row in enumerate(table.rows):
+        styles = ("bold green" if (number, n) in table.best else "" for n in range(len(row)))
+        shown.add_row(*map(Text, row, styles))
+    return shown

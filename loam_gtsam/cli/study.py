@@ -5,14 +5,14 @@ from __future__ import annotations
 import itertools
 import statistics
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from loam_gtsam.cli.console import file_name, progress_bar, stop_requests
+from loam_gtsam.cli.console import file_name, print_plain, progress_bar, stop_requests
 from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.studies.trial_runner import (
@@ -20,18 +20,17 @@ from loam_gtsam.studies.trial_runner import (
     LocalWorkers,
     cluster_workers,
     local_workers,
-    run_here,
-    run_on,
+    run_trials,
 )
 from loam_gtsam.studies.trial_spec import Spec, load_spec
-from loam_gtsam.studies.trial_table import (
+from loam_gtsam.studies.trials import (
     TABLE_FILE,
     TRIALS_FOLDER,
+    Row,
     TrialStore,
     import_pyarrow,
     write_table,
 )
-from loam_gtsam.studies.trials import Row, Trial
 
 _SHOWN_ERRORS = 3
 
@@ -49,21 +48,23 @@ def execute(path: Path, options: StudyOptions) -> int:
     folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_study"
     make_folder(folder / TRIALS_FOLDER)
     store = TrialStore(folder)
-    missing = [trial for trial in _different(spec.trials) if _must_run(store.load(trial), options)]
+    # Each computation once: two names may stand for the same configuration.
+    different = {trial.id: trial for trial in spec.trials}.values()
+    missing = [trial for trial in different if _must_run(store.load(trial), options)]
     with stop_requests() as stop:
         try:
             with (
-                _rows(missing, options, lambda: stop.signum is not None) as rows,
+                _workers(options, len(missing)) as workers,
                 _progress(spec.name, len(missing), options.quiet) as count,
             ):
-                for done in rows:
+                for done in run_trials(missing, lambda: stop.signum is not None, workers):
                     store.save(done)
                     count(done)
         except KeyboardInterrupt:
             pass
         finally:  # also after an error: the finished trials are worth a table
             found = [row for row in map(store.load, spec.trials) if row is not None]
-            write_table(folder / TABLE_FILE, found, spec)
+            write_table(folder / TABLE_FILE, found, spec.text, spec.trials)
     failed = [row for row in found if row["error"]]
     if not options.quiet:
         console = Console()
@@ -76,35 +77,24 @@ def execute(path: Path, options: StudyOptions) -> int:
     return 1 if failed else 0
 
 
-def _different(trials: Sequence[Trial]) -> list[Trial]:
-    """Each computation once: two names may stand for the same configuration."""
-    return list({trial.id: trial for trial in trials}.values())
-
-
 def _must_run(found: Row | None, options: StudyOptions) -> bool:
     return found is None or options.overwrite or (options.retry_failed and bool(found["error"]))
 
 
-@contextmanager
-def _rows(
-    trials: Sequence[Trial], options: StudyOptions, stopped: Callable[[], bool]
-) -> Iterator[Iterator[Row]]:
-    """The rows of the trials as they are finished, from where the options have them run."""
-    place: AbstractContextManager[LocalWorkers | ClusterWorkers]
-    if options.scheduler is not None and trials:
-        place = cluster_workers(options.scheduler)
-    elif options.workers is not None and trials:
-        place = local_workers(min(options.workers, len(trials)))
-    else:
-        yield run_here(trials, stopped)
-        return
-    with place as workers:
-        yield run_on(workers, trials, stopped)
+def _workers(
+    options: StudyOptions, count: int
+) -> AbstractContextManager[LocalWorkers | ClusterWorkers | None]:
+    """Where so many trials run; None stands for this process."""
+    if options.scheduler is not None and count:
+        return cluster_workers(options.scheduler)
+    if options.workers is not None and count:
+        return local_workers(min(options.workers, count))
+    return nullcontext()
 
 
 @contextmanager
 def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], None]]:
-    """A progress bar on stderr, as the function to call after each trial."""
+    """Show a progress bar; gives the function to call after each trial."""
     numbers = itertools.count(1)
     with progress_bar(name, total, quiet=quiet) as show:
 
@@ -127,9 +117,8 @@ def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
             values = [
                 row[metric]
                 for row in rows
-                if (row["sequence"], row["config"]) == (sequence, config)
+                if (row["sequence"], row["config"], row["error"]) == (sequence, config, None)
                 and row[metric] is not None
-                and not row["error"]
             ]
             cells.append(Text(f"{statistics.median(values):.4g}" if values else "-"))
         table.add_row(Text(sequence), *cells)
@@ -141,13 +130,13 @@ def _print_outcome(
 ) -> None:
     for row in failed[:_SHOWN_ERRORS]:
         last_line = row["error"].strip().splitlines()[-1]
-        console.print(f"  {_label(row)} failed: {last_line}", markup=False, soft_wrap=True)
+        print_plain(console, f"  {_label(row)} failed: {last_line}")
     if len(failed) > _SHOWN_ERRORS:
         console.print(f"  and {len(failed) - _SHOWN_ERRORS} more; see the column 'error'")
     console.print(f"{len(found)} of {total} trials done, {len(failed)} of them failed")
     if len(found) < total:
         console.print("Stopped; the same command goes on from here.")
-    console.print(f"Written to {file}", markup=False, soft_wrap=True)
+    print_plain(console, f"Written to {file}")
 
 
 def _label(row: Row) -> str:

@@ -52,6 +52,7 @@ class Comparison:
     notes : sentences that a reader of the numbers must know
     interrupted : whether the user stopped the comparison before the data set ended
     error : what ended the comparison early, or None
+    shared_guess : whether all solvers of this package had the guesses of the first of them
     """
 
     name: str
@@ -60,6 +61,7 @@ class Comparison:
     notes: tuple[str, ...] = ()
     interrupted: bool = False
     error: Exception | None = None
+    shared_guess: bool = False
 
     @property
     def frames(self) -> int:
@@ -74,20 +76,17 @@ class Comparison:
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """The numbers of one run; NaN where there is none. Defined in ``docs/compare.md``.
+    """The numbers of one run, see ``docs/compare.md``; NaN where there is none.
 
     Attributes
     ----------
-    ate_m, ate_max_m, rotation_deg : absolute error of the trajectory after alignment, see
-        :class:`loam_gtsam.studies.evaluation.AbsoluteError`
-    rpe_percent, rpe_deg_per_m : relative error over path lengths, see
-        :class:`loam_gtsam.studies.evaluation.RelativeError`
+    ate_m, ate_max_m, rotation_deg : :class:`~loam_gtsam.studies.evaluation.AbsoluteError`
+    rpe_percent, rpe_deg_per_m : :class:`~loam_gtsam.studies.evaluation.RelativeError`
     path_m : length of the reference trajectory that was compared
     iterations, solver_iterations : associations and solver steps, mean of the solved frames
     matches : number of matches of the last association, median of the solved frames
     ms_median, ms_95 : milliseconds per frame without reading, the first frame left out
-    map_points : points of the whole map
-    solved : number of frames whose pose was solved
+    map_points, solved : points of the whole map, frames whose pose was solved
     lengths : metres, the path lengths of the relative error
     problem : why an error is missing
     """
@@ -123,8 +122,8 @@ def compare_solvers(
     ----------
     contenders : the first one is the reference where there is no truth
     max_frames : stop after so many sweeps; no further sweep is read
-    shared_guess : all solvers of this package start from the guesses of the first of them, see
-        :class:`loam_gtsam.studies.contenders.SharedGuess`; else each predicts from its own motion
+    shared_guess : whether all solvers of this package start from the guesses of the first of them
+        (:class:`~loam_gtsam.studies.contenders.SharedGuess`)
     on_frame : called with the number of each sweep and the first contender's result; a
         KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far
 
@@ -143,9 +142,7 @@ def compare_solvers(
         If the data set cannot be read.
     """
     _check_names(contenders)
-    configs, notes = _common_configs(contenders, dataset)
-    runners = _make_runners(contenders, configs, dataset, shared_guess)
-    first = next((config for config in configs if config is not None), None)
+    runners, first, notes = _make_runners(contenders, dataset, shared_guess)
     error: Exception | None = None
     interrupted = False
     done = 0
@@ -176,6 +173,7 @@ def compare_solvers(
         notes=tuple(notes),
         interrupted=interrupted,
         error=error,
+        shared_guess=shared_guess,
     )
 
 
@@ -195,27 +193,38 @@ def _check_names(contenders: Sequence[Contender]) -> None:
 
 
 def _make_runners(
-    contenders: Sequence[Contender],
-    configs: Sequence[Config | None],
-    dataset: Dataset,
-    shared_guess: bool,
-) -> list[PipelineRunner | PeerRunner]:
-    """A runner for each contender, in their order."""
-    runners: list[PipelineRunner | PeerRunner] = []
-    guess: SharedGuess | None = None
-    first = next((config for config in configs if config is not None), None)
+    contenders: Sequence[Contender], dataset: Dataset, shared_guess: bool
+) -> tuple[list[PipelineRunner | PeerRunner], Config | None, list[str]]:
+    """A runner for each contender, the first configuration, and what had to be made equal to it."""
+    configs = [entry.config and effective_config(entry.config, dataset) for entry in contenders]
+    found = ((entry.name, c) for entry, c in zip(contenders, configs, strict=True) if c is not None)
+    name, first = next(found, ("", None))
     common = first or effective_config(Config(), dataset)
+    runners: list[PipelineRunner | PeerRunner] = []
+    notes: list[str] = []
+    guess: SharedGuess | None = None
     for entry, config in zip(contenders, configs, strict=True):
         if config is None:
             runners.append(PeerRunner(make_peer(entry.name), common))
             continue
+        shared: dict[str, Any] = {section: getattr(common, section) for section in _SHARED}
+        # How often and from what rotation a sweep is de-skewed again is part of the method.
+        own = config.deskew
+        shared["deskew"] = common.deskew.changed(refine=own.refine, rotation=own.rotation)
+        notes += (
+            f"{entry.name}: section {section} is that of {name}, so that all get the same features "
+            "at the same moments"
+            for section, value in shared.items()
+            if getattr(config, section) != value
+        )
+        config = config.changed(**shared)
         imu = imu_buffer(dataset, config)
         pipeline = Pipeline(config, imu=imu, solver=entry.solver, odometry=guess)
         if shared_guess and guess is None:
             steady = ConstantVelocity(pipeline.mapper.imu)
             pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)
         runners.append(PipelineRunner(entry.name, pipeline))
-    return runners
+    return runners, first, notes
 
 
 def score_all(comparison: Comparison) -> tuple[Scores, ...]:
@@ -223,18 +232,14 @@ def score_all(comparison: Comparison) -> tuple[Scores, ...]:
 
     Without truth the first run is the reference and has no errors itself.
     """
-    reference = comparison.reference
-    has_none = comparison.truth is None
-    pairs = [
-        (run, None if has_none and number == 0 else reference)
-        for number, run in enumerate(comparison.runs)
-    ]
-    scores = [score(run, against) for run, against in pairs]
-    found = [entry.lengths for entry in scores if entry.lengths]
-    if len(set(found)) < 2:
-        return tuple(scores)
+    references = [comparison.reference] * len(comparison.runs)
+    pairs = list(zip(comparison.runs, [comparison.truth, *references[1:]], strict=True))
+    scores = tuple(score(run, reference) for run, reference in pairs)
+    found = {entry.lengths for entry in scores if entry.lengths}
+    if len(found) < 2:
+        return scores
     # Some runs have poses over a part of the path only: the lengths must fit the shortest part.
-    return tuple(score(run, against, min(found)) for run, against in pairs)
+    return tuple(score(run, reference, min(found)) for run, reference in pairs)
 
 
 def score(
@@ -265,12 +270,11 @@ def score(
     try:
         if reference is not None:
             absolute = absolute_error(run.trajectory, reference)
-            there = interpolate(reference, absolute.stamps)
             values |= {
                 "ate_m": absolute.rmse,
                 "ate_max_m": absolute.maximum,
                 "rotation_deg": absolute.rotation_rmse_deg,
-                "path_m": there.path_length,
+                "path_m": interpolate(reference, absolute.stamps).path_length,
             }
             given = None if lengths is None else np.array(lengths, np.float64)
             relative = relative_error(run.trajectory, reference, given)
@@ -291,8 +295,7 @@ class FrameDifferences:
     Attributes
     ----------
     frames : (N,) numbers of the frames that both solvers have a pose for
-    metres, degrees : (N,) distance and angle of the poses, see
-        :func:`loam_gtsam.studies.evaluation.pose_differences`
+    metres, degrees : (N,) see :func:`~loam_gtsam.studies.evaluation.pose_differences`
     """
 
     frames: IntArray
@@ -313,32 +316,3 @@ def frame_differences(comparison: Comparison) -> dict[str, FrameDifferences]:
         frames = np.array(run.used, np.int64)[np.isin(trajectory.stamps, stamps)]
         found[run.name] = FrameDifferences(frames, metres, degrees)
     return found
-
-
-def _common_configs(
-    contenders: Sequence[Contender], dataset: Dataset
-) -> tuple[list[Config | None], list[str]]:
-    """The configurations to run with, and a note for each section that had to be made equal."""
-    configs: list[Config | None] = []
-    notes: list[str] = []
-    first: tuple[str, Config] | None = None
-    for entry in contenders:
-        if entry.config is None:
-            configs.append(None)
-            continue
-        config = effective_config(entry.config, dataset)
-        if first is None:
-            first = entry.name, config
-        name, common = first
-        shared = {section: getattr(common, section) for section in _SHARED}
-        # How often and from what rotation a sweep is de-skewed again is part of the method.
-        own = config.deskew
-        shared["deskew"] = common.deskew.changed(refine=own.refine, rotation=own.rotation)
-        for section, value in shared.items():
-            if getattr(config, section) != value:
-                notes.append(
-                    f"{entry.name}: section {section} is that of {name}, so that all get the same "
-                    "features at the same moments"
-                )
-        configs.append(config.changed(**shared))
-    return configs, notes

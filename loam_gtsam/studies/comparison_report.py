@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ from loam_gtsam.studies.evaluation import (
     distance_travelled,
     interpolate,
 )
-from loam_gtsam.studies.report_html import write_report
+from loam_gtsam.studies.report_html import TextTable, list_html, page, picture_html, table_html
 from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
 from loam_gtsam.view import plots
 
@@ -48,19 +48,12 @@ REPORT_FILE = "report.html"
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of the tables.
-
-    Attributes
-    ----------
-    key : attribute of :class:`loam_gtsam.studies.comparison.Scores`
-    digits : number of digits after the decimal point
-    lower_wins : whether the smallest value is the best
-    """
+    """A column of the tables; ``key`` is an attribute of :class:`Scores`."""
 
     key: str
     title: str
     meaning: str
-    digits: int = 3
+    digits: int
     lower_wins: bool = False
 
 
@@ -92,15 +85,13 @@ class ScoredComparison:
     """A comparison with the scores of every run and the differences from the first run."""
 
     comparison: Comparison
-    shared_guess: bool
     scores: tuple[Scores, ...]
     differences: dict[str, FrameDifferences]
 
     @classmethod
-    def of(cls, comparison: Comparison, shared_guess: bool) -> ScoredComparison:
+    def of(cls, comparison: Comparison) -> ScoredComparison:
         """Score every run."""
-        scores = score_all(comparison)
-        return cls(comparison, shared_guess, scores, frame_differences(comparison))
+        return cls(comparison, score_all(comparison), frame_differences(comparison))
 
     @property
     def rows(self) -> list[tuple[SolverRun, Scores]]:
@@ -123,31 +114,38 @@ class ScoredComparison:
             about += f"; path {path:.1f} m, RPE over {listed} m"
         guesses = (
             "every solver of this package starts from the guess of the first of them"
-            if self.shared_guess
+            if self.comparison.shared_guess
             else "every solver predicts its guesses from its own motion"
         )
         problems = [f"{run.name}: {s.problem}" for run, s in self.rows if s.problem]
         return [about, guesses, *self.comparison.notes, *problems]
 
 
-def format_score(scores: Scores, column: Column) -> str:
-    """One score as text, a dash where there is none."""
-    value = getattr(scores, column.key)
-    return "-" if value != value else f"{value:.{column.digits}f}"
-
-
-def best_cells(results: ScoredComparison) -> set[tuple[int, int]]:
-    """(row, column) of the best value of each column; column 0 is the name."""
-    winners = set()
-    for index, column in enumerate(COLUMNS, 1):
+def score_table(results: ScoredComparison, columns: Sequence[Column] = COLUMNS) -> TextTable:
+    """Some columns of the scores as a table, a dash where there is no number."""
+    rows = [[run.name] for run in results.comparison.runs]
+    best = set()
+    for index, column in enumerate(columns, 1):
         values = np.array([getattr(scores, column.key) for scores in results.scores], np.float64)
+        for row, value in zip(rows, values.tolist(), strict=True):
+            row.append(f"{value:.{column.digits}f}" if value == value else "-")
         if column.lower_wins and np.isfinite(values).sum() > 1:
-            winners.add((int(np.nanargmin(values)), index))
-    return winners
+            best.add((int(np.nanargmin(values)), index))
+    return TextTable(["solver", *(column.title for column in columns)], rows, frozenset(best))
 
 
-def median_95_max(values: FloatArray) -> tuple[float, float, float]:
-    """Median, 95th percentile and maximum."""
+def difference_table(results: ScoredComparison) -> TextTable:
+    """The differences from the first run as a table."""
+    rows = []
+    for name, difference in results.differences.items():
+        metres, degrees = _median_95_max(difference.metres), _median_95_max(difference.degrees)
+        numbers = [f"{1e3 * value:.2f}" for value in metres] + [f"{value:.4f}" for value in degrees]
+        rows.append([name, *numbers])
+    header = ("solver", "median [mm]", "95 %", "max", "median [deg]", "95 %", "max")
+    return TextTable(header, rows)
+
+
+def _median_95_max(values: FloatArray) -> tuple[float, float, float]:
     median, high = np.percentile(values, (50.0, 95.0))
     return float(median), float(high), float(values.max())
 
@@ -162,9 +160,14 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
         folder / "comparison.csv",
         ["solver", "version", *(column.key for column in COLUMNS), "path_m", "solved", "problem"],
         (
-            [run.name, run.version]
-            + [getattr(scores, column.key) for column in COLUMNS]
-            + [scores.path_m, scores.solved, scores.problem]
+            [
+                run.name,
+                run.version,
+                *(getattr(scores, column.key) for column in COLUMNS),
+                scores.path_m,
+                scores.solved,
+                scores.problem,
+            ]
             for run, scores in results.rows
         ),
     )
@@ -178,17 +181,15 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
         write_tum(folder / name, trajectory)
         files.append(name)
     drawn = _draw(results, folder) if plot else []
-    write_report(
-        folder / REPORT_FILE,
-        f"Comparison on {comparison.name}",
-        results.notes,
-        ["solver", *(column.title for column in COLUMNS)],
-        [[run.name, *(format_score(s, column) for column in COLUMNS)] for run, s in results.rows],
-        best_cells(results),
-        {column.title: column.meaning for column in COLUMNS},
-        {PICTURES[name]: folder / name for name in drawn},
-        {run.name: _settings(run) for run in comparison.runs},
-    )
+    pictures = {PICTURES[name]: folder / name for name in drawn}
+    sections = {
+        "Scores": table_html(score_table(results)),
+        **{caption: picture_html(caption, file) for caption, file in pictures.items()},
+        "Definitions": list_html({column.title: column.meaning for column in COLUMNS}),
+        "What was run": list_html({run.name: _settings(run) for run in comparison.runs}),
+    }
+    title = f"Comparison on {comparison.name}"
+    write_text(folder / REPORT_FILE, page(title, results.notes, sections))
     return [*files, *drawn, REPORT_FILE]
 
 
@@ -196,23 +197,22 @@ def _summary(results: ScoredComparison) -> dict[str, Any]:
     solvers = []
     for run, scores in results.rows:
         difference = results.differences.get(run.name)
-        solvers.append(
-            {
-                "name": run.name,
-                "version": run.version,
-                "config": None if run.config is None else config_to_dict(run.config),
-                "scores": asdict(scores),
-                "stages_ms": _stages(run),
-                "difference_m": difference and median_95_max(difference.metres),
-                "difference_deg": difference and median_95_max(difference.degrees),
-            }
-        )
+        solver = {
+            "name": run.name,
+            "version": run.version,
+            "config": run.config and config_to_dict(run.config),
+            "scores": asdict(scores),
+            "stages_ms": _stages(run),
+            "difference_m": difference and _median_95_max(difference.metres),
+            "difference_deg": difference and _median_95_max(difference.degrees),
+        }
+        solvers.append(solver)
     comparison = results.comparison
     return {
         "dataset": comparison.name,
         "frames": comparison.frames,
         "reference": results.against,
-        "shared_guess": results.shared_guess,
+        "shared_guess": comparison.shared_guess,
         "interrupted": comparison.interrupted,
         "error": comparison.error and f"{type(comparison.error).__name__}: {comparison.error}",
         "notes": results.notes,
@@ -261,10 +261,8 @@ def _csv_field(value: Any) -> Any:
 def _stages(run: SolverRun) -> dict[str, float]:
     """Median milliseconds of each stage, over the frames after the first in which it ran."""
     names, seconds = stage_seconds(run.updates[1:])
-    return {
-        name: 1e3 * float(np.nanmedian(column))
-        for name, column in zip(names, seconds.T, strict=True)
-    }
+    medians = (1e3 * float(np.nanmedian(column)) for column in seconds.T)
+    return dict(zip(names, medians, strict=True))
 
 
 def _settings(run: SolverRun) -> str:
@@ -272,17 +270,14 @@ def _settings(run: SolverRun) -> str:
     if run.config is None:
         about = "its own defaults; see docs/compare.md for its de-skew and the moment of its poses"
         return f"{run.version}; {about}"
-    ours, default = (dict(_flat(config_to_dict(c))) for c in (run.config, Config()))
-    changed = [f"{key} = {value}" for key, value in ours.items() if value != default[key]]
+    default = config_to_dict(Config())
+    changed = [
+        f"{section}.{key} = {value}"
+        for section, values in config_to_dict(run.config).items()
+        for key, value in values.items()
+        if value != default[section][key]
+    ]
     return f"{run.version}; differs from the default in: {', '.join(changed) or 'nothing'}"
-
-
-def _flat(tree: dict[str, Any], prefix: str = "") -> Iterable[tuple[str, Any]]:
-    for key, value in tree.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 # -- pictures --------------------------------------------------------------------------------------
@@ -338,7 +333,6 @@ def _aligned(trajectory: Trajectory, reference: Trajectory, stamps: IntArray) ->
 
 
 def _within(truth: Trajectory | None, others: Iterable[Trajectory]) -> Trajectory | None:
-    """The part of the truth within the time span of the other trajectories."""
     if truth is None:
         return None
     stamps = np.concatenate([other.stamps for other in others])

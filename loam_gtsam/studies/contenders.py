@@ -106,31 +106,28 @@ class SolverRun:
     @classmethod
     def of_result(cls, name: str, result: RunResult) -> SolverRun:
         """The run of a pipeline of this package."""
-        updates = result.updates
+        updates = list(result.updates)
         if result.loops is not None:
-            poses = iter(result.trajectory.map_T_lidar)
-            updates = tuple(
-                replace(update, map_T_lidar=gtsam.Pose3(next(poses)))
-                if update.status.has_pose
-                else update
-                for update in updates
-            )
+            placed = [n for n, update in enumerate(updates) if update.status.has_pose]
+            for number, pose in zip(placed, result.trajectory.map_T_lidar, strict=True):
+                updates[number] = replace(updates[number], map_T_lidar=gtsam.Pose3(pose))
         return cls(
             name=name,
             version=f"loam_gtsam {installed_version()}",
             config=result.config,
-            updates=updates,
+            updates=tuple(updates),
             map_points=len(result.edge_points) + len(result.plane_points),
         )
 
     @property
     def used(self) -> tuple[int, ...]:
         """Numbers of the frames with a pose; of this package's solvers also predicted poses."""
-        if self.config is None:
-            wanted = [update.status is FrameStatus.OK for update in self.updates]
-        else:
-            wanted = [update.status.has_pose for update in self.updates]
-        return tuple(np.flatnonzero(wanted).tolist())
+        return tuple(
+            number
+            for number, update in enumerate(self.updates)
+            if update.status is FrameStatus.OK
+            or (self.config is not None and update.status.has_pose)
+        )
 
     @property
     def trajectory(self) -> Trajectory:
@@ -170,13 +167,8 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
 class SharedGuess:
     """An odometry for several pipelines: the first one predicts, the others take the same step.
 
-    The step is the guess seen from the last pose. The pipeline that asks first for a sweep gets the
-    guess of ``odometry``; every other pipeline gets the same step from its own last pose, with the
-    same twist.
-
-    Parameters
-    ----------
-    odometry : of the first pipeline
+    The pipeline that asks first for a sweep gets the guess of ``odometry``, its own; every other
+    pipeline gets the same step from its own last pose, with the same twist.
     """
 
     def __init__(self, odometry: Odometry) -> None:
@@ -205,16 +197,9 @@ class SharedGuess:
 
 
 class PipelineRunner:
-    """A pipeline of this package as a contender.
+    """A pipeline of this package as a contender; its ``updates`` are one per sweep so far.
 
-    Parameters
-    ----------
-    name : of the contender
-    pipeline : for this contender alone, and so is its IMU buffer, which learns the gyro's bias
-
-    Attributes
-    ----------
-    updates : one per sweep so far
+    Pipeline and IMU buffer are for this contender alone: the buffer learns the gyro's bias.
     """
 
     def __init__(self, name: str, pipeline: Pipeline) -> None:
@@ -236,17 +221,12 @@ class PeerRunner:
     Parameters
     ----------
     config : decides which points of a sweep are used, and their times
-
-    Attributes
-    ----------
-    updates : one per sweep so far
-    problem : what ended the peer early, else ""
     """
 
     def __init__(self, peer: Peer, config: Config) -> None:
         self.peer, self.config = peer, config
         self.updates: list[MapUpdate] = []
-        self.problem = ""
+        self.problem = ""  # what ended the peer early
         self._last_stamp: int | None = None
 
     def register(self, sweep: Sweep, extraction: Extraction | None = None) -> None:
@@ -274,26 +254,15 @@ class PeerRunner:
         if self._last_stamp is not None and sweep.stamp <= self._last_stamp:
             return replace(unused, status=FrameStatus.BAD_STAMP)
         try:
-            registered = self.peer.register(sweep.stamp, points)
+            update = self.peer.register(sweep.stamp, points)
         except Exception as error:  # foreign code: it may raise anything
             self.problem = f"ended at frame {len(self.updates)}: {type(error).__name__}: {error}"
             return replace(unused, message=self.problem)
         self._last_stamp = sweep.stamp
-        return MapUpdate(
-            stamp=registered.stamp,
-            map_T_lidar=gtsam.Pose3(registered.map_T_lidar),
-            status=FrameStatus.OK,
-            timings={"register": registered.seconds},
-        )
+        return update
 
     def result(self, frames: int) -> SolverRun:
         """The run over the first ``frames`` sweeps."""
-        package = self.peer.package
-        return SolverRun(
-            name=self.peer.name,
-            version=f"{package} {installed_version(package)}",
-            config=None,
-            updates=tuple(self.updates[:frames]),
-            map_points=self.peer.map_points,
-            problem=self.problem,
-        )
+        peer, updates = self.peer, tuple(self.updates[:frames])
+        version = f"{peer.package} {installed_version(peer.package)}"
+        return SolverRun(peer.name, version, None, updates, peer.map_points, self.problem)

@@ -62,7 +62,7 @@ class LoamGtsam(EvalioPipeline):
     def __init__(self) -> None:
         super().__init__()
         self._params: dict[str, Any] = self.default_params()
-        self._implied: dict[str, Any] = {}
+        self._implied: dict[str, Any] = {}  # what the data set says
         self._lidar_T_imu = gtsam.Pose3()
         self._period = 0.1
         self._samples: list[ImuMeasurement] = []
@@ -165,15 +165,12 @@ class LoamGtsam(EvalioPipeline):
         edges, planes = self._pipeline.map_points()
         return {"edges": _as_points(edges), "planes": _as_points(planes)}
 
-    def _covered(self, sweep: LidarMeasurement) -> bool:
-        """Whether the IMU has samples up to the end of a sweep, or has no samples at all."""
-        end = sweep.stamp.to_nsec() + round(self._period * 1e9)
-        return self._newest is None or self._newest >= end
-
     def _map_waiting(self) -> None:
-        while self._waiting and (
-            len(self._waiting) > _LONGEST_QUEUE or self._covered(self._waiting[0])
-        ):
+        while self._waiting:
+            end = self._waiting[0].stamp.to_nsec() + round(self._period * 1e9)
+            waits = self._newest is not None and self._newest < end
+            if waits and len(self._waiting) <= _LONGEST_QUEUE:
+                break
             self._map(self._waiting.pop(0))
 
     def _map(self, sweep: LidarMeasurement) -> None:
@@ -189,7 +186,8 @@ class LoamGtsam(EvalioPipeline):
         if not update.status.has_pose:
             return
         stamp = Stamp.from_nsec(update.stamp)
-        self.save(stamp, _as_se3(update.map_T_lidar.compose(self._lidar_T_imu)))
+        pose = update.map_T_lidar.compose(self._lidar_T_imu)
+        self.save(stamp, SE3(SO3.from_mat(pose.rotation().matrix()), pose.translation()))
         features = extraction.features
         if self._shows and features is not None:
             shown = {"edges": _as_points(features.edges), "planes": _as_points(features.planes)}
@@ -217,10 +215,6 @@ def _as_samples(samples: list[ImuMeasurement]) -> ImuSamples:
         gyro=np.array([sample.gyro for sample in samples]),
         acceleration=np.array([sample.accel for sample in samples]),
     )
-
-
-def _as_se3(pose: gtsam.Pose3) -> SE3:
-    return SE3(SO3.from_mat(pose.rotation().matrix()), pose.translation())
 
 
 def _as_points(points: FloatArray) -> list[Point]:

@@ -28,9 +28,8 @@ class AbsoluteError:
     Attributes
     ----------
     rmse, median, maximum : metres, of the positions after alignment
-    rotation_rmse_deg : degrees, of the orientations after the rotation that fits the *orientations*
-        best. The rotation that fits the positions is no substitute: on a nearly straight path the
-        noise of the positions decides its roll about the path.
+    rotation_rmse_deg : degrees, of the orientations after the rotation that fits *them* best. The
+        rotation that fits the positions leaves the roll about a straight path to their noise.
     translations : (N,) metres, error of each pose
     stamps : (N,) nanoseconds of the poses that were compared
     """
@@ -51,9 +50,9 @@ def align_positions(
     Parameters
     ----------
     estimate, reference : (N, 3) metres
-    rotation : (3, 3) decides what the positions leave open: the roll about a line if all positions
-        lie on a line, the whole rotation if the positions do not move. :func:`align_rotations`
-        gives a good one; identity if None
+    rotation : (3, 3) decides what the positions leave open, the roll if they lie on a line or the
+        whole rotation if they do not move; :func:`align_rotations` gives a good one; identity if
+        None
 
     References
     ----------
@@ -63,9 +62,8 @@ def align_positions(
     moments = (reference - mean_r).T @ (estimate - mean_e)
     spread = np.linalg.svd(moments, compute_uv=False)
     if spread[1] <= _NO_SPREAD * spread[0]:
-        moments = moments + (_NO_SPREAD * spread[0] or 1.0) * (
-            np.eye(3) if rotation is None else rotation
-        )
+        offered = np.eye(3) if rotation is None else rotation
+        moments = moments + (_NO_SPREAD * spread[0] or 1.0) * offered
     result = np.eye(4)
     result[:3, :3] = _nearest_rotation(moments)
     result[:3, 3] = mean_r - result[:3, :3] @ mean_e
@@ -75,9 +73,6 @@ def align_positions(
 def align_rotations(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     """Rotation ``reference_R_estimate`` (3, 3) that best maps orientations to a reference.
 
-    The rotation is the chordal mean of ``reference estimate^T``: it minimises the sum of squared
-    Frobenius norms of ``reference - R estimate``.
-
     References
     ----------
     Hartley, Trumpf, Dai and Li, Rotation averaging, IJCV 103, 2013 (the chordal L2 mean).
@@ -86,7 +81,6 @@ def align_rotations(estimate: FloatArray, reference: FloatArray) -> FloatArray:
 
 
 def _nearest_rotation(matrix: FloatArray) -> FloatArray:
-    """The rotation R that maximises ``trace(R^T matrix)``."""
     u, _, vt = np.linalg.svd(matrix)
     rotation: FloatArray = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
     return rotation
@@ -123,10 +117,9 @@ def absolute_error(
 ) -> AbsoluteError:
     """Absolute error (ATE) of the poses whose stamps lie inside the reference.
 
-    The reference is interpolated at the stamps of the estimate.
-
     Parameters
     ----------
+    reference : is interpolated at the stamps of the estimate
     aligned : fit positions by a rigid transform (SE(3), :func:`align_positions`) and orientations
         by a rotation (:func:`align_rotations`) first; else the poses are compared as they are
 
@@ -176,9 +169,8 @@ class RelativeError:
 def path_lengths(path: float) -> FloatArray:
     """Lengths in metres over which relative errors are taken on a path of ``path`` metres.
 
-    Eight multiples u, 2 u, ... 8 u, where u is the largest of 0.1, 0.2, 0.5, 1, ... 100 m with
-    16 u <= ``path``: from every pose of the first half the longest is still possible. From 1600 m
-    on these are KITTI's 100, 200, ... 800 m.
+    They are u, 2 u, ... 8 u, where u is the largest of 0.1, 0.2, 0.5, 1, ... 100 m with
+    16 u <= ``path``; from 1600 m on, KITTI's 100, 200, ... 800 m.
 
     Raises
     ------
@@ -199,10 +191,9 @@ def relative_error(
 ) -> RelativeError:
     """Relative error (RPE) of the poses whose stamps lie inside the reference.
 
-    The reference is interpolated at the stamps of the estimate.
-
     Parameters
     ----------
+    reference : is interpolated at the stamps of the estimate
     lengths : (L,) metres along the reference; :func:`path_lengths` of its path if None
 
     Raises
@@ -258,7 +249,7 @@ def pose_differences(
 
     Parameters
     ----------
-    estimate, reference : the reference is interpolated at the stamps of the estimate
+    reference : is interpolated at the stamps of the estimate
 
     Returns
     -------
@@ -299,7 +290,6 @@ def _common(
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:
-    """Angles (N,) in degrees of rotations (N, 3, 3)."""
     if not len(rotations):
         return np.zeros(0)
     angles: FloatArray = np.degrees(Rotation.from_matrix(rotations).magnitude())
@@ -307,7 +297,6 @@ def _angles_deg(rotations: FloatArray) -> FloatArray:
 
 
 def _check_stamps(caller: str, trajectory: Trajectory) -> None:
-    """Raise InputError unless the trajectory can be interpolated."""
     if len(trajectory) < 2:
         raise InputError(
             f"{caller}: expected 2 or more poses to interpolate between, got {len(trajectory)}"

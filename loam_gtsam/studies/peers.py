@@ -16,7 +16,14 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.geometry import move_points
-from loam_gtsam.types import FloatArray, InputError, LoamError, Trajectory
+from loam_gtsam.types import (
+    FloatArray,
+    FrameStatus,
+    InputError,
+    LoamError,
+    MapUpdate,
+    Trajectory,
+)
 
 
 class PeerError(LoamError):
@@ -39,22 +46,6 @@ class TimedPoints:
     span: tuple[float, float]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PeerPose:
-    """The pose of a sweep in the map of a peer.
-
-    Attributes
-    ----------
-    stamp : nanoseconds, the moment that the pose belongs to
-    map_T_lidar : (4, 4)
-    seconds : time that the registration took
-    """
-
-    stamp: int
-    map_T_lidar: FloatArray
-    seconds: float
-
-
 class Peer(ABC):
     """Another system, which registers one sweep at a time.
 
@@ -64,7 +55,7 @@ class Peer(ABC):
     package : name of the package for pip
     module : name of the package for ``import``
     alone : whether instances in one process share state, so that only one may run at a time
-    poses : of all sweeps so far
+    updates : one per registered sweep; stamp, pose, status and time have a meaning
     """
 
     name: str
@@ -73,14 +64,19 @@ class Peer(ABC):
     alone: bool = False
 
     def __init__(self) -> None:
-        self.poses: list[PeerPose] = []
+        self.updates: list[MapUpdate] = []
 
-    def register(self, stamp: int, sweep: TimedPoints) -> PeerPose:
+    def register(self, stamp: int, sweep: TimedPoints) -> MapUpdate:
         """Register a sweep and measure the time of the registration itself.
 
         Parameters
         ----------
         stamp : nanoseconds from which the times of the points count
+
+        Returns
+        -------
+        MapUpdate
+            Its stamp is the moment that the pose belongs to.
 
         Raises
         ------
@@ -89,15 +85,19 @@ class Peer(ABC):
         """
         started = time.perf_counter()
         pose, moment = self._register(stamp, sweep)
-        seconds = time.perf_counter() - started
-        self.poses.append(PeerPose(stamp + round(moment * 1e9), pose, seconds))
-        return self.poses[-1]
+        timings = {"register": time.perf_counter() - started}
+        stamp += round(moment * 1e9)
+        update = MapUpdate(stamp, gtsam.Pose3(pose), FrameStatus.OK, timings=timings)
+        self.updates.append(update)
+        return update
 
     @property
     def trajectory(self) -> Trajectory:
         """One pose per sweep, stamped with the moment that it belongs to."""
-        poses = np.array([pose.map_T_lidar for pose in self.poses]).reshape(-1, 4, 4)
-        return Trajectory(np.array([pose.stamp for pose in self.poses], np.int64), poses)
+        return Trajectory.from_poses(
+            [update.stamp for update in self.updates],
+            [update.map_T_lidar for update in self.updates],
+        )
 
     @property
     @abstractmethod
@@ -115,26 +115,39 @@ class _IcpPeer(Peer):
     Attributes
     ----------
     deskew : whether the peer de-skews the sweeps
+    settings_class, system_class : names of the classes of its settings and of the system itself
     """
 
     deskew: bool = True
+    settings_class: str
+    system_class: str
 
     def __init__(self) -> None:
         super().__init__()
-        self._icp = self._make_icp()
-
-    @abstractmethod
-    def _make_icp(self) -> Any:
-        """The system itself, with its settings."""
+        settings = getattr(_module(self, "config"), self.settings_class)()
+        settings.data.deskew = self.deskew
+        if settings.mapping.voxel_size is None:  # as its own load_config does
+            settings.mapping.voxel_size = settings.data.max_range / 100.0
+        self._icp = getattr(_module(self, self.module), self.system_class)(settings)
 
     @property
     def map_points(self) -> int:
         """See :attr:`Peer.map_points`."""
         return len(self._icp.local_map.point_cloud())
 
-    def _check_times(self, times: FloatArray) -> None:
-        if len(times) == 0 or times.min() >= times.max():
-            raise InputError(f"{self.name}: expected points of different times to de-skew with")
+    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
+        times, moment = np.zeros(0), sum(sweep.span) / 2.0
+        if self.deskew:
+            if len(sweep.times) == 0 or sweep.times.min() >= sweep.times.max():
+                # Equal times would end the process.
+                raise InputError(f"{self.name}: expected points of different times to de-skew with")
+            times, moment = self._deskewed(sweep.times)
+        self._icp.register_frame(sweep.points, times)
+        return np.array(self._icp.last_pose), moment
+
+    @abstractmethod
+    def _deskewed(self, times: FloatArray) -> tuple[FloatArray, float]:
+        """Times in the peer's own unit, and the moment that the peer de-skews to, in seconds."""
 
 
 class KissIcp(_IcpPeer):
@@ -149,20 +162,10 @@ class KissIcp(_IcpPeer):
     """
 
     name, package, module = "kiss-icp", "kiss-icp", "kiss_icp"
+    settings_class, system_class = "KISSConfig", "KissICP"
 
-    def _make_icp(self) -> Any:
-        settings = _module(self, "config").KISSConfig()
-        settings.data.deskew = self.deskew
-        if settings.mapping.voxel_size is None:  # as its own load_config does
-            settings.mapping.voxel_size = settings.data.max_range / 100.0
-        return _module(self, "kiss_icp").KissICP(settings)
-
-    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
-        if self.deskew:
-            self._check_times(sweep.times)  # equal times would end the process
-        self._icp.register_frame(sweep.points, sweep.times)
-        moment = float(sweep.times.max()) if self.deskew else sum(sweep.span) / 2.0
-        return np.array(self._icp.last_pose), moment
+    def _deskewed(self, times: FloatArray) -> tuple[FloatArray, float]:
+        return times, float(times.max())
 
 
 class KissIcpNoDeskew(KissIcp):
@@ -184,21 +187,11 @@ class GenzIcp(_IcpPeer):
 
     name, package, module = "genz-icp", "genz-icp", "genz_icp"
     alone = True
+    settings_class, system_class = "GenZConfig", "GenZICP"
 
-    def _make_icp(self) -> Any:
-        settings = _module(self, "config").GenZConfig()
-        settings.data.deskew = self.deskew
-        return _module(self, "genz_icp").GenZICP(settings)
-
-    def _register(self, stamp: int, sweep: TimedPoints) -> tuple[FloatArray, float]:
-        times = sweep.times
-        if not self.deskew:
-            self._icp.register_frame(sweep.points, np.zeros(0))
-            return np.array(self._icp.last_pose), sum(sweep.span) / 2.0
-        self._check_times(times)
+    def _deskewed(self, times: FloatArray) -> tuple[FloatArray, float]:
         first, last = float(times.min()), float(times.max())
-        self._icp.register_frame(sweep.points, (times - first) / (last - first))
-        return np.array(self._icp.last_pose), (first + last) / 2.0
+        return (times - first) / (last - first), (first + last) / 2.0
 
 
 class GenzIcpNoDeskew(GenzIcp):

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from html import escape
 from pathlib import Path
 from string import Template
 
-from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.types import OutputError
 
 _PAGE = Template("""<!DOCTYPE html>
@@ -42,75 +42,61 @@ $body
 _BEST = ' class="best"'
 
 
-def write_report(
-    path: str | Path,
-    title: str,
-    intro: Sequence[str],
-    header: Sequence[str],
-    rows: Sequence[Sequence[str]],
-    best: Iterable[tuple[int, int]],
-    definitions: Mapping[str, str],
-    pictures: Mapping[str, Path],
-    facts: Mapping[str, str],
-) -> None:
-    """Write the report; all texts are plain texts, which this function escapes.
+@dataclass(frozen=True, slots=True)
+class TextTable:
+    """A table of texts, for the terminal and for the report.
+
+    Attributes
+    ----------
+    best : (row, column) of the cells to point out; column 0 is the name of the row
+    """
+
+    header: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    best: frozenset[tuple[int, int]] = frozenset()
+
+
+def page(title: str, intro: Sequence[str], sections: Mapping[str, str]) -> str:
+    """The page as text.
 
     Parameters
     ----------
     intro : paragraphs at the top
-    header, rows : of the table of scores
-    best : (row, column) of the cells in bold type
-    definitions : column name -> meaning of the column
-    pictures : caption -> PNG file, which is embedded in the page
-    facts : solver -> version and settings
-
-    Raises
-    ------
-    OutputError
-        If a picture cannot be read or the page cannot be written.
+    sections : heading -> HTML of its content. Only this HTML is not escaped.
     """
-    body = [
-        "<h2>Scores</h2>",
-        _table(header, rows, set(best)),
-        *(_picture(caption, file) for caption, file in pictures.items()),
-        "<h2>Definitions</h2>",
-        _list(definitions),
-        "<h2>What was run</h2>",
-        _list(facts),
-    ]
-    page = _PAGE.substitute(
+    return _PAGE.substitute(
         title=escape(title),
         intro="\n".join(f'<p class="note">{escape(text)}</p>' for text in intro),
-        body="\n".join(body),
+        body="\n".join(f"<h2>{escape(name)}</h2>\n{html}" for name, html in sections.items()),
     )
-    with atomic_file(path) as file:
-        file.write(page.encode("utf-8"))
 
 
-def _table(header: Sequence[str], rows: Sequence[Sequence[str]], best: set[tuple[int, int]]) -> str:
-    head = "".join(f"<th>{escape(cell)}</th>" for cell in header)
+def table_html(table: TextTable) -> str:
+    """A table, its best cells in bold type."""
+    head = "".join(f"<th>{escape(cell)}</th>" for cell in table.header)
     lines = []
-    for number, row in enumerate(rows):
-        cells = "".join(
-            f"<td{_BEST if (number, column) in best else ''}>{escape(cell)}</td>"
+    for number, row in enumerate(table.rows):
+        cells = (
+            f"<td{_BEST if (number, column) in table.best else ''}>{escape(cell)}</td>"
             for column, cell in enumerate(row)
         )
-        lines.append(f"<tr>{cells}</tr>")
+        lines.append(f"<tr>{''.join(cells)}</tr>")
     return (
         f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
         f"<tbody>{''.join(lines)}</tbody></table></div>"
     )
 
 
-def _picture(caption: str, file: Path) -> str:
+def picture_html(caption: str, file: Path) -> str:
+    """A PNG file, embedded in the page; OutputError if the file cannot be read."""
     try:
         data = base64.b64encode(file.read_bytes()).decode("ascii")
     except OSError as error:
         raise OutputError(f"{file}: cannot read the picture for the report: {error}") from error
-    text = escape(caption)
-    return f'<h2>{text}</h2>\n<img alt="{text}" src="data:image/png;base64,{data}">'
+    return f'<img alt="{escape(caption)}" src="data:image/png;base64,{data}">'
 
 
-def _list(entries: Mapping[str, str]) -> str:
+def list_html(entries: Mapping[str, str]) -> str:
+    """A list of names and what they stand for."""
     lines = (f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in entries.items())
     return f"<dl>{''.join(lines)}</dl>"

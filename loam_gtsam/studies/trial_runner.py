@@ -22,7 +22,7 @@ from functools import partial
 from typing import Any
 
 from loam_gtsam.studies.trials import Row, Trial, empty_row, run_trial, versions
-from loam_gtsam.types import LoamError, MapUpdate, OutputError
+from loam_gtsam.types import LoamError, OutputError
 
 _POLL = 0.2
 """Seconds between two checks whether the user has asked to stop."""
@@ -40,48 +40,44 @@ class ClusterError(LoamError):
     """The scheduler of a cluster cannot be reached, or the connection was lost."""
 
 
-def run_here(trials: Sequence[Trial], stopped: Stopped) -> Iterator[Row]:
-    """Run trials in this process, one after the other.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        After the frame during which the user asked to stop.
-    """
-
-    def on_frame(number: int, update: MapUpdate) -> None:
-        if stopped():
-            raise KeyboardInterrupt
-
-    for trial in trials:
-        if stopped():
-            raise KeyboardInterrupt
-        yield run_trial(trial, on_frame)
-
-
-def run_on(
-    workers: LocalWorkers | ClusterWorkers,
+def run_trials(
     trials: Sequence[Trial],
     stopped: Stopped,
+    workers: LocalWorkers | ClusterWorkers | None = None,
     work: Work | None = None,
 ) -> Iterator[Row]:
-    """Run trials on workers; a row comes as soon as its trial is finished.
+    """Run trials; a row comes as soon as its trial is finished.
 
-    A trial whose worker process dies runs again. Workers get as many trials as they have slots and
-    no more: the scheduler of a cluster suspects every trial that a dying worker held.
+    Parameters
+    ----------
+    workers : None for this process, one trial after the other; a stop acts after each frame
 
     Raises
     ------
     KeyboardInterrupt
         If the user asked to stop; trials under way are lost.
+
+    Notes
+    -----
+    A trial whose worker process dies runs again. Workers get as many trials as they have slots and
+    no more: the scheduler of a cluster suspects every trial that a dying worker held.
     """
+
+    def stop_if_asked(*_: object) -> None:
+        if stopped():
+            raise KeyboardInterrupt
+
+    if workers is None:
+        for trial in trials:
+            stop_if_asked()
+            yield run_trial(trial, stop_if_asked)
+        return
     task = partial(_work_if_same_versions, work or run_trial, versions())
     waiting = deque(trials)
     running: dict[Future[Row], Trial] = {}
     deaths: Counter[str] = Counter()
     while waiting or running:
-        if stopped():
-            raise KeyboardInterrupt
+        stop_if_asked()
         # Without any worker, one trial waits at the scheduler for the first one.
         while waiting and len(running) < max(1, workers.slots):
             trial = waiting.popleft()
@@ -109,9 +105,6 @@ def _work_if_same_versions(work: Work, wanted: Mapping[str, str], trial: Trial) 
     return work(trial)
 
 
-# -- processes of this machine -----------------------------------------------------------------
-
-
 class LocalWorkers:
     """Executors of one process each: a process that dies takes no other trial with it."""
 
@@ -137,8 +130,8 @@ class LocalWorkers:
         return future
 
     def _start(self) -> ProcessPoolExecutor:
-        """A new process; Ctrl-C in a terminal reaches every process, and the caller handles it."""
         others = set(multiprocessing.active_children())
+        # Ctrl-C in a terminal reaches every process, and the caller handles it.
         executor = ProcessPoolExecutor(
             1, multiprocessing.get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
         )
@@ -163,25 +156,19 @@ def local_workers(count: int) -> Iterator[LocalWorkers]:
             executor.shutdown(cancel_futures=True)
 
 
-# -- a Dask cluster ----------------------------------------------------------------------------
-
-
 class ClusterWorkers:
     """The workers of a Dask cluster."""
 
     def __init__(self, client: Any) -> None:
-        self._client = client
+        self.client = client
         # Not pure: a scheduler that still holds an old result would hand it out again.
         self.executor: Executor = client.get_executor(pure=False)
+        self.submit: Callable[[Work, Trial], Future[Row]] = self.executor.submit
 
     @property
     def slots(self) -> int:
         """Number of trials that can run at the same time."""
-        return sum(self._client.nthreads().values())
-
-    def submit(self, work: Work, trial: Trial) -> Future[Row]:
-        """Start a trial; at most ``slots`` trials should be under way."""
-        return self.executor.submit(work, trial)
+        return sum(self.client.nthreads().values())
 
 
 @contextmanager

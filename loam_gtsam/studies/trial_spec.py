@@ -27,8 +27,7 @@ class Spec:
 
     Attributes
     ----------
-    name : of the file, without its ending
-    text : content of the file
+    name, text : of the file, without its ending, and its content
     trials : sequences x configurations x seeds, in this order
     metrics : columns of the table that are shown at the end
     """
@@ -46,6 +45,24 @@ class _Sequence:
     frames: int | None
     changes: Mapping[str, Any]
     where: str
+
+    @property
+    def is_world(self) -> bool:
+        return self.path.startswith("sim:")
+
+    @property
+    def own_seed(self) -> int | None:
+        """The seed in the address or among the options of a built-in world; None without one."""
+        query = dict(parse_qsl(self.path.partition("?")[2]))
+        seed = self.options.get("seed", query.get("seed"))
+        try:
+            return None if seed is None else int(seed)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"{self.where}: seed: expected an integer, got {seed!r}") from error
+
+    def seeds(self, given: list[int]) -> list[int | None]:
+        """The seeds of the specification, else of the address, else 0."""
+        return [*(given or [self.own_seed or 0])] if self.is_world else [None]
 
 
 def load_spec(path: str | Path) -> Spec:
@@ -91,18 +108,17 @@ def load_spec(path: str | Path) -> Spec:
         )
         for label, sequence in sequences.items()
         for config_name, entry in configs.items()
-        for seed in _seeds_of(sequence, seeds)
+        for seed in sequence.seeds(seeds)
     )
     return Spec(path.stem, text, trials, _metrics(f"{name}: metrics", entries.get("metrics")))
 
 
 def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequence:
-    """A sequence from a path, or from a mapping with the key ``path``."""
     entries = {"path": value} if isinstance(value, str) else _mapping(where, value, _SEQUENCE)
     path = entries.get("path")
     if not isinstance(path, str) or not path:
         raise ConfigError(f"{where}: expected a path, or a mapping with the key 'path'")
-    if not _is_world(path):
+    if not path.startswith("sim:"):
         # Absolute: the same relative path under another folder is other data. Symbolic links stay:
         # on another machine they may lead to another place.
         path = os.path.abspath(folder / Path(path).expanduser())
@@ -116,7 +132,6 @@ def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequ
 
 
 def _config(where: str, value: Any, folder: Path) -> Contender:
-    """A contender from the name of a solver, or from a mapping with name and changes."""
     entries = {"solver": value} if isinstance(value, str) else _mapping(where, value, _CONFIG)
     solver = entries.get("solver", "gtsam")
     if not isinstance(solver, str):
@@ -136,7 +151,6 @@ def _config(where: str, value: Any, folder: Path) -> Contender:
 
 
 def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
-    """``config`` with new values of the keys ``section.key``."""
     for key in changes:
         if "." not in key:
             raise ConfigError(f"{where}: expected SECTION.KEY: VALUE, got {key!r}")
@@ -144,7 +158,6 @@ def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
 
 
 def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[int]:
-    """The seeds, checked against the sequences that use them."""
     if value is None:
         return []
     if (
@@ -155,36 +168,16 @@ def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[i
         or len(set(value)) < len(value)
     ):
         raise ConfigError(f"{where}: expected a list of different integers from 0, got {value!r}")
-    worlds = [sequence for sequence in sequences.values() if _is_world(sequence.path)]
+    worlds = [sequence for sequence in sequences.values() if sequence.is_world]
     if not worlds:
         raise ConfigError(
             f"{where}: only built-in worlds (sim:NAME) have a seed, and none is among the "
             "sequences; recorded data runs once per configuration"
         )
-    for sequence in worlds:
-        if _own_seed(sequence) is not None:
-            raise ConfigError(
-                f"{sequence.where}: has a seed of its own; remove it, or remove 'seeds'"
-            )
+    for world in worlds:
+        if world.own_seed is not None:
+            raise ConfigError(f"{world.where}: has a seed of its own; remove it, or remove 'seeds'")
     return value
-
-
-def _seeds_of(sequence: _Sequence, seeds: list[int]) -> list[int | None]:
-    """The seeds of a sequence: of the specification, else of its address, else 0."""
-    if not _is_world(sequence.path):
-        return [None]
-    own = _own_seed(sequence)
-    return [*seeds] or [0 if own is None else own]
-
-
-def _own_seed(sequence: _Sequence) -> int | None:
-    """The seed in the address or among the options of a built-in world; None without one."""
-    query = dict(parse_qsl(sequence.path.partition("?")[2]))
-    seed = sequence.options.get("seed", query.get("seed"))
-    try:
-        return None if seed is None else int(seed)
-    except (TypeError, ValueError) as error:
-        raise ConfigError(f"{sequence.where}: seed: expected an integer, got {seed!r}") from error
 
 
 def _metrics(where: str, value: Any) -> tuple[str, ...]:
@@ -195,10 +188,6 @@ def _metrics(where: str, value: Any) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _is_world(path: str) -> bool:
-    return path.startswith("sim:")
-
-
 def _count(where: str, value: Any) -> int | None:
     if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
         raise ConfigError(f"{where}: expected a number of sweeps, at least 1, got {value!r}")
@@ -206,7 +195,6 @@ def _count(where: str, value: Any) -> int | None:
 
 
 def _named(where: str, value: Any) -> dict[str, Any]:
-    """``value``, checked to be a mapping that is not empty."""
     if not value:
         raise ConfigError(f"{where}: expected at least one, as NAME: VALUE")
     return _mapping(where, value)

@@ -1,6 +1,8 @@
 """Trials of a parameter study: a trial is one run of one solver on one sequence, and gives a row.
 
-A row holds the numbers of the run, or the error that ended it.
+A row holds the numbers of the run, or the error that ended it. The row of a finished trial is
+written to a small file at once, so that an interrupted study can go on; the table of all trials is
+a Parquet file that is made of these files.
 """
 
 from __future__ import annotations
@@ -12,22 +14,24 @@ import socket
 import time
 import traceback
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import cache
 from itertools import islice
+from pathlib import Path
 from typing import Any
 
 from loam_gtsam import datasets
 from loam_gtsam.config import Config, config_to_dict
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import OnFrame, effective_config, run
 from loam_gtsam.studies.comparison import score
 from loam_gtsam.studies.contenders import PeerRunner, SolverRun
 from loam_gtsam.studies.evaluation import pose_differences
 from loam_gtsam.studies.peers import make_peer
-from loam_gtsam.types import FrameStatus, LoamError, Trajectory
+from loam_gtsam.types import FrameStatus, LoamError, OutputError, Trajectory
 
 Row = dict[str, Any]
 """The values of a trial by the name of their column, see :data:`COLUMNS`; None if not known."""
@@ -36,30 +40,15 @@ VERSIONS = ("loam_gtsam", "gtsam", "numpy")
 """Packages whose version decides the numbers of the solvers of this package."""
 
 METRICS = (
-    "ate_m",
-    "ate_max_m",
-    "rotation_deg",
-    "rpe_percent",
-    "rpe_deg_per_m",
-    "drift_percent",
-    "iterations",
-    "solver_iterations",
-    "matches",
-    "ms_median",
-    "ms_95",
-)
+    "ate_m", "ate_max_m", "rotation_deg", "rpe_percent", "rpe_deg_per_m", "drift_percent",
+    "iterations", "solver_iterations", "matches", "ms_median", "ms_95",
+)  # fmt: skip
 """Columns to compare solvers by; see ``docs/compare.md`` and ``docs/parameter_studies.md``."""
 
 COLUMNS: dict[str, type] = {
-    "trial": str,
-    "sequence": str,
-    "config": str,
+    **dict.fromkeys(("trial", "sequence", "config"), str),
     "seed": int,
-    "path": str,
-    "options": str,
-    "config_hash": str,
-    "peer": str,
-    "peer_version": str,
+    **dict.fromkeys(("path", "options", "config_hash", "peer", "peer_version"), str),
     **{f"{name}_version": str for name in VERSIONS},
     "frames": int,
     **{f"frames_{status}": int for status in FrameStatus},
@@ -76,6 +65,9 @@ COLUMNS: dict[str, type] = {
 
 NOT_REPEATABLE = ("ms_median", "ms_95", "wall_s", "host")
 """Columns that differ when the same trial runs again; all other columns are the same."""
+
+TABLE_FILE = "results.parquet"
+TRIALS_FOLDER = "trials"
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,15 +101,9 @@ class Trial:
     @property
     def id(self) -> str:
         """Hash of all that decides the result: not the names of the trial, nor the data itself."""
-        return _hash(
-            {
-                "path": self.path,
-                "options": dict(self.options),
-                "frames": self.frames,
-                "seed": self.seed,
-                "config": self.config_hash,
-            }
-        )
+        names = "path", "frames", "seed"
+        deciding = {name: getattr(self, name) for name in names}
+        return _hash(deciding | {"options": dict(self.options), "config": self.config_hash})
 
     @property
     def dataset_options(self) -> dict[str, Any]:
@@ -160,21 +146,17 @@ def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
 
 def empty_row(trial: Trial) -> Row:
     """The row of a trial that has not run."""
-    row: Row = dict.fromkeys(COLUMNS)
-    return (
-        row
-        | dict(versions())
-        | {
-            "trial": trial.id,
-            "sequence": trial.sequence,
-            "config": trial.config_name,
-            "seed": trial.seed,
-            "path": trial.path,
-            "options": json.dumps(dict(trial.options), sort_keys=True, default=str),
-            "config_hash": trial.config_hash,
-            "peer": trial.peer,
-        }
-    )
+    known = {
+        "trial": trial.id,
+        "sequence": trial.sequence,
+        "config": trial.config_name,
+        "seed": trial.seed,
+        "path": trial.path,
+        "options": json.dumps(dict(trial.options), sort_keys=True, default=str),
+        "config_hash": trial.config_hash,
+        "peer": trial.peer,
+    }
+    return dict.fromkeys(COLUMNS) | dict(versions()) | known
 
 
 def _run_pipeline(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
@@ -195,7 +177,6 @@ def _run_peer(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> Solve
 
 
 def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
-    """The columns that are computed from a run."""
     scores = score(finished, truth)
     counts = Counter(update.status for update in finished.updates)
     row: Row = {
@@ -237,3 +218,88 @@ def _hash(value: Mapping[str, Any]) -> str:
     """A hash that is equal on every machine; a value that JSON does not know counts as text."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
+
+
+# -- files -----------------------------------------------------------------------------------------
+
+
+class TrialStore:
+    """The files of the finished trials of a study.
+
+    Parameters
+    ----------
+    folder : of the results; the files of the trials are in its folder ``trials``
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder / TRIALS_FOLDER
+
+    def save(self, row: Row) -> None:
+        """Write the row of a finished trial; OutputError if the file cannot be written."""
+        with atomic_file(self._file(row["trial"])) as file:
+            file.write((json.dumps(row, indent=1, allow_nan=False) + "\n").encode("utf-8"))
+
+    def load(self, trial: Trial) -> Row | None:
+        """The row of a trial if the installed versions have finished it; else None.
+
+        The row of a file that cannot be read is None as well: the trial runs again.
+        """
+        try:
+            row = json.loads(self._file(trial.id).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        if not isinstance(row, dict) or set(row) != set(COLUMNS) or row["trial"] != trial.id:
+            return None
+        if any(row[name] != value for name, value in versions().items()):
+            return None
+        # The names in the specification may have changed since the trial ran.
+        return row | {"sequence": trial.sequence, "config": trial.config_name}
+
+    def _file(self, trial: str) -> Path:
+        return self.folder / f"{trial}.json"
+
+
+def write_table(path: Path, rows: Iterable[Row], text: str, trials: Iterable[Trial]) -> None:
+    """Write the table of a study.
+
+    Parameters
+    ----------
+    text, trials : specification of the study; the text and all configurations become metadata
+
+    Raises
+    ------
+    OutputError
+        If pyarrow is missing or the file cannot be written.
+    """
+    arrow, parquet = import_pyarrow()
+    kinds = {str: arrow.string(), int: arrow.int64(), float: arrow.float64()}
+    configs = {trial.config_hash: config_to_dict(trial.config) for trial in trials}
+    metadata = {"loam_gtsam.spec": text, "loam_gtsam.configs": json.dumps(configs)}
+    schema = arrow.schema([(name, kinds[kind]) for name, kind in COLUMNS.items()], metadata)
+    with atomic_file(path) as file:
+        parquet.write_table(arrow.Table.from_pylist(list(rows), schema), file)
+
+
+def read_table(path: Path) -> tuple[list[Row], Mapping[str, Any]]:
+    """The rows of a table, and the full configurations by their ``config_hash``.
+
+    Raises
+    ------
+    OutputError
+        If pyarrow is missing.
+    """
+    _, parquet = import_pyarrow()
+    table = parquet.read_table(path)
+    return table.to_pylist(), json.loads(table.schema.metadata[b"loam_gtsam.configs"])
+
+
+def import_pyarrow() -> tuple[Any, Any]:
+    """``pyarrow`` and ``pyarrow.parquet``; OutputError if they are not installed."""
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise OutputError(
+            f'the table needs pyarrow ({error}): pip install "loam_gtsam[cluster]"'
+        ) from error
+    return pyarrow, pyarrow.parquet

@@ -20,8 +20,7 @@ from typer.testing import Result
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.studies import trial_runner
-from loam_gtsam.studies.trial_table import TABLE_FILE, read_table
-from loam_gtsam.studies.trials import Row, Trial, empty_row
+from loam_gtsam.studies.trials import TABLE_FILE, Row, Trial, empty_row, read_table
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "parameter_studies.md"
 

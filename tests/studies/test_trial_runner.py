@@ -17,8 +17,15 @@ from support.trials import SPEC, repeatable, trial_of, write_spec
 
 from loam_gtsam.studies import trial_runner
 from loam_gtsam.studies.trial_spec import load_spec
-from loam_gtsam.studies.trial_table import TABLE_FILE, read_table
-from loam_gtsam.studies.trials import Row, Trial, empty_row, run_trial, versions
+from loam_gtsam.studies.trials import (
+    TABLE_FILE,
+    Row,
+    Trial,
+    empty_row,
+    read_table,
+    run_trial,
+    versions,
+)
 from loam_gtsam.types import MapUpdate
 
 
@@ -62,16 +69,16 @@ def in_order(trials: tuple[Trial, ...], rows: list[Row]) -> list[Row]:
 def test_a_stop_between_two_trials_starts_no_other(monkeypatch):
     monkeypatch.setattr(trial_runner, "run_trial", lambda *_: pytest.fail("a trial was started"))
     with pytest.raises(KeyboardInterrupt):
-        list(trial_runner.run_here([trial_of()], lambda: True))
+        list(trial_runner.run_trials([trial_of()], lambda: True))
 
 
 def test_the_death_of_a_worker_in_the_middle_changes_no_number(tmp_path):
     trials = load_spec(write_spec(tmp_path, SPEC)).trials
-    here = list(trial_runner.run_here(trials, never))
+    here = list(trial_runner.run_trials(trials, never))
     flag = tmp_path / "died"
     work = partial(dies, trials[1].id, str(flag))
     with trial_runner.local_workers(2) as workers:
-        rows = list(trial_runner.run_on(workers, trials, never, work))
+        rows = list(trial_runner.run_trials(trials, never, workers, work))
     assert flag.exists()
     assert in_order(trials, rows) == repeatable(here)
     assert all(row["error"] is None for row in rows)
@@ -89,7 +96,7 @@ def test_a_trial_that_always_kills_its_worker_fails_alone(where, request, tmp_pa
         monkeypatch.setattr(cluster.scheduler, "allowed_failures", 0)
         workers = trial_runner.cluster_workers(cluster.scheduler_address)
     with workers as pool:
-        rows = list(trial_runner.run_on(pool, trials, never, partial(dies, trials[0].id, "")))
+        rows = list(trial_runner.run_trials(trials, never, pool, partial(dies, trials[0].id, "")))
     errors = {row["trial"]: row["error"] for row in rows}
     assert errors.pop(trials[0].id).startswith(("KilledWorker: ", "BrokenProcessPool: "))
     assert set(errors.values()) == {None}
@@ -103,7 +110,7 @@ def test_a_stop_ends_the_wait_for_workers_and_the_workers(tmp_path):
 
     def run_until_stopped() -> None:
         with trial_runner.local_workers(2) as pool:
-            for row in trial_runner.run_on(pool, trials, lambda: bool(rows)):
+            for row in trial_runner.run_trials(trials, lambda: bool(rows), pool):
                 rows.append(row)
 
     with pytest.raises(KeyboardInterrupt):

@@ -18,8 +18,14 @@ from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies import trials
 from loam_gtsam.studies.contenders import SolverRun
 from loam_gtsam.studies.evaluation import absolute_error, pose_differences, relative_error
-from loam_gtsam.studies.trial_table import TRIALS_FOLDER, TrialStore
-from loam_gtsam.studies.trials import COLUMNS, empty_row, run_trial, versions
+from loam_gtsam.studies.trials import (
+    COLUMNS,
+    TRIALS_FOLDER,
+    TrialStore,
+    empty_row,
+    run_trial,
+    versions,
+)
 from loam_gtsam.types import BadSweep, FrameStatus, MapUpdate
 
 
@@ -129,7 +135,7 @@ def test_a_peer_gets_the_sweeps_and_the_sensor(monkeypatch):
 
         def register(self, stamp, sweep):
             seen.append(sweep.points.shape[0])
-            return SimpleNamespace(stamp=stamp, map_T_lidar=np.eye(4), seconds=0.001)
+            return MapUpdate(stamp, gtsam.Pose3(), FrameStatus.OK)
 
     monkeypatch.setattr(trials, "make_peer", lambda name: Still())
     near = Config().sensor.changed(max_range=3.0)

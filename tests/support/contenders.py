@@ -33,8 +33,8 @@ class FakePeer(Peer):
         return 7
 
     def _register(self, stamp, sweep):
-        if len(self.poses) == self.fails_at:
+        if len(self.updates) == self.fails_at:
             raise RuntimeError("cannot [go] on")
         pose = np.eye(4)
-        pose[0, 3] = len(self.poses)
+        pose[0, 3] = len(self.updates)
         return pose, 0.0

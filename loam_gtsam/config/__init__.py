@@ -6,45 +6,27 @@ returns a named one; :meth:`Config.changed` and :meth:`Section.changed` change v
 :func:`dump_config` writes YAML with the meaning of every key as a comment.
 """
 
-from loam_gtsam.config.base import Section, meaning
-from loam_gtsam.config.files import (
-    config_from_dict,
-    config_to_dict,
-    dump_config,
-    load_config,
-    parse_config,
-)
-from loam_gtsam.config.frontend import DeskewConfig, FeatureConfig, OdometryConfig, SensorConfig
-from loam_gtsam.config.imu import ImuConfig
-from loam_gtsam.config.loops import LoopConfig, PoseGraphConfig
-from loam_gtsam.config.mapping import MapConfig, RelocalizationConfig
-from loam_gtsam.config.output import BagConfig, LiveConfig
-from loam_gtsam.config.registration import CovarianceConfig, MatchingConfig, SolverConfig
-from loam_gtsam.config.tree import PRESETS, Config, preset
-
-__all__ = [
-    "PRESETS",
-    "BagConfig",
-    "Config",
-    "CovarianceConfig",
-    "DeskewConfig",
-    "FeatureConfig",
-    "ImuConfig",
-    "LiveConfig",
-    "LoopConfig",
-    "MapConfig",
-    "MatchingConfig",
-    "OdometryConfig",
-    "PoseGraphConfig",
-    "RelocalizationConfig",
-    "Section",
-    "SensorConfig",
-    "SolverConfig",
-    "config_from_dict",
-    "config_to_dict",
-    "dump_config",
-    "load_config",
-    "meaning",
-    "parse_config",
-    "preset",
-]
+from loam_gtsam.config.additions import BagConfig as BagConfig
+from loam_gtsam.config.additions import ImuConfig as ImuConfig
+from loam_gtsam.config.additions import LiveConfig as LiveConfig
+from loam_gtsam.config.additions import LoopConfig as LoopConfig
+from loam_gtsam.config.additions import PoseGraphConfig as PoseGraphConfig
+from loam_gtsam.config.base import Section as Section
+from loam_gtsam.config.base import meaning as meaning
+from loam_gtsam.config.estimator import CovarianceConfig as CovarianceConfig
+from loam_gtsam.config.estimator import DeskewConfig as DeskewConfig
+from loam_gtsam.config.estimator import FeatureConfig as FeatureConfig
+from loam_gtsam.config.estimator import MapConfig as MapConfig
+from loam_gtsam.config.estimator import MatchingConfig as MatchingConfig
+from loam_gtsam.config.estimator import OdometryConfig as OdometryConfig
+from loam_gtsam.config.estimator import RelocalizationConfig as RelocalizationConfig
+from loam_gtsam.config.estimator import SensorConfig as SensorConfig
+from loam_gtsam.config.estimator import SolverConfig as SolverConfig
+from loam_gtsam.config.files import config_from_dict as config_from_dict
+from loam_gtsam.config.files import config_to_dict as config_to_dict
+from loam_gtsam.config.files import dump_config as dump_config
+from loam_gtsam.config.files import load_config as load_config
+from loam_gtsam.config.files import parse_config as parse_config
+from loam_gtsam.config.tree import PRESETS as PRESETS
+from loam_gtsam.config.tree import Config as Config
+from loam_gtsam.config.tree import preset as preset

@@ -1,15 +1,17 @@
-"""Sections of the configuration: pydantic models, and errors that name the key."""
+"""Sections of the configuration: pydantic models, changes of them, errors that name the key."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args, get_origin
+from collections.abc import Callable, Iterable, Mapping
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
 
 from annotated_types import Ge, Le
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
 from pydantic_core import ErrorDetails, PydanticCustomError
+from ruamel.yaml import YAML
+from ruamel.yaml.scalarbool import ScalarBoolean
 
 from loam_gtsam.types import ConfigError
 
@@ -43,13 +45,7 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
 ) -> Any:
-    """A field of a section, which the string below it describes.
-
-    Parameters
-    ----------
-    unit, source : empty if there is none
-    low, high : inclusive bounds of a number
-    """
+    """A field of a section, which the string below it describes; its bounds are inclusive."""
     return Field(
         default,
         ge=low,
@@ -77,11 +73,8 @@ class RefusedError(ConfigError):
     """A section that was refused: ``keys`` of it are wrong, for a ``reason``."""
 
     def __init__(self, section: str, keys: tuple[str, ...], reason: str) -> None:
-        super().__init__(section, keys, reason)
-        self.section, self.keys, self.reason = section, keys, reason
-
-    def __str__(self) -> str:
-        return f"{self.section}.{self.keys[0]}: {self.reason}"
+        super().__init__(f"{section}.{keys[0]}: {reason}")
+        self.keys, self.reason = keys, reason
 
 
 class Section(BaseModel):
@@ -172,3 +165,80 @@ def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:
     close = difflib.get_close_matches(asked, list(known), n=1)
     hint = f"; did you mean {close[0]!r}?" if close else ""
     return hint + (f" (known: {', '.join(sorted(known))})" if listing else "")
+
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+
+def override(
+    section: AnySection,
+    data: Mapping[Any, Any],
+    where: Callable[[tuple[Any, ...]], str],
+    above: tuple[str, ...] = (),
+) -> AnySection:
+    """A section with the values of nested mappings in place of its own.
+
+    Parameters
+    ----------
+    where : names the place of a key, given its path from the top, in an error message
+    above : path of the section from the top
+
+    Raises
+    ------
+    ConfigError
+        Naming the key, its place, what was expected and what came.
+    """
+    values: dict[str, Any] = {}
+    keys: dict[str, Any] = {}
+    for key, value in data.items():
+        name = key if isinstance(key, str) else shown(key)
+        current = vars(section).get(name)
+        if isinstance(current, Section) and isinstance(value, Mapping):
+            values[name] = override(current, value, where, (*above, name))
+        else:
+            values[name] = _plain(value)
+        keys[name] = key
+    try:
+        return Section.changed(section, **values)
+    except RefusedError as error:
+        name = next((key for key in error.keys if key in keys), error.keys[0])
+        place = where((*above, keys.get(name, name)))
+        raise ConfigError(f"{place}{'.'.join((*above, name))}: {error.reason}") from None
+
+
+def _plain(value: Any) -> Any:
+    """A value without what the parser keeps of the looks of a boolean, which is no bool then."""
+    if isinstance(value, list):
+        return [_plain(entry) if isinstance(entry, ScalarBoolean) else entry for entry in value]
+    return bool(value) if isinstance(value, ScalarBoolean) else value
+
+
+def nested(changes: Iterable[str | Mapping[str, Any]], where: str) -> dict[str, Any]:
+    """Changes as :meth:`Config.changed` takes them, as mappings within mappings for `override`."""
+    tree: dict[str, Any] = {}
+    for change in changes:
+        _merge(tree, _assignment(change, where) if isinstance(change, str) else change)
+    return tree
+
+
+def _merge(tree: dict[str, Any], change: Mapping[str, Any]) -> None:
+    for key, value in change.items():
+        name, dot, rest = key.partition(".")
+        if dot:
+            value = {rest: value}
+        if isinstance(value, Mapping):
+            below = tree.get(name)
+            tree[name] = below if isinstance(below, dict) else {}
+            _merge(tree[name], value)
+        else:
+            tree[name] = value
+
+
+def _assignment(text: str, where: str) -> dict[str, Any]:
+    key, separator, value = text.partition("=")
+    if not separator or not key.strip():
+        raise ConfigError(f"{where}expected SECTION.KEY=VALUE, got {text!r}")
+    try:
+        return {key.strip(): YAML(typ="safe", pure=True).load(value)}
+    except Exception as error:  # a day 32 is a ValueError, deep nesting a RecursionError
+        raise ConfigError(f"{where}{text}: {value!r} is not a YAML value") from error

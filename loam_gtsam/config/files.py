@@ -11,8 +11,7 @@ from typing import Any
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from loam_gtsam.config.base import Section, meaning, nearest, shown
-from loam_gtsam.config.changes import override
+from loam_gtsam.config.base import Section, meaning, nearest, override, shown
 from loam_gtsam.config.tree import PRESETS, Config
 from loam_gtsam.types import ConfigError
 

@@ -7,14 +7,25 @@ from typing import Any, Self
 
 from pydantic import model_validator
 
-from loam_gtsam.config.base import Section, nearest, out_of_order
-from loam_gtsam.config.changes import with_changes
-from loam_gtsam.config.frontend import DeskewConfig, FeatureConfig, OdometryConfig, SensorConfig
-from loam_gtsam.config.imu import ImuConfig
-from loam_gtsam.config.loops import LoopConfig, PoseGraphConfig
-from loam_gtsam.config.mapping import MapConfig, RelocalizationConfig
-from loam_gtsam.config.output import BagConfig, LiveConfig
-from loam_gtsam.config.registration import CovarianceConfig, MatchingConfig, SolverConfig
+from loam_gtsam.config.additions import (
+    BagConfig,
+    ImuConfig,
+    LiveConfig,
+    LoopConfig,
+    PoseGraphConfig,
+)
+from loam_gtsam.config.base import Section, nearest, nested, out_of_order, override
+from loam_gtsam.config.estimator import (
+    CovarianceConfig,
+    DeskewConfig,
+    FeatureConfig,
+    MapConfig,
+    MatchingConfig,
+    OdometryConfig,
+    RelocalizationConfig,
+    SensorConfig,
+    SolverConfig,
+)
 from loam_gtsam.types import ConfigError
 
 
@@ -66,7 +77,8 @@ class Config(Section):
         >>> Config().changed("solver.iterations=5", "imu.enabled=false").solver.iterations
         5
         """
-        return with_changes(self.model_copy(update=sections), changes, source)
+        where = f"{source}: " if source else ""
+        return override(self.model_copy(update=sections), nested(changes, where), lambda _: where)
 
 
 _CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0, post_depth=0.0)

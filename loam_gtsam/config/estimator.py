@@ -1,0 +1,328 @@
+"""The sections of the estimator: sweep, features, prediction, map, registration."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from loam_gtsam.config.base import Count, Section, parameter
+
+
+class SensorConfig(Section):
+    """The properties of the lidar and of its sweeps that the data itself does not tell."""
+
+    in_order = (("min_range", "max_range"),)
+
+    model: Literal["auto", "vlp16", "hdl32", "hdl64", "os1-16", "os1-32", "os1-64", "os1-128"] = (
+        parameter("auto")
+    )
+    """The model of the lidar selects the table of beam elevations for rings from elevations; auto
+    detects the model from the data."""
+    rings: Literal["auto", "field", "rows", "elevation"] = parameter("auto")
+    """Ring numbers of the points come from a field of the cloud, from its rows or from the
+    elevations of the points; auto tries the three in this order."""
+    times: Literal["auto", "field", "azimuth", "none"] = parameter("auto")
+    """Times of the points come from a field of the cloud or from the azimuths of the points; auto
+    tries the two in this order, and none maps the sweeps without de-skewing."""
+    spin: Literal["auto", "clockwise", "counterclockwise"] = parameter("auto")
+    """The lidar rotates in this sense, seen from above; it is used for times from azimuths."""
+    start_azimuth_deg: float = parameter(180.0, unit="degrees", low=-360.0, high=360.0)
+    """A sweep starts at this azimuth, counted from x towards y."""
+    period: float = parameter(0.1, unit="s", low=1e-4)
+    """A sweep lasts this long; the duration is used for times from azimuths."""
+    stamp: Literal["auto", "start", "middle", "end"] = parameter("auto")
+    """The stamp of a sweep is this moment of it, for times from azimuths; auto takes what the
+    layout of the data set implies (KITTI: middle), else the start."""
+    min_range: float = parameter(0.5, unit="m", source="A-LOAM uses 0.3 to 5", low=0.0)
+    """Points nearer to the lidar than this are dropped."""
+    max_range: float = parameter(120.0, unit="m", low=0.0)
+    """Points farther from the lidar than this are dropped."""
+
+
+class FeatureConfig(Section):
+    """Scan registration: the choice of edge and plane features among the points of a sweep."""
+
+    in_order = (("sharp_per_sector", "edges_per_sector"),)
+
+    sectors: int = parameter(6, source="LOAM", low=1)
+    """Every ring is divided into this many sectors, which each give their own features."""
+    half_window: int = parameter(5, source="LOAM", low=1)
+    """The curvature at a point takes this many neighbours on either side of it in its ring."""
+    edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
+    """An edge point needs at least this curvature, the squared norm of the sum of differences."""
+    range_noise: float = parameter(
+        0.02, unit="m", source="LOAM takes all points that are not edges", low=0.0
+    )
+    """The ranges of the sensor have this standard deviation. A plane point is taken only where its
+    ring scatters about a smooth surface by less than four times this value, which foliage does
+    not; 0 turns the test off."""
+    post_depth: float = parameter(
+        0.5, unit="m", source="LOAM takes only what its curvature finds", low=0.0
+    )
+    """A pole, a run of a ring too short for the curvature, is an edge where it stands in front of
+    what is on both sides of it by more than this; 0 turns the search for poles off."""
+    post_width: float = parameter(0.5, unit="m", low=0.0)
+    """A run of a ring counts as a pole only if it is narrower than this."""
+    plane_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
+    """A plane point has at most this curvature."""
+    sharp_per_sector: int = parameter(2, source="LOAM", low=0)
+    """At most this many edge points of a sector count as sharp; scan-to-scan odometry uses them."""
+    edges_per_sector: int = parameter(20, source="LOAM", low=0)
+    """At most this many edge points are taken from a sector, the sharp ones included."""
+    flat_per_sector: int = parameter(4, source="LOAM", low=0)
+    """At most this many plane points of a sector count as flat; scan-to-scan odometry uses them."""
+    max_gap: float = parameter(0.05, unit="m^2", source="LOAM", low=0.0)
+    """The suppression of points beside a chosen one stops at a gap with a squared width above
+    this."""
+    occlusion_gap: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
+    """Two neighbours with a squared distance above this may be the rim of an occlusion."""
+    occlusion_ratio: float = parameter(0.1, source="LOAM", low=0.0)
+    """Two neighbours are on one ray if their distance, scaled to one range and divided by the
+    range, is below this."""
+    grazing_ratio: float = parameter(0.0002, source="LOAM", low=0.0)
+    """A beam grazes the surface if both squared gaps beside its point exceed this times the squared
+    range of the point."""
+    plane_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
+    """The plane points of one ring are thinned to one per voxel of this size."""
+
+
+class DeskewConfig(Section):
+    """De-skewing: the removal of the motion distortion from a sweep."""
+
+    enabled: bool = parameter(True)
+    """Sweeps are de-skewed with the predicted motion, and again with the solution."""
+    refine: bool = parameter(True, source="LOAM de-skews once")
+    """Sweeps are de-skewed again with the solution, and the first two are registered anew when
+    their motion is known; false de-skews once, with the prediction."""
+    rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
+    """The rotation within a sweep comes from here: auto takes the gyro of an IMU where it covers
+    the sweep, else a constant velocity; orientation takes the attitude of the IMU in place of its
+    gyro."""
+    reference: Literal["start", "middle", "end", "stamp"] = parameter("start")
+    """The pose of a sweep is that of the lidar at this moment of the sweep."""
+
+
+class OdometryConfig(Section):
+    """The prediction of the motion, from which the mapper starts."""
+
+    method: Literal["constant_velocity", "scan_to_scan"] = parameter("constant_velocity")
+    """The predicted motion repeats the last one, or comes from scan-to-scan registration."""
+    iterations: int = parameter(25, source="LOAM", low=1)
+    """Scan-to-scan registration takes at most this many iterations."""
+    max_distance: float = parameter(5.0, unit="m", source="LOAM", low=0)
+    """Scan-to-scan registration matches no points farther apart than this."""
+    ring_gap: int = parameter(2, source="LOAM", low=1)
+    """Scan-to-scan registration searches this many rings above and below the ring of a match."""
+
+
+class MapConfig(Section):
+    """The map of edge and plane points, in cubes of which those in a window are in memory."""
+
+    in_order = (("edge_voxel", "cube_size"), ("plane_voxel", "cube_size"))
+
+    cube_size: float = parameter(50.0, unit="m", source="LOAM", low=1.0)
+    """Every cube of the map has this edge length."""
+    window: tuple[Count, Count, Count] = parameter((21, 21, 11), source="LOAM")
+    """The window holds this many cubes along x, y and z."""
+    window_margin: int = parameter(3, unit="cubes", source="LOAM", low=0)
+    """The window shifts when the cube of the sensor is this near the edge of the window."""
+    neighbourhood: tuple[Count, Count, Count] = parameter((5, 5, 5), source="LOAM")
+    """A sweep is matched with this many cubes around the sensor, along x, y and z."""
+    field_of_view: bool = parameter(True, source="LOAM")
+    """A sweep is matched only with cubes that have a corner 30 to 150 degrees off the up axis."""
+    edge_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.01)
+    """The edge map keeps one point per voxel of this size."""
+    plane_voxel: float = parameter(0.4, unit="m", source="LOAM", low=0.01)
+    """The plane map keeps one point per voxel of this size."""
+    insertion: Literal["settled", "centroid"] = parameter("settled")
+    """New points enter a cube in this way: settled keeps the first point of a voxel; centroid
+    filters the cube again with its new points, as LOAM does."""
+    archive_megabytes: float = parameter(512.0, unit="MB", low=0.0)
+    """Cubes that left the window take at most this much memory. Beyond it, the oldest go to
+    archive_dir, or are dropped and counted if archive_dir is not set."""
+    archive_dir: str | None = parameter(None)
+    """Archived cubes go to this folder; null keeps them in memory."""
+
+
+class RelocalizationConfig(Section):
+    """The test whether a sweep is lost, and the search for its place."""
+
+    in_order = (
+        ("min_agreement", "found_agreement"),
+        ("min_share", "found_share"),
+        ("radius", "max_radius"),
+    )
+
+    enabled: bool = parameter(True, source="LOAM believes every solve")
+    """Every sweep is tested, and is lost if it fits the map less well than the sweeps before it;
+    false believes every solve."""
+    memory: int = parameter(10, low=1)
+    """The usual shares are medians over this many earlier sweeps; no sweep is lost before them."""
+    min_agreement: float = parameter(
+        0.8, source="at least 0.88 was seen in the built-in scenes and KITTI, at most 0.75 when "
+        "kidnapped", low=0.0, high=1.0,
+    )  # fmt: skip
+    """A sweep is lost if the share of its matches within three standard deviations is below this
+    times the usual share."""
+    min_share: float = parameter(0.4, low=0.0, high=1.0)
+    """A sweep is lost as well if the share of its features that are matched and agree is below this
+    times the usual share."""
+    found_agreement: float = parameter(0.9, low=0.0, high=1.0)
+    """A lost sweep is found again only if the share of its matches within three standard deviations
+    is at least this times the usual share."""
+    found_share: float = parameter(0.6, low=0.0, high=1.0)
+    """A lost sweep is found again only if the share of its features that are matched and agree is
+    at least this times the usual share."""
+    max_acceleration: float = parameter(60.0, unit="m/s^2", low=0.0)
+    """A pose is a jump if it is farther from the predicted one than this acceleration explains. It
+    is handed out without a motion, and the velocity from before stays."""
+    max_turn_acceleration: float = parameter(60.0, unit="rad/s^2", low=0.0)
+    """A pose is a jump as well if its rotation differs from the predicted one by more than this
+    angular acceleration explains."""
+    radius: float = parameter(10.0, unit="m", low=0.0)
+    """The search begins within this radius about the predicted pose."""
+    radius_growth: float = parameter(1.0, unit="m", low=0.0)
+    """The radius of the search grows by this with every lost sweep."""
+    max_radius: float = parameter(30.0, unit="m", low=0.0, high=100.0)
+    """The radius of the search does not grow beyond this."""
+
+
+class MatchingConfig(Section):
+    """The association of features with lines and planes of the map."""
+
+    max_edges: int = parameter(500, source="LOAM matches all", low=0)
+    """At most this many edge features of a sweep are matched, evenly spread over it; 0 matches all.
+    All features enter the map."""
+    max_planes: int = parameter(2000, source="LOAM matches all", low=0)
+    """At most this many plane features of a sweep are matched, evenly spread over it; 0 matches
+    all. All features enter the map."""
+    trial_edges: int = parameter(150, low=1)
+    """At most this many edge features are matched where many poses are tried, in the search for a
+    lost sweep and for a loop closure."""
+    trial_planes: int = parameter(500, low=1)
+    """At most this many plane features are matched where many poses are tried."""
+    neighbours: int = parameter(5, source="LOAM", low=3)
+    """A line or plane is fitted to this many map points nearest to a feature."""
+    max_distance: float = parameter(1.0, unit="m", source="LOAM", low=0.0)
+    """A feature is matched only if its nearest map points are all within this distance."""
+    wide_search: float = parameter(4.0, source="LOAM has no such search", low=1.0)
+    """With fewer matches than solver.min_matches, the search is repeated with max_distance and the
+    voxels of the map enlarged by this factor. This helps at the start on open ground, where the
+    rings of one sweep are too far apart; 1 turns the search off."""
+    wide_below: float = parameter(8.0, low=0.0)
+    """Lines are searched for within wide_search times max_distance, too, if fewer planes than this
+    fix a translation, counted as if they lay across it."""
+    line_ratio: float = parameter(10.0, source="LOAM uses 3", low=1.0)
+    """A line needs its largest eigenvalue above this times the second one."""
+    plane_fit: Literal["centroid", "unit_offset"] = parameter(
+        "centroid", source="LOAM and A-LOAM use unit_offset"
+    )
+    """Planes are fitted in this way: about the centroid, or by A n = -1 (unit_offset), which cannot
+    represent a plane through the map origin."""
+    plane_tolerance: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
+    """A plane is accepted only if none of its map points is farther from it than this."""
+    plane_ratio: float = parameter(0.2, low=0.0, high=1.0)
+    """A plane needs its second eigenvalue above this times the largest one: points along one ring
+    of a sparse sensor have no normal."""
+    max_ring_cosine: float = parameter(0.5, low=0.0)
+    """The cosine between an edge line and its ring is at most this, for a line along the ring is
+    no edge."""
+    min_incidence_sine: float = parameter(0.05, low=0.0, high=1.0)
+    """The sine of the angle between a plane and the viewing ray is at least this, for a plane that
+    contains the ray says nothing."""
+    keep_translation: float = parameter(0.05, unit="m", source="LOAM uses 0", low=0.0)
+    """Lines and planes are kept, and only distances and weights renewed, while the pose has moved
+    less than this since the search and turned less than keep_rotation_deg; 0 searches each time."""
+    keep_rotation_deg: float = parameter(0.3, unit="degrees", source="LOAM uses 0", low=0.0)
+    """Lines and planes are searched for again when the pose has turned by this since the search."""
+    point_sigma: float = parameter(0.03, unit="m", low=1e-6)
+    """A measured point has this standard deviation about a surface."""
+    fit_uncertainty: bool = parameter(True)
+    """The variance of a match includes that of the line or plane at the point (regression
+    leverage); false gives every match point_sigma."""
+    weight_slope: float = parameter(0.9, source="LOAM", low=0.0)
+    """A match has the weight 1 - slope * |distance|, for planes over sqrt(range), with this slope;
+    0 gives all matches the same weight."""
+    weight_range: Literal["lidar", "map"] = parameter(
+        "lidar", source="LIO-SAM uses lidar, LOAM uses map"
+    )
+    """The range in the weight of a plane is that from the lidar or from the map origin."""
+    min_weight: float = parameter(0.1, source="LOAM", low=0.0, high=1.0)
+    """A match with a smaller weight than this is dropped."""
+
+
+class SolverConfig(Section):
+    """The solve for the pose of a sweep."""
+
+    method: Literal["gtsam", "loam", "aloam"] = parameter("gtsam")
+    """The pose is solved by a factor graph (gtsam), by LOAM's Gauss-Newton on Euler angles (loam),
+    or by A-LOAM's robust Levenberg-Marquardt (aloam)."""
+    iterations: int = parameter(10, source="LOAM", low=1)
+    """A solve associates the features with the map at most this many times."""
+    inner_iterations: int = parameter(2, source="A-LOAM uses 4", low=1)
+    """After each association, Levenberg-Marquardt takes at most this many iterations."""
+    rotation_tolerance_deg: float = parameter(0.05, unit="degrees", source="LOAM", low=0.0)
+    """The solve stops when an association turns the pose by less than this and moves it by less
+    than translation_tolerance."""
+    translation_tolerance: float = parameter(0.0005, unit="m", source="LOAM", low=0.0)
+    """The solve stops when an association moves the pose by less than this and turns it by less
+    than rotation_tolerance_deg."""
+    kernel: Literal["huber", "geman_mcclure"] = parameter("huber")
+    """The method gtsam has this robust kernel on the matches; geman_mcclure all but ignores matches
+    that are far off, for traffic and crowds."""
+    kernel_width: float = parameter(1.345, source="95 % efficiency on normal noise", low=0.1)
+    """The Huber kernel on the matches has this width, in units of their scatter; .inf turns it off.
+    The Geman-McClure kernel is 2.816 times as wide, which makes the two alike on normal noise."""
+    step_sigmas: float = parameter(0.5, low=0.0)
+    """The solve stops as well when an association moves the pose by less than this many of its
+    standard deviations; 0 turns this rule off."""
+    min_matches: int = parameter(50, source="LOAM", low=6)
+    """A sweep with fewer matches than this is not solved."""
+    min_map_edges: int = parameter(0, source="LOAM uses 11", low=0)
+    """A sweep is solved only if the local map has at least this many edge points."""
+    min_map_planes: int = parameter(50, source="A-LOAM uses 51, LOAM uses 101", low=0)
+    """A sweep is solved only if the local map has at least this many plane points."""
+    degeneracy: Literal["prior", "project", "off"] = parameter("prior", source="LOAM projects")
+    """Degenerate directions, which a scan does not fix, are treated like this by the method gtsam:
+    prior adds the predicted motion with its own covariance; project keeps that motion exactly;
+    off believes the scan."""
+    min_aligned: float = parameter(8.0, low=0.0)
+    """A direction is degenerate if fewer matches than this fix it, counted as if their normals
+    pointed that way."""
+    acceleration_sigma: float = parameter(2.0, unit="m/s^2", low=1e-6)
+    """The motion of constant velocity is believed to within this acceleration along degenerate
+    directions."""
+    turn_sigma: float = parameter(2.0, unit="rad/s^2", low=1e-6)
+    """The motion of constant velocity is believed to within this angular acceleration along
+    degenerate directions."""
+    degeneracy_threshold: float = parameter(100.0, source="LOAM", low=0.0)
+    """The method loam projects the step out of eigenvectors of A^T A that have eigenvalues below
+    this (mixed rad and m); 0 turns the projection off."""
+    degeneracy_projector: Literal["correct", "published"] = parameter("correct")
+    """The method loam projects by V^-1 V2 with eigenvectors as rows (correct), or as columns like
+    the published Eigen port, which is no projection onto the good directions; only to study it."""
+    huber_delta: float = parameter(0.1, unit="m", source="A-LOAM", low=0.0)
+    """The loss of the method aloam turns linear at this residual; 0 keeps it quadratic."""
+    cost_tolerance: float = parameter(1e-6, source="the default of Ceres", low=0.0)
+    """A step of the method aloam that changes the cost by less than this share ends the inner
+    iterations and is not taken."""
+
+
+class CovarianceConfig(Section):
+    """The calibration of the covariances that are handed out; no pose depends on it."""
+
+    match_cell: float = parameter(
+        1.6, unit="m", source="neighbours lie within matching.max_distance", low=0.01
+    )
+    """The residuals of matches in one cell of this size count as one error, for they share map
+    points."""
+    ground_cell: float = parameter(0.8, unit="m", low=0.01)
+    """A cell of this size is new ground when it is matched for the first time."""
+    drift: float = parameter(
+        6.0,
+        source="fitted on seeds 100-103 of the built-in scenes, see docs/consistency.md",
+        low=0.0,
+    )
+    """The error of the map grows by this times the share of new ground in a frame's covariance."""
+    window: int = parameter(10, low=1)
+    """The acceleration, which the motion of constant velocity misses, is averaged over this many
+    frames."""

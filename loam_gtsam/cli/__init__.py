@@ -5,6 +5,6 @@ from __future__ import annotations
 
 def main() -> None:
     """Entry point of ``loam-gtsam``."""
-    from loam_gtsam.cli.app import main as run_app
+    from loam_gtsam.cli.app import app
 
-    run_app()
+    app(prog_name="loam-gtsam")

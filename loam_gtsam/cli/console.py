@@ -17,17 +17,13 @@ from pathlib import Path
 from types import FrameType
 
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TextColumn,
-    TimeRemainingColumn,
-)
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
 
 from loam_gtsam.io.atomic import make_folder, staged_files
 from loam_gtsam.pipeline import OnFrame
-from loam_gtsam.types import MapUpdate, OutputError
+from loam_gtsam.types import DatasetError, MapUpdate, OutputError
 from loam_gtsam.view import plots
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -65,16 +61,13 @@ def write_results(
 ) -> list[str]:
     """Replace earlier results by new ones, which took long to compute; returns their names.
 
-    Parameters
-    ----------
-    folder, known, last : see :func:`loam_gtsam.io.atomic.staged_files`
-    write : writes all files into the folder that it is given, and returns their names
+    ``write`` writes all files into the folder that it is given, and returns their names. For the
+    others see :func:`~loam_gtsam.io.atomic.staged_files`.
 
     Raises
     ------
     OutputError
-        If the results could not be written into ``folder``, naming the temporary folder into which
-        they were written instead.
+        Naming the temporary folder into which the results were written instead.
     """
     try:
         with staged_files(folder, known, last) as new:
@@ -169,6 +162,35 @@ def frame_progress(name: str, total: int, stop: StopRequest, *, quiet: bool) -> 
                 raise KeyboardInterrupt  # run() ends here, between two frames
 
         yield on_frame
+
+
+def exit_code(
+    error: Exception | None, stop: StopRequest, updates: Sequence[MapUpdate], nothing: str
+) -> int:
+    """The exit code after the results were written; raises what ended the command early.
+
+    Raises
+    ------
+    DatasetError
+        With the message ``nothing`` and the first problem, if no frame was usable.
+    """
+    if error is not None:
+        raise error
+    if stop.signum is not None:
+        return 128 + stop.signum
+    if not any(update.status.usable for update in updates):
+        first = next((update.message for update in updates if update.message), "")
+        raise DatasetError(f"{nothing}; the first: {first}; see also: loam-gtsam inspect")
+    return 0
+
+
+def number_table(first: str, title: str, columns: Sequence[str]) -> Table:
+    """An empty table of numbers, with a column of names called ``first``."""
+    heading = Text(title, style="bold") if title else None
+    table = Table(first, title=heading, title_justify="left", box=None)
+    for column in columns:
+        table.add_column(Text(column), justify="right")
+    return table
 
 
 def print_written(

@@ -19,13 +19,7 @@ _LISTED = 10
 
 
 def execute(options: OptimizeOptions) -> int:
-    """Optimise a pose graph; returns the exit code.
-
-    Raises
-    ------
-    LoamError
-        If a file cannot be read or written, or the graph cannot be solved.
-    """
+    """Optimise a pose graph; returns the exit code."""
     path, trajectory = options.graph, options.trajectory
     target = options.output or path.with_name(f"{path.stem}_optimized{path.suffix}")
     written = [target]

@@ -1,14 +1,10 @@
-"""Options of the commands, each declared once, and what they say as objects.
-
-A command takes groups of options: dataclasses whose fields are what typer reads. See
-:func:`command`.
-"""
+"""Options of the commands, each declared once: a command takes one dataclass of options."""
 
 from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -18,114 +14,102 @@ if TYPE_CHECKING:  # the help of a command needs neither GTSAM nor SciPy
     from loam_gtsam.config import Config
     from loam_gtsam.datasets.base import Dataset
 
-DEBUG = "loam_gtsam.debug"
-"""Key in the context of a command: whether ``--debug`` was given."""
-
-Frames = Annotated[int | None, typer.Option(min=1, help="Stop after so many sweeps.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing but errors.")]
+_TYPER = "typer"
 
 
-def _set_debug(ctx: typer.Context, wanted: bool) -> bool:
-    if wanted:
-        ctx.meta[DEBUG] = True
-    return wanted
+def option(help: str, *names: str, default: Any = None, **how: Any) -> Any:
+    """A field that is an option of a command, with the further arguments of typer.Option."""
+    return field(default=default, metadata={_TYPER: typer.Option(*names, help=help, **how)})
 
 
-_Debug = Annotated[
-    bool, typer.Option("--debug", callback=_set_debug, help="Show the traceback of an error.")
-]
+def flag(help: str, *names: str) -> Any:
+    """A field that is an option without a value, off unless given."""
+    return option(help, *names, default=False)
 
 
-def command(function: Callable[..., None]) -> Callable[..., None]:
-    """Make a function with groups of options one that typer understands.
+def argument(metavar: str, help: str) -> Any:
+    """A field that is the argument of a command."""
+    return field(metadata={_TYPER: typer.Argument(metavar=metavar, help=help)})
 
-    Every parameter whose type is a dataclass is replaced by the fields of that dataclass, and
-    ``--debug`` is added.
+
+@dataclass(frozen=True, kw_only=True)
+class Options:
+    """Options of every command."""
+
+    debug: bool = flag("Show the traceback of an error.", "--debug")
+
+
+def command(function: Callable[[Any], int | None]) -> Callable[..., None]:
+    """Make a function of one dataclass of options, which returns an exit code, one for typer.
+
+    A ``LoamError`` becomes one message on stderr and the exit code 1.
     """
-    groups: dict[str, Any] = {}
-    parameters: list[inspect.Parameter] = []
-    hints = get_type_hints(function, include_extras=True)
-    for name, parameter in inspect.signature(function).parameters.items():
-        if is_dataclass(hints[name]):
-            groups[name] = hints[name]
-            types = get_type_hints(hints[name], include_extras=True)
-            options = inspect.signature(groups[name]).parameters.values()
-            parameters += [option.replace(annotation=types[option.name]) for option in options]
-        else:
-            parameters.append(parameter.replace(annotation=hints[name]))
-    debug = inspect.Parameter("debug", inspect.Parameter.KEYWORD_ONLY, default=False)
-    parameters.append(debug.replace(annotation=_Debug))
+    (group,) = (kind for name, kind in get_type_hints(function).items() if name != "return")
 
-    def call(*, debug: bool, **values: Any) -> None:
-        for name, group in groups.items():
-            values[name] = group(**{item.name: values.pop(item.name) for item in fields(group)})
-        function(**values)
+    def call(**values: Any) -> None:
+        from loam_gtsam.types import LoamError
 
+        options = group(**values)
+        try:
+            code = function(options)
+        except KeyboardInterrupt:
+            typer.echo("stopped; nothing was computed yet", err=True)
+            code = 130
+        except LoamError as error:
+            if options.debug:
+                raise
+            typer.secho("error: ", fg=typer.colors.RED, bold=True, err=True, nl=False)
+            typer.echo(str(error), err=True)
+            code = 1
+        raise typer.Exit(code or 0)
+
+    hints = get_type_hints(group)
+    parameters = [
+        inspect.Parameter(
+            item.name,
+            inspect.Parameter.KEYWORD_ONLY,
+            default=inspect.Parameter.empty if item.default is MISSING else item.default,
+            annotation=Annotated[hints[item.name], item.metadata[_TYPER]],
+        )
+        for item in sorted(fields(group), key=lambda item: item.name == "debug")
+    ]
     call.__name__, call.__doc__ = function.__name__, function.__doc__
     call.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     vars(call)["__signature__"] = inspect.Signature(parameters)
     return call
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class InputOptions:
-    """The data set that a command reads."""
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions(Options):
+    """The data set that a command reads, and changes of a configuration."""
 
-    path: Annotated[
-        str,
-        typer.Argument(
-            metavar="PATH",
-            help="A folder of .bin sweeps (KITTI), a ROS 1 or ROS 2 bag, an .mcap or .db3 file, a "
-            "sequence of a known data set (docs/inputs.md), or a built-in world such as "
-            "sim:street_loop.",
-        ),
-    ]
-    topic: Annotated[
-        str | None,
-        typer.Option(help="Topic of the sweeps [default: the one with most messages]."),
-    ] = None
-    imu_topic: Annotated[
-        str | None,
-        typer.Option(help="Topic of the IMU [default: the one with most messages]."),
-    ] = None
-    loader_options: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--option",
-            metavar="KEY=VALUE",
-            help="Option of the loader, e.g. time_unit=ns; may be given repeatedly. Those of each "
-            "loader: docs/inputs.md.",
-        ),
-    ] = None
+    path: str = argument(
+        "PATH",
+        "A folder of .bin sweeps (KITTI), a ROS 1 or ROS 2 bag, an .mcap or .db3 file, a "
+        "sequence of a known data set (docs/inputs.md), or a built-in world such as "
+        "sim:street_loop.",
+    )
+    topic: str | None = option("Topic of the sweeps [default: the one with most messages].")
+    imu_topic: str | None = option("Topic of the IMU [default: the one with most messages].")
+    loader_options: list[str] | None = option(
+        "Option of the loader, e.g. time_unit=ns; may be given repeatedly. Those of each loader: "
+        "docs/inputs.md.",
+        "--option",
+        metavar="KEY=VALUE",
+    )
+    sensor: str | None = option(
+        "Sensor model (sensor.model): vlp16, hdl32, hdl64, os1-16, os1-32, os1-64 or os1-128."
+    )
+    overrides: list[str] | None = option(
+        "Change one value; may be given repeatedly.", "--set", metavar="SECTION.KEY=VALUE"
+    )
 
     def dataset(self) -> Dataset:
         """Open the data set."""
         from loam_gtsam.datasets import open_dataset
 
-        options: dict[str, Any] = dict(
-            _key_value("--option", entry) for entry in self.loader_options or []
-        )
+        options = dict(_key_value("--option", entry) for entry in self.loader_options or [])
         return open_dataset(self.path, topic=self.topic, imu_topic=self.imu_topic, **options)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SensorOptions:
-    """The sensor and single values, which change a configuration."""
-
-    sensor: Annotated[
-        str | None,
-        typer.Option(
-            help="Sensor model (sensor.model): vlp16, hdl32, hdl64, os1-16, os1-32, os1-64 or "
-            "os1-128."
-        ),
-    ] = None
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--set", metavar="SECTION.KEY=VALUE", help="Change one value; may be given repeatedly."
-        ),
-    ] = None
 
     def changed(self, config: Config) -> Config:
         """``config`` with ``--sensor``, then with every ``--set`` at once."""
@@ -140,20 +124,15 @@ class SensorOptions:
         return config.changed(*(self.overrides or []), source="--set")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ConfigOptions(SensorOptions):
-    """The configuration of a command."""
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions(SourceOptions):
+    """A data set and a configuration."""
 
-    preset: Annotated[
-        str | None,
-        typer.Option(help="Named configuration to start from: default, loam or aloam."),
-    ] = None
-    config: Annotated[
-        Path | None, typer.Option("--config", metavar="FILE", help="YAML configuration.")
-    ] = None
+    preset: str | None = option("Named configuration to start from: default, loam or aloam.")
+    config: Path | None = option("YAML configuration.", metavar="FILE")
 
     def settings(self) -> Config:
-        """The preset or the file, then ``--sensor``, then each ``--set`` in turn."""
+        """The preset or the file, then ``--sensor``, then every ``--set``."""
         from loam_gtsam.config import load_config, preset
 
         if self.preset is not None and self.config is not None:
@@ -165,102 +144,76 @@ class ConfigOptions(SensorOptions):
         return self.changed(preset(self.preset or "default"))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OutputOptions:
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions(Options):
     """Where results go, and what is shown of them."""
 
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for the results [default: one in loam_gtsam_output, named after the "
-            "data]. If it holds earlier results, a new folder beside it is used (DIR-2, DIR-3, "
-            "...).",
-        ),
-    ] = None
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace earlier results in DIR.")
-    ] = False
-    plot: Annotated[
-        bool | None,
-        typer.Option(
-            "--plot/--no-plot", help="Draw pictures [default: if matplotlib is installed]."
-        ),
-    ] = None
-    quiet: Quiet = False
+    output: Path | None = option(
+        "Folder for the results [default: one in loam_gtsam_output, named after the data]. If it "
+        "holds earlier results, a new folder beside it is used (DIR-2, DIR-3, ...).",
+        metavar="DIR",
+    )
+    overwrite: bool = flag("Replace earlier results in DIR.", "--overwrite")
+    plot: bool | None = option(
+        "Draw pictures [default: if matplotlib is installed].", "--plot/--no-plot"
+    )
+    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class MappingOptions(OutputOptions):
-    """Options that ``demo`` and ``run`` share."""
+@dataclass(frozen=True, kw_only=True)
+class DemoOptions(OutputOptions):
+    """Options of ``demo``."""
 
-    profile: Annotated[bool, typer.Option("--profile", help="Show the time per stage.")] = False
+    scene: str = option("Built-in scene; a wrong name lists them.", default="street_loop")
+    frames: int = option("Number of sweeps.", default=150, min=1)
+    profile: bool = flag("Show the time per stage.", "--profile")
 
     def of_a_run(self) -> RunOptions:
         """Options of ``run`` with the same values."""
-        return RunOptions(**{item.name: getattr(self, item.name) for item in fields(self)})
+        shared = {item.name: getattr(self, item.name) for item in fields(OutputOptions)}
+        return RunOptions(path=f"sim:{self.scene}", profile=self.profile, **shared)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RunOptions(MappingOptions):
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(OutputOptions, InspectOptions):
     """Options of ``run``."""
 
-    frames: Frames = None
-    bag: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Also write a bag with LOAM's topics: ROS 1 (FILE.bag), ROS 2 (FILE.mcap, or a "
-            "folder if FILE has no suffix).",
-        ),
-    ] = None
-    view: Annotated[
-        bool,
-        typer.Option("--view", help="Watch the run live, in the Rerun viewer (viewer extra)."),
-    ] = False
-    rrd: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.rrd",
-            help="Save what --view shows, to be opened later with: rerun FILE.rrd.",
-        ),
-    ] = None
-    loops: Annotated[
-        bool,
-        typer.Option(
-            "--loops",
-            help="Close loops: look for places seen before, let the map follow, and write the "
-            "pose graph (loops.enabled).",
-        ),
-    ] = False
-    workers: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            max=16,
-            help="Processes that extract features ahead of the solve; by default one for more "
-            "than 200 sweeps. The result is the same.",
-        ),
-    ] = None
-    resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Go on from the last checkpoint in the output folder, if a run of the same data "
-            "and configuration was stopped or killed; the result is the same.",
-        ),
-    ] = False
-    checkpoint: Annotated[
-        float,
-        typer.Option(
-            min=0.0,
-            metavar="SECONDS",
-            help="Time from one checkpoint to the next; 0 writes none.",
-        ),
-    ] = 60.0
+    profile: bool = flag("Show the time per stage.", "--profile")
+    frames: int | None = option("Stop after so many sweeps.", min=1)
+    bag: Path | None = option(
+        "Also write a bag with LOAM's topics: ROS 1 (FILE.bag), ROS 2 (FILE.mcap, or a folder if "
+        "FILE has no suffix).",
+        metavar="FILE",
+    )
+    view: bool = flag("Watch the run live, in the Rerun viewer (viewer extra).", "--view")
+    rrd: Path | None = option(
+        "Save what --view shows, to be opened later with: rerun FILE.rrd.", metavar="FILE.rrd"
+    )
+    loops: bool = flag(
+        "Close loops: look for places seen before, let the map follow, and write the pose graph "
+        "(loops.enabled).",
+        "--loops",
+    )
+    workers: int | None = option(
+        "Processes that extract features ahead of the solve; by default one for more than 200 "
+        "sweeps. The result is the same.",
+        min=0,
+        max=16,
+    )
+    resume: bool = flag(
+        "Go on from the last checkpoint in the output folder, if a run of the same data and "
+        "configuration was stopped or killed; the result is the same.",
+        "--resume",
+    )
+    checkpoint: float = option(
+        "Time from one checkpoint to the next; 0 writes none.",
+        default=60.0,
+        min=0.0,
+        metavar="SECONDS",
+    )
 
-    def check(self, path: str) -> None:
-        """Refuse options that contradict each other, or that would replace the input ``path``."""
+    def check(self) -> None:
+        """Refuse options that contradict each other, or that would replace the input."""
         from loam_gtsam.types import OutputError
 
         if self.resume and (self.bag is not None or self.rrd is not None):
@@ -272,109 +225,91 @@ class RunOptions(MappingOptions):
             raise typer.BadParameter(
                 "--resume and --overwrite contradict each other; give one only"
             )
-        source = Path(path).resolve()
+        source = Path(self.path).resolve()
         if self.bag is not None and self.bag.resolve() in (source, *source.parents):
             raise OutputError(
                 f"--bag {self.bag}: the input must not be replaced; choose another name"
             )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CompareOptions(OutputOptions):
+@dataclass(frozen=True, kw_only=True)
+class CompareOptions(OutputOptions, SourceOptions):
     """Options of ``compare``."""
 
-    frames: Frames = None
-    solvers: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--solver",
-            metavar="NAME",
-            help="gtsam, another preset (loam, aloam), a configuration file (.yaml), or a peer "
-            "(kiss-icp, small-gicp, genz-icp; see docs/compare.md); may be given repeatedly. "
-            "Without truth the first one is the reference [default: gtsam and all presets].",
-        ),
-    ] = None
-    shared_guess: Annotated[
-        bool,
-        typer.Option(
-            "--shared-guess",
-            help="All solvers of this package start from the guesses of the first of them.",
-        ),
-    ] = False
+    frames: int | None = option("Stop after so many sweeps.", min=1)
+    solvers: list[str] | None = option(
+        "gtsam, another preset (loam, aloam), a configuration file (.yaml), or a peer (kiss-icp, "
+        "small-gicp, genz-icp; see docs/compare.md); may be given repeatedly. Without truth the "
+        "first one is the reference [default: gtsam and all presets].",
+        "--solver",
+        metavar="NAME",
+    )
+    shared_guess: bool = flag(
+        "All solvers of this package start from the guesses of the first of them.",
+        "--shared-guess",
+    )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class StudyOptions:
+@dataclass(frozen=True, kw_only=True)
+class StudyOptions(Options):
     """Options of ``study``."""
 
-    workers: Annotated[
-        int | None,
-        typer.Option(min=1, help="Processes on this machine [default: none, in this process]."),
-    ] = None
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Run on a Dask cluster, e.g. tcp://HOST:8786; paths must exist on its workers.",
-        ),
-    ] = None
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="Folder for the results [default: loam_gtsam_output/NAME_study]. Trials that are "
-            "finished there are not run again.",
-        ),
-    ] = None
-    retry_failed: Annotated[
-        bool, typer.Option("--retry-failed", help="Run failed trials again.")
-    ] = False
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Run all trials again, finished ones as well.")
-    ] = False
-    quiet: Quiet = False
+    spec: Path = argument(
+        "SPEC", "What to run: sequences, configs, seeds (YAML; see docs/parameter_studies.md)."
+    )
+    workers: int | None = option(
+        "Processes on this machine [default: none, in this process].", min=1
+    )
+    scheduler: str | None = option(
+        "Run on a Dask cluster, e.g. tcp://HOST:8786; paths must exist on its workers.",
+        metavar="ADDRESS",
+    )
+    output: Path | None = option(
+        "Folder for the results [default: loam_gtsam_output/NAME_study]. Trials that are finished "
+        "there are not run again.",
+        metavar="DIR",
+    )
+    retry_failed: bool = flag("Run failed trials again.", "--retry-failed")
+    overwrite: bool = flag("Run all trials again, finished ones as well.", "--overwrite")
+    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class OptimizeOptions:
+@dataclass(frozen=True, kw_only=True)
+class OptimizeOptions(Options):
     """Options of ``optimize``."""
 
-    graph: Annotated[
-        Path,
-        typer.Argument(metavar="GRAPH", help="A pose graph: NAME.g2o, or GTSAM's NAME.graph."),
-    ]
-    output: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Where to write it [default: NAME_optimized.*]."),
-    ] = None
-    trajectory: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Also write the poses as TUM, if the graph has stamps."),
-    ] = None
-    robust: Annotated[
-        bool,
-        typer.Option("--robust/--plain", help="Switch off loops that contradict the others."),
-    ] = True
-    max_chi2: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Squared Mahalanobis distance from which a loop contradicts [default: that of "
-            "pose_graph.max_chi2].",
-        ),
-    ] = None
-    overwrite: Overwrite = False
-    quiet: Quiet = False
+    graph: Path = argument("GRAPH", "A pose graph: NAME.g2o, or GTSAM's NAME.graph.")
+    output: Path | None = option("Where to write it [default: NAME_optimized.*].", metavar="FILE")
+    trajectory: Path | None = option(
+        "Also write the poses as TUM, if the graph has stamps.", metavar="FILE"
+    )
+    robust: bool = option(
+        "Switch off loops that contradict the others.", "--robust/--plain", default=True
+    )
+    max_chi2: float | None = option(
+        "Squared Mahalanobis distance from which a loop contradicts [default: that of "
+        "pose_graph.max_chi2].",
+        min=0.0,
+    )
+    overwrite: bool = flag("Replace an existing file.", "--overwrite")
+    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ConfigOptions(Options):
+    """Options of ``config``."""
+
+    preset: str = option("Named configuration.", default="default")
+    output: Path | None = option("Write to a file instead of the screen.", metavar="FILE")
+    overwrite: bool = flag("Replace an existing file.", "--overwrite")
 
 
 def _key_value(option: str, entry: str) -> tuple[str, Any]:
     """``KEY=VALUE`` with the value read as YAML."""
-    from ruamel.yaml import YAML
+    from loam_gtsam.config.base import assignment
+    from loam_gtsam.types import ConfigError
 
-    key, separator, text = entry.partition("=")
-    if not separator or not key.strip():
-        raise typer.BadParameter(f"{option} {entry}: expected KEY=VALUE")
     try:
-        return key.strip(), YAML(typ="safe", pure=True).load(text)
-    except Exception as error:  # a day 32 is a ValueError, deep nesting a RecursionError
-        raise typer.BadParameter(f"{option} {entry}: {text!r} is not a YAML value") from error
+        return next(iter(assignment(entry, f"{option}: ", "KEY=VALUE").items()))
+    except ConfigError as error:
+        raise typer.BadParameter(str(error)) from error

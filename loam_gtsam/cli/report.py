@@ -11,22 +11,14 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from loam_gtsam.cli.console import number_table
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buffer
-from loam_gtsam.types import (
-    BadSweep,
-    FeatureSweep,
-    FrameStatus,
-    ImuSamples,
-    MapUpdate,
-    Scan,
-    Sweep,
-    SweepError,
-)
+from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Sweep, SweepError
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
 _MESSAGES = 3
@@ -44,12 +36,7 @@ def summary(
 ) -> Group:
     """Table of a run: frames, statuses, accuracy, IMU; below it the problems and odd frames.
 
-    Parameters
-    ----------
-    name : of the data set
-    seconds : that the run took
-    accuracy : as in ``summary.json``; empty without truth
-    problems : of the input, in sentences
+    The name and the ``problems`` are those of the data set, the accuracy is as in ``summary.json``.
     """
     frames, path = len(result.updates), result.trajectory.path_length
     rows = {
@@ -146,9 +133,7 @@ def _odd_frames(updates: Sequence[MapUpdate]) -> list[str]:
 def profile_table(updates: Sequence[MapUpdate]) -> Table:
     """Median and 95th percentile over the frames in which a stage ran, and share of all time."""
     names, seconds = stage_seconds(updates)
-    table = Table("stage", title="Time per frame [ms]", title_justify="left", box=None)
-    for column in ("median", "95 %", "share"):
-        table.add_column(column, justify="right")
+    table = number_table("stage", "Time per frame [ms]", ("median", "95 %", "share"))
     total = float(np.nansum(seconds)) or 1.0
     columns = [*zip(names, seconds.T, strict=True), ("total", np.nansum(seconds, axis=1))]
     for name, column in columns:
@@ -172,18 +157,15 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
         except SweepError as error:
             problems.append(f"sweep {number}: {error}")
             continue
-        problems += _imu_beside(dataset.imu if config.imu.enabled else None, sweep)
+        problems += _imu_beside(dataset, config, sweep)
         break
     if len(dataset) == 0:
         problems.append("no sweeps in it")
     imu = imu_buffer(dataset, config)
     if imu is not None:
-        report = imu.report
-        orientation = _ORIENTATIONS[report.orientation]
-        rows["IMU, used"] = (
-            f"{report.samples} samples at {report.rate:.0f} Hz, orientation {orientation}"
-        )
-        problems += report.problems
+        used = f"{imu.report.samples} samples at {imu.report.rate:.0f} Hz"
+        rows["IMU, used"] = f"{used}, orientation {_ORIENTATIONS[imu.report.orientation]}"
+        problems += imu.report.problems
     parts: list[Any] = [_table(info.kind, rows)]
     if facts:
         parts.append(_table("First usable sweep", facts))
@@ -193,8 +175,9 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     return Group(*parts), bool(facts)
 
 
-def _imu_beside(imu: ImuSamples | None, sweep: Sweep) -> list[str]:
+def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:
     """A problem if the IMU has no samples at a sweep, as on another clock."""
+    imu = dataset.imu if config.imu.enabled else None
     if imu is None or len(imu.stamps) == 0:
         return []
     stamp = sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
@@ -208,43 +191,29 @@ def _imu_beside(imu: ImuSamples | None, sweep: Sweep) -> list[str]:
 
 
 def _sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:
-    """Label -> value, of one sweep.
-
-    Raises
-    ------
-    SweepError
-        If the mapper could not use it, saying why.
-    """
+    """Label -> value, of one sweep; a SweepError says why the mapper could not use it."""
     if isinstance(sweep, BadSweep):
         raise SweepError(sweep.message)
     if isinstance(sweep, FeatureSweep):
         features = sweep.features
         cloud = "none" if sweep.cloud is None else f"{len(sweep.cloud)} points"
-        return {
-            "stamp": f"{features.stamp} ns",
-            "features": f"{len(features.edges)} edge and {len(features.planes)} plane points",
-            "full cloud": cloud,
+        facts = {"stamp": f"{features.stamp} ns", "full cloud": cloud}
+    else:
+        columns = usable_columns(sweep, config)
+        ranges = np.linalg.norm(columns.xyz.astype(np.float64), axis=0)
+        low, middle, high = np.percentile(ranges, (0.0, 50.0, 100.0))
+        rings = assign_rings(columns, config.sensor)
+        features = extract_features(sweep, config)
+        points, finite = len(sweep.points), int(np.isfinite(sweep.points).all(axis=1).sum())
+        facts = {
+            "stamp": f"{sweep.stamp} ns",
+            "points": f"{points}, {points - finite} of them not finite, {len(columns)} usable",
+            "range": f"{low:.1f} to {high:.1f} m, median {middle:.1f} m",
+            "beams": rings.note,
+            "times": assign_times(columns, rings, config).note,
         }
-    return _scan_facts(sweep, config)
-
-
-def _scan_facts(scan: Scan, config: Config) -> dict[str, str]:
-    finite = np.isfinite(scan.points).all(axis=1)
-    columns = usable_columns(scan, config)
-    ranges = np.linalg.norm(columns.xyz.astype(np.float64), axis=0)
-    low, middle, high = np.percentile(ranges, (0.0, 50.0, 100.0))
-    rings = assign_rings(columns, config.sensor)
-    times = assign_times(columns, rings, config)
-    features = extract_features(scan, config)
-    not_finite = len(scan.points) - int(finite.sum())
-    return {
-        "stamp": f"{scan.stamp} ns",
-        "points": f"{len(scan.points)}, {not_finite} of them not finite, {len(columns)} usable",
-        "range": f"{low:.1f} to {high:.1f} m, median {middle:.1f} m",
-        "beams": rings.note,
-        "times": times.note,
-        "features": f"{len(features.edges)} edge and {len(features.planes)} plane points",
-    }
+    kinds = f"{len(features.edges)} edge and {len(features.planes)} plane points"
+    return facts | {"features": kinds}
 
 
 def _table(title: str, rows: Mapping[str, str]) -> Table:

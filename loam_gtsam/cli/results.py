@@ -23,8 +23,7 @@ from loam_gtsam.types import LoamError, OutputError, Trajectory
 from loam_gtsam.view import frame_plot, plots
 from loam_gtsam.view.observers import LastFrame
 
-FRAME_PLOT = "frame.png"
-PLOT_FILES = ("trajectory.png", "map.png", FRAME_PLOT, "timings.png")
+PLOT_FILES = ("trajectory.png", "map.png", "frame.png", "timings.png")
 ERROR_PLOT = "errors.png"
 TRUTH_FILE = "truth.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
@@ -33,20 +32,15 @@ RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE)
 
 @dataclass(frozen=True, slots=True)
 class Results:
-    """A run with what is known of its input, ready to be written.
-
-    Attributes
-    ----------
-    info : what is known of the data set after the run
-    accuracy : for the summary: errors against the truth, or ``problem``; empty without truth
-    map_truth : the truth in the map frame, for the pictures; None if it cannot be compared
-    """
+    """A run with what is known of its input, ready to be written."""
 
     run: RunResult
     dataset: Dataset
     info: DatasetInfo
     accuracy: dict[str, Any]
+    """Errors against the truth, or ``problem``; empty without truth."""
     map_truth: Trajectory | None
+    """The truth in the map frame; None if it cannot be compared."""
 
     @staticmethod
     def of(run: RunResult, dataset: Dataset) -> Results:
@@ -71,14 +65,15 @@ class Results:
         return files
 
     def _draw(self, folder: Path, last: LastFrame) -> list[str]:
-        files = [name for name in PLOT_FILES if name != FRAME_PLOT or last.seen]
+        path, cloud, frame, timings = PLOT_FILES
         run, trajectory, truth = self.run, self.run.trajectory, self.map_truth
         loops = None if run.loops is None else run.loops.loop_ends()
-        plots.plot_trajectory(folder / "trajectory.png", trajectory, truth, loops)
-        plots.plot_map(folder / "map.png", run.edge_points, run.plane_points, trajectory)
+        plots.plot_trajectory(folder / path, trajectory, truth, loops)
+        plots.plot_map(folder / cloud, run.edge_points, run.plane_points, trajectory)
         if last.seen:
-            frame_plot.plot_frame(folder / FRAME_PLOT, last.frame(), last.around())
-        plots.plot_timings(folder / "timings.png", run.updates)
+            frame_plot.plot_frame(folder / frame, last.frame(), last.around())
+        plots.plot_timings(folder / timings, run.updates)
+        files = [name for name in PLOT_FILES if name != frame or last.seen]
         if truth is not None and self.dataset.truth is not None:
             error = absolute_error(trajectory, self.dataset.truth)
             plots.plot_errors(folder / ERROR_PLOT, error.stamps, error.translations)
@@ -87,13 +82,7 @@ class Results:
 
 
 def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:
-    """Whether a folder holds the complete results of a run of ``total`` sweeps.
-
-    Raises
-    ------
-    OutputError
-        If the folder holds the results of another run.
-    """
+    """Whether a folder holds the complete results of the run; an OutputError if of another."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         written = (folder / "config.yaml").read_text(encoding="utf-8")

@@ -13,6 +13,7 @@ from rich.console import Console
 from loam_gtsam.cli.console import (
     StopRequest,
     draws_pictures,
+    exit_code,
     file_name,
     frame_progress,
     output_folder,
@@ -27,7 +28,7 @@ from loam_gtsam.cli.results import RUN_OUTPUTS, Results, is_complete
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.checkpoint import Checkpoint
-from loam_gtsam.pipeline import Observer, Pipeline, RunResult, run
+from loam_gtsam.pipeline import Observer, Pipeline, run
 from loam_gtsam.types import DatasetError, MapUpdate, Sweep
 from loam_gtsam.view import plots
 from loam_gtsam.view.observers import LastFrame, watch
@@ -41,11 +42,7 @@ _WORTH_A_PROCESS = 200
 def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     """Run, write the results, print the summary; returns the exit code.
 
-    Raises
-    ------
-    LoamError
-        If the run cannot start or its results cannot be written. An error that ended the run early
-        is raised after the results up to there were written.
+    An error that ends the run early is raised after the results up to there were written.
     """
     if options.loops:
         config = config.changed("loops.enabled=true")
@@ -53,13 +50,16 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
     last = LastFrame()
-    known = (*RUN_OUTPUTS, CHECKPOINT)
-    with output_folder(wanted, known, overwrite=options.overwrite or options.resume) as folder:
+    known, overwrite = (*RUN_OUTPUTS, CHECKPOINT), options.overwrite or options.resume
+    with output_folder(wanted, known, overwrite=overwrite) as folder:
         if options.resume and is_complete(folder, config, dataset, total):
             if not options.quiet:
                 print_plain(Console(), f"{folder}: complete, {total} sweeps")
             return 0
-        checkpoint = _checkpoint(folder, options)
+        checkpoint: Checkpoint | None = None
+        if options.checkpoint > 0.0:
+            place = folder / CHECKPOINT
+            checkpoint = Checkpoint(place, seconds=options.checkpoint, resume=options.resume)
         started = time.perf_counter()
         # The bag is closed when the results are written: an error there must not cost them.
         with stop_requests() as stop, _observers(options, config, last) as observe:
@@ -76,16 +76,11 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
                 )
             seconds = time.perf_counter() - started
             if not result.updates:
-                raise DatasetError(
-                    f"{dataset.name}: no sweeps in it; see what is understood with: "
-                    "loam-gtsam inspect"
-                )
+                raise DatasetError(f"{dataset.name}: no sweeps in it; see loam-gtsam inspect")
             results = Results.of(result, dataset)
+            drawn = last if plot else None
             files = write_results(
-                folder,
-                RUN_OUTPUTS,
-                "summary.json",
-                lambda new: results.write(new, last if plot else None),
+                folder, RUN_OUTPUTS, "summary.json", lambda new: results.write(new, drawn)
             )
             if checkpoint is not None and not result.interrupted and result.error is None:
                 checkpoint.remove()
@@ -93,18 +88,12 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         console = Console()
         if options.profile:
             console.print(profile_table(result.updates))
-        console.print(
-            summary(result, dataset.name, seconds, results.accuracy, results.info.problems)
-        )
+        problems = results.info.problems
+        console.print(summary(result, dataset.name, seconds, results.accuracy, problems))
         print_written(console, stop, len(result.updates), total, folder, files)
         _print_hints(console, options, folder, stop)
-    return _exit_code(result, stop, dataset.name)
-
-
-def _checkpoint(folder: Path, options: RunOptions) -> Checkpoint | None:
-    if options.checkpoint == 0.0:
-        return None
-    return Checkpoint(folder / CHECKPOINT, seconds=options.checkpoint, resume=options.resume)
+    nothing = f"{dataset.name}: none of the {len(result.updates)} sweeps could be used"
+    return exit_code(result.error, stop, result.updates, nothing)
 
 
 def worker_count(asked: int | None, sweeps: int) -> int:
@@ -149,17 +138,3 @@ def _print_hints(console: Console, options: RunOptions, folder: Path, stop: Stop
         print_plain(console, f"Bag written to {bag}")
     if rrd is not None and rrd.exists():
         print_plain(console, f"Recording written to {rrd}; look at it with: rerun {rrd}")
-
-
-def _exit_code(result: RunResult, stop: StopRequest, name: str) -> int:
-    """The exit code of a run whose results are written; raises what ended the run early."""
-    if result.error is not None:
-        raise result.error
-    if stop.signum is not None:
-        return 128 + stop.signum
-    if not any(update.status.usable for update in result.updates):
-        raise DatasetError(
-            f"{name}: none of the {len(result.updates)} sweeps could be used; the first: "
-            f"{result.updates[0].message}; see also: loam-gtsam inspect"
-        )
-    return 0

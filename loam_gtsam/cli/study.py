@@ -8,11 +8,18 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
+import typer
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from loam_gtsam.cli.console import file_name, print_plain, progress_bar, stop_requests
+from loam_gtsam.cli.console import (
+    file_name,
+    number_table,
+    print_plain,
+    progress_bar,
+    stop_requests,
+)
 from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.studies.trial_runner import (
@@ -35,16 +42,12 @@ from loam_gtsam.studies.trials import (
 _SHOWN_ERRORS = 3
 
 
-def execute(path: Path, options: StudyOptions) -> int:
-    """Run the trials that are not finished, write the table and a summary; returns the exit code.
-
-    Raises
-    ------
-    LoamError
-        If the study cannot start, a result cannot be written, or the cluster is lost.
-    """
+def execute(options: StudyOptions) -> int:
+    """Run the trials that are not finished, write table and summary; returns the exit code."""
+    if options.workers is not None and options.scheduler is not None:
+        raise typer.BadParameter("give --workers or --scheduler, not both")
     import_pyarrow()
-    spec = load_spec(path)
+    spec = load_spec(options.spec)
     folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_study"
     make_folder(folder / TRIALS_FOLDER)
     store = TrialStore(folder)
@@ -96,21 +99,19 @@ def _workers(
 def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], None]]:
     """Show a progress bar; gives the function to call after each trial."""
     numbers = itertools.count(1)
+
+    def count(row: Row) -> None:
+        end = "failed" if row["error"] else f"{row['wall_s']:.1f} s"
+        show(next(numbers), f"{_label(row)}: {end}")
+
     with progress_bar(name, total, quiet=quiet) as show:
-
-        def count(row: Row) -> None:
-            end = "failed" if row["error"] else f"{row['wall_s']:.1f} s"
-            show(next(numbers), f"{_label(row)}: {end}")
-
         yield count
 
 
 def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
     """Medians over the seeds, one row per sequence and one column per configuration."""
-    table = Table("sequence", title=Text(metric, style="bold"), title_justify="left", box=None)
     configs = list(dict.fromkeys(trial.config_name for trial in spec.trials))
-    for config in configs:
-        table.add_column(Text(config), justify="right")
+    table = number_table("sequence", metric, configs)
     for sequence in dict.fromkeys(trial.sequence for trial in spec.trials):
         cells = []
         for config in configs:

@@ -15,8 +15,7 @@ from ruamel.yaml.scalarbool import ScalarBoolean
 
 from loam_gtsam.types import ConfigError
 
-_LONGEST = 200
-"""Characters of a value in an error message."""
+_LONGEST = 200  # characters of a value in an error message
 _LARGEST = (1 << 63) - 1
 _PAIR = "pair"
 _EXPECTED = {
@@ -29,7 +28,6 @@ _EXPECTED = {
     "less_than_equal": "at most {le}",
     "model_type": "a mapping, for it is a section",
 }
-"""What was expected, by the type of pydantic's error."""
 
 Count = Annotated[int, Ge(1), Le(_LARGEST)]
 """An entry of a tuple: a whole number of at least 1."""
@@ -217,7 +215,7 @@ def nested(changes: Iterable[str | Mapping[str, Any]], where: str) -> dict[str, 
     """Changes as :meth:`Config.changed` takes them, as mappings within mappings for `override`."""
     tree: dict[str, Any] = {}
     for change in changes:
-        _merge(tree, _assignment(change, where) if isinstance(change, str) else change)
+        _merge(tree, assignment(change, where) if isinstance(change, str) else change)
     return tree
 
 
@@ -234,10 +232,11 @@ def _merge(tree: dict[str, Any], change: Mapping[str, Any]) -> None:
             tree[name] = value
 
 
-def _assignment(text: str, where: str) -> dict[str, Any]:
+def assignment(text: str, where: str, form: str = "SECTION.KEY=VALUE") -> dict[str, Any]:
+    """A text in this form as a mapping of the key to the value, read as YAML."""
     key, separator, value = text.partition("=")
     if not separator or not key.strip():
-        raise ConfigError(f"{where}expected SECTION.KEY=VALUE, got {text!r}")
+        raise ConfigError(f"{where}expected {form}, got {text!r}")
     try:
         return {key.strip(): YAML(typ="safe", pure=True).load(value)}
     except Exception as error:  # a day 32 is a ValueError, deep nesting a RecursionError

@@ -20,6 +20,13 @@ _STAGED = ".loam_gtsam_new"
 """Folder of new files among the old ones, until all of them are written."""
 
 
+_ADVICE = "; choose another folder or free some space"
+
+
+def _refused(what: str, error: OSError, advice: str = "") -> OutputError:
+    return OutputError(f"{what}: {error.strerror or error}{advice}")
+
+
 @contextmanager
 def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
     """Open a binary file that takes the place of ``path`` when the block ends without an error.
@@ -42,23 +49,14 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise OutputError(
-            f"{path}: cannot write the file: {error.strerror or error}; "
-            "choose another folder or free some space"
-        ) from error
+        raise _refused(f"{path}: cannot write the file", error, _ADVICE) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in UTF-8, see :func:`atomic_file`.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
+    """Write a text file in UTF-8, see :func:`atomic_file`."""
     with atomic_file(path) as file:
         file.write(text.encode("utf-8"))
 
@@ -67,11 +65,6 @@ def write_json(path: str | Path, value: Any) -> None:
     """Write plain values, mappings and sequences as JSON, see :func:`atomic_file`.
 
     NaN and infinity, for which JSON has no numbers, become ``null``.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
     """
     write_text(path, json.dumps(_without_nan(value), indent=2, allow_nan=False) + "\n")
 
@@ -100,9 +93,7 @@ def make_folder(directory: str | Path) -> Path:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot make this output folder: {error.strerror or error}"
-        ) from error
+        raise _refused(f"{folder}: cannot make this output folder", error) from error
     return folder
 
 
@@ -111,15 +102,14 @@ def staged_files(folder: Path, known: Sequence[str], last: str) -> Iterator[Path
     """Make a folder for new files, which replace the old files in ``folder`` at the end.
 
     If the block ends with an error, or the process is killed in it, the old files are as they were.
-    After the block the new files are moved, one rename each. ``last`` is removed before the others
-    are moved and comes at the end: if ``last`` is there, all files are of one run.
+    After the block the new files are moved, one rename each.
 
     Parameters
     ----------
     folder : where the files are to be; other files in it stay
-    known : names of files that an earlier run may have left; those that are not written anew are
-        removed
-    last : name of the file that marks the others as complete
+    known : names of files that an earlier run may have left, which are removed if not written anew
+    last : name of the file that is removed first and moved last: if it is there, all files are of
+        one run
 
     Raises
     ------
@@ -137,10 +127,7 @@ def staged_files(folder: Path, known: Sequence[str], last: str) -> Iterator[Path
         for name in names:
             os.replace(staged / name, folder / name)
     except OSError as error:
-        raise OutputError(
-            f"{folder}: cannot write there: {error.strerror or error}; choose another folder or "
-            "free some space"
-        ) from error
+        raise _refused(f"{folder}: cannot write there", error, _ADVICE) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 

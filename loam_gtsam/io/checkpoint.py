@@ -42,10 +42,9 @@ class Checkpoint:
 
     Parameters
     ----------
-    folder : made when the first checkpoint is written. Only files of checkpoints in it are ever
-        removed; without ``resume``, those of an earlier run are removed at the start.
+    folder : made when the first checkpoint is written; only files of checkpoints are ever removed
     seconds : of wall-clock time from one checkpoint to the next
-    resume : go on from the checkpoint in the folder, if there is one
+    resume : go on from the checkpoint in the folder, if there is one; else it is removed
 
     Examples
     --------
@@ -81,14 +80,13 @@ class Checkpoint:
 
         Returns
         -------
-        Stamps of the sweeps that were processed, nanoseconds, and their updates; empty at the
-        start.
+        Stamps of the sweeps that were processed, nanoseconds, and their updates.
 
         Raises
         ------
         OutputError
-            If the state of ``roots`` cannot be kept, if the checkpoint is of another run or
-            version or cannot be read, or if other files in the folder have the names of its files.
+            If the state cannot be kept, the checkpoint is of another run or version or cannot be
+            read, or other files in the folder have the names of its files.
         """
         self._about = {"loam_gtsam": installed_version(), **about}
         self._parts = []
@@ -105,13 +103,12 @@ class Checkpoint:
                     "it or choose another folder"
                 )
             return [], []
-        frames = _Frames()
+        frames, part = _Frames(), _Frames()
         try:
             state, header = _read(newest)
             self._check(header["about"])
             self._parts = header["parts"]
             for start, end in zip([0, *self._parts], self._parts, strict=False):
-                part = _Frames()
                 thaw(_read(self._frames_file(start, end))[0], {"frames": part}, {})
                 frames.stamps += part.stamps
                 frames.updates += part.updates
@@ -130,15 +127,10 @@ class Checkpoint:
         roots: Mapping[str, Any],
         shared: Mapping[str, Any],
     ) -> None:
-        """Write the state after a frame.
+        """Write the state after a frame: that of the roots, and what all sweeps so far gave.
 
         If the state cannot be written, or something in it cannot be kept, the log says so once and
         the run goes on.
-
-        Parameters
-        ----------
-        stamps, updates : of all sweeps so far
-        roots, shared : as in :meth:`begin`
         """
         done, total = (self._parts or [0])[-1], len(updates)
         if total == done:
@@ -162,16 +154,13 @@ class Checkpoint:
         self._written = time.monotonic()
 
     def remove(self) -> None:
-        """Remove the checkpoint, once the results of the run are written elsewhere.
-
-        Other files in the folder stay, and then the folder as well.
-        """
+        """Remove the checkpoint; other files in the folder stay, and then the folder as well."""
         with suppress(OSError):
             for path in self._files():
                 if _is_ours(path):
                     path.unlink(missing_ok=True)
-            for path in self.folder.glob(".*.tmp"):
-                if _UNFINISHED.fullmatch(path.name):  # by a process that was killed
+            for path in self.folder.glob(".*.tmp"):  # by a process that was killed
+                if _UNFINISHED.fullmatch(path.name):
                     path.unlink(missing_ok=True)
             self.folder.rmdir()  # fails if it is not empty
 

@@ -57,16 +57,8 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
 
     A line has the stamp, the status and the upper triangle of
     :attr:`loam_gtsam.types.MapUpdate.covariance`, row by row: ``rx_rx rx_ry ... z_z`` in rad^2,
-    rad m and m^2, along the axes of the lidar. Empty where the frame was not solved.
-
-    Parameters
-    ----------
-    updates : of a run; frames with a bad stamp are left out
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
+    rad m and m^2, along the axes of the lidar; empty where the frame was not solved. Frames with a
+    bad stamp are left out.
     """
     rows, columns = np.triu_indices(6)
     names = [f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
@@ -90,17 +82,6 @@ def stage_seconds(updates: Sequence[MapUpdate]) -> tuple[tuple[str, ...], FloatA
 def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     """Write everything that is known about each of the N frames; no pickle is needed to read it.
 
-    Parameters
-    ----------
-    updates : of a run, frames with a bad stamp included
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-
-    Notes
-    -----
     docs/outputs.md lists the keys; :class:`loam_gtsam.types.MapUpdate` says what the values mean.
     """
     nothing = np.full((6, 6), np.nan)

@@ -11,6 +11,7 @@ import json
 import sys
 from collections import Counter, deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -25,7 +26,6 @@ STRUCTURE = "structure"
 _T = TypeVar("_T", bound=type)
 _MARKED: dict[str, type] = {}
 _PACKAGE = __name__.partition(".")[0]
-_KINDS = "biuf"
 
 
 def checkpointed(cls: _T) -> _T:
@@ -44,8 +44,8 @@ def freeze(roots: Mapping[str, object], shared: Mapping[str, object]) -> Frozen:
     Parameters
     ----------
     roots : objects whose state is kept, by name; they may refer to each other
-    shared : objects to which the roots refer and which are not kept, because they are there again
-        when the state is read: configuration, samples of an IMU
+    shared : objects to which the roots refer and which are there again when the state is read:
+        configuration, samples of an IMU
 
     Raises
     ------
@@ -56,7 +56,7 @@ def freeze(roots: Mapping[str, object], shared: Mapping[str, object]) -> Frozen:
     states = {}
     for name, root in roots.items():
         try:
-            states[name] = writer.encode(_state(root))
+            states[name] = writer.encode(root.__getstate__())
         except TypeError as error:
             raise TypeError(f"{_name(type(root))}: {error}") from error
     return writer.frozen(states)
@@ -96,10 +96,6 @@ def _class_of(name: str, base: type = object) -> type:
     if not (isinstance(found, type) and issubclass(found, base) and _name(found) == name):
         raise KeyError(name)
     return found
-
-
-def _state(value: Any) -> Any:
-    return value.__getstate__()
 
 
 def _set_state(value: Any, state: Any) -> None:
@@ -143,41 +139,36 @@ class _Writer:
 
     def _tagged(self, value: Any) -> list[Any]:
         kind = type(value)
-        if isinstance(value, np.ndarray):
-            return ["array", self._array(value)]
-        if isinstance(value, np.generic):
-            return ["scalar", self._array(np.asarray(value))]
+        if isinstance(value, (np.ndarray, np.generic)):
+            tag = "scalar" if isinstance(value, np.generic) else "array"
+            return [tag, self._array(np.asarray(value))]
         if kind in (list, tuple, set):
             return [kind.__name__, self._each(value)]
         if kind is deque:
             return ["deque", self._each(value), value.maxlen]
         if kind in (dict, Counter):
             return [kind.__name__, [self._each(pair) for pair in value.items()]]
-        if kind is gtsam.Pose3:
-            return ["pose", self._array(value.matrix())]
-        if kind is gtsam.Rot3:
-            return ["rotation", self._array(value.matrix())]
+        if kind in (gtsam.Pose3, gtsam.Rot3):
+            return ["pose" if kind is gtsam.Pose3 else "rotation", self._array(value.matrix())]
         if isinstance(value, tuple):
             return ["named", self._class(value), self._each(value)]
-        return ["object", self._class(value), self.encode(_state(value))]
+        return ["object", self._class(value), self.encode(value.__getstate__())]
 
     def _each(self, values: Any) -> list[Any]:
         return [self.encode(value) for value in values]
 
     def _class(self, value: object) -> str:
         name = _name(type(value))
-        try:
+        with suppress(KeyError):
             if _class_of(name) is type(value):
                 return name
-        except KeyError:
-            pass
         raise TypeError(
             f"{name} cannot be in a checkpoint; if its attributes say all about it, mark the class "
             "with loam_gtsam.io.state.checkpointed, else leave it out of what __getstate__ gives"
         )
 
     def _array(self, array: NDArray[Any]) -> int:
-        if array.dtype.kind not in _KINDS:
+        if array.dtype.kind not in "biuf":
             raise TypeError(f"an array of {array.dtype} cannot be in a checkpoint")
         turned = array.flags.f_contiguous and not array.flags.c_contiguous
         flat = (array.T if turned else array).ravel()
@@ -217,11 +208,10 @@ class _Reader:
             _set_state(made, self.decode(entry[2]))
             return made
         container = self._made[entry[-1]] = _CONTAINERS[tag]()
-        for part in entry[1]:
-            if tag == "list":
-                container.append(self.decode(part))
-            else:
-                key, value = self.each(part)
+        if tag == "list":
+            container.extend(map(self.decode, entry[1]))
+        else:
+            for key, value in map(self.each, entry[1]):
                 container[key] = value
         return container
 

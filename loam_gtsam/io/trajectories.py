@@ -25,11 +25,6 @@ def write_tum(
     ----------
     trajectory : stamps become seconds with nine decimals, exactly
     comments : written as ``# key: value`` at the top
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
     """
     notes = dict(comments or {}) | {"columns": "stamp_s x y z qx qy qz qw (map_T_lidar)"}
     lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
@@ -47,11 +42,6 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
     """Write the upper three rows of each pose, row by row, 12 numbers a line (KITTI format).
 
     The axes are those of the lidar, not KITTI's camera.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
     """
     rows = trajectory.map_T_lidar[:, :3, :].reshape(-1, 12).tolist()
     write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))

@@ -372,7 +372,7 @@ _ENDLESS = """
 import itertools, signal, sys, time
 signal.signal(signal.SIGINT, signal.default_int_handler)  # as in a terminal
 import loam_gtsam.datasets
-from loam_gtsam.cli.app import main
+from loam_gtsam.cli import main
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 
 pause = float(sys.argv.pop())

@@ -1,10 +1,10 @@
-"""The sections of the estimator: sweep, features, prediction, map, registration."""
+"""Every parameter, section by section: the estimator, then what a run may add to it."""
 
 from __future__ import annotations
 
 from typing import Literal
 
-from loam_gtsam.config.base import Count, Section, parameter
+from loam_gtsam.config.base import Count, Finite, Section, parameter
 
 
 class SensorConfig(Section):
@@ -49,15 +49,11 @@ class FeatureConfig(Section):
     """The curvature at a point takes this many neighbours on either side of it in its ring."""
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
-    range_noise: float = parameter(
-        0.02, unit="m", source="LOAM takes all points that are not edges", low=0.0
-    )
+    range_noise: float = parameter(0.02, unit="m", source="LOAM takes whatever is no edge", low=0.0)
     """The ranges of the sensor have this standard deviation. A plane point is taken only where its
     ring scatters about a smooth surface by less than four times this value, which foliage does
     not; 0 turns the test off."""
-    post_depth: float = parameter(
-        0.5, unit="m", source="LOAM takes only what its curvature finds", low=0.0
-    )
+    post_depth: float = parameter(0.5, unit="m", source="LOAM has no such search", low=0.0)
     """A pole, a run of a ring too short for the curvature, is an edge where it stands in front of
     what is on both sides of it by more than this; 0 turns the search for poles off."""
     post_width: float = parameter(0.5, unit="m", low=0.0)
@@ -71,8 +67,7 @@ class FeatureConfig(Section):
     flat_per_sector: int = parameter(4, source="LOAM", low=0)
     """At most this many plane points of a sector count as flat; scan-to-scan odometry uses them."""
     max_gap: float = parameter(0.05, unit="m^2", source="LOAM", low=0.0)
-    """The suppression of points beside a chosen one stops at a gap with a squared width above
-    this."""
+    """The suppression beside a chosen point stops at a gap with a squared width above this."""
     occlusion_gap: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """Two neighbours with a squared distance above this may be the rim of an occlusion."""
     occlusion_ratio: float = parameter(0.1, source="LOAM", low=0.0)
@@ -94,9 +89,8 @@ class DeskewConfig(Section):
     """Sweeps are de-skewed again with the solution, and the first two are registered anew when
     their motion is known; false de-skews once, with the prediction."""
     rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
-    """The rotation within a sweep comes from here: auto takes the gyro of an IMU where it covers
-    the sweep, else a constant velocity; orientation takes the attitude of the IMU in place of its
-    gyro."""
+    """The rotation within a sweep comes from the gyro of an IMU where that covers the sweep, else
+    from a constant velocity (auto), or from the attitude of the IMU (orientation)."""
     reference: Literal["start", "middle", "end", "stamp"] = parameter("start")
     """The pose of a sweep is that of the lidar at this moment of the sweep."""
 
@@ -224,8 +218,7 @@ class MatchingConfig(Section):
     """A plane needs its second eigenvalue above this times the largest one: points along one ring
     of a sparse sensor have no normal."""
     max_ring_cosine: float = parameter(0.5, low=0.0)
-    """The cosine between an edge line and its ring is at most this, for a line along the ring is
-    no edge."""
+    """The cosine between an edge and its ring is at most this; a line along a ring is no edge."""
     min_incidence_sine: float = parameter(0.05, low=0.0, high=1.0)
     """The sine of the angle between a plane and the viewing ray is at least this, for a plane that
     contains the ray says nothing."""
@@ -289,8 +282,7 @@ class SolverConfig(Section):
     """A direction is degenerate if fewer matches than this fix it, counted as if their normals
     pointed that way."""
     acceleration_sigma: float = parameter(2.0, unit="m/s^2", low=1e-6)
-    """The motion of constant velocity is believed to within this acceleration along degenerate
-    directions."""
+    """Along degenerate directions, constant velocity is believed to within this acceleration."""
     turn_sigma: float = parameter(2.0, unit="rad/s^2", low=1e-6)
     """The motion of constant velocity is believed to within this angular acceleration along
     degenerate directions."""
@@ -313,16 +305,159 @@ class CovarianceConfig(Section):
     match_cell: float = parameter(
         1.6, unit="m", source="neighbours lie within matching.max_distance", low=0.01
     )
-    """The residuals of matches in one cell of this size count as one error, for they share map
-    points."""
+    """Matches in one cell of this size count as one error, for they share points of the map."""
     ground_cell: float = parameter(0.8, unit="m", low=0.01)
     """A cell of this size is new ground when it is matched for the first time."""
-    drift: float = parameter(
-        6.0,
-        source="fitted on seeds 100-103 of the built-in scenes, see docs/consistency.md",
-        low=0.0,
-    )
+    drift: float = parameter(6.0, source="fitted, see docs/consistency.md", low=0.0)
     """The error of the map grows by this times the share of new ground in a frame's covariance."""
     window: int = parameter(10, low=1)
-    """The acceleration, which the motion of constant velocity misses, is averaged over this many
-    frames."""
+    """The acceleration that constant velocity misses is averaged over this many frames."""
+
+
+class ImuConfig(Section):
+    """The use of an inertial measurement unit (IMU); without one, nothing here matters."""
+
+    enabled: bool = parameter(True)
+    """The measurements of the IMU are used; false maps as if there were no IMU."""
+    prior: Literal["off", "blend", "equivalent", "sigma"] = parameter(
+        "equivalent", source="LOAM blends"
+    )
+    """Roll and pitch of the IMU act on the pose in this way: off, not at all; blend, mixed in after
+    the solve; equivalent, by a factor that has the weight's share of what the scan knows, which
+    gives the same mean; sigma, by a gravity direction of the given standard deviation."""
+    weight: float = parameter(
+        0.01, source="LOAM uses 0.002; on slopes that is too little to be seen", low=0.0, high=0.999
+    )
+    """Roll and pitch of the IMU have this share in the result of blend and equivalent."""
+    sigma_deg: float = parameter(0.5, unit="degrees", low=1e-4)
+    """The gravity direction of the IMU has this standard deviation, its slow errors included. It is
+    used by sigma, and by equivalent where the scan or the angles allow no equivalent factor."""
+    level: bool = parameter(True)
+    """The z axis of the map points up from the start; false takes the frame of the first pose."""
+    still_seconds: float = parameter(0.5, unit="s", low=0.0)
+    """The platform may be at rest for this long before the first sweep; that window is examined."""
+    average_seconds: float = parameter(
+        0.1, unit="s", source="the period of a sweep; LOAM uses 0", low=0.0
+    )
+    """Roll and pitch of a frame are the mean over this duration, brought to the moment of the frame
+    by the gyro; 0 takes those of the moment itself."""
+    max_gap: float = parameter(0.1, unit="s", low=1e-3)
+    """A gap between samples that is longer than this is not bridged."""
+    lidar_R_imu_deg: tuple[Finite, Finite, Finite] = parameter((0.0, 0.0, 0.0), unit="degrees")
+    """These are roll, pitch and yaw of the rotation Rz Ry Rx that takes vectors from the frame of
+    the IMU into the frame of the lidar."""
+    lidar_t_imu: tuple[Finite, Finite, Finite] = parameter((0.0, 0.0, 0.0), unit="m")
+    """The IMU has this position in the frame of the lidar; pre-integration uses it."""
+    filter_seconds: float = parameter(60.0, unit="s", low=0.1)
+    """The attitude filter, which replaces a missing orientation, has this time constant."""
+    preintegration: bool = parameter(False)
+    """Every pose is predicted from gyro and accelerometer, with velocity and biases estimated over
+    the last frames, and the prediction decides directions that the scan does not fix."""
+    lag: int = parameter(20, low=2)
+    """The graph of the pre-integration keeps this many frames."""
+    gravity: float = parameter(9.81, unit="m/s^2", low=0.0)
+    """The gravitational acceleration has this magnitude at the place of the recording."""
+    gyro_noise: float = parameter(2e-4, unit="rad/s/sqrt(Hz)", low=1e-9)
+    """The white noise of the gyro has this density."""
+    acceleration_noise: float = parameter(2e-3, unit="m/s^2/sqrt(Hz)", low=1e-9)
+    """The white noise of the accelerometer has this density."""
+    gyro_bias_walk: float = parameter(2e-5, unit="rad/s^2/sqrt(Hz)", low=1e-12)
+    """The random walk of the gyro's bias has this density."""
+    acceleration_bias_walk: float = parameter(2e-4, unit="m/s^3/sqrt(Hz)", low=1e-12)
+    """The random walk of the accelerometer's bias has this density."""
+
+
+class PoseGraphConfig(Section):
+    """The choice of keyframes, the graph of their poses, and which loop closures it uses."""
+
+    keyframe_distance: float = parameter(4.0, unit="m", low=0.0)
+    """A frame is a keyframe if it is at least this far from the last keyframe."""
+    keyframe_angle_deg: float = parameter(30.0, unit="degrees", low=0.0)
+    """A frame is a keyframe as well if it is turned by at least this against the last keyframe."""
+    walk: float = parameter(0.02, unit="m/sqrt(m)", low=0.0)
+    """The odometry drifts by more than its covariances know, like a random walk. The standard
+    deviation of the position grows by this times the square root of the distance travelled."""
+    turn_walk_deg: float = parameter(0.02, unit="degrees/sqrt(m)", low=0.0)
+    """The standard deviation of the rotation grows by this times the square root of the distance
+    travelled, for the same reason as that of the position (walk)."""
+    max_chi2: float = parameter(40.0, source="one of 10,000 right loops exceeds 28", low=0.0)
+    """A loop closure is used if its squared Mahalanobis distance (6 degrees of freedom) from what
+    all the others say is not above this."""
+    kernel_width: float = parameter(5.0, source="right loop closures have sqrt(6)", low=0.1)
+    """The Huber kernel on the whitened norm of a loop closure has this width in iSAM2; .inf turns
+    the kernel off."""
+    believed_loops: int = parameter(6, low=2)
+    """At least this many loop closures that agree pairwise are used against the odometry."""
+    follow_distance: float = parameter(0.05, unit="m", low=0.0)
+    """Map points follow their keyframe once a loop closure has moved it by more than this as seen
+    from the newest keyframe; an error of follow_angle_deg in the newest one is allowed for."""
+    follow_angle_deg: float = parameter(0.2, unit="degrees", low=0.0)
+    """Map points follow their keyframe as well once it has been turned by more than this."""
+
+
+class LoopConfig(Section):
+    """The search for loop closures, and the tests that a candidate has to pass."""
+
+    enabled: bool = parameter(False)
+    """Loop closures are searched for during a run, and the map follows them."""
+    min_way: float = parameter(30.0, unit="m", low=0.0)
+    """Two keyframes form a loop closure only if at least this was travelled between them."""
+    gate: float = parameter(10.0, unit="m", low=0.0)
+    """A candidate lies within a gate about the keyframe. The radius of the gate is the sum of three
+    parts, of which this is the constant one."""
+    gate_sigmas: float = parameter(3.0, low=0.0)
+    """The second part of the gate is this many standard deviations of the two positions."""
+    gate_drift: float = parameter(0.02, low=0.0)
+    """The third part of the gate is this share of the distance travelled between the two keyframes,
+    for drift that the covariances do not know."""
+    rings: int = parameter(20, source="Scan Context", low=1)
+    """The place descriptor has this many rings."""
+    sectors: int = parameter(60, source="Scan Context", low=4)
+    """The place descriptor has this many sectors."""
+    reach: float = parameter(60.0, unit="m", source="Scan Context uses 80", low=1.0)
+    """The place descriptor covers points up to this range."""
+    max_unlike: float = parameter(0.6, source="Scan Context uses 0.2 to 0.6", low=0.0)
+    """A candidate is tried if the distance of the two place descriptors is not above this."""
+    tries: int = parameter(2, low=1)
+    """At most this many candidates are verified for a keyframe."""
+    neighbours: int = parameter(6, low=0)
+    """The submap of a candidate has its features and those of so many keyframes on either side."""
+    search: float = parameter(8.0, unit="m", low=1.0)
+    """The keyframe is searched for within this radius about the candidate."""
+    min_share: float = parameter(0.5, low=0.0, high=1.0)
+    """At least this share of the features off level ground must have a match in the submap."""
+    min_agreement: float = parameter(
+        0.9, source="right loops have 0.97 or more, those shifted by 3 m along a street 0.75, "
+        "other wrong ones less than 0.5", low=0.0, high=1.0,
+    )  # fmt: skip
+    """At least this share of the matches must lie within three standard deviations."""
+    min_aligned: float = parameter(30.0, low=0.0)
+    """Every direction must be fixed by this many matches, counted as for solver.min_aligned."""
+
+
+class BagConfig(Section):
+    """The topics and frames that a run writes into a bag, or publishes."""
+
+    map_frame: str = parameter("camera_init", source="LOAM")
+    """Poses and clouds have this frame_id; whatever its name, its axes are those of the map."""
+    lidar_frame: str = parameter("aft_mapped", source="LOAM")
+    """Poses have this child_frame_id."""
+    registered: bool = parameter(True)
+    """The topic /velodyne_cloud_registered is written, which makes up most of a bag."""
+    surround_every: int = parameter(5, source="LOAM", low=0)
+    """The topic /laser_cloud_surround gets a message once in this many frames; 0 writes none."""
+
+
+class LiveConfig(Section):
+    """The queues of a live run, in which sweeps wait, and which of them are dropped."""
+
+    queue: int = parameter(20, low=1)
+    """At most this many sweeps wait while another one is mapped; when_full applies to any more."""
+    when_full: Literal["drop_oldest", "keep_newest", "never"] = parameter("drop_oldest")
+    """Room for a new sweep is made in this way: the sweep that has waited longest is dropped, or
+    all waiting sweeps are dropped, or none is dropped and the queue grows."""
+    imu_queue: int = parameter(20_000, low=1)
+    """At most this many IMU samples wait for the next sweep; the oldest are dropped first."""
+    imu_wait: float = parameter(0.2, unit="s", low=0.0)
+    """A sweep waits for the IMU samples up to its end, but not longer than this after it was
+    received; until the map is levelled, it waits imu.still_seconds more."""

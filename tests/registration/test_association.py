@@ -342,62 +342,11 @@ def test_the_range_in_the_weight_is_from_the_sensor_or_from_the_map_origin():
 # -- whole scenes ----------------------------------------------------------------------------------
 
 
-def grid(a, b, step=0.25):
-    u, v = np.meshgrid(np.arange(*a, step), np.arange(*b, step), indexing="ij")
-    return u.ravel(), v.ravel()
-
-
 def map_of(points, voxel=0.01, **changes):
     cubes = CubeMap(MapConfig(field_of_view=False).changed(**changes), voxel)
     if len(points):
         cubes.insert(points)
     return cubes
-
-
-POLES = np.array([[4.0, 3.0], [7.0, -2.0], [-3.0, 5.0]])
-
-
-def test_a_corner_with_poles_is_matched_exactly():
-    """Floor and two walls that meet in a corner, and three vertical poles."""
-    u, v = grid((-8, 10), (-8, 10))
-    floor = np.column_stack([u, v, np.full(len(u), -1.5)])
-    u, v = grid((-8, 10), (-1, 6))
-    front = np.column_stack([np.full(len(u), 10.0), u, v])
-    left = np.column_stack([u, np.full(len(u), 10.0), v])
-    heights = np.arange(-1.0, 4.0, 0.25)
-    poles = np.array([[x, y, z] for x, y in POLES for z in heights])
-    pose = gtsam.Pose3.Expmap(np.array([0.05, -0.1, 0.4, 1.0, -2.0, 0.3]))
-
-    inside = np.random.default_rng(0).uniform(-4, 8, (200, 2))
-    off = 0.07
-    planes = np.concatenate([
-        np.column_stack([inside[:60], np.full(60, -1.5 + off)]),
-        np.column_stack([np.full(60, 10.0 - off), inside[60:120, 0], 2 + inside[60:120, 1] / 4]),
-        np.column_stack([inside[120:180, 0], np.full(60, 10.0 - off), 2 + inside[120:180, 1] / 4]),
-    ])  # fmt: skip
-    edges = np.array([[x, y - off, z] for x, y in POLES for z in np.linspace(-0.4, 3.0, 9)])
-    to_lidar = pose.inverse().matrix()
-    matches = associate(
-        transform(to_lidar, edges),
-        transform(to_lidar, planes),
-        pose,
-        map_of(poles),
-        map_of(np.concatenate([floor, front, left])),
-        changed(min_incidence_sine=0.0),
-    )
-    assert len(matches.edges) == len(edges)
-    assert len(matches.planes) == len(planes)
-    assert len(matches) == len(edges) + len(planes)
-    np.testing.assert_allclose(np.abs(matches.edges.directions), [Z] * 27, atol=1e-7)
-    np.testing.assert_allclose(matches.edges.centres[:, :2], POLES.repeat(9, axis=0), atol=1e-12)
-    np.testing.assert_allclose(matches.edges.distances, off, atol=1e-7)
-    normals = np.repeat([Z, X, Y], 60, axis=0)
-    np.testing.assert_allclose(np.abs(matches.planes.normals), normals, atol=1e-7)
-    np.testing.assert_allclose(np.abs(matches.planes.distances), off, atol=1e-7)
-    np.testing.assert_allclose(
-        np.abs(matches.planes.offsets), np.repeat([1.5, 10.0, 10.0], 60), atol=1e-6
-    )
-    np.testing.assert_allclose(matches.planes.points, transform(to_lidar, planes), atol=1e-12)
 
 
 def cloud(rng):
@@ -408,77 +357,6 @@ def cloud(rng):
     groups = centres + (rng.normal(size=(120, 12, 3)) * spread) @ bases
     points = centres[:, 0] + rng.normal(0, 0.2, (120, 3))
     return points, groups.reshape(-1, 3)
-
-
-def brute_force(points_map, cubes, pose, config):
-    """Indices of the line and plane matches and their fits, one feature after the other."""
-    up, sensor = pose[:3, 2], pose[:3, 3]
-    lines, planes = {}, {}
-    for i, q in enumerate(points_map):
-        squared = ((cubes - q) ** 2).sum(axis=1)
-        nearest = np.argsort(squared)[: config.neighbours]
-        if len(nearest) < config.neighbours or squared[nearest[-1]] >= config.max_distance**2:
-            continue
-        group = cubes[nearest]
-        centre = group.mean(axis=0)
-        values, vectors = np.linalg.eigh((group - centre).T @ (group - centre) / len(group))
-        ray = q - sensor
-        ring = np.cross(up, ray) / np.linalg.norm(np.cross(up, ray))
-        u, n = vectors[:, 2], vectors[:, 0]
-        distance = np.linalg.norm(np.cross(q - centre, u))
-        if (
-            values[2] > config.line_ratio * values[1]
-            and abs(u @ ring) <= config.max_ring_cosine
-            and 1 - config.weight_slope * distance > config.min_weight
-        ):
-            lines[i] = (u, distance)
-        height, reach = n @ (q - centre), np.linalg.norm(ray)
-        if (
-            np.abs((group - centre) @ n).max() <= config.plane_tolerance
-            and values[1] > config.plane_ratio * values[2]
-            and abs(n @ ray) >= config.min_incidence_sine * reach
-            and 1 - config.weight_slope * abs(height) / np.sqrt(reach) > config.min_weight
-        ):
-            planes[i] = (n, abs(height))
-    return lines, planes
-
-
-@pytest.mark.parametrize("config", [
-    changed(max_distance=2.0),
-    changed(neighbours=7, max_distance=2.0, line_ratio=3.0, plane_ratio=0.3,
-            min_incidence_sine=0.5, weight_slope=1.8, max_ring_cosine=0.9),
-])  # fmt: skip
-def test_equals_brute_force(config):
-    rng = np.random.default_rng(1)
-    points, cubes = cloud(rng)
-    pose = gtsam.Pose3.Expmap(np.array([0.1, 0.2, -0.5, 3.0, -2.0, 1.0]))
-    features = transform(pose.inverse().matrix(), points)
-    held = map_of(cubes, voxel=1e-3)
-    matches = associate(features, features, pose, held, held, config)
-    lines, planes = brute_force(points, cubes, pose.matrix(), config)
-    assert 8 < len(lines) < 110
-    assert 8 < len(planes) < 110
-    np.testing.assert_array_equal(matches.edges.indices, list(lines))
-    np.testing.assert_array_equal(matches.planes.indices, list(planes))
-    for i, (u, distance) in enumerate(lines.values()):
-        assert abs(matches.edges.directions[i] @ u) == pytest.approx(1.0, abs=1e-9)
-        assert matches.edges.distances[i] == pytest.approx(distance, abs=1e-9)
-    for i, (n, height) in enumerate(planes.values()):
-        assert abs(matches.planes.normals[i] @ n) == pytest.approx(1.0, abs=1e-9)
-        assert abs(matches.planes.distances[i]) == pytest.approx(height, abs=1e-9)
-    np.testing.assert_array_equal(matches.edges.points, features[matches.edges.indices])
-
-
-def test_the_same_input_gives_the_same_bits():
-    points, cubes = cloud(np.random.default_rng(1))
-    first, second = (
-        associate(points, points, gtsam.Pose3(), map_of(cubes), map_of(cubes), CONFIG)
-        for _ in range(2)
-    )
-    for one_, other in ((first.edges, second.edges), (first.planes, second.planes)):
-        for item in dataclasses.fields(one_):
-            a, b = getattr(one_, item.name), getattr(other, item.name)
-            assert a is b is None or a.tobytes() == b.tobytes()
 
 
 @pytest.mark.parametrize("match", [match_lines, match_planes])
@@ -679,25 +557,9 @@ def test_renewed_matches_keep_their_shapes_and_measure_anew():
     np.testing.assert_allclose(after.planes.weights, [1 - 0.9 * 0.15 / np.sqrt(reach)], atol=1e-9)
 
 
-def test_renewed_at_the_same_pose_nothing_changes():
-    before, after = both(), rematched(both(), gtsam.Pose3(), CONFIG)
-    for kind in ("edges", "planes"):
-        for field in dataclasses.fields(getattr(before, kind)):
-            old, new = (getattr(getattr(each, kind), field.name) for each in (before, after))
-            assert old is new is None or np.allclose(old, new, rtol=1e-7, atol=1e-12)
-
-
 def test_a_renewed_match_that_is_too_far_is_dropped():
     far = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 1.0, 0.0]))
     after = rematched(both(), far, CONFIG)
     assert (len(after.edges), len(after.planes)) == (0, 1)
     away = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
     assert len(rematched(both(), away, CONFIG)) == 0
-
-
-def test_matches_that_all_stay_are_not_copied():
-    near = gtsam.Pose3(gtsam.Rot3(), np.array([0.01, 0.0, 0.0]))
-    before = both()
-    after = rematched(before, near, CONFIG)
-    assert after.edges.points is before.edges.points
-    assert after.planes.points is before.planes.points

@@ -6,17 +6,22 @@ from itertools import pairwise
 import gtsam
 import numpy as np
 import pytest
+from support.matches import difference
 
 from loam_gtsam.config import Config, OdometryConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import move_points
+from loam_gtsam.imu.preintegration import Prediction as Predicted
 from loam_gtsam.registration.odometry import (
     ConstantVelocity,
+    Moment,
     ScanToScan,
     _RingSearch,
     advance,
     make_odometry,
+    predict,
 )
 from loam_gtsam.types import Features, FrameStatus, MapUpdate
 
@@ -33,10 +38,6 @@ def update(pose=START, twist=TWIST, stamp=STAMP):
 def empty(stamp=STAMP + PERIOD, span=(0.0, 0.1)):
     none = np.empty((0, 3))
     return dataclasses.replace(Features.from_points(stamp, none, none), span=span)
-
-
-def difference(a, b):
-    return np.abs(a.localCoordinates(b)).max()
 
 
 # -- constant velocity -----------------------------------------------------------------------------
@@ -110,6 +111,65 @@ def test_scan_to_scan_starts_from_the_gyro():
     expected = ConstantVelocity(Gyro([0.0, 0.0, 2.0])).guess(empty(), update())
     found = odometry.guess(empty(), update())
     assert np.array_equal(found.map_T_lidar.matrix(), expected.map_T_lidar.matrix())
+
+
+# -- the prediction of the mapper ------------------------------------------------------------------
+
+SECOND = STAMP + PERIOD
+MIDDLE = Moment(STAMP + PERIOD // 2, advance(START, TWIST, 0.05), True)
+OTHER = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 3.0]))
+
+
+class Inertial(Gyro):
+    """A gyro with a pre-integration that knows one pose."""
+
+    known = Predicted(0, OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)))
+
+    def predict(self, stamp):
+        return self.known if stamp <= self.until else None
+
+
+def predicted(imu=None, guess=None, twist=None, last=MIDDLE):
+    points = np.random.default_rng(0).uniform(-9.0, 9.0, (50, 3))
+    features = Features.from_points(SECOND, points, points)
+    sweep = MovingSweep(dataclasses.replace(features, span=(0.0, 0.1)), Config())
+    found = predict(sweep, last and update(), last, imu, Config().solver, guess, twist)
+    assert difference(found.map_T_middle, found.posed.map_T_middle(found.map_T_lidar)) < 1e-12
+    return found
+
+
+def test_without_an_imu_the_motion_goes_on_with_the_spread_of_an_acceleration():
+    found, config = predicted(), Config().solver
+    assert difference(found.map_T_lidar, advance(START, TWIST, 0.1)) < 1e-12
+    np.testing.assert_array_equal(found.posed.twist, TWIST)
+    assert difference(found.motion.map_T_lidar, advance(START, TWIST, 0.15)) < 1e-12
+    sigmas = 0.5 * 0.1**2 * np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
+    np.testing.assert_allclose(found.motion.information, np.diag(sigmas**-2.0))
+    first = predicted(last=None)
+    assert difference(first.map_T_lidar, gtsam.Pose3()) == 0.0
+    assert not first.motion.information.any()
+
+
+@pytest.mark.parametrize("imu", [None, Inertial([0.0, 0.0, 2.0])])
+def test_a_given_guess_and_twist_take_the_place_of_the_predicted_ones(imu):
+    guess, twist = START.retract(np.full(6, 0.1)), 0.5 * TWIST
+    found = predicted(imu, guess, twist)
+    assert difference(found.map_T_lidar, guess) < 1e-12
+    np.testing.assert_array_equal(found.posed.twist, twist)
+    # What the IMU expects does not depend on the guess.
+    expected = found.map_T_middle if imu is None else OTHER
+    assert difference(found.motion.map_T_lidar, expected) < 1e-12
+
+
+def test_by_pre_integration_the_pose_of_the_middle_is_the_predicted_one():
+    found = predicted(Inertial([0.0, 0.0, 2.0]))
+    assert difference(found.map_T_middle, OTHER) < 1e-12
+    np.testing.assert_allclose(found.motion.information, np.diag(1.0 / np.arange(1.0, 7.0)))
+    velocity = OTHER.rotation().matrix() @ found.posed.twist[3:]
+    np.testing.assert_allclose(velocity, [1.0, 0.0, 0.5], atol=1e-12)
+    # Where pre-integration fails, the gyro alone predicts.
+    failed = predicted(Inertial([0.0, 0.0, 2.0], until=STAMP))
+    assert difference(failed.map_T_lidar, advance(START, TWIST, 0.1)) < 1e-12
 
 
 # -- scan to scan ----------------------------------------------------------------------------------

@@ -13,7 +13,6 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from support.matches import make_matches
 from support.strategies import FEW, generators
-from support.worlds import room_features
 
 from loam_gtsam.config import Config, MatchingConfig, SolverConfig, preset
 from loam_gtsam.datasets import SimulatedWorld
@@ -239,23 +238,3 @@ def test_a_drive_through_the_mirror_is_the_mirrored_drive() -> None:
         step = mirror(here).localCoordinates(there)
         assert np.degrees(np.linalg.norm(step[:3])) < 0.02
         assert np.linalg.norm(step[3:]) < 2e-3
-
-
-@FEW
-@given(rng=generators())
-def test_the_order_of_features_does_not_matter_to_the_mapper(rng: np.random.Generator) -> None:
-    runs: list[list[gtsam.Pose3]] = []
-    for shuffle in (False, True):
-        mapper, found = Mapper(ALL), []
-        for number in range(4):
-            pose = gtsam.Pose3.Expmap(0.05 * number * np.array([0, 0, 0.3, 1.0, 0, 0]))
-            part = room_features(pose, number * 10**8, np.random.default_rng(number), 2000)
-            if shuffle:
-                orders = rng.permutation(len(part.edges)), rng.permutation(len(part.planes))
-                part = Features.from_points(
-                    part.stamp, part.edges[orders[0]], part.planes[orders[1]]
-                )
-            found.append(mapper.register(part, pose).map_T_lidar)
-        runs.append(found)
-    for here, there in zip(*runs, strict=True):
-        assert apart(here, there) < 1e-9

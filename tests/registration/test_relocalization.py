@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 
 import gtsam
@@ -13,9 +14,24 @@ from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.disturbances import Disturbed, MissingSweeps, MovingObjects, Outliers
 from loam_gtsam.datasets.sim.kidnapping import Kidnapped
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.pipeline import Pipeline, run
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.relocalization import Fit, FitMonitor, likely_poses, sample_features
+from loam_gtsam.registration.odometry import Moment, predict
+from loam_gtsam.registration.relocalization import (
+    Fit,
+    FitMonitor,
+    Found,
+    Lost,
+    doubtful,
+    likely_poses,
+    sample_features,
+    search,
+)
+from loam_gtsam.registration.report import Clock
+from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
 
 AT = 22
@@ -199,6 +215,69 @@ def test_a_few_points_stand_for_a_sweep():
     assert sample_features(edges[:0], planes[:0]).shape == (0, 3)
 
 
+# -- the search ------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def before(calm):
+    """The mapper when the sweep AT comes."""
+    pipeline = Pipeline()
+    for sweep in list(calm)[:AT]:
+        pipeline.process(sweep)
+    return pipeline.mapper
+
+
+def frame_of(mapper, sweep):
+    config, last = mapper.config, mapper.last
+    moving = MovingSweep(extract_features(sweep, config), config)
+    middle = Moment(last.middle_stamp, last.map_T_middle, True)
+    predicted = predict(moving, last, middle, None, config.solver)
+    matcher = FrameMatcher.of(predicted.posed, mapper.maps, config, middle, Clock(), refine=True)
+    return Frame(matcher, predicted, [])
+
+
+def search_in(mapper, sweep, monitor):
+    """Whether the solve is in doubt, the outcome of the search, and the solution in doubt."""
+    frame = frame_of(mapper, sweep)
+    solution = frame.solve(mapper.solver)
+    doubt = doubtful(frame, solution, monitor, mapper.last.twist)
+    return doubt, search(frame, solution, monitor, mapper.solver), solution
+
+
+def test_a_search_finds_a_sweep_that_was_carried_away_and_changes_nothing(before, kidnapped):
+    points = before.maps.points()
+    doubt, found, solution = search_in(before, list(kidnapped)[AT], before.monitor)
+    assert doubt
+    assert isinstance(found, Found)
+    assert found.message.startswith("relocalised, moved by 3.")
+    truth = kidnapped.truth.map_T_lidar[AT, :3, 3]
+    assert np.linalg.norm(found.solution.map_T_lidar.translation() - truth) < 0.15
+    assert np.linalg.norm(solution.map_T_lidar.translation() - truth) > 1.0
+    assert before.monitor.lost == 0
+    assert all(map(np.array_equal, before.maps.points(), points))
+
+
+def test_a_search_of_too_small_a_radius_says_that_the_sweep_is_lost(before, kidnapped):
+    monitor = deepcopy(before.monitor)
+    monitor.config = monitor.config.changed(radius=1.0, max_radius=1.0)
+    monitor.lost = 2
+    _, outcome, _ = search_in(before, list(kidnapped)[AT], monitor)
+    assert isinstance(outcome, Lost)
+    assert "nothing fits within 1 m; lost for 3 sweeps" in outcome.message
+    assert monitor.lost == 2
+
+
+def test_a_sweep_that_fits_keeps_its_solution_if_the_search_finds_nothing_better(before, calm):
+    frame = frame_of(before, list(calm)[AT])
+    solution = frame.solve(before.solver)
+    assert not doubtful(frame, solution, before.monitor, before.last.twist)
+    nothing = GtsamSolver(before.config.solver.changed(min_matches=10**6))
+    found = search(frame, solution, before.monitor, nothing)
+    assert isinstance(found, Found)
+    assert (found.solution, found.message) == (solution, "")
+    np.testing.assert_array_equal(found.twist, frame.twist_to(solution.map_T_lidar))
+
+
 # -- whole runs ------------------------------------------------------------------------------------
 
 
@@ -272,22 +351,6 @@ def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
     assert sizes[-1] > sizes[AT - 1]
     truth = kidnapped.truth.map_T_lidar[-1, :3, 3]
     assert np.linalg.norm(updates[-1].map_T_lidar.translation() - truth) < 0.15
-
-
-def test_a_reset_starts_a_new_map(calm):
-    pipeline = Pipeline()
-    sweeps = list(calm)
-    for sweep in sweeps[:12]:
-        pipeline.process(sweep)
-    before = pipeline.mapper.maps.planes.count()
-    pipeline.mapper.reset()
-    assert pipeline.mapper.maps.planes.count() == 0
-    update = pipeline.process(sweeps[12])
-    assert update.status is FrameStatus.FIRST
-    assert update.map_T_lidar.equals(gtsam.Pose3(), 1e-12)
-    assert not pipeline.mapper.monitor.ready
-    assert pipeline.process(sweeps[13]).status.solved
-    assert 0 < pipeline.mapper.maps.planes.count() < before
 
 
 def test_few_matches_twice_in_a_row_start_a_search(calm):

@@ -17,8 +17,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.loops.consistency import chi_squared, loop_to_switch, relative_pose_covariance
+from loam_gtsam.loops.incremental import relative_pose_covariance
 from loam_gtsam.loops.keyframes import is_pose, pose_number
+from loam_gtsam.loops.loop_selection import chi_squared, loop_to_switch
 from loam_gtsam.types import BoolArray, FloatArray, InputError
 
 _INLIER = 0.5
@@ -71,8 +72,7 @@ class LoopReport:
     ----------
     earlier, later : numbers of the poses
     active : whether the loop closure was used
-    chi_squared : squared Mahalanobis distance from what all the others say, with 6 degrees of
-        freedom
+    chi_squared : squared Mahalanobis distance from what all the others say, 6 degrees of freedom
     """
 
     earlier: int
@@ -131,19 +131,16 @@ def optimize_graph(
     problem = _Problem(saved, saved.loops if loops is None else loops)
     active = np.ones(len(problem.loops), np.bool_)
     try:
-        graph, poses = problem.solve(active)
-        distances = problem.test(graph, poses, active)
+        graph, poses, distances = problem.solve(active)
         if robust and (distances > max_chi2).any():
             active = problem.inliers()
-            graph, poses = problem.solve(active)
-            distances = problem.test(graph, poses, active)
+            graph, poses, distances = problem.solve(active)
             for _ in range(2 * len(active)):
                 number = loop_to_switch(active, distances, max_chi2)
                 if number is None:
                     break
                 active[number] = not active[number]
-                graph, poses = problem.solve(active)
-                distances = problem.test(graph, poses, active)
+                graph, poses, distances = problem.solve(active)
     except RuntimeError as error:  # GTSAM's own, as for an indeterminate system
         raise InputError(
             "the factors do not determine the poses: is some pose connected to no other? "
@@ -158,7 +155,6 @@ def optimize_graph(
 
 
 def _check(saved: SavedGraph) -> None:
-    """Refuse a graph whose factors leave a variable without a value or a connection."""
     keys = sorted(saved.poses.keys())
     if not keys:
         raise InputError("graph: expected poses, got none")
@@ -187,13 +183,7 @@ def _check(saved: SavedGraph) -> None:
 
 
 class _Problem:
-    """Factors of a graph, of which the loop closures can be left out.
-
-    Parameters
-    ----------
-    saved : start values and factors
-    loops : positions of the loop closures in the factors
-    """
+    """Factors of a graph, of which the loop closures (positions ``loops``) can be left out."""
 
     def __init__(self, saved: SavedGraph, loops: Sequence[int]) -> None:
         self.saved, self.loops = saved, tuple(loops)
@@ -215,21 +205,18 @@ class _Problem:
             graph.add(gtsam.PriorFactorPose3(first, saved.poses.atPose3(first), noise))
         return graph
 
-    def solve(self, active: BoolArray) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-        """The factors that were used and the poses that fit them best."""
+    def solve(
+        self, active: BoolArray
+    ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values, FloatArray]:
+        """Factors that were used, poses, and distance (L,) of each loop closure from the others."""
         graph = self.factors(active)
         params = gtsam.LevenbergMarquardtParams()
         params.setVerbosityLM("SILENT")
         params.setRelativeErrorTol(1e-9)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, params)
-        return graph, optimizer.optimize()
-
-    def test(
-        self, graph: gtsam.NonlinearFactorGraph, poses: gtsam.Values, active: BoolArray
-    ) -> FloatArray:
-        """(L,) squared distance of each loop closure from what all the others say."""
+        poses = optimizer.optimize()
         if not self.loops:
-            return np.empty(0)
+            return graph, poses, np.empty(0)
         marginals = gtsam.Marginals(graph, poses)
         distances = []
         for place, on in zip(self.loops, active.tolist(), strict=True):
@@ -240,21 +227,20 @@ class _Problem:
             known = between, relative_pose_covariance(between, joint, first, second)
             noise = factor.noiseModel().covariance()
             distances.append(chi_squared(factor.measured(), noise, *known, included=on))
-        return np.array(distances)
+        return graph, poses, np.array(distances)
 
     def inliers(self) -> BoolArray:
         """Which loop closures graduated non-convexity finds right, all other factors being right.
 
         The loss is that of Geman and McClure: truncated least squares loses all loop closures where
-        most are wrong (ten right ones of sixty, measured). GNC copies factors, which GTSAM cannot
-        do with a CustomFactor: it gets the linearised factor.
+        most are wrong (ten right ones of sixty, measured).
         """
         poses = self.saved.poses
         graph = self.factors(np.ones(len(self.loops), np.bool_))
         params = gtsam.GncLMParams()
         for place in range(graph.size()):
             factor = graph.at(place)
-            if isinstance(factor, gtsam.CustomFactor):
+            if isinstance(factor, gtsam.CustomFactor):  # which GNC cannot copy
                 params.setAllowNonNoiseModelFactors(True)
                 linear = gtsam.LinearContainerFactor(factor.linearize(poses), poses)
                 graph.replace(place, linear)

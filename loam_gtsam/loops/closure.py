@@ -68,22 +68,14 @@ class LoopCloser(Protocol):
 class Rejection(StrEnum):
     """The reason why a keyframe or a candidate gave no loop closure."""
 
-    NO_FEATURES = "no_features"
-    """The keyframe has no features."""
-    TOO_RECENT = "too_recent"
-    """No keyframe is far enough back, in metres travelled."""
-    OUT_OF_REACH = "out_of_reach"
-    """All earlier keyframes are too far away, even if the poses are as wrong as they may be."""
-    UNLIKE = "unlike"
-    """The descriptor of the candidate is too different."""
-    FEW_MATCHES = "few_matches"
-    """The registration has too few matches to solve for the motion."""
-    LITTLE_OVERLAP = "little_overlap"
-    """The registration matches too few of the features."""
-    DISAGREES = "disagrees"
-    """The registration leaves too many of its matches far apart."""
-    DEGENERATE = "degenerate"
-    """The registration leaves a direction free, as along a corridor."""
+    NO_FEATURES = "no_features"  # the keyframe has none
+    TOO_RECENT = "too_recent"  # no keyframe is far enough back, in metres travelled
+    OUT_OF_REACH = "out_of_reach"  # even if the poses are as wrong as they may be
+    UNLIKE = "unlike"  # the descriptor of the candidate is too different
+    FEW_MATCHES = "few_matches"  # too few to solve for the motion
+    LITTLE_OVERLAP = "little_overlap"  # too few of the features are matched
+    DISAGREES = "disagrees"  # too many of the matches are left far apart
+    DEGENERATE = "degenerate"  # a direction is left free, as along a corridor
 
 
 @dataclass(slots=True)
@@ -92,10 +84,10 @@ class LoopStatistics:
 
     Attributes
     ----------
-    keyframes : number of keyframes for which loop closures were looked for
-    candidates : number of earlier keyframes that were registered, or rejected by their descriptor
-    verified : number of loop closures that were returned
-    rejected : number of keyframes and candidates by the reason of their rejection
+    keyframes : for which loop closures were looked for
+    candidates : earlier keyframes that were registered, or rejected by their descriptor
+    verified : loop closures that were returned
+    rejected : keyframes and candidates, by the reason
     """
 
     keyframes: int = 0
@@ -121,12 +113,8 @@ class ScanLoopCloser:
         self.config = self._whole.loops
         self._solver = GtsamSolver(self._whole.solver)
         # A trial only has to come near: a full registration follows the best one.
-        self._rough_solver = GtsamSolver(
-            self._whole.solver.changed(
-                translation_tolerance=_NEAR[0],
-                rotation_tolerance_deg=_NEAR[1],
-            )
-        )
+        near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
+        self._rough_solver = GtsamSolver(self._whole.solver.changed(**near))
         self.reset()
 
     def reset(self) -> None:
@@ -146,9 +134,6 @@ class ScanLoopCloser:
         """See :meth:`LoopCloser.detect`."""
         self._describe(history)
         self.statistics.keyframes += 1
-        if len(keyframe.edges) + len(keyframe.planes) == 0:
-            self._reject(Rejection.NO_FEATURES)
-            return None
         near = self._near(keyframe, history)
         if isinstance(near, Rejection):
             self._reject(near)
@@ -193,9 +178,10 @@ class ScanLoopCloser:
         if self._judged(fit(solution)) is not None:
             matching = trial_matching(whole.matching)
             # The ground is where it was: height zero, and the tilt that the graph says.
-            rotation = known.rotation()
-            heading = gtsam.Rot3.Yaw(turn - _heading(rotation)).compose(rotation)
-            start = gtsam.Pose3(heading, np.zeros(3))
+            matrix = known.rotation().matrix()
+            missing = turn - float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+            turned = gtsam.Rot3.Yaw(missing).compose(known.rotation())
+            start = gtsam.Pose3(turned, np.zeros(3))
             held = np.concatenate([cubes.points() for cubes in maps])
             around = likely_poses(sample_features(*features), held, [start], config.search, _STARTS)
             starts = start, *around
@@ -232,6 +218,8 @@ class ScanLoopCloser:
     def _near(self, keyframe: Keyframe, history: PoseGraph) -> IntArray | Rejection:
         """Numbers of the keyframes that may be at the same place."""
         config = self.config
+        if len(keyframe.edges) + len(keyframe.planes) == 0:
+            return Rejection.NO_FEATURES
         travelled = keyframe.travelled - np.array([other.travelled for other in history.keyframes])
         old = np.flatnonzero(travelled >= config.min_way)
         if len(old) == 0:
@@ -283,10 +271,9 @@ class ScanLoopCloser:
         ]
         here = history.pose(candidate)
         poses = [here.between(history.pose(other.index)).matrix() for other in chosen]
-        kinds = [other.edges for other in chosen], [other.planes for other in chosen]
-        for cubes, parts in zip(maps, kinds, strict=True):
-            points = [transform(pose, part) for pose, part in zip(poses, parts, strict=True)]
-            cubes.insert(np.concatenate(points))
+        for cubes, kind in zip(maps, ("edges", "planes"), strict=True):
+            parts = (getattr(other, kind) for other in chosen)
+            cubes.insert(np.concatenate(list(map(transform, poses, parts))))
         return maps
 
     def _judged(self, fit: Fit) -> Rejection | None:
@@ -298,11 +285,7 @@ class ScanLoopCloser:
     def _covariance(
         self, solution: Solution, earlier: Keyframe, later: Keyframe
     ) -> FloatArray | None:
-        """(6, 6) covariance of a loop closure; None if the registration leaves a direction free.
-
-        The own errors of both keyframes are added to the error of the registration: that of the
-        candidate displaces the submap, that of the new keyframe comes from de-skewing its features.
-        """
+        """(6, 6) covariance of a loop closure; None if the registration leaves a direction free."""
         seen = localizability(solution.matches, solution.map_T_lidar)
         if seen.aligned[0] < self.config.min_aligned:
             return None
@@ -313,6 +296,8 @@ class ScanLoopCloser:
             return None
         covariance = error.covariance
         to_later = solution.map_T_lidar.inverse().AdjointMap()
+        # The own error of the candidate displaces the submap, that of the new keyframe comes from
+        # de-skewing its features.
         for keyframe, moved in ((earlier, to_later), (later, np.eye(6))):
             if keyframe.update.uncertainty is not None:
                 covariance = covariance + moved @ keyframe.update.uncertainty.own @ moved.T
@@ -344,9 +329,3 @@ def _odometry_distance(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
             since = keyframe.travelled - travelled[loop.later]
             gone = np.minimum(gone, since + np.abs(travelled - travelled[loop.earlier]))
     return gone
-
-
-def _heading(rotation: gtsam.Rot3) -> float:
-    """Heading of a rotation, rad about z."""
-    matrix = rotation.matrix()
-    return float(np.arctan2(matrix[1, 0], matrix[0, 0]))

@@ -1,8 +1,8 @@
 """Pose graphs as files: g2o, and GTSAM's own serialisation.
 
 g2o (Kuemmerle et al., g2o: A General Framework for Graph Optimization, ICRA 2011) knows poses and
-motions between them; GTSAM's text archives know every factor. The pose of keyframe ``i`` has the
-key ``gtsam.symbol("x", i)`` in memory and the number ``i`` in a file.
+motions between them; GTSAM's text archives know every factor. In a file, the pose of keyframe ``i``
+has the number ``i``.
 """
 
 from __future__ import annotations
@@ -113,16 +113,14 @@ def _pose_text(pose: gtsam.Pose3) -> str:
 
 def _read_g2o(path: Path) -> SavedGraph:
     graph, poses, stamps = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
-    fixed: list[tuple[int, str]] = []
-    edges: list[tuple[int, int, FloatArray, str]] = []
+    factors: list[tuple[str, list[int], FloatArray, str]] = []
     for number, line in enumerate(_text(path).splitlines(), 1):
         where = f"{path}:{number}"
-        words = line.split()
-        if line.startswith(_STAMP) and len(words) == 4:
-            stamps[_key(words[2], where)] = _integer(words[3], where)
-        if not words or words[0].startswith("#"):
+        tag, *fields = line.split() or ("#",)
+        if line.startswith(_STAMP) and len(fields) == 3:
+            stamps[_key(fields[1], where)] = _integer(fields[2], where)
+        if tag.startswith("#"):
             continue
-        tag, fields = words[0], words[1:]
         if tag not in _NUMBERS:
             raise DatasetError(
                 f"{where}: expected {', '.join(_NUMBERS)} (poses in 3D and motions between them), "
@@ -132,25 +130,25 @@ def _read_g2o(path: Path) -> SavedGraph:
             raise DatasetError(
                 f"{where}: {tag} takes {_NUMBERS[tag]} numbers, this line has {len(fields)}"
             )
-        if tag == _FIX:
-            fixed.append((_key(fields[0], where), where))
-        elif tag == _POSE:
-            key = _key(fields[0], where)
-            if poses.exists(key):
-                raise DatasetError(f"{where}: there already is a pose {pose_number(key)}")
-            poses.insert(key, _pose(_floats(fields[1:], where), where))
+        keys = [_key(word, where) for word in fields[: 2 if tag == _EDGE else 1]]
+        numbers = _floats(fields[len(keys) :], where)
+        if tag != _POSE:
+            factors.append((tag, keys, numbers, where))
+        elif poses.exists(keys[0]):
+            raise DatasetError(f"{where}: there already is a pose {pose_number(keys[0])}")
         else:
-            first, second = (_key(word, where) for word in fields[:2])
-            edges.append((first, second, _floats(fields[2:], where), where))
+            poses.insert(keys[0], _pose(numbers, where))
     if poses.size() == 0:
         raise DatasetError(f"{path}: expected lines that begin with {_POSE}, found none")
-    for key, where in fixed:
-        _exists(poses, key, where)
-        held = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
-        graph.add(gtsam.PriorFactorPose3(key, poses.atPose3(key), held))
-    for first, second, numbers, where in edges:
-        _exists(poses, first, where)
-        _exists(poses, second, where)
+    for tag, keys, numbers, where in sorted(factors, key=lambda factor: factor[0] == _EDGE):
+        for key in keys:
+            if not poses.exists(key):
+                raise DatasetError(f"{where}: there is no {_POSE} {pose_number(key)}")
+        if tag == _FIX:
+            held = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
+            graph.add(gtsam.PriorFactorPose3(keys[0], poses.atPose3(keys[0]), held))
+            continue
+        first, second = keys
         if first == second:
             raise DatasetError(f"{where}: expected a motion between two poses, got the same twice")
         noise = gtsam.noiseModel.Gaussian.Information(_information(numbers[7:], where))
@@ -179,11 +177,6 @@ def _information(upper: FloatArray, where: str) -> FloatArray:
         )
     swapped: FloatArray = matrix[np.ix_(_SWAP, _SWAP)]
     return swapped
-
-
-def _exists(poses: gtsam.Values, key: int, where: str) -> None:
-    if not poses.exists(key):
-        raise DatasetError(f"{where}: there is no {_POSE} {pose_number(key)}")
 
 
 def _integer(word: str, where: str) -> int:

@@ -14,7 +14,6 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.loops.consistency import relative_pose_covariance
 from loam_gtsam.types import BoolArray, FloatArray, InputError, OutputError
 
 _RELINEARIZE = 1e-3
@@ -30,9 +29,6 @@ _Step = tuple[Any, ...]
 
 class IncrementalGraph:
     """Factors and the current estimate of their variables.
-
-    :meth:`__getstate__` writes factors and values with GTSAM's own serialisation, which keeps every
-    bit.
 
     Attributes
     ----------
@@ -59,12 +55,8 @@ class IncrementalGraph:
 
     def __setstate__(self, state: list[_Step]) -> None:
         self.__init__()  # type: ignore[misc]
-        repeat: dict[str, Callable[..., None]] = {
-            "add": self.add,
-            "add_loop": self.add_loop,
-            "switch": self.switch,
-            "restart": self.restart,
-        }
+        calls: tuple[Callable[..., None], ...] = self.add, self.add_loop, self.switch, self.restart
+        repeat = {call.__name__: call for call in calls}
         for name, *given in state:
             repeat[name](*map(_from_text, given))
 
@@ -130,7 +122,6 @@ class IncrementalGraph:
 
         Parameters
         ----------
-        values : the estimate
         active : (L,) which loop closures are in the graph
         factors : all factors but loop closures; those that the graph has if None
         """
@@ -171,6 +162,17 @@ class IncrementalGraph:
             before = self.values
 
 
+def relative_pose_covariance(
+    between: gtsam.Pose3, joint: gtsam.JointMarginal, earlier: int, later: int
+) -> FloatArray:
+    """(6, 6) covariance of ``earlier_T_later`` from the joint covariance of both poses."""
+    to_later = between.inverse().AdjointMap()
+    own, other = joint.at(earlier, earlier), joint.at(later, later)
+    crossed = to_later @ joint.at(earlier, later)
+    covariance: FloatArray = to_later @ own @ to_later.T + other - crossed - crossed.T
+    return covariance
+
+
 def _new_isam() -> gtsam.ISAM2:
     params = gtsam.ISAM2Params()
     params.relinearizeSkip = 1
@@ -184,13 +186,12 @@ _TEXTS: dict[str, type] = {cls.__name__: cls for cls in (gtsam.NonlinearFactorGr
 
 
 def _as_text(value: Any) -> Any:
-    """Factors or values as (name of the class, text); anything else as it is."""
+    """Factors or values as (name of the class, text), which keeps every bit."""
     name = type(value).__name__
     return (name, value.serialize()) if name in _TEXTS else value
 
 
 def _from_text(value: Any) -> Any:
-    """The inverse of :func:`_as_text`."""
     if not isinstance(value, tuple):
         return value
     name, text = value

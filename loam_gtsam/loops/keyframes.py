@@ -6,19 +6,17 @@ mapper's poses is ``odom``: continuous, and drifting; ``map`` is the corrected o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike
 
 from loam_gtsam.config import Config, PoseGraphConfig
 from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.geometry import as_array, as_vector, symmetric, transform
+from loam_gtsam.geometry import as_array, symmetric, transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate, Trajectory
+from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate
 
 _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
 """rad and m added to every standard deviation: a factor must not be infinitely sure."""
@@ -121,11 +119,6 @@ def keyframe_points(
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
     """``edges``, ``planes`` and ``distinct`` of a :class:`Keyframe`; empty without features.
 
-    Parameters
-    ----------
-    config : ``deskew`` and the voxels of ``map`` are used
-    imu : source of the rotation within the sweep; None for constant velocity
-
     Raises
     ------
     InputError
@@ -142,42 +135,6 @@ def keyframe_points(
     to_reference = posed.middle_T_reference.inverse().matrix()
     edges, planes = (transform(to_reference, part) for part in posed.points)
     return edges, planes, sweep.distinct
-
-
-def interpolate_trajectory(
-    updates: Sequence[MapUpdate],
-    keyframes: Sequence[Keyframe],
-    pose_of: Callable[[int], gtsam.Pose3],
-) -> Trajectory:
-    """The frames of a run, corrected by the keyframes before and after each.
-
-    A frame keeps its motion from either keyframe; where the two disagree, they count in proportion
-    of time.
-
-    Parameters
-    ----------
-    updates : results of the mapper; frames with a bad stamp are left out
-    keyframes : those of the same run, in the order of time
-    pose_of : ``map_T_lidar`` of the keyframe of a number
-    """
-    good = [update for update in updates if update.status.has_pose]
-    stamps = np.array([update.stamp for update in good], np.int64)
-    starts = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
-    nexts = np.searchsorted(starts, stamps, side="right").tolist()
-    poses = []
-    for update, after in zip(good, nexts, strict=True):
-        around = keyframes[max(after - 1, 0) : after + 1]
-        found = [
-            pose_of(keyframe.index).compose(keyframe.odom_T_lidar.between(update.map_T_lidar))
-            for keyframe in around
-        ]
-        pose = found[0] if found else update.map_T_lidar
-        if len(found) == 2:
-            share = (update.stamp - around[0].stamp) / (around[1].stamp - around[0].stamp)
-            step = gtsam.Pose3.Logmap(pose.between(found[1]))
-            pose = pose.compose(gtsam.Pose3.Expmap(share * step))
-        poses.append(pose)
-    return Trajectory.from_poses(stamps, poses)
 
 
 def odometry_between(
@@ -212,11 +169,3 @@ def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gauss
         raise InputError(f"covariance: expected no negative eigenvalue, got {values[0]:.3g}")
     positive = (vectors * np.maximum(values, 0.0)) @ vectors.T  # rounding, far from the origin
     return gtsam.noiseModel.Gaussian.Covariance(positive + np.diag(_LEAST_SIGMAS[-size:] ** 2))
-
-
-def direction(name: str, vector: ArrayLike) -> gtsam.Unit3:
-    """The direction of a (3,) vector of any length; InputError if it has none."""
-    array = as_vector(vector, name)
-    if not np.linalg.norm(array) > 0.0:
-        raise InputError(f"{name}: expected a direction, got the zero vector")
-    return gtsam.Unit3(array)

@@ -1,27 +1,24 @@
-"""Selection of the loop closures that are used, each time a new one comes.
+"""Selection of the loop closures that are used: how each is tested, and what a new one changes.
 
-Of loop closures that contradict each other the larger number is believed that agree pairwise
-(Mangelson et al., Pairwise Consistent Measurement Set Maximization, ICRA 2018). Then the squared
-Mahalanobis distance of each from what all the others say decides, one by one. Equations:
-docs/maths/pose_graph.md.
+The squared Mahalanobis distance of each loop closure from what all other factors say decides, one
+by one: equations (1) and (2) of docs/maths/pose_graph.md. Of loop closures that contradict each
+other the larger number is believed that agree pairwise, equation (3) (Mangelson, Dominic, Eustice
+and Vasudevan, Pairwise Consistent Measurement Set Maximization for Robust Multi-Robot Map Merging,
+ICRA 2018).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.loops.consistency import (
-    chi_squared,
-    consistent,
-    consistent_set,
-    loop_to_switch,
-)
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.incremental import IncrementalGraph
-from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, odometry_between, pose_key
+from loam_gtsam.types import BoolArray, FloatArray
 
 _LIKELY = 12.6
 """Squared Mahalanobis distance that 95 % of right loop closures do not exceed."""
@@ -29,16 +26,97 @@ _SWITCHES = 50
 """Largest number of loop closures that are switched one by one after a new one."""
 
 
+def chi_squared(
+    measured: gtsam.Pose3,
+    noise: FloatArray,
+    between: gtsam.Pose3,
+    covariance: FloatArray,
+    *,
+    included: bool,
+) -> float:
+    """Squared Mahalanobis distance of a measured motion from what all other factors say.
+
+    Parameters
+    ----------
+    measured, noise : motion between two poses and its (6, 6) covariance
+    between, covariance : the same according to the graph
+    included : whether the measured motion is a factor of the graph
+    """
+    residual = gtsam.Pose3.Logmap(measured.between(between))
+    scatter = noise - covariance if included else noise + covariance
+    values, vectors = np.linalg.eigh(symmetric(scatter))
+    # An included motion that alone fixes some direction cannot be contradicted in that direction.
+    least = 1e-9 * float(np.trace(noise)) / 6.0
+    parts = (vectors.T @ residual) ** 2 / np.maximum(values, least)
+    return float(parts[values > least].sum())
+
+
+def loop_to_switch(active: BoolArray, distances: FloatArray, max_chi2: float) -> int | None:
+    """The loop closure that greedy selection switches next, off or on.
+
+    Parameters
+    ----------
+    active : (L,) which loop closures are in the graph
+    distances : (L,) squared Mahalanobis distance of each from what all the others say
+    max_chi2 : largest distance of a loop closure that agrees with the others
+
+    Returns
+    -------
+    The active loop closure that contradicts the others most, or else the inactive one that fits
+    best; None if all active ones agree with the others and all inactive ones contradict them.
+    """
+    if len(active) == 0:
+        return None
+    worst = int(np.where(active, distances, -1.0).argmax())
+    best = int(np.where(active, np.inf, distances).argmin())
+    if active[worst] and distances[worst] > max_chi2:
+        return worst
+    return best if not active[best] and distances[best] <= max_chi2 else None
+
+
+def consistent_set(number: int, agreeing: Callable[[int], set[int]]) -> set[int]:
+    """Loop closures that agree pairwise, a given one among them: as many as greedy search finds.
+
+    ``agreeing`` gives the numbers of the other loop closures that agree with one.
+    """
+    others = {other: agreeing(other) for other in agreeing(number)}
+    chosen = {number}
+    for other in sorted(others, key=lambda n: (-len(others[n]), n)):
+        if chosen <= others[other]:
+            chosen.add(other)
+    return chosen
+
+
+def consistent(
+    one: LoopClosure, two: LoopClosure, keyframes: Sequence[Keyframe], config: PoseGraphConfig
+) -> bool:
+    """Whether two loop closures and the odometry between their ends make a cycle that closes.
+
+    Ends in different sessions have no odometry between them, so nothing contradicts them.
+    """
+    ends = (one.earlier, two.earlier), (one.later, two.later)
+    if any(keyframes[a].session != keyframes[b].session for a, b in ends):
+        return True
+    (first, second), (last, before) = ([keyframes[index] for index in pair] for pair in ends)
+    start, start_covariance = odometry_between(first, second, config)
+    end, end_covariance = odometry_between(before, last, config)
+    rest = two.earlier_T_later.compose(end)
+    by_start, by_loop = rest.inverse().AdjointMap(), end.inverse().AdjointMap()
+    covariance = end_covariance + by_start @ start_covariance @ by_start.T
+    covariance = covariance + by_loop @ two.covariance @ by_loop.T
+    distance = chi_squared(
+        one.earlier_T_later, one.covariance, start.compose(rest), covariance, included=False
+    )
+    return distance <= config.max_chi2
+
+
 class LoopSelection:
     """Loop closures of a graph, and which of them are active.
 
     Parameters
     ----------
-    config : ``max_chi2``, ``believed_loops``, ``kernel_width``, ``walk`` and ``turn_walk_deg`` are
-        used
-    graph : the graph, in which the loop closures are switched
-    keyframes : the list of the graph, which grows
-    loops : those that are in the graph; :meth:`add` appends the new one
+    graph : the loop closures are switched in it
+    keyframes, loops : lists of the graph, which grow; :meth:`add` appends the new loop closure
     """
 
     def __init__(
@@ -54,13 +132,9 @@ class LoopSelection:
         self._compared: list[bytearray] = []
 
     def add(self, loop: LoopClosure) -> bool:
-        """Add a loop closure, and switch off those that contradict the rest of the graph.
+        """Add a loop closure; returns whether it is active.
 
         All are tested anew, since right ones make it easier to tell wrong ones.
-
-        Returns
-        -------
-        Whether the new one is active.
         """
         number = len(self._loops)
         factor = gtsam.NonlinearFactorGraph()
@@ -97,7 +171,6 @@ class LoopSelection:
         return chi_squared(loop.earlier_T_later, loop.covariance, between, covariance, included=on)
 
     def _agreeing(self, number: int) -> set[int]:
-        """Numbers of the other loop closures that are consistent with one."""
         return {n for n in range(len(self._loops)) if n != number and self._agree(n, number)}
 
     def _agree(self, one: int, two: int) -> bool:

@@ -51,10 +51,7 @@ class LoopMapping:
         """``odom_T_lidar`` of the keyframes, to which their map points are fixed."""
 
     def reset(self) -> None:
-        """Forget everything, as the mapper's reset does: the next frame is the first of a new run.
-
-        A closer that remembers keyframes must have a ``reset()`` of its own, which is called.
-        """
+        """Forget everything, as the mapper's reset does; a ``reset()`` of the closer is called."""
         self.graph.reset()
         reset_closer = getattr(self.closer, "reset", None)
         if reset_closer is not None:
@@ -68,17 +65,7 @@ class LoopMapping:
         return self.graph.correction
 
     def add(self, update: MapUpdate, features: Features) -> bool:
-        """Add a frame that the mapper has just registered.
-
-        Parameters
-        ----------
-        update : result of the mapper
-        features : those of the frame's sweep
-
-        Returns
-        -------
-        Whether a loop was closed.
-        """
+        """Add a frame that the mapper has just registered; returns whether a loop was closed."""
         aid = self._mapper.imu
         self.graph.imu = None if aid is None else aid.trusted_gyro  # which the mapper may give up
         keyframe = self.graph.add(update, features)

@@ -11,10 +11,11 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 
 from loam_gtsam.geometry import as_vector
 from loam_gtsam.loops.incremental import IncrementalGraph
-from loam_gtsam.loops.keyframes import Keyframe, direction, is_pose_key, noise_model, pose_key
+from loam_gtsam.loops.keyframes import Keyframe, is_pose_key, noise_model, pose_key
 from loam_gtsam.types import FloatArray, InputError
 
 _UNDETERMINED = 1e-9
@@ -26,7 +27,7 @@ class FactorGraph:
 
     Attributes
     ----------
-    keyframes : keyframe ``i`` has the pose with the key ``gtsam.symbol("x", i)``
+    keyframes : in the order of time
     """
 
     keyframes: list[Keyframe]
@@ -39,19 +40,16 @@ class FactorGraph:
     ) -> None:
         """Add any factor of GTSAM on poses of keyframes and on variables of your own.
 
-        The factor is believed: it is no loop closure that could be switched off. A CustomFactor may
-        be added as well, best one of :func:`loam_gtsam.factors.checked_factor`; GTSAM can neither
-        copy nor serialise it, so the graph can then be optimised, but not be written to a file
-        (:func:`~loam_gtsam.loops.files.write_graph`) or to a checkpoint, both of which raise
-        OutputError.
+        The factor is believed: it is no loop closure that could be switched off. It may be a
+        CustomFactor, best one of :func:`loam_gtsam.factors.checked_factor`. GTSAM cannot serialise
+        a CustomFactor, so writing the graph to a file or to a checkpoint then raises OutputError.
 
         Parameters
         ----------
         factor : a factor, or several that are to be added together; ``gtsam.symbol("x", i)`` is the
             key of the pose ``map_T_lidar`` of keyframe ``i``
         values : start values of variables of your own (landmarks, biases, extrinsics) that are not
-            in the graph yet; any letter but ``x`` may be in their keys. :meth:`estimate` tells
-            their values.
+            in the graph yet, whose keys have another letter than ``x``
 
         Raises
         ------
@@ -59,14 +57,13 @@ class FactorGraph:
             If something is of a wrong type or not finite, a key is unknown or taken, or the new
             variables are not determined. The graph is then as it was before.
         """
-        self._graph.add(*checked_factors(factor, values, self._graph.values))
+        self._graph.add(*_checked(factor, values, self._graph.values))
 
     def add_position(self, index: int, position: FloatArray, covariance: FloatArray) -> None:
         """Add a measured position of a keyframe, as from GPS.
 
         Parameters
         ----------
-        index : number of the keyframe
         position : (3,) metres, in the frame of the map
         covariance : (3, 3) m^2
 
@@ -85,17 +82,15 @@ class FactorGraph:
 
         Parameters
         ----------
-        index : number of the keyframe
-        up_lidar : (3,) the upward direction in the lidar's axes; any length
+        up_lidar, up_map : (3,) the upward direction in the axes of lidar and map; any length
         sigma : standard deviation, rad
-        up_map : (3,) the upward direction in the map's axes
 
         Raises
         ------
         InputError
             If there is no such keyframe, or a direction has no length.
         """
-        here, there = direction("up_lidar", up_lidar), direction("up_map", up_map)
+        here, there = _direction("up_lidar", up_lidar), _direction("up_map", up_map)
         if not sigma > 0.0:
             raise InputError(f"sigma: expected rad above 0, got {sigma!r}")
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
@@ -127,9 +122,18 @@ class FactorGraph:
         Raises
         ------
         InputError
-            If there is no variable of that key.
+            If there is no variable of that key, or GTSAM cannot hand it to Python.
         """
-        return value_at(self._graph.values, key)
+        values = self._graph.values
+        if not values.exists(key):
+            raise InputError(f"key: expected one of a variable in the graph, got {_names([key])}")
+        getters = sorted((name for name in dir(gtsam.Values) if name.startswith("at")), key=len)
+        for name in ("atPose3", "atPoint3", *getters):
+            try:
+                return getattr(values, name)(key)
+            except RuntimeError:
+                continue
+        raise InputError(f"variable {_names([key])}: GTSAM cannot hand its type to Python")
 
     def estimate_covariance(self, key: int) -> FloatArray:
         """(d, d) marginal covariance of a variable of :meth:`add_factor`, in its tangent space."""
@@ -144,23 +148,10 @@ class FactorGraph:
         return pose_key(index)
 
 
-def checked_factors(
+def _checked(
     given: object, start: object, known: gtsam.Values
 ) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
-    """Factors and the start values of their new variables, if they can be added to a graph.
-
-    Parameters
-    ----------
-    given : a factor, or a graph of factors
-    start : start values of the variables that are not known; None if there are none
-    known : variables of the graph
-
-    Raises
-    ------
-    InputError
-        If something is of a wrong type or not finite, a key is unknown or taken, or the factors do
-        not determine the new variables.
-    """
+    """``factor`` and ``values`` of :meth:`FactorGraph.add_factor`, checked and copied."""
     factors = gtsam.NonlinearFactorGraph()
     if isinstance(given, gtsam.NonlinearFactorGraph):
         factors.push_back(given)
@@ -199,27 +190,7 @@ def checked_factors(
     return factors, new
 
 
-def value_at(values: gtsam.Values, key: int) -> Any:
-    """The variable of a key, whatever its type.
-
-    Raises
-    ------
-    InputError
-        If there is none, or GTSAM cannot hand it to Python.
-    """
-    if not values.exists(key):
-        raise InputError(f"key: expected one of a variable in the graph, got {_names([key])}")
-    getters = sorted((name for name in dir(gtsam.Values) if name.startswith("at")), key=len)
-    for name in ("atPose3", "atPoint3", *getters):
-        try:
-            return getattr(values, name)(key)
-        except RuntimeError:
-            continue
-    raise InputError(f"variable {_names([key])}: GTSAM cannot hand its type to Python")
-
-
 def _check_values(new: gtsam.Values, known: gtsam.Values) -> None:
-    """Refuse start values that are not finite, or of keys that are taken."""
     for key in new.keys():  # noqa: SIM118 (no mapping)
         if is_pose_key(key):
             raise InputError(f"values: {_names([key])} is of a keyframe; use another letter than x")
@@ -233,7 +204,6 @@ def _check_values(new: gtsam.Values, known: gtsam.Values) -> None:
 def _check_keys(
     factors: gtsam.NonlinearFactorGraph, new: gtsam.Values, known: gtsam.Values
 ) -> set[int]:
-    """The keys of factors, if each is known or new and each new one is used."""
     used: set[int] = set()
     for place in range(factors.size()):
         keys = factors.at(place).keys()
@@ -250,6 +220,13 @@ def _check_keys(
     if unused or not used:
         raise InputError(f"values: no factor is on {_names(unused) or 'any variable'}")
     return used
+
+
+def _direction(name: str, vector: ArrayLike) -> gtsam.Unit3:
+    array = as_vector(vector, name)
+    if not np.linalg.norm(array) > 0.0:
+        raise InputError(f"{name}: expected a direction, got the zero vector")
+    return gtsam.Unit3(array)
 
 
 def _names(keys: Iterable[int]) -> str:

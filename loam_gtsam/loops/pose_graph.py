@@ -2,10 +2,7 @@
 
 Poses of a run drift. Keyframes, the motion between them with its covariance, and loop closures tell
 where they really are. A loop closure that contradicts the others is switched off. Equations:
-docs/maths/pose_graph.md.
-
-The pose of keyframe ``i`` has the key ``gtsam.symbol("x", i)``. The frame of the mapper's poses is
-``odom``: continuous, and drifting; ``map`` is the corrected one (ROS REP-105).
+docs/maths/pose_graph.md. Frames and keys: :mod:`loam_gtsam.loops.keyframes`.
 """
 
 from __future__ import annotations
@@ -24,7 +21,6 @@ from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import (
     Keyframe,
     LoopClosure,
-    interpolate_trajectory,
     keyframe_points,
     noise_model,
     odometry_between,
@@ -55,7 +51,6 @@ class PoseGraph(FactorGraph):
     Attributes
     ----------
     imu : as given
-    keyframes : in the order of time
     loops : all loop closures that were added
     """
 
@@ -135,12 +130,9 @@ class PoseGraph(FactorGraph):
     def add_loop(self, loop: LoopClosure) -> bool:
         """Add a loop closure; those that contradict the rest of the graph are switched off.
 
-        A loop closure is active if its squared Mahalanobis distance from what all the others say is
-        not above ``pose_graph.max_chi2``, see :mod:`loam_gtsam.loops.loop_selection`.
-
         Returns
         -------
-        Whether the loop closure is active.
+        Whether the loop closure is active, see :mod:`loam_gtsam.loops.loop_selection`.
 
         Raises
         ------
@@ -178,14 +170,14 @@ class PoseGraph(FactorGraph):
         return self._graph.active
 
     def chi_squared(self, number: int) -> float:
-        """Squared Mahalanobis distance of a loop closure from what all other factors say.
-
-        It has 6 degrees of freedom.
-        """
+        """Squared Mahalanobis distance of a loop closure from what all other factors say."""
         return self._selection.chi_squared(number)
 
     def trajectory(self, updates: Sequence[MapUpdate], session: int = 0) -> Trajectory:
-        """The frames of a run, corrected: between two keyframes, by both in proportion of time.
+        """The frames of a run, corrected by the keyframes before and after each.
+
+        A frame keeps its motion from either keyframe; where the two disagree, they count in
+        proportion of time.
 
         Parameters
         ----------
@@ -193,7 +185,20 @@ class PoseGraph(FactorGraph):
         session : number of the run, see :meth:`new_session`
         """
         keyframes = [keyframe for keyframe in self.keyframes if keyframe.session == session]
-        return interpolate_trajectory(updates, keyframes, self.pose)
+        good = [update for update in updates if update.status.has_pose]
+        stamps = np.array([update.stamp for update in good], np.int64)
+        starts = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
+        nexts = np.searchsorted(starts, stamps, side="right").tolist()
+        poses = []
+        for update, after in zip(good, nexts, strict=True):
+            pose, around = update.map_T_lidar, keyframes[max(after - 1, 0) : after + 1]
+            found = [self.pose(k.index).compose(k.odom_T_lidar.between(pose)) for k in around]
+            if len(found) == 2:
+                share = (update.stamp - around[0].stamp) / (around[1].stamp - around[0].stamp)
+                step = gtsam.Pose3.Logmap(found[0].between(found[1]))
+                found[0] = found[0].compose(gtsam.Pose3.Expmap(share * step))
+            poses.append(found[0] if found else pose)
+        return Trajectory.from_poses(stamps, poses)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane features of all keyframes in the map, (E, 3) and (P, 3) metres."""

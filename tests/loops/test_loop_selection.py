@@ -1,14 +1,110 @@
-"""Which loop closures are used: right ones, wrong ones, ones that contradict the odometry."""
+"""Selection of loop closures: the tests of each, and right, wrong and contradicting ones."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import gtsam
 import numpy as np
 import pytest
-from support.pose_graphs import SIGMAS, drifted, filled, off, right_loops, square, wrong_loops
+from support.pose_graphs import (
+    SIGMAS,
+    drifted,
+    filled,
+    frames,
+    off,
+    right_loops,
+    settings,
+    square,
+    wrong_loops,
+)
 
 from loam_gtsam.loops.batch import optimize_graph
-from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
+from loam_gtsam.loops.loop_selection import (
+    chi_squared,
+    consistent,
+    consistent_set,
+    loop_to_switch,
+)
+
+
+def test_chi_squared_is_the_same_before_and_after_the_loop_is_in():
+    truth = square(20, 2)
+    rng = np.random.default_rng(12)
+    graph = filled(drifted(truth, rng), max_chi2=1e9, kernel_width=np.inf)
+    for loop in right_loops(truth, rng, 3):
+        graph.add_loop(loop)
+    extra = right_loops(truth, rng, 7)[3]
+    between, covariance = graph.relative(extra.earlier, extra.later)
+    before = chi_squared(
+        extra.earlier_T_later, extra.covariance, between, covariance, included=False
+    )
+    graph.add_loop(extra)
+    assert graph.chi_squared(3) == pytest.approx(before, rel=0.05)
+    assert before < 40.0
+
+
+def test_loops_agree_if_their_cycle_closes():
+    truth = square(10, 2)
+    keyframes = filled(truth).keyframes
+    config = settings().pose_graph
+    one, other = (
+        LoopClosure(a, b, truth[a].between(truth[b]), np.diag(SIGMAS**2))
+        for a, b in ((3, 43), (7, 49))
+    )
+    assert consistent(one, other, keyframes, config)
+    assert consistent(other, one, keyframes, config)
+    aside = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.6, 0.0]))
+    off_by = replace(other, earlier_T_later=other.earlier_T_later.compose(aside))
+    assert not consistent(one, off_by, keyframes, config)
+    assert not consistent(off_by, one, keyframes, config)
+    # Both off alike agree with each other.
+    near = replace(one, earlier=4, later=44, earlier_T_later=truth[4].between(truth[44]))
+    shifted = [replace(loop, earlier_T_later=loop.earlier_T_later.compose(aside))
+               for loop in (one, near)]  # fmt: skip
+    assert consistent(*shifted, keyframes, config)
+
+
+def test_the_covariance_of_a_cycle_is_that_of_monte_carlo():
+    """Pairs of right loops over a drifting odometry pass as often as 6 freedoms let them."""
+    truth = square(10, 2)
+    rng = np.random.default_rng(5)
+    limit = 10.64  # exceeded by a tenth
+    config = settings(max_chi2=limit).pose_graph
+    passed = 0
+    for _ in range(200):
+        nothing, none = np.empty((0, 3)), np.empty(0, np.bool_)
+        keyframes = [
+            Keyframe(number, update, float(number), nothing, nothing, none)
+            for number, update in enumerate(frames(drifted(truth, rng)))
+        ]
+        pair = []
+        for a, b in ((3, 43), (9, 51)):
+            seen = truth[a].between(truth[b]).retract(SIGMAS * rng.normal(size=6))
+            pair.append(LoopClosure(a, b, seen, np.diag(SIGMAS**2)))
+        passed += consistent(*pair, keyframes, config)
+    assert 0.83 < passed / 200 < 0.96
+
+
+def test_the_largest_group_that_agrees_is_found():
+    groups = [{1, 2, 4}, {0, 2}, {0, 1}, set(), {0}]
+    assert consistent_set(2, groups.__getitem__) == {0, 1, 2}
+    assert consistent_set(4, groups.__getitem__) == {0, 4}
+    assert consistent_set(3, groups.__getitem__) == {3}
+
+
+@pytest.mark.parametrize(
+    ("active", "distances", "expected"),
+    [
+        ([True, True, False], [41.0, 50.0, 1.0], 1),  # the worst goes first
+        ([True, True, False, False], [40.0, 2.0, 30.0, 20.0], 3),  # then the best comes
+        ([True, False], [40.0, 40.1], None),
+        ([False, False], [99.0, 41.0], None),
+        ([], [], None),
+    ],
+)
+def test_the_loop_that_contradicts_most_is_switched_first(active, distances, expected):
+    assert loop_to_switch(np.array(active, bool), np.array(distances), 40.0) == expected
 
 
 @pytest.mark.parametrize("seed", [0, 1])

@@ -194,11 +194,7 @@ def line_rows(
 
 
 def plane_rows(
-    points: ArrayLike,
-    normals: ArrayLike,
-    offsets: ArrayLike,
-    weights: ArrayLike,
-    sigmas: ArrayLike,
+    points: ArrayLike, normals: ArrayLike, offsets: ArrayLike, weights: ArrayLike, sigmas: ArrayLike
 ) -> MatchRows:
     """Rows of M point-to-plane matches.
 
@@ -277,11 +273,7 @@ def checked_factor(
 
 
 def point_to_plane_factor(
-    key: int,
-    point: ArrayLike,
-    normal: ArrayLike,
-    offset: float,
-    noise: gtsam.noiseModel.Base,
+    key: int, point: ArrayLike, normal: ArrayLike, offset: float, noise: gtsam.noiseModel.Base
 ) -> gtsam.CustomFactor:
     """One point-to-plane match as a factor on the pose ``key``.
 

@@ -215,9 +215,7 @@ def fit_lines(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
     return centres, symmetric_eigenvector(covariance, eigenvalues[2]), eigenvalues
 
 
-def fit_planes(
-    neighbours: FloatArray,
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def fit_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Least-squares plane through each group of points, about its centroid.
 
     Parameters

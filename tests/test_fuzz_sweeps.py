@@ -10,15 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.strategies import (
-    FEW,
-    START,
-    WILD,
-    configs,
-    generators,
-    imu_streams,
-    scans,
-)
+from support.strategies import FEW, START, WILD, configs, generators, imu_streams, scans
 
 from loam_gtsam.config import (
     Config,

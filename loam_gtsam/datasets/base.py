@@ -6,17 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, TypedDict, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
-from loam_gtsam.types import (
-    BadSweep,
-    DatasetError,
-    ImuSamples,
-    IntArray,
-    Scan,
-    Sweep,
-    Trajectory,
-)
+from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
+from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, IntArray, Scan, Sweep, Trajectory
 
 
 @dataclass(slots=True)
@@ -37,7 +30,7 @@ class DatasetInfo:
     problems: list[str] = field(default_factory=list)
 
 
-class BagOptions(TypedDict, total=False):
+class BagOptions(TimeOptions, total=False):
     """Keyword arguments of every loader of bags with ``PointCloud2`` sweeps; all may be left out.
 
     Attributes
@@ -52,9 +45,6 @@ class BagOptions(TypedDict, total=False):
 
     topic: str | None
     imu_topic: str | None
-    time_field: str | None
-    time_unit: str | None
-    stamp_is: str | None
 
 
 @runtime_checkable

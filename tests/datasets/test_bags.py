@@ -20,19 +20,10 @@ from support.bags import (
     write_bag,
 )
 
-from loam_gtsam.datasets import (
-    BagDataset,
-    Dataset,
-    open_dataset,
-)
+from loam_gtsam.datasets import BagDataset, Dataset, open_dataset
 from loam_gtsam.datasets.bags.bag import POINT_CLOUD
 from loam_gtsam.datasets.bags.bag_reader import choose_topic
-from loam_gtsam.types import (
-    BadSweep,
-    DatasetError,
-    LoamError,
-    Scan,
-)
+from loam_gtsam.types import BadSweep, DatasetError, LoamError, Scan
 
 
 @pytest.mark.parametrize("kind", KINDS)

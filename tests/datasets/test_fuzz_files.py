@@ -15,28 +15,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.bags import KINDS, cloud, imu, loam_recording, store_of, write_bag
-from support.strategies import (
-    FEW,
-    START,
-    mutated,
-    mutations,
-)
+from support.strategies import FEW, START, mutated, mutations
 
-from loam_gtsam.config import (
-    Config,
-)
+from loam_gtsam.config import Config
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.loops.files import read_graph
-from loam_gtsam.types import (
-    BadSweep,
-    FeatureSweep,
-    LoamError,
-    Scan,
-)
+from loam_gtsam.types import BadSweep, FeatureSweep, LoamError, Scan
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 

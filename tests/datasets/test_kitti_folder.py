@@ -6,21 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.bags import (
-    sweep_points,
-    write_sweeps,
-)
+from support.bags import sweep_points, write_sweeps
 
-from loam_gtsam.datasets import (
-    KittiDataset,
-    open_dataset,
-)
+from loam_gtsam.datasets import KittiDataset, open_dataset
 from loam_gtsam.datasets.kitti.folder import raise_elevation
-from loam_gtsam.types import (
-    BadSweep,
-    DatasetError,
-    Scan,
-)
+from loam_gtsam.types import BadSweep, DatasetError, Scan
 
 
 @pytest.mark.parametrize(

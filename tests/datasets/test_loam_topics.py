@@ -7,29 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import (
-    ROS1,
-    START,
-    cloud,
-    imu,
-    loam_recording,
-    odometry,
-    sweep_points,
-    write_bag,
-)
+from support.bags import ROS1, START, cloud, imu, loam_recording, odometry, sweep_points, write_bag
 
-from loam_gtsam.datasets import (
-    BagDataset,
-    LoamTopicsDataset,
-    open_dataset,
-)
+from loam_gtsam.datasets import BagDataset, LoamTopicsDataset, open_dataset
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.datasets.decode.tables import read_tum
-from loam_gtsam.types import (
-    BadSweep,
-    DatasetError,
-    FeatureSweep,
-)
+from loam_gtsam.types import BadSweep, DatasetError, FeatureSweep
 
 
 @pytest.mark.parametrize("loam_axes", [False, True])

@@ -7,25 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import (
-    START,
-    sweep_points,
-    write_sweeps,
-)
+from support.bags import START, sweep_points, write_sweeps
 
-from loam_gtsam.datasets import (
-    ArrayDataset,
-    Dataset,
-    KittiDataset,
-    open_dataset,
-)
-from loam_gtsam.types import (
-    ConfigError,
-    DatasetError,
-    InputError,
-    LoamError,
-    Scan,
-)
+from loam_gtsam.datasets import ArrayDataset, Dataset, KittiDataset, open_dataset
+from loam_gtsam.types import ConfigError, DatasetError, InputError, LoamError, Scan
 
 
 def test_a_folder_above_the_sweeps_says_where_they_are(tmp_path: Path) -> None:

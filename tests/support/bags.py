@@ -202,11 +202,7 @@ def make_message(
             break
         order = ">" if big else "<"
         target = np.ndarray(
-            (height, width),
-            values.dtype.newbyteorder(order),
-            data,
-            field.offset,
-            (row_step, step),
+            (height, width), values.dtype.newbyteorder(order), data, field.offset, (row_step, step)
         )
         target[:] = values.reshape(height, width)
     data.setflags(write=False)

@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
+from itertools import islice
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -25,14 +26,11 @@ from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_opti
 from loam_gtsam.datasets.decode.pointcloud2 import (
     NO_TIMES,
     Decoded,
+    TimeOptions,
     decode_with_times,
     describe_fields,
 )
-from loam_gtsam.datasets.decode.tables import (
-    clean_imu,
-    describe_imu,
-    describe_stamps,
-)
+from loam_gtsam.datasets.decode.tables import clean_imu, describe_imu, describe_stamps
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -63,18 +61,12 @@ class BagDataset:
     ) -> None:
         if unknown := options.keys() - BagOptions.__annotations__.keys():
             raise TypeError(f"unexpected keyword arguments: {', '.join(sorted(unknown))}")
-        topic, imu_topic = options.get("topic"), options.get("imu_topic")
-        time_unit, stamp_is = options.get("time_unit"), options.get("stamp_is")
-        check_time_options(time_unit, stamp_is)
-        self._path = Path(path)
-        self._parts = tuple(parts)
+        topic, imu_topic = options.pop("topic", None), options.pop("imu_topic", None)
+        check_time_options(options.get("time_unit"), options.get("stamp_is"))
+        self._path, self._parts = Path(path), tuple(parts)
         self.name = self._path.stem
         self.sensor: Mapping[str, Any] = {}
-        self._options = {
-            "time_field": options.get("time_field"),
-            "time_unit": time_unit,
-            "stamp_is": stamp_is,
-        }
+        self._options: TimeOptions = options
         self._problems: list[str] = []
         with closing(open_bag(self._path, self._parts)) as reader:
             topics = topic_types(reader)
@@ -86,7 +78,6 @@ class BagDataset:
             )
             self._count = topics[self.topic][1]
         self._decision: TimeDecision | None = None
-        self._facts: dict[str, str] = {}
         self._peek()
 
     def __len__(self) -> int:
@@ -111,7 +102,17 @@ class BagDataset:
         """All samples of the IMU topic, or None; reads them at the first access."""
         if self.imu_topic is None:
             return None
-        return read_imu(self._path, self.imu_topic, self._problems, self._parts)
+        rows, lost = [], 0
+        for message in read_messages(self._path, [self.imu_topic], self._problems, self._parts):
+            if isinstance(message, BadSweep):
+                lost += 1
+            else:
+                rows.append(decode_imu(message.content))
+        if lost:
+            self._problems.append(f"IMU: {lost} messages cannot be read")
+        stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+        values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 10)
+        return clean_imu(stamps, values, self._problems)
 
     @property
     def truth(self) -> Trajectory | None:
@@ -135,22 +136,22 @@ class BagDataset:
         """Decide on the times, once for the whole run, and collect what there is to say."""
         decoded: list[Decoded] = []
         stamps: list[int] = []
-        offsets: list[int] = []
-        failure: LoamError | None = None
-        fields = ""
-        for number, message in enumerate(read_messages(self._path, [self.topic], [], self._parts)):
-            if number == _PEEK:
-                break
+        failure = fields = ""
+        stream = read_messages(self._path, [self.topic], [], self._parts)
+        for message in islice(stream, _PEEK):
             if isinstance(message, BadSweep):
-                failure = failure or DatasetError(message.message)
+                failure = failure or message.message
                 continue
             try:
                 decoded.append(self._decode(message))
-                stamps.append(decoded[-1].scan.stamp)
-                offsets.append(stamps[-1] - message.received)
-                fields = fields or describe_fields(message.content)
             except LoamError as error:
-                failure = failure or error
+                failure = failure or str(error)
+                continue
+            if not stamps:
+                fields = describe_fields(message.content)
+                # A sweep that cannot be read has only a receive time; this leads to the stamps'.
+                self._clock_offset = decoded[0].scan.stamp - message.received
+            stamps.append(decoded[-1].scan.stamp)
         if not decoded:
             raise DatasetError(
                 f"{self._path}, topic {self.topic}: no sweep can be decoded: "
@@ -158,42 +159,22 @@ class BagDataset:
             )
         # The last one: near time zero an absolute time can still look like an offset.
         self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)
-        # A sweep that cannot be read has only a receive time; this leads to the stamps' clock.
-        self._clock_offset = offsets[0]
-        facts = self._facts
-        facts["topic"] = self.topic
-        facts["sweeps"] = str(self._count)
-        describe_stamps(np.array(stamps, dtype=np.int64), facts, self._problems)
-        facts["stamps"] = f"from {stamps[0] * 1e-9:.6f} s"
-        facts["fields"] = fields
-        facts["points"] = f"{len(decoded[0].scan.points)} in the first sweep"
-        facts["point times"] = str(self._decision or "none recorded")
-        facts["rings"] = _describe_rings(decoded[0].scan)
-        if self._decision is None and self._options["time_field"] != NO_TIMES:
+        self._facts = {"topic": self.topic, "sweeps": str(self._count)}
+        describe_stamps(np.array(stamps, dtype=np.int64), self._facts, self._problems)
+        self._facts |= {
+            "stamps": f"from {stamps[0] * 1e-9:.6f} s",
+            "fields": fields,
+            "points": f"{len(decoded[0].scan.points)} in the first sweep",
+            "point times": str(self._decision or "none recorded"),
+            "rings": _describe_rings(decoded[0].scan),
+        }
+        if self._decision is None and self._options.get("time_field") != NO_TIMES:
             self._problems.append("no per-point time field: times can only come from the azimuth")
         if outliers := sum(d.outliers for d in decoded):
             self._problems.append(
                 f"{outliers} points of the first {len(decoded)} sweeps have a time far outside "
                 "their sweep and are left out"
             )
-
-
-def read_imu(
-    path: Path, topic: str, problems: list[str], parts: Sequence[Path] = ()
-) -> ImuSamples | None:
-    """All samples of a ``sensor_msgs/Imu`` topic; ``parts`` as for ``open_bag``."""
-    stamps, rows, lost = [], [], 0
-    for message in read_messages(path, [topic], problems, parts):
-        if isinstance(message, BadSweep):
-            lost += 1
-            continue
-        stamp, row = decode_imu(message.content)
-        stamps.append(stamp)
-        rows.append(row)
-    if lost:
-        problems.append(f"IMU: {lost} messages cannot be read")
-    values = np.array(rows, dtype=np.float64).reshape(-1, 10)
-    return clean_imu(np.array(stamps, dtype=np.int64), values, problems)
 
 
 def _describe_rings(scan: Scan) -> str:

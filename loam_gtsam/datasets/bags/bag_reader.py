@@ -31,17 +31,9 @@ class Message:
 
 
 def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
-    """An opened reader.
+    """An opened reader; DatasetError if there is no bag, or it is damaged.
 
-    Parameters
-    ----------
-    parts : the bags of a recording that was split, all ROS 1 or all ROS 2; ``path`` then only
-        names them
-
-    Raises
-    ------
-    DatasetError
-        If there is no bag, or it is damaged.
+    ``parts`` are the bags of a recording that was split; ``path`` then only names them.
     """
     bags = list(parts or [path])
     for bag in bags:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from contextlib import closing
+from contextlib import closing, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.datasets.bags.bag_reader import (
+    Message,
     bag_kind,
     open_bag,
     read_messages,
@@ -31,14 +32,7 @@ from loam_gtsam.datasets.decode.loam_messages import (
 )
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.datasets.decode.tables import describe_stamps
-from loam_gtsam.types import (
-    BadSweep,
-    DatasetError,
-    FeatureSweep,
-    ImuSamples,
-    LoamError,
-    Trajectory,
-)
+from loam_gtsam.types import BadSweep, DatasetError, FeatureSweep, ImuSamples, LoamError, Trajectory
 
 MAPPED = "/aft_mapped_to_init"
 
@@ -124,26 +118,23 @@ class LoamTopicsDataset:
         """LOAM's own mapped poses (``/aft_mapped_to_init``), for comparison, or None."""
         if MAPPED not in self._types:
             return None
-        stamps, poses = [], []
+        found = []
         for message in read_messages(self._path, [MAPPED], self._problems):
-            if isinstance(message, BadSweep):
-                continue
-            try:
-                pose = self._decoder.pose(MAPPED, message.content)
-            except DatasetError as error:
-                self._problems.append(f"left out: {error}")
-                continue
-            stamps.append(message_stamp(message.content))
-            poses.append(pose)
-        return Trajectory(
-            np.array(stamps, dtype=np.int64), np.array(poses, dtype=float).reshape(-1, 4, 4)
-        )
+            if isinstance(message, Message):
+                try:
+                    pose = self._decoder.pose(MAPPED, message.content)
+                    found.append((message_stamp(message.content), pose))
+                except DatasetError as error:
+                    self._problems.append(f"left out: {error}")
+        stamps = np.array([stamp for stamp, _ in found], dtype=np.int64)
+        return Trajectory(stamps, np.reshape([pose for _, pose in found], (-1, 4, 4)))
 
     def info(self) -> DatasetInfo:
         """Description of the bag; reads the recorded poses of LOAM if there are any."""
         facts = {"sweeps": f"up to {len(self)}", "axes": self.axes}
         facts["topics"] = ", ".join(f"{topic} ({self._types[topic][1]})" for topic in self._topics)
         problems: list[str] = []
+        tolerance = f"{STAMP_TOLERANCE_NS * 1e-6:g} ms"
         if self.recorded is not None:
             facts["recorded result"] = f"{MAPPED}, {len(self.recorded)} poses"
             describe_stamps(self.recorded.stamps, facts, problems)
@@ -154,22 +145,17 @@ class LoamTopicsDataset:
         if len(counts) > 1:
             problems.append(
                 "the topics have different numbers of messages; those without partners within "
-                f"{STAMP_TOLERANCE_NS * 1e-6:g} ms are left out"
+                f"{tolerance} are left out"
             )
         if CLOUD not in self._topics:
             problems.append(f"no {CLOUD}: no full-resolution cloud")
         problems += [
-            f"{count} messages of {topic} without partners within "
-            f"{STAMP_TOLERANCE_NS * 1e-6:g} ms, left out"
+            f"{count} messages of {topic} without partners within {tolerance}, left out"
             for topic, count in self.unmatched.items()
             if count
         ]
-        return DatasetInfo(
-            f"{bag_kind(self._path)} with LOAM topics",
-            str(self._path),
-            facts,
-            problems + self._problems,
-        )
+        kind = f"{bag_kind(self._path)} with LOAM topics"
+        return DatasetInfo(kind, str(self._path), facts, problems + self._problems)
 
     def _sweep(self, group: Mapping[str, Any]) -> FeatureSweep | BadSweep:
         try:
@@ -181,12 +167,9 @@ class LoamTopicsDataset:
         topic = CLOUD if CLOUD in self._types else PLANES
         spread = None
         for message in read_messages(self._path, [topic], []):
-            if isinstance(message, BadSweep):
-                continue
-            try:
-                spread = directions_spread(finite_points(topic, message.content))
-            except DatasetError:
-                continue  # it becomes a bad sweep of the run
+            if isinstance(message, Message):
+                with suppress(DatasetError):  # it becomes a bad sweep of the run
+                    spread = directions_spread(finite_points(topic, message.content))
             if spread is not None:
                 break
         try:

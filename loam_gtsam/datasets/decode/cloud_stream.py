@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Unpack
 
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
-from loam_gtsam.datasets.decode.pointcloud2 import Decoded, decode_with_times
+from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions, decode_with_times
 from loam_gtsam.types import LoamError, Scan
 
 _OPEN = 10
@@ -18,7 +18,7 @@ class CloudStream:
 
     Parameters
     ----------
-    time_field, time_unit, stamp_is : see
+    options : ``time_field``, ``time_unit``, ``stamp_is``: see
         :func:`loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
 
     Attributes
@@ -31,15 +31,9 @@ class CloudStream:
         If an option is unknown.
     """
 
-    def __init__(
-        self,
-        *,
-        time_field: str | None = None,
-        time_unit: str | None = None,
-        stamp_is: str | None = None,
-    ) -> None:
-        check_time_options(time_unit, stamp_is)
-        self._options = {"time_field": time_field, "time_unit": time_unit, "stamp_is": stamp_is}
+    def __init__(self, **options: Unpack[TimeOptions]) -> None:
+        check_time_options(options.get("time_unit"), options.get("stamp_is"))
+        self._options = options
         self.decision: TimeDecision | None = None
         self._decided = 0
 
@@ -52,17 +46,14 @@ class CloudStream:
             If its layout, a field or its times cannot be understood.
         """
         if self._decided >= _OPEN:
-            return self._decode(message, self.decision).scan
+            return decode_with_times(message, decision=self.decision, **self._options).scan
         try:
-            decoded = self._decode(message, None)
+            decoded = decode_with_times(message, **self._options)
         except LoamError:
             if self.decision is None:
                 raise
-            return self._decode(message, self.decision).scan
+            return decode_with_times(message, decision=self.decision, **self._options).scan
         if decoded.decision is not None:
             self.decision = decoded.decision
             self._decided += 1
         return decoded.scan
-
-    def _decode(self, message: Any, decision: TimeDecision | None) -> Decoded:
-        return decode_with_times(message, decision=decision, **self._options)

@@ -3,12 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.types import FloatArray, Trajectory
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """Sensors of a known data set: extrinsics, and topics in its bags.
+
+    Attributes
+    ----------
+    kind : name of the data set
+    lidar_T_imu : extrinsics
+    source : where the extrinsics are from, as text
+    body_T_lidar : pose of the lidar in the frame of the reference poses
+    topic, imu_topic : of the sweeps and of the IMU in its bags
+    """
+
+    kind: str
+    lidar_T_imu: FloatArray
+    source: str
+    body_T_lidar: FloatArray
+    topic: str = ""
+    imu_topic: str = ""
 
 
 def rigid_transform(rotation: Rotation, translation: Sequence[float] | FloatArray) -> FloatArray:

@@ -5,31 +5,19 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.datasets.decode.pointcloud2 import DATATYPES
 from loam_gtsam.types import DatasetError
 
-# sensor_msgs/PointField, as PCD's TYPE and SIZE name the same
-_CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
+XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
+"""Record of a point in the files of KITTI and MulRan."""
+_CODES = {code: number for number, code in DATATYPES.items()}
 _PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA")
-
-
-@dataclass(frozen=True, slots=True)
-class Stamp:
-    """Stamp as in a ROS 2 header."""
-
-    sec: int
-    nanosec: int
-
-
-@dataclass(frozen=True, slots=True)
-class Header:
-    """Header as in ROS 2."""
-
-    stamp: Stamp
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +34,7 @@ class Field:
 class PackedCloud:
     """Cloud with what :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_with_times` needs."""
 
-    header: Header
+    header: Any
     height: int
     width: int
     fields: tuple[Field, ...]
@@ -57,18 +45,7 @@ class PackedCloud:
 
 
 def read_records(path: Path, stamp: int, record: np.dtype[Any]) -> PackedCloud:
-    """A file that is nothing but records.
-
-    Parameters
-    ----------
-    stamp : nanoseconds
-    record : of little-endian fields
-
-    Raises
-    ------
-    DatasetError
-        If the file cannot be read or its size is no multiple of the record's.
-    """
+    """A file that is nothing but records of little-endian fields; ``stamp`` in nanoseconds."""
     data = _read_bytes(path)
     step = record.itemsize
     if len(data) % step:
@@ -123,13 +100,7 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
 
 
 def firing_by_firing(cloud: PackedCloud, beams: int, columns: int, source: str) -> PackedCloud:
-    """Cloud as a range image, for points that come firing by firing.
-
-    Raises
-    ------
-    DatasetError
-        If there are not ``beams`` x ``columns`` of them.
-    """
+    """Cloud as a range image, for ``beams`` x ``columns`` points that come firing by firing."""
     count = cloud.width * cloud.height
     if count != beams * columns:
         raise DatasetError(
@@ -151,7 +122,7 @@ def _packed(
 ) -> PackedCloud:
     assert record.fields is not None
     return PackedCloud(
-        header=Header(Stamp(stamp // 10**9, stamp % 10**9)),
+        header=SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)),
         height=height,
         width=width,
         fields=tuple(

@@ -7,20 +7,19 @@ unit, because a sweep lasts 0.02 to 1 s and the units are a thousand apart.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.types import BoolArray, DatasetError, FloatArray
 
-Unit = Literal["s", "ms", "us", "ns"]
-Moment = Literal["start", "middle", "end"]
-
 SWEEP_SECONDS = (0.02, 1.0)
 """Shortest and longest plausible sweep: spinning sensors run at 5 to 20 Hz, with room to spare.
 The ratio is below 1000, so at most one unit fits."""
+ANCHORS: dict[str, float] = {"start": 0.0, "middle": 0.5, "end": 1.0}
+"""Share of the sweep before the moment that its stamp is."""
 _NANOSECONDS: dict[str, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _TRIM = 100
 """One value in this many is set aside at either end before the span is measured."""
@@ -42,9 +41,9 @@ class TimeDecision:
     """
 
     field: str
-    unit: Unit
+    unit: str
     clock: Literal["offset", "stamp", "own"]
-    anchor: Moment | None
+    anchor: str | None
     span: tuple[float, float]
 
     def __str__(self) -> str:
@@ -91,7 +90,7 @@ def decide_times(
     if unit is None:
         unit = _fitting_unit(float(base) + low, float(base) + high, high - low, field)
     scale = 1e-9 * _NANOSECONDS[unit]
-    anchor: Any = stamp_is
+    anchor = stamp_is
     clock: Literal["offset", "stamp", "own"]
     # Both ends: an absolute time near zero (a simulated clock) is told from an offset by the stamp.
     first = float(base) * scale + low * scale
@@ -104,11 +103,10 @@ def decide_times(
     else:
         clock = "own"
         anchor = anchor or "start"
-    decision = TimeDecision(field, unit, clock, anchor, (0.0, 0.0))  # type: ignore[arg-type]
+    decision = TimeDecision(field, unit, clock, anchor, (0.0, 0.0))
     times, outlier = apply_times(values, stamp, decision)
     inliers = times[~outlier]
-    span = (float(inliers.min()), float(inliers.max()))
-    return TimeDecision(field, unit, clock, anchor, span)  # type: ignore[arg-type]
+    return replace(decision, span=(float(inliers.min()), float(inliers.max())))
 
 
 def apply_times(
@@ -137,8 +135,7 @@ def apply_times(
     inliers = relative[~outlier]
     first, last = float(inliers.min()) * scale, float(inliers.max()) * scale
     if decision.anchor is not None:
-        weight = {"start": 0.0, "middle": 0.5, "end": 1.0}[decision.anchor]
-        shift = -(first + weight * (last - first))
+        shift = -(first + ANCHORS[decision.anchor] * (last - first))
     elif decision.clock == "stamp":
         shift = (_to_ns(base, decision.unit) - stamp) * 1e-9
     else:
@@ -156,10 +153,7 @@ def apply_times(
 
 def check_time_options(unit: str | None, stamp_is: str | None) -> None:
     """Raise DatasetError unless both options are known."""
-    for name, value, known in (
-        ("time_unit", unit, get_args(Unit)),
-        ("stamp_is", stamp_is, get_args(Moment)),
-    ):
+    for name, value, known in (("time_unit", unit, _NANOSECONDS), ("stamp_is", stamp_is, ANCHORS)):
         if value is not None and value not in known:
             raise DatasetError(f"{name}: expected one of {', '.join(known)}; got {value!r}")
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,8 @@ NO_TIMES = "none"
 _WILD_RING = 2.0**31
 """Bound of beam numbers; larger floats, which no integer holds, are clipped to it."""
 
-# sensor_msgs/PointField: INT8 = 1 ... FLOAT64 = 8
-_DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Numbers of ``sensor_msgs/PointField``, by numpy's codes."""
 
 
 def decode_pointcloud2(
@@ -62,6 +62,14 @@ def decode_pointcloud2(
     ).scan
 
 
+class TimeOptions(TypedDict, total=False):
+    """How the times of points are read; see :func:`decode_pointcloud2`. All may be left out."""
+
+    time_field: str | None
+    time_unit: str | None
+    stamp_is: str | None
+
+
 @dataclass(frozen=True, slots=True)
 class Decoded:
     """A decoded cloud, and what was found out about its times.
@@ -79,24 +87,20 @@ class Decoded:
 
 
 def decode_with_times(
-    msg: Any,
-    *,
-    time_field: str | None = None,
-    time_unit: str | None = None,
-    stamp_is: str | None = None,
-    decision: TimeDecision | None = None,
+    msg: Any, *, decision: TimeDecision | None = None, **options: Unpack[TimeOptions]
 ) -> Decoded:
     """Decode one PointCloud2 message and tell how its times were read.
 
     ``decision`` is the one of an earlier sweep: a whole run then reads its times in one way, also
     where a sweep has too few points to tell.
     """
-    check_time_options(time_unit, stamp_is)
+    unit, stamp_is = options.get("time_unit"), options.get("stamp_is")
+    check_time_options(unit, stamp_is)
     layout = _Layout(msg)
     stamp = message_stamp(msg)
     points = _points(layout)
     rings = _rings(layout)
-    values = _time_values(layout, time_field)
+    values = _time_values(layout, options.get("time_field"))
     rows = 0
     if rings is None and layout.height > 1:
         rows = min(layout.height, layout.width)
@@ -112,7 +116,7 @@ def decode_with_times(
         # Only measured points: drivers leave anything in the time of a missing return.
         measured = column[finite]
         decision = decision or decide_times(
-            measured, stamp, field=name, unit=time_unit, stamp_is=stamp_is
+            measured, stamp, field=name, unit=unit, stamp_is=stamp_is
         )
         measured_times, outlier = apply_times(measured, stamp, decision)
         outliers = int(outlier.sum())
@@ -153,8 +157,8 @@ def message_stamp(msg: Any) -> int:
 def describe_fields(msg: Any) -> str:
     """Fields of a PointCloud2 for people: ``x float32, ..., t uint32``."""
     return ", ".join(
-        f"{field.name} {np.dtype(_DATATYPES[field.datatype]).name}"
-        if field.datatype in _DATATYPES
+        f"{field.name} {np.dtype(DATATYPES[field.datatype]).name}"
+        if field.datatype in DATATYPES
         else f"{field.name} datatype {field.datatype}"
         for field in msg.fields
     )
@@ -205,11 +209,11 @@ class _Layout:
     def column(self, name: str) -> NDArray[Any]:
         """(height * width,) values of a field, in native byte order."""
         field = self.fields[name]
-        if field.datatype not in _DATATYPES:
+        if field.datatype not in DATATYPES:
             raise DatasetError(
                 f"PointCloud2 field {name!r}: unknown datatype {field.datatype}, expected 1 to 8"
             )
-        dtype = np.dtype(self.order + _DATATYPES[field.datatype])
+        dtype = np.dtype(self.order + DATATYPES[field.datatype])
         if field.count > 1:  # 0 is what old PCL versions write for 1
             raise DatasetError(f"PointCloud2 field {name!r}: expected count 1, got {field.count}")
         if self.size == 0:

@@ -13,6 +13,7 @@ import numpy as np
 
 from loam_gtsam.types import (
     MAX_STAMP,
+    BoolArray,
     DatasetError,
     FloatArray,
     ImuSamples,
@@ -58,17 +59,22 @@ def read_lines(path: Path) -> list[str]:
         raise DatasetError(f"{path}: cannot read: {error}") from error
 
 
-def read_stamps(path: Path) -> IntArray:
-    """One time in seconds per line, as nanoseconds."""
-    stamps = []
-    for number, line in enumerate(read_lines(path), start=1):
+def convert_lines(path: Path, convert: Callable[[str], _Row], expected: str) -> list[_Row]:
+    """What ``convert`` makes of each line; a DatasetError names the line at its ValueError."""
+    rows = []
+    for number, line in enumerate(map(str.strip, read_lines(path)), start=1):
         try:
-            stamps.append(seconds_to_ns(line))
+            rows.append(convert(line))
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected a time in seconds, got {line.strip()[:80]!r}"
+                f"{path}:{number}: expected {expected}, got {line[:80]!r}: {error}"
             ) from error
-    return np.array(stamps, dtype=np.int64)
+    return rows
+
+
+def read_stamps(path: Path) -> IntArray:
+    """One time in seconds per line, as nanoseconds."""
+    return np.array(convert_lines(path, seconds_to_ns, "a time in seconds"), dtype=np.int64)
 
 
 def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
@@ -78,7 +84,7 @@ def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArra
     ----------
     path : file
     columns : their names. The time is ``t`` (seconds), ``ns`` (whole nanoseconds), or the two
-        columns ``secs nsecs``. A first line of just these names is skipped.
+        columns ``secs nsecs``. A line of just these names is skipped.
     separator : as for ``str.split``
 
     Returns
@@ -118,6 +124,16 @@ def read_tum(path: str | Path) -> Trajectory:
     return Trajectory(*read_pose_table(Path(path), "t x y z qx qy qz qw", None))
 
 
+def read_poses(path: Path, problems: list[str]) -> Trajectory:
+    """Reference poses in order of time, of a table ``secs,nsecs,x,y,z,qx,qy,qz,qw`` or as TUM's."""
+    first = next((line for line in read_lines(path) if not line.startswith("#")), "")
+    clock, separator = ("secs nsecs", ",") if "," in first else ("t", None)
+    stamps, poses = read_pose_table(path, f"{clock} x y z qx qy qz qw", separator)
+    if len(stamps) == 0:
+        raise DatasetError(f"{path}: no poses")
+    return sorted_trajectory(stamps, poses, path.name, problems)
+
+
 def pose_matrix(numbers: Sequence[float]) -> FloatArray:
     """(4, 4) transform of ``x y z qx qy qz qw``.
 
@@ -147,22 +163,19 @@ def _read_rows(
 ) -> tuple[IntArray, list[_Row]]:
     """Stamps (N,), and what ``convert`` makes of the other numbers of each row."""
     names = columns.split()
-    stamps, rows = [], []
-    for number, line in enumerate(read_lines(path), start=1):
+
+    def split(line: str) -> tuple[int, _Row] | None:
         cells = [cell.strip() for cell in line.split(separator)]
-        if not line.strip() or line.lstrip().startswith("#") or (number == 1 and cells == names):
-            continue
-        try:
-            if len(cells) != len(names):
-                raise ValueError(f"{len(cells)} columns")
-            stamps.append(_stamp(names[0], cells))
-            rows.append(convert([float(cell) for cell in cells[2 if names[0] == "secs" else 1 :]]))
-        except ValueError as error:
-            raise DatasetError(
-                f"{path}:{number}: expected {len(names)} numbers ({columns}), "
-                f"got {line.strip()[:80]!r}: {error}"
-            ) from error
-    return np.array(stamps, dtype=np.int64), rows
+        if not line or line.startswith("#") or cells == names:
+            return None
+        if len(cells) != len(names):
+            raise ValueError(f"{len(cells)} columns")
+        numbers = [float(cell) for cell in cells[2 if names[0] == "secs" else 1 :]]
+        return _stamp(names[0], cells), convert(numbers)
+
+    found = convert_lines(path, split, f"{len(names)} numbers ({columns})")
+    rows = [row for row in found if row is not None]
+    return np.array([stamp for stamp, _ in rows], np.int64), [row for _, row in rows]
 
 
 def _stamp(clock: str, cells: list[str]) -> int:
@@ -182,10 +195,15 @@ def sorted_trajectory(
     order = np.argsort(stamps, kind="stable")
     if (np.diff(stamps) < 0).any():
         problems.append(f"{source}: poses out of order, sorted")
-    first = np.diff(stamps[order], prepend=np.iinfo(np.int64).min // 2) > 0
+    first = _later_than_before(stamps[order])
     if dropped := len(stamps) - int(first.sum()):
         problems.append(f"{source}: {dropped} poses with a repeated stamp left out")
     return Trajectory(stamps[order[first]], poses[order[first]])
+
+
+def _later_than_before(stamps: IntArray) -> BoolArray:
+    later: BoolArray = np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0
+    return later
 
 
 def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:
@@ -199,7 +217,7 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     """
     keep = np.flatnonzero((np.abs(values) < _ABSURD).all(axis=1))  # NaN compares false
     order = keep[np.argsort(stamps[keep], kind="stable")]
-    later = np.diff(stamps[order], prepend=np.iinfo(np.int64).min // 2) > 0
+    later = _later_than_before(stamps[order])
     if dropped := len(stamps) - int(later.sum()):
         problems.append(
             f"IMU: {dropped} samples with NaN, absurd values or a repeated stamp left out"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
 from loam_gtsam.datasets.decode.extrinsics import describe_extrinsics, extrinsic_settings
+from loam_gtsam.datasets.decode.packed_points import XYZI, read_records
 from loam_gtsam.datasets.decode.point_times import TimeDecision, apply_times, decide_times
 from loam_gtsam.datasets.decode.tables import (
     clean_imu,
@@ -20,21 +21,17 @@ from loam_gtsam.datasets.decode.tables import (
     read_table,
     read_tum,
 )
-from loam_gtsam.datasets.kitti.poses import (
+from loam_gtsam.datasets.kitti.drive import (
     camera_T_lidar_of,
     lidar_T_imu_of,
     odometry_truth,
     oxts_imu,
     oxts_truth,
     read_oxts,
+    sweep_stamps,
+    turn_seconds,
 )
-from loam_gtsam.datasets.kitti.times import sweep_stamps, turn_seconds
-from loam_gtsam.types import (
-    DatasetError,
-    ImuSamples,
-    Scan,
-    Trajectory,
-)
+from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
 
 KITTI_SENSOR: Mapping[str, Any] = {
     "spin": "clockwise",
@@ -47,7 +44,6 @@ Geiger et al. 2013), the cut between sweeps is behind. The sense of rotation was
 from behind by exactly the true motion; the order in the files, ring by ring, runs the other way."""
 
 _FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
-_POINT_BYTES = 16
 
 
 class KittiDataset(SweepFiles):
@@ -90,7 +86,6 @@ class KittiDataset(SweepFiles):
                 f"vertical_angle_offset_deg: expected degrees, got {vertical_angle_offset_deg!r}"
             )
         self._times_folder = self._root / "t_ns"
-        self._has_times = self._times_folder.is_dir()
         self._problems: list[str] = []
         self.stamps = sweep_stamps(self._root, self._files, self._problems)
         self._camera_T_lidar = camera_T_lidar_of(self._root)
@@ -102,7 +97,7 @@ class KittiDataset(SweepFiles):
                 "scanner is (it comes with the calibration of the day)"
             )
         self.sensor: Mapping[str, Any] = self._implied(folder)
-        self._decision = self._decide_times() if self._has_times else None
+        self._decision = self._decide_times() if self._times_folder.is_dir() else None
 
     @cached_property
     def imu(self) -> ImuSamples | None:
@@ -148,7 +143,7 @@ class KittiDataset(SweepFiles):
 
     def _implied(self, folder: Path) -> Mapping[str, Any]:
         sensor: dict[str, Any] = {}
-        if self._has_times:
+        if self._times_folder.is_dir():
             pass  # they say it all
         elif self._camera_T_lidar is not None:
             sensor = dict(KITTI_SENSOR) | {"times": "none"}
@@ -164,7 +159,8 @@ class KittiDataset(SweepFiles):
         return sensor
 
     def _read(self, file: Path, stamp: int) -> Scan:
-        points = _read_points(file)
+        rows = read_records(file, stamp, XYZI).data.view("<f4").reshape(-1, 4)
+        points: NDArray[np.floating] = np.ascontiguousarray(rows[:, :3], dtype=np.float32)
         if self._offset:
             points = raise_elevation(points, self._offset)
         if self._decision is None:
@@ -209,20 +205,6 @@ def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.fl
         horizontal > 0.0, cosine * points[:, 2] + sine * horizontal, points[:, 2]
     )
     return raised
-
-
-def _read_points(file: Path) -> NDArray[np.float32]:
-    try:
-        size = file.stat().st_size
-        if size % _POINT_BYTES:
-            raise DatasetError(
-                f"{file}: {size} bytes is not a multiple of {_POINT_BYTES} (float32 x y z "
-                "intensity); the file is truncated or in another format"
-            )
-        values = np.fromfile(file, dtype="<f4").reshape(-1, 4)
-    except OSError as error:
-        raise DatasetError(f"{file}: cannot read the sweep: {error}") from error
-    return np.ascontiguousarray(values[:, :3], dtype=np.float32)
 
 
 def find_sweeps(path: Path) -> Path | None:

@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from loam_gtsam.datasets.decode.extrinsics import extrinsic_settings
+from loam_gtsam.datasets.decode.extrinsics import Rig
 from loam_gtsam.datasets.decode.packed_points import read_records
 from loam_gtsam.datasets.decode.tables import read_pose_table, sorted_trajectory
-from loam_gtsam.datasets.known.layouts import HELIPR_OTHERS, first_existing, helipr_truth
-from loam_gtsam.datasets.known.stamped_files import PackedFiles, missing_files
+from loam_gtsam.datasets.known.layouts import (
+    HELIPR_LIDARS,
+    HELIPR_OTHERS,
+    first_existing,
+    helipr_truth,
+)
+from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.datasets.known.xsens import read_xsens
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
 
+_XYZI = ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")
 RECORDS = {
     "Ouster": np.dtype(
-        [
-            *((name, "<f4") for name in ("x", "y", "z", "intensity")),
-            ("t", "<u4"),
-            *((name, "<u2") for name in ("reflectivity", "ring", "ambient")),
-        ]
+        [*_XYZI, ("t", "<u4"), *((name, "<u2") for name in ("reflectivity", "ring", "ambient"))]
     ),
-    "Velodyne": np.dtype(
-        [
-            *((name, "<f4") for name in ("x", "y", "z", "intensity")),
-            ("ring", "<u2"),
-            ("time", "<f4"),
-        ]
-    ),
+    "Velodyne": np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")]),
 }
 """Fields of a point, without padding (the data set's file player)."""
 IMU_T_LIDAR = {
@@ -54,7 +50,7 @@ IMU_T_LIDAR = {
 """Extrinsics of the data set's Pointcloud-Toolbox (``transformINStoLiDAR.py``)."""
 
 
-class HeLiPRDataset(PackedFiles):
+class HeLiPRDataset(StampedFiles):
     """A sequence of HeLiPR.
 
     Parameters
@@ -88,49 +84,42 @@ class HeLiPRDataset(PackedFiles):
     ) -> None:
         root = Path(path)
         folder = _lidar_folder(root, lidar)
-        self._lidar = folder.name
+        name = folder.name
         super().__init__(
             root,
-            f"HeLiPR sequence, {self._lidar}",
+            Rig(
+                kind=f"HeLiPR sequence, {name}",
+                lidar_T_imu=inverse_pose(IMU_T_LIDAR[name]),
+                source="HeLiPR-Pointcloud-Toolbox",
+                body_T_lidar=np.eye(4),
+            ),
             folder,
             "*.bin",
-            int,
-            read=partial(read_records, record=RECORDS[self._lidar]),
+            partial(read_records, record=RECORDS[name]),
+            imu=first_existing(root, ["Inertial_data/xsens_imu.csv", "xsens_imu.csv"]),
+            truth=helipr_truth(root, name),
             time_unit=time_unit,
             stamp_is=stamp_is,
         )
-        self._root = root
-        self.sensor = extrinsic_settings(inverse_pose(IMU_T_LIDAR[self._lidar]))
-        self._extrinsics_source = "HeLiPR-Pointcloud-Toolbox"
-        listing = first_existing(root, ["stamp.csv"])
-        self._problems += missing_files(listing, self._lidar.lower(), self.stamps)
+        self._look_for_missing(first_existing(root, ["stamp.csv"]), name.lower())
 
-    @cached_property
-    def imu(self) -> ImuSamples | None:
-        """The IMU of ``xsens_imu.csv``, or None."""
-        path = first_existing(self._root, ["Inertial_data/xsens_imu.csv", "xsens_imu.csv"])
-        return None if path is None else read_xsens(path, self._problems)
+    def _read_imu(self, path: Path) -> ImuSamples | None:
+        return read_xsens(path, self._problems)
 
-    @cached_property
-    def truth(self) -> Trajectory | None:
-        """Poses of the lidar itself, or None."""
-        path = helipr_truth(self._root, self._lidar)
-        if path is None:
-            return None
+    def _read_truth(self, path: Path) -> Trajectory:
         stamps, poses = read_pose_table(path, "ns x y z qx qy qz qw", None)
         return sorted_trajectory(stamps, poses, path.name, self._problems)
 
 
 def _lidar_folder(root: Path, lidar: str | None) -> Path:
-    if lidar is not None and lidar not in RECORDS:
+    if lidar is not None and lidar not in HELIPR_LIDARS:
         reason = "it does not sweep rings" if lidar in HELIPR_OTHERS else "unknown"
-        raise DatasetError(f"lidar: expected {' or '.join(RECORDS)}, got {lidar!r}: {reason}")
-    for name in [lidar] if lidar else RECORDS:
+        raise DatasetError(f"lidar: expected {' or '.join(HELIPR_LIDARS)}, got {lidar!r}: {reason}")
+    for name in [lidar] if lidar else HELIPR_LIDARS:
         folder = first_existing(root, [f"LiDAR/{name}", name])
         if folder is not None:
             return folder
     others = [name for name in HELIPR_OTHERS if first_existing(root, [f"LiDAR/{name}", name])]
     hint = f"; {', '.join(others)} cannot be used: no rings" if others else ""
-    raise DatasetError(
-        f"{root}: no HeLiPR sequence: expected LiDAR/{lidar or ' or LiDAR/'.join(RECORDS)}{hint}"
-    )
+    wanted = lidar or " or LiDAR/".join(HELIPR_LIDARS)
+    raise DatasetError(f"{root}: no HeLiPR sequence: expected LiDAR/{wanted}{hint}")

@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
-from functools import cached_property
 from pathlib import Path
 from typing import Unpack
 
-import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
 from loam_gtsam.datasets.base import BagOptions
-from loam_gtsam.datasets.decode.extrinsics import rigid_transform
-from loam_gtsam.datasets.decode.packed_points import firing_by_firing, read_pcd
+from loam_gtsam.datasets.decode.extrinsics import Rig, rigid_transform
+from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import pose_matrix
+from loam_gtsam.datasets.known.bag_sequence import BagSequence
 from loam_gtsam.datasets.known.layouts import (
     NEWER_COLLEGE_SCANS,
     first_existing,
     newer_college_sequence,
     newer_college_sequences,
 )
-from loam_gtsam.datasets.known.stamped_files import PackedFiles
+from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.geometry import inverse_pose
-from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
+from loam_gtsam.types import DatasetError
 
 _SENSOR_T_LIDAR = rigid_transform(
     Rotation.from_euler("z", 180.0, degrees=True), [0.0, 0.0, 0.03618]
@@ -55,8 +52,6 @@ RIG_2021 = Rig(
 )
 """``os_sensor_to_base`` of the data set's ``os_imu_lidar_transforms.yaml``, as ptudes and evalio
 quote it. Points are in the frame of the case."""
-
-_BEAMS, _COLUMNS, _PERIOD = 64, 1024, 0.1
 
 
 class NewerCollegeBags(BagSequence):
@@ -95,7 +90,7 @@ class NewerCollegeBags(BagSequence):
         )
 
 
-class NewerCollegeClouds(PackedFiles):
+class NewerCollegeClouds(StampedFiles):
     """A sequence of 2020 as PCD files.
 
     Parameters
@@ -116,41 +111,18 @@ class NewerCollegeClouds(PackedFiles):
         root = Path(path)
         super().__init__(
             root,
-            f"{RIG_2020.kind}, PCD files",
+            replace(RIG_2020, kind=f"{RIG_2020.kind}, PCD files"),
             root / NEWER_COLLEGE_SCANS,
             "*.pcd",
-            _cloud_stamp,
-            read=read_pcd,
+            read_pcd,
+            name="cloud_SECONDS_NANOSECONDS",
+            truth=_truth_file(root, "rooster"),
+            in_order=True,
             time_unit=time_unit,
             stamp_is=stamp_is,
         )
+        self.sensor = {}  # there is no IMU
         self._problems.append("IMU: not read from this layout; the bags have one")
-
-    @property
-    def imu(self) -> ImuSamples | None:
-        """Always None: only the bags have an IMU."""
-        return None
-
-    @cached_property
-    def truth(self) -> Trajectory | None:
-        """The reference poses, moved to the lidar; None without their file."""
-        path = _truth_file(self._path, "rooster")
-        return None if path is None else read_poses(path, RIG_2020.body_T_lidar, self._problems)
-
-    def _read(self, file: Path, stamp: int) -> Scan:
-        if self._first[0] is not None:
-            return super()._read(file, stamp)
-        cloud = firing_by_firing(self._unpack(file, stamp), _BEAMS, _COLUMNS, str(file))
-        column = np.arange(_BEAMS * _COLUMNS) % _COLUMNS
-        return replace(self._decode(cloud).scan, times=_PERIOD / _COLUMNS * column)
-
-
-def _cloud_stamp(stem: str) -> int:
-    """Nanoseconds of ``cloud_1583836591_182590976``."""
-    match = re.fullmatch(r"cloud_(\d+)_(\d{1,9})", stem)
-    if match is None:
-        raise ValueError(f"{stem} is not cloud_SECONDS_NANOSECONDS")
-    return int(match[1]) * 10**9 + int(match[2])
 
 
 def _choose(root: Path, sequence: str | None) -> tuple[str, list[Path]]:

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import re
-from functools import cached_property
+from dataclasses import replace
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 
-from loam_gtsam.datasets.bags.bag_sequence import BagSequence, Rig, read_poses
 from loam_gtsam.datasets.base import BagOptions
-from loam_gtsam.datasets.decode.extrinsics import extrinsic_settings
+from loam_gtsam.datasets.decode.extrinsics import Rig
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import clean_imu, pose_matrix, read_table
-from loam_gtsam.datasets.known.layouts import SPIRES_CLOUDS, spires_bags, spires_truth
-from loam_gtsam.datasets.known.stamped_files import PackedFiles
+from loam_gtsam.datasets.known.bag_sequence import BagSequence
+from loam_gtsam.datasets.known.layouts import (
+    SPIRES_CLOUDS,
+    first_existing,
+    spires_bags,
+    spires_truth,
+)
+from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.geometry import inverse_pose
-from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
+from loam_gtsam.types import DatasetError, ImuSamples
 
 _CAMERA_T_LIDAR = pose_matrix(
     [
@@ -67,7 +71,7 @@ class OxfordSpiresBags(BagSequence):
         super().__init__(root, parts, RIG, spires_truth(root), **options)
 
 
-class OxfordSpiresClouds(PackedFiles):
+class OxfordSpiresClouds(StampedFiles):
     """A sequence as PCD files.
 
     Parameters
@@ -83,38 +87,19 @@ class OxfordSpiresClouds(PackedFiles):
         root = Path(path)
         super().__init__(
             root,
-            f"{RIG.kind}, PCD files",
+            replace(RIG, kind=f"{RIG.kind}, PCD files"),
             root / SPIRES_CLOUDS,
             "*.pcd",
-            _cloud_stamp,
-            read=read_pcd,
+            read_pcd,
+            name="SECONDS.NANOSECONDS",
+            imu=first_existing(root, ["raw/imu.csv"]),
+            truth=spires_truth(root),
             time_unit=time_unit,
             stamp_is=stamp_is,
         )
-        self.sensor = extrinsic_settings(RIG.lidar_T_imu)
-        self._extrinsics_source = RIG.source
 
-    @cached_property
-    def imu(self) -> ImuSamples | None:
-        """The IMU of ``raw/imu.csv``, or None."""
-        path = self._path / "raw" / "imu.csv"
-        if not path.is_file():
-            return None
+    def _read_imu(self, path: Path) -> ImuSamples | None:
         columns = "secs nsecs acc_x acc_y acc_z ang_vel_x ang_vel_y ang_vel_z"
         stamps, values = read_table(path, columns, ",")
         samples = np.hstack([np.zeros((len(values), 4)), values[:, 3:], values[:, :3]])
         return clean_imu(stamps, samples, self._problems)
-
-    @cached_property
-    def truth(self) -> Trajectory | None:
-        """The reference poses, moved from the base to the lidar; None without their file."""
-        path = spires_truth(self._path)
-        return None if path is None else read_poses(path, RIG.body_T_lidar, self._problems)
-
-
-def _cloud_stamp(stem: str) -> int:
-    """Nanoseconds of ``1710338090.123456789`` or ``cloud_1710338090_123456789``."""
-    match = re.fullmatch(r"(?:cloud_)?(\d+)[._](\d{9})", stem)
-    if match is None:
-        raise ValueError(f"{stem} is not SECONDS.NANOSECONDS")
-    return int(match[1]) * 10**9 + int(match[2])

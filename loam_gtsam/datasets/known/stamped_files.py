@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -11,123 +12,134 @@ from typing import Any
 import numpy as np
 
 from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
-from loam_gtsam.datasets.decode.extrinsics import describe_extrinsics
-from loam_gtsam.datasets.decode.packed_points import PackedCloud
-from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
-from loam_gtsam.datasets.decode.pointcloud2 import decode_with_times, describe_fields
-from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps, read_lines
-from loam_gtsam.types import (
-    MAX_STAMP,
-    DatasetError,
-    ImuSamples,
-    IntArray,
-    Scan,
-    Trajectory,
+from loam_gtsam.datasets.decode.extrinsics import (
+    Rig,
+    describe_extrinsics,
+    extrinsic_settings,
+    moved_to_lidar,
 )
+from loam_gtsam.datasets.decode.packed_points import PackedCloud, firing_by_firing
+from loam_gtsam.datasets.decode.point_times import ANCHORS, TimeDecision, check_time_options
+from loam_gtsam.datasets.decode.pointcloud2 import decode_with_times, describe_fields
+from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps, read_lines, read_poses
+from loam_gtsam.types import MAX_STAMP, DatasetError, ImuSamples, Scan, Trajectory
 
+_NAMES = {
+    "NANOSECONDS": r"(-?\d+)",
+    "SECONDS.NANOSECONDS": r"(?:cloud_)?(\d+)[._](\d{9})",
+    "cloud_SECONDS_NANOSECONDS": r"cloud_(\d+)_(\d{1,9})",
+}
+BEAMS, COLUMNS, PERIOD = 64, 1024, 0.1
+"""Ouster's OS1-64 at 10 Hz: points of a sweep come firing by firing, 64 each, in 0.1 s."""
 _TRIED = 10
 """Sweeps looked at, at most, to decide on times."""
 
 
 class StampedFiles(SweepFiles):
-    """A data set with one file per sweep.
+    """A data set with one file per sweep, whose fields are those of a PointCloud2.
 
     Parameters
     ----------
     path : as the user gave it
-    kind : name of the data set
-    folder : of the files
-    pattern : of their names
-    stamp_of : nanoseconds of a file, from its name without suffix; raises ValueError
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        kind: str,
-        folder: Path,
-        pattern: str,
-        stamp_of: Callable[[str], int],
-    ) -> None:
-        self._path, self._kind, self._folder = path, kind, folder
-        self.name = path.resolve().name or "sweeps"
-        self.sensor: Mapping[str, Any] = {}
-        self._extrinsics_source = ""
-        self._problems: list[str] = []
-        found = []
-        for file in folder.glob(pattern):
-            try:
-                stamp = stamp_of(file.stem)
-                if abs(stamp) > MAX_STAMP:
-                    raise ValueError("out of range")
-                found.append((stamp, file))
-            except ValueError as error:
-                raise DatasetError(
-                    f"{file}: expected a name that is the stamp of the sweep: {error}"
-                ) from error
-        if not found:
-            raise DatasetError(f"{folder}: no sweeps ({pattern})")
-        found.sort()
-        self._files = [file for _, file in found]
-        self.stamps = np.array([stamp for stamp, _ in found], dtype=np.int64)
-
-    @property
-    @abstractmethod
-    def imu(self) -> ImuSamples | None:
-        """All IMU data if there is any."""
-
-    @property
-    @abstractmethod
-    def truth(self) -> Trajectory | None:
-        """Poses of the lidar if the data comes with them."""
-
-    @abstractmethod
-    def _sweep_facts(self) -> dict[str, str]:
-        """Label and text of the facts about the points."""
-
-    def info(self) -> DatasetInfo:
-        """Description of the files; reads the first sweeps, the IMU and the reference poses."""
-        imu, truth = self.imu, self.truth  # first: they may find problems
-        info = DatasetInfo(self._kind, str(self._path), {"sweeps": str(len(self))})
-        describe_stamps(self.stamps, info.facts, info.problems)
-        info.facts |= self._sweep_facts()
-        info.facts["IMU"] = describe_imu(imu) if imu is not None else "none"
-        if imu is not None and self._extrinsics_source:
-            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._extrinsics_source)
-        info.facts["reference poses"] = str(len(truth)) if truth is not None else "none"
-        info.problems.extend(self._problems)
-        return info
-
-
-class PackedFiles(StampedFiles):
-    """A data set whose files hold fields as a PointCloud2 does, the times of the points included.
-
-    Parameters
-    ----------
+    rig : of the data set
+    folder, pattern : of the files
     read : makes the cloud of a file with its stamp
+    name : of a file, without suffix: ``NANOSECONDS``, ``SECONDS.NANOSECONDS`` or
+        ``cloud_SECONDS_NANOSECONDS``
+    imu, truth : files of the IMU and of the reference poses, or None
+    in_order : whether sweeps without times of points are complete ones of an OS1-64, firing by
+        firing
     time_unit, stamp_is : see :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
     """
 
     def __init__(
         self,
         path: Path,
-        kind: str,
+        rig: Rig,
         folder: Path,
         pattern: str,
-        stamp_of: Callable[[str], int],
-        *,
         read: Callable[[Path, int], PackedCloud],
-        time_unit: str | None,
-        stamp_is: str | None,
+        *,
+        name: str = "NANOSECONDS",
+        imu: Path | None = None,
+        truth: Path | None = None,
+        in_order: bool = False,
+        time_unit: str | None = None,
+        stamp_is: str | None = None,
     ) -> None:
         check_time_options(time_unit, stamp_is)
-        super().__init__(path, kind, folder, pattern, stamp_of)
-        self._unpack = read
+        self._path, self._rig, self._folder, self._unpack = path, rig, folder, read
+        self._imu_file, self._truth_file = imu, truth
+        self._in_order, self._stamp_is = in_order, stamp_is or "start"
         self._decode = partial(decode_with_times, time_unit=time_unit, stamp_is=stamp_is)
+        self.name = path.resolve().name or "sweeps"
+        self.sensor: Mapping[str, Any] = extrinsic_settings(rig.lidar_T_imu)
+        found = sorted((_stamp(file, name), file) for file in folder.glob(pattern))
+        if not found:
+            raise DatasetError(f"{folder}: no sweeps ({pattern})")
+        self._files = [file for _, file in found]
+        self.stamps = np.array([stamp for stamp, _ in found], dtype=np.int64)
+        self._problems: list[str] = []
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """All IMU data if there is any."""
+        return None if self._imu_file is None else self._read_imu(self._imu_file)
+
+    @cached_property
+    def truth(self) -> Trajectory | None:
+        """Reference poses, moved to the lidar; None without their file."""
+        if self._truth_file is None:
+            return None
+        return moved_to_lidar(self._read_truth(self._truth_file), self._rig.body_T_lidar)
+
+    def info(self) -> DatasetInfo:
+        """Description of the files; reads the first sweeps, the IMU and the reference poses."""
+        imu, truth = self.imu, self.truth  # first: they may find problems
+        info = DatasetInfo(self._rig.kind, str(self._path), {"sweeps": str(len(self))})
+        describe_stamps(self.stamps, info.facts, info.problems)
+        decision, info.facts["fields"] = self._first
+        info.facts["point times"] = str(decision or "none")
+        if decision is None and self._in_order:
+            info.facts["point times"] = (
+                f"from the order of the points, {COLUMNS} firings in {PERIOD:g} s, stamp at sweep "
+                f"{self._stamp_is}"
+            )
+        info.facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        if imu is not None:
+            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._rig.source)
+        info.facts["reference poses"] = str(len(truth)) if truth is not None else "none"
+        info.problems.extend(self._problems)
+        return info
+
+    def _read_imu(self, path: Path) -> ImuSamples | None:
+        raise NotImplementedError
+
+    def _read_truth(self, path: Path) -> Trajectory:
+        return read_poses(path, self._problems)
+
+    def _look_for_missing(self, listing: Path | None, sensor: str) -> None:
+        """A problem if a list of ``stamp,sensor`` rows names sweeps that have no file."""
+        rows = (line.partition(",") for line in (read_lines(listing) if listing else []))
+        listed = [
+            int(stamp)
+            for stamp, _, name in rows
+            if name.strip() == sensor and stamp.strip().isdecimal()
+        ]
+        missing = np.setdiff1d(np.array(listed, np.int64), self.stamps)
+        if listing and len(missing):
+            self._problems.append(
+                f"{listing.name} lists {len(missing)} sweeps without a file, the first {missing[0]}"
+            )
 
     def _read(self, file: Path, stamp: int) -> Scan:
         cloud = self._unpack(file, stamp)
-        return self._decode(cloud, decision=self._first[0]).scan
+        decision, _ = self._first
+        if decision is not None or not self._in_order:
+            return self._decode(cloud, decision=decision).scan
+        scan = self._decode(firing_by_firing(cloud, BEAMS, COLUMNS, str(file))).scan
+        column = np.arange(BEAMS * COLUMNS) % COLUMNS  # of a range image, row by row
+        return replace(scan, times=PERIOD * (column / COLUMNS - ANCHORS[self._stamp_is]))
 
     @cached_property
     def _first(self) -> tuple[TimeDecision | None, str]:
@@ -141,21 +153,14 @@ class PackedFiles(StampedFiles):
                 message = message or str(error)
         raise DatasetError(f"{self._folder}: no usable sweep among the first {_TRIED}; {message}")
 
-    def _sweep_facts(self) -> dict[str, str]:
-        decision, fields = self._first
-        return {"fields": fields, "point times": str(decision or "none")}
 
-
-def missing_files(listing: Path | None, sensor: str, stamps: IntArray) -> list[str]:
-    """A problem if a list of ``stamp,sensor`` rows names sweeps that have no file."""
-    if listing is None:
-        return []
-    listed = [
-        int(stamp)
-        for stamp, _, name in (line.partition(",") for line in read_lines(listing))
-        if name.strip() == sensor and stamp.strip().isdecimal()
-    ]
-    missing = np.setdiff1d(np.array(listed, np.int64), stamps)
-    if len(missing) == 0:
-        return []
-    return [f"{listing.name} lists {len(missing)} sweeps without a file, the first {missing[0]}"]
+def _stamp(file: Path, name: str) -> int:
+    match = re.fullmatch(_NAMES[name], file.stem)
+    reason = f"{file.stem} is not {name}"
+    if match is not None:
+        *seconds, nanoseconds = map(int, match.groups())
+        stamp = sum(seconds) * 10**9 + nanoseconds
+        if abs(stamp) <= MAX_STAMP:
+            return stamp
+        reason = "out of range"
+    raise DatasetError(f"{file}: expected a name that is the stamp of the sweep: {reason}")

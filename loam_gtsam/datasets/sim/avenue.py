@@ -7,13 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from loam_gtsam.datasets.sim.scenes import (
-    Kerb,
-    Scene,
-    build_streets,
-    points_along,
-    rolling_ground,
-)
+from loam_gtsam.datasets.sim.scenes import Kerb, Scene, build_streets, points_along, rolling_ground
 from loam_gtsam.types import ConfigError, FloatArray
 
 _STREAM = 8
@@ -60,9 +54,7 @@ def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
             kerb = Kerb(corner, following, side > 0.0, ground)
             sides.append((rng, kerb, side == turns[number], side == turns[number + 1]))
     return Scene(
-        name="avenue",
-        solids=build_streets(sides, ground),
-        waypoints=_way(corners, metres),
+        name="avenue", solids=build_streets(sides, ground), waypoints=_way(corners, metres)
     )
 
 

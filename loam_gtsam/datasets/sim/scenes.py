@@ -184,10 +184,7 @@ def build_slopes(seed: int) -> Scene:
     rng = np.random.default_rng([seed, 0, 5])
     # The third harmonic makes the grade more even, and so the climb longer at the same grade.
     number, amplitude, phase = 2.0 * np.pi / _HILL, 7.2, -0.25 * np.pi
-    waves = [
-        [amplitude, number, 0.0, phase],
-        [-amplitude / 9.0, 3.0 * number, 0.0, 3.0 * phase],
-    ]
+    waves = [[amplitude, number, 0.0, phase], [-amplitude / 9.0, 3.0 * number, 0.0, 3.0 * phase]]
     ground = Ground(np.vstack([waves, rolling_ground(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
     bends = np.array(
         [[0, 0], [80, 14], [175, -6], [265, 16], [350, 0], [400, -4]], dtype=np.float64

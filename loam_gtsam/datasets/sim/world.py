@@ -55,10 +55,7 @@ SENSORS: dict[str, tuple[FloatArray, int]] = {
     "vlp16": (np.linspace(-15.0, 15.0, 16), 1800),
     "hdl32": (np.linspace(-30.67, 10.67, 32), 1800),
     # Two blocks of lasers: 1/2 degree apart below, 1/3 above.
-    "hdl64": (
-        np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)]),
-        2000,
-    ),
+    "hdl64": (np.concatenate([np.linspace(-24.33, -8.83, 32), np.linspace(-8.33, 2.0, 32)]), 2000),
     "os1-16": (np.linspace(-22.5, 22.5, 16), 1024),
     "os1-32": (np.linspace(-22.5, 22.5, 32), 1024),
     "os1-64": (np.linspace(-22.5, 22.5, 64), 1024),

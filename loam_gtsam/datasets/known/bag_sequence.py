@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Unpack
@@ -13,37 +12,13 @@ from loam_gtsam.datasets.bags.bag import BagDataset
 from loam_gtsam.datasets.bags.bag_reader import open_bag
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo
 from loam_gtsam.datasets.decode.extrinsics import (
+    Rig,
     describe_extrinsics,
     extrinsic_settings,
     moved_to_lidar,
 )
-from loam_gtsam.datasets.decode.tables import (
-    read_lines,
-    read_pose_table,
-    sorted_trajectory,
-)
-from loam_gtsam.types import DatasetError, FloatArray, Trajectory
-
-
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """Sensors of a data set: topics and extrinsics.
-
-    Attributes
-    ----------
-    kind : name of the data set
-    topic, imu_topic : of the sweeps and of the IMU in its bags
-    body_T_lidar : pose of the lidar in the frame of the reference poses
-    lidar_T_imu : extrinsics
-    source : where the extrinsics are from, as text
-    """
-
-    kind: str
-    topic: str
-    imu_topic: str
-    body_T_lidar: FloatArray
-    lidar_T_imu: FloatArray
-    source: str
+from loam_gtsam.datasets.decode.tables import read_poses
+from loam_gtsam.types import Trajectory
 
 
 class BagSequence(BagDataset):
@@ -88,7 +63,7 @@ class BagSequence(BagDataset):
         """The reference poses, moved to the lidar; None without their file."""
         if self._truth_file is None:
             return None
-        return read_poses(self._truth_file, self._rig.body_T_lidar, self._problems)
+        return moved_to_lidar(read_poses(self._truth_file, self._problems), self._rig.body_T_lidar)
 
     def info(self) -> DatasetInfo:
         """Description of the bags, with their extrinsics and reference poses."""
@@ -99,28 +74,7 @@ class BagSequence(BagDataset):
             info.facts["bags"] = f"{self._parts[0].name} and {len(self._parts) - 1} more"
         if self.sensor:
             info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._rig.source)
-        info.facts["reference poses"] = describe_truth(truth, self._truth_file)
+        info.facts["reference poses"] = "none"
+        if truth is not None and self._truth_file is not None:
+            info.facts["reference poses"] = f"{len(truth)} ({self._truth_file.name})"
         return info
-
-
-def describe_truth(truth: Trajectory | None, path: Path | None) -> str:
-    """Number and file of the reference poses as text."""
-    return "none" if truth is None or path is None else f"{len(truth)} ({path.name})"
-
-
-def read_poses(path: Path, body_T_lidar: FloatArray, problems: list[str]) -> Trajectory:
-    """Poses of the lidar from a file of poses of its carrier.
-
-    Parameters
-    ----------
-    path : ``secs,nsecs,x,y,z,qx,qy,qz,qw`` or TUM's ``t x y z qx qy qz qw``
-    problems : is appended to
-    """
-    first = next((line for line in read_lines(path) if not line.startswith("#")), "")
-    if "," in first:
-        stamps, poses = read_pose_table(path, "secs nsecs x y z qx qy qz qw", ",")
-    else:
-        stamps, poses = read_pose_table(path, "t x y z qx qy qz qw", None)
-    if len(stamps) == 0:
-        raise DatasetError(f"{path}: no poses")
-    return moved_to_lidar(sorted_trajectory(stamps, poses, path.name, problems), body_T_lidar)

@@ -1,4 +1,4 @@
-"""KITTI's GPS/IMU (``oxts``) and the poses of its odometry benchmark, at the scanner.
+"""What lies beside KITTI's sweeps: stamps, the GPS/IMU (``oxts``), poses and calibration.
 
 References
 ----------
@@ -8,23 +8,29 @@ the ``readme.txt`` and ``dataformat.txt`` of the development kits.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
+from loam_gtsam.datasets.decode.point_times import SWEEP_SECONDS
 from loam_gtsam.datasets.decode.tables import (
+    DEFAULT_PERIOD_NS,
     clean_imu,
+    convert_lines,
     describe_rate,
     read_lines,
+    read_stamps,
     sorted_trajectory,
 )
-from loam_gtsam.datasets.kitti.times import read_dates
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.geometry import inverse_pose
-from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
+from loam_gtsam.types import MAX_STAMP, DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
+_RAW = "velodyne_points"
 _EARTH_RADIUS = 6378137.0
 """Metres, as in the development kit."""
 _LATITUDE, _LONGITUDE, _ALTITUDE = 0, 1, 2
@@ -37,14 +43,73 @@ _BRIDGED_NS = 100_000_000
 """Default of ``imu.max_gap``."""
 
 
-def read_oxts(root: Path) -> tuple[IntArray, FloatArray] | None:
-    """Stamps (ns) and the 30 values of each packet of ``oxts/``, or None without the folder.
+def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntArray:
+    """Nanoseconds of each sweep, by ``times.txt`` or ``velodyne_points/timestamps.txt``."""
+    path, raw = root / "times.txt", root / _RAW / "timestamps.txt"
+    if path.is_file():
+        stamps = read_stamps(path)
+    elif raw.is_file():
+        path, listed = raw, read_dates(raw)
+        stamps = _of_files(listed, files)
+        if missing := len(listed) - len(stamps):
+            problems.append(f"{missing} sweeps of {path.name} have no file")
+    else:
+        problems.append("no times.txt: 10 Hz assumed")
+        return np.arange(len(files), dtype=np.int64) * DEFAULT_PERIOD_NS
+    if len(stamps) != len(files):
+        raise DatasetError(
+            f"{path}: {len(stamps)} stamps for {len(files)} sweeps; expected one line for each "
+            ".bin file"
+        )
+    return stamps
 
-    Raises
-    ------
-    DatasetError
-        If a packet or the list of stamps is damaged, or their numbers differ.
-    """
+
+def turn_seconds(
+    root: Path, files: Sequence[Path], stamps: IntArray, problems: list[str]
+) -> float | None:
+    """Median duration of a sweep of a raw drive; None if it does not tell."""
+    paths = [root / _RAW / f"timestamps_{end}.txt" for end in ("start", "end")]
+    if not all(path.is_file() for path in paths):
+        return None
+    first, last = (_of_files(read_dates(path), files) for path in paths)
+    if not len(first) == len(last) == len(files):
+        raise DatasetError(
+            f"{paths[0]}, {paths[1].name}: {len(first)} and {len(last)} stamps for "
+            f"{len(files)} sweeps"
+        )
+    seconds = float(np.median(last - first)) * 1e-9
+    if not SWEEP_SECONDS[0] <= seconds <= SWEEP_SECONDS[1]:
+        raise DatasetError(f"{paths[1]}: sweeps of {seconds:g} s (median), expected about 0.1")
+    outside = int(np.count_nonzero((stamps < first) | (stamps > last)))
+    if outside:
+        problems.append(f"{outside} stamps lie outside their sweep's start and end")
+    return round(seconds, 6)
+
+
+def read_dates(path: Path) -> IntArray:
+    """KITTI raw: ``2011-09-26 13:02:25.594360375`` per line, as nanoseconds since 1970 UTC."""
+
+    def nanoseconds(line: str) -> int:
+        date, _, fraction = line.partition(".")
+        moment = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
+        stamp = int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9])
+        if abs(stamp) > MAX_STAMP:
+            raise ValueError("out of range")
+        return stamp
+
+    return np.array(convert_lines(path, nanoseconds, "a date and time"), dtype=np.int64)
+
+
+def _of_files(listed: IntArray, files: Sequence[Path]) -> IntArray:
+    """Stamps of the files of a drive, of all its listed ones: some drives lack a few sweeps."""
+    numbers = [int(file.stem) if file.stem.isdecimal() else -1 for file in files]
+    if len(listed) > len(numbers) and min(numbers) >= 0 and max(numbers) < len(listed):
+        return listed[numbers]
+    return listed
+
+
+def read_oxts(root: Path) -> tuple[IntArray, FloatArray] | None:
+    """Stamps (ns) and the 30 values of each packet of ``oxts/``, or None without the folder."""
     folder = root / "oxts"
     files = sorted((folder / "data").glob("*.txt"))
     if not files:
@@ -105,29 +170,23 @@ def lidar_T_imu_of(root: Path) -> FloatArray | None:
     if path is None:
         return None
     numbers = _calibration(path)
-    result = np.eye(4)
     try:
-        result[:3, :3] = np.reshape(numbers["R"], (3, 3))
-        result[:3, 3] = numbers["T"]
+        rows = np.column_stack([np.reshape(numbers["R"], (3, 3)), np.reshape(numbers["T"], 3)])
     except (KeyError, ValueError) as error:
         raise DatasetError(f"{path}: expected R: with 9 and T: with 3 numbers") from error
-    return result
+    return _homogeneous(rows)
 
 
 def camera_T_lidar_of(root: Path) -> FloatArray | None:
     """``Tr`` of an odometry sequence's ``calib.txt``; None without the file or the line."""
     path = root / "calib.txt"
-    if not path.is_file():
-        return None
-    numbers = _calibration(path)
+    numbers = _calibration(path) if path.is_file() else {}
     if "Tr" not in numbers:
         return None
-    result = np.eye(4)
     try:
-        result[:3] = np.reshape(numbers["Tr"], (3, 4))
+        return _homogeneous(np.reshape(numbers["Tr"], (3, 4)))
     except ValueError as error:
         raise DatasetError(f"{path}: expected Tr: with 12 numbers") from error
-    return result
 
 
 def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> Trajectory | None:
@@ -135,18 +194,20 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
     path = root.resolve().parent.parent / "poses" / f"{root.resolve().name}.txt"
     if not path.is_file():
         return None
-    lines = read_lines(path)
-    poses = np.tile(np.eye(4), (len(lines), 1, 1))
-    for number, line in enumerate(lines, start=1):
-        try:
-            poses[number - 1, :3] = np.reshape([float(word) for word in line.split()], (3, 4))
-        except ValueError as error:
-            raise DatasetError(
-                f"{path}:{number}: expected 12 numbers, got {line.strip()[:80]!r}"
-            ) from error
+
+    def pose(line: str) -> FloatArray:
+        return _homogeneous(np.reshape([float(word) for word in line.split()], (3, 4)))
+
+    poses = convert_lines(path, pose, "12 numbers")
     if len(poses) != len(stamps):
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")
-    return Trajectory(stamps, inverse_pose(camera_T_lidar) @ poses @ camera_T_lidar)
+    moved = inverse_pose(camera_T_lidar) @ np.reshape(poses, (-1, 4, 4)) @ camera_T_lidar
+    return Trajectory(stamps, moved)
+
+
+def _homogeneous(rows: FloatArray) -> FloatArray:
+    """(4, 4) of the first three rows."""
+    return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 
 def _calibration(path: Path) -> dict[str, list[float]]:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from loam_gtsam.datasets.known.newer_college import NewerCollegeClouds as NewerCollegeClouds
     from loam_gtsam.datasets.known.oxford_spires import OxfordSpiresBags as OxfordSpiresBags
     from loam_gtsam.datasets.known.oxford_spires import OxfordSpiresClouds as OxfordSpiresClouds
-    from loam_gtsam.datasets.sim.city import build_city as build_city
+    from loam_gtsam.datasets.sim.streets import build_city as build_city
     from loam_gtsam.datasets.sim.world import SimulatedWorld as SimulatedWorld
 
 _LAZY = {
@@ -48,7 +48,7 @@ _LAZY = {
     "OxfordSpiresBags": "known.oxford_spires",
     "OxfordSpiresClouds": "known.oxford_spires",
     "SimulatedWorld": "sim.world",
-    "build_city": "sim.city",
+    "build_city": "sim.streets",
     "decode_pointcloud2": "decode.pointcloud2",
 }
 __all__ = ["Dataset", "DatasetInfo", "Sweep", "open_dataset", *_LAZY]

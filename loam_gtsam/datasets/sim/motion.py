@@ -9,7 +9,7 @@ from scipy.interpolate import CubicSpline, make_interp_spline
 from scipy.ndimage import gaussian_filter1d
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.sim.scenes import Scene
+from loam_gtsam.datasets.sim.streets import Scene, distances_along
 from loam_gtsam.types import FloatArray
 
 GRAVITY = 9.81
@@ -57,11 +57,10 @@ class Motion:
         if scene.closed:
             points = np.vstack([points, points[:1]])
         bounds = "periodic" if scene.closed else "natural"
-        chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        chord = distances_along(points)
         rough = CubicSpline(chord, points, bc_type=bounds)
         fine = np.linspace(0.0, chord[-1], max(200, int(chord[-1] / 0.1)))
-        step = np.linalg.norm(np.diff(rough(fine), axis=0), axis=1)
-        length = np.concatenate([[0.0], np.cumsum(step)])
+        length = distances_along(rough(fine))
         velocity, bend = rough(fine, 1), rough(fine, 2)
         curvature = np.abs(velocity[:, 0] * bend[:, 1] - velocity[:, 1] * bend[:, 0])
         curvature /= np.linalg.norm(velocity, axis=1) ** 3

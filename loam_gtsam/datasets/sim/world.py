@@ -17,13 +17,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.base import DatasetInfo
-from loam_gtsam.datasets.sim import avenue as _avenue
-from loam_gtsam.datasets.sim import bare_scenes as _bare_scenes
-from loam_gtsam.datasets.sim import scenes as _scenes
-from loam_gtsam.datasets.sim.avenue import build_avenue
 from loam_gtsam.datasets.sim.motion import GRAVITY, Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
-from loam_gtsam.datasets.sim.scenes import Scene
+from loam_gtsam.datasets.sim.scenes import BUILDERS
+from loam_gtsam.datasets.sim.streets import Scene, build_avenue
 from loam_gtsam.geometry import as_stamps, inverse_pose
 from loam_gtsam.types import (
     ConfigError,
@@ -46,9 +43,7 @@ __all__ = [
     "build_avenue",
 ]
 
-_BUILDERS = _scenes.BUILDERS | _bare_scenes.BUILDERS | _avenue.BUILDERS
-
-SCENES: tuple[str, ...] = tuple(_BUILDERS)
+SCENES: tuple[str, ...] = tuple(BUILDERS)
 """Names of the built-in places."""
 
 SENSORS: dict[str, tuple[FloatArray, int]] = {
@@ -140,14 +135,14 @@ class SimulatedWorld:
         acceleration_noise: float = 0.03,
         acceleration_bias: tuple[float, float, float] = (0.03, -0.02, 0.04),
     ) -> None:
-        if isinstance(scene, str) and scene not in _BUILDERS:
+        if isinstance(scene, str) and scene not in BUILDERS:
             raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
         _whole_at_least("seed", seed, 0)
         _whole_at_least("frames", frames, 1)
         _whole_at_least("columns", columns, 8)
-        self.scene = _BUILDERS[scene](seed) if isinstance(scene, str) else scene
+        self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)

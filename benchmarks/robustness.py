@@ -29,12 +29,13 @@ from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.disturbances import (
     Disturbed,
+    Kidnapped,
     MissingSweeps,
     MovingObjects,
     Outliers,
     SectorDropouts,
+    SkippedAhead,
 )
-from loam_gtsam.datasets.sim.kidnapping import Kidnapped, SkippedAhead
 from loam_gtsam.pipeline import effective_config, run
 from loam_gtsam.studies.evaluation import absolute_error, interpolate
 from loam_gtsam.types import FloatArray, Scan, Trajectory

@@ -11,8 +11,13 @@ import pytest
 
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.datasets.arrays import ArrayDataset
-from loam_gtsam.datasets.sim.disturbances import Disturbed, MissingSweeps, MovingObjects, Outliers
-from loam_gtsam.datasets.sim.kidnapping import Kidnapped
+from loam_gtsam.datasets.sim.disturbances import (
+    Disturbed,
+    Kidnapped,
+    MissingSweeps,
+    MovingObjects,
+    Outliers,
+)
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features

@@ -1,9 +1,10 @@
-"""Sweeps as they should not be: passing objects, outliers, drop-outs, gaps.
+"""Sweeps as they should not be: passing objects, outliers, drop-outs, gaps, a kidnapped lidar.
 
 Any data set can be made harder, its truth and IMU are handed through:
 ``Disturbed(dataset, [Outliers(0.2), MissingSweeps(at=(40, 80))])``. Everything random comes from a
-seed and the number of the sweep: iterating twice gives the same sweeps twice. For a lidar that is
-put somewhere else see :mod:`loam_gtsam.datasets.sim.kidnapping`.
+seed and the number of the sweep: iterating twice gives the same sweeps twice. In
+:class:`SkippedAhead` and :class:`Kidnapped` the lidar is put somewhere else between two sweeps, and
+the truth jumps with it.
 """
 
 from __future__ import annotations
@@ -11,18 +12,27 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import islice
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.base import ChangedDataset, Dataset, DatasetInfo
+from loam_gtsam.datasets.decode.extrinsics import rigid_transform
+from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.types import (
+    BadSweep,
     BoolArray,
     ConfigError,
     FeatureSweep,
     FloatArray,
+    ImuSamples,
     InputError,
+    IntArray,
     Scan,
     Sweep,
+    Trajectory,
 )
 
 _REACH = 60.0
@@ -64,11 +74,8 @@ class Outliers(Disturbance):
         """See :meth:`Disturbance.apply`."""
         rng = np.random.default_rng([self.seed, number])
         chosen = rng.permutation(len(scan.points))[: round(self.share * len(scan.points))]
-        points = scan.points.astype(np.float64)
         ranges = rng.uniform(*self.ranges, len(chosen))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            points[chosen] *= (ranges / np.linalg.norm(points[chosen], axis=1))[:, None]
-        return replace(scan, points=points.astype(scan.points.dtype))
+        return _at_ranges(scan, chosen, ranges)
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,9 +206,7 @@ class MovingObjects(Disturbance):
         hit = np.isfinite(ranges)
         rng = np.random.default_rng([self.seed, number])
         ranges[hit] += self.range_noise * rng.standard_normal(int(hit.sum()))
-        points = scan.points.astype(np.float64)
-        points[hit] *= (ranges[hit] / np.linalg.norm(points[hit], axis=1))[:, None]
-        return replace(scan, points=points.astype(scan.points.dtype))
+        return _at_ranges(scan, hit, ranges[hit])
 
     def _ranges(self, scan: Scan, later: float = 0.0) -> FloatArray:
         """(N,) metres to the nearest box where it is nearer than the point itself, else inf."""
@@ -261,12 +266,11 @@ class Disturbed(ChangedDataset):
         for number, sweep in enumerate(self._dataset):
             if not self._keeps(number):
                 continue
-            if isinstance(sweep, FeatureSweep):
-                raise InputError("Disturbed: expected raw sweeps, got features")
+            found = _raw(sweep, "Disturbed")
             for disturbance in self._disturbances:
-                if isinstance(sweep, Scan):
-                    sweep = disturbance.apply(number, sweep)
-            yield sweep
+                if isinstance(found, Scan):
+                    found = disturbance.apply(number, found)
+            yield found
 
     def _keeps(self, number: int) -> bool:
         return all(disturbance.keeps(number) for disturbance in self._disturbances)
@@ -274,6 +278,153 @@ class Disturbed(ChangedDataset):
     def info(self) -> DatasetInfo:
         """Description of the data set, with what disturbs it."""
         return self._info(disturbed_by=", ".join(map(str, self._disturbances)) or "nothing")
+
+
+class SkippedAhead(ChangedDataset):
+    """A drive out of which some sweeps were cut, and the gap in time closed: a kidnapped lidar.
+
+    Works on any data; the lidar jumps to where it really went, at the speed it had there.
+
+    Parameters
+    ----------
+    dataset : of raw sweeps; they are read up to the cut at once
+    first, count : the sweeps to cut out
+
+    Raises
+    ------
+    InputError
+        If there is nothing before or after the cut.
+    """
+
+    def __init__(self, dataset: Dataset, first: int, count: int) -> None:
+        if not (first > 0 and count > 0 and first + count < len(dataset)):
+            raise InputError(
+                f"SkippedAhead: expected sweeps within 1 to {len(dataset) - 2} to cut out, got "
+                f"{count} from {first}"
+            )
+        super().__init__(dataset, "skipped ahead")
+        self._first, self._count = first, count
+        ends = islice(dataset, first, first + count + 1, count)
+        self._begin, self._end = (_raw(sweep, "SkippedAhead").stamp for sweep in ends)
+
+    def __len__(self) -> int:
+        return len(self._dataset) - self._count
+
+    def __iter__(self) -> Iterator[Sweep]:
+        for number, sweep in enumerate(self._dataset):
+            if number < self._first:
+                yield sweep
+            elif number >= self._first + self._count:
+                later = _raw(sweep, "SkippedAhead")
+                yield replace(later, stamp=later.stamp - (self._end - self._begin))
+
+    @property
+    def imu(self) -> ImuSamples | None:
+        """The IMU with the same stretch cut out."""
+        imu = self._dataset.imu
+        if imu is None:
+            return None
+        keep, stamps = self._cut(imu.stamps)
+        turned = None if imu.orientation is None else imu.orientation[keep]
+        return ImuSamples(stamps, turned, imu.gyro[keep], imu.acceleration[keep])
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """Poses with the same stretch cut out: they jump."""
+        truth = self._dataset.truth
+        if truth is None:
+            return None
+        keep, stamps = self._cut(truth.stamps)
+        return Trajectory(stamps, truth.map_T_lidar[keep])
+
+    def _cut(self, stamps: IntArray) -> tuple[BoolArray, IntArray]:
+        after = stamps >= self._end
+        keep = (stamps < self._begin) | after
+        return keep, (stamps - after * (self._end - self._begin))[keep]
+
+    def info(self) -> DatasetInfo:
+        """Description of the data set, with the cut."""
+        return self._info(cut_out=f"{self._count} sweeps from {self._first}")
+
+
+class Kidnapped(ChangedDataset):
+    """A simulated drive in which the lidar is put somewhere else between two sweeps.
+
+    From then on it rides along in its new place, seen from where it would have been.
+
+    Parameters
+    ----------
+    world : the drive
+    number : of the first sweep elsewhere
+    move : metres, lidar frame
+    turn_deg : about the lidar's z axis, after the move
+
+    Raises
+    ------
+    InputError
+        If the drive has no sweep before and at ``number``.
+    """
+
+    def __init__(
+        self,
+        world: SimulatedWorld,
+        number: int,
+        move: tuple[float, float, float] = (1.0, 0.0, 0.0),
+        turn_deg: float = 0.0,
+    ) -> None:
+        if not 0 < number < len(world):
+            raise InputError(f"Kidnapped: expected a sweep in 1 to {len(world) - 1}, got {number}")
+        super().__init__(world, "kidnapped")
+        self._world, self._number = world, number
+        turn = Rotation.from_euler("z", turn_deg, degrees=True)
+        self._moved = world.seen_from(rigid_transform(turn, move))
+        self._change = f"at sweep {number} by {move} m and {turn_deg:g} degrees"
+
+    def __len__(self) -> int:
+        return len(self._world)
+
+    def __iter__(self) -> Iterator[Scan]:
+        return (self[number] for number in range(len(self)))
+
+    def __getitem__(self, number: int) -> Scan:
+        number += len(self) if number < 0 else 0
+        world = self._world if number < self._number else self._moved
+        return world.sweep(number)
+
+    @cached_property
+    def truth(self) -> Trajectory:
+        """Exact poses at the start of every sweep; they jump."""
+        stamps = self._world.truth.stamps
+        before = self._world.truth.map_T_lidar[: self._number]
+        after = self._moved.truth_at(stamps[self._number :]).map_T_lidar
+        return Trajectory(stamps, np.concatenate([before, after]))
+
+    @cached_property
+    def imu(self) -> ImuSamples:
+        """IMU that is moved along with the lidar, but does not feel the jump."""
+        before, after = self._world.imu, self._moved.imu
+        here = (before.stamps < self._world.truth.stamps[self._number])[:, None]
+        names = ("orientation", "gyro", "acceleration")
+        columns = [np.where(here, getattr(before, name), getattr(after, name)) for name in names]
+        return ImuSamples(before.stamps, *columns)
+
+    def info(self) -> DatasetInfo:
+        """Description of the drive, with the change of place."""
+        return self._info(kidnapped=self._change)
+
+
+def _at_ranges(scan: Scan, chosen: IntArray | BoolArray, ranges: FloatArray) -> Scan:
+    """The sweep with its chosen points moved along their beams."""
+    points = scan.points.astype(np.float64)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        points[chosen] *= (ranges / np.linalg.norm(points[chosen], axis=1))[:, None]
+    return replace(scan, points=points.astype(scan.points.dtype))
+
+
+def _raw(sweep: Sweep, who: str) -> Scan | BadSweep:
+    if isinstance(sweep, FeatureSweep):
+        raise InputError(f"{who}: expected raw sweeps, got features")
+    return sweep
 
 
 def _check_share(share: float) -> None:

@@ -139,24 +139,29 @@ class SimulatedWorld:
             raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
-        _whole_at_least("seed", seed, 0)
-        _whole_at_least("frames", frames, 1)
-        _whole_at_least("columns", columns, 8)
+        for label, whole, least in (
+            ("seed", seed, 0),
+            ("frames", frames, 1),
+            ("columns", columns, 8),
+        ):
+            if whole is not None and not isinstance(whole, (int, np.integer)):
+                raise ConfigError(f"{label}: expected a whole number, got {whole!r}")
+            _at_least(label, least if whole is None else whole, least)
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
-        for label, value in {
-            "range_noise": range_noise,
-            "foliage_noise": foliage_noise,
-            "imu_noise": imu_noise,
-            "gyro_noise": gyro_noise,
-            "acceleration_noise": acceleration_noise,
-        }.items():
-            _at_least(label, value, 0.0)
-        _at_least("rate", rate, 0.1)
-        _at_least("speed", speed, 0.01)
-        _at_least("max_range", max_range, _MIN_RANGE)
+        for label, value, limit in (
+            ("range_noise", range_noise, 0.0),
+            ("foliage_noise", foliage_noise, 0.0),
+            ("imu_noise", imu_noise, 0.0),
+            ("gyro_noise", gyro_noise, 0.0),
+            ("acceleration_noise", acceleration_noise, 0.0),
+            ("rate", rate, 0.1),
+            ("speed", speed, 0.01),
+            ("max_range", max_range, _MIN_RANGE),
+        ):
+            _at_least(label, value, limit)
         if not 0.0 <= dropout < 1.0:
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
         self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
@@ -191,11 +196,9 @@ class SimulatedWorld:
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
         stamp = self._stamp(i)
         world_T_lidar = self._motion.world_T_lidar((stamp - _EPOCH) * 1e-9 + self._times)
-        rotation = world_T_lidar[:, :3, :3]
-        directions = np.einsum("cij,jcb->icb", rotation, self._beams)
-        ranges, soft = cast_rays(
-            self.scene.solids, world_T_lidar[:, :3, 3], directions, self._max_range
-        )
+        directions = np.einsum("cij,jcb->icb", world_T_lidar[:, :3, :3], self._beams)
+        origins = world_T_lidar[:, :3, 3]
+        ranges, soft = cast_rays(self.scene.solids, origins, directions, self._max_range)
         rng = np.random.default_rng([self._seed, i])
         lost = rng.random(ranges.shape) < self._dropout
         ranges += self._range_noise * rng.standard_normal(ranges.shape)
@@ -258,11 +261,11 @@ class SimulatedWorld:
         shape = gyro.shape
         wrong = Rotation.from_rotvec(self._imu_noise * rng.standard_normal(shape))
         orientation = (Rotation.from_matrix(poses[:, :3, :3]) * wrong).as_quat()
-        noise, bias = self._gyro
-        gyro = gyro + bias + noise * rng.standard_normal(shape)
-        noise, bias = self._acceleration
-        acceleration = acceleration + bias + noise * rng.standard_normal(shape)
-        return ImuSamples(stamps, orientation, gyro, acceleration)
+        measured = [
+            exact + bias + noise * rng.standard_normal(shape)
+            for exact, (noise, bias) in ((gyro, self._gyro), (acceleration, self._acceleration))
+        ]
+        return ImuSamples(stamps, orientation, *measured)
 
     def info(self) -> DatasetInfo:
         """Scene, sensor, frames and length of the way; reads nothing."""
@@ -271,8 +274,7 @@ class SimulatedWorld:
             "scene": self.scene.name,
             "sensor": f"{self.sensor['model']}: {beams} beams x {columns} columns, clockwise",
             "frames": f"{self._frames} at {self._rate:g} Hz",
-            "path": f"{self.truth.path_length:.1f} m"
-            + (f", {'closed' if self.scene.closed else 'open'}"),
+            "path": f"{self.truth.path_length:.1f} m, {'closed' if self.scene.closed else 'open'}",
             "noise": f"{self._range_noise:g} m, {100.0 * self._dropout:g} % lost",
             "times": "per point, seconds from the start of the sweep",
             "imu": f"200 Hz, orientation within {self._imu_noise:g} rad",
@@ -300,26 +302,14 @@ class SimulatedWorld:
 
 def _beam_directions(turns: FloatArray, elevations_deg: FloatArray) -> FloatArray:
     """(3, columns, beams) unit vectors, clockwise from straight behind."""
-    azimuth = np.pi - 2.0 * np.pi * turns[:, None]
-    elevation = np.deg2rad(elevations_deg)[None, :]
-    return np.stack(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.broadcast_to(np.sin(elevation), (len(turns), len(elevations_deg))),
-        ]
-    )
+    azimuth, elevation = np.pi - 2.0 * np.pi * turns[:, None], np.deg2rad(elevations_deg)[None, :]
+    level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(turns), elevation.size))
+    return np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, up])
 
 
 def _seconds(stamps: IntArray) -> FloatArray:
     """Seconds since the first sweep; the difference is taken in integers."""
     return (stamps - _EPOCH).astype(np.float64) * 1e-9
-
-
-def _whole_at_least(name: str, value: int | None, least: int) -> None:
-    if value is not None and not isinstance(value, (int, np.integer)):
-        raise ConfigError(f"{name}: expected a whole number, got {value!r}")
-    _at_least(name, least if value is None else value, least)
 
 
 def _at_least(name: str, value: float, least: float) -> None:

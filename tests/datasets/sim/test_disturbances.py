@@ -12,12 +12,13 @@ from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.sim.disturbances import (
     Disturbance,
     Disturbed,
+    Kidnapped,
     MissingSweeps,
     MovingObjects,
     Outliers,
     SectorDropouts,
+    SkippedAhead,
 )
-from loam_gtsam.datasets.sim.kidnapping import Kidnapped, SkippedAhead
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.types import BadSweep, ConfigError, Features, FeatureSweep, InputError, Scan
 

@@ -1,14 +1,19 @@
 """A user's own factors: on the pose of a sweep, and between it and the last one."""
 
+import re
+from pathlib import Path
+from typing import Any
+
 import gtsam
 import numpy as np
 import pytest
 
+from loam_gtsam.config import Config
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.registration.solvers.own_factors import LAST_KEY, PoseContext, own_factors
-from loam_gtsam.types import Features, InputError
+from loam_gtsam.types import Features, FrameStatus, InputError
 
 LAST = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.2, 0.1), np.array([3.0, -1.0, 0.5]))
 MOVED = gtsam.Pose3(gtsam.Rot3.Ypr(0.1, 0.05, -0.02), np.array([1.0, 0.2, -0.1]))
@@ -116,3 +121,18 @@ def test_wheels_hold_the_pose_along_a_hall_without_ends():
 def test_what_is_no_factor_of_the_frame_is_an_error(factors, says):
     with pytest.raises(InputError, match=f"extra_factors: .*{says}"):
         own_factors(lambda context: factors, CONTEXT)
+
+
+def test_the_solvers_of_the_documentation_keep_degenerate_frames_degenerate():
+    """A hall without ends; a solver that drops ``motion`` would call every frame ok."""
+    page = Path(__file__).resolve().parents[2] / "docs/own_factor.md"
+    blocks = re.findall(r"^```python\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
+    names: dict[str, Any] = {}
+    for block in blocks[-2:]:
+        exec(block, names)
+    for kind in (names["Loud"], names["GaussNewton"]):
+        rng = np.random.default_rng(1)
+        mapper = Mapper(solver=kind(Config().solver))
+        for number in range(3):
+            update = mapper.register(hall_features(gtsam.Pose3(), number * 10**8, rng))
+        assert update.status is FrameStatus.DEGENERATE

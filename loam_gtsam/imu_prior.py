@@ -103,18 +103,13 @@ def tilt_information(information: FloatArray, rotation: gtsam.Rot3) -> FloatArra
     Directions that L (6, 6) does not know at all count as free, so that what depends on them
     comes out as (almost) unknown instead of as an error.
     """
-    return _inverse(_tilt_covariance(information, roll_pitch_jacobian(rotation))[1])
+    covariance = _tilt_covariance(information, roll_pitch_jacobian(rotation))[1]
+    return np.asarray(np.linalg.inv(covariance), np.float64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RollPitchPrior:
-    """A Gaussian on roll and pitch.
-
-    Attributes
-    ----------
-    roll_pitch : (2,) rad
-    information : (2, 2)
-    """
+    """A Gaussian on roll and pitch: (2,) rad, and its (2, 2) information."""
 
     roll_pitch: FloatArray
     information: FloatArray
@@ -150,7 +145,7 @@ def equivalent_prior(
         jacobian[:, :3] = jacobian[:, :3] @ gtsam.Rot3.ExpmapDerivative(moved)
         gain, covariance = _tilt_covariance(information, jacobian)
         missing = _wrapped(goal - roll_pitch(rotation))
-        knows = _inverse(covariance)
+        knows = np.asarray(np.linalg.inv(covariance), np.float64)
         # The force on roll and pitch that takes the scan's solution there.
         force = knows @ (missing + jacobian[:, :3] @ moved)
         if np.abs(missing).max() < _EXACT:
@@ -165,13 +160,9 @@ def equivalent_prior(
 def roll_pitch_factor(
     key: int, prior: RollPitchPrior, level_R_map: gtsam.Rot3
 ) -> gtsam.CustomFactor:
-    """A prior on roll and pitch as a factor on the pose ``key``.
+    """A prior on roll and pitch as a factor on the pose ``key``, a Pose3 ``map_T_lidar``.
 
-    Parameters
-    ----------
-    key : of a Pose3 ``map_T_lidar``
-    prior : with a positive definite information
-    level_R_map : see :class:`~loam_gtsam.imu.level.Level`
+    The information of the prior is positive definite; ``level_R_map`` is as in :func:`blend`.
     """
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
@@ -213,8 +204,3 @@ def _tilt_covariance(
     values = np.maximum(values, max(_FLOOR * values[-1], np.finfo(np.float64).tiny))
     gain: FloatArray = vectors @ ((vectors.T @ jacobian.T) / values[:, None])
     return gain, jacobian @ gain
-
-
-def _inverse(covariance: FloatArray) -> FloatArray:
-    inverse: FloatArray = np.linalg.inv(covariance).astype(np.float64, copy=False)
-    return inverse

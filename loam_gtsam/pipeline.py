@@ -10,13 +10,11 @@ from itertools import islice
 from typing import Any, TypeVar
 
 import gtsam
-import numpy as np
 
 from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.extrinsic_check import extrinsic_problem
 from loam_gtsam.imu.level import Level
 from loam_gtsam.imu.quality import ImuReport
 from loam_gtsam.io.checkpoint import Checkpoint
@@ -39,7 +37,6 @@ from loam_gtsam.types import (
     Scan,
     Sweep,
     Trajectory,
-    stack_poses,
 )
 
 OnFrame = Callable[[int, MapUpdate], None]
@@ -453,9 +450,6 @@ def _stamp(sweep: Sweep) -> int:
 
 
 def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
-    solved = [update for update in updates if update.status.solved]
-    stamps = np.array([update.stamp for update in solved], np.int64)
-    poses = stack_poses(update.map_T_lidar for update in solved)
     return ImuSummary(
         report=aid.buffer.report,
         level=aid.level,
@@ -463,7 +457,7 @@ def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
         sweep_motions=Counter(str(update.sweep_motion) for update in updates),
         tilt_priors=Counter(str(update.tilt_prior) for update in updates),
         gyro_trusted=aid.trusted_gyro is not None,
-        problem=extrinsic_problem(aid.buffer, stamps, poses) if len(solved) > 1 else "",
+        problem=aid.mounting_problem,
     )
 
 

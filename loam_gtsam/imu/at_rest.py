@@ -9,7 +9,6 @@ import numpy as np
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.imu.quaternions import as_rot3
-from loam_gtsam.imu.store import rows_of
 from loam_gtsam.types import FloatArray, ImuSamples
 
 REST_LEAST = 0.1
@@ -63,8 +62,10 @@ class RestWindow:
         return float(np.arctan2(away, up @ self.acceleration))
 
 
-def find_rest(config: ImuConfig, samples: ImuSamples) -> RestWindow | None:
-    """The rest that these samples make; None if they are not at rest.
+def find_rest(
+    config: ImuConfig, samples: ImuSamples, count: int | None = None
+) -> RestWindow | None:
+    """The rest that the first ``count`` samples make, or all; None if they are not at rest.
 
     At rest means: gyro and acceleration scatter little (:data:`REST_GYRO`,
     :data:`REST_ACCELERATION`) and do not drift (:data:`REST_DRIFT`), the mean rate is a possible
@@ -76,49 +77,38 @@ def find_rest(config: ImuConfig, samples: ImuSamples) -> RestWindow | None:
     config : section ``imu``
     samples : in order of time, in lidar axes, the orientation NaN where unknown
     """
-    stamps, gyro, acceleration = samples.stamps, samples.gyro, samples.acceleration
+    stamps, gyro = samples.stamps[:count], samples.gyro[:count]
+    acceleration, orientation = samples.acceleration[:count], samples.orientation
     if len(stamps) < REST_SAMPLES or stamps[-1] - stamps[0] < REST_LEAST * 1e9:
         return None
     mean_gyro, mean_acceleration = gyro.mean(axis=0), acceleration.mean(axis=0)
-    weight = float(np.linalg.norm(mean_acceleration))
-    drift_gyro, drift_acceleration = REST_DRIFT_FLOOR
     if (
         np.diff(stamps).max() > config.max_gap * 1e9
         or gyro.std(axis=0).max() > REST_GYRO
         or acceleration.std(axis=0).max() > REST_ACCELERATION
-        or _drifts(gyro, drift_gyro)
-        or _drifts(acceleration, drift_acceleration)
+        or _drifts(gyro, REST_DRIFT_FLOOR[0])
+        or _drifts(acceleration, REST_DRIFT_FLOOR[1])
         or np.linalg.norm(mean_gyro) > REST_TURN
-        or abs(weight - config.gravity) > REST_GRAVITY
+        or abs(float(np.linalg.norm(mean_acceleration)) - config.gravity) > REST_GRAVITY
     ):
         return None
     world_R_lidar = None
-    if samples.orientation is not None:
-        known = samples.orientation[np.isfinite(samples.orientation[:, 0])]
+    if orientation is not None:
+        known = orientation[:count][np.isfinite(orientation[:count, 0])]
         if len(known):
             # q and -q are one rotation: bring all to one side before they are averaged.
             mean = np.where(known @ known[0] < 0.0, -1.0, 1.0) @ known
             world_R_lidar = as_rot3(mean / np.linalg.norm(mean))
-    return RestWindow(
-        first=int(stamps[0]),
-        last=int(stamps[-1]),
-        samples=len(stamps),
-        gyro=mean_gyro,
-        acceleration=mean_acceleration,
-        world_R_lidar=world_R_lidar,
-    )
+    first, last = int(stamps[0]), int(stamps[-1])
+    return RestWindow(first, last, len(stamps), mean_gyro, mean_acceleration, world_R_lidar)
 
 
 def rest_at_start(config: ImuConfig, samples: ImuSamples) -> RestWindow | None:
-    """The rest in the first ``still_seconds`` of a stream, or in a half or a quarter of them.
-
-    Parameters are those of :func:`find_rest`, at least one sample.
-    """
+    """The rest in the first ``still_seconds`` of one or more samples, or in half or a quarter."""
     stamps = samples.stamps
     for share in (1.0, 0.5, 0.25):
         end = int(stamps[0]) + round(share * config.still_seconds * 1e9)
-        first = slice(0, int(np.searchsorted(stamps, end, side="right")))
-        rest = find_rest(config, rows_of(samples, first))
+        rest = find_rest(config, samples, int(np.searchsorted(stamps, end, side="right")))
         if rest is not None:
             return rest
     return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
@@ -58,8 +58,7 @@ def filter_block(
     seconds: float,
     max_step: float,
 ) -> tuple[FloatArray, FilterState]:
-    """Orientation of samples that follow ``state``: heading and fast motion from the gyro, up
-    from the acceleration.
+    """Orientation of the samples behind a state: heading and fast motion from the gyro.
 
     The gyro is integrated; accelerations turned into that slowly drifting frame are averaged by a
     first-order filter; the frame is then turned the shortest way so that the average points up.
@@ -75,8 +74,7 @@ def filter_block(
 
     Returns
     -------
-    world_R_body : (4, N) quaternions
-    state : at the last sample
+    ``world_R_body``, (4, N) quaternions, and the state at the last sample.
     """
     steps = np.diff(stamps, prepend=state.stamp).astype(np.float64) * 1e-9
     lost = steps > seconds
@@ -93,13 +91,12 @@ def filter_block(
     world_R_drifting = levelling(force)
     world_R_body = quaternion_product(world_R_drifting, drifting)
     world_R_body /= np.sqrt((world_R_body * world_R_body).sum(axis=0))
-    last = FilterState(
+    last = replace(
+        state,
         stamp=int(stamps[-1]),
         rate=gyro[:, -1],
         world_R_body=world_R_body[:, -1:],
         force=rotate(world_R_drifting[:, -1:], force[:, -1:])[:, 0],
-        bias=state.bias,
-        hold=state.hold,
         since=int(since[-1]),
     )
     return world_R_body, last
@@ -122,8 +119,7 @@ class GravityFilter:
         self._config = config
         # States before each block, and the number of samples that are filtered.
         self._states: list[FilterState] = []
-        self._done = 0
-        self._start_end = 0
+        self._done = self._start_end = 0
         self._start_dropped = False
         self._room = np.zeros((0, 4))
 
@@ -144,16 +140,10 @@ class GravityFilter:
         self._start_dropped = True
 
     def orientations(self, samples: ImuSamples) -> FloatArray | None:
-        """(N, 4) quaternions x y z w of all samples; those filtered before cost no time.
+        """(N, 4) quaternions x y z w of ``world_R_lidar`` of all samples, at least one, in order.
 
-        Parameters
-        ----------
-        samples : (N,) at least one, in order of time, in lidar axes
-
-        Returns
-        -------
-        ``world_R_lidar``, or None if the acceleration at the start is not gravity. A view, valid
-        until the next call.
+        None if the acceleration at the start is not gravity. A view, valid until the next call;
+        samples filtered before cost no time.
         """
         stamps, gyro, acceleration = samples.stamps, samples.gyro, samples.acceleration
         count = len(stamps)
@@ -168,14 +158,9 @@ class GravityFilter:
         while self._done < count:
             begin = (len(self._states) - 1) * BLOCK
             end = min(begin + BLOCK, count)
-            quaternions, state = filter_block(
-                self._states[-1],
-                stamps[begin:end],
-                gyro[begin:end].T,
-                acceleration[begin:end].T,
-                self._config.filter_seconds,
-                self._config.max_gap,
-            )
+            block = stamps[begin:end], gyro[begin:end].T, acceleration[begin:end].T
+            limits = self._config.filter_seconds, self._config.max_gap
+            quaternions, state = filter_block(self._states[-1], *block, *limits)
             self._room[begin:end] = quaternions.T
             self._done = end
             if end - begin == BLOCK:

@@ -26,7 +26,6 @@ from loam_gtsam.imu.quaternions import (
     rotation_steps,
     running_product,
 )
-from loam_gtsam.imu.store import SampleStore
 from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_array
 
 REST_AHEAD = 0.1
@@ -47,6 +46,96 @@ _UNIT = 1e-3
 """Deviation of a quaternion's length from one that is still rounding (float32 has 1e-7)."""
 
 
+class SampleStore:
+    """Stamps and values of IMU samples, sorted by stamp, one sample for each stamp.
+
+    Parameters
+    ----------
+    counts : "duplicates", "out_of_order" and "too_late" are counted here
+
+    Attributes
+    ----------
+    accepts_from : older samples are dropped, nanoseconds; None accepts all
+    """
+
+    def __init__(self, counts: Counter[str]) -> None:
+        self._counts = counts
+        self.accepts_from: int | None = None
+        self._newest_arrival = np.iinfo(np.int64).min
+        self._waiting: list[tuple[IntArray, FloatArray]] = []
+        self._count = 0
+        # Longer than needed: a live stream is then copied a few times in all, not at every merge.
+        self._room_stamps = np.zeros(0, np.int64)
+        self._room = np.zeros((0, 10))
+
+    @property
+    def samples(self) -> ImuSamples:
+        """All samples; views that are valid until the next :meth:`merge`."""
+        values = self._room[: self._count]
+        stamps = self._room_stamps[: self._count]
+        return ImuSamples(stamps, values[:, :4], values[:, 4:7], values[:, 7:])
+
+    @property
+    def stamps(self) -> IntArray:
+        """(N,) nanoseconds, ascending; a view like ``samples``."""
+        return self._room_stamps[: self._count]
+
+    def add(self, stamps: IntArray, values: FloatArray) -> None:
+        """Keep samples, in any order, for the next :meth:`merge`.
+
+        ``values`` (N, 10) are quaternion x y z w (NaN where unknown), gyro and acceleration.
+        """
+        if self.accepts_from is not None:
+            young = stamps >= self.accepts_from
+            self._counts["too_late"] += len(stamps) - int(young.sum())
+            stamps, values = stamps[young], values[young]
+        if len(stamps) == 0:
+            return
+        newest = np.maximum.accumulate(np.concatenate([[self._newest_arrival], stamps]))
+        self._counts["out_of_order"] += int((stamps < newest[:-1]).sum())
+        self._newest_arrival = int(newest[-1])
+        self._waiting.append((stamps, values))
+
+    def merge(self) -> tuple[int, int] | None:
+        """Sort in what was added.
+
+        Returns
+        -------
+        Index from which on samples have changed, and the stamp of the earliest new sample; None if
+        there was nothing new.
+        """
+        if not self._waiting:
+            return None
+        stamps = np.concatenate([part[0] for part in self._waiting])
+        values = np.concatenate([part[1] for part in self._waiting])
+        self._waiting.clear()
+        earliest = int(stamps.min())
+        # Nothing before this index changes; as a rule the index is the end.
+        at = int(np.searchsorted(self.stamps, earliest))
+        # The old samples first: of equal stamps a stable sort then keeps the first to come.
+        stamps = np.concatenate([self.stamps[at:], stamps])
+        values = np.concatenate([self._room[at : self._count], values])
+        order = np.argsort(stamps, kind="stable")
+        stamps = stamps[order]
+        kept = np.concatenate([[True], stamps[1:] != stamps[:-1]])
+        self._counts["duplicates"] += len(stamps) - int(kept.sum())
+        self._count = at + int(kept.sum())
+        if self._count > len(self._room):
+            more = 2 * self._count - at
+            self._room_stamps = np.concatenate([self._room_stamps[:at], np.zeros(more, int)])
+            self._room = np.concatenate([self._room[:at], np.zeros((more, 10))])
+        self._room_stamps[at : self._count] = stamps[kept]
+        self._room[at : self._count] = values[order][kept]
+        return at, earliest
+
+    def drop(self, count: int) -> None:
+        """Drop the ``count`` oldest samples, fewer than all, and from now on every older one."""
+        held = slice(count, self._count)
+        self._room_stamps, self._room = self._room_stamps[held].copy(), self._room[held].copy()
+        self._count -= count
+        self.accepts_from = int(self._room_stamps[0])
+
+
 class ImuBuffer:
     """IMU samples in lidar axes, in order of time, to be asked about any time.
 
@@ -61,9 +150,6 @@ class ImuBuffer:
     Attributes
     ----------
     lidar_R_imu : the configured rotation from IMU into lidar axes
-    gyro_bias : (3,) rad/s in lidar axes, subtracted by :meth:`rotations_since` and
-        :meth:`rotation_between`. It does not touch :meth:`orientation`, whose filter takes the
-        bias of the rest at the start.
 
     Raises
     ------
@@ -72,10 +158,8 @@ class ImuBuffer:
     """
 
     def __init__(self, config: ImuConfig, samples: ImuSamples | None = None) -> None:
-        self._config = config
-        self._gap = round(config.max_gap * 1e9)
-        roll, pitch, yaw = np.deg2rad(config.lidar_R_imu_deg)
-        self.lidar_R_imu = gtsam.Rot3.RzRyRx(roll, pitch, yaw)
+        self._config, self._gap = config, round(config.max_gap * 1e9)
+        self.lidar_R_imu = gtsam.Rot3.RzRyRx(*np.deg2rad(config.lidar_R_imu_deg))
         self._bias = np.zeros(3)
         self._counts: Counter[str] = Counter()
         self._store = SampleStore(self._counts)
@@ -88,7 +172,9 @@ class ImuBuffer:
 
     @property
     def gyro_bias(self) -> FloatArray:
-        """(3,) rad/s, lidar axes."""
+        """(3,) rad/s in lidar axes, subtracted by the rotations, but not by :meth:`orientation`,
+        whose filter takes the bias of the rest at the start.
+        """
         return self._bias
 
     @gyro_bias.setter
@@ -111,17 +197,18 @@ class ImuBuffer:
         stamps, values = stamps[finite], values[finite]
         if len(stamps) == 0:
             return
-        quaternions, unnormalised = _normalised(values[:, :4])
-        known = ~np.isnan(quaternions[0])
-        counts["unnormalised"] += unnormalised
+        with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+            norms = np.linalg.norm(values[:, :4], axis=1)
+            known = (norms > 1.0 / _ABSURD) & (norms < _ABSURD)
+            quaternions = np.where(known, values[:, :4].T / norms, np.nan)
+            counts["unnormalised"] += int((known & (np.abs(norms - 1.0) > _UNIT)).sum())
         counts["no_orientation"] += len(stamps) - int(known.sum())
         self._quality.watch_orientation(quaternions[:, known], values[:, 4:7])
         lidar_R_imu = self.lidar_R_imu.matrix()
-        turned = np.empty_like(values)
-        turned[:, :4] = quaternion_product(quaternions, inverse(from_rot3(self.lidar_R_imu))).T
-        turned[:, 4:7] = values[:, 4:7] @ lidar_R_imu.T
-        turned[:, 7:] = values[:, 7:] @ lidar_R_imu.T
-        self._store.add(stamps, turned)
+        values[:, :4] = quaternion_product(quaternions, inverse(from_rot3(self.lidar_R_imu))).T
+        values[:, 4:7] = values[:, 4:7] @ lidar_R_imu.T
+        values[:, 7:] = values[:, 7:] @ lidar_R_imu.T
+        self._store.add(stamps, values)
 
     def forget_old(self, stamp: int) -> None:
         """Drop the samples that no frame from ``stamp`` on needs; once a frame in a live run.
@@ -165,10 +252,9 @@ class ImuBuffer:
         Beyond the newest sample that one is held, for ``max_gap`` at most (LOAM holds it for
         ever). None before the first sample, inside a longer gap, or without any orientation.
         """
-        quaternions = self._orientations()
+        quaternions, stamps = self._orientations(), self._store.stamps
         if quaternions is None:
             return None
-        stamps = self._store.stamps
         low = int(np.searchsorted(stamps, stamp - self._gap, side="left"))
         high = int(np.searchsorted(stamps, stamp + self._gap, side="right"))
         known = low + np.flatnonzero(np.isfinite(quaternions[low:high, 0]))
@@ -258,9 +344,7 @@ class ImuBuffer:
             self._filter.changed_from(*changed)
 
     def _rates(self, first: int, last: int, origin: int) -> tuple[FloatArray, FloatArray] | None:
-        """Seconds (K,) from ``origin`` and rates (3, K) of the samples around a stretch of time,
-        or None where it is not covered.
-        """
+        """Seconds (K,) from ``origin`` and rates (3, K) around a stretch; None if not covered."""
         self._merge()
         stamps = self._store.stamps
         low = int(np.searchsorted(stamps, first, side="right")) - 1
@@ -291,24 +375,16 @@ class ImuBuffer:
 def _checked(samples: ImuSamples) -> tuple[IntArray, FloatArray]:
     """Stamps (N,) and values (N, 10): quaternion (zero where unknown), gyro, acceleration."""
     stamps = as_stamps(samples.stamps, "ImuSamples.stamps")
-    columns = []
-    for name, width in (("orientation", 4), ("gyro", 3), ("acceleration", 3)):
-        column = getattr(samples, name)
-        if column is None and name == "orientation":
-            column = np.zeros((len(stamps), 4))
-        column = np.asarray(column)
+    unknown = np.zeros((len(stamps), 4))
+    columns = {
+        "orientation": unknown if samples.orientation is None else np.asarray(samples.orientation),
+        "gyro": np.asarray(samples.gyro),
+        "acceleration": np.asarray(samples.acceleration),
+    }
+    for name, column in columns.items():
+        width = 4 if name == "orientation" else 3
         check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
-        columns.append(column)
-    return stamps, np.hstack(columns).astype(np.float64)
-
-
-def _normalised(quaternions: FloatArray) -> tuple[FloatArray, int]:
-    """(4, N) unit quaternions of (N, 4), NaN where absurd, and how many were not of unit length."""
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
-        norms = np.linalg.norm(quaternions, axis=1)
-        known = (norms > 1.0 / _ABSURD) & (norms < _ABSURD)
-        off = known & (np.abs(norms - 1.0) > _UNIT)
-        return np.where(known, quaternions.T / norms, np.nan), int(off.sum())
+    return stamps, np.hstack(list(columns.values())).astype(np.float64)
 
 
 def _rotation_vectors(
@@ -316,10 +392,8 @@ def _rotation_vectors(
 ) -> FloatArray | None:
     """(K, 3) rotation vectors from time 0 to ``seconds``, None if one is beyond :data:`WRAP`.
 
-    Parameters
-    ----------
-    seconds : (K,) between ``earliest`` <= 0 and ``latest`` >= 0
-    times, rates : (N,) seconds and (3, N) rad/s
+    ``earliest`` <= 0 <= ``latest`` are the ends of ``seconds``; ``times`` (N,) are those of
+    ``rates`` (3, N).
     """
     begin = int(np.floor(earliest / _FINE))
     end = int(np.ceil(latest / _FINE)) + 2

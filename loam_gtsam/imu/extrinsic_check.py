@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import gtsam
 import numpy as np
 
-from loam_gtsam.geometry import as_array, as_stamps
-from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.geometry import as_array, as_points
+from loam_gtsam.types import FloatArray
 
 EXTRINSIC_LIMIT = np.deg2rad(5.0)
 """rad from which on a configured rotation is called wrong."""
@@ -19,7 +16,7 @@ EXTRINSIC_FRAMES = 20
 """Pairs of frames below which nothing is said."""
 
 
-def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArray) -> str:
+def extrinsic_problem(by_scan: FloatArray, by_gyro: FloatArray, lidar_R_imu: gtsam.Rot3) -> str:
     """Say so if another ``lidar_R_imu_deg`` would fit the motion of the scans better.
 
     The rotations from frame to frame by the gyro and by the scans are the same vectors in two sets
@@ -28,9 +25,8 @@ def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArr
 
     Parameters
     ----------
-    buffer : with the configured rotation
-    stamps : (N,) nanoseconds
-    map_T_lidar : (N, 4, 4) poses, from scans alone
+    by_scan, by_gyro : (N, 3) rotation vectors from frame to frame, rad, lidar axes
+    lidar_R_imu : the configured rotation
 
     Returns
     -------
@@ -42,15 +38,10 @@ def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArr
     InputError
         If the shapes do not fit.
     """
-    stamps = as_stamps(stamps, "stamps")
-    rotations = as_array(map_T_lidar, "map_T_lidar", (len(stamps), 4, 4))[:, :3, :3]
-    turns = [buffer.rotation_between(int(a), int(b)) for a, b in pairwise(stamps)]
-    known = np.array([turn is not None for turn in turns], dtype=np.bool_)
-    if known.sum() < EXTRINSIC_FRAMES:
+    by_scan = as_points(by_scan, "by_scan")
+    by_gyro = as_array(by_gyro, "by_gyro", by_scan.shape)
+    if len(by_scan) < EXTRINSIC_FRAMES:
         return ""
-    relative = np.einsum("nji,njk->nik", rotations[:-1], rotations[1:])[known]
-    by_scan = np.array([gtsam.Rot3.Logmap(gtsam.Rot3(matrix)) for matrix in relative])
-    by_gyro = np.array([gtsam.Rot3.Logmap(turn) for turn in turns if turn is not None])
     # How far, unlike about which axis, does not depend on the extrinsics: a pair that disagrees
     # in that is a lost track or a gyro fault, and would only mislead.
     unlike = np.abs(np.linalg.norm(by_scan, axis=1) - np.linalg.norm(by_gyro, axis=1))
@@ -67,9 +58,8 @@ def extrinsic_problem(buffer: ImuBuffer, stamps: IntArray, map_T_lidar: FloatArr
     weakest = strength[1] + sign * strength[2]
     if away <= EXTRINSIC_LIMIT or variance > EXTRINSIC_SIGMA**2 * weakest:
         return ""
-    angles = np.rad2deg(better.compose(buffer.lidar_R_imu).rpy()).round().astype(int)
+    angles = np.rad2deg(better.compose(lidar_R_imu).rpy()).round().astype(int)
     return (
         f"IMU: its rotations fit those of the scans better by {np.rad2deg(away):.0f} degrees with "
-        f"imu.lidar_R_imu_deg = {angles.tolist()}; check how the "
-        "IMU is mounted"
+        f"imu.lidar_R_imu_deg = {angles.tolist()}; check how the IMU is mounted"
     )

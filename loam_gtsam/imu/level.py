@@ -42,50 +42,32 @@ def find_level(
 ) -> Level | None:
     """Find up from the samples of ``still_seconds`` before a moment and as long after it.
 
+    None if there is no orientation at that moment.
+
     Parameters
     ----------
-    buffer : the IMU's samples
-    config : section ``imu``
-    stamp : nanoseconds of the moment
-    map_T_lidar : pose of that moment; only its rotation counts
+    buffer, config : the IMU's samples, and section ``imu``
+    stamp, map_T_lidar : nanoseconds and pose of the moment, of which only the rotation counts
     levelled : whether the map is to have its z axis up: ``level_R_map`` is then the identity, and
         ``roll`` and ``pitch`` say how the lidar stands in the map
-
-    Returns
-    -------
-    Level or None
-        None if there is no orientation at that moment.
     """
     found = mean_orientation(buffer, stamp, config.still_seconds)
     if found is None:
         return None
     world_R_lidar, count = found
-    roll, pitch = world_R_lidar.rpy()[:2]
+    roll, pitch = map(float, world_R_lidar.rpy()[:2])
     level_R_lidar = gtsam.Rot3.RzRyRx(roll, pitch, 0.0)
-    return Level(
-        gtsam.Rot3() if levelled else level_R_lidar.compose(map_T_lidar.rotation().inverse()),
-        float(roll),
-        float(pitch),
-        count,
-        "moving" if buffer.rest_at(stamp) is None else "still",
-    )
+    level_R_map = level_R_lidar.compose(map_T_lidar.rotation().inverse())
+    source = "moving" if buffer.rest_at(stamp) is None else "still"
+    return Level(gtsam.Rot3() if levelled else level_R_map, roll, pitch, count, source)
 
 
 def mean_orientation(buffer: ImuBuffer, stamp: int, reach: float) -> tuple[gtsam.Rot3, int] | None:
     """``world_R_lidar`` of a moment from all samples around it, and the number of samples.
 
-    Every sample is brought to that moment by the gyro, so the platform may be turning. If it has
-    turned too far, or the gyro has a gap, the answer is the orientation of the moment alone.
-
-    Parameters
-    ----------
-    buffer : the IMU's samples
-    stamp : nanoseconds of the moment
-    reach : seconds before and after the moment
-
-    Returns
-    -------
-    None if there is no orientation at that moment.
+    Samples of ``reach`` seconds before and after ``stamp`` (nanoseconds) are brought to that moment
+    by the gyro, so the platform may be turning. If it has turned too far, or the gyro has a gap,
+    the answer is the orientation of the moment alone; None if there is none.
     """
     here = buffer.orientation(stamp)
     if here is None:

@@ -1,8 +1,9 @@
 """The window of frames behind pre-integration: a graph that forgets its oldest frame.
 
-GTSAM's own fixed-lag smoothers were tried and are as accurate. They do not give the joint
-covariance of the newest frame, which the next prediction needs, and the incremental one keeps a
-slot for every factor it ever had.
+Pose and velocity of a state are those of the IMU, in the map; see docs/maths/inertial.md, to which
+the equation numbers refer. GTSAM's own fixed-lag smoothers were tried and are as accurate. They do
+not give the joint covariance of the newest frame, which the next prediction needs, and the
+incremental one keeps a slot for every factor it ever had.
 """
 
 from __future__ import annotations
@@ -16,17 +17,22 @@ import numpy as np
 from gtsam.symbol_shorthand import B, G, V, X
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.imu.preintegration_factors import (
-    POSE,
-    REST,
-    VELOCITY,
-    integration_steps,
-    preintegration_parameters,
-    propagated_covariance,
-    scan_factor,
-)
-from loam_gtsam.types import FloatArray, ImuSamples, SweepError
+from loam_gtsam.types import FloatArray, ImuSamples, InputError, SweepError
 
+STATE = 18
+POSE, VELOCITY, BIASES, GRAVITY = slice(0, 6), slice(6, 9), slice(9, 15), slice(15, 18)
+REST = slice(BIASES.start, GRAVITY.stop)
+"""Parts of a state; REST is what does not move."""
+
+_INTEGRATION_NOISE = 1e-4
+"""m/sqrt(s): what two samples 5 ms apart miss of a vehicle's jerk; negligible, but not zero."""
+_RANK = 1e-9
+"""Eigenvalues below this, of an information scaled to 1, are rounding."""
+_MOST = 1e18
+"""1 nm: larger ones are no measurement, and leave no digits for the rest of the graph."""
+_BLOCK = 1e-6
+"""Rotation and translation of a scan are not told apart in scale further than this (rad/m): a
+whole block may be zero up to rounding."""
 _ITERATIONS = 3
 _SMALL_STEP = 1e-2
 """Gauss-Newton stops below this (rad, m, m/s, m/s^2): what is left is about its square, and the
@@ -35,7 +41,7 @@ next frame takes that away."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class InertialState:
-    """The newest frame of the window.
+    """The state of a frame.
 
     Attributes
     ----------
@@ -70,64 +76,198 @@ class InertialState:
         return values
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class WindowFrame:
-    """A frame of the window, by what its factors are made of.
+    """The prediction of a frame, and the factors between the frame before and this one.
+
+    Parameters
+    ----------
+    made_of : section ``imu``, number of the frame, state of the frame before, stamp of the frame in
+        nanoseconds, and the IMU samples between the two and around them
 
     Attributes
     ----------
-    before : state of the frame before, from which this one is predicted
-    stamp : nanoseconds
-    samples : IMU samples between the two frames
-    scan : pose, root and offset for :func:`scan_factor`; None if the scan says nothing
-    """
-
-    before: InertialState
-    stamp: int
-    samples: ImuSamples
-    scan: tuple[gtsam.Pose3, FloatArray, FloatArray] | None = None
-
-
-def predict_state(
-    config: ImuConfig, last: InertialState, number: int, stamp: int, samples: ImuSamples
-) -> tuple[InertialState, gtsam.NonlinearFactor, FloatArray]:
-    """State of frame ``number + 1``, at ``stamp``, from the last one and the samples between them.
-
-    Returns
-    -------
-    state : with its covariance
-    factor : pre-integrated, between the two frames
-    rate : (3,) rad/s of the gyro at ``stamp``
+    number : of the frame
+    predicted : state by the samples, with its covariance
+    rate : (3,) rad/s of the gyro at the end
+    graph : the factors
+    scan : arguments of :func:`scan_factor` behind the key; empty if the scan says nothing
 
     Raises
     ------
-    InputError, SweepError
-        As :func:`integration_steps`; the latter also if the samples are absurd.
+    SweepError
+        If the samples do not cover the time between, are not in order, have a gap, or add up to a
+        motion without a finite covariance.
     """
-    steps, gyro, acceleration, rate = integration_steps(samples, last.stamp, stamp, config.max_gap)
-    # GTSAM takes the attitude at the beginning of a piece for all of it. In the middle the
-    # acceleration has turned by half the piece: without it, 8 mm/s^2 too much in a bend of
+
+    def __init__(self, *made_of: *tuple[ImuConfig, int, InertialState, int, ImuSamples]) -> None:
+        self.__setstate__((made_of, ()))
+
+    # GTSAM's pre-integrated factors cannot be kept; what they are made of can.
+    def __getstate__(self) -> tuple[Any, Any]:
+        return self._made_of, self.scan
+
+    def __setstate__(self, state: tuple[Any, Any]) -> None:
+        config, self.number, before, stamp, samples = state[0]
+        samples = _covering(samples, before.stamp, stamp, config.max_gap)
+        self._made_of = config, self.number, before, stamp, samples
+        self.predicted, factor, self.rate = _predict(*self._made_of)
+        self.graph = gtsam.NonlinearFactorGraph()
+        self.graph.add(factor)
+        self.scan: tuple[Any, ...] = ()
+        if state[1]:
+            self.add_scan(*state[1])
+
+    def add_scan(self, *scan: *tuple[gtsam.Pose3, gtsam.Pose3, FloatArray]) -> None:
+        """Add what the scan says."""
+        self.scan = scan
+        self.graph.add(scan_factor(X(self.number), *scan))
+
+
+def _covering(samples: ImuSamples, start: int, stop: int, max_gap: float) -> ImuSamples:
+    """Gyro and acceleration from ``start`` to ``stop`` and one sample on either side, as views."""
+    stamps = samples.stamps
+    if stop <= start:
+        raise SweepError(f"stamp: expected later than {start}, got {stop}")
+    if not len(stamps) or stamps[0] > start or stamps[-1] < stop:
+        have = f"{stamps[0]} to {stamps[-1]}" if len(stamps) else "none"
+        raise SweepError(f"IMU samples: expected to cover {start} to {stop}, got {have}")
+    rows = slice(stamps.searchsorted(start, "right") - 1, stamps.searchsorted(stop) + 1)
+    gaps = np.diff(stamps[rows])
+    if gaps.min() <= 0 or gaps.max() > round(max_gap * 1e9):
+        raise SweepError(
+            f"IMU samples: expected steps above 0 and up to {max_gap:g} s, "
+            f"got {gaps.min() * 1e-9:g} to {gaps.max() * 1e-9:g} s"
+        )
+    return ImuSamples(stamps[rows], None, samples.gyro[rows], samples.acceleration[rows])
+
+
+def _predict(
+    config: ImuConfig, n: int, last: InertialState, stamp: int, samples: ImuSamples
+) -> tuple[InertialState, gtsam.NonlinearFactor, FloatArray]:
+    """State of frame ``n`` from the one before, the factor between the two, and the last rate."""
+    # Offsets in integers first: floats do not hold nanoseconds since 1970.
+    times = (samples.stamps - last.stamp) * 1e-9
+    knots = np.concatenate([[0.0], times[1:-1], [(stamp - last.stamp) * 1e-9]])
+    columns = (*samples.gyro.T, *samples.acceleration.T)
+    joined = np.stack([np.interp(knots, times, column) for column in columns], axis=1)
+    steps, means = np.diff(knots), 0.5 * (joined[1:] + joined[:-1])
+    gyro, acceleration = means[:, :3], means[:, 3:]
+    # GTSAM takes the attitude at the beginning of a step for all of it. In the middle the
+    # acceleration has turned by half the step: without it, 8 mm/s^2 too much in a bend of
     # 4 m/s^2 and 0.8 rad/s.
     seen = acceleration - last.acceleration_bias
     acceleration += 0.5 * steps[:, None] * np.cross(gyro - last.gyro_bias, seen)
-    measured = gtsam.PreintegratedCombinedMeasurements(
-        preintegration_parameters(config, last.map_gravity), last.bias
-    )
+    parameters = gtsam.PreintegrationCombinedParams(last.map_gravity)
+    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
+    parameters.setAccelerometerCovariance(config.acceleration_noise**2 * np.eye(3))
+    parameters.setBiasOmegaCovariance(config.gyro_bias_walk**2 * np.eye(3))
+    parameters.setBiasAccCovariance(config.acceleration_bias_walk**2 * np.eye(3))
+    parameters.setIntegrationCovariance(_INTEGRATION_NOISE**2 * np.eye(3))
+    measured = gtsam.PreintegratedCombinedMeasurements(parameters, last.bias)
     for step, turning, force in zip(steps, gyro, acceleration, strict=True):
         measured.integrateMeasurement(force, turning, step)
     there = measured.predict(gtsam.NavState(last.map_T_imu, last.velocity), last.bias)
     predicted = replace(last, stamp=stamp, map_T_imu=there.pose(), velocity=there.velocity())
-    n = number
     factor = gtsam.CombinedImuFactorWithGravityVector(
-        X(n), V(n), X(n + 1), V(n + 1), B(n), B(n + 1), G(0), measured
+        X(n - 1), V(n - 1), X(n), V(n), B(n - 1), B(n), G(0), measured
     )
-    values = last.values(n)
+    values = last.values(n - 1)
     values.insert(G(0), last.map_gravity)
-    values.insert(predicted.values(n + 1))
-    covariance = propagated_covariance(factor.linearize(values), last.covariance)
-    if not np.isfinite(covariance).all():
+    values.insert(predicted.values(n))
+    covariance = _propagated_covariance(factor.linearize(values), last.covariance)
+    return replace(predicted, covariance=covariance), factor, joined[-1, :3]
+
+
+def _propagated_covariance(factor: gtsam.GaussianFactor, covariance: FloatArray) -> FloatArray:
+    """Covariance (18, 18) of the next state from that of the last one, equation (2).
+
+    The whitened factor says ``A e + C e_next = w`` with unit normal w, where ``e`` holds the last
+    state and gravity. C is square and regular, so that ``e_next = C^-1 (w - A e)``.
+    """
+    jacobian = factor.jacobian()[0]
+    # Columns as the factor has its keys: X, V, next X, next V, B, next B, G.
+    x, v, next_x, next_v, b, next_b, g = np.split(jacobian, [6, 9, 15, 18, 24, 30], axis=1)
+    try:
+        root = np.linalg.inv(np.hstack([next_x, next_v, next_b]))
+    except np.linalg.LinAlgError as error:
+        raise SweepError(f"IMU samples: their motion has no covariance: {error}") from error
+    transition = np.zeros((STATE, STATE))
+    with np.errstate(over="ignore", invalid="ignore"):  # of absurd samples
+        transition[:15] = -root @ np.hstack([x, v, b, g])
+        transition[GRAVITY, GRAVITY] = np.eye(3)
+        moved: FloatArray = transition @ covariance @ transition.T
+        moved[:15, :15] += root @ root.T
+    if not np.isfinite(moved).all():
         raise SweepError("IMU samples: the motion they make has no finite covariance")
-    return replace(predicted, covariance=covariance), factor, rate
+    return moved
+
+
+def scan_residual(
+    map_T_imu: gtsam.Pose3, lidar_T_imu: gtsam.Pose3, measured: gtsam.Pose3
+) -> tuple[FloatArray, FloatArray]:
+    """Pose error of the lidar against the scan's, equation (3), and its Jacobian by the IMU's pose.
+
+    Rotation is ``Log(R_m' R)`` and translation ``R_m' (t - t_m)``, along the *measured* axes. The
+    blind direction of a corridor is then fixed in the map. In the logarithm of the whole pose
+    it would turn with every estimate of the rotation, and a milliradian of noise in that would let
+    the walls tell a little of the way along them.
+
+    Error (6,) in rad and m, and derivative (6, 6).
+    """
+    # Relative pose: its translation is already along the measured axes.
+    apart = measured.between(map_T_imu.compose(lidar_T_imu.inverse()))
+    turned = apart.rotation()
+    error = np.concatenate([gtsam.Rot3.Logmap(turned), apart.translation()])
+    derivative = np.zeros((6, 6))
+    derivative[:3, :3] = gtsam.Rot3.LogmapDerivative(error[:3])
+    derivative[3:, 3:] = turned.matrix()
+    return error, derivative @ lidar_T_imu.AdjointMap()
+
+
+def scan_factor(
+    key: int, lidar_T_imu: gtsam.Pose3, measured: gtsam.Pose3, root: FloatArray
+) -> gtsam.CustomFactor:
+    """``root e`` on the IMU's pose ``key``, with ``e`` of :func:`scan_residual`; root is (M, 6)."""
+
+    def call(
+        this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
+    ) -> FloatArray:
+        error, derivative = scan_residual(values.atPose3(key), lidar_T_imu, measured)
+        if jacobians is not None:
+            jacobians[0] = np.asfortranarray(root @ derivative)
+        whitened: FloatArray = root @ error
+        return whitened
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), [key], call)
+
+
+def information_root(information: FloatArray) -> FloatArray:
+    """S (M, 6) with ``S' S = information`` (6, 6); M is the rank.
+
+    Raises
+    ------
+    InputError
+        If the information is larger than any scan's, or has a negative eigenvalue beyond rounding.
+    """
+    largest = np.abs(information).max()
+    if largest > _MOST:
+        raise InputError(
+            f"information: expected entries up to {_MOST:g} (1 / rad^2, 1 / m^2), got {largest:g}"
+        )
+    # Rotation and translation differ in unit: each is scaled to 1 before ranks are told.
+    sizes = np.sqrt(np.maximum(np.diag(information).reshape(2, 3).max(axis=1), 0))
+    if not sizes.any():
+        sizes[:] = 1.0
+    scale = np.repeat(np.maximum(sizes, _BLOCK * sizes[::-1]), 3)
+    eigenvalues, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    if eigenvalues[0] < -_RANK:
+        raise InputError(
+            f"information: expected no negative eigenvalue, got {eigenvalues[0]:.3g} "
+            "(with the largest rotation and translation entries scaled to 1)"
+        )
+    seen = eigenvalues > _RANK
+    root: FloatArray = np.sqrt(eigenvalues[seen])[:, None] * vectors[:, seen].T * scale
+    return root
 
 
 class Window:
@@ -135,21 +275,18 @@ class Window:
 
     Parameters
     ----------
-    config : section ``imu``
-    lidar_T_imu : pose of the IMU in the lidar frame
     state : the only frame at first, with its covariance as prior. Pose, velocity and the rest are
         taken as independent of each other.
+    lag : largest number of frames
 
     Attributes
     ----------
     newest : number of the newest frame
     """
 
-    def __init__(self, config: ImuConfig, lidar_T_imu: gtsam.Pose3, state: InertialState) -> None:
-        self._config, self._lidar_T_imu = config, lidar_T_imu
-        self.newest = 0
+    def __init__(self, state: InertialState, lag: int) -> None:
+        self.newest, self._lag = 0, lag
         self._frames: deque[WindowFrame] = deque()
-        self._links: deque[gtsam.NonlinearFactorGraph] = deque()
         self._values = state.values(0)
         self._values.insert(G(0), state.map_gravity)
         normal = gtsam.noiseModel.Gaussian.Covariance
@@ -165,56 +302,37 @@ class Window:
         self._prior.add(gtsam.LinearContainerFactor(joint, self._values))
 
     def __getstate__(self) -> dict[str, Any]:
-        # Custom factors cannot be written: the links are made again from their frames.
-        prior, values = self._prior.serialize(), self._values.serialize()
-        return vars(self) | {"_links": deque(), "_prior": prior, "_values": values}
+        return vars(self) | {k: vars(self)[k].serialize() for k in ("_prior", "_values")}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state)
-        self._prior, self._values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        vars(self).update(state, _prior=gtsam.NonlinearFactorGraph(), _values=gtsam.Values())
         self._prior.deserialize(state["_prior"])
         self._values.deserialize(state["_values"])
-        for n, frame in enumerate(self._frames, self.newest - len(self._frames)):
-            _, imu_factor, _ = predict_state(
-                self._config, frame.before, n, frame.stamp, frame.samples
-            )
-            self._link(n + 1, frame, imu_factor)
 
-    def append(
-        self, frame: WindowFrame, predicted: InertialState, imu_factor: gtsam.NonlinearFactor
-    ) -> InertialState:
-        """Add a frame with what :func:`predict_state` said of it, solve, and return its state.
+    def append(self, frame: WindowFrame) -> InertialState:
+        """Add a frame behind the newest one, solve, and return its state.
 
         Raises
         ------
         RuntimeError, numpy.linalg.LinAlgError
             If there is no finite solution; the window is of no use then.
         """
-        self.newest += 1
+        self.newest = frame.number
         self._frames.append(frame)
-        self._link(self.newest, frame, imu_factor)
-        self._values.insert(predicted.values(self.newest))
-        state = predicted if frame.scan is None else self._solved(frame.stamp)
-        if len(self._frames) > self._config.lag:
+        self._values.insert(frame.predicted.values(frame.number))
+        state = self._solved(frame.predicted.stamp) if frame.scan else frame.predicted
+        if len(self._frames) > self._lag:
             self._forget()
         return state
-
-    def _link(self, number: int, frame: WindowFrame, imu_factor: gtsam.NonlinearFactor) -> None:
-        graph = gtsam.NonlinearFactorGraph()
-        graph.add(imu_factor)
-        if frame.scan is not None:
-            measured, root, offset = frame.scan
-            graph.add(scan_factor(X(number), self._lidar_T_imu, measured, root, offset))
-        self._links.append(graph)
 
     def _solved(self, stamp: int) -> InertialState:
         """Gauss-Newton over the window, and the marginal of the newest frame."""
         graph = gtsam.NonlinearFactorGraph(self._prior)
-        for link in self._links:
-            graph.push_back(link)
-        older = [key(n) for n in range(self._oldest, self.newest) for key in (X, V, B)]
-        newest = gtsam.Ordering([key(self.newest) for key in (X, V, B)] + [G(0)])
-        values = self._values
+        for frame in self._frames:
+            graph.push_back(frame.graph)
+        n, values = self.newest, self._values
+        older = [key(k) for k in range(n - len(self._frames), n) for key in (X, V, B)]
+        newest = gtsam.Ordering([X(n), V(n), B(n), G(0)])
         for _ in range(_ITERATIONS):
             past, rest = graph.linearize(values).eliminatePartialSequential(gtsam.Ordering(older))
             last = rest.eliminateSequential(newest)
@@ -228,29 +346,18 @@ class Window:
         if not np.isfinite(step.vector()).all() or not np.isfinite(covariance).all():
             raise RuntimeError("the window has no finite solution")
         self._values = values
-        n = self.newest
         bias = values.atConstantBias(B(n))
-        return InertialState(
-            stamp,
-            values.atPose3(X(n)),
-            values.atVector(V(n)),
-            bias.accelerometer(),
-            bias.gyroscope(),
-            values.atVector(G(0)),
-            covariance,
-        )
-
-    @property
-    def _oldest(self) -> int:
-        return self.newest - len(self._frames)
+        biases = bias.accelerometer(), bias.gyroscope()
+        motion = values.atPose3(X(n)), values.atVector(V(n))
+        return InertialState(stamp, *motion, *biases, values.atVector(G(0)), covariance)
 
     def _forget(self) -> None:
         """Marginalise the oldest frame: what it said about the next one stays, linearised."""
-        graph = self._prior
-        graph.push_back(self._links.popleft())
-        oldest = [key(self._oldest) for key in (X, V, B)]
-        _, rest = graph.linearize(self._values).eliminatePartialSequential(gtsam.Ordering(oldest))
+        n = self.newest - len(self._frames)
+        oldest = [X(n), V(n), B(n)]
+        self._prior.push_back(self._frames.popleft().graph)
+        linear = self._prior.linearize(self._values)
+        _, rest = linear.eliminatePartialSequential(gtsam.Ordering(oldest))
         self._prior = gtsam.LinearContainerFactor.ConvertLinearGraph(rest, self._values)
         for key in oldest:
             self._values.erase(key)
-        self._frames.popleft()

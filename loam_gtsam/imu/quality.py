@@ -93,7 +93,9 @@ class QualityLog:
     @property
     def measured(self) -> bool:
         """Whether the samples hold an orientation that is no placeholder."""
-        return self._quaternions > 0 and not self._placeholder
+        enough = self._quaternions >= REST_SAMPLES
+        placeholder = enough and self.constant and self._fastest > FROZEN_TURN
+        return self._quaternions > 0 and not placeholder
 
     def drop(self, stamps: IntArray) -> None:
         """Keep the numbers of samples that are dropped: all of ``stamps`` but the last one."""
@@ -137,11 +139,6 @@ class QualityLog:
             problems=tuple(problems),
         )
 
-    @property
-    def _placeholder(self) -> bool:
-        enough = self._quaternions >= REST_SAMPLES
-        return enough and self.constant and self._fastest > FROZEN_TURN
-
     def _gaps(self, stamps: IntArray) -> IntArray:
         steps = np.diff(stamps)
         return steps[steps > round(self._config.max_gap * 1e9)]
@@ -151,11 +148,6 @@ class QualityLog:
     ) -> tuple[str, list[str]]:
         """Where the orientation comes from, and what is wrong with that."""
         problems = []
-        if self._placeholder:
-            problems.append(
-                f"IMU: the orientation never changes while the gyro says {self._fastest:.2g} "
-                "rad/s: it is a placeholder and not used"
-            )
         if self.measured:
             if rest is not None and rest.disagreement > TILT_LIMIT:
                 problems.append(
@@ -166,6 +158,11 @@ class QualityLog:
                     "to off"
                 )
             return "ahrs", problems
+        if self._quaternions:
+            problems.append(
+                f"IMU: the orientation never changes while the gyro says {self._fastest:.2g} "
+                "rad/s: it is a placeholder and not used"
+            )
         if not samples:
             return "none", problems
         if not filtered:

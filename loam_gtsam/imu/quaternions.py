@@ -12,6 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from loam_gtsam.geometry import cross
 from loam_gtsam.types import FloatArray
 
 
@@ -31,15 +32,13 @@ def quaternion_product(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def inverse(q: FloatArray) -> FloatArray:
     """(4, N) of the opposite rotations."""
-    opposite: FloatArray = q * np.array([[-1.0], [-1.0], [-1.0], [1.0]])
-    return opposite
+    return np.vstack([-q[:3], q[3:]])
 
 
 def rotate(q: FloatArray, vectors: FloatArray) -> FloatArray:
     """Vectors (3, N) turned by ``q`` (4, N) or (4, 1)."""
-    axis, w = q[:3], q[3]
-    twice = 2.0 * np.cross(axis, vectors, axis=0)
-    turned: FloatArray = vectors + w * twice + np.cross(axis, twice, axis=0)
+    twice = 2.0 * cross(q[:3], vectors)
+    turned: FloatArray = vectors + q[3] * twice + cross(q[:3], twice)
     return turned
 
 
@@ -55,9 +54,8 @@ def logarithm(q: FloatArray) -> FloatArray:
     q = np.where(q[3] < 0.0, -q, q)
     sine = np.sqrt((q[:3] * q[:3]).sum(axis=0))
     angle = 2.0 * np.arctan2(sine, q[3])
-    vectors: FloatArray = q[:3] * np.divide(
-        angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-12
-    )
+    ratio = np.divide(angle, sine, out=np.full_like(sine, 2.0), where=sine > 1e-12)
+    vectors: FloatArray = q[:3] * ratio
     return vectors
 
 
@@ -76,19 +74,16 @@ def rotation_steps(seconds: FloatArray, rates: FloatArray) -> FloatArray:
     """
     step = np.diff(seconds)
     before, after = rates[:, :-1], rates[:, 1:]
-    vectors: FloatArray = 0.5 * step * (before + after)
-    vectors += step * step / 12.0 * np.cross(before, after, axis=0)
+    vectors: FloatArray = 0.5 * step * (before + after) + step * step / 12.0 * cross(before, after)
     return vectors
 
 
 def running_product(steps: FloatArray) -> FloatArray:
     """(4, N) of ``steps_0 steps_1 ... steps_k`` for every k."""
-    product = steps
-    shift = 1
+    product, shift = steps, 1
     while shift < steps.shape[1]:
-        product = np.hstack(
-            [product[:, :shift], quaternion_product(product[:, :-shift], product[:, shift:])]
-        )
+        longer = quaternion_product(product[:, :-shift], product[:, shift:])
+        product = np.hstack([product[:, :shift], longer])
         shift *= 2
     return product
 
@@ -98,8 +93,7 @@ def running_filter(keep: FloatArray, new: FloatArray, start: FloatArray) -> Floa
 
     ``keep`` (N,) may be zero anywhere, which forgets all that was before.
     """
-    keep, y = keep.copy(), new.copy()
-    shift = 1
+    keep, y, shift = keep.copy(), new.copy(), 1
     while shift < len(keep):
         y[:, shift:] = y[:, shift:] + keep[shift:] * y[:, :-shift]
         keep[shift:] = keep[shift:] * keep[:-shift]
@@ -111,8 +105,8 @@ def running_filter(keep: FloatArray, new: FloatArray, start: FloatArray) -> Floa
 def levelling(up: FloatArray) -> FloatArray:
     """Quaternions (4, N) of the shortest rotations that turn ``up`` (3, N, any length) to z.
 
-    Where ``up`` points straight down any half turn does; it is the one about x. Where it is zero
-    nothing is turned.
+    Where ``up`` points straight down the half turn is the one about x; where it is zero nothing is
+    turned.
     """
     x, y, z = up / np.maximum(np.sqrt((up * up).sum(axis=0)), 1e-300)
     q = np.stack([y, -x, np.zeros_like(x), 1.0 + z])

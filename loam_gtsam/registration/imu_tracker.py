@@ -12,6 +12,7 @@ import numpy as np
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.extrinsic_check import extrinsic_problem
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import InertialOdometry, Prediction
 from loam_gtsam.imu_prior import (
@@ -35,6 +36,8 @@ the turn: far above the noise of either, below what a wrong axis or sign makes."
 _DISTRUST = 5
 """Number of frames in which gyro and scan disagree, less the number in which they agree, from which
 on the gyro is not used."""
+_PAIRS = 2000
+"""Number of pairs of frames, the newest, behind the check of the mounting."""
 _SCAN_VARIANCE = 4.0
 """By which the scan's information is divided before pre-integration believes it: errors of scans
 against one map last over frames (built-in scenes: mean squared errors of 1 to 4 times the
@@ -64,7 +67,7 @@ class ImuTracker:
         """Forget all frames: as a new tracker on the same buffer, with the bias it was given."""
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
-        self._disagreements = 0
+        self._disagreements, self._turns = 0, np.zeros((0, 6))
         self._inertial: InertialOdometry | None = None
         self._predicted: int | None = None
 
@@ -81,6 +84,11 @@ class ImuTracker:
         """The buffer, while its gyro agrees with the scans."""
         return self.buffer if self._disagreements < _DISTRUST else None
 
+    @property
+    def mounting_problem(self) -> str:
+        """What :func:`extrinsic_problem` says of the frames compared so far, "" if nothing."""
+        return extrinsic_problem(self._turns[:, :3], self._turns[:, 3:], self.buffer.lidar_R_imu)
+
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps by the gyro; None while it is not to be trusted."""
         gyro = self.trusted_gyro
@@ -89,10 +97,8 @@ class ImuTracker:
     def first_pose(self, stamp: int, given: gtsam.Pose3 | None = None) -> gtsam.Pose3:
         """Pose of the first sweep: the origin of a map whose z axis points up, if configured.
 
-        Parameters
-        ----------
-        stamp : nanoseconds
-        given : pose that a user wants, in a map of the user's own; up is then found in that map
+        ``given`` is the pose that a user wants, in a map of the user's own; up is then found in
+        that map. ``stamp`` is in nanoseconds.
         """
         rest = self.buffer.rest_at(stamp)
         if rest is not None:
@@ -123,9 +129,8 @@ class ImuTracker:
         if config.prior in ("off", "blend"):
             return solution, TiltPrior.NONE
         measured = self._attitude(stamp)
-        if measured is None:
+        if measured is None or self.level is None:
             return solution, TiltPrior.DROPPED
-        assert self.level is not None
         if config.prior == "sigma":
             return solution, TiltPrior.GRAVITY  # it was in the solve
         pose, information = solution.map_T_lidar, solution.information
@@ -143,30 +148,28 @@ class ImuTracker:
         """Blend roll and pitch into the pose of a moment: only with ``imu.prior: blend``."""
         if self.config.prior != "blend":
             return map_T_lidar, TiltPrior.NONE
-        measured = self._attitude(stamp)
-        if measured is None:
+        measured, level, weight = self._attitude(stamp), self.level, self.config.weight
+        if measured is None or level is None:
             return map_T_lidar, TiltPrior.DROPPED
-        assert self.level is not None
-        up = self.level.level_R_map
-        if too_steep(up.compose(map_T_lidar.rotation()), measured):
-            blended = blend_direction(map_T_lidar, measured, self.config.weight, self.level.map_up)
+        if too_steep(level.level_R_map.compose(map_T_lidar.rotation()), measured):
+            blended = blend_direction(map_T_lidar, measured, weight, level.map_up)
             return blended, TiltPrior.GRAVITY
-        return blend(map_T_lidar, measured, self.config.weight, up), TiltPrior.BLEND
+        return blend(map_T_lidar, measured, weight, level.level_R_map), TiltPrior.BLEND
 
     def compare_gyro(self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3]) -> None:
         """Learn the gyro's bias from two solved poses; distrust a gyro that contradicts them.
 
-        Parameters
-        ----------
-        last, now : stamps and poses of the middles of two sweeps
+        ``last`` and ``now`` are stamps and poses of the middles of two sweeps.
         """
         turned = self.buffer.rotation_between(last[0], now[0])
         if turned is None or now[0] <= last[0]:  # sweeps of unlike length
             return
         scan = last[1].rotation().between(now[1].rotation())
         missing = gtsam.Rot3.Logmap(scan.between(turned))
+        by_scan, by_gyro = gtsam.Rot3.Logmap(scan), gtsam.Rot3.Logmap(turned)
+        self._turns = np.vstack([self._turns, np.hstack([by_scan, by_gyro])])[-_PAIRS:]
         limit, share = _DISAGREEMENT
-        allowed = limit + share * float(np.linalg.norm(gtsam.Rot3.Logmap(scan)))
+        allowed = limit + share * float(np.linalg.norm(by_scan))
         if np.linalg.norm(missing) > allowed:
             self._disagreements = min(self._disagreements + 1, 2 * _DISTRUST)
             return
@@ -220,10 +223,7 @@ class ImuTracker:
         return prediction
 
     def observe(
-        self,
-        last: tuple[int, gtsam.Pose3],
-        now: tuple[int, gtsam.Pose3],
-        information: FloatArray,
+        self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3], information: FloatArray
     ) -> None:
         """Take in what the scan alone said about a moment, for the predictions to come.
 
@@ -250,7 +250,7 @@ class ImuTracker:
             self._inertial = None
 
     def _attitude(self, stamp: int) -> gtsam.Rot3 | None:
-        """``world_R_lidar``, None if there is none or if up is not known in the map."""
+        """``world_R_lidar``; None if unknown, or up is unknown in the map."""
         if self.level is None:
             return None
         if self.trusted_gyro is None or not self.config.average_seconds:

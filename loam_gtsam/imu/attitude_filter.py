@@ -32,13 +32,11 @@ class FilterState:
 
     Attributes
     ----------
-    stamp : stamp of the sample, nanoseconds
-    rate : (3,) rate of the sample, rad/s, bias included
+    stamp : of the sample, nanoseconds
+    rate, bias : (3,) of the gyro, rad/s; the rate includes the bias
     world_R_body : (4, 1) quaternion
     force : (3,) filtered acceleration in the world, m/s^2
-    bias : (3,) bias of the gyro, rad/s
-    hold : stamp up to which the force stays as it is, nanoseconds
-    since : stamp from which on the force has been averaged, nanoseconds
+    hold, since : stamps up to which the force stays, and from which on it has been averaged
     """
 
     stamp: int
@@ -109,10 +107,6 @@ class GravityFilter:
     rest is the bias of the gyro, its mean acceleration counts as if seen for a whole time constant.
     Else the bias is zero, and the mean acceleration of the first ``still_seconds`` is a weak start.
     The heading starts at zero.
-
-    Parameters
-    ----------
-    config : section ``imu``
     """
 
     def __init__(self, config: ImuConfig) -> None:
@@ -173,8 +167,12 @@ class GravityFilter:
         self._start_end = int(stamps[0]) + round(config.still_seconds * 1e9)
         rest = rest_at_start(config, samples)
         if rest is not None:
-            bias, force, hold = rest.gyro, rest.acceleration, rest.last
-            learnt = config.filter_seconds
+            bias, force, hold, learnt = (
+                rest.gyro,
+                rest.acceleration,
+                rest.last,
+                config.filter_seconds,
+            )
         else:
             part = slice(0, int(np.searchsorted(stamps, self._start_end, side="right")))
             steps = rotation_steps((stamps[part] - stamps[0]) * 1e-9, gyro[part].T)
@@ -186,12 +184,6 @@ class GravityFilter:
             return None
         roll = np.arctan2(force[1], force[2])
         pitch = np.arctan2(-force[0], np.hypot(force[1], force[2]))
-        return FilterState(
-            stamp=int(stamps[0]),
-            rate=gyro[0].copy(),
-            world_R_body=from_rot3(gtsam.Rot3.RzRyRx(roll, pitch, 0.0)),
-            force=np.array([0.0, 0.0, weight]),
-            bias=bias,
-            hold=hold,
-            since=hold - round(learnt * 1e9),
-        )
+        world_R_body = from_rot3(gtsam.Rot3.RzRyRx(roll, pitch, 0.0))
+        up, since = np.array([0.0, 0.0, weight]), hold - round(learnt * 1e9)
+        return FilterState(int(stamps[0]), gyro[0].copy(), world_R_body, up, bias, hold, since)

@@ -71,14 +71,8 @@ class SampleStore:
     @property
     def samples(self) -> ImuSamples:
         """All samples; views that are valid until the next :meth:`merge`."""
-        values = self._room[: self._count]
-        stamps = self._room_stamps[: self._count]
+        stamps, values = self._room_stamps[: self._count], self._room[: self._count]
         return ImuSamples(stamps, values[:, :4], values[:, 4:7], values[:, 7:])
-
-    @property
-    def stamps(self) -> IntArray:
-        """(N,) nanoseconds, ascending; a view like ``samples``."""
-        return self._room_stamps[: self._count]
 
     def add(self, stamps: IntArray, values: FloatArray) -> None:
         """Keep samples, in any order, for the next :meth:`merge`.
@@ -99,10 +93,8 @@ class SampleStore:
     def merge(self) -> tuple[int, int] | None:
         """Sort in what was added.
 
-        Returns
-        -------
-        Index from which on samples have changed, and the stamp of the earliest new sample; None if
-        there was nothing new.
+        The answer is the index from which on samples have changed and the stamp of the earliest new
+        sample; None if there was nothing new.
         """
         if not self._waiting:
             return None
@@ -111,9 +103,10 @@ class SampleStore:
         self._waiting.clear()
         earliest = int(stamps.min())
         # Nothing before this index changes; as a rule the index is the end.
-        at = int(np.searchsorted(self.stamps, earliest))
+        old = self.samples.stamps
+        at = int(np.searchsorted(old, earliest))
         # The old samples first: of equal stamps a stable sort then keeps the first to come.
-        stamps = np.concatenate([self.stamps[at:], stamps])
+        stamps = np.concatenate([old[at:], stamps])
         values = np.concatenate([self._room[at : self._count], values])
         order = np.argsort(stamps, kind="stable")
         stamps = stamps[order]
@@ -224,7 +217,7 @@ class ImuBuffer:
         if store.accepts_from is not None and first < store.accepts_from:
             store.accepts_from = None
         # The sample before `first` stays, and the blocks of the filter do not shift.
-        count = int(np.searchsorted(store.stamps, first, side="right")) - 1
+        count = int(np.searchsorted(store.samples.stamps, first, side="right")) - 1
         count -= count % BLOCK
         if count <= 0:
             return
@@ -232,19 +225,19 @@ class ImuBuffer:
         if self._quality.constant:  # then the filter is in use, or may be later
             self._filter.orientations(store.samples)
             self._filter.drop(count)
-        self._quality.drop(store.stamps[: count + 1])
+        self._quality.drop(store.samples.stamps[: count + 1])
         store.drop(count)
 
     def __len__(self) -> int:
         """Number of samples that are held."""
         self._merge()
-        return len(self._store.stamps)
+        return len(self._store.samples.stamps)
 
     @property
     def report(self) -> ImuReport:
         """Numbers of all samples so far, and what was wrong with them."""
         filtered = self._orientations() is not None
-        return self._quality.report(self._store.stamps, self._rest_at_start(), filtered)
+        return self._quality.report(self._store.samples.stamps, self._rest_at_start(), filtered)
 
     def orientation(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar`` (world z up), interpolated between the neighbours.
@@ -252,7 +245,7 @@ class ImuBuffer:
         Beyond the newest sample that one is held, for ``max_gap`` at most (LOAM holds it for
         ever). None before the first sample, inside a longer gap, or without any orientation.
         """
-        quaternions, stamps = self._orientations(), self._store.stamps
+        quaternions, stamps = self._orientations(), self._store.samples.stamps
         if quaternions is None:
             return None
         low = int(np.searchsorted(stamps, stamp - self._gap, side="left"))
@@ -287,11 +280,6 @@ class ImuBuffer:
         (K, 3) rotation vectors of ``at_stamp_R_at(stamp + seconds)``, rad; None if a gap longer
         than ``max_gap`` or the start of the data is in the way, if the end is more than ``max_gap``
         back (until then the last rate is held), or if the lidar turns by more than 3 rad.
-
-        Raises
-        ------
-        InputError
-            If ``seconds`` is no row of finite numbers.
         """
         seconds = as_array(seconds, "seconds", ("K",))
         earliest, latest = seconds.min(initial=0.0), seconds.max(initial=0.0)
@@ -322,12 +310,9 @@ class ImuBuffer:
         """
         quaternions, samples = self._orientations(), self._store.samples
         part = slice(*np.searchsorted(samples.stamps, [first, last + 1]))
-        return ImuSamples(
-            stamps=samples.stamps[part].copy(),
-            orientation=None if quaternions is None else quaternions[part].copy(),
-            gyro=samples.gyro[part].copy(),
-            acceleration=samples.acceleration[part].copy(),
-        )
+        orientation = None if quaternions is None else quaternions[part].copy()
+        gyro, acceleration = samples.gyro[part].copy(), samples.acceleration[part].copy()
+        return ImuSamples(samples.stamps[part].copy(), orientation, gyro, acceleration)
 
     def rest_at(self, stamp: int) -> RestWindow | None:
         """The rest from ``still_seconds`` before ``stamp`` to 0.1 s after it; None if none.
@@ -346,7 +331,7 @@ class ImuBuffer:
     def _rates(self, first: int, last: int, origin: int) -> tuple[FloatArray, FloatArray] | None:
         """Seconds (K,) from ``origin`` and rates (3, K) around a stretch; None if not covered."""
         self._merge()
-        stamps = self._store.stamps
+        stamps = self._store.samples.stamps
         low = int(np.searchsorted(stamps, first, side="right")) - 1
         high = int(np.searchsorted(stamps, last, side="left"))
         if low < 0 or (high == len(stamps) and last - int(stamps[-1]) > self._gap):
@@ -359,14 +344,14 @@ class ImuBuffer:
 
     def _rest_at_start(self) -> RestWindow | None:
         """The rest at the start of all samples, dropped ones included."""
-        if not self._start_is_held or len(self._store.stamps) == 0:
+        if not self._start_is_held or len(self._store.samples.stamps) == 0:
             return self._rest
         return rest_at_start(self._config, self._store.samples)
 
     def _orientations(self) -> FloatArray | None:
         """(N, 4) quaternions of ``world_R_lidar``, NaN where unknown; None if all are."""
         self._merge()
-        if len(self._store.stamps) == 0:
+        if len(self._store.samples.stamps) == 0:
             return None
         samples = self._store.samples
         return samples.orientation if self._quality.measured else self._filter.orientations(samples)
@@ -375,16 +360,13 @@ class ImuBuffer:
 def _checked(samples: ImuSamples) -> tuple[IntArray, FloatArray]:
     """Stamps (N,) and values (N, 10): quaternion (zero where unknown), gyro, acceleration."""
     stamps = as_stamps(samples.stamps, "ImuSamples.stamps")
-    unknown = np.zeros((len(stamps), 4))
-    columns = {
-        "orientation": unknown if samples.orientation is None else np.asarray(samples.orientation),
-        "gyro": np.asarray(samples.gyro),
-        "acceleration": np.asarray(samples.acceleration),
-    }
-    for name, column in columns.items():
-        width = 4 if name == "orientation" else 3
-        check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
-    return stamps, np.hstack(list(columns.values())).astype(np.float64)
+    count, orientation = len(stamps), samples.orientation
+    quaternions = np.zeros((count, 4)) if orientation is None else np.asarray(orientation)
+    gyro, acceleration = np.asarray(samples.gyro), np.asarray(samples.acceleration)
+    check_array(quaternions, "ImuSamples.orientation", (count, 4), "numbers")
+    check_array(gyro, "ImuSamples.gyro", (count, 3), "numbers")
+    check_array(acceleration, "ImuSamples.acceleration", (count, 3), "numbers")
+    return stamps, np.hstack([quaternions, gyro, acceleration]).astype(np.float64)
 
 
 def _rotation_vectors(

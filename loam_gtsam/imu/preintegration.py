@@ -41,7 +41,6 @@ _JUMP = 30.0
 wrong match, a map put elsewhere). An information ten times too large in sigma stays below it."""
 _LEAST_SIGMA = 1e-6
 """rad and m: keeps a covariance regular after a scan that claims more."""
-_ZERO = (0.0, 0.0, 0.0)
 _UNSOLVABLE = RuntimeError, np.linalg.LinAlgError
 """What GTSAM and numpy raise where there is no finite solution."""
 
@@ -68,18 +67,16 @@ class StartSigmas:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Pose and velocity of the next frame by the IMU.
+    """Pose of the next frame by the IMU.
 
     Attributes
     ----------
-    stamp : nanoseconds
     map_T_lidar : predicted pose
     velocity : (3,) m/s of the lidar, map frame
     covariance : (6, 6) of the pose, ``[rotation, translation]``, right perturbation; it has an
         inverse
     """
 
-    stamp: int
     map_T_lidar: gtsam.Pose3
     velocity: FloatArray
     covariance: FloatArray
@@ -123,8 +120,8 @@ class InertialOdometry:
         map_gravity: FloatArray,
         stamp: int,
         map_T_lidar: gtsam.Pose3,
-        velocity: FloatArray | tuple[float, ...] = _ZERO,
-        gyro_bias: FloatArray | tuple[float, ...] = _ZERO,
+        velocity: FloatArray,
+        gyro_bias: FloatArray,
         sigmas: StartSigmas | None = None,
     ) -> None:
         self.config = config
@@ -149,12 +146,7 @@ class InertialOdometry:
         self._start_at(state, map_T_lidar, velocity)
 
     def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
-        """Pose at ``stamp``, from the newest frame and the samples since.
-
-        Parameters
-        ----------
-        stamp : nanoseconds
-        samples : in lidar axes, finite, from ``state.stamp`` or before to ``stamp`` or after
+        """Pose at ``stamp``, nanoseconds, from the newest frame and the samples since, lidar axes.
 
         Raises
         ------
@@ -168,7 +160,6 @@ class InertialOdometry:
         lever = np.cross(frame.rate - self.state.gyro_bias, self._lidar_T_imu.translation())
         map_T_imu = frame.predicted.map_T_imu
         prediction = Prediction(
-            stamp,
             map_T_imu.compose(self._lidar_T_imu.inverse()),
             frame.predicted.velocity - map_T_imu.rotation().matrix() @ lever,
             self._to_lidar @ frame.predicted.covariance[POSE, POSE] @ self._to_lidar.T,
@@ -207,8 +198,7 @@ class InertialOdometry:
             with np.errstate(over="ignore", invalid="ignore"):
                 expected = rows @ covariance @ rows.T + np.eye(len(rows))
             if not _has_inverse(expected):
-                self._start(predicted, 1)
-                return
+                return self._start(predicted, 1)
             if surprise @ np.linalg.solve(expected, surprise) > _JUMP**2:
                 known = _updated(covariance, rows, expected)
                 # A velocity that was wrong looks like this too: it is free along the jump, and
@@ -217,8 +207,7 @@ class InertialOdometry:
                 jump = measured.rotation().matrix() @ error[3:] / seconds
                 free = predicted.covariance[VELOCITY, VELOCITY] + np.outer(jump, jump)
                 moved = replace(predicted, map_T_imu=measured.compose(self._lidar_T_imu))
-                self._start(_uncorrelated(moved, known, free), 1)
-                return
+                return self._start(_uncorrelated(moved, known, free), 1)
             frame.add_scan(self._lidar_T_imu, measured, root)
         try:
             self.state = self._window.append(frame)
@@ -241,10 +230,7 @@ class InertialOdometry:
         self._start_at(state, map_T_lidar, velocity)
 
     def _start_at(
-        self,
-        state: InertialState,
-        map_T_lidar: gtsam.Pose3,
-        velocity: FloatArray | tuple[float, ...],
+        self, state: InertialState, map_T_lidar: gtsam.Pose3, velocity: FloatArray
     ) -> None:
         """Begin a window at a pose of the lidar, with stamp, biases and gravity of ``state``."""
         from_lidar = np.linalg.inv(self._to_lidar)

@@ -86,17 +86,10 @@ class WindowFrame:
 
     Attributes
     ----------
-    number : of the frame
+    number, graph : of the frame, and its factors
     predicted : state by the samples, with its covariance
     rate : (3,) rad/s of the gyro at the end
-    graph : the factors
     scan : arguments of :func:`scan_factor` behind the key; empty if the scan says nothing
-
-    Raises
-    ------
-    SweepError
-        If the samples do not cover the time between, are not in order, have a gap, or add up to a
-        motion without a finite covariance.
     """
 
     def __init__(self, *made_of: *tuple[ImuConfig, int, InertialState, int, ImuSamples]) -> None:
@@ -157,12 +150,12 @@ def _predict(
     # 4 m/s^2 and 0.8 rad/s.
     seen = acceleration - last.acceleration_bias
     acceleration += 0.5 * steps[:, None] * np.cross(gyro - last.gyro_bias, seen)
-    parameters = gtsam.PreintegrationCombinedParams(last.map_gravity)
-    parameters.setGyroscopeCovariance(config.gyro_noise**2 * np.eye(3))
-    parameters.setAccelerometerCovariance(config.acceleration_noise**2 * np.eye(3))
-    parameters.setBiasOmegaCovariance(config.gyro_bias_walk**2 * np.eye(3))
-    parameters.setBiasAccCovariance(config.acceleration_bias_walk**2 * np.eye(3))
-    parameters.setIntegrationCovariance(_INTEGRATION_NOISE**2 * np.eye(3))
+    parameters, unit = gtsam.PreintegrationCombinedParams(last.map_gravity), np.eye(3)
+    parameters.setGyroscopeCovariance(config.gyro_noise**2 * unit)
+    parameters.setAccelerometerCovariance(config.acceleration_noise**2 * unit)
+    parameters.setBiasOmegaCovariance(config.gyro_bias_walk**2 * unit)
+    parameters.setBiasAccCovariance(config.acceleration_bias_walk**2 * unit)
+    parameters.setIntegrationCovariance(_INTEGRATION_NOISE**2 * unit)
     measured = gtsam.PreintegratedCombinedMeasurements(parameters, last.bias)
     for step, turning, force in zip(steps, gyro, acceleration, strict=True):
         measured.integrateMeasurement(force, turning, step)

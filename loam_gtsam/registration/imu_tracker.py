@@ -12,9 +12,9 @@ import numpy as np
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.extrinsic_check import extrinsic_problem
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import InertialOdometry, Prediction
+from loam_gtsam.imu.quality import extrinsic_problem
 from loam_gtsam.imu_prior import (
     blend,
     blend_direction,

@@ -7,7 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.imu import START, part, rot3, turning
+from support.imu import START, as_seen_by, motion, moving, part, rot, rot3, turning
 from support.matches import make_matches
 
 from loam_gtsam.config import ImuConfig, SolverConfig
@@ -20,6 +20,7 @@ from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import ImuSamples, TiltPrior
 
 NOW = START + 500_000_000
+FLAT = gtsam.Rot3()
 FRAME = 100_000_000
 SOLVER = GtsamSolver(SolverConfig(rotation_tolerance_deg=1e-9, translation_tolerance=1e-9))
 
@@ -27,10 +28,14 @@ SOLVER = GtsamSolver(SolverConfig(rotation_tolerance_deg=1e-9, translation_toler
 def tracker_for(measured, level_R_map=None, **config):
     """A tracker that knows up in the map; ``measured`` is the IMU's rotation or its samples."""
     samples = turning(measured) if isinstance(measured, gtsam.Rot3) else measured
-    config = ImuConfig(**config)
-    tracker = ImuTracker(config, ImuBuffer(config, samples))
-    tracker.level = Level(level_R_map or gtsam.Rot3(), 0.0, 0.0, 1, "still")
+    tracker = new_tracker(samples, **config)
+    tracker.level = Level(level_R_map or FLAT, 0.0, 0.0, 1, "still")
     return tracker
+
+
+def new_tracker(samples, **config):
+    config = ImuConfig(**config)
+    return ImuTracker(config, ImuBuffer(config, samples))
 
 
 def solve(rng, map_T_lidar, factors=()):
@@ -163,22 +168,17 @@ def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
     np.testing.assert_allclose(moved, expected, atol=1e-3 * np.linalg.norm(expected))
 
 
-def test_only_sigma_is_a_factor_of_the_solve():
+def test_only_sigma_is_a_factor_of_the_solve_and_off_leaves_the_pose():
     for prior in ("off", "blend", "equivalent"):
         assert tracker_for(rot3(1, 0, 0), prior=prior).factors(NOW) == ()
-    assert len(tracker_for(rot3(1, 0, 0), prior="sigma").factors(NOW)) == 1
+    (factor,) = tracker_for(rot3(1, 0, 0), prior="sigma").factors(NOW)
+    assert list(factor.keys()) == [POSE_KEY]
+    solution, off = with_information(gtsam.Pose3(), np.eye(6)), tracker_for(FLAT, prior="off")
+    assert off.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
+    assert off.blend_tilt(NOW, solution.map_T_lidar) == (solution.map_T_lidar, TiltPrior.NONE)
 
 
 # -- off and blend ---------------------------------------------------------------------------------
-
-
-def test_off_leaves_the_pose():
-    tracker = tracker_for(rot3(5, 0, 0), prior="off")
-    solution = solve(np.random.default_rng(4), gtsam.Pose3())
-    assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.NONE)
-    pose, tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)
-    assert pose is solution.map_T_lidar
-    assert tilt is TiltPrior.NONE
 
 
 def test_blend_is_done_after_the_solve():
@@ -251,16 +251,6 @@ def test_a_steep_pitch_counts_however_well_the_scan_knows_it(steep):
     assert tracker_for(rot3(20, 84.0, 0)).add_tilt(NOW, below)[1] is TiltPrior.EQUIVALENT
 
 
-@pytest.mark.parametrize("prior", ["equivalent", "blend"])
-def test_below_85_degrees_it_is_the_mode_itself(prior):
-    tracker = tracker_for(rot3(20, 84.0, 0), prior=prior)
-    solution = solve(np.random.default_rng(6), gtsam.Pose3(rot3(20, 84.5, 50), np.ones(3)))
-    tilt = tracker.add_tilt(NOW, solution)[1]
-    if prior == "blend":
-        tilt = tracker.blend_tilt(NOW, solution.map_T_lidar)[1]
-    assert tilt == prior
-
-
 def test_nothing_jumps_where_the_modes_take_turns():
     """A lidar that pitches through 85 degrees, IMU 0.2 degrees off: steps stay small."""
     information = 1e6 * np.eye(6)
@@ -297,9 +287,7 @@ def test_in_a_gap_the_prior_is_dropped(prior, gap):
 
 def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_it():
     samples = turning(rot3(4, 3, 0), seconds=2.0)
-    late = part(samples, samples.stamps >= NOW + FRAME)
-    config = ImuConfig()
-    tracker = ImuTracker(config, ImuBuffer(config, late))
+    tracker = new_tracker(part(samples, samples.stamps >= NOW + FRAME))
     assert close(tracker.first_pose(NOW), gtsam.Pose3())
     solution = solve(np.random.default_rng(8), gtsam.Pose3())
     assert tracker.add_tilt(NOW, solution) == (solution, TiltPrior.DROPPED)
@@ -320,8 +308,7 @@ def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_
 @pytest.mark.parametrize("tilt", [(4, -3), (180, 0), (-100, 60), (20, 90), (0, -90)])
 def test_the_first_pose_is_level_at_the_origin(tilt):
     attitude = rot3(*tilt, 77)
-    config = ImuConfig()
-    pose = ImuTracker(config, ImuBuffer(config, turning(attitude))).first_pose(NOW)
+    pose = new_tracker(turning(attitude)).first_pose(NOW)
     np.testing.assert_allclose(pose.rotation().matrix()[2], attitude.matrix()[2], atol=1e-9)
     np.testing.assert_array_equal(pose.translation(), np.zeros(3))
     if abs(tilt[1]) < 90:
@@ -332,9 +319,7 @@ def test_the_first_pose_is_level_at_the_origin(tilt):
 @pytest.mark.parametrize("given", [None, gtsam.Pose3(rot3(30, 10, 90), np.ones(3))])
 def test_a_map_that_is_not_levelled_knows_up_too(level, given):
     """With a start of the user's own, that one counts."""
-    samples = turning(rot3(4, -3, 77))
-    config = ImuConfig(level=level)
-    tracker = ImuTracker(config, ImuBuffer(config, samples))
+    tracker = new_tracker(turning(rot3(4, -3, 77)), level=level)
     pose = tracker.first_pose(NOW, given)
     if given is not None:
         assert pose is given
@@ -346,9 +331,7 @@ def test_a_map_that_is_not_levelled_knows_up_too(level, given):
 
 @pytest.mark.parametrize(("rate", "bias"), [(0.0, 0.01), (0.3, 0.0)])
 def test_a_rest_at_the_start_gives_the_bias_of_the_gyro(rate, bias):
-    samples = turning(rot3(0, 0, 0), rate=(0, 0, rate), bias=(0, 0, bias))
-    config = ImuConfig()
-    tracker = ImuTracker(config, ImuBuffer(config, samples))
+    tracker = new_tracker(turning(FLAT, rate=(0, 0, rate), bias=(0, 0, bias)))
     tracker.first_pose(NOW)
     np.testing.assert_allclose(tracker.buffer.gyro_bias, [0, 0, bias], atol=1e-12)
     assert tracker.level.source == ("moving" if rate else "still")
@@ -366,9 +349,7 @@ def frames(rate, count):
 
 
 def turning_tracker(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):
-    config = ImuConfig()
-    samples = turning(rot3(0, 0, 0), seconds=seconds, rate=rate, bias=bias)
-    return ImuTracker(config, ImuBuffer(config, samples))
+    return new_tracker(turning(FLAT, seconds=seconds, rate=rate, bias=bias))
 
 
 def test_the_bias_of_the_gyro_is_learnt():
@@ -408,10 +389,8 @@ def test_how_much_gyro_and_scan_may_differ(degrees, agrees):
     """At rest 0.3 degrees a frame; half of the turn more when turning."""
     for turn in (0.0, 4.0):
         by_scan = np.radians([0.0, 0.0, turn])
-        config = ImuConfig()
         off = by_scan + np.radians([0.0, 0.0, degrees + 0.5 * turn])
-        samples = turning(rot3(0, 0, 0), seconds=3.0, rate=tuple(off / 0.1))
-        tracker = ImuTracker(config, ImuBuffer(config, samples))
+        tracker = turning_tracker(tuple(off / 0.1), seconds=3.0)
         poses = frames(by_scan / 0.1, 6)
         for last, now in pairwise(poses):
             tracker.compare_gyro(last, now)
@@ -432,9 +411,18 @@ def test_frames_that_cannot_be_compared_teach_nothing():
     assert tracker.buffer.gyro_bias.any()
 
 
-def test_factors_are_on_the_pose_of_the_frame():
-    (factor,) = tracker_for(rot3(1, 0, 0), prior="sigma").factors(NOW)
-    assert list(factor.keys()) == [POSE_KEY]
+def test_the_check_of_the_mounting_sees_frames_whose_samples_are_forgotten():
+    tracker = new_tracker(as_seen_by(moving(6.0), rot(0, 0, 90)))
+    stamps = NOW + FRAME * np.arange(50)
+    rotations = motion((stamps - START) * 1e-9)[0].as_matrix()
+    poses = [gtsam.Pose3(gtsam.Rot3(rotation), np.zeros(3)) for rotation in rotations]
+    for last, now in pairwise(zip(stamps.tolist(), poses, strict=True)):
+        tracker.compare_gyro(last, now)
+    tracker.buffer.forget_old(NOW + 120 * 10**9)
+    assert len(tracker.buffer) < 200
+    assert "[0, 0, 90]" in tracker.mounting_problem
+    tracker.reset()
+    assert tracker.mounting_problem == ""
 
 
 # -- pre-integration -------------------------------------------------------------------------------
@@ -451,7 +439,7 @@ def accelerating(acceleration, seconds=2.0):
 def at(frame, acceleration):
     seconds = frame * FRAME * 1e-9
     along = seconds + 0.5 * acceleration * seconds**2
-    return NOW + frame * FRAME, gtsam.Pose3(gtsam.Rot3(), np.array([along, 0.0, 0.0]))
+    return NOW + frame * FRAME, gtsam.Pose3(FLAT, np.array([along, 0.0, 0.0]))
 
 
 def observed(tracker, frames, acceleration, information):
@@ -482,7 +470,7 @@ def test_where_the_scan_says_nothing_the_prediction_runs_on_and_says_so():
     for last, now in pairwise(range(7, 14)):
         predicted = tracker.predict(at(now, 2.0)[0])
         sigmas.append(np.sqrt(predicted.covariance[3, 3]))
-        wrong = at(now, 2.0)[1].compose(gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0])))
+        wrong = at(now, 2.0)[1].compose(gtsam.Pose3(FLAT, np.array([3.0, 0.0, 0.0])))
         tracker.observe(at(last, 2.0), (at(now, 2.0)[0], wrong), blind)
     predicted = tracker.predict(at(14, 2.0)[0])
     off = at(14, 2.0)[1].localCoordinates(predicted.map_T_lidar)[3]

@@ -285,17 +285,12 @@ def test_a_direction_without_information_is_free():
     assert np.linalg.eigvalsh(knows)[0] < 1e-6 * np.linalg.eigvalsh(knows)[1]
 
 
-@pytest.mark.parametrize("largest", [1e-4, 1.0, 1e8])
+@pytest.mark.parametrize("largest", [0.0, 1e-4, 1.0, 1e8])
 def test_no_information_is_a_share_of_the_largest_whatever_its_unit(largest):
     information = largest * np.diag([0.0, 1e-3, 1e-4, 1e-5, 1e-6, 1.0])
     expected = largest * np.diag([1e-12, 1e-3])
-    np.testing.assert_allclose(tilt_information(information, FLAT), expected, rtol=1e-9)
-
-
-def test_a_scan_that_says_nothing_at_all_is_no_error():
-    knows = tilt_information(np.zeros((6, 6)), FLAT)
-    assert np.isfinite(knows).all()
-    assert np.abs(knows).max() < 1e-300
+    found = tilt_information(information, FLAT)
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-300)
 
 
 # -- steep -----------------------------------------------------------------------------------------

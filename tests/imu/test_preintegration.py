@@ -462,14 +462,6 @@ def test_a_disagreement_within_reason_does_not():
     assert odo.restarts == 0
 
 
-def test_a_start_at_unknown_speed():
-    odo = odometry()  # velocity zero, to 0.5 m/s
-    found = drive(odo, 10, 30.0)
-    assert odo.restarts == 1
-    np.testing.assert_allclose(found.map_T_lidar.translation(), [30.0, 0.0, 0.0], atol=0.01)
-    np.testing.assert_allclose(odo.state.velocity, [30.0, 0.0, 0.0], atol=0.05)
-
-
 def test_a_graph_that_cannot_be_solved_begins_anew():
     # Noise so small that no digits are left for the scan.
     tiny = dict.fromkeys(

@@ -30,8 +30,7 @@ _EXACT = 1e-12
 
 def roll_pitch(rotation: gtsam.Rot3) -> FloatArray:
     """(2,) rad."""
-    angles: FloatArray = np.array(rotation.rpy()[:2], dtype=np.float64)
-    return angles
+    return np.array(rotation.rpy()[:2], dtype=np.float64)
 
 
 def roll_pitch_jacobian(rotation: gtsam.Rot3) -> FloatArray:
@@ -131,8 +130,7 @@ def equivalent_prior(
     ----------
     level_R_lidar : the scan's solution
     information : (6, 6) of the scan there, tangent order of the package
-    measured : ``world_R_lidar`` of the IMU, z up
-    weight : w, at least 0 and below 1
+    measured, weight : as in :func:`blend`; the weight is below 1
     """
     goal = blended_angles(level_R_lidar, measured, weight)
     moved = np.zeros(3)
@@ -178,12 +176,8 @@ def gravity_factor(
 ) -> gtsam.AttitudeFactorPose3:
     """The IMU's gravity direction as a factor on the pose ``key``; free of yaw, fit for any tilt.
 
-    Parameters
-    ----------
-    key : of a Pose3 ``map_T_lidar``
-    measured : ``world_R_lidar`` of the IMU, z up
-    sigma : standard deviation of the direction, rad
-    map_up : (3,) unit, see :attr:`~loam_gtsam.imu.level.Level.map_up`
+    ``sigma`` is the standard deviation of the direction, rad; the rest as in
+    :func:`blend_direction`.
     """
     noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
     lidar_up = gtsam.Unit3(np.array(measured.matrix()[2]))

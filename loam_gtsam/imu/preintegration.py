@@ -124,8 +124,8 @@ class InertialOdometry:
         gyro_bias: FloatArray,
         sigmas: StartSigmas | None = None,
     ) -> None:
-        self.config = config
-        self._sigmas = sigmas = sigmas or StartSigmas()
+        self.config, self._sigmas = config, sigmas or StartSigmas()
+        sigmas = self._sigmas
         gravity = as_vector(map_gravity, "map_gravity")
         size = float(np.linalg.norm(gravity))
         if size < 1.0:
@@ -175,9 +175,9 @@ class InertialOdometry:
         Parameters
         ----------
         measured : ``map_T_lidar`` at the optimum of the scan alone
-        information : (6, 6) of the tangent at ``measured``, positive semi-definite: nothing is
-            inverted, so that it may be singular; zero if the scan says nothing. It is believed;
-            errors that last over frames are to be allowed for.
+        information : (6, 6) of the tangent there, positive semi-definite; singular or zero where
+            the scan says nothing. It is believed; errors that last over frames are to be allowed
+            for.
 
         Raises
         ------
@@ -259,10 +259,7 @@ def _uncorrelated(state: InertialState, pose: FloatArray, velocity: FloatArray) 
 
 
 def _updated(covariance: FloatArray, rows: FloatArray, expected: FloatArray) -> FloatArray:
-    """Covariance (6, 6) after measurements of unit noise with the Jacobian ``rows`` (M, 6).
-
-    ``expected`` is the covariance (M, M) of the innovation.
-    """
+    """Covariance (6, 6) after measurements of unit noise with Jacobian (M, 6) ``rows``."""
     gain = np.linalg.solve(expected, rows @ covariance).T
     left = np.eye(6) - gain @ rows
     updated: FloatArray = left @ covariance @ left.T + gain @ gain.T

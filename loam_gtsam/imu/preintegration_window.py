@@ -235,13 +235,7 @@ def scan_factor(
 
 
 def information_root(information: FloatArray) -> FloatArray:
-    """S (M, 6) with ``S' S = information`` (6, 6); M is the rank.
-
-    Raises
-    ------
-    InputError
-        If the information is larger than any scan's, or has a negative eigenvalue beyond rounding.
-    """
+    """S (M, 6) with ``S' S = information`` (6, 6), of rank M; InputError if there is none."""
     largest = np.abs(information).max()
     if largest > _MOST:
         raise InputError(
@@ -305,10 +299,8 @@ class Window:
     def append(self, frame: WindowFrame) -> InertialState:
         """Add a frame behind the newest one, solve, and return its state.
 
-        Raises
-        ------
-        RuntimeError, numpy.linalg.LinAlgError
-            If there is no finite solution; the window is of no use then.
+        A RuntimeError or numpy's LinAlgError says that there is no finite solution; the window is
+        of no use then.
         """
         self.newest = frame.number
         self._frames.append(frame)

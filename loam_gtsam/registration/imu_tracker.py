@@ -47,6 +47,9 @@ information's over 10 to 50 frames)."""
 class ImuTracker:
     """The IMU's part in mapping, and what it has learnt from the frames so far.
 
+    Two sweeps that are compared, ``last`` and ``now``, are the stamps and the solved poses of their
+    middles.
+
     Parameters
     ----------
     config : section ``imu``
@@ -58,8 +61,7 @@ class ImuTracker:
     """
 
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
-        self.config = config
-        self.buffer = buffer
+        self.config, self.buffer = config, buffer
         self._given_bias = buffer.gyro_bias
         self.reset()
 
@@ -157,10 +159,7 @@ class ImuTracker:
         return blend(map_T_lidar, measured, weight, level.level_R_map), TiltPrior.BLEND
 
     def compare_gyro(self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3]) -> None:
-        """Learn the gyro's bias from two solved poses; distrust a gyro that contradicts them.
-
-        ``last`` and ``now`` are stamps and poses of the middles of two sweeps.
-        """
+        """Learn the gyro's bias from two solved sweeps; distrust a gyro that contradicts them."""
         turned = self.buffer.rotation_between(last[0], now[0])
         if turned is None or now[0] <= last[0]:  # sweeps of unlike length
             return
@@ -227,10 +226,7 @@ class ImuTracker:
     ) -> None:
         """Take in what the scan alone said about a moment, for the predictions to come.
 
-        Parameters
-        ----------
-        last, now : stamps and poses of the middles of two sweeps, both solved
-        information : (6, 6) of the second, zero along directions in which the scan is not believed
+        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed.
         """
         stamp, pose = now
         if not self.config.preintegration or self.level is None or stamp <= last[0]:

@@ -346,7 +346,7 @@ def run(
         then, with ``error`` set, instead of raising
     extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
     loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
-    observe : e.g. :func:`loam_gtsam.view.clouds.record`, for a bag
+    observe : e.g. :func:`loam_gtsam.view.observers.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
         needs the usual ``if __name__ == "__main__":``.

@@ -31,7 +31,7 @@ from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.pipeline import Observer, Pipeline, run
 from loam_gtsam.types import DatasetError, MapUpdate, Sweep
 from loam_gtsam.view import plots
-from loam_gtsam.view.observers import LastFrame, watch
+from loam_gtsam.view.observers import LastFrame, record, watch
 
 CHECKPOINT = "checkpoint"
 """Folder among the results, until they are complete."""
@@ -115,7 +115,6 @@ def _observers(options: RunOptions, config: Config, last: LastFrame) -> Iterator
             observers.append(watch(stack.enter_context(viewer)))
         if options.bag is not None:
             from loam_gtsam.ros.bag_writer import BagWriter
-            from loam_gtsam.view.clouds import record
 
             bag = BagWriter(options.bag, config.bag, overwrite=options.overwrite)
             observers.append(record(stack.enter_context(bag)))

@@ -1,6 +1,6 @@
 """A run as a ROS bag with LOAM's topics, written frame by frame; ROS itself is not needed.
 
-What it holds is said in :mod:`loam_gtsam.ros.frame_messages`.
+What it holds is said in :mod:`loam_gtsam.ros.messages`.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rosbags import rosbag1, rosbag2
 
 from loam_gtsam.config import BagConfig
 from loam_gtsam.io.atomic import ClosingWriter
-from loam_gtsam.ros.frame_messages import TYPES, FrameMessages, Points
+from loam_gtsam.ros.messages import TYPES, FrameMessages, Points
 from loam_gtsam.types import MapUpdate, OutputError
 
 _ROS2_VERSION: Literal[8] = 8

@@ -1,6 +1,6 @@
 """A live run without ROS: messages come in as they are measured, poses come out.
 
-The queues, what waits for what, and what is dropped when the mapper is too slow are here; a node
+Here are the queues, what waits for what, and what is dropped when the mapper is too slow; the node
 only hands messages over (:mod:`loam_gtsam.ros.node`).
 """
 
@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -23,10 +24,11 @@ from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.pipeline import Observer, Pipeline
+from loam_gtsam.registration.odometry import Odometry
+from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
-from loam_gtsam.ros.live_imu import LiveImu
+from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checked_stamp
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
-from loam_gtsam.ros.live_sweeps import ReadySweep, SweepDecoder, checked_stamp
 from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate, Sweep
 
 _POLL = 0.02
@@ -66,6 +68,9 @@ class LiveMapper:
     If nothing is dropped and no sweep waits in vain, poses and map are those of
     :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
 
+    Nothing here grows with the run but what the pipeline keeps: the map, and keyframes if loops are
+    looked for.
+
     Parameters
     ----------
     config : section ``live`` says how long the queues are
@@ -73,13 +78,14 @@ class LiveMapper:
     features : topics of LOAM's front end that will come, in place of clouds
     axes : of those, see :class:`loam_gtsam.datasets.bags.loam_topics.LoamTopicsDataset`
     clouds : decodes the clouds; None takes a new one without options
-    observe : called after each sweep, e.g. to publish it; its time counts as such
-    extra_factors, loop_closer : see :func:`loam_gtsam.pipeline.run`
+    observe : called after each sweep, e.g. to publish it; its time counts as publishing
+    solver, odometry, extra_factors, loop_closer : see :class:`loam_gtsam.pipeline.Pipeline`
     clock : nanoseconds, never going back
 
     Attributes
     ----------
-    pipeline : the mapper and what is around it; not to be touched while ``step`` runs
+    pipeline : the mapper and what is around it; not to be touched while ``step`` runs, and another
+        one after :meth:`reset`
 
     Raises
     ------
@@ -96,6 +102,8 @@ class LiveMapper:
         axes: Literal["auto", "lidar", "loam"] = "auto",
         clouds: CloudStream | None = None,
         observe: Observer | None = None,
+        solver: ScanSolver | None = None,
+        odometry: Odometry | None = None,
         extra_factors: ExtraFactors | None = None,
         loop_closer: LoopCloser | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
@@ -108,10 +116,15 @@ class LiveMapper:
         self._imu: LiveImu | None = None
         if imu and config.imu.enabled:
             self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
-        buffer = None if self._imu is None else self._imu.buffer
-        self.pipeline = Pipeline(
-            config, imu=buffer, extra_factors=extra_factors, loop_closer=loop_closer
+        self._new_pipeline = partial(
+            Pipeline,
+            config,
+            solver=solver,
+            odometry=odometry,
+            extra_factors=extra_factors,
+            loop_closer=loop_closer,
         )
+        self.pipeline = self._new_pipeline(imu=None if self._imu is None else self._imu.buffer)
         self._matcher = StampMatcher(features)
         self._features = frozenset(features)
         self._observe, self._clock = observe, clock
@@ -131,7 +144,7 @@ class LiveMapper:
 
         Parameters
         ----------
-        message : as rosbags, rclpy or rospy hand it out
+        message : as rosbags or rclpy hand it out
         received : nanoseconds of the clock; None is now
 
         Raises
@@ -218,7 +231,7 @@ class LiveMapper:
                     return None
                 received, content = self._queue.popleft()
             try:
-                self._current = self._decoder.ready(received, content)
+                self._current = self._decoder.decode(received, content)
             except DatasetError as error:
                 self.fault(str(error))
         current = self._current
@@ -227,8 +240,21 @@ class LiveMapper:
         self._current = None
         return self._map(current)
 
+    def reset(self) -> None:
+        """Begin a new run, e.g. after :attr:`loam_gtsam.types.SweepFault.CLOCK_SET_BACK`.
+
+        Map, motion, loops and IMU samples are forgotten; how messages are read, and the counts of
+        the report, are kept. Messages that wait are the first of the new run. To be called from
+        ``observe``, or between two steps, by the thread that maps.
+        """
+        self.pipeline.reset()  # parts of the user's own forget too
+        if self._imu is not None:
+            self._imu.forget()
+        self.pipeline = self._new_pipeline(imu=None if self._imu is None else self._imu.buffer)
+        self._no_level = False
+
     def wait(self, seconds: float) -> None:
-        """Until a message comes, but not longer than this."""
+        """Wait until a message comes, but not longer than this."""
         self._news.wait(seconds)
 
     def work(self, stop: threading.Event) -> None:

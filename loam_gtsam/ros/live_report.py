@@ -70,17 +70,15 @@ class LiveReport:
         if self.without_imu:
             parts.append(f"{self.without_imu} mapped before their IMU samples came")
         parts.append(f"{self.waiting} waiting (most: {self.deepest})")
-        parts += [
-            f"{stage} {1e3 * took.median:.0f} ms (95 %: {1e3 * took.p95:.0f}, worst: "
-            f"{1e3 * took.worst:.0f})"
-            for stage, took in self.latency.items()
-        ]
+        for stage, took in self.latency.items():
+            median, p95, worst = (f"{1e3 * s:.0f}" for s in (took.median, took.p95, took.worst))
+            parts.append(f"{stage} {median} ms (95 %: {p95}, worst: {worst})")
         return "; ".join(parts)
 
 
 @dataclass(slots=True)
 class LiveLog:
-    """Counts while the run goes on; not locked."""
+    """Counts while the run goes on, bounded however long that is; not locked."""
 
     received: Counter[str] = field(default_factory=Counter)
     dropped: Counter[str] = field(default_factory=Counter)
@@ -104,13 +102,9 @@ class LiveLog:
         """As it is now, to keep."""
         latency = {}
         if self._seconds:
-            columns = np.percentile(
-                np.array(self._seconds), [50, 95, 100], axis=0, method="inverted_cdf"
-            ).T
-            latency = {
-                stage: Latency(*column)
-                for stage, column in zip(STAGES, columns.tolist(), strict=True)
-            }
+            seconds = np.array(self._seconds)
+            ranks = np.percentile(seconds, [50, 95, 100], axis=0, method="inverted_cdf")
+            latency = dict(zip(STAGES, map(Latency, *ranks.tolist()), strict=True))
         return LiveReport(
             received=dict(self.received),
             dropped=dict(self.dropped),

@@ -1,11 +1,20 @@
-"""ROS messages of LOAM's outputs, for ROS 1 and ROS 2, without ROS.
+"""The ROS messages of a run, frame by frame, for a bag or a live node. ROS itself is not needed.
 
+| topic | type | when |
+|---|---|---|
+| ``/tf`` | ``tf2_msgs/TFMessage`` | every frame |
+| ``/aft_mapped_to_init`` | ``nav_msgs/Odometry`` | every frame |
+| ``/velodyne_cloud_registered`` | ``sensor_msgs/PointCloud2`` | every frame with a sweep |
+| ``/laser_cloud_surround`` | ``sensor_msgs/PointCloud2`` | every fifth frame |
+| ``/aft_mapped_path`` | ``nav_msgs/Path`` | whenever the path has grown by a tenth |
+
+Names, types and frames are those of LOAM (J. Zhang and S. Singh) and A-LOAM; the path is A-LOAM's.
 Axes are those of the map and of the lidar (x forward, y left, z up), as in A-LOAM.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gtsam
@@ -13,14 +22,27 @@ import numpy as np
 from numpy.typing import NDArray
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from loam_gtsam.config import BagConfig
 from loam_gtsam.geometry import symmetric
-from loam_gtsam.types import FloatArray, MapUpdate, OutputError, check_array
+from loam_gtsam.types import ConfigError, FloatArray, MapUpdate, OutputError, check_array
 
-ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-PATH_TYPE = "nav_msgs/msg/Path"
-CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
-TF_TYPE = "tf2_msgs/msg/TFMessage"
+TF = "/tf"
+ODOMETRY = "/aft_mapped_to_init"
+REGISTERED = "/velodyne_cloud_registered"
+SURROUND = "/laser_cloud_surround"
+PATH = "/aft_mapped_path"
+TYPES = {
+    TF: "tf2_msgs/msg/TFMessage",
+    ODOMETRY: "nav_msgs/msg/Odometry",
+    REGISTERED: "sensor_msgs/msg/PointCloud2",
+    SURROUND: "sensor_msgs/msg/PointCloud2",
+    PATH: "nav_msgs/msg/Path",
+}
+"""Topic -> type of its messages."""
 
+_PATH_STEP = 10
+"""Poses by which the path grows at least before it is written again; later a tenth of its length,
+so that all path messages together are eleven times the last one, not its square."""
 _NS = 10**9
 _LAST_SECOND = 2**31
 """ROS 2 counts seconds in an int32; ROS 1, in a uint32, reaches twice as far."""
@@ -31,8 +53,8 @@ _UNKNOWN = np.zeros(36)
 _UNKNOWN[0] = -1.0
 _UNKNOWN.flags.writeable = False
 
-StampedPose = tuple[int, gtsam.Pose3]
-"""Nanoseconds and ``map_T_lidar``."""
+Points = NDArray[np.floating]
+"""(N, 4) metres in the map frame, and the intensity."""
 
 
 def ros_covariance(covariance: FloatArray, map_T_lidar: gtsam.Pose3) -> FloatArray:
@@ -53,93 +75,140 @@ def ros_covariance(covariance: FloatArray, map_T_lidar: gtsam.Pose3) -> FloatArr
     """
     if not np.isfinite(covariance).all():
         return _UNKNOWN
-    rotation = map_T_lidar.rotation().matrix()
     turn = np.zeros((6, 6))
-    turn[:3, 3:] = turn[3:, :3] = rotation
-    # to the last bit: consumers may check
+    turn[:3, 3:] = turn[3:, :3] = map_T_lidar.rotation().matrix()
+    # Symmetric to the last bit: whoever reads the message may check.
     return symmetric(turn @ covariance @ turn.T).reshape(36)
 
 
-class Messages:
-    """Builds messages of one ROS version and serialises them.
+class FrameMessages:
+    """Serialised messages of one frame after the other.
+
+    The poses of all frames are kept, for the path: 14 MB in an hour at 10 Hz.
 
     Parameters
     ----------
-    ros1 : ROS 1 instead of ROS 2
-    map_frame, lidar_frame : names of the frames
+    config : names of the frames, and which clouds to make
+    ros1 : serialise for ROS 1 bags instead of ROS 2
+
+    Attributes
+    ----------
+    store : the types, as rosbags has them
+
+    Raises
+    ------
+    ConfigError
+        If the names of the frames are empty or equal.
     """
 
-    def __init__(self, ros1: bool, map_frame: str, lidar_frame: str) -> None:
-        # All of these are the same from Humble to today.
+    def __init__(self, config: BagConfig, *, ros1: bool = False) -> None:
+        if config.map_frame == config.lidar_frame or not (config.map_frame and config.lidar_frame):
+            raise ConfigError(
+                "bag.map_frame, bag.lidar_frame: expected two different names, got "
+                f"{config.map_frame!r} and {config.lidar_frame!r}"
+            )
+        # All of these types are the same from Humble to today.
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         if ros1:  # not part of that store
             definition = "geometry_msgs/TransformStamped[] transforms\n"
-            self.store.register(get_types_from_msg(definition, TF_TYPE))
-        self._ros1, self._map, self._lidar = ros1, map_frame, lidar_frame
+            self.store.register(get_types_from_msg(definition, TYPES[TF]))
+        self._config, self._ros1 = config, ros1
+        self._poses: list[tuple[int, gtsam.Pose3]] = []
+        self._path_length = 0
 
-    def odometry(self, update: MapUpdate) -> bytes:
-        """``nav_msgs/Odometry``: the pose, and the twist in the lidar's own axes."""
+    def frame(
+        self,
+        update: MapUpdate,
+        cloud: Callable[[], Points | None] | None = None,
+        surround: Callable[[], Points] | None = None,
+    ) -> Iterator[tuple[str, bytes]]:
+        """Topic and message, the pose first; each is made when its turn comes.
+
+        A frame with a bad stamp has none. One whose messages are not all asked for does not count.
+
+        Parameters
+        ----------
+        update : of the frame
+        cloud : gives the de-skewed points of the sweep, in the map frame
+        surround : gives the map points around the sensor; called when they are due
+
+        Raises
+        ------
+        OutputError
+            If a message cannot say the stamp.
+        InputError
+            If a cloud is not (N, 4).
+        """
+        if not update.status.has_pose:
+            return
+        config = self._config
+        yield TF, self._transform(update)
+        yield ODOMETRY, self._odometry(update)
+        points = cloud() if cloud is not None and config.registered else None
+        if points is not None:
+            yield REGISTERED, self._cloud(update.stamp, points)
+        every = config.surround_every
+        if surround is not None and every and len(self._poses) % every == 0:
+            yield SURROUND, self._cloud(update.stamp, surround())
+        self._poses.append((update.stamp, update.map_T_lidar))
+        if len(self._poses) - self._path_length >= max(_PATH_STEP, self._path_length // 10):
+            yield from self.path()
+
+    def path(self) -> Iterator[tuple[str, bytes]]:
+        """The whole path, if it has grown since it was last made."""
+        if len(self._poses) > self._path_length:
+            self._path_length = len(self._poses)
+            yield PATH, self._path(self._poses)
+
+    def _odometry(self, update: MapUpdate) -> bytes:
+        """The pose, and the twist in the lidar's own axes."""
         pose, (turn, velocity) = update.map_T_lidar, np.split(update.twist, 2)
-        message = self._make(
-            ODOMETRY_TYPE,
+        twist = self._make(
+            "geometry_msgs/msg/Twist",
+            linear=self._xyz("Vector3", velocity),
+            angular=self._xyz("Vector3", turn),
+        )
+        return self._serialised(
+            ODOMETRY,
             header=self._header(update.stamp),
-            child_frame_id=self._lidar,
+            child_frame_id=self._config.lidar_frame,
             pose=self._make(
                 "geometry_msgs/msg/PoseWithCovariance",
                 pose=self._pose(pose),
                 covariance=ros_covariance(update.covariance, pose),
             ),
             twist=self._make(
-                "geometry_msgs/msg/TwistWithCovariance",
-                twist=self._make(
-                    "geometry_msgs/msg/Twist",
-                    linear=self._xyz("Vector3", velocity),
-                    angular=self._xyz("Vector3", turn),
-                ),
-                covariance=_UNKNOWN,
+                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=_UNKNOWN
             ),
         )
-        return self._serialise(message, ODOMETRY_TYPE)
 
-    def transform(self, update: MapUpdate) -> bytes:
-        """``tf2_msgs/TFMessage`` with the one transform from the lidar's frame to the map's."""
+    def _transform(self, update: MapUpdate) -> bytes:
+        """The one transform from the lidar's frame to the map's."""
         pose = update.map_T_lidar
         stamped = self._make(
             "geometry_msgs/msg/TransformStamped",
             header=self._header(update.stamp),
-            child_frame_id=self._lidar,
+            child_frame_id=self._config.lidar_frame,
             transform=self._make(
                 "geometry_msgs/msg/Transform",
                 translation=self._xyz("Vector3", pose.translation()),
                 rotation=self._quaternion(pose),
             ),
         )
-        return self._serialise(self._make(TF_TYPE, transforms=[stamped]), TF_TYPE)
+        return self._serialised(TF, transforms=[stamped])
 
-    def path(self, poses: Sequence[StampedPose]) -> bytes:
-        """``nav_msgs/Path`` of one pose at least; its own stamp is that of the last."""
+    def _path(self, poses: Sequence[tuple[int, gtsam.Pose3]]) -> bytes:
+        """One pose at least; the stamp of the path is that of its last pose."""
         stamped = [
             self._make(
                 "geometry_msgs/msg/PoseStamped", header=self._header(stamp), pose=self._pose(pose)
             )
             for stamp, pose in poses
         ]
-        header = self._header(poses[-1][0])
-        return self._serialise(self._make(PATH_TYPE, header=header, poses=stamped), PATH_TYPE)
+        return self._serialised(PATH, header=self._header(poses[-1][0]), poses=stamped)
 
-    def cloud(self, stamp: int, points_map: NDArray[np.floating]) -> bytes:
-        """``sensor_msgs/PointCloud2`` with float32 fields x, y, z, intensity.
-
-        Parameters
-        ----------
-        stamp : nanoseconds
-        points_map : (N, 4): metres in the map frame, and the intensity
-
-        Raises
-        ------
-        InputError
-            If the shape is wrong.
-        """
+    def _cloud(self, stamp: int, points_map: Points) -> bytes:
+        """float32 fields x, y, z, intensity."""
         check_array(points_map, "points_map", ("N", len(_FIELDS)))
         rows = np.ascontiguousarray(points_map, dtype="<f4")
         step = rows.itemsize * len(_FIELDS)
@@ -150,8 +219,8 @@ class Messages:
             )
             for number, name in enumerate(_FIELDS)
         ]  # fmt: skip
-        message = self._make(
-            CLOUD_TYPE,
+        return self._serialised(
+            REGISTERED,
             header=self._header(stamp),
             height=1,
             width=len(rows),
@@ -162,14 +231,14 @@ class Messages:
             data=rows.view(np.uint8).reshape(-1),
             is_dense=bool(np.isfinite(rows).all()),
         )
-        return self._serialise(message, CLOUD_TYPE)
 
     def _make(self, name: str, /, **values: Any) -> Any:
         return self.store.types[name](**values)
 
-    def _serialise(self, message: Any, name: str) -> bytes:
+    def _serialised(self, topic: str, **values: Any) -> bytes:
+        name = TYPES[topic]
         serialise = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
-        return bytes(serialise(message, name))
+        return bytes(serialise(self._make(name, **values), name))
 
     def _header(self, stamp: int) -> Any:
         seconds, rest = divmod(int(stamp), _NS)
@@ -181,7 +250,8 @@ class Messages:
         time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         # ROS 1 publishers count in seq; in a bag nothing depends on it.
         counter = {"seq": 0} if self._ros1 else {}
-        return self._make("std_msgs/msg/Header", **counter, stamp=time, frame_id=self._map)
+        frame = self._config.map_frame
+        return self._make("std_msgs/msg/Header", **counter, stamp=time, frame_id=frame)
 
     def _pose(self, pose: gtsam.Pose3) -> Any:
         return self._make(

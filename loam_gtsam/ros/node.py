@@ -1,79 +1,226 @@
 """The ROS 2 node: ``python -m loam_gtsam.ros --ros-args -p cloud_topic:=/points``.
 
-Everything but subscriptions, publishers and parameters is in :mod:`loam_gtsam.ros.topics`.
+Messages cross the border to ROS as bytes and are read by rosbags, as those of a bag are. So the
+node needs no message package to decode, and what is mapped live and from a bag is the same.
 """
 
 from __future__ import annotations
 
+import logging
+import threading
+from collections.abc import Callable, Mapping
 from functools import partial
 from importlib import import_module
 from typing import Any
 
-try:
-    import rclpy
-    from rclpy.executors import ExternalShutdownException
-    from rclpy.qos import QoSProfile, ReliabilityPolicy
-except ImportError as error:
-    raise ImportError(
-        "loam_gtsam.ros needs rclpy of ROS 2: source /opt/ros/DISTRO/setup.bash first, and use the "
-        "Python of that distribution (3.11 or newer: Jazzy or later)"
-    ) from error
+from loam_gtsam.config import Config, load_config, preset
+from loam_gtsam.datasets.decode.cloud_stream import CloudStream
+from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
+from loam_gtsam.datasets.decode.loam_messages import ODOMETRY as LOAM_ODOMETRY
+from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.io.run_files import write_run
+from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.ros.live import LiveMapper
+from loam_gtsam.ros.messages import ODOMETRY, REGISTERED, TYPES, FrameMessages
+from loam_gtsam.types import ConfigError, MapUpdate, OutputError, Sweep
+from loam_gtsam.view.observers import registered_cloud, surrounding_cloud
 
-from loam_gtsam.ros.frame_messages import TYPES
-from loam_gtsam.ros.topics import PARAMETERS, RosRun
+PARAMETERS: dict[str, Any] = {
+    "cloud_topic": "/points",
+    "imu_topic": "",
+    "loam_topics": False,
+    "full_clouds": True,
+    "axes": "auto",
+    "preset": "default",
+    "config": "",
+    "sensor": "auto",
+    "map_frame": "",
+    "lidar_frame": "",
+    "time_field": "",
+    "time_unit": "",
+    "stamp_is": "",
+    "output": "",
+    "report_every": 10.0,
+}
+"""Parameters of the node with their defaults; an empty text is none. See docs/live.md."""
 
+_CLOUD_TYPE, _IMU_TYPE = TYPES[REGISTERED], "sensor_msgs/msg/Imu"
+_IMU_DEPTH = 1000
+"""IMU messages that ROS keeps while Python is busy."""
 _DEPTH = 10
-"""Messages of a topic that ROS keeps for a slow subscriber."""
+"""Published messages of a topic that ROS keeps for a slow subscriber."""
+
+_log = logging.getLogger(__name__)
 
 
-def connect(node: Any) -> RosRun:
-    """Declare the parameters of a node, subscribe and advertise.
+class LiveNode:
+    """A live run between the subscriptions and publishers of a ROS 2 node.
 
     Parameters
     ----------
-    node : an ``rclpy.node.Node``
+    node : an ``rclpy.node.Node``; the constructor declares its parameters, subscribes, advertises
+    on_error : called when an error ends the thread that maps
 
-    Returns
-    -------
-    RosRun
-        To be started, and stopped when the node ends.
+    Attributes
+    ----------
+    live : maps the sweeps
 
     Raises
     ------
     LoamError
-        If a parameter is wrong.
+        If a parameter is wrong, or the output folder cannot be made.
     """
-    values = {
-        name: node.declare_parameter(name, default).value for name, default in PARAMETERS.items()
-    }
-    publishers = {
-        topic: node.create_publisher(_message_class(kind), topic, _DEPTH)
-        for topic, kind in TYPES.items()
-    }
 
-    def publish(topic: str, message: bytes) -> None:
-        # RTPS pads to words of four bytes, which not every middleware does for serialised messages.
-        publishers[topic].publish(message + bytes(-len(message) % 4))
-
-    run = RosRun(values, publish, ros1=False, on_error=rclpy.try_shutdown)
-    for topic, kind in run.subscriptions.items():
-        # Best effort, for it takes from reliable publishers too.
-        qos = QoSProfile(depth=run.depths[topic], reliability=ReliabilityPolicy.BEST_EFFORT)
-        node.create_subscription(
-            _message_class(kind), topic, partial(run.receive, topic), qos, raw=True
+    def __init__(self, node: Any, on_error: Callable[[], object] = lambda: None) -> None:
+        values = {
+            name: node.declare_parameter(name, default).value
+            for name, default in PARAMETERS.items()
+        }
+        config = config_of(values)
+        self._messages = FrameMessages(config.bag)
+        self._read = self._messages.store.deserialize_cdr
+        self._features: tuple[str, ...] = ()
+        if values["loam_topics"]:
+            self._features = (*REQUIRED, CLOUD) if values["full_clouds"] else REQUIRED
+        self.live = LiveMapper(
+            config,
+            imu=bool(values["imu_topic"]),
+            features=self._features,
+            axes=values["axes"],
+            clouds=CloudStream(
+                time_field=values["time_field"] or None,
+                time_unit=values["time_unit"] or None,
+                stamp_is=values["stamp_is"] or None,
+            ),
+            observe=self._observe,
         )
-    if values["report_every"] > 0.0:
-        logger = node.get_logger()
-        node.create_timer(values["report_every"], lambda: logger.info(str(run.live.report())))
-    return run
+        self._output = make_folder(values["output"]) if values["output"] else None
+        self._updates: list[MapUpdate] = []
+        self._on_error = on_error
+        self._error: Exception | None = None
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._work, name="loam_gtsam", daemon=True)
+        self._publishers = {
+            topic: node.create_publisher(_message_class(kind), topic, _DEPTH)
+            for topic, kind in TYPES.items()
+        }
+        self._subscribe(node, values["cloud_topic"], values["imu_topic"], config.live.queue)
+        if values["report_every"] > 0.0:
+            logger = node.get_logger()
+            node.create_timer(values["report_every"], lambda: logger.info(str(self.live.report())))
+
+    def start(self) -> None:
+        """Begin to map, in a thread of its own."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """End the thread between two sweeps, and write the run if there is a folder for it.
+
+        Raises
+        ------
+        Exception
+            What ended the thread earlier.
+        """
+        self._stop.set()
+        self._thread.join()
+        if self._output is not None and self._updates:
+            result = self.live.pipeline.result(self._updates, error=self._error)
+            write_run(result, self._output, dataset="live")
+        if self._error is not None:
+            raise self._error
+
+    def _subscribe(self, node: Any, cloud: str, imu: str, queue: int) -> None:
+        from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+        kinds = dict.fromkeys(self._features or (cloud,), _CLOUD_TYPE)
+        if self._features:
+            kinds[LOAM_ODOMETRY] = TYPES[ODOMETRY]
+        if imu:
+            kinds[imu] = _IMU_TYPE
+        for topic, kind in kinds.items():
+            # Best effort, for it takes from reliable publishers too.
+            qos = QoSProfile(
+                depth=_IMU_DEPTH if kind == _IMU_TYPE else queue,
+                reliability=ReliabilityPolicy.BEST_EFFORT,
+            )
+            receive = partial(self._receive, topic, kind)
+            node.create_subscription(_message_class(kind), topic, receive, qos, raw=True)
+
+    def _receive(self, topic: str, kind: str, raw: bytes) -> None:
+        try:
+            message = self._read(raw, kind)
+        except Exception as error:  # whatever damage makes it stumble over
+            self.live.fault(f"{topic}: cannot deserialise a {kind}: {type(error).__name__}")
+            return
+        if kind == _IMU_TYPE:
+            self.live.add_imu(message)
+        elif topic in self._features:
+            self.live.add_features(topic, message)
+        else:
+            self.live.add_cloud(message)
+
+    def _work(self) -> None:
+        try:
+            self.live.work(self._stop)
+        except Exception as error:  # handed to the thread that asks to stop
+            self._error = error
+            self._on_error()
+
+    def _observe(self, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+        if self._output is not None:
+            self._updates.append(update)
+        frame = self._messages.frame(
+            update,
+            lambda: registered_cloud(sweep, update, pipeline.mapper),
+            lambda: surrounding_cloud(update, pipeline.mapper),
+        )
+        try:
+            for topic, message in frame:
+                # RTPS pads to words of four bytes, which not every middleware does for bytes.
+                self._publishers[topic].publish(message + bytes(-len(message) % 4))
+        except OutputError as error:
+            _log.warning("not published: %s", error)
+
+
+def config_of(values: Mapping[str, Any]) -> Config:
+    """The configuration that the parameters of a node ask for.
+
+    Raises
+    ------
+    ConfigError
+        If they are wrong.
+    """
+    if values["config"] and values["preset"] != "default":
+        raise ConfigError("give preset or config, not both; a file names its preset itself")
+    config = load_config(values["config"]) if values["config"] else preset(values["preset"])
+    if values["sensor"] != "auto":
+        config = config.changed({"sensor.model": values["sensor"]})
+    frames = {name: values[name] for name in ("map_frame", "lidar_frame") if values[name]}
+    return config.changed(bag=config.bag.changed(**frames))
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the node until it is interrupted."""
+    """Run the node until it is interrupted.
+
+    Raises
+    ------
+    ImportError
+        If there is no ROS 2.
+    LoamError
+        If a parameter is wrong.
+    """
+    try:
+        import rclpy
+        from rclpy.executors import ExternalShutdownException
+    except ImportError as error:
+        raise ImportError(
+            "loam_gtsam.ros needs rclpy of ROS 2: source /opt/ros/DISTRO/setup.bash first, and use "
+            "the Python of that distribution (3.11 or newer: Jazzy or later)"
+        ) from error
     rclpy.init(args=arguments)
     node = rclpy.create_node("loam_gtsam")
     try:
-        run = connect(node)
+        run = LiveNode(node, on_error=rclpy.try_shutdown)
         run.start()
         try:
             rclpy.spin(node)
@@ -90,7 +237,3 @@ def _message_class(kind: str) -> Any:
     """``sensor_msgs/msg/Imu`` as a class."""
     package, _, name = kind.partition("/msg/")
     return getattr(import_module(f"{package}.msg"), name)
-
-
-if __name__ == "__main__":
-    main()

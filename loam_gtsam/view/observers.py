@@ -1,19 +1,60 @@
-"""A run as it is shown: views of its frames, made of what the mapper has just used."""
+"""Observers of a run, which record or show its frames as the mapper has just left them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Protocol
 
 import numpy as np
 
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.geometry import transform
-from loam_gtsam.mapper import Registered
+from loam_gtsam.mapper import Mapper, Registered
 from loam_gtsam.pipeline import Observer, Pipeline
-from loam_gtsam.types import FloatArray, MapUpdate, Sweep
-from loam_gtsam.view.clouds import registered_cloud, surrounding_cloud
+from loam_gtsam.types import (
+    BadSweep,
+    Features,
+    FeatureSweep,
+    FloatArray,
+    MapUpdate,
+    Scan,
+    Sweep,
+    SweepError,
+    SweepMotion,
+)
 from loam_gtsam.view.frame_view import FrameView, FrameWatcher, MapView
 
 _NONE = np.zeros((0, 3))
+_NO_ROWS = np.zeros(0, np.int64)
+
+
+class Recording(Protocol):
+    """What takes the frames; :class:`loam_gtsam.ros.bag_writer.BagWriter` does."""
+
+    def write(
+        self,
+        update: MapUpdate,
+        cloud: FloatArray | None = None,
+        surround: Callable[[], FloatArray] | None = None,
+    ) -> None:
+        """Append one frame."""
+
+
+def record(recording: Recording) -> Observer:
+    """The ``observe`` of :func:`loam_gtsam.pipeline.run` that writes every frame.
+
+    Examples
+    --------
+    >>> with BagWriter("mapped.mcap") as bag:  # doctest: +SKIP
+    ...     run(dataset, config, observe=record(bag))
+    """
+
+    def observe(sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
+        cloud = registered_cloud(sweep, update, pipeline.mapper)
+        recording.write(update, cloud, lambda: surrounding_cloud(update, pipeline.mapper))
+
+    return observe
 
 
 def watch(*watchers: FrameWatcher) -> Observer:
@@ -87,7 +128,7 @@ def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline)
     if seen is not None:
         pose = seen.map_T_middle.matrix()
         edges, planes = (transform(map_T_odom @ pose, part) for part in (seen.edges, seen.planes))
-        points, feet, residuals = matched(seen)
+        points, feet, residuals = matched_points(seen)
         points, feet = transform(map_T_odom, points), transform(map_T_odom, feet)
     # The perturbation of a pose is in the axes of the lidar.
     rotation = map_T_lidar[:3, :3]
@@ -105,7 +146,28 @@ def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline)
     )
 
 
-def matched(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
+def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) -> MapView:
+    """The map around the sensor, the path of the sensor, and the loops.
+
+    Parameters
+    ----------
+    update : of the last frame
+    pipeline : as it is right after that frame
+    path : (3,) positions of all frames so far, in the frame of the mapper
+    """
+    map_T_odom = _correction(pipeline)
+    cloud = surrounding_cloud(update, pipeline.mapper)
+    points, is_plane = transform(map_T_odom, cloud[:, :3]), cloud[:, 3] > 0.0
+    positions = np.array(path).reshape(-1, 3)
+    ends, on = np.zeros((0, 2, 3)), np.zeros(0, np.bool_)
+    if pipeline.loops is not None and len(pipeline.loops.graph):
+        keyframes = pipeline.loops.graph.poses()[:, :3, 3]
+        positions = np.concatenate([keyframes, transform(map_T_odom, positions[-1:])])
+        ends, on = pipeline.loops.loop_ends()
+    return MapView(points[~is_plane], points[is_plane], positions, ends, on)
+
+
+def matched_points(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Matched features, the feet of their distances, and these over their standard deviations.
 
     Returns
@@ -128,26 +190,74 @@ def matched(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
     return points, feet, np.linalg.norm(points - feet, axis=1) / sigmas
 
 
-def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) -> MapView:
-    """The map around the sensor, the way it came, and the loops.
+def registered_cloud(sweep: Sweep, update: MapUpdate, mapper: Mapper) -> FloatArray | None:
+    """All usable points of a sweep, de-skewed with its final motion, in the map frame.
 
     Parameters
     ----------
-    update : of the last frame
-    pipeline : as it is right after that frame
-    path : (3,) positions of all frames so far, in the frame of the mapper
+    sweep : as it was processed
+    update : the result
+    mapper : that made it; the sensor and the de-skew are read as it does
+
+    Returns
+    -------
+    (N, 4) metres, and LOAM's intensity: the ring plus the seconds since the sweep began. None if
+    there are no points. Those of another front end have intensity 0.
     """
-    map_T_odom = _correction(pipeline)
-    cloud = surrounding_cloud(update, pipeline.mapper)
-    points, is_plane = transform(map_T_odom, cloud[:, :3]), cloud[:, 3] > 0.0
-    way = np.array(path).reshape(-1, 3)
-    ends, on = np.zeros((0, 2, 3)), np.zeros(0, np.bool_)
-    if pipeline.loops is not None and len(pipeline.loops.graph):
-        way = np.concatenate(
-            [pipeline.loops.graph.poses()[:, :3, 3], transform(map_T_odom, way[-1:])]
-        )
-        ends, on = pipeline.loops.loop_ends()
-    return MapView(points[~is_plane], points[is_plane], way, ends, on)
+    if isinstance(sweep, FeatureSweep):
+        if sweep.cloud is None:
+            return None
+        points = transform(update.map_T_lidar.matrix(), sweep.cloud)
+        return np.column_stack([points, np.zeros(len(points))])
+    if isinstance(sweep, BadSweep):
+        return None
+    try:
+        organised = organise(sweep, mapper.config)
+    except SweepError:
+        return None
+    points = _deskewed(sweep, organised, update, mapper)
+    rings = np.repeat(organised.ring_of_start, np.diff(organised.ring_starts))
+    return np.column_stack([points, rings + (organised.times - organised.span[0])])
+
+
+def surrounding_cloud(update: MapUpdate, mapper: Mapper) -> FloatArray:
+    """Map points of the cubes around the sensor, those that the next sweep is matched with.
+
+    Returns
+    -------
+    (N, 4) metres, map frame, and the intensity: 0 of edge, 1 of plane points
+    """
+    pose = update.map_T_lidar.matrix()
+    parts = []
+    for intensity, cubes in enumerate((mapper.maps.edges, mapper.maps.planes)):
+        points = cubes.points(cubes.neighbourhood(pose))
+        parts.append(np.column_stack([points, np.full(len(points), float(intensity))]))
+    return np.concatenate(parts)
+
+
+def _deskewed(
+    scan: Scan, organised: OrganisedSweep, update: MapUpdate, mapper: Mapper
+) -> FloatArray:
+    """(N, 3) points of a sweep in the map frame, moved as the mapper moves features."""
+    since_scan = (update.stamp - scan.stamp) * 1e-9
+    first, last = organised.span
+    points = Features(
+        stamp=update.stamp,
+        edges=_NONE,
+        planes=organised.xyz.T.astype(np.float64),
+        edge_times=np.zeros(0),
+        plane_times=organised.times - since_scan,
+        edge_rings=_NO_ROWS,
+        plane_rings=_NO_ROWS,
+        sharp=_NO_ROWS,
+        flat=_NO_ROWS,
+        span=(first - since_scan, last - since_scan),
+    )
+    # As it was for this frame: the gyro may have been given up since.
+    turned = update.sweep_motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
+    imu = mapper.imu.buffer if turned and mapper.imu is not None else None
+    posed = MovingSweep(points, mapper.config, imu, thin=False).at(update.twist)
+    return transform(posed.map_T_middle(update.map_T_lidar).matrix(), posed.points[1])
 
 
 def _correction(pipeline: Pipeline) -> FloatArray:

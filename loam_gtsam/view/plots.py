@@ -1,11 +1,15 @@
-"""Pictures of a run as PNG files. Needs the ``plot`` extra; nothing is shown on a screen."""
+"""Pictures of a run as PNG files. Needs the ``plot`` extra; nothing is shown on a screen.
+
+Every function writes the file ``path`` and raises :class:`loam_gtsam.types.OutputError` if
+matplotlib is missing or the file cannot be written.
+"""
 
 from __future__ import annotations
 
 import importlib.util
 import io
-import itertools
 from collections.abc import Mapping, Sequence
+from itertools import cycle, islice
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +27,7 @@ _RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8"
 """Of the solvers of a comparison, in the order they were named."""
 _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
+"""Pale ground, dark walls: what stands out of the ground stands out of the page."""
 _MAX_BYTES = 300_000
 """Larger pictures are reduced to ``_PALETTE`` colours: they are for READMEs and reports."""
 _PALETTE = 255
@@ -47,26 +52,14 @@ def plot_trajectory(
 
     Parameters
     ----------
-    path : of the PNG file
     trajectory : ``map_T_lidar``
     truth : reference poses in the map frame (align them first), or None
     loops : (L, 2, 3) ends of loops in the map and (L,) which are used; the others are dotted
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
-    figure = empty_figure(9.0, 7.0)
-    top, side = figure.subplots(2, 1, height_ratios=(4, 1))
-    if truth is not None:
-        xyz = truth.map_T_lidar[:, :3, 3]
-        top.plot(xyz[:, 0], xyz[:, 1], color=TRUTH, lw=3.0, label="truth")
-        side.plot(_travelled(xyz), xyz[:, 2], color=TRUTH, lw=3.0)
-    xyz = trajectory.map_T_lidar[:, :3, 3]
-    top.plot(xyz[:, 0], xyz[:, 1], color=PATH, lw=1.4, label="estimate")
-    top.plot(xyz[:1, 0], xyz[:1, 1], "o", color=INK, ms=6, label="start")
-    side.plot(_travelled(xyz), xyz[:, 2], color=PATH, lw=1.4)
+    lines = [] if truth is None else [("truth", truth, TRUTH, 3.0)]
+    figure, top = _trajectory_figure(7.0, [*lines, ("estimate", trajectory, PATH, 1.4)])
+    start = trajectory.map_T_lidar[:1, :3, 3]
+    top.plot(start[:, 0], start[:, 1], "o", color=INK, ms=6, label="start")
     if loops is not None:
         for name, on, style in (("loops", loops[1], "-o"), ("loops, not used", ~loops[1], ":o")):
             ends = loops[0][on]
@@ -74,10 +67,8 @@ def plot_trajectory(
                 continue
             label = [f"{len(ends)} {name}", *[""] * (len(ends) - 1)]
             top.plot(ends[:, :, 0].T, ends[:, :, 1].T, style, color=INK, lw=0.8, ms=2, label=label)
-    top.set_aspect("equal", adjustable="datalim")
-    top.set(xlabel="x [m]", ylabel="y [m]", title=f"{trajectory.path_length:.1f} m travelled")
+    top.set_title(f"{trajectory.path_length:.1f} m travelled")
     top.legend(frameon=False)
-    side.set(xlabel="distance travelled [m]", ylabel="z [m]")
     save_figure(figure, path)
 
 
@@ -91,14 +82,8 @@ def plot_map(
 
     Parameters
     ----------
-    path : of the PNG file
     edges, planes : (E, 3) and (P, 3) metres, map frame
     trajectory : drawn on top, or None
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(9.0, 7.0)
     axes = figure.subplots()
@@ -110,10 +95,7 @@ def plot_map(
         bar.set_label("height [m]")
         bar.outline.set_visible(False)
     if trajectory is not None and len(trajectory):
-        xyz = trajectory.map_T_lidar[:, :3, 3]
-        axes.plot(xyz[:, 0], xyz[:, 1], color="white", lw=3.0)
-        axes.plot(xyz[:, 0], xyz[:, 1], color=PATH, lw=1.6)
-        axes.plot(xyz[:1, 0], xyz[:1, 1], "o", color=PATH, mec="white", ms=7)
+        _draw_path(axes, trajectory.map_T_lidar[:, :3, 3])
     axes.set_aspect("equal")
     axes.margins(0.02)
     axes.set(xlabel="x [m]", ylabel="y [m]")
@@ -125,14 +107,8 @@ def plot_errors(path: str | Path, stamps: IntArray, errors: FloatArray) -> None:
 
     Parameters
     ----------
-    path : of the PNG file
     stamps : (N,) nanoseconds
     errors : (N,) metres, see :class:`loam_gtsam.studies.evaluation.AbsoluteError`
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(9.0, 3.2)
     axes = figure.subplots()
@@ -156,23 +132,15 @@ def plot_loops(
 
     Parameters
     ----------
-    path : of the PNG file
-    panels : title -> (N, 3) points of the map and (K, 3) the way, metres
+    panels : title -> (N, 3) points of the map and (K, 3) positions of the sensor, metres
     loops : (L, 2, 3) their ends in the last of the maps
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(4.6 * len(panels), 3.6)
     row = figure.subplots(1, len(panels), sharex=True, sharey=True, squeeze=False)[0]
     for axes, (title, (points, way)) in zip(row, panels.items(), strict=True):
         if len(points):
             _top_view(axes, points)
-        axes.plot(way[:, 0], way[:, 1], color="white", lw=2.6)
-        axes.plot(way[:, 0], way[:, 1], color=PATH, lw=1.4)
-        axes.plot(way[:1, 0], way[:1, 1], "o", color=PATH, mec="white", ms=6)
+        _draw_path(axes, way)
         axes.set_title(title, loc="left", fontsize=10)
         axes.set_aspect("equal")
         axes.set_xlabel("x [m]")
@@ -186,20 +154,14 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
 
     Parameters
     ----------
-    path : of the PNG file
     updates : of a run
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(9.0, 4.0)
     axes = figure.subplots()
     names, seconds = stage_seconds(updates)
     if names:
         milliseconds = 1e3 * np.nan_to_num(seconds)
-        colours = [_STAGE_COLOURS[i % len(_STAGE_COLOURS)] for i in range(len(names))]
+        colours = list(islice(cycle(_STAGE_COLOURS), len(names)))
         labels = [
             f"{name}  {median:.1f} ms"
             for name, median in zip(names, np.median(milliseconds, axis=0), strict=True)
@@ -224,28 +186,14 @@ def plot_trajectories(
 
     Parameters
     ----------
-    path : of the PNG file
     trajectories : by name, all in one frame (align them first)
     truth : reference poses in the same frame, or None
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
-    figure = empty_figure(9.0, 7.5)
-    top, side = figure.subplots(2, 1, height_ratios=(4, 1))
     lines = [] if truth is None else [("truth", truth, TRUTH, 4.0)]
-    named = zip(trajectories.items(), itertools.cycle(_RUN_COLOURS), strict=False)
+    named = zip(trajectories.items(), cycle(_RUN_COLOURS), strict=False)
     lines += [(name, trajectory, colour, 1.3) for (name, trajectory), colour in named]
-    for name, trajectory, colour, width in lines:
-        xyz = trajectory.map_T_lidar[:, :3, 3]
-        top.plot(xyz[:, 0], xyz[:, 1], color=colour, lw=width, label=name)
-        side.plot(_travelled(xyz), xyz[:, 2], color=colour, lw=width)
-    top.set_aspect("equal", adjustable="datalim")
-    top.set(xlabel="x [m]", ylabel="y [m]")
+    figure, top = _trajectory_figure(7.5, lines)
     top.legend(frameon=False)
-    side.set(xlabel="distance travelled [m]", ylabel="z [m]")
     save_figure(figure, path)
 
 
@@ -260,24 +208,17 @@ def plot_curves(
 
     Parameters
     ----------
-    path : of the PNG file
     panels : label of the vertical axis -> solver -> (N,) x and (N,) y; a solver has the colour of
         its place in the first panel
     log : logarithmic vertical axes; values below a millionth of the panel's largest, which are
         rounding, are left out
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(9.0, 1.0 + 2.8 * len(panels))
     rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (ylabel, curves) in zip(rows, panels.items(), strict=True):
         largest = max((float(np.nanmax(y)) for _, y in curves.values() if len(y)), default=0.0)
-        for (name, (x, y)), colour in zip(
-            curves.items(), itertools.cycle(_RUN_COLOURS), strict=False
-        ):
+        coloured = zip(curves.items(), cycle(_RUN_COLOURS), strict=False)
+        for (name, (x, y)), colour in coloured:
             axes.plot(x, np.where(y > 1e-6 * largest, y, np.nan) if log else y, color=colour,
                       lw=1.4, label=name if len(x) else None)  # fmt: skip
         if log:
@@ -296,19 +237,13 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
 
     Parameters
     ----------
-    path : of the PNG file
     stages : solver -> stage -> milliseconds
-
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(9.0, 1.4 + 0.5 * len(stages))
     axes = figure.subplots()
     names = list(dict.fromkeys(stage for row in stages.values() for stage in row))
     left = np.zeros(len(stages))
-    for stage, colour in zip(names, itertools.cycle(_STAGE_COLOURS), strict=False):
+    for stage, colour in zip(names, cycle(_STAGE_COLOURS), strict=False):
         width = np.array([row.get(stage, 0.0) for row in stages.values()])
         axes.barh(list(stages), width, left=left, color=colour, height=0.6, label=stage)
         left += width
@@ -318,8 +253,34 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
     save_figure(figure, path)
 
 
+def _trajectory_figure(
+    height: float, lines: Sequence[tuple[str, Trajectory, str, float]]
+) -> tuple[Any, Any]:
+    """Names, trajectories, colours and widths from above and by height; the upper axes too."""
+    figure = empty_figure(9.0, height)
+    top, side = figure.subplots(2, 1, height_ratios=(4, 1))
+    for name, trajectory, colour, width in lines:
+        xyz = trajectory.map_T_lidar[:, :3, 3]
+        top.plot(xyz[:, 0], xyz[:, 1], color=colour, lw=width, label=name)
+        travelled = np.cumsum(np.linalg.norm(np.diff(xyz, axis=0, prepend=xyz[:1]), axis=1))
+        side.plot(travelled, xyz[:, 2], color=colour, lw=width)
+    top.set_aspect("equal", adjustable="datalim")
+    top.set(xlabel="x [m]", ylabel="y [m]")
+    side.set(xlabel="distance travelled [m]", ylabel="z [m]")
+    return figure, top
+
+
+def _draw_path(axes: Any, xyz: FloatArray) -> None:
+    """A path on a map, from its start on."""
+    axes.plot(xyz[:, 0], xyz[:, 1], color="white", lw=3.0)
+    axes.plot(xyz[:, 0], xyz[:, 1], color=PATH, lw=1.6)
+    axes.plot(xyz[:1, 0], xyz[:1, 1], "o", color=PATH, mec="white", ms=7)
+
+
 def _top_view(axes: Any, points: FloatArray) -> Any:
     """Greatest height per cell; cells with fewer points are fainter."""
+    from matplotlib.colors import LinearSegmentedColormap
+
     # A few stray points far away would leave everything else small and of one colour.
     low, high = np.percentile(points, (0.2, 99.8), axis=0)
     points = points[((points[:, :2] >= low[:2]) & (points[:, :2] <= high[:2])).all(axis=1)]
@@ -337,25 +298,11 @@ def _top_view(axes: Any, points: FloatArray) -> Any:
         alpha=opacity.reshape(rows, columns),
         extent=(low[0], low[0] + columns * size, low[1], low[1] + rows * size),
         origin="lower",
-        cmap=_height_colours(),
+        cmap=LinearSegmentedColormap.from_list("height", _HEIGHT_COLOURS),
         vmin=low[2],
         vmax=max(high[2], low[2] + 1e-3),
         interpolation="nearest",
     )
-
-
-def _height_colours() -> Any:
-    """Pale ground, dark walls: what stands out of the ground stands out of the page."""
-    from matplotlib.colors import LinearSegmentedColormap
-
-    return LinearSegmentedColormap.from_list("height", _HEIGHT_COLOURS)
-
-
-def _travelled(xyz: FloatArray) -> FloatArray:
-    """(N,) metres from the start along (N, 3) positions."""
-    steps = np.linalg.norm(np.diff(xyz, axis=0), axis=1)
-    travelled: FloatArray = np.concatenate(([0.0], np.cumsum(steps)))[: len(xyz)]
-    return travelled
 
 
 def empty_figure(width: float, height: float) -> Any:

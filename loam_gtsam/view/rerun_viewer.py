@@ -99,17 +99,15 @@ class RerunViewer(ClosingWriter):
         # One each: a window that is closed must not cost the file anything.
         self._streams: list[Any] = [self._shown()] if window else []
         if self._file is not None:
-            self._streams.append(self._saved(self._file))
+            stream = self._rr.RecordingStream(_NAME)
+            stream.save(self._file.sink, default_blueprint=_blueprint())
+            self._file.opened()
+            self._streams.append(stream)
         self._log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         self._log("map/lidar", self._rr.TransformAxes3D(2.0), static=True)
 
     def show(self, frame: FrameView, around: Callable[[], MapView]) -> None:
-        """Draw a frame; every tenth with the map around it.
-
-        Parameters
-        ----------
-        frame : to be drawn
-        around : makes the map's view
+        """Draw a frame; every tenth with the map, which ``around`` makes.
 
         Raises
         ------
@@ -124,7 +122,6 @@ class RerunViewer(ClosingWriter):
             stream.set_time("frame", sequence=frame.number)
             stream.set_time("stamp", timestamp=np.datetime64(frame.update.stamp, "ns"))
         self._draw_frame(frame)
-        self._draw_matches(frame)
         self._plot(frame)
         self._around = around
         if self.frames % self._every == 0:
@@ -149,57 +146,43 @@ class RerunViewer(ClosingWriter):
             stream.disconnect()
         if self._file is None or self.path is None:
             return
-        self._file.wait()
-        self._file.check()
+        self._file.finish()
         if not self.frames:
             self.path.unlink(missing_ok=True)
 
-    # -- what is drawn -------------------------------------------------------------------------
-
     def _draw_frame(self, frame: FrameView) -> None:
-        """Pose, covariance, sweep and features."""
+        """Pose, covariance, sweep, features and matches."""
         rr, pose = self._rr, frame.map_T_lidar
         self._log("map/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         self._log("map/covariance", self._ellipsoid(pose[:3, 3], frame.position_covariance))
         self._log("map/sweep", self._points(_thinned(frame.sweep, self._most_sweep), _SWEEP, 1.5))
         self._log("map/features/edges", self._points(frame.edges, _EDGE, 2.0))
         self._log("map/features/planes", self._points(frame.planes, _PLANE, 2.0))
-
-    def _draw_matches(self, frame: FrameView) -> None:
-        rr, colours = self._rr, residual_colours(frame.residuals)
+        colours = residual_colours(frame.residuals)
         ends = frame.points + self._exaggerate * (frame.feet - frame.points)
         lines = np.stack([frame.points, ends], axis=1)
         self._log("map/matches/points", self._points(frame.points, colours, 3.0))
-        self._log(
-            "map/matches/residuals",
-            rr.LineStrips3D(lines, colors=colours, radii=rr.Radius.ui_points(1.0)),
-        )
+        self._log("map/matches/residuals", self._lines(lines, colours, 1.0))
 
     def _draw_map(self) -> None:
         """The last view of the map, if it has not been drawn."""
         if self._around is None:
             return
         view, self._around = self._around(), None
-        rr = self._rr
         total = max(len(view.edges) + len(view.planes), 1)
         for name, points, colour in (
             ("edges", view.edges, _MAP_EDGE),
             ("planes", view.planes, _MAP_PLANE),
         ):
-            most = self._most_map * len(points) // total
-            entity = f"map/surroundings/{name}"
-            self._log(entity, self._points(_thinned(points, most), colour, 1.0))
-        path = _thinned(view.path, _MOST_PATH)
-        self._log(
-            "map/trajectory",
-            rr.LineStrips3D([path], colors=[_PATH], radii=rr.Radius.ui_points(2.0)),
-        )
+            some = _thinned(points, self._most_map * len(points) // total)
+            self._log(f"map/surroundings/{name}", self._points(some, colour, 1.0))
+        path = [_thinned(view.path, _MOST_PATH)]
+        self._log("map/trajectory", self._lines(path, _PATH, 2.0))
         for name, on, colour in (
             ("used", view.loops_on, _LOOP_ON),
             ("switched_off", ~view.loops_on, _LOOP_OFF),
         ):
-            lines = rr.LineStrips3D(view.loops[on], colors=[colour], radii=rr.Radius.ui_points(1.5))
-            self._log(f"map/loops/{name}", lines)
+            self._log(f"map/loops/{name}", self._lines(view.loops[on], colour, 1.5))
 
     def _plot(self, frame: FrameView) -> None:
         """Numbers over time, and what went wrong in words."""
@@ -236,21 +219,20 @@ class RerunViewer(ClosingWriter):
     def _points(self, points: FloatArray, colours: Any, size: float) -> Any:
         """Points of one colour or of one each, of a size on the screen."""
         colours = [colours] if isinstance(colours, tuple) else colours
-        radii = self._rr.Radius.ui_points(0.5 * size)
-        return self._rr.Points3D(points, colors=colours, radii=radii)
+        return self._rr.Points3D(
+            points, colors=colours, radii=self._rr.Radius.ui_points(0.5 * size)
+        )
+
+    def _lines(self, strips: Any, colours: Any, radius: float) -> Any:
+        """Lines of one colour or of one each, of a width on the screen."""
+        colours = [colours] if isinstance(colours, tuple) else colours
+        return self._rr.LineStrips3D(
+            strips, colors=colours, radii=self._rr.Radius.ui_points(radius)
+        )
 
     def _log(self, entity: str, what: Any, *, static: bool = False) -> None:
         for stream in self._streams:
             stream.log(entity, what, static=static)
-
-    # -- where it goes -------------------------------------------------------------------------
-
-    def _saved(self, file: RrdFile) -> Any:
-        """A stream into a file."""
-        stream = self._rr.RecordingStream(_NAME)
-        stream.save(file.sink, default_blueprint=_blueprint())
-        file.opened()
-        return stream
 
     def _shown(self) -> Any:
         """A stream into a window."""

@@ -1,7 +1,14 @@
-"""An ``.rrd`` file that Rerun fills through a pipe.
+"""An ``.rrd`` file that Rerun fills through a pipe, until its own file sink survives a full disk.
 
-Rerun's own file sink waits for ever once a disk is full (seen in 0.41). Behind a pipe it never
-fails, and what goes wrong with the file is an error like any other.
+In rerun-sdk 0.41.0 the thread of the file sink ends at the first write that fails. If a flush is
+waiting just then, the flush times out, and ``disconnect`` and the end of the process never return.
+To see it: limit the file size (``RLIMIT_FSIZE``, SIGXFSZ ignored) to 1 MB, log 30 clouds of 5,000
+points into ``RecordingStream.save``, ``flush(timeout_sec=5)``, ``disconnect()``. There was no
+report of it at github.com/rerun-io/rerun in November 2026; the timeout of a flush came with its
+pull request 11008. When ``viewer`` in pyproject.toml allows a later rerun-sdk, try that again: if
+``disconnect`` returns, this file is no longer needed.
+
+Behind a pipe the sink never fails, and what goes wrong with the file is an error like any other.
 """
 
 from __future__ import annotations
@@ -70,21 +77,16 @@ class RrdFile:
         os.close(self._write_end)
 
     def check(self) -> None:
-        """Raise if something could not be written.
-
-        Raises
-        ------
-        OutputError
-            Which ends with what to do.
-        """
+        """Raise an OutputError if something could not be written."""
         if self._problem is not None:
             raise self._unwritable(self._problem) from self._problem
 
-    def wait(self) -> None:
-        """Wait until all is in the file. The other side must have closed :attr:`sink`."""
+    def finish(self) -> None:
+        """Wait until all is in the file, and :meth:`check`; :attr:`sink` must have been closed."""
         self._thread.join(_PATIENCE)
         if self._thread.is_alive():
             self._problem = TimeoutError("the disk does not keep up")
+        self.check()
 
     def _unwritable(self, error: OSError) -> OutputError:
         return OutputError(

@@ -18,8 +18,7 @@ from rosbags.typesys import Stores, get_typestore
 from loam_gtsam.config import BagConfig
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.ros.bag_writer import BagWriter
-from loam_gtsam.ros.frame_messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF
-from loam_gtsam.ros.messages import ros_covariance
+from loam_gtsam.ros.messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, ros_covariance
 from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, OutputError
 
 START = 1_700_000_000_123_456_789
@@ -412,7 +411,7 @@ def test_a_cloud_has_four_columns_and_may_be_empty_or_have_holes(tmp_path: Path)
     holes = make_cloud(0)
     holes[3, 1] = np.nan
     with BagWriter(tmp_path / "run.bag") as bag:
-        with pytest.raises(InputError, match=r"\(N, 4\) array, got shape \(40, 3\)"):
+        with pytest.raises(InputError, match=r"\(N, 4\) floats, got shape \(40, 3\)"):
             bag.write(make_update(0), make_cloud(0)[:, :3])
         bag.write(make_update(1), np.zeros((0, 4)))
         bag.write(make_update(2), holes)

@@ -22,7 +22,7 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.ros.bag_writer import BagWriter
-from loam_gtsam.ros.frame_messages import ODOMETRY, REGISTERED, SURROUND
+from loam_gtsam.ros.messages import ODOMETRY, REGISTERED, SURROUND
 from loam_gtsam.types import (
     BadSweep,
     Features,
@@ -33,7 +33,7 @@ from loam_gtsam.types import (
     Scan,
     SweepMotion,
 )
-from loam_gtsam.view.clouds import record, registered_cloud, surrounding_cloud
+from loam_gtsam.view.observers import record, registered_cloud, surrounding_cloud
 
 STAMP = 1_700_000_000_000_000_000
 PLACE = gtsam.Pose3.Expmap(np.array([0.2, -0.1, 1.5, 3.0, 4.0, -1.0]))

@@ -55,8 +55,7 @@ def test_what_goes_through_the_pipe_is_in_the_file(tmp_path):
     with open(file.sink, "wb") as sink:
         file.opened()
         sink.write(data)
-    file.wait()
-    file.check()
+    file.finish()
     assert (tmp_path / "run.rrd").read_bytes() == data
 
 
@@ -67,9 +66,8 @@ def test_a_full_disk_is_an_error_and_does_not_block(tmp_path):
     with open(file.sink, "wb") as sink:
         file.opened()
         sink.write(bytes(3_000_000))
-    file.wait()
     with pytest.raises(OutputError, match="free some space"):
-        file.check()
+        file.finish()
 
 
 # -- with Rerun --------------------------------------------------------------------------------

@@ -1,0 +1,291 @@
+"""The ROS 2 node between messages and mapper, with a small stand-in for ROS."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.highlevel import AnyReader
+from support.bags import ROS2, loam_recording, write_bag
+from support.live_replay import IMU, POINTS, bag_of, recorded
+
+from loam_gtsam.config import LiveConfig
+from loam_gtsam.datasets import open_dataset
+from loam_gtsam.datasets.decode.tables import read_tum
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.pipeline import RunResult, run
+from loam_gtsam.ros.live_report import LiveReport
+from loam_gtsam.ros.messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, TYPES
+from loam_gtsam.ros.node import PARAMETERS, LiveNode, config_of, main
+from loam_gtsam.types import ConfigError, DatasetError, OutputError
+
+FRAMES = 11
+Raw = list[tuple[str, bytes]]
+
+
+@pytest.fixture(scope="module")
+def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    world = SimulatedWorld("shaken", frames=FRAMES, columns=240)
+    folder = tmp_path_factory.mktemp("node")
+    return bag_of(folder / "bag", recorded(world, "sqlite3"), "sqlite3")
+
+
+@pytest.fixture(scope="module")
+def offline(bag: Path) -> RunResult:
+    return run(open_dataset(bag))
+
+
+def raw_messages(bag: Path) -> Raw:
+    with AnyReader([bag], default_typestore=ROS2) as reader:
+        return [(connection.topic, bytes(raw)) for connection, _, raw in reader.messages()]
+
+
+def wait_for(condition: Callable[[], bool]) -> None:
+    patience = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < patience
+        time.sleep(0.002)
+
+
+class FakeNode:
+    """What the package uses of an ``rclpy.node.Node``."""
+
+    def __init__(self, **parameters: Any) -> None:
+        self.parameters = parameters
+        self.declared: dict[str, Any] = {}
+        self.subscribed: dict[str, Any] = {}
+        self.callbacks: dict[str, Callable[[bytes], None]] = {}
+        self.published: Raw = []
+        self.said: list[str] = []
+        self.report: Callable[[], None] = lambda: None
+        self.calls: list[str] = []
+
+    def declare_parameter(self, name: str, default: Any) -> Any:
+        self.declared[name] = default
+        return SimpleNamespace(value=self.parameters.get(name, default))
+
+    def create_publisher(self, kind: type, topic: str, depth: int) -> Any:
+        assert kind.__name__ == TYPES[topic].rpartition("/")[2]
+        return SimpleNamespace(publish=lambda message: self.publish(topic, message))
+
+    def publish(self, topic: str, message: bytes) -> None:
+        assert type(message) is bytes
+        assert len(message) % 4 == 0
+        self.published.append((topic, message))
+
+    def create_subscription(
+        self, kind: type, topic: str, callback: Callable[[bytes], None], qos: Any, *, raw: bool
+    ) -> None:
+        self.subscribed[topic] = (kind.__name__, qos.depth, qos.reliability, raw)
+        self.callbacks[topic] = callback
+
+    def create_timer(self, seconds: float, callback: Callable[[], None]) -> None:
+        self.report = callback
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(info=self.said.append)
+
+    def destroy_node(self) -> None:
+        self.calls.append("destroy")
+
+
+def module(name: str, **content: Any) -> ModuleType:
+    made = ModuleType(name)
+    vars(made).update(content)
+    return made
+
+
+@pytest.fixture(autouse=True)
+def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The modules of ROS 2, as far as the package imports them."""
+
+    class ExternalShutdownException(Exception):  # noqa: N818
+        pass
+
+    made = module("rclpy", ended=ExternalShutdownException())
+    modules = [
+        made,
+        module("rclpy.executors", ExternalShutdownException=ExternalShutdownException),
+        module(
+            "rclpy.qos",
+            QoSProfile=SimpleNamespace,
+            ReliabilityPolicy=SimpleNamespace(BEST_EFFORT="best effort"),
+        ),
+    ]
+    for package, *names in (
+        ("sensor_msgs", "PointCloud2", "Imu"),
+        ("nav_msgs", "Odometry", "Path"),
+        ("tf2_msgs", "TFMessage"),
+    ):
+        content = {name: type(name, (), {}) for name in names}
+        modules += [module(package), module(f"{package}.msg", **content)]
+    for fake in modules:
+        monkeypatch.setitem(sys.modules, fake.__name__, fake)
+    return made
+
+
+def play(node: FakeNode, live: LiveNode, messages: Raw, frames: int) -> None:
+    """Start, hear the messages, and stop after so many frames."""
+    live.start()
+    for topic, raw in messages:
+        if topic in node.callbacks:
+            node.callbacks[topic](raw)
+    wait_for(lambda: sum(live.live.report().statuses.values()) == frames)
+    live.stop()
+
+
+def assert_published(published: Raw, offline: RunResult) -> None:
+    """The poses of the run on every frame, and the other topics as often as they are due."""
+    counts = {topic: sum(name == topic for name, _ in published) for topic in TYPES}
+    assert counts == {TF: FRAMES, ODOMETRY: FRAMES, REGISTERED: FRAMES, SURROUND: 3, PATH: 1}
+    places = [
+        ROS2.deserialize_cdr(raw, TYPES[topic]).pose.pose.position
+        for topic, raw in published
+        if topic == ODOMETRY
+    ]
+    np.testing.assert_array_equal(
+        [[p.x, p.y, p.z] for p in places], [u.map_T_lidar.translation() for u in offline.updates]
+    )
+    # The pose goes out before the clouds, which take longer.
+    assert [topic for topic, _ in published[:4]] == [TF, ODOMETRY, REGISTERED, SURROUND]
+
+
+def test_the_node_maps_what_it_hears(
+    monkeypatch: pytest.MonkeyPatch, rclpy: Any, bag: Path, offline: RunResult
+) -> None:
+    node = FakeNode(imu_topic=IMU)
+
+    def spin(spun: object) -> None:
+        assert spun is node
+        for topic, raw in raw_messages(bag):
+            node.callbacks[topic](raw)
+        wait_for(lambda: PATH in dict(node.published))
+        node.report()
+        raise rclpy.ended
+
+    rclpy.init = lambda args: node.calls.append(f"init {args}")
+    rclpy.create_node = lambda name: node
+    rclpy.spin = spin
+    rclpy.try_shutdown = lambda: node.calls.append("shutdown")
+    main(["--ros-args"])
+    assert node.declared == PARAMETERS
+    assert node.subscribed == {
+        POINTS: ("PointCloud2", 20, "best effort", True),
+        IMU: ("Imu", 1000, "best effort", True),
+    }
+    assert_published(node.published, offline)
+    assert "sweeps mapped" in node.said[0]
+    assert node.calls == ["init ['--ros-args']", "destroy", "shutdown"]
+    node.parameters, node.calls = {"preset": "slow"}, []
+    with pytest.raises(ConfigError, match="unknown preset 'slow'"):
+        main()
+    assert node.calls[1:] == ["destroy", "shutdown"]
+
+
+def test_the_files_of_the_run_are_written_when_the_node_ends(
+    bag: Path, offline: RunResult, tmp_path: Path
+) -> None:
+    node = FakeNode(imu_topic=IMU, output=str(tmp_path / "run"))
+    play(node, LiveNode(node), raw_messages(bag), FRAMES)
+    written = read_tum(tmp_path / "run" / "trajectory.tum")
+    np.testing.assert_allclose(written.map_T_lidar, offline.trajectory.map_T_lidar, atol=1e-8)
+
+
+def test_topics_of_loam_need_no_imu(tmp_path: Path) -> None:
+    with AnyReader([write_bag(tmp_path / "topics", "ros1", loam_recording())]) as reader:
+        messages = [
+            (connection.topic, bytes(ROS2.ros1_to_cdr(raw, connection.msgtype)))
+            for connection, _, raw in reader.messages()
+        ]
+    node = FakeNode(loam_topics=True, full_clouds=False, preset="aloam")
+    play(node, LiveNode(node), messages, 3)
+    assert len(node.subscribed) == 3
+    assert node.subscribed["/laser_odom_to_init"][0] == "Odometry"
+    assert {topic for topic, _ in node.published} == {TF, ODOMETRY, SURROUND}
+    LiveNode(node := FakeNode(loam_topics=True))
+    assert len(node.subscribed) == 4
+
+
+def test_damaged_bytes_are_counted() -> None:
+    live = LiveNode(node := FakeNode())
+    node.callbacks[POINTS](b"\x00\x01\x00\x00 not a cloud")
+    ((reason, count),) = live.live.report().faults.items()
+    assert reason.startswith("/points: cannot deserialise a sensor_msgs/msg/PointCloud2")
+    assert count == 1
+
+
+def test_a_stamp_that_no_message_can_say_is_not_published_and_the_run_goes_on(
+    bag: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    node = FakeNode()
+    published: list[str] = []
+
+    def publish(topic: str, raw: bytes) -> None:
+        published.append(topic)
+        if len(published) == 1:
+            raise OutputError("stamp -1 ns")
+
+    node.publish = publish  # type: ignore[method-assign]
+    clouds = [entry for entry in raw_messages(bag) if entry[0] == POINTS]
+    play(node, LiveNode(node), clouds[:2], 2)
+    assert published == [TF, TF, ODOMETRY, REGISTERED, SURROUND]
+    assert caplog.messages == ["not published: stamp -1 ns"]
+
+
+def test_an_error_ends_the_thread_and_is_raised_when_it_is_stopped(bag: Path) -> None:
+    node = FakeNode()
+
+    def publish(topic: str, raw: bytes) -> None:
+        raise RuntimeError("the network is gone")
+
+    node.publish = publish  # type: ignore[method-assign]
+    ended: list[bool] = []
+    live = LiveNode(node, on_error=lambda: ended.append(True))
+    live.start()
+    node.callbacks[POINTS](dict(raw_messages(bag))[POINTS])
+    wait_for(lambda: bool(ended))
+    with pytest.raises(RuntimeError, match="the network is gone"):
+        live.stop()
+
+
+def test_parameters_make_the_configuration(tmp_path: Path) -> None:
+    asked = {"preset": "aloam", "sensor": "vlp16", "map_frame": "map", "lidar_frame": "base"}
+    config = config_of(PARAMETERS | asked)
+    assert (config.solver.method, config.sensor.model) == ("aloam", "vlp16")
+    assert (config.bag.map_frame, config.bag.lidar_frame) == ("map", "base")
+    file = tmp_path / "my.yaml"
+    file.write_text("live: {queue: 3}\nbag: {map_frame: world}\n")
+    config = config_of(PARAMETERS | {"config": str(file)})
+    assert (config.live.queue, config.bag.map_frame) == (3, "world")
+    wrong: list[tuple[dict[str, str], type[Exception]]] = [
+        ({"config": str(file), "preset": "loam"}, ConfigError),
+        ({"sensor": "sonar"}, ConfigError),
+        ({"map_frame": "same", "lidar_frame": "same"}, ConfigError),
+        ({"axes": "camera"}, ConfigError),
+        ({"time_unit": "hours"}, DatasetError),
+        ({"output": str(file)}, OutputError),
+    ]
+    for parameters, error in wrong:
+        with pytest.raises(error):
+            LiveNode(FakeNode(**parameters))
+
+
+def test_the_page_on_live_runs_lists_every_parameter_and_field() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs" / "live.md"
+    text = page.read_text("utf-8")
+    fields = [item.name for item in dataclasses.fields(LiveReport)]
+    keys = [f"live.{key}" for key in LiveConfig.model_fields]
+    assert [name for name in (*PARAMETERS, *fields, *keys) if f"`{name}`" not in text] == []
+
+
+def test_without_ros_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rclpy", None)
+    with pytest.raises(ImportError, match=r"source /opt/ros/DISTRO/setup.bash"):
+        main()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import sys
 import threading
@@ -10,9 +11,10 @@ from array import array
 from collections import deque
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
+from types import ModuleType
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from support.bags import ROS1, START, cloud, imu, loam_recording, write_bag
@@ -28,16 +30,34 @@ from support.live_replay import (
     replay,
 )
 
-from loam_gtsam.config import Config, DeskewConfig, ImuConfig, LiveConfig
+from loam_gtsam.config import (
+    Config,
+    DeskewConfig,
+    ImuConfig,
+    LiveConfig,
+    OdometryConfig,
+    PoseGraphConfig,
+    preset,
+)
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.bags.bag_reader import Message
 from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.pipeline import RunResult, run
+from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.pipeline import Pipeline, RunResult, imu_buffer, run
+from loam_gtsam.registration.odometry import make_odometry
+from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.ros.live import LiveMapper, LiveResult
 from loam_gtsam.ros.live_report import OTHER_REASONS, LiveLog
-from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate
+from loam_gtsam.types import (
+    ConfigError,
+    DatasetError,
+    FrameStatus,
+    InputError,
+    MapUpdate,
+    SweepFault,
+)
 
 FRAMES = 12
 
@@ -71,10 +91,18 @@ def assert_the_same(live: LiveMapper, results: list[LiveResult], offline: RunRes
     np.testing.assert_array_equal(result.edge_points, offline.edge_points)
     np.testing.assert_array_equal(result.plane_points, offline.plane_points)
     assert result.map_stats == offline.map_stats
+    trajectory = result.trajectory.map_T_lidar
+    np.testing.assert_array_equal(trajectory, offline.trajectory.map_T_lidar)
 
 
 def late(messages: list[Message], topic: str, delay: int) -> list[Message]:
     return [replace(m, received=m.received + delay) if m.topic == topic else m for m in messages]
+
+
+def shifted(message: Any, seconds: int) -> Any:
+    """The message with another stamp."""
+    stamp = replace(message.header.stamp, sec=message.header.stamp.sec + seconds)
+    return replace(message, header=replace(message.header, stamp=stamp))
 
 
 def shaken_up(messages: list[Message]) -> list[Message]:
@@ -213,32 +241,132 @@ def test_units_of_g_and_missing_orientations_are_read_as_those_of_a_bag(tmp_path
     assert "gravity_filter" in aid.buffer.report.orientation
 
 
-def as_rclpy(message: Any) -> Any:
-    """Bytes as ``array.array``."""
-    if not hasattr(message, "data"):
-        return message
-    return replace(message, data=array("B", message.data.tobytes()))
-
-
-def as_rospy(message: Any) -> Any:
-    """Bytes as such, other names in the stamp, tuples for arrays."""
-    stamp = message.header.stamp
-    moment = SimpleNamespace(secs=stamp.sec, nsecs=stamp.nanosec)
-    message = replace(message, header=replace(message.header, stamp=moment))
-    if hasattr(message, "data"):
-        return replace(message, data=message.data.tobytes())
-    return replace(message, orientation_covariance=tuple(message.orientation_covariance))
-
-
-@pytest.mark.parametrize("converted", [as_rclpy, as_rospy])
-def test_messages_of_rclpy_and_rospy_are_read_as_those_of_rosbags(
-    bag: Path, offline: RunResult, converted: Any
-) -> None:
+def test_messages_of_rclpy_are_read_as_those_of_rosbags(bag: Path, offline: RunResult) -> None:
+    messages = messages_of(bag)
+    for number, message in enumerate(messages):
+        if message.topic == POINTS:  # rclpy hands bytes out as array.array
+            content = replace(message.content, data=array("B", message.content.data.tobytes()))
+            messages[number] = replace(message, content=content)
     clock = Clock()
     live = LiveMapper(imu=True, clock=clock)
-    messages = [replace(m, content=converted(m.content)) for m in messages_of(bag)]
-    results = replay(live, clock, messages)
-    np.testing.assert_array_equal(poses(r.update for r in results), poses(offline.updates))
+    assert_the_same(live, replay(live, clock, messages), offline)
+
+
+# --- with every part of a run, and begun anew -----------------------------------------------
+
+
+class OneLoop:
+    """A user's loop closer, which remembers how many keyframes it saw."""
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        self.seen = 0
+
+    def detect(self, keyframe: Any, history: Any) -> LoopClosure | None:
+        self.seen += 1
+        if self.seen != 4:
+            return None
+        motion = history.relative(0, 3)[0].compose(gtsam.Pose3(gtsam.Rot3(), np.full(3, 0.02)))
+        return LoopClosure(0, 3, motion, np.eye(6) * 1e-6)
+
+
+def near_the_start(_: Any) -> list[gtsam.NonlinearFactor]:
+    """A user's own factors."""
+    noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
+    return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)]
+
+
+PARTS: dict[str, tuple[Config, Any]] = {
+    "loops": (
+        Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9)),
+        lambda: {"loop_closer": OneLoop()},
+    ),
+    "pre-integration": (Config(imu=ImuConfig(preintegration=True)), dict),
+    "own factors": (Config(), lambda: {"extra_factors": near_the_start}),
+    "own solver": (Config(), lambda: {"solver": make_solver(preset("aloam").solver)}),
+    "own odometry": (
+        Config(),
+        lambda: {"odometry": make_odometry(OdometryConfig(method="scan_to_scan"))},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_a_live_run_is_that_of_the_bag_with_every_part_and_again_after_a_reset(
+    bag: Path, offline: RunResult, name: str
+) -> None:
+    config, parts = PARTS[name]
+    dataset = open_dataset(bag)
+    pipeline = Pipeline(config, imu=imu_buffer(dataset, config), **parts())
+    expected = pipeline.result([pipeline.process(sweep) for sweep in dataset])
+    assert (poses(expected.updates) != poses(offline.updates)).any() or expected.loops is not None
+
+    clock = Clock()
+    live = LiveMapper(config, imu=True, clock=clock, **parts())
+    assert_the_same(live, replay(live, clock, messages_of(bag)), expected)
+    live.reset()
+    assert_the_same(live, replay(live, clock, messages_of(bag)), expected)
+    report = live.report()
+    assert report.statuses["first"] == 2
+    assert sum(report.statuses.values()) == 2 * FRAMES
+    assert report.late == {"imu": 0}
+
+
+def test_a_run_goes_on_after_the_clock_was_set_back_if_it_is_reset(bag: Path) -> None:
+    def observe(sweep: Any, update: MapUpdate, pipeline: Pipeline) -> None:
+        if update.fault is SweepFault.CLOCK_SET_BACK:
+            live.reset()
+
+    clock = Clock()
+    live = LiveMapper(imu=True, clock=clock, observe=observe)
+    messages = messages_of(bag)
+    ahead = [replace(m, content=shifted(m.content, 3600)) for m in messages]
+    later = [replace(m, received=m.received + 3600 * 1000 * MS) for m in messages]
+    statuses = [str(result.update.status) for result in replay(live, clock, [*ahead, *later])]
+    assert statuses[FRAMES:] == ["bad_stamp"] * 5 + ["first"] + ["ok"] * (FRAMES - 6)
+
+
+def test_sweeps_from_the_future_cost_the_next_ones_no_samples(tmp_path: Path) -> None:
+    messages = recorded(SimulatedWorld("shaken", frames=28, columns=90))
+    for number in [n for n, m in enumerate(messages) if m.topic == POINTS][22:25]:
+        content = shifted(messages[number].content, 3600)
+        messages[number] = replace(messages[number], content=content)
+    path = bag_of(tmp_path / "bag", messages)
+    clock = Clock()
+    live = LiveMapper(imu=True, clock=clock)
+    assert_the_same(live, replay(live, clock, messages_of(path)), run(open_dataset(path)))
+    assert live.report().statuses["bad_stamp"] == 3
+
+
+def bytes_of(root: object) -> int:
+    """What an object and all that it refers to take."""
+    seen, todo, total = set(), [root], 0
+    while todo:
+        item = todo.pop()
+        if id(item) not in seen and not isinstance(item, type | ModuleType):
+            seen.add(id(item))
+            total += sys.getsizeof(item)
+            todo += gc.get_referents(item)
+    return total
+
+
+def test_a_run_of_twice_as_many_sweeps_keeps_no_more() -> None:
+    clock = Clock(START)
+    live = LiveMapper(imu=True, clock=clock)
+    sample, sizes = np.eye(10)[3], []
+    for number in range(2400):
+        for part in range(2):
+            live.add_imu(imu(ROS1, START + (100 * number + 50 * part) * MS, sample))
+        live.add_cloud(thin(number))
+        clock.now += 100 * MS
+        while live.step() is not None:
+            clock.now += number % 7
+        if number % 1200 == 1199:
+            sizes.append(bytes_of([live._log, live._imu, live._queue, live.pipeline]))
+    assert sum(live.report().statuses.values()) > 2380
+    assert sizes[1] < 1.01 * sizes[0]
 
 
 # --- waiting for the IMU --------------------------------------------------------------------

@@ -29,7 +29,7 @@ from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
 from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checked_stamp
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
-from loam_gtsam.types import ConfigError, DatasetError, FrameStatus, InputError, MapUpdate, Sweep
+from loam_gtsam.types import ConfigError, DatasetError, InputError, MapUpdate, Sweep
 
 _POLL = 0.02
 """Seconds after which a worker looks whether a sweep has waited for long enough."""
@@ -68,8 +68,7 @@ class LiveMapper:
     If nothing is dropped and no sweep waits in vain, poses and map are those of
     :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
 
-    Nothing here grows with the run but what the pipeline keeps: the map, and keyframes if loops are
-    looked for.
+    Nothing here grows with the run but what the pipeline keeps: the map, and loops' keyframes.
 
     Parameters
     ----------
@@ -116,14 +115,10 @@ class LiveMapper:
         self._imu: LiveImu | None = None
         if imu and config.imu.enabled:
             self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
-        self._new_pipeline = partial(
-            Pipeline,
-            config,
-            solver=solver,
-            odometry=odometry,
-            extra_factors=extra_factors,
-            loop_closer=loop_closer,
-        )
+        # fmt: off
+        self._new_pipeline = partial(Pipeline, config, solver=solver, odometry=odometry,
+                                     extra_factors=extra_factors, loop_closer=loop_closer)
+        # fmt: on
         self.pipeline = self._new_pipeline(imu=None if self._imu is None else self._imu.buffer)
         self._matcher = StampMatcher(features)
         self._features = frozenset(features)
@@ -142,10 +137,7 @@ class LiveMapper:
     def add_cloud(self, message: Any, received: int | None = None) -> None:
         """Queue a ``sensor_msgs/PointCloud2``; whatever is wrong with it is found when it is due.
 
-        Parameters
-        ----------
-        message : as rosbags or rclpy hand it out
-        received : nanoseconds of the clock; None is now
+        ``received`` is in nanoseconds of the clock; None is now.
 
         Raises
         ------
@@ -218,12 +210,7 @@ class LiveMapper:
     # -- from the one thread that maps -------------------------------------------------------------
 
     def step(self) -> LiveResult | None:
-        """Map the next sweep.
-
-        Returns
-        -------
-        None if there is none, or if it waits for the IMU: see :meth:`wait`.
-        """
+        """Map the next sweep; None if there is none or the next one waits for the IMU."""
         self._news.clear()
         while self._current is None:
             with self._lock:
@@ -305,10 +292,5 @@ class LiveMapper:
             self._observe(current.sweep, update, self.pipeline)
         result = LiveResult(current.sweep, update, current.received, started, mapped, self._clock())
         with self._lock:
-            self._log.statuses[str(update.status)] += 1
-            if update.status is FrameStatus.UNUSABLE_SCAN:
-                self._log.fault(update.message)
-            elif not update.status.has_pose:
-                self._log.late["sweep"] += 1
-            self._log.took(*result.seconds)
+            self._log.mapped(update, result.seconds)
         return result

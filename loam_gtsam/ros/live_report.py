@@ -8,6 +8,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from loam_gtsam.types import FrameStatus, MapUpdate
+
 STAGES = ("waiting", "mapping", "publishing", "total")
 _LATEST = 1000
 """Sweeps of which the latencies are kept."""
@@ -94,8 +96,13 @@ class LiveLog:
         new = reason not in self.faults and len(self.faults) >= _REASONS
         self.faults[OTHER_REASONS if new else reason] += 1
 
-    def took(self, *seconds: float) -> None:
-        """Note how long a sweep took, by stage."""
+    def mapped(self, update: MapUpdate, seconds: tuple[float, ...]) -> None:
+        """Count a sweep, and note how long it took, by stage."""
+        self.statuses[str(update.status)] += 1
+        if update.status is FrameStatus.UNUSABLE_SCAN:
+            self.fault(update.message)
+        elif not update.status.has_pose:
+            self.late["sweep"] += 1
         self._seconds.append(seconds)
 
     def report(self, waiting: int, unmatched: Mapping[str, int]) -> LiveReport:
@@ -105,14 +112,11 @@ class LiveLog:
             seconds = np.array(self._seconds)
             ranks = np.percentile(seconds, [50, 95, 100], axis=0, method="inverted_cdf")
             latency = dict(zip(STAGES, map(Latency, *ranks.tolist()), strict=True))
+        counts = ("received", "dropped", "faults", "late", "statuses")
         return LiveReport(
-            received=dict(self.received),
-            dropped=dict(self.dropped),
+            **{name: dict(getattr(self, name)) for name in counts},
             unmatched=dict(unmatched),
-            faults=dict(self.faults),
-            late=dict(self.late),
             without_imu=self.without_imu,
-            statuses=dict(self.statuses),
             waiting=waiting,
             deepest=self.deepest,
             latency=latency,

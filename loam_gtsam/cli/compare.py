@@ -57,9 +57,8 @@ def execute(options: CompareOptions) -> int:
             lambda new: report.write_comparison(results, new, plot),
         )
     if not options.quiet:
-        screen = Console()
-        screen.print(_summary(results, seconds))
-        console.print_written(screen, stop, comparison.frames, total, folder, files)
+        Console().print(_summary(results, seconds))
+        console.print_written(stop, comparison.frames, total, folder, files)
     updates = [update for run in comparison.runs for update in run.updates]
     nothing = f"{name}: no solver could use any of the {comparison.frames} sweeps"
     return console.exit_code(comparison.error, stop, updates, nothing)

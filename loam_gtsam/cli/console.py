@@ -16,6 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
@@ -27,7 +28,6 @@ from loam_gtsam.types import DatasetError, MapUpdate, OutputError
 from loam_gtsam.view import plots
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_SHOW_CURSOR = b"\x1b[?25h"
 
 
 def file_name(name: str) -> str:
@@ -113,8 +113,8 @@ def stop_requests() -> Iterator[StopRequest]:
         for number in _SIGNALS:
             signal.signal(number, signal.SIG_DFL)
         if sys.stderr.isatty():
-            # Unbuffered, for a signal may arrive in the middle of a buffered write.
-            os.write(sys.stderr.fileno(), _SHOW_CURSOR)
+            # The cursor is shown again; unbuffered, for a signal may come in a buffered write.
+            os.write(sys.stderr.fileno(), b"\x1b[?25h")
 
     before = {number: signal.getsignal(number) for number in _SIGNALS}
     for number, handler in before.items():
@@ -131,13 +131,9 @@ def stop_requests() -> Iterator[StopRequest]:
 def progress_bar(name: str, total: int, *, quiet: bool) -> Iterator[Callable[[int, str], None]]:
     """Show a progress bar on stderr; gives the function that sets it to a number, with a note."""
     console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[note]}", style="dim", markup=False),
-        TimeRemainingColumn(),
-    )
+    name_column = TextColumn("{task.description}", markup=False)
+    note_column = TextColumn("{task.fields[note]}", style="dim", markup=False)
+    columns = (name_column, BarColumn(), MofNCompleteColumn(), note_column, TimeRemainingColumn())
     with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
         task = bar.add_task(name, total=total, note="")
 
@@ -194,16 +190,11 @@ def number_table(first: str, title: str, columns: Sequence[str]) -> Table:
 
 
 def print_written(
-    console: Console, stop: StopRequest, frames: int, total: int, folder: Path, files: list[str]
+    stop: StopRequest, frames: int, total: int, folder: Path, files: Sequence[str]
 ) -> None:
     """Print the last lines of a command: whether it was stopped, and where its files are."""
     if stop.signum is not None:
         name = signal.Signals(stop.signum).name
         done = f"after frame {frames} of {total}"
-        console.print(f"Stopped by {name} {done}; what was computed until then is written.")
-    print_plain(console, f"Written to {folder}: {', '.join(files)}")
-
-
-def print_plain(console: Console, text: str) -> None:
-    """Print a line that may hold names of files: no markup in it, and never broken."""
-    console.print(text, markup=False, soft_wrap=True)
+        typer.echo(f"Stopped by {name} {done}; what was computed until then is written.")
+    typer.echo(f"Written to {folder}: {', '.join(files)}")

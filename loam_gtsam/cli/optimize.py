@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import typer
 from rich.console import Console
 from rich.table import Table
 
-from loam_gtsam.cli.console import print_plain
 from loam_gtsam.cli.options import OptimizeOptions
 from loam_gtsam.config import Config
 from loam_gtsam.io.trajectories import write_tum
@@ -48,9 +48,8 @@ def execute(options: OptimizeOptions) -> int:
         corrected = Trajectory.from_poses([stamps[key] for key in keys], poses)
         write_tum(trajectory, corrected, comments={"graph": path.name})
     if not options.quiet:
-        console = Console()
-        console.print(_table(saved, result, keys))
-        print_plain(console, f"Written to {', '.join(map(str, written))}")
+        Console().print(_table(saved, result, keys))
+        typer.echo(f"Written to {', '.join(map(str, written))}")
     return 0
 
 

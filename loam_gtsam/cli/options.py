@@ -217,10 +217,9 @@ class RunOptions(OutputOptions, InspectOptions):
         from loam_gtsam.types import OutputError
 
         if self.resume and (self.bag is not None or self.rrd is not None):
-            recording = "--bag" if self.bag is not None else "--rrd"
-            raise typer.BadParameter(
-                f"--resume: the frames before would not be in {recording}; give one only"
-            )
+            other = "--bag" if self.bag is not None else "--rrd"
+            problem = f"--resume: the frames before would not be in {other}; give one only"
+            raise typer.BadParameter(problem)
         if self.resume and self.overwrite:
             raise typer.BadParameter(
                 "--resume and --overwrite contradict each other; give one only"

@@ -31,7 +31,7 @@ def summary(
     result: RunResult,
     name: str,
     seconds: float,
-    accuracy: dict[str, Any],
+    accuracy: Mapping[str, Any],
     problems: Sequence[str] = (),
 ) -> Group:
     """Table of a run: frames, statuses, accuracy, IMU; below it the problems and odd frames.

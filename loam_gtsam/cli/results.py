@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.pipeline import RunResult, effective_config
 from loam_gtsam.studies.evaluation import (
+    AbsoluteError,
     absolute_error,
     align_positions,
     align_rotations,
@@ -30,55 +32,72 @@ LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
 RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Results:
     """A run with what is known of its input, ready to be written."""
 
     run: RunResult
-    dataset: Dataset
     info: DatasetInfo
-    accuracy: dict[str, Any]
+    truth: Trajectory | None
+    last: LastFrame | None
+    """For the pictures; None draws none."""
+    accuracy: Mapping[str, Any] = field(default_factory=dict)
     """Errors against the truth, or ``problem``; empty without truth."""
-    map_truth: Trajectory | None
+    error: AbsoluteError | None = None
+    map_truth: Trajectory | None = None
     """The truth in the map frame; None if it cannot be compared."""
 
     @staticmethod
-    def of(run: RunResult, dataset: Dataset) -> Results:
+    def of(run: RunResult, dataset: Dataset, last: LastFrame | None) -> Results:
         """Compare a run with the truth of its data set, if there is any."""
-        accuracy, map_truth = _compare_with_truth(run.trajectory, dataset.truth)
-        return Results(run, dataset, _input_info(dataset), accuracy, map_truth)
+        trajectory, truth = run.trajectory, dataset.truth
+        results = Results(run=run, info=_input_info(dataset), truth=truth, last=last)
+        if truth is None:
+            return results
+        try:
+            error = absolute_error(trajectory, truth)
+        except ValueError as problem:  # no overlap in time, or stamps of the truth that repeat
+            return replace(results, accuracy={"problem": str(problem)})
+        there = interpolate(truth, error.stamps)
+        inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
+        here = trajectory.map_T_lidar[inside]
+        turn = align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
+        map_T_truth = align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
+        accuracy = {
+            "ate_rmse_m": error.rmse,
+            "ate_max_m": error.maximum,
+            "compared_poses": len(error.stamps),
+            "compared_length_m": there.path_length,
+        }
+        moved = Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
+        return replace(results, accuracy=accuracy, error=error, map_truth=moved)
 
-    def write(self, folder: Path, last: LastFrame | None) -> list[str]:
-        """Write all files, with pictures if ``last`` is given; returns their names."""
+    def write(self, folder: Path) -> list[str]:
+        """Write all files into a folder; returns their names."""
         extra = {"accuracy": self.accuracy or None, "input": asdict(self.info)}
         files = list(RUN_FILES)
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
-        if self.dataset.truth is not None:
-            write_tum(folder / TRUTH_FILE, self.dataset.truth)
+        if self.truth is not None:
+            write_tum(folder / TRUTH_FILE, self.truth)
             files.append(TRUTH_FILE)
         if self.run.loops is not None:
             write_tum(folder / LOOP_FILES[0], self.run.odometry, comments={"frame": "odom"})
             write_graph(folder / LOOP_FILES[1], self.run.loops.graph.saved())
-            files.extend(LOOP_FILES)
-        if last is not None:
-            files.extend(self._draw(folder, last))
-        return files
+            files += LOOP_FILES
+        return files if self.last is None else files + self._draw(folder, self.last)
 
     def _draw(self, folder: Path, last: LastFrame) -> list[str]:
         path, cloud, frame, timings = PLOT_FILES
-        run, trajectory, truth = self.run, self.run.trajectory, self.map_truth
+        run, trajectory = self.run, self.run.trajectory
         loops = None if run.loops is None else run.loops.loop_ends()
-        plots.plot_trajectory(folder / path, trajectory, truth, loops)
+        plots.plot_trajectory(folder / path, trajectory, self.map_truth, loops)
         plots.plot_map(folder / cloud, run.edge_points, run.plane_points, trajectory)
         if last.seen:
             frame_plot.plot_frame(folder / frame, last.frame(), last.around())
         plots.plot_timings(folder / timings, run.updates)
-        files = [name for name in PLOT_FILES if name != frame or last.seen]
-        if truth is not None and self.dataset.truth is not None:
-            error = absolute_error(trajectory, self.dataset.truth)
-            plots.plot_errors(folder / ERROR_PLOT, error.stamps, error.translations)
-            files.append(ERROR_PLOT)
-        return files
+        if self.error is not None:
+            plots.plot_errors(folder / ERROR_PLOT, self.error.stamps, self.error.translations)
+        return [name for name in (*PLOT_FILES, ERROR_PLOT) if (folder / name).exists()]
 
 
 def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:
@@ -97,30 +116,6 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
             "sweeps); choose another folder, or --overwrite without --resume"
         )
     return True
-
-
-def _compare_with_truth(
-    trajectory: Trajectory, truth: Trajectory | None
-) -> tuple[dict[str, Any], Trajectory | None]:
-    """Accuracy for the summary, and the truth in the map frame for the pictures."""
-    if truth is None:
-        return {}, None
-    try:
-        error = absolute_error(trajectory, truth)
-    except ValueError as problem:  # no overlap in time, or stamps of the truth that repeat
-        return {"problem": str(problem)}, None
-    there = interpolate(truth, error.stamps)
-    inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
-    here = trajectory.map_T_lidar[inside]
-    turn = align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
-    map_T_truth = align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
-    accuracy = {
-        "ate_rmse_m": error.rmse,
-        "ate_max_m": error.maximum,
-        "compared_poses": len(error.stamps),
-        "compared_length_m": there.path_length,
-    }
-    return accuracy, Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
 
 
 def _input_info(dataset: Dataset) -> DatasetInfo:

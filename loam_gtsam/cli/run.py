@@ -8,20 +8,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
+import typer
 from rich.console import Console
 
-from loam_gtsam.cli.console import (
-    StopRequest,
-    draws_pictures,
-    exit_code,
-    file_name,
-    frame_progress,
-    output_folder,
-    print_plain,
-    print_written,
-    stop_requests,
-    write_results,
-)
+from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RunOptions
 from loam_gtsam.cli.report import profile_table, summary
 from loam_gtsam.cli.results import RUN_OUTPUTS, Results, is_complete
@@ -35,8 +25,7 @@ from loam_gtsam.view.observers import LastFrame, record, watch
 
 CHECKPOINT = "checkpoint"
 """Folder among the results, until they are complete."""
-_WORTH_A_PROCESS = 200
-"""Sweeps by which a process has saved the second that it takes to start."""
+_WORTH_A_PROCESS = 200  # sweeps, by which a process has saved the second that it takes to start
 
 
 def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
@@ -46,15 +35,15 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     """
     if options.loops:
         config = config.changed("loops.enabled=true")
-    plot = draws_pictures(options.plot)
-    wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
+    plot = console.draws_pictures(options.plot)
+    wanted = options.output or Path("loam_gtsam_output") / console.file_name(dataset.name)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
     last = LastFrame()
     known, overwrite = (*RUN_OUTPUTS, CHECKPOINT), options.overwrite or options.resume
-    with output_folder(wanted, known, overwrite=overwrite) as folder:
+    with console.output_folder(wanted, known, overwrite=overwrite) as folder:
         if options.resume and is_complete(folder, config, dataset, total):
             if not options.quiet:
-                print_plain(Console(), f"{folder}: complete, {total} sweeps")
+                typer.echo(f"{folder}: complete, {total} sweeps")
             return 0
         checkpoint: Checkpoint | None = None
         if options.checkpoint > 0.0:
@@ -62,8 +51,8 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             checkpoint = Checkpoint(place, seconds=options.checkpoint, resume=options.resume)
         started = time.perf_counter()
         # The bag is closed when the results are written: an error there must not cost them.
-        with stop_requests() as stop, _observers(options, config, last) as observe:
-            with frame_progress(dataset.name, total, stop, quiet=options.quiet) as on_frame:
+        with console.stop_requests() as stop, _observers(options, config, last) as observe:
+            with console.frame_progress(dataset.name, total, stop, quiet=options.quiet) as on_frame:
                 result = run(
                     dataset,
                     config,
@@ -77,30 +66,25 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             seconds = time.perf_counter() - started
             if not result.updates:
                 raise DatasetError(f"{dataset.name}: no sweeps in it; see loam-gtsam inspect")
-            results = Results.of(result, dataset)
-            drawn = last if plot else None
-            files = write_results(
-                folder, RUN_OUTPUTS, "summary.json", lambda new: results.write(new, drawn)
-            )
+            results = Results.of(result, dataset, last if plot else None)
+            files = console.write_results(folder, RUN_OUTPUTS, "summary.json", results.write)
             if checkpoint is not None and not result.interrupted and result.error is None:
                 checkpoint.remove()
     if not options.quiet:
-        console = Console()
         if options.profile:
-            console.print(profile_table(result.updates))
+            Console().print(profile_table(result.updates))
         problems = results.info.problems
-        console.print(summary(result, dataset.name, seconds, results.accuracy, problems))
-        print_written(console, stop, len(result.updates), total, folder, files)
-        _print_hints(console, options, folder, stop)
+        Console().print(summary(result, dataset.name, seconds, results.accuracy, problems))
+        console.print_written(stop, len(result.updates), total, folder, files)
+        _print_hints(options, folder, stop)
     nothing = f"{dataset.name}: none of the {len(result.updates)} sweeps could be used"
-    return exit_code(result.error, stop, result.updates, nothing)
+    return console.exit_code(result.error, stop, result.updates, nothing)
 
 
 def worker_count(asked: int | None, sweeps: int) -> int:
     """Processes for feature extraction; if ``asked`` is None, one if it is worth its start."""
-    if asked is not None:
-        return asked
-    return int(sweeps > _WORTH_A_PROCESS and (os.cpu_count() or 1) > 1)
+    worth_it = sweeps > _WORTH_A_PROCESS and (os.cpu_count() or 1) > 1
+    return int(worth_it) if asked is None else asked
 
 
 @contextmanager
@@ -126,14 +110,13 @@ def _observers(options: RunOptions, config: Config, last: LastFrame) -> Iterator
         yield observe
 
 
-def _print_hints(console: Console, options: RunOptions, folder: Path, stop: StopRequest) -> None:
-    """Print how to go on, and where the bag and the recording are."""
+def _print_hints(options: RunOptions, folder: Path, stop: console.StopRequest) -> None:
     bag, rrd = options.bag, options.rrd
     if options.plot is None and not plots.available():
-        print_plain(console, 'No pictures without matplotlib: pip install "loam_gtsam[plot]"')
+        typer.echo('No pictures without matplotlib: pip install "loam_gtsam[plot]"')
     if stop.signum is not None and options.checkpoint > 0.0 and not (bag or rrd):
-        print_plain(console, f"To go on: the same command with --output {folder} --resume")
+        typer.echo(f"To go on: the same command with --output {folder} --resume")
     if bag is not None and bag.exists():
-        print_plain(console, f"Bag written to {bag}")
+        typer.echo(f"Bag written to {bag}")
     if rrd is not None and rrd.exists():
-        print_plain(console, f"Recording written to {rrd}; look at it with: rerun {rrd}")
+        typer.echo(f"Recording written to {rrd}; look at it with: rerun {rrd}")

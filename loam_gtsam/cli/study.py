@@ -13,13 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from loam_gtsam.cli.console import (
-    file_name,
-    number_table,
-    print_plain,
-    progress_bar,
-    stop_requests,
-)
+from loam_gtsam.cli import console
 from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.studies.trial_runner import (
@@ -48,13 +42,17 @@ def execute(options: StudyOptions) -> int:
         raise typer.BadParameter("give --workers or --scheduler, not both")
     import_pyarrow()
     spec = load_spec(options.spec)
-    folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_study"
+    folder = options.output or Path("loam_gtsam_output") / f"{console.file_name(spec.name)}_study"
     make_folder(folder / TRIALS_FOLDER)
     store = TrialStore(folder)
     # Each computation once: two names may stand for the same configuration.
     different = {trial.id: trial for trial in spec.trials}.values()
-    missing = [trial for trial in different if _must_run(store.load(trial), options)]
-    with stop_requests() as stop:
+    missing = []
+    for trial in different:
+        row = store.load(trial)
+        if row is None or options.overwrite or (options.retry_failed and row["error"]):
+            missing.append(trial)
+    with console.stop_requests() as stop:
         try:
             with (
                 _workers(options, len(missing)) as workers,
@@ -70,18 +68,20 @@ def execute(options: StudyOptions) -> int:
             write_table(folder / TABLE_FILE, found, spec.text, spec.trials)
     failed = [row for row in found if row["error"]]
     if not options.quiet:
-        console = Console()
-        console.print("Medians over the seeds")
+        typer.echo("Medians over the seeds")
         for metric in spec.metrics:
-            console.print(_summary(spec, found, metric))
-        _print_outcome(console, len(spec.trials), found, failed, folder / TABLE_FILE)
+            Console().print(_summary(spec, found, metric))
+        for row in failed[:_SHOWN_ERRORS]:
+            typer.echo(f"  {_label(row)} failed: {row['error'].strip().splitlines()[-1]}")
+        if len(failed) > _SHOWN_ERRORS:
+            typer.echo(f"  and {len(failed) - _SHOWN_ERRORS} more; see the column 'error'")
+        typer.echo(f"{len(found)} of {len(spec.trials)} trials done, {len(failed)} of them failed")
+        if len(found) < len(spec.trials):
+            typer.echo("Stopped; the same command goes on from here.")
+        typer.echo(f"Written to {folder / TABLE_FILE}")
     if stop.signum is not None:
         return 128 + stop.signum
     return 1 if failed else 0
-
-
-def _must_run(found: Row | None, options: StudyOptions) -> bool:
-    return found is None or options.overwrite or (options.retry_failed and bool(found["error"]))
 
 
 def _workers(
@@ -104,14 +104,14 @@ def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], No
         end = "failed" if row["error"] else f"{row['wall_s']:.1f} s"
         show(next(numbers), f"{_label(row)}: {end}")
 
-    with progress_bar(name, total, quiet=quiet) as show:
+    with console.progress_bar(name, total, quiet=quiet) as show:
         yield count
 
 
 def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
     """Medians over the seeds, one row per sequence and one column per configuration."""
     configs = list(dict.fromkeys(trial.config_name for trial in spec.trials))
-    table = number_table("sequence", metric, configs)
+    table = console.number_table("sequence", metric, configs)
     for sequence in dict.fromkeys(trial.sequence for trial in spec.trials):
         cells = []
         for config in configs:
@@ -124,20 +124,6 @@ def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
             cells.append(Text(f"{statistics.median(values):.4g}" if values else "-"))
         table.add_row(Text(sequence), *cells)
     return table
-
-
-def _print_outcome(
-    console: Console, total: int, found: Sequence[Row], failed: Sequence[Row], file: Path
-) -> None:
-    for row in failed[:_SHOWN_ERRORS]:
-        last_line = row["error"].strip().splitlines()[-1]
-        print_plain(console, f"  {_label(row)} failed: {last_line}")
-    if len(failed) > _SHOWN_ERRORS:
-        console.print(f"  and {len(failed) - _SHOWN_ERRORS} more; see the column 'error'")
-    console.print(f"{len(found)} of {total} trials done, {len(failed)} of them failed")
-    if len(found) < total:
-        console.print("Stopped; the same command goes on from here.")
-    print_plain(console, f"Written to {file}")
 
 
 def _label(row: Row) -> str:

@@ -61,13 +61,9 @@ def write_results(
 ) -> list[str]:
     """Replace earlier results by new ones, which took long to compute; returns their names.
 
-    ``write`` writes all files into the folder that it is given, and returns their names. For the
-    others see :func:`~loam_gtsam.io.atomic.staged_files`.
-
-    Raises
-    ------
-    OutputError
-        Naming the temporary folder into which the results were written instead.
+    ``write`` writes all files into the folder that it is given, and returns their names; for the
+    others see :func:`~loam_gtsam.io.atomic.staged_files`. If that fails, the results are written
+    into a temporary folder, which the OutputError names.
     """
     try:
         with staged_files(folder, known, last) as new:
@@ -165,10 +161,7 @@ def exit_code(
 ) -> int:
     """The exit code after the results were written; raises what ended the command early.
 
-    Raises
-    ------
-    DatasetError
-        With the message ``nothing`` and the first problem, if no frame was usable.
+    If no frame was usable, that is a DatasetError: ``nothing``, and the first problem.
     """
     if error is not None:
         raise error

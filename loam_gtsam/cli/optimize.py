@@ -14,8 +14,7 @@ from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
 from loam_gtsam.types import DatasetError, OutputError, Trajectory
 
-_LISTED = 10
-"""Loops that are switched off: how many of them are listed at most."""
+_LISTED = 10  # at most, of the loops that are switched off
 
 
 def execute(options: OptimizeOptions) -> int:
@@ -35,11 +34,9 @@ def execute(options: OptimizeOptions) -> int:
     saved = read_graph(path)
     keys = saved.keys
     if trajectory is not None and set(keys) - set(saved.stamps):
-        raise DatasetError(
-            f"{path}: has no stamps for some poses, which --trajectory needs; leave it out"
-        )
-    default = Config().pose_graph.max_chi2
-    max_chi2 = default if options.max_chi2 is None else options.max_chi2
+        lack = "has no stamps for some poses, which --trajectory needs; leave it out"
+        raise DatasetError(f"{path}: {lack}")
+    max_chi2 = Config().pose_graph.max_chi2 if options.max_chi2 is None else options.max_chi2
     result = optimize_graph(saved, robust=options.robust, max_chi2=max_chi2)
     stamps = {key: saved.stamps[key] for key in keys if key in saved.stamps}
     write_graph(target, SavedGraph(result.factors, result.poses, stamps))

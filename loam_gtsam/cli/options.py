@@ -244,8 +244,7 @@ class CompareOptions(OutputOptions, SourceOptions):
         metavar="NAME",
     )
     shared_guess: bool = flag(
-        "All solvers of this package start from the guesses of the first of them.",
-        "--shared-guess",
+        "All solvers of this package start from the guesses of the first of them.", "--shared-guess"
     )
 
 

@@ -21,10 +21,8 @@ from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buf
 from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Sweep, SweepError
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
-_MESSAGES = 3
-_TRIED_SWEEPS = 5
-_MIN_PATH = 10.0
-"""Metres. An error in per cent of a shorter path says nothing."""
+_MESSAGES, _TRIED_SWEEPS = 3, 5
+_MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
 
 def summary(
@@ -80,7 +78,7 @@ def _imu_facts(imu: ImuSummary) -> dict[str, str]:
     level = imu.level
     if level is None:
         known = imu.report.orientation != "none"
-        up = "unknown: no samples about the first sweep" if known else "unknown: no orientation"
+        up = "unknown: no " + ("samples about the first sweep" if known else "orientation")
     else:
         angles = f"roll {np.degrees(level.roll):.2f}, pitch {np.degrees(level.pitch):.2f} deg"
         state = "at rest" if level.source == "still" else "moving"
@@ -110,10 +108,9 @@ def _imu_problems(imu: ImuSummary) -> list[str]:
     problems = list(imu.report.problems)
     dropped = imu.tilt_priors.get("dropped", 0)
     if dropped and imu.report.orientation != "none":
-        problems.append(
-            f"IMU: no orientation at {dropped} of {sum(imu.tilt_priors.values())} sweeps: gaps "
-            "longer than imu.max_gap, or another clock than that of the sweeps"
-        )
+        at = f"{dropped} of {sum(imu.tilt_priors.values())} sweeps"
+        why = "gaps longer than imu.max_gap, or another clock than that of the sweeps"
+        problems.append(f"IMU: no orientation at {at}: {why}")
     if not imu.gyro_trusted:
         problems.append(
             "IMU: its gyro turned unlike the scans and was given up; check imu.lidar_R_imu_deg, "
@@ -166,13 +163,11 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
         used = f"{imu.report.samples} samples at {imu.report.rate:.0f} Hz"
         rows["IMU, used"] = f"{used}, orientation {_ORIENTATIONS[imu.report.orientation]}"
         problems += imu.report.problems
-    parts: list[Any] = [_table(info.kind, rows)]
-    if facts:
-        parts.append(_table("First usable sweep", facts))
-    parts += [Text(f"problem: {problem}", style="yellow") for problem in problems]
+    tables = [_table(info.kind, rows), *([_table("First usable sweep", facts)] if facts else [])]
+    notes = [Text(f"problem: {problem}", style="yellow") for problem in problems]
     verdict = "can be run" if facts else "cannot be run: no usable sweep among the first few"
-    parts.append(Text(verdict, style="green" if facts else "red"))
-    return Group(*parts), bool(facts)
+    end = Text(verdict, style="green" if facts else "red")
+    return Group(*tables, *notes, end), bool(facts)
 
 
 def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:

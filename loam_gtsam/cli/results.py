@@ -14,13 +14,7 @@ from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.pipeline import RunResult, effective_config
-from loam_gtsam.studies.evaluation import (
-    AbsoluteError,
-    absolute_error,
-    align_positions,
-    align_rotations,
-    interpolate,
-)
+from loam_gtsam.studies import evaluation
 from loam_gtsam.types import LoamError, OutputError, Trajectory
 from loam_gtsam.view import frame_plot, plots
 from loam_gtsam.view.observers import LastFrame
@@ -43,7 +37,7 @@ class Results:
     """For the pictures; None draws none."""
     accuracy: Mapping[str, Any] = field(default_factory=dict)
     """Errors against the truth, or ``problem``; empty without truth."""
-    error: AbsoluteError | None = None
+    error: evaluation.AbsoluteError | None = None
     map_truth: Trajectory | None = None
     """The truth in the map frame; None if it cannot be compared."""
 
@@ -55,14 +49,14 @@ class Results:
         if truth is None:
             return results
         try:
-            error = absolute_error(trajectory, truth)
+            error = evaluation.absolute_error(trajectory, truth)
         except ValueError as problem:  # no overlap in time, or stamps of the truth that repeat
             return replace(results, accuracy={"problem": str(problem)})
-        there = interpolate(truth, error.stamps)
+        there = evaluation.interpolate(truth, error.stamps)
         inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
         here = trajectory.map_T_lidar[inside]
-        turn = align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
-        map_T_truth = align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
+        turn = evaluation.align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
+        map_T_truth = evaluation.align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
         accuracy = {
             "ate_rmse_m": error.rmse,
             "ate_max_m": error.maximum,

@@ -16,22 +16,9 @@ from rich.text import Text
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import StudyOptions
 from loam_gtsam.io.atomic import make_folder
-from loam_gtsam.studies.trial_runner import (
-    ClusterWorkers,
-    LocalWorkers,
-    cluster_workers,
-    local_workers,
-    run_trials,
-)
+from loam_gtsam.studies import trial_runner as runner
+from loam_gtsam.studies import trials
 from loam_gtsam.studies.trial_spec import Spec, load_spec
-from loam_gtsam.studies.trials import (
-    TABLE_FILE,
-    TRIALS_FOLDER,
-    Row,
-    TrialStore,
-    import_pyarrow,
-    write_table,
-)
 
 _SHOWN_ERRORS = 3
 
@@ -40,15 +27,14 @@ def execute(options: StudyOptions) -> int:
     """Run the trials that are not finished, write table and summary; returns the exit code."""
     if options.workers is not None and options.scheduler is not None:
         raise typer.BadParameter("give --workers or --scheduler, not both")
-    import_pyarrow()
+    trials.import_pyarrow()
     spec = load_spec(options.spec)
     folder = options.output or Path("loam_gtsam_output") / f"{console.file_name(spec.name)}_study"
-    make_folder(folder / TRIALS_FOLDER)
-    store = TrialStore(folder)
-    # Each computation once: two names may stand for the same configuration.
-    different = {trial.id: trial for trial in spec.trials}.values()
+    make_folder(folder / trials.TRIALS_FOLDER)
+    store = trials.TrialStore(folder)
     missing = []
-    for trial in different:
+    # Each computation once: two names may stand for the same configuration.
+    for trial in {trial.id: trial for trial in spec.trials}.values():
         row = store.load(trial)
         if row is None or options.overwrite or (options.retry_failed and row["error"]):
             missing.append(trial)
@@ -58,14 +44,14 @@ def execute(options: StudyOptions) -> int:
                 _workers(options, len(missing)) as workers,
                 _progress(spec.name, len(missing), options.quiet) as count,
             ):
-                for done in run_trials(missing, lambda: stop.signum is not None, workers):
+                for done in runner.run_trials(missing, lambda: stop.signum is not None, workers):
                     store.save(done)
                     count(done)
         except KeyboardInterrupt:
             pass
         finally:  # also after an error: the finished trials are worth a table
             found = [row for row in map(store.load, spec.trials) if row is not None]
-            write_table(folder / TABLE_FILE, found, spec.text, spec.trials)
+            trials.write_table(folder / trials.TABLE_FILE, found, spec.text, spec.trials)
     failed = [row for row in found if row["error"]]
     if not options.quiet:
         typer.echo("Medians over the seeds")
@@ -78,7 +64,7 @@ def execute(options: StudyOptions) -> int:
         typer.echo(f"{len(found)} of {len(spec.trials)} trials done, {len(failed)} of them failed")
         if len(found) < len(spec.trials):
             typer.echo("Stopped; the same command goes on from here.")
-        typer.echo(f"Written to {folder / TABLE_FILE}")
+        typer.echo(f"Written to {folder / trials.TABLE_FILE}")
     if stop.signum is not None:
         return 128 + stop.signum
     return 1 if failed else 0
@@ -86,21 +72,21 @@ def execute(options: StudyOptions) -> int:
 
 def _workers(
     options: StudyOptions, count: int
-) -> AbstractContextManager[LocalWorkers | ClusterWorkers | None]:
+) -> AbstractContextManager[runner.LocalWorkers | runner.ClusterWorkers | None]:
     """Where so many trials run; None stands for this process."""
     if options.scheduler is not None and count:
-        return cluster_workers(options.scheduler)
+        return runner.cluster_workers(options.scheduler)
     if options.workers is not None and count:
-        return local_workers(min(options.workers, count))
+        return runner.local_workers(min(options.workers, count))
     return nullcontext()
 
 
 @contextmanager
-def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], None]]:
+def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[trials.Row], None]]:
     """Show a progress bar; gives the function to call after each trial."""
     numbers = itertools.count(1)
 
-    def count(row: Row) -> None:
+    def count(row: trials.Row) -> None:
         end = "failed" if row["error"] else f"{row['wall_s']:.1f} s"
         show(next(numbers), f"{_label(row)}: {end}")
 
@@ -108,7 +94,7 @@ def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[Row], No
         yield count
 
 
-def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
+def _summary(spec: Spec, rows: Sequence[trials.Row], metric: str) -> Table:
     """Medians over the seeds, one row per sequence and one column per configuration."""
     configs = list(dict.fromkeys(trial.config_name for trial in spec.trials))
     table = console.number_table("sequence", metric, configs)
@@ -126,6 +112,6 @@ def _summary(spec: Spec, rows: Sequence[Row], metric: str) -> Table:
     return table
 
 
-def _label(row: Row) -> str:
+def _label(row: trials.Row) -> str:
     seed = "" if row["seed"] is None else f", seed {row['seed']}"
     return f"{row['sequence']} x {row['config']}{seed}"

@@ -124,13 +124,7 @@ class Section(BaseModel):
         return self
 
     def changed(self, /, **values: Any) -> Self:
-        """A copy with other values, as ``config.solver.changed(iterations=5)``.
-
-        Raises
-        ------
-        ConfigError
-            If there is no such parameter, or a value does not fit.
-        """
+        """A copy with other values, as ``config.solver.changed(iterations=5)``."""
         return type(self)(**{**vars(self), **values})
 
 
@@ -146,9 +140,8 @@ def shown(value: Any) -> str:
     """A value in an error message: short, for aliases in YAML can make one of any length."""
     if isinstance(value, Mapping):
         return f"a mapping of {len(value)} keys"
-    if isinstance(value, (list, tuple)) and any(
-        isinstance(entry, (list, tuple, Mapping)) for entry in value
-    ):
+    nests = (list, tuple, Mapping)
+    if isinstance(value, (list, tuple)) and any(isinstance(entry, nests) for entry in value):
         return f"a list of {len(value)} lists or mappings"
     try:
         text = repr(value)
@@ -176,15 +169,8 @@ def override(
 ) -> AnySection:
     """A section with the values of nested mappings in place of its own.
 
-    Parameters
-    ----------
-    where : names the place of a key, given its path from the top, in an error message
-    above : path of the section from the top
-
-    Raises
-    ------
-    ConfigError
-        Naming the key, its place, what was expected and what came.
+    An error names the key, its place by ``where`` of its path from the top, what was expected and
+    what came; ``above`` is the path of the section.
     """
     values: dict[str, Any] = {}
     keys: dict[str, Any] = {}
@@ -205,7 +191,7 @@ def override(
 
 
 def _plain(value: Any) -> Any:
-    """A value without what the parser keeps of the looks of a boolean, which is no bool then."""
+    """A value whose booleans are bools, not what the parser makes to keep their looks."""
     if isinstance(value, list):
         return [_plain(entry) if isinstance(entry, ScalarBoolean) else entry for entry in value]
     return bool(value) if isinstance(value, ScalarBoolean) else value

@@ -152,9 +152,8 @@ class RelocalizationConfig(Section):
     memory: int = parameter(10, low=1)
     """The usual shares are medians over this many earlier sweeps; no sweep is lost before them."""
     min_agreement: float = parameter(
-        0.8, source="at least 0.88 was seen in the built-in scenes and KITTI, at most 0.75 when "
-        "kidnapped", low=0.0, high=1.0,
-    )  # fmt: skip
+        0.8, source="at least 0.88 on the way, at most 0.75 when kidnapped", low=0.0, high=1.0
+    )
     """A sweep is lost if the share of its matches within three standard deviations is below this
     times the usual share."""
     min_share: float = parameter(0.4, low=0.0, high=1.0)
@@ -235,9 +234,7 @@ class MatchingConfig(Section):
     weight_slope: float = parameter(0.9, source="LOAM", low=0.0)
     """A match has the weight 1 - slope * |distance|, for planes over sqrt(range), with this slope;
     0 gives all matches the same weight."""
-    weight_range: Literal["lidar", "map"] = parameter(
-        "lidar", source="LIO-SAM uses lidar, LOAM uses map"
-    )
+    weight_range: Literal["lidar", "map"] = parameter("lidar", source="LOAM uses map")
     """The range in the weight of a plane is that from the lidar or from the map origin."""
     min_weight: float = parameter(0.1, source="LOAM", low=0.0, high=1.0)
     """A match with a smaller weight than this is dropped."""
@@ -284,8 +281,7 @@ class SolverConfig(Section):
     acceleration_sigma: float = parameter(2.0, unit="m/s^2", low=1e-6)
     """Along degenerate directions, constant velocity is believed to within this acceleration."""
     turn_sigma: float = parameter(2.0, unit="rad/s^2", low=1e-6)
-    """The motion of constant velocity is believed to within this angular acceleration along
-    degenerate directions."""
+    """Along degenerate directions, a constant turn rate is believed to within this acceleration."""
     degeneracy_threshold: float = parameter(100.0, source="LOAM", low=0.0)
     """The method loam projects the step out of eigenvectors of A^T A that have eigenvalues below
     this (mixed rad and m); 0 turns the projection off."""
@@ -384,8 +380,7 @@ class PoseGraphConfig(Section):
     """A loop closure is used if its squared Mahalanobis distance (6 degrees of freedom) from what
     all the others say is not above this."""
     kernel_width: float = parameter(5.0, source="right loop closures have sqrt(6)", low=0.1)
-    """The Huber kernel on the whitened norm of a loop closure has this width in iSAM2; .inf turns
-    the kernel off."""
+    """In iSAM2 a loop closure has a Huber kernel of this whitened width; .inf turns it off."""
     believed_loops: int = parameter(6, low=2)
     """At least this many loop closures that agree pairwise are used against the odometry."""
     follow_distance: float = parameter(0.05, unit="m", low=0.0)
@@ -427,9 +422,8 @@ class LoopConfig(Section):
     min_share: float = parameter(0.5, low=0.0, high=1.0)
     """At least this share of the features off level ground must have a match in the submap."""
     min_agreement: float = parameter(
-        0.9, source="right loops have 0.97 or more, those shifted by 3 m along a street 0.75, "
-        "other wrong ones less than 0.5", low=0.0, high=1.0,
-    )  # fmt: skip
+        0.9, source="right loops have 0.97 or more, wrong ones at most 0.75", low=0.0, high=1.0
+    )
     """At least this share of the matches must lie within three standard deviations."""
     min_aligned: float = parameter(30.0, low=0.0)
     """Every direction must be fixed by this many matches, counted as for solver.min_aligned."""

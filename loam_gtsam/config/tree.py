@@ -12,43 +12,28 @@ from pydantic import model_validator
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
+from loam_gtsam.config import sections
 from loam_gtsam.config.base import Section, meaning, nearest, nested, out_of_order, override, shown
-from loam_gtsam.config.sections import (
-    BagConfig,
-    CovarianceConfig,
-    DeskewConfig,
-    FeatureConfig,
-    ImuConfig,
-    LiveConfig,
-    LoopConfig,
-    MapConfig,
-    MatchingConfig,
-    OdometryConfig,
-    PoseGraphConfig,
-    RelocalizationConfig,
-    SensorConfig,
-    SolverConfig,
-)
 from loam_gtsam.types import ConfigError
 
 
 class Config(Section):
     """The whole configuration."""
 
-    sensor: SensorConfig = SensorConfig()
-    features: FeatureConfig = FeatureConfig()
-    deskew: DeskewConfig = DeskewConfig()
-    odometry: OdometryConfig = OdometryConfig()
-    map: MapConfig = MapConfig()
-    matching: MatchingConfig = MatchingConfig()
-    solver: SolverConfig = SolverConfig()
-    imu: ImuConfig = ImuConfig()
-    relocalization: RelocalizationConfig = RelocalizationConfig()
-    covariance: CovarianceConfig = CovarianceConfig()
-    pose_graph: PoseGraphConfig = PoseGraphConfig()
-    loops: LoopConfig = LoopConfig()
-    bag: BagConfig = BagConfig()
-    live: LiveConfig = LiveConfig()
+    sensor: sections.SensorConfig = sections.SensorConfig()
+    features: sections.FeatureConfig = sections.FeatureConfig()
+    deskew: sections.DeskewConfig = sections.DeskewConfig()
+    odometry: sections.OdometryConfig = sections.OdometryConfig()
+    map: sections.MapConfig = sections.MapConfig()
+    matching: sections.MatchingConfig = sections.MatchingConfig()
+    solver: sections.SolverConfig = sections.SolverConfig()
+    imu: sections.ImuConfig = sections.ImuConfig()
+    relocalization: sections.RelocalizationConfig = sections.RelocalizationConfig()
+    covariance: sections.CovarianceConfig = sections.CovarianceConfig()
+    pose_graph: sections.PoseGraphConfig = sections.PoseGraphConfig()
+    loops: sections.LoopConfig = sections.LoopConfig()
+    bag: sections.BagConfig = sections.BagConfig()
+    live: sections.LiveConfig = sections.LiveConfig()
 
     @model_validator(mode="after")
     def _check_matches(self) -> Self:
@@ -85,64 +70,49 @@ class Config(Section):
 
 
 _WIDTH = 100
-_CLASSICAL_FEATURES = FeatureConfig(range_noise=0.0, post_depth=0.0)
-_CLASSICAL_MATCHING = MatchingConfig(
-    max_edges=0,
-    max_planes=0,
-    wide_search=1.0,
-    line_ratio=3.0,
-    plane_fit="unit_offset",
-    plane_ratio=0.0,
-    max_ring_cosine=1.0,
-    min_incidence_sine=0.0,
-    fit_uncertainty=False,
-    weight_range="map",
-    keep_translation=0.0,
-)
+_CLASSICAL = {
+    "features": {"range_noise": 0.0, "post_depth": 0.0},
+    "deskew": {"refine": False, "rotation": "constant_velocity"},
+    "odometry.method": "scan_to_scan",
+    "map.insertion": "centroid",
+    "matching": {
+        "max_edges": 0,
+        "max_planes": 0,
+        "wide_search": 1.0,
+        "line_ratio": 3.0,
+        "plane_fit": "unit_offset",
+        "plane_ratio": 0.0,
+        "max_ring_cosine": 1.0,
+        "min_incidence_sine": 0.0,
+        "fit_uncertainty": False,
+        "weight_range": "map",
+        "keep_translation": 0.0,
+    },
+    "solver": {"step_sigmas": 0.0, "min_map_edges": 11},
+    "relocalization.enabled": False,
+}
 
 PRESETS: dict[str, Config] = {
     "default": Config(),
     # Zhang and Singh, LOAM (RSS 2014), constants of the published laserMapping.
-    "loam": Config(
-        features=_CLASSICAL_FEATURES,
-        deskew=DeskewConfig(refine=False, rotation="constant_velocity"),
-        odometry=OdometryConfig(method="scan_to_scan"),
-        map=MapConfig(insertion="centroid"),
-        matching=_CLASSICAL_MATCHING,
-        solver=SolverConfig(method="loam", step_sigmas=0.0, min_map_edges=11, min_map_planes=101),
-        imu=ImuConfig(prior="blend", weight=0.002, average_seconds=0.0),
-        relocalization=RelocalizationConfig(enabled=False),
+    "loam": Config().changed(
+        _CLASSICAL,
+        {"solver": {"method": "loam", "min_map_planes": 101}},
+        {"imu": {"prior": "blend", "weight": 0.002, "average_seconds": 0.0}},
     ),
-    # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings.
-    "aloam": Config(
-        features=_CLASSICAL_FEATURES,
-        deskew=DeskewConfig(refine=False, rotation="constant_velocity"),
-        odometry=OdometryConfig(method="scan_to_scan"),
-        map=MapConfig(neighbourhood=(5, 5, 3), field_of_view=False, insertion="centroid"),
-        matching=_CLASSICAL_MATCHING.changed(weight_slope=0.0),
-        solver=SolverConfig(
-            method="aloam",
-            iterations=2,
-            inner_iterations=4,
-            step_sigmas=0.0,
-            min_matches=6,  # A-LOAM has no minimum; fewer cannot fix a pose
-            min_map_edges=11,
-            min_map_planes=51,
-        ),
-        imu=ImuConfig(enabled=False),
-        relocalization=RelocalizationConfig(enabled=False),
+    # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings. It has no minimum of
+    # matches; fewer than 6 cannot fix a pose.
+    "aloam": Config().changed(
+        _CLASSICAL,
+        {"map": {"neighbourhood": [5, 5, 3], "field_of_view": False}, "imu.enabled": False},
+        {"solver": {"method": "aloam", "iterations": 2, "inner_iterations": 4, "min_matches": 6}},
+        {"solver.min_map_planes": 51, "matching.weight_slope": 0.0},
     ),
 }
 
 
 def preset(name: str, where: str = "") -> Config:
-    """The configuration called ``name``; an error message begins with ``where``.
-
-    Raises
-    ------
-    ConfigError
-        If there is no such preset.
-    """
+    """The configuration called ``name``; the error that there is none begins with ``where``."""
     if not isinstance(name, str) or name not in PRESETS:
         raise ConfigError(f"{where}unknown preset {shown(name)}{nearest(name, PRESETS)}")
     return PRESETS[name]

@@ -16,15 +16,12 @@ import numpy as np
 
 from loam_gtsam.types import OutputError
 
-_STAGED = ".loam_gtsam_new"
-"""Folder of new files among the old ones, until all of them are written."""
+_STAGED = ".loam_gtsam_new"  # folder of new files among the old ones, until all are written
 
 
-_ADVICE = "; choose another folder or free some space"
-
-
-def _refused(what: str, error: OSError, advice: str = "") -> OutputError:
-    return OutputError(f"{what}: {error.strerror or error}{advice}")
+def _refused(problem: str, error: OSError) -> OutputError:
+    advice = "choose another folder or free some space"
+    return OutputError(f"{problem}: {error.strerror or error}; {advice}")
 
 
 @contextmanager
@@ -49,7 +46,7 @@ def atomic_file(path: str | Path) -> Iterator[BinaryIO]:
             os.fsync(file.fileno())
         os.replace(temporary, path)
     except OSError as error:
-        raise _refused(f"{path}: cannot write the file", error, _ADVICE) from error
+        raise _refused(f"{path}: cannot write the file", error) from error
     finally:
         with suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -80,13 +77,7 @@ def _without_nan(value: Any) -> Any:
 
 
 def make_folder(directory: str | Path) -> Path:
-    """Make a folder and check that files can be written there.
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be made, or no file can be written in it.
-    """
+    """Make a folder and check that files can be written there, else raise an OutputError."""
     folder = Path(directory)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -110,11 +101,6 @@ def staged_files(folder: Path, known: Sequence[str], last: str) -> Iterator[Path
     known : names of files that an earlier run may have left, which are removed if not written anew
     last : name of the file that is removed first and moved last: if it is there, all files are of
         one run
-
-    Raises
-    ------
-    OutputError
-        If a file cannot be written or moved.
     """
     staged = folder / _STAGED
     try:
@@ -127,16 +113,13 @@ def staged_files(folder: Path, known: Sequence[str], last: str) -> Iterator[Path
         for name in names:
             os.replace(staged / name, folder / name)
     except OSError as error:
-        raise _refused(f"{folder}: cannot write there", error, _ADVICE) from error
+        raise _refused(f"{folder}: cannot write there", error) from error
     finally:
         shutil.rmtree(staged, ignore_errors=True)
 
 
 class ClosingWriter(ABC):
-    """Writer of an output that grows during a run; leaving its ``with`` block closes the writer.
-
-    The output is closed after an error or Ctrl-C as well.
-    """
+    """Writer of an output that grows during a run; its ``with`` block closes it in any case."""
 
     @abstractmethod
     def close(self) -> None:

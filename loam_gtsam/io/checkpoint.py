@@ -55,8 +55,7 @@ class Checkpoint:
     """
 
     def __init__(self, folder: str | Path, *, seconds: float = 60.0, resume: bool = False) -> None:
-        self.folder = Path(folder)
-        self.seconds = seconds
+        self.folder, self.seconds = Path(folder), seconds
         self._resume = resume
         self._warned = False
         self._parts: list[int] = []  # how many frames there were at each checkpoint
@@ -114,9 +113,8 @@ class Checkpoint:
                 frames.updates += part.updates
             thaw(state, roots, shared)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise OutputError(
-                f"{newest}: the checkpoint cannot be read: {error}; start again without resuming"
-            ) from error
+            problem = f"{newest}: the checkpoint cannot be read: {error}"
+            raise OutputError(f"{problem}; start again without resuming") from error
         self._written = time.monotonic()
         return frames.stamps, frames.updates
 
@@ -185,11 +183,9 @@ class Checkpoint:
 
 def _is_ours(path: Path) -> bool:
     """Whether a file is one that a checkpoint wrote."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            return {f"{_HEADER}.npy", f"{STRUCTURE}.npy"} <= set(archive.namelist())
-    except (OSError, zipfile.BadZipFile):
-        return False
+    with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+        return {f"{_HEADER}.npy", f"{STRUCTURE}.npy"} <= set(archive.namelist())
+    return False
 
 
 def _write(path: Path, frozen: Frozen, header: Mapping[str, Any]) -> None:

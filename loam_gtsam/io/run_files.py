@@ -1,6 +1,7 @@
 """Results of a run as files: map, covariances, everything about every frame, and a summary.
 
-Every file is written beside its final name and then renamed, see :mod:`loam_gtsam.io.atomic`.
+Every file is written beside its final name and then renamed, see :mod:`loam_gtsam.io.atomic`; an
+:class:`~loam_gtsam.types.OutputError` says that a file could not be written.
 """
 
 from __future__ import annotations
@@ -16,22 +17,13 @@ from loam_gtsam.config import dump_config
 from loam_gtsam.io.atomic import atomic_file, make_folder, write_json, write_text
 from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.types import (
-    FloatArray,
-    IntArray,
-    MapUpdate,
-    Uncertainty,
-    check_array,
-    stack_poses,
-)
+from loam_gtsam.types import FloatArray, IntArray, MapUpdate, Uncertainty, check_array, stack_poses
 
 if TYPE_CHECKING:
     from loam_gtsam.pipeline import ImuSummary, RunResult
 
 _NS = 10**9
-_MAX_MESSAGES = 20
-"""Messages of frames kept in ``summary.json``; ``run.npz`` has them all."""
-
+_MAX_MESSAGES = 20  # in summary.json; run.npz has them all
 EDGE_COLOUR, PLANE_COLOUR = (214, 96, 32), (110, 125, 140)
 """Red, green, blue of the two kinds of map points in the PLY file."""
 
@@ -47,8 +39,6 @@ RUN_FILES = (
     "summary.json",
 )
 """What :func:`write_run` writes."""
-
-
 _AXES = ("rx", "ry", "rz", "x", "y", "z")
 
 
@@ -143,8 +133,6 @@ def write_ply(path: str | Path, edges: NDArray[np.floating], planes: NDArray[np.
     ------
     InputError
         If a shape is wrong.
-    OutputError
-        If the file cannot be written.
     """
     for name, points in (("edges", edges), ("planes", planes)):
         check_array(points, f"write_ply: {name}", ("N", 3))
@@ -184,11 +172,6 @@ def write_run(
     directory : made if it does not exist
     dataset : what was run, for the records
     extra : further entries of the summary (plain numbers, strings, lists and mappings)
-
-    Raises
-    ------
-    OutputError
-        If the folder cannot be made or a file cannot be written.
     """
     folder = make_folder(directory)
     trajectory = result.trajectory
@@ -209,8 +192,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
     """What ``summary.json`` says about a run; lengths in metres, times in the unit of the name."""
     trajectory = result.trajectory
     seconds = np.nansum(stage_seconds(result.updates)[1], axis=1)
-    messages = [f"frame {n}: {u.status}: {u.message}" for n, u in enumerate(result.updates)
-                if u.message]  # fmt: skip
+    told = [(n, u) for n, u in enumerate(result.updates) if u.message]
     return {
         "loam_gtsam": installed_version(),
         "frames": len(result.updates),
@@ -224,7 +206,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
             "sweeps": sum(u.n_not_finite > 0 for u in result.updates),
             "points": sum(u.n_not_finite for u in result.updates),
         },
-        "messages": messages[:_MAX_MESSAGES],
+        "messages": [f"frame {n}: {u.status}: {u.message}" for n, u in told[:_MAX_MESSAGES]],
         "path_length_m": trajectory.path_length,
         "duration_s": float(np.ptp(trajectory.stamps)) / _NS if len(trajectory) else 0.0,
         "frame_ms_median": 1e3 * float(np.median(seconds)) if len(seconds) else None,
@@ -265,9 +247,8 @@ def _imu_part(imu: ImuSummary) -> dict[str, Any]:
     counted = ("samples", "gaps", "duplicates", "out_of_order", "not_finite", "orientation")
     return {name: getattr(report, name) for name in counted} | {
         "rate_hz": report.rate,
-        "level": None
-        if level is None
-        else {
+        "level": level
+        and {
             "roll_deg": float(np.degrees(level.roll)),
             "pitch_deg": float(np.degrees(level.pitch)),
             "map_up": level.map_up.tolist(),

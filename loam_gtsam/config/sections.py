@@ -49,7 +49,7 @@ class FeatureConfig(Section):
     """The curvature at a point takes this many neighbours on either side of it in its ring."""
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
-    range_noise: float = parameter(0.02, unit="m", source="LOAM takes whatever is no edge", low=0.0)
+    range_noise: float = parameter(0.02, unit="m", source="LOAM takes all that is no edge", low=0.0)
     """The ranges of the sensor have this standard deviation. A plane point is taken only where its
     ring scatters about a smooth surface by less than four times this value, which foliage does
     not; 0 turns the test off."""
@@ -152,7 +152,7 @@ class RelocalizationConfig(Section):
     memory: int = parameter(10, low=1)
     """The usual shares are medians over this many earlier sweeps; no sweep is lost before them."""
     min_agreement: float = parameter(
-        0.8, source="at least 0.88 on the way, at most 0.75 when kidnapped", low=0.0, high=1.0
+        0.8, source="0.88 or more is usual, at most 0.75 when kidnapped", low=0.0, high=1.0
     )
     """A sweep is lost if the share of its matches within three standard deviations is below this
     times the usual share."""
@@ -379,10 +379,10 @@ class PoseGraphConfig(Section):
     max_chi2: float = parameter(40.0, source="one of 10,000 right loops exceeds 28", low=0.0)
     """A loop closure is used if its squared Mahalanobis distance (6 degrees of freedom) from what
     all the others say is not above this."""
-    kernel_width: float = parameter(5.0, source="right loop closures have sqrt(6)", low=0.1)
-    """In iSAM2 a loop closure has a Huber kernel of this whitened width; .inf turns it off."""
+    kernel_width: float = parameter(5.0, source="right loops have a norm of sqrt(6)", low=0.1)
+    """In iSAM2 a loop closure has a Huber kernel, this wide after whitening; .inf turns it off."""
     believed_loops: int = parameter(6, low=2)
-    """At least this many loop closures that agree pairwise are used against the odometry."""
+    """At least this many loop closures that agree pairwise are used even against the odometry."""
     follow_distance: float = parameter(0.05, unit="m", low=0.0)
     """Map points follow their keyframe once a loop closure has moved it by more than this as seen
     from the newest keyframe; an error of follow_angle_deg in the newest one is allowed for."""

@@ -320,17 +320,10 @@ def _deviations(
 ) -> tuple[FloatArray, FloatArray]:
     """Standard deviations (M,) of the distance of a new point, m, and of the tilt of the fit, rad.
 
-    The variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)`` (Draper and Smith,
-    Applied Regression Analysis, 3rd ed., section 3.1), is large where the point lies far to a side
-    in which the neighbours are narrow, as across the rings of a sparse sensor.
-
-    Parameters
-    ----------
-    roughness : (M,) mean squared distance of the neighbours across the line or plane, m^2
-    spread : (M,) variance of the neighbours along the line, or along the plane's narrow side, m^2
-    leverage : (M,) squared distance from the centre in units of the neighbours' variances
-    parameters : number of parameters of the fit, per direction across the line or plane
-    neighbours : k
+    The first is the variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)``
+    (Draper and Smith, Applied Regression Analysis, 3rd ed., section 3.1). ``roughness`` and
+    ``spread`` are variances of the k neighbours, m^2, across and along the fit; ``parameters`` are
+    those of the fit per direction across.
     """
     least = config.point_sigma**2
     scatter, variance = np.full((2, len(roughness)), least)

@@ -19,14 +19,12 @@ from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdat
 _LONGEST = 10.0
 """Seconds for which a motion is extrapolated at most; after a longer gap, or with a wrong stamp,
 the extrapolated pose would be anywhere."""
-_SHORTEST = 1e-3
-"""Least seconds between the middles of two sweeps."""
+_SHORTEST = 1e-3  # least seconds between the middles of two sweeps
 _REASSOCIATE_EVERY = 5
 """Gauss-Newton iterations per association of the scan-to-scan odometry (LOAM)."""
 _WEIGHT_SLOPE = 1.8
 """Weight 1 - 1.8 |d| after the first association of the scan-to-scan odometry (LOAM)."""
-_MIN_MATCHES = 10
-"""Least matches of the scan-to-scan odometry; with fewer the twist stays (LOAM)."""
+_MIN_MATCHES = 10  # least matches of the scan-to-scan odometry; with fewer the twist stays (LOAM)
 _CONVERGED = 1e-5
 """Change of the motion over a sweep, rad and m, below which the scan-to-scan odometry stops."""
 _RING_SPACING = 1e4

@@ -28,20 +28,15 @@ _AGREE = 3.0
 """Standard deviations within which a match agrees with the pose: 99.7 % of normal noise."""
 _CELL = 0.5
 """Size of a search cell, metres: half the reach of a match, which is then the neighbouring cell."""
-_SPACING = 2
-"""Cells between trial positions: 1 m, from which a solve converges."""
+_SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
 _TURN = np.radians(5.0)
 """Angle between trial headings: half of it moves a point at 15 m by little more than a cell."""
-_REACH = 40.0
-"""Largest horizontal distance of a point that is scored, metres."""
-_HEIGHT = 10.0
-"""Largest height above or below the lidar of a point that is scored, metres."""
-_SAMPLE = (60, 140)
-"""Number of edge and plane features that are scored."""
+_REACH = 40.0  # largest horizontal distance of a point that is scored, metres
+_HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
+_SAMPLE = (60, 140)  # number of edge and plane features that are scored
 _START_ROUNDS = 2
 """Number of times the first two sweeps are registered anew while their motion becomes known."""
-_PLACES = 6
-"""Largest number of places that are tried for a sweep that does not fit the map."""
+_PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 _CLEARLY = 1.02
 """Ratio by which another motion within a sweep must fit better than the motion before."""
 _APART = (1.5, np.radians(12.0))

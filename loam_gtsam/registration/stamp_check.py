@@ -11,8 +11,7 @@ LARGEST_STEP = 10.0
 leads 50 m away from the prediction. For a slow sensor the limit is ten of its own intervals."""
 IN_A_ROW = 5
 """Number of consecutive doubted sweeps with consistent stamps that shows that the clock was set."""
-_STEPS = 10
-"""Intervals of the sensor between two sweeps above which a stamp is doubted."""
+_STEPS = 10  # intervals of the sensor between two sweeps above which a stamp is doubted
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,8 +37,7 @@ _REDESCENDING = 2.816
 """Width of a Geman-McClure kernel over the width of a Huber kernel with the same efficiency on
 normal noise: 3.787 and 1.345 at 95 %."""
 
-_TO_SIGMA = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
+_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
 _FUSE = gtsam.LevenbergMarquardtParams()
 _FUSE.setVerbosityLM("SILENT")
@@ -46,8 +45,7 @@ _FUSE.setlambdaInitial(1e-12)  # a single pose near its optimum: plain Gauss-New
 _FUSE.setRelativeErrorTol(1e-14)
 _FUSE.setAbsoluteErrorTol(0.0)
 
-_CERTAIN = 1e10
-"""Information that outweighs every other factor: 0.01 mrad and 0.01 mm."""
+_CERTAIN = 1e10  # information that outweighs every other factor: 0.01 mrad and 0.01 mm
 
 
 class GtsamSolver:

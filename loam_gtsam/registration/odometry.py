@@ -171,25 +171,23 @@ def predict(
     """
     steady = ConstantVelocity(imu).at(sweep.reference_stamp, last)
     inertial = None if last is None or imu is None else imu.predict(sweep.stamp)
-    if inertial is None:
-        posed = sweep.at(steady.twist if twist is None else np.asarray(twist, np.float64))
-        guess = steady.map_T_lidar if guess is None else guess
-        middle = posed.map_T_middle(guess)
-        information = np.zeros((6, 6))
-        if moment is not None:
-            seconds = moment.seconds_to(sweep.stamp)
-            sigmas = np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
-            information = np.diag((0.5 * seconds**2 * sigmas) ** -2.0)
-        return Prediction(posed, guess, middle, MotionPrior(middle, information))
-    if twist is None:
+    if twist is None and inertial is not None:
         velocity = inertial.map_T_lidar.rotation().matrix().T @ inertial.velocity
         twist = sweep.twist_at_reference(steady.twist[:3], velocity)
-    posed = sweep.at(np.asarray(twist, np.float64))
-    if guess is None:
+    posed = sweep.at(steady.twist if twist is None else np.asarray(twist, np.float64))
+    if guess is None and inertial is not None:
         guess = inertial.map_T_lidar.compose(posed.middle_T_reference)
-    information = np.linalg.inv(inertial.covariance).astype(np.float64)
-    motion = MotionPrior(inertial.map_T_lidar, information)
-    return Prediction(posed, guess, posed.map_T_middle(guess), motion)
+    guess = steady.map_T_lidar if guess is None else guess
+    middle = posed.map_T_middle(guess)
+    motion = MotionPrior(middle, np.zeros((6, 6)))
+    if inertial is not None:
+        information = np.linalg.inv(inertial.covariance).astype(np.float64)
+        motion = MotionPrior(inertial.map_T_lidar, information)
+    elif moment is not None:
+        seconds = moment.seconds_to(sweep.stamp)
+        sigmas = np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
+        motion = MotionPrior(middle, np.diag((0.5 * seconds**2 * sigmas) ** -2.0))
+    return Prediction(posed, guess, middle, motion)
 
 
 def twist_to(

@@ -198,13 +198,6 @@ def test_a_limit_of_one_keeps_lines_along_the_ring_and_no_limit_is_needed_above_
     assert len(one(match_lines, 5 * Z, line_group(0.4 * Y, centre=5 * Z))) == 1
 
 
-def test_it_is_the_ring_of_the_sensor_that_counts_not_the_horizon():
-    """A sensor rolled by 90 degrees scans a vertical pole along its ring."""
-    rolled = gtsam.Pose3(gtsam.Rot3.Rx(np.pi / 2), np.zeros(3)).matrix()
-    assert len(one(match_lines, AHEAD, line_group(0.4 * Z), pose=rolled)) == 0
-    assert len(one(match_lines, AHEAD, line_group(0.4 * Y), pose=rolled)) == 1
-
-
 def test_a_plane_must_be_flat():
     for tolerance in (0.1, 0.2):
         config = changed(plane_tolerance=tolerance)
@@ -349,47 +342,6 @@ def map_of(points, voxel=0.01, **changes):
     return cubes
 
 
-def cloud(rng):
-    """Features, and a map of noisy patches, strokes and scattered points around the origin."""
-    centres = rng.uniform(-60, 60, (120, 1, 3))
-    bases = np.array([gtsam.Rot3.Expmap(2 * rng.normal(size=3)).matrix() for _ in range(120)])
-    spread = 10.0 ** rng.uniform(-2.5, 0.0, (120, 1, 3))
-    groups = centres + (rng.normal(size=(120, 12, 3)) * spread) @ bases
-    points = centres[:, 0] + rng.normal(0, 0.2, (120, 3))
-    return points, groups.reshape(-1, 3)
-
-
-@pytest.mark.parametrize("match", [match_lines, match_planes])
-def test_another_map_frame_changes_nothing_but_the_frame(match):
-    rng = np.random.default_rng(2)
-    points, cubes = cloud(rng)
-    squared = ((cubes - points[:, None]) ** 2).sum(axis=2)
-    nearest = np.argsort(squared, axis=1)[:, :5]
-    group, squared = cubes[nearest], np.take_along_axis(squared, nearest, axis=1)
-    pose = gtsam.Pose3.Expmap(np.array([0.1, 0.2, -0.5, 3.0, -2.0, 1.0])).matrix()
-    lidar = transform(np.linalg.inv(pose), points)
-    new_T_map = gtsam.Pose3.Expmap(np.array([1.0, -2.0, 0.5, 300.0, -500.0, 20.0])).matrix()
-    config = changed(max_distance=2.0)
-    here = match(lidar, points, group, squared, pose, config)
-    there = match(
-        lidar,
-        transform(new_T_map, points),
-        transform(new_T_map, group.reshape(-1, 3)).reshape(group.shape),
-        squared,
-        new_T_map @ pose,
-        config,
-    )
-    assert 8 < len(here) < len(points)
-    np.testing.assert_array_equal(there.indices, here.indices)
-    np.testing.assert_allclose(np.abs(there.distances), np.abs(here.distances), atol=1e-9)
-    np.testing.assert_allclose(there.sigmas, here.sigmas, rtol=1e-6)
-    np.testing.assert_allclose(there.weights, here.weights, rtol=1e-9)
-    axes = "directions" if match is match_lines else "normals"
-    turned = getattr(here, axes) @ new_T_map[:3, :3].T
-    cosines = np.einsum("ij,ij->i", turned, getattr(there, axes))
-    np.testing.assert_allclose(np.abs(cosines), 1.0, atol=1e-9)
-
-
 @pytest.mark.parametrize(("limit", "rows"), [
     (0, range(12)),
     (12, range(12)),
@@ -459,18 +411,6 @@ def test_a_distinct_edge_without_a_line_near_is_searched_for_more_widely():
     np.testing.assert_array_equal(match(CONFIG, None).indices, [1, 3])
     assert match(CONFIG, None).distinct is None
     np.testing.assert_array_equal(match(CONFIG, np.full(5, True)).indices, [1, 3])
-
-
-def test_of_too_many_edges_the_distinct_ones_are_matched_and_known_by_their_rows():
-    held = map_of(np.concatenate([poles((5.0, 0.0)), poles((5.0, 8.0), spacing=FAR_APART)]))
-    features = np.array([[5, 0, 0.01 * n] for n in range(6)] + [[5.0, 8, 0], [5, 0, 0.1]])
-    distinct = np.isin(np.arange(8), [3, 6, 7])
-    found = associate(
-        features, np.empty((0, 3)), gtsam.Pose3(), held, held, changed(max_edges=4), distinct
-    )
-    np.testing.assert_array_equal(found.edges.indices, [0, 3, 6, 7])
-    np.testing.assert_array_equal(found.edges.points, features[[0, 3, 6, 7]])
-    np.testing.assert_array_equal(found.edges.distinct, [False, True, True, True])
 
 
 def wall(across, count):

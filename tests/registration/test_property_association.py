@@ -143,26 +143,6 @@ def test_association_is_brute_force_with_gates(
 
 
 @given(rng=generators())
-def test_the_order_of_features_and_map_points_does_not_matter(rng: np.random.Generator) -> None:
-    poles, walls = scene(rng)
-    pose = gtsam.Pose3()
-    edges, planes = (rng.permutation(p)[:40] + rng.normal(0, 0.05, (40, 3)) for p in (poles, walls))
-    maps = cubes_of(poles), cubes_of(walls)
-    found = associate(edges, planes, pose, *maps, EXACT)
-    orders = rng.permutation(40), rng.permutation(40)
-    shuffled = [cubes_of(rng.permutation(cubes.points())) for cubes in maps]
-    other = associate(edges[orders[0]], planes[orders[1]], pose, *shuffled, EXACT)
-    for one, two, order in zip(
-        (found.edges, found.planes), (other.edges, other.planes), orders, strict=True
-    ):
-        assert sorted(order[two.indices].tolist()) == one.indices.tolist()
-        back = np.argsort(order[two.indices])
-        np.testing.assert_allclose(np.abs(two.distances[back]), np.abs(one.distances), atol=1e-12)
-        np.testing.assert_allclose(two.weights[back], one.weights, atol=1e-12)
-        np.testing.assert_allclose(two.sigmas[back], one.sigmas, rtol=1e-6)
-
-
-@given(rng=generators())
 def test_renewed_matches_are_the_old_ones_seen_from_the_new_pose(rng: np.random.Generator) -> None:
     poles, walls = scene(rng)
     pose = gtsam.Pose3.Expmap(rng.normal(0, 0.02, 6))

@@ -123,7 +123,7 @@ OTHER = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 3.0]))
 class Inertial(Gyro):
     """A gyro with a pre-integration that knows one pose."""
 
-    known = Predicted(0, OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)))
+    known = Predicted(OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)))
 
     def predict(self, stamp):
         return self.known if stamp <= self.until else None

@@ -113,9 +113,8 @@ def test_the_covariance_is_about_right():
     _, _, loops = driven(World(3), poses, updates(poses), settings())
     nees = []
     for loop in loops:
-        error = (
-            poses[loop.earlier].between(poses[loop.later]).localCoordinates(loop.earlier_T_later)
-        )
+        true = poses[loop.earlier].between(poses[loop.later])
+        error = true.localCoordinates(loop.earlier_T_later)
         nees.append(error @ np.linalg.solve(loop.covariance, error))
     assert len(loops) > 8
     assert 0.05 < np.mean(nees) < 12.0  # of 6; the poses here have none of the error they claim
@@ -148,39 +147,39 @@ def test_another_place_that_the_drift_would_allow_is_rejected():
     assert strict.statistics.rejected == {Rejection.UNLIKE: 1}
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        ({"min_share": 1.0}, Rejection.LITTLE_OVERLAP),
-        ({"min_aligned": 1e6}, Rejection.DEGENERATE),
-    ],
-)
-def test_every_test_of_a_registration_can_reject(change, reason):
+@pytest.fixture(scope="module")
+def back_again():
     poses = there_and_back(0.5, turn_at=20)
     graph, closer, _ = driven(World(1), poses, updates(poses), settings(min_way=12.0))
+    return poses, graph, closer
+
+
+def test_a_right_candidate_is_verified(back_again):
+    poses, graph, closer = back_again
     good = closer.verify(graph.keyframes[-1], 1, graph)
-    assert isinstance(good, LoopClosure)
     assert (good.earlier, good.later) == (1, len(poses) - 1)
     assert 0.5 < good.share <= 1.0
     assert off(good, poses)[0] < 0.1
     assert 0.9 < good.agreement <= 1.0
-    strict = ScanLoopCloser(settings(min_way=12.0, **change))
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        (["loops.min_share=1.0"], Rejection.LITTLE_OVERLAP),
+        (["loops.min_aligned=1e6"], Rejection.DEGENERATE),
+        # The noise is 0.01.
+        (["matching.point_sigma=0.001", "matching.fit_uncertainty=false"], Rejection.DISAGREES),
+    ],
+)
+def test_every_test_of_a_registration_can_reject(back_again, changes, reason):
+    _, graph, _ = back_again
+    strict = ScanLoopCloser(settings(min_way=12.0).changed(*changes))
     assert strict.verify(graph.keyframes[-1], 1, graph) is reason
 
 
-def test_matches_that_lie_elsewhere_disagree():
-    poses = there_and_back(0.5, turn_at=20)
-    config = settings(min_way=12.0)
-    graph, closer, _ = driven(World(1), poses, updates(poses), config)
-    assert isinstance(closer.verify(graph.keyframes[-1], 1, graph), LoopClosure)
-    exact = config.matching.changed(point_sigma=0.001, fit_uncertainty=False)  # noise is 0.01
-    strict = ScanLoopCloser(config.changed(matching=exact))
-    assert strict.verify(graph.keyframes[-1], 1, graph) is Rejection.DISAGREES
-
-
-def test_too_few_features_to_solve():
-    poses = there_and_back(0.5, turn_at=20)
-    graph, closer, _ = driven(World(1), poses, updates(poses), settings(min_way=12.0))
+def test_too_few_features_to_solve(back_again):
+    _, graph, closer = back_again
     last = graph.keyframes[-1]
     few = replace(last, edges=last.edges[:5], planes=last.planes[:20], distinct=last.distinct[:5])
     # What cannot be solved overlaps with nothing.
@@ -214,14 +213,12 @@ def test_where_not_to_look():
 def test_what_loops_have_tied_is_looked_for_less_far():
     """The drift that nobody knows grows with the way from the last loop, not from the start."""
     graph = PoseGraph(settings())
-    for update in updates(
-        [gtsam.Pose3(gtsam.Rot3(), np.array([2.0 * k, 0, 0])) for k in range(40)]
-    ):
+    straight = [gtsam.Pose3(gtsam.Rot3(), np.array([2.0 * k, 0, 0])) for k in range(40)]
+    for update in updates(straight):
         graph.add(update)
     last = graph.keyframes[-1]
-    np.testing.assert_allclose(
-        _odometry_distance(last, graph), 78.0 - 2.0 * np.arange(40), atol=1e-6
-    )
+    distances = _odometry_distance(last, graph)
+    np.testing.assert_allclose(distances, 78.0 - 2.0 * np.arange(40), atol=1e-6)
     loop = LoopClosure(3, 35, graph.pose(3).between(graph.pose(35)), OWN)
     assert graph.add_loop(loop)
     tied = _odometry_distance(last, graph)

@@ -60,9 +60,8 @@ def test_loops_agree_if_their_cycle_closes():
     assert not consistent(off_by, one, keyframes, config)
     # Both off alike agree with each other.
     near = replace(one, earlier=4, later=44, earlier_T_later=truth[4].between(truth[44]))
-    shifted = [replace(loop, earlier_T_later=loop.earlier_T_later.compose(aside))
-               for loop in (one, near)]  # fmt: skip
-    assert consistent(*shifted, keyframes, config)
+    two = (replace(k, earlier_T_later=k.earlier_T_later.compose(aside)) for k in (one, near))
+    assert consistent(*two, keyframes, config)
 
 
 def test_the_covariance_of_a_cycle_is_that_of_monte_carlo():

@@ -40,23 +40,14 @@ class Known:
         return LoopClosure(earlier, later, POSES[earlier].between(POSES[later]), OWN)
 
 
-def driven(first, look=False, again=None, **pose_graph):
+def driven(first, look=False, **pose_graph):
     """A way out and back, with a mark above each keyframe in the mapper's map.
 
-    Parameters
-    ----------
-    first : keyframe from which on the closer finds loops
-    look : ask for the map after every frame
-    again : mapper and loops of an earlier drive, which are reset
+    Loops are found from the keyframe ``first`` on; ``look`` asks for the map after every frame.
     """
     config = settings(**pose_graph)
-    if again is None:
-        mapper = Mapper(config)
-        loops = LoopMapping(mapper, config, Known(first))
-    else:
-        mapper, loops, _ = again
-        mapper.reset()
-        loops.reset()
+    mapper = Mapper(config)
+    loops = LoopMapping(mapper, config, Known(first))
     world, rng = World(0), np.random.default_rng(0)
     closed = []
     for update in updates(POSES, DRIFT):
@@ -142,14 +133,6 @@ def test_to_look_at_the_map_changes_nothing():
         np.testing.assert_allclose(points, wanted, atol=1e-12)
 
 
-def test_after_a_reset_all_is_as_in_a_new_one():
-    """The closer of the package has no keyframes of the run before either."""
-    first = driven(first=30)
-    assert_same(driven(first=30, again=first), driven(first=30))
-    assert first[1].graph.keyframes[0].index == 0
-    assert len(first[1].graph) == len(POSES)
-
-
 class Remembering:
     """A loop closer of one's own, which finds a loop with the keyframe it saw four before."""
 
@@ -174,12 +157,8 @@ class Remembering:
 def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, preintegration):
     """With a loop closer of one's own, and looked at after every frame."""
     dataset = open_dataset("sim:corridor?frames=16&columns=300&speed=8")
-    config = Config().changed(
-        f"imu.preintegration={str(preintegration).lower()}",
-        "pose_graph.keyframe_distance=0.1",
-        "pose_graph.follow_distance=0.0001",
-        "pose_graph.follow_angle_deg=0.0001",
-    )
+    limits = {"keyframe_distance": 0.1, "follow_distance": 1e-4, "follow_angle_deg": 1e-4}
+    config = settings(**limits).changed({"imu.preintegration": preintegration})
     sweeps = list(dataset)
 
     def pipeline():

@@ -44,12 +44,8 @@ def test_align_recovers_a_rigid_transform(seed):
     np.testing.assert_array_equal(
         align_positions(points, points @ truth[:3, :3].T + truth[:3, 3], rotation(1, 2, 3)), found
     )
-
-
-def test_align_does_not_mirror():
-    points = np.random.default_rng(1).normal(size=(20, 3))
-    found = align_positions(points, points * [1, 1, -1])
-    assert np.linalg.det(found[:3, :3]) == pytest.approx(1.0)
+    mirrored = align_positions(points, points * [1, 1, -1])
+    assert np.linalg.det(mirrored[:3, :3]) == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -113,20 +109,21 @@ def test_interpolation_ends_where_the_trajectory_ends(outside):
         interpolate(some, start + np.array([5, outside]))
 
 
-@pytest.mark.parametrize("stamps", [[0, 1, 1, 2], [0, 2, 1, 3]])
-def test_stamps_that_do_not_increase_are_named(stamps):
-    bad = Trajectory(np.array(stamps), np.tile(np.eye(4), (4, 1, 1)))
-    with pytest.raises(InputError, match="got 1 at index 2"):
+@pytest.mark.parametrize(
+    ("stamps", "message"),
+    [
+        ([0, 1, 1, 2], "increasing stamps, got 1 at index 2"),
+        ([0, 2, 1, 3], "increasing stamps, got 1 at index 2"),
+        ([], "2 or more poses .* got 0"),
+        ([7], "2 or more poses .* got 1"),
+    ],
+)
+def test_a_reference_that_cannot_be_interpolated_is_refused(stamps, message):
+    bad = Trajectory(np.array(stamps, np.int64), np.tile(np.eye(4), (len(stamps), 1, 1)))
+    with pytest.raises(InputError, match=f"interpolate: expected {message}"):
         interpolate(bad, np.array([1]))
-    with pytest.raises(InputError, match=r"absolute_error: .* increasing stamps"):
-        absolute_error(bad, bad)
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_a_reference_without_a_stretch_is_refused(count):
-    short = Trajectory(np.arange(count), np.tile(np.eye(4), (count, 1, 1)))
-    with pytest.raises(InputError, match=f"2 or more poses .* got {count}"):
-        absolute_error(winding(), short)
+    with pytest.raises(InputError, match=f"absolute_error: expected {message}"):
+        absolute_error(winding(), bad)
 
 
 # -- absolute error --------------------------------------------------------------------------------
@@ -134,11 +131,10 @@ def test_a_reference_without_a_stretch_is_refused(count):
 
 def test_a_rigid_change_is_no_error_unless_unaligned():
     truth = winding()
-    moved = changed(truth, pose(np.random.default_rng(4), 2.0) @ truth.map_T_lidar)
-    error = absolute_error(moved, truth)
+    error = absolute_error(moved(truth), truth)
     assert error.maximum < 1e-11
     assert error.rotation_rmse_deg < 1e-5
-    raw = absolute_error(moved, truth, aligned=False)
+    raw = absolute_error(moved(truth), truth, aligned=False)
     assert raw.rmse > 1.0
     assert raw.rotation_rmse_deg > 10.0
 
@@ -187,9 +183,7 @@ def test_on_a_straight_path_the_orientation_error_is_that_of_the_orientations(no
 
 def test_a_standstill_has_no_error():
     still = Trajectory(np.arange(5), np.tile(np.eye(4), (5, 1, 1)))
-    error = absolute_error(
-        changed(still, pose(np.random.default_rng(8)) @ still.map_T_lidar), still
-    )
+    error = absolute_error(moved(still), still)
     assert error.maximum < 1e-12
     assert error.rotation_rmse_deg < 1e-5
 
@@ -198,9 +192,7 @@ def test_absolute_errors_are_those_of_evo():
     metrics = pytest.importorskip("evo.core.metrics")
     trajectory = pytest.importorskip("evo.core.trajectory")
     truth = winding()
-    rng = np.random.default_rng(9)
-    noisy = np.array([p @ pose(rng, 0.02) for p in truth.map_T_lidar])
-    ours = changed(truth, pose(rng) @ noisy)
+    ours = moved(disturbed(truth))
 
     def theirs(some):
         stamps = some.stamps * 1e-9
@@ -239,19 +231,11 @@ def test_relative_error_of_known_drifts():
     assert turning.rotation_deg_per_m == pytest.approx(np.degrees(0.1) / 9.5)
 
 
-def test_relative_error_does_not_depend_on_the_map_frame():
-    truth = winding()
-    one, other = (relative_error(e, truth) for e in (disturbed(truth), moved(disturbed(truth))))
-    assert one.translation_percent > 0.1
-    np.testing.assert_allclose(one.translations, other.translations, rtol=1e-9)
-    np.testing.assert_allclose(one.rotations, other.rotations, rtol=1e-6)
-
-
 def test_relative_error_is_that_of_the_kitti_kit_with_every_start():
     truth, estimate = winding(60), disturbed(winding(60))
     lengths = np.array([5.0, 10.0, 20.0])
-    travelled = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(truth.map_T_lidar[:, :3, 3], axis=0),
-                                                    axis=1))]  # fmt: skip
+    steps = np.linalg.norm(np.diff(truth.map_T_lidar[:, :3, 3], axis=0), axis=1)
+    travelled = np.r_[0.0, np.cumsum(steps)]
     translations, rotations = [], []
     for length in lengths:
         for i in range(len(truth)):

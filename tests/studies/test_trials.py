@@ -15,7 +15,6 @@ from support.trials import trial_of
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import RunResult, run
-from loam_gtsam.studies import trials
 from loam_gtsam.studies.contenders import SolverRun
 from loam_gtsam.studies.evaluation import absolute_error, pose_differences, relative_error
 from loam_gtsam.studies.trials import (
@@ -82,25 +81,26 @@ def test_loops_correct_the_poses_that_are_scored():
     assert found.updates[2] is bad
 
 
-class NoTruth(SimulatedWorld):
-    truth = None
+@pytest.fixture
+def opened(monkeypatch):
+    """Sets the data set that every trial opens."""
 
+    def use(dataset):
+        monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: dataset)
 
-class Broken(ListDataset):
-    def __init__(self):
-        super().__init__([RuntimeError("oops")])
+    return use
 
 
 @pytest.mark.parametrize(
-    ("dataset", "error"),
+    ("items", "error"),
     [
-        (Broken, "RuntimeError: oops"),
-        (lambda: ListDataset([]), "no sweeps in it"),
-        (lambda: ListDataset([BadSweep(n, f"damaged {n}") for n in range(3)]), "damaged 0"),
+        ([RuntimeError("oops")], "RuntimeError: oops"),
+        ([], "no sweeps in it"),
+        ([BadSweep(n, f"damaged {n}") for n in range(3)], "damaged 0"),
     ],
 )
-def test_what_goes_wrong_in_a_trial_is_in_its_row(monkeypatch, dataset, error):
-    monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: dataset())
+def test_what_goes_wrong_in_a_trial_is_in_its_row(opened, items, error):
+    opened(ListDataset(items))
     row = run_trial(trial_of())
     assert error in row["error"]
     assert row["wall_s"] >= 0.0
@@ -118,29 +118,23 @@ def test_what_keeps_a_trial_from_starting_is_in_its_row(trial, error):
     assert error in run_trial(trial)["error"]
 
 
-def test_without_truth_there_are_no_errors_and_the_row_says_why(monkeypatch):
-    world = NoTruth("room", frames=3, columns=300)
-    monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: world)
+def test_without_truth_there_are_no_errors_and_the_row_says_why(opened):
+    opened(ListDataset(list(SimulatedWorld("room", frames=3, columns=300))))
     row = run_trial(trial_of())
     assert (row["error"], row["problem"]) == (None, "no truth")
     assert row["ate_m"] is row["rpe_percent"] is row["drift_percent"] is None
     assert row["ms_median"] > 0.0
 
 
-def test_a_peer_gets_the_sweeps_and_the_sensor(monkeypatch):
+def test_a_peer_gets_the_sweeps_and_the_sensor(fake, monkeypatch):
     seen = []
-
-    class Still:
-        name, package, map_points = "still", "numpy", 7
-
-        def register(self, stamp, sweep):
-            seen.append(sweep.points.shape[0])
-            return MapUpdate(stamp, gtsam.Pose3(), FrameStatus.OK)
-
-    monkeypatch.setattr(trials, "make_peer", lambda name: Still())
+    monkeypatch.setattr(
+        fake, "_register", lambda *a: (seen.append(len(a[2].times)), (np.eye(4), 0.0))[1]
+    )
+    monkeypatch.setattr(fake, "package", "numpy")
     near = Config().sensor.changed(max_range=3.0)
     rows = [
-        run_trial(trial_of(peer="still", frames=5, config=config))
+        run_trial(trial_of(peer="fake", frames=5, config=config))
         for config in (Config(), Config(sensor=near))
     ]
     assert [row["frames_ok"] for row in rows] == [5, 5]
@@ -150,24 +144,17 @@ def test_a_peer_gets_the_sweeps_and_the_sensor(monkeypatch):
     assert sum(seen[5:]) < sum(seen[:5])
 
 
-def test_a_peer_that_fails_in_the_middle_is_an_error(monkeypatch):
-    class Failing:
-        name, package, map_points = "failing", "numpy", 0
-
-        def register(self, stamp, sweep):
-            raise RuntimeError("out of patience")
-
-    monkeypatch.setattr(trials, "make_peer", lambda name: Failing())
-    assert "out of patience" in run_trial(trial_of(peer="failing", frames=3))["error"]
+def test_a_peer_that_fails_in_the_middle_is_an_error(fake, monkeypatch):
+    monkeypatch.setattr(fake, "fails_at", 2)
+    monkeypatch.setattr(fake, "package", "numpy")
+    assert "cannot [go] on" in run_trial(trial_of(peer="fake", frames=3))["error"]
 
 
-def test_a_trial_that_is_stopped_is_no_row():
+def test_a_trial_that_is_stopped_is_no_row(fake):
     def stop(number: int, update: MapUpdate) -> None:
         raise KeyboardInterrupt
 
-    for peer in (None, "small-gicp"):
-        if peer is not None:
-            pytest.importorskip("small_gicp")
+    for peer in (None, "fake"):
         with pytest.raises(KeyboardInterrupt):
             run_trial(trial_of(peer=peer), stop)
 

@@ -8,6 +8,7 @@ peers get the points and times that these features were extracted from.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any
@@ -46,9 +47,8 @@ class Comparison:
 
     Attributes
     ----------
-    name : of the data set
+    name, truth : of the data set
     runs : one per contender, in their order
-    truth : of the data set, or None
     notes : sentences that a reader of the numbers must know
     interrupted : whether the user stopped the comparison before the data set ended
     error : what ended the comparison early, or None
@@ -178,7 +178,6 @@ def compare_solvers(
 
 
 def _check_names(contenders: Sequence[Contender]) -> None:
-    """Raise InputError unless the contenders can run side by side."""
     names = [entry.name for entry in contenders]
     if not names or len(set(names)) < len(names):
         raise InputError(
@@ -245,11 +244,10 @@ def score_all(comparison: Comparison) -> tuple[Scores, ...]:
 def score(
     run: SolverRun, reference: Trajectory | None, lengths: Sequence[float] | None = None
 ) -> Scores:
-    """The scores of one run.
+    """The scores of one run, without errors if there is no reference.
 
     Parameters
     ----------
-    reference : errors are taken against this trajectory; there are no errors if None
     lengths : metres, path lengths of the relative error; those that fit the path if None
     """
     solved = [update for update in run.updates if update.status.solved]
@@ -290,7 +288,7 @@ def score(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDifferences:
-    """Distance of one solver's poses from those of the first-named one, frame by frame.
+    """Distance of one solver's poses from those of the first-named one.
 
     Attributes
     ----------
@@ -305,14 +303,11 @@ class FrameDifferences:
 
 def frame_differences(comparison: Comparison) -> dict[str, FrameDifferences]:
     """Differences of the other solvers by name; a run too short to compare is left out."""
-    first, *others = comparison.runs
+    first = comparison.runs[0].trajectory
     found = {}
-    for run in others:
-        trajectory = run.trajectory
-        try:
-            stamps, metres, degrees = pose_differences(trajectory, first.trajectory)
-        except InputError:
-            continue
-        frames = np.array(run.used, np.int64)[np.isin(trajectory.stamps, stamps)]
-        found[run.name] = FrameDifferences(frames, metres, degrees)
+    for run in comparison.runs[1:]:
+        with suppress(InputError):
+            stamps, *apart = pose_differences(run.trajectory, first)
+            frames = np.array(run.used, np.int64)[np.isin(run.trajectory.stamps, stamps)]
+            found[run.name] = FrameDifferences(frames, *apart)
     return found

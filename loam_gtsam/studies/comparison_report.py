@@ -32,7 +32,7 @@ from loam_gtsam.studies.evaluation import (
     interpolate,
 )
 from loam_gtsam.studies.report_html import TextTable, list_html, page, picture_html, table_html
-from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
+from loam_gtsam.types import FloatArray, InputError, Trajectory
 from loam_gtsam.view import plots
 
 TRUTH_FILE = "truth.tum"
@@ -228,9 +228,8 @@ _FRAME_COLUMNS = (
 
 def _frame_rows(results: ScoredComparison) -> Iterable[list[Any]]:
     for run in results.comparison.runs:
-        apart = results.differences.get(run.name)
         found = {}
-        if apart is not None:
+        if (apart := results.differences.get(run.name)) is not None:
             pairs = zip(apart.metres.tolist(), apart.degrees.tolist(), strict=True)
             found = dict(zip(apart.frames.tolist(), pairs, strict=True))
         for number, update in enumerate(run.updates):
@@ -245,17 +244,17 @@ def _frame_rows(results: ScoredComparison) -> Iterable[list[Any]]:
 
 def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
     """Write comma-separated values; a number that is not known is an empty field."""
+
+    def field(value: Any) -> Any:
+        if not isinstance(value, float):
+            return value
+        return f"{value:.9g}" if math.isfinite(value) else ""
+
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(header)
-    writer.writerows([_csv_field(value) for value in row] for row in rows)
+    writer.writerows(map(field, row) for row in rows)
     write_text(path, text.getvalue())
-
-
-def _csv_field(value: Any) -> Any:
-    if not isinstance(value, float):
-        return value
-    return f"{value:.9g}" if math.isfinite(value) else ""
 
 
 def _stages(run: SolverRun) -> dict[str, float]:
@@ -293,20 +292,27 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
         drawn.append(name)
         return folder / name
 
+    truth, reference = comparison.truth, comparison.reference
     aligned: dict[str, Trajectory] = {}
     errors: dict[str, tuple[NDArray[Any], FloatArray]] = {}
     for run in comparison.runs:
+        trajectory = run.trajectory
         try:
-            found = absolute_error(run.trajectory, comparison.reference)
+            found = absolute_error(trajectory, reference)
         except InputError:  # too few poses
             continue
-        aligned[run.name] = _aligned(run.trajectory, comparison.reference, found.stamps)
-        there = interpolate(comparison.reference, found.stamps).map_T_lidar[:, :3, 3]
+        here = trajectory.map_T_lidar[np.isin(trajectory.stamps, found.stamps)]
+        there = interpolate(reference, found.stamps).map_T_lidar[:, :3, 3]
+        reference_T_map = align_positions(here[:, :3, 3], there)
+        aligned[run.name] = Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
         errors[run.name] = distance_travelled(there), found.translations
+    if aligned and truth is not None:
+        stamps = np.concatenate([trajectory.stamps for trajectory in aligned.values()])
+        inside = (truth.stamps >= stamps.min()) & (truth.stamps <= stamps.max())
+        truth = Trajectory(truth.stamps[inside], truth.map_T_lidar[inside])
     if aligned:
-        truth = _within(comparison.truth, aligned.values())
         plots.plot_trajectories(path("trajectories.png"), aligned, truth)
-    if errors and comparison.truth is not None:
+    if errors and truth is not None:
         panels = {"position error [m]": errors}
         plots.plot_curves(path("errors.png"), panels, "distance travelled [m]")
     if results.differences:
@@ -322,19 +328,3 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
     if any(stages.values()):
         plots.plot_stages(path("stages.png"), stages)
     return drawn
-
-
-def _aligned(trajectory: Trajectory, reference: Trajectory, stamps: IntArray) -> Trajectory:
-    """The trajectory in the frame of the reference, fitted over the poses at ``stamps``."""
-    inside = np.isin(trajectory.stamps, stamps)
-    there = interpolate(reference, stamps).map_T_lidar[:, :3, 3]
-    reference_T_map = align_positions(trajectory.map_T_lidar[inside][:, :3, 3], there)
-    return Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
-
-
-def _within(truth: Trajectory | None, others: Iterable[Trajectory]) -> Trajectory | None:
-    if truth is None:
-        return None
-    stamps = np.concatenate([other.stamps for other in others])
-    inside = (truth.stamps >= stamps.min()) & (truth.stamps <= stamps.max())
-    return Trajectory(truth.stamps[inside], truth.map_T_lidar[inside])

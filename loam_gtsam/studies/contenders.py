@@ -40,8 +40,7 @@ class Contender:
 
     Attributes
     ----------
-    name : of a solver of this package its preset (``gtsam`` is the default preset), of a peer its
-        name in :data:`loam_gtsam.studies.peers.PEERS`
+    name : of the preset (``gtsam`` is the default one), or of a peer
     config : of a solver of this package; None for a peer
     solver : a user's own solver in place of the one that ``config`` names
     """
@@ -90,8 +89,7 @@ class SolverRun:
     name : of the contender
     version : of the package that the contender comes from
     config : as used; None for a peer
-    updates : one per sweep, corrected by loop closures if there are any; of a peer only stamp,
-        pose, status and time have a meaning
+    updates : one per sweep, corrected by loop closures if there are any
     map_points : points of the whole map; of a peer the points or voxels that it still keeps
     problem : what ended the contender early, else ""
     """
@@ -140,13 +138,10 @@ class SolverRun:
 
 
 def extract_for_all(sweep: Sweep, config: Config) -> Extraction | None:
-    """The features of a sweep for several pipelines; None if the sweep has no points.
-
-    No feature is left out, as if for scan-to-scan odometry: each pipeline thins the features to the
-    voxels of its own map.
-    """
+    """The features of a sweep for several pipelines; None if the sweep has no points."""
     if not isinstance(sweep, Scan):
         return None
+    # No feature is left out: each pipeline thins the features to the voxels of its own map.
     return extract(sweep, config.changed({"odometry.method": "scan_to_scan"}))
 
 
@@ -230,13 +225,7 @@ class PeerRunner:
         self._last_stamp: int | None = None
 
     def register(self, sweep: Sweep, extraction: Extraction | None = None) -> None:
-        """Register a sweep; a peer takes the points and not the features.
-
-        Raises
-        ------
-        InputError
-            If the sweep has features instead of points.
-        """
+        """Register a sweep; InputError if it has features instead of points."""
         if isinstance(sweep, FeatureSweep):
             raise InputError("peers need the points of raw sweeps; this data set has features only")
         self.updates.append(self._update(sweep))

@@ -102,8 +102,7 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
             f"interpolate: stamps {stamps.min()} to {stamps.max()} leave the trajectory "
             f"{trajectory.stamps[0]} to {trajectory.stamps[-1]}"
         )
-    start = trajectory.stamps[0]
-    times, queries = (trajectory.stamps - start) * 1e-9, (stamps - start) * 1e-9
+    times, queries = ((some - trajectory.stamps[0]) * 1e-9 for some in (trajectory.stamps, stamps))
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     rotations = Rotation.from_matrix(trajectory.map_T_lidar[:, :3, :3])
     poses[:, :3, :3] = Slerp(times, rotations)(queries).as_matrix()
@@ -152,10 +151,8 @@ class RelativeError:
     Attributes
     ----------
     translation_percent, rotation_deg_per_m : mean over all pairs of all lengths
-    lengths : (L,) metres along the reference
-    pairs : (L,) number of pairs of each length
-    translations, rotations : (L,) mean of each length, per cent and degrees per metre; NaN where
-        there is no pair
+    lengths, pairs : (L,) metres along the reference, and number of pairs
+    translations, rotations : (L,) mean of each length; NaN where there is no pair
     """
 
     translation_percent: float
@@ -207,7 +204,7 @@ def relative_error(
     For each length d and each start i, the end j is the first pose more than d along the
     reference after i. With the relative motions Q of the reference and P of the estimate,
     ``E = Q^-1 P`` counts ``|translation(E)| / d`` and ``angle(E) / d``. KITTI's development kit
-    takes every tenth start; here every pose is one, as the paths are shorter.
+    takes every tenth pose as a start; here every pose is one.
 
     References
     ----------
@@ -246,10 +243,6 @@ def pose_differences(
     estimate: Trajectory, reference: Trajectory
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Distances between two trajectories, pose by pose, both seen from their first common moment.
-
-    Parameters
-    ----------
-    reference : is interpolated at the stamps of the estimate
 
     Returns
     -------

@@ -37,7 +37,7 @@ class TimedPoints:
     Attributes
     ----------
     points : (N, 3) float64, metres, lidar frame at each point's own time
-    times : (N,) seconds from the stamp, from the data or else from the azimuth of the points
+    times : (N,) seconds from the stamp
     span : (first, last) seconds from the stamp covered by the sweep
     """
 
@@ -51,9 +51,7 @@ class Peer(ABC):
 
     Attributes
     ----------
-    name : of the peer on the command line
-    package : name of the package for pip
-    module : name of the package for ``import``
+    name, package, module : name on the command line, for pip and for ``import``
     alone : whether instances in one process share state, so that only one may run at a time
     updates : one per registered sweep; stamp, pose, status and time have a meaning
     """
@@ -71,12 +69,8 @@ class Peer(ABC):
 
         Parameters
         ----------
-        stamp : nanoseconds from which the times of the points count
-
-        Returns
-        -------
-        MapUpdate
-            Its stamp is the moment that the pose belongs to.
+        stamp : nanoseconds from which the times of the points count; that of the result is the
+            moment that the pose belongs to
 
         Raises
         ------
@@ -94,10 +88,8 @@ class Peer(ABC):
     @property
     def trajectory(self) -> Trajectory:
         """One pose per sweep, stamped with the moment that it belongs to."""
-        return Trajectory.from_poses(
-            [update.stamp for update in self.updates],
-            [update.map_T_lidar for update in self.updates],
-        )
+        stamps = [update.stamp for update in self.updates]
+        return Trajectory.from_poses(stamps, [update.map_T_lidar for update in self.updates])
 
     @property
     @abstractmethod
@@ -112,10 +104,7 @@ class Peer(ABC):
 class _IcpPeer(Peer):
     """A peer of the KISS-ICP family.
 
-    Attributes
-    ----------
-    deskew : whether the peer de-skews the sweeps
-    settings_class, system_class : names of the classes of its settings and of the system itself
+    ``settings_class`` and ``system_class`` are names in the package of the peer.
     """
 
     deskew: bool = True
@@ -265,12 +254,10 @@ def make_peer(name: str) -> Peer:
 
 
 def _module(peer: Peer, name: str = "") -> Any:
-    """A module of the peer's package."""
     try:
         return importlib.import_module(f"{peer.module}.{name}" if name else peer.module)
     except ImportError as error:
         raise PeerError(
-            f"{peer.name} cannot be imported ({error}); install it with: "
-            f"pip install {peer.package}, "
-            'or all peers with: pip install "loam_gtsam[bench]"'
+            f"{peer.name} cannot be imported ({error}); install it with: pip install "
+            f'{peer.package}, or all peers with: pip install "loam_gtsam[bench]"'
         ) from error

@@ -30,8 +30,6 @@ _CONNECT_SECONDS = 10
 _DEATHS = 4
 """Number of worker processes that may die of one trial before the trial counts as failed."""
 
-Stopped = Callable[[], bool]
-"""Whether the user has asked to stop."""
 Work = Callable[[Trial], Row]
 """What a worker does with a trial: :func:`loam_gtsam.studies.trials.run_trial`, except in tests."""
 
@@ -42,7 +40,7 @@ class ClusterError(LoamError):
 
 def run_trials(
     trials: Sequence[Trial],
-    stopped: Stopped,
+    stopped: Callable[[], bool],
     workers: LocalWorkers | ClusterWorkers | None = None,
     work: Work | None = None,
 ) -> Iterator[Row]:
@@ -50,6 +48,7 @@ def run_trials(
 
     Parameters
     ----------
+    stopped : whether the user has asked to stop
     workers : None for this process, one trial after the other; a stop acts after each frame
 
     Raises

@@ -76,12 +76,12 @@ class Trial:
 
     Attributes
     ----------
-    sequence, config_name : names of the sequence and of the configuration in the specification
+    sequence, config_name : names in the specification
     path, options : of the data set, see :func:`loam_gtsam.datasets.open_dataset`
     frames : number of sweeps after which the trial stops; None takes all sweeps
     seed : of a built-in world; None for recorded data
     config : of the run; a peer uses the section ``sensor`` only
-    peer : name in :data:`loam_gtsam.studies.peers.PEERS`; None for a solver of this package
+    peer : name of a peer; None for a solver of this package
     """
 
     sequence: str
@@ -101,8 +101,7 @@ class Trial:
     @property
     def id(self) -> str:
         """Hash of all that decides the result: not the names of the trial, nor the data itself."""
-        names = "path", "frames", "seed"
-        deciding = {name: getattr(self, name) for name in names}
+        deciding = {name: getattr(self, name) for name in ("path", "frames", "seed")}
         return _hash(deciding | {"options": dict(self.options), "config": self.config_hash})
 
     @property
@@ -182,8 +181,7 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
     row: Row = {
         "frames": len(finished.updates),
         **{f"frames_{status}": counts[status] for status in FrameStatus},
-        **{name: getattr(scores, name) for name in METRICS if name != "drift_percent"},
-        "drift_percent": math.nan,
+        **{name: getattr(scores, name, math.nan) for name in METRICS},
         "path_m": scores.path_m,
         "rpe_shortest_m": min(scores.lengths, default=math.nan),
         "map_points": scores.map_points,
@@ -224,12 +222,7 @@ def _hash(value: Mapping[str, Any]) -> str:
 
 
 class TrialStore:
-    """The files of the finished trials of a study.
-
-    Parameters
-    ----------
-    folder : of the results; the files of the trials are in its folder ``trials``
-    """
+    """The files of the finished trials of a study, in a folder beside the table."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / TRIALS_FOLDER

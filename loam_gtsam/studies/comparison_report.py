@@ -112,11 +112,9 @@ class ScoredComparison:
         if lengths:
             listed = ", ".join(f"{length:g}" for length in lengths)
             about += f"; path {path:.1f} m, RPE over {listed} m"
-        guesses = (
-            "every solver of this package starts from the guess of the first of them"
-            if self.comparison.shared_guess
-            else "every solver predicts its guesses from its own motion"
-        )
+        guesses = "every solver predicts its guesses from its own motion"
+        if self.comparison.shared_guess:
+            guesses = "every solver of this package starts from the guess of the first of them"
         problems = [f"{run.name}: {s.problem}" for run, s in self.rows if s.problem]
         return [about, guesses, *self.comparison.notes, *problems]
 
@@ -156,30 +154,16 @@ def _median_95_max(values: FloatArray) -> tuple[float, float, float]:
 def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> list[str]:
     """Write all files; returns their names."""
     comparison = results.comparison
-    _write_csv(
-        folder / "comparison.csv",
-        ["solver", "version", *(column.key for column in COLUMNS), "path_m", "solved", "problem"],
-        (
-            [
-                run.name,
-                run.version,
-                *(getattr(scores, column.key) for column in COLUMNS),
-                scores.path_m,
-                scores.solved,
-                scores.problem,
-            ]
-            for run, scores in results.rows
-        ),
-    )
+    keys = [*(column.key for column in COLUMNS), "path_m", "solved", "problem"]
+    rows = ([run.name, run.version, *(getattr(s, key) for key in keys)] for run, s in results.rows)
+    _write_csv(folder / "comparison.csv", ["solver", "version", *keys], rows)
     write_json(folder / "comparison.json", _summary(results))
     _write_csv(folder / "frames.csv", _FRAME_COLUMNS, _frame_rows(results))
-    files = list(TABLE_FILES)
-    trajectories = [(f"trajectory_{run.name}.tum", run.trajectory) for run in comparison.runs]
+    trajectories = {f"trajectory_{run.name}.tum": run.trajectory for run in comparison.runs}
     if comparison.truth is not None:
-        trajectories.append((TRUTH_FILE, comparison.truth))
-    for name, trajectory in trajectories:
+        trajectories[TRUTH_FILE] = comparison.truth
+    for name, trajectory in trajectories.items():
         write_tum(folder / name, trajectory)
-        files.append(name)
     drawn = _draw(results, folder) if plot else []
     pictures = {PICTURES[name]: folder / name for name in drawn}
     sections = {
@@ -190,7 +174,7 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
     }
     title = f"Comparison on {comparison.name}"
     write_text(folder / REPORT_FILE, page(title, results.notes, sections))
-    return [*files, *drawn, REPORT_FILE]
+    return [*TABLE_FILES, *trajectories, *drawn, REPORT_FILE]
 
 
 def _summary(results: ScoredComparison) -> dict[str, Any]:

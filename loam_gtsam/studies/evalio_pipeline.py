@@ -105,11 +105,8 @@ class LoamGtsam(EvalioPipeline):
     def set_lidar_params(self, params: LidarParams) -> None:
         """Take the range limits and the duration of a sweep."""
         self._period = 1.0 / params.rate
-        self._implied |= {
-            "min_range": params.min_range,
-            "max_range": params.max_range,
-            "period": self._period,
-        }
+        limits = {"min_range": params.min_range, "max_range": params.max_range}
+        self._implied |= limits | {"period": self._period}
 
     def set_imu_params(self, params: ImuParams) -> None:
         """Take noise and gravity, which only pre-integration uses."""
@@ -177,7 +174,10 @@ class LoamGtsam(EvalioPipeline):
         if self._pipeline is None:
             raise InputError("add_lidar: initialize() must come first")
         if self._buffer is not None and self._samples:
-            self._buffer.add(_as_samples(self._samples))
+            stamps = np.array([sample.stamp.to_nsec() for sample in self._samples], np.int64)
+            gyro = np.array([sample.gyro for sample in self._samples])
+            acceleration = np.array([sample.accel for sample in self._samples])
+            self._buffer.add(ImuSamples(stamps, None, gyro, acceleration))
             self._samples.clear()
             self._buffer.forget_old(sweep.stamp.to_nsec())
         scan = _as_scan(sweep)
@@ -205,15 +205,6 @@ def _as_scan(sweep: LidarMeasurement) -> Scan:
         stamp=sweep.stamp.to_nsec(),
         times=times if (times != times[:1]).any() else None,
         rings=rings if rings.any() else None,
-    )
-
-
-def _as_samples(samples: list[ImuMeasurement]) -> ImuSamples:
-    return ImuSamples(
-        stamps=np.array([sample.stamp.to_nsec() for sample in samples], np.int64),
-        orientation=None,
-        gyro=np.array([sample.gyro for sample in samples]),
-        acceleration=np.array([sample.accel for sample in samples]),
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -88,11 +88,11 @@ def load_spec(path: str | Path) -> Spec:
     frames = _count(f"{name}: frames", entries.get("frames"))
     sequences = {
         key: _sequence(f"{name}: sequences.{key}", value, folder, frames)
-        for key, value in _named(f"{name}: sequences", entries.get("sequences")).items()
+        for key, value in _named(name, "sequences", entries)
     }
     configs = {
         key: _config(f"{name}: configs.{key}", value, folder)
-        for key, value in _named(f"{name}: configs", entries.get("configs")).items()
+        for key, value in _named(name, "configs", entries)
     }
     seeds = _seeds(f"{name}: seeds", entries.get("seeds"), sequences)
     trials = tuple(
@@ -122,13 +122,9 @@ def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequ
         # Absolute: the same relative path under another folder is other data. Symbolic links stay:
         # on another machine they may lead to another place.
         path = os.path.abspath(folder / Path(path).expanduser())
-    return _Sequence(
-        path=path,
-        options=_mapping(f"{where}.options", entries.get("options", {})),
-        frames=_count(f"{where}.frames", entries.get("frames", frames)),
-        changes=_mapping(f"{where}.set", entries.get("set", {})),
-        where=where,
-    )
+    options = _mapping(f"{where}.options", entries.get("options", {}))
+    frames = _count(f"{where}.frames", entries.get("frames", frames))
+    return _Sequence(path, options, frames, _mapping(f"{where}.set", entries.get("set", {})), where)
 
 
 def _config(where: str, value: Any, folder: Path) -> Contender:
@@ -160,13 +156,8 @@ def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
 def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[int]:
     if value is None:
         return []
-    if (
-        not isinstance(value, list)
-        or not value
-        or not all(isinstance(seed, int) and not isinstance(seed, bool) for seed in value)
-        or min(value) < 0
-        or len(set(value)) < len(value)
-    ):
+    numbers = isinstance(value, list) and all(type(seed) is int and seed >= 0 for seed in value)
+    if not numbers or not value or len(set(value)) < len(value):
         raise ConfigError(f"{where}: expected a list of different integers from 0, got {value!r}")
     worlds = [sequence for sequence in sequences.values() if sequence.is_world]
     if not worlds:
@@ -177,7 +168,7 @@ def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[i
     for world in worlds:
         if world.own_seed is not None:
             raise ConfigError(f"{world.where}: has a seed of its own; remove it, or remove 'seeds'")
-    return value
+    return list(value)
 
 
 def _metrics(where: str, value: Any) -> tuple[str, ...]:
@@ -189,15 +180,15 @@ def _metrics(where: str, value: Any) -> tuple[str, ...]:
 
 
 def _count(where: str, value: Any) -> int | None:
-    if value is not None and (not isinstance(value, int) or isinstance(value, bool) or value < 1):
+    if value is not None and (type(value) is not int or value < 1):
         raise ConfigError(f"{where}: expected a number of sweeps, at least 1, got {value!r}")
     return value
 
 
-def _named(where: str, value: Any) -> dict[str, Any]:
-    if not value:
-        raise ConfigError(f"{where}: expected at least one, as NAME: VALUE")
-    return _mapping(where, value)
+def _named(name: str, key: str, entries: Mapping[str, Any]) -> Iterable[tuple[str, Any]]:
+    if not entries.get(key):
+        raise ConfigError(f"{name}: {key}: expected at least one, as NAME: VALUE")
+    return _mapping(f"{name}: {key}", entries[key]).items()
 
 
 def _mapping(where: str, value: Any, known: tuple[str, ...] = ()) -> dict[str, Any]:

@@ -51,12 +51,7 @@ class MovingSweep:
     """
 
     def __init__(
-        self,
-        features: Features,
-        config: Config,
-        imu: ImuBuffer | None = None,
-        *,
-        thin: bool = True,
+        self, features: Features, config: Config, imu: ImuBuffer | None = None, *, thin: bool = True
     ) -> None:
         first, end = features.span
         moving = config.deskew.enabled and end > first

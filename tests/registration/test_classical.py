@@ -403,8 +403,7 @@ def test_the_last_small_step_is_not_taken():
 
 
 @pytest.mark.parametrize(
-    ("name", "kind"),
-    [("default", GtsamSolver), ("loam", ClassicalSolver), ("aloam", ALoamSolver)],
+    ("name", "kind"), [("default", GtsamSolver), ("loam", ClassicalSolver), ("aloam", ALoamSolver)]
 )
 def test_a_preset_names_its_solver(name, kind):
     config = preset(name)

@@ -23,12 +23,7 @@ from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows, concatenate_rows, line_rows, plane_rows
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.solvers.base import (
-    Associate,
-    MotionPrior,
-    Solution,
-    rematch,
-)
+from loam_gtsam.registration.solvers.base import Associate, MotionPrior, Solution, rematch
 from loam_gtsam.types import FloatArray, InputError
 
 # LOAM's (rx, ry, rz) are (pitch, yaw, roll), and LOAM's (x, y, z) are (left, up, forward): the

@@ -24,13 +24,7 @@ from loam_gtsam.registration.degeneracy import (
     unseen_by_planes,
 )
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.solvers.base import (
-    POSE_KEY,
-    Associate,
-    MotionPrior,
-    Solution,
-    rematch,
-)
+from loam_gtsam.registration.solvers.base import POSE_KEY, Associate, MotionPrior, Solution, rematch
 from loam_gtsam.types import BoolArray, FloatArray
 
 _REDESCENDING = 2.816
@@ -168,9 +162,7 @@ def _without(
 
 
 def fuse(
-    map_T_lidar: gtsam.Pose3,
-    information: FloatArray,
-    factors: Sequence[gtsam.NonlinearFactor],
+    map_T_lidar: gtsam.Pose3, information: FloatArray, factors: Sequence[gtsam.NonlinearFactor]
 ) -> tuple[gtsam.Pose3, FloatArray]:
     """Fuse a solution with further factors on the same pose.
 

@@ -52,10 +52,8 @@ class ArrayDataset:
         sensor: Mapping[str, Any] | None = None,
     ) -> None:
         entries = list(scans)
-        self.name = name
+        self.name, self.imu, self.truth = name, imu, truth
         self.sensor: Mapping[str, Any] = dict(sensor or {})
-        self._imu = imu
-        self._truth = truth
         self._scans: list[Scan] = []
         ready = [entry for entry in entries if isinstance(entry, Scan)]
         if ready:
@@ -92,16 +90,6 @@ class ArrayDataset:
     def __iter__(self) -> Iterator[Scan]:
         return iter(self._scans)
 
-    @property
-    def imu(self) -> ImuSamples | None:
-        """IMU as given."""
-        return self._imu
-
-    @property
-    def truth(self) -> Trajectory | None:
-        """Reference poses as given."""
-        return self._truth
-
     def info(self) -> DatasetInfo:
         """Description of the arrays."""
         info = DatasetInfo("arrays", self.name, {"sweeps": str(len(self))})
@@ -112,7 +100,7 @@ class ArrayDataset:
             info.facts[f"point {label}"] = (
                 f"given for {len(self) - missing} of {len(self)} sweeps" if self._scans else "none"
             )
-        info.facts["IMU"] = describe_imu(self._imu) if self._imu is not None else "none"
+        info.facts["IMU"] = describe_imu(self.imu)
         if not self._scans:
             info.problems.append("no sweeps")
         return info

@@ -78,10 +78,7 @@ class Dataset(Protocol):
 class ChangedDataset:
     """A data set made of another one, whose sweeps, IMU or reference poses subclasses change.
 
-    Parameters
-    ----------
-    dataset : the other one
-    change : what was done to it, for its name
+    What was done to the other one (``change``) is added to its name.
     """
 
     def __init__(self, dataset: Dataset, change: str) -> None:

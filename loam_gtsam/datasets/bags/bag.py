@@ -71,11 +71,9 @@ class BagDataset:
         with closing(open_bag(self._path, self._parts)) as reader:
             topics = topic_types(reader)
             self.topic = choose_topic(self._path, topics, POINT_CLOUD, topic, self._problems)
-            self.imu_topic = (
-                choose_topic(self._path, topics, IMU, imu_topic, self._problems)
-                if imu_topic is not None or any(kind == IMU for kind, _ in topics.values())
-                else None
-            )
+            self.imu_topic = None
+            if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
+                self.imu_topic = choose_topic(self._path, topics, IMU, imu_topic, self._problems)
             self._count = topics[self.topic][1]
         self._decision: TimeDecision | None = None
         self._peek()
@@ -125,7 +123,7 @@ class BagDataset:
         facts = dict(self._facts)
         if self.imu_topic is not None:
             facts["IMU topic"] = self.imu_topic
-        facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        facts["IMU"] = describe_imu(imu)
         kind = bag_kind(self._parts[0] if self._parts else self._path)
         return DatasetInfo(kind, str(self._path), facts, list(self._problems))
 

@@ -9,21 +9,10 @@ from loam_gtsam.types import DatasetError
 
 
 def decode_imu(msg: Any) -> tuple[int, tuple[float, ...]]:
-    """Stamp and numbers of one Imu message.
+    """Stamp and numbers of one Imu message, as rosbags, rclpy or rospy hand it out.
 
-    Parameters
-    ----------
-    msg : a message as rosbags, rclpy or rospy hand it out
-
-    Returns
-    -------
-    stamp : nanoseconds
-    values : (10,) quaternion x y z w (zero if the message says that there is none), rad/s, m/s^2
-
-    Raises
-    ------
-    DatasetError
-        If it is no Imu message.
+    The numbers are (10,) quaternion x y z w (zero if the message says that there is none), rad/s,
+    m/s^2.
     """
     stamp = message_stamp(msg)
     try:

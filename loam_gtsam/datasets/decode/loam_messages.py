@@ -28,7 +28,7 @@ _FLATNESS = 0.85
 degrees, so their directions vary by at most 0.7 of what the azimuth makes of the other two."""
 
 # x_loam = left, y_loam = up, z_loam = forward
-_LIDAR_R_LOAM: FloatArray = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_LIDAR_T_LOAM: FloatArray = np.eye(4)[[2, 0, 1, 3]]
 
 
 class StampMatcher:
@@ -50,12 +50,12 @@ class StampMatcher:
             del own[stamp if stamp in own else min(own)]
             self.unmatched[topic] += 1
         own[stamp] = message
-        nearest = {}
-        for other, stamps in self._waiting.items():
-            best = min(stamps, key=lambda s: abs(s - stamp), default=None)
-            if best is None:
-                return None
-            nearest[other] = best
+        if not all(self._waiting.values()):
+            return None
+        nearest = {
+            other: min(stamps, key=lambda s: abs(s - stamp))
+            for other, stamps in self._waiting.items()
+        }
         if max(nearest.values()) - min(nearest.values()) > STAMP_TOLERANCE_NS:
             return None
         group = {other: self._waiting[other].pop(best) for other, best in nearest.items()}
@@ -80,16 +80,10 @@ class FeatureDecoder:
 
     def __init__(self, axes: Literal["lidar", "loam"]) -> None:
         self._loam = axes == "loam"
-        self._lidar_R_message: FloatArray = _LIDAR_R_LOAM if self._loam else np.eye(3)
+        self._lidar_T_message: FloatArray = _LIDAR_T_LOAM if self._loam else np.eye(4)
 
     def sweep(self, group: Mapping[str, Any]) -> FeatureSweep:
-        """Topic -> message as a sweep, with the stamp of the odometry.
-
-        Raises
-        ------
-        LoamError
-            If a message cannot be understood.
-        """
+        """Topic -> message as a sweep, with the stamp of the odometry."""
         return FeatureSweep(
             features=Features.from_points(
                 message_stamp(group[ODOMETRY]),
@@ -101,22 +95,13 @@ class FeatureDecoder:
         )
 
     def pose(self, topic: str, message: Any) -> FloatArray:
-        """(4, 4) pose of an odometry message.
-
-        Raises
-        ------
-        DatasetError
-            If it is no pose.
-        """
-        pose = message.pose.pose
-        p, q = pose.position, pose.orientation
+        """(4, 4) pose of an odometry message."""
+        p, q = message.pose.pose.position, message.pose.pose.orientation
         try:
             message_T = pose_matrix([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
         except ValueError as error:
             raise DatasetError(f"topic {topic}: not a pose: {error}") from error
-        change = np.eye(4)
-        change[:3, :3] = self._lidar_R_message
-        converted: FloatArray = change @ message_T @ change.T
+        converted: FloatArray = self._lidar_T_message @ message_T @ self._lidar_T_message.T
         return converted
 
     def _points(self, topic: str, message: Any) -> NDArray[np.floating]:
@@ -126,13 +111,7 @@ class FeatureDecoder:
 
 
 def finite_points(topic: str, message: Any) -> NDArray[np.floating]:
-    """(N, 3) points of a de-skewed cloud, in its own axes.
-
-    Raises
-    ------
-    DatasetError
-        If it cannot be decoded.
-    """
+    """(N, 3) points of a de-skewed cloud, in its own axes."""
     try:
         # Whatever looks like a time in it is none.
         points: NDArray[np.floating] = decode_pointcloud2(message, time_field=NO_TIMES).points
@@ -152,13 +131,7 @@ def directions_spread(points: NDArray[np.floating]) -> FloatArray | None:
 
 
 def decide_axes(topic: str, spread: FloatArray | None) -> Literal["lidar", "loam"]:
-    """The axes in which directions spread so: they do least along the vertical one.
-
-    Raises
-    ------
-    DatasetError
-        If that does not stand out.
-    """
+    """The axes in which directions spread so: they do least along the vertical one."""
     if spread is not None:
         order = np.argsort(spread)
         if spread[order[0]] < _FLATNESS * spread[order[1]] and order[0] in (1, 2):

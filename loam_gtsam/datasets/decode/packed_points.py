@@ -57,16 +57,10 @@ def read_records(path: Path, stamp: int, record: np.dtype[Any]) -> PackedCloud:
 
 
 def read_pcd(path: Path, stamp: int) -> PackedCloud:
-    """A PCD file, ``DATA`` ascii, binary or binary_compressed; fields named ``_`` are padding.
+    """A PCD file, ``DATA`` ascii, binary or binary_compressed; ``stamp`` in nanoseconds.
 
-    Parameters
-    ----------
-    stamp : nanoseconds
-
-    Raises
-    ------
-    DatasetError
-        If it is no such file, or cut off; or compressed, and the package for it is missing.
+    Fields named ``_`` are padding. DatasetError if the file cannot be understood or is cut off, or
+    if it is compressed and the package for that is missing.
 
     References
     ----------
@@ -80,13 +74,12 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
         kind = header["DATA"][0]
     except (KeyError, ValueError, TypeError, IndexError) as error:
         raise DatasetError(f"{path}: the PCD header cannot be understood: {error!r}") from error
+    body = data[start:]
     if kind == "ascii":
-        body = _from_text(path, data[start:], record)
-    elif kind == "binary":
-        body = data[start:]
+        body = _from_text(path, body, record)
     elif kind == "binary_compressed":
-        body = _decompressed(path, data[start:], record, width * height)
-    else:
+        body = _decompressed(path, body, record, width * height)
+    elif kind != "binary":
         raise DatasetError(
             f"{path}: PCD with DATA {kind}; expected ascii, binary or binary_compressed"
         )
@@ -160,10 +153,8 @@ def _pcd_record(header: dict[str, list[str]]) -> np.dtype[Any]:
         zip(names, kinds, header["SIZE"], counts, strict=True)
     ):
         base = f"<{ {'F': 'f', 'I': 'i', 'U': 'u'}[kind] }{int(size)}"
-        if name == "_" or int(count) != 1:
-            layout.append((f"_{number}", base, (int(count),)))
-        else:
-            layout.append((name, base))
+        padding = name == "_" or int(count) != 1
+        layout.append((f"_{number}", base, (int(count),)) if padding else (name, base))
     return np.dtype(layout)
 
 

@@ -21,6 +21,11 @@ The ratio is below 1000, so at most one unit fits."""
 ANCHORS: dict[str, float] = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Share of the sweep before the moment that its stamp is."""
 _NANOSECONDS: dict[str, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
+_CLOCKS = {
+    "offset": "relative to the stamp",
+    "stamp": "absolute",
+    "own": "absolute, in another clock than the stamp",
+}
 _TRIM = 100
 """One value in this many is set aside at either end before the span is measured."""
 
@@ -47,11 +52,7 @@ class TimeDecision:
     span: tuple[float, float]
 
     def __str__(self) -> str:
-        clock = {
-            "offset": "relative to the stamp",
-            "stamp": "absolute",
-            "own": "absolute, in another clock than the stamp",
-        }[self.clock]
+        clock = _CLOCKS[self.clock]
         anchor = f", sweep {self.anchor} put at the stamp" if self.anchor else ""
         first, last = self.span
         return (
@@ -68,21 +69,11 @@ def decide_times(
     unit: str | None = None,
     stamp_is: str | None = None,
 ) -> TimeDecision:
-    """Decide from the numbers of one sweep what they mean.
+    """Decide from the numbers (N,) of one sweep what they mean.
 
-    Parameters
-    ----------
-    values : (N,) point times as the driver wrote them
-    stamp : of the sweep, nanoseconds
-    field : what to call them in messages
-    unit : ``s``, ``ms``, ``us`` or ``ns``; None decides
-    stamp_is : put the ``start``, ``middle`` or ``end`` of the sweep at the stamp, whatever the
-        numbers say; None decides
-
-    Raises
-    ------
-    DatasetError
-        If the numbers fit no unit, or an option is unknown.
+    ``field`` is what messages call them. A ``unit`` (``s``, ``ms``, ``us``, ``ns``) or the moment
+    that the stamp is (``start``, ``middle``, ``end``) is not decided where it is given.
+    DatasetError if the numbers fit no unit, or an option is unknown.
     """
     check_time_options(unit, stamp_is)
     relative, base = _split(values)
@@ -112,17 +103,10 @@ def decide_times(
 def apply_times(
     values: NDArray[Any], stamp: int, decision: TimeDecision
 ) -> tuple[FloatArray, BoolArray]:
-    """Seconds from the stamp for each point of a sweep.
+    """Seconds (N,) from the stamp for each point of a sweep, and (N,) which are outliers.
 
-    Returns
-    -------
-    times : (N,) seconds; outliers are clipped to the rest of the sweep
-    outlier : (N,) True where the value is not finite or far outside the sweep
-
-    Raises
-    ------
-    DatasetError
-        If the sweep does not lie where ``decision`` says it should.
+    Outliers are not finite or far outside the sweep; their times are clipped to the rest of it.
+    DatasetError if the sweep does not lie where ``decision`` says it should.
     """
     if len(values) == 0:
         return np.zeros(0), np.zeros(0, np.bool_)

@@ -72,18 +72,13 @@ class TimeOptions(TypedDict, total=False):
 
 @dataclass(frozen=True, slots=True)
 class Decoded:
-    """A decoded cloud, and what was found out about its times.
-
-    Attributes
-    ----------
-    scan : the sweep
-    decision : how its times were read, or None if it has none
-    outliers : number of points taken out because their time lies far outside the sweep
-    """
+    """A decoded cloud, and what was found out about its times."""
 
     scan: Scan
     decision: TimeDecision | None
+    """None if the cloud has no times."""
     outliers: int
+    """Points taken out because their time lies far outside the sweep."""
 
 
 def decode_with_times(
@@ -101,7 +96,7 @@ def decode_with_times(
     points = _points(layout)
     rings = _rings(layout)
     values = _time_values(layout, options.get("time_field"))
-    rows = 0
+    rows = outliers = 0
     if rings is None and layout.height > 1:
         rows = min(layout.height, layout.width)
         if layout.height > layout.width:  # one column of the image per row of the message
@@ -110,7 +105,6 @@ def decode_with_times(
             values = (values[0], values[1][order]) if values is not None else None
     finite = np.isfinite(points).all(axis=1)
     times = None
-    outliers = 0
     if values is not None and finite.any():
         name, column = values
         # Only measured points: drivers leave anything in the time of a missing return.
@@ -136,13 +130,7 @@ def decode_with_times(
 
 
 def message_stamp(msg: Any) -> int:
-    """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message.
-
-    Raises
-    ------
-    DatasetError
-        If there is none, or it is no number.
-    """
+    """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message."""
     try:
         stamp = msg.header.stamp
         if hasattr(stamp, "secs"):  # rospy
@@ -240,14 +228,14 @@ def _points(layout: _Layout) -> NDArray[Any]:
             f"PointCloud2: no field {', '.join(missing)}; the message has: "
             f"{', '.join(layout.fields) or 'no fields'}"
         )
-    columns = [layout.column(name) for name in "xyz"]
-    for name, column in zip("xyz", columns, strict=True):
+    columns = {name: layout.column(name) for name in "xyz"}
+    for name, column in columns.items():
         if column.dtype.kind != "f":
             raise DatasetError(
                 f"PointCloud2 field {name!r}: expected float32 or float64, got {column.dtype}"
             )
     with np.errstate(invalid="ignore"):  # some bit patterns of NaN do not survive a change of width
-        return np.stack(columns, axis=1)
+        return np.stack(list(columns.values()), axis=1)
 
 
 def _rings(layout: _Layout) -> NDArray[Any] | None:

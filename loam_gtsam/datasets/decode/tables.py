@@ -34,13 +34,7 @@ _Row = TypeVar("_Row")
 
 
 def seconds_to_ns(text: str) -> int:
-    """Decimal seconds as integer nanoseconds; no detour over binary floating point.
-
-    Raises
-    ------
-    ValueError
-        If the text is not a number up to :data:`loam_gtsam.types.MAX_STAMP`.
-    """
+    """Decimal seconds as integer nanoseconds; no detour over binary floating point."""
     try:
         nanoseconds = Decimal(text.strip()) * 10**9
         # before it becomes an integer, which may have a million digits
@@ -103,10 +97,7 @@ def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArra
 
 
 def read_pose_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
-    """Stamps (N,) and poses (N, 4, 4) of a table whose last columns are ``x y z qx qy qz qw``.
-
-    For the parameters and errors see :func:`read_table`.
-    """
+    """Stamps (N,) and poses (N, 4, 4) of a table whose last columns are ``x y z qx qy qz qw``."""
     stamps, poses = _read_rows(path, columns, separator, pose_matrix)
     return stamps, np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
 
@@ -135,13 +126,7 @@ def read_poses(path: Path, problems: list[str]) -> Trajectory:
 
 
 def pose_matrix(numbers: Sequence[float]) -> FloatArray:
-    """(4, 4) transform of ``x y z qx qy qz qw``.
-
-    Raises
-    ------
-    ValueError
-        If a number is not finite, or the quaternion is not roughly of unit length.
-    """
+    """(4, 4) transform of ``x y z qx qy qz qw``."""
     x, y, z, w = _finite(numbers)[3:]
     length = math.sqrt(x * x + y * y + z * z + w * w)
     if not 0.5 < length < 2.0:
@@ -246,12 +231,13 @@ def is_in_g(acceleration: FloatArray) -> bool:
     return bool(0.8 < np.median(np.linalg.norm(acceleration, axis=1)) < 1.2)
 
 
-def describe_imu(samples: ImuSamples) -> str:
+def describe_imu(samples: ImuSamples | None) -> str:
     """Count and rate of IMU samples as text."""
+    if samples is None:
+        return "none"
     orientation = "with" if samples.orientation is not None else "without"
-    return (
-        f"{len(samples.stamps)} samples, {describe_rate(samples.stamps)}, {orientation} orientation"
-    )
+    rate = describe_rate(samples.stamps)
+    return f"{len(samples.stamps)} samples, {rate}, {orientation} orientation"
 
 
 def describe_rate(stamps: IntArray) -> str:

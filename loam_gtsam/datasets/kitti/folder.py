@@ -134,7 +134,7 @@ class KittiDataset(SweepFiles):
             info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in sensor.items())
         if self._offset:
             info.facts["elevation raised by"] = f"{np.degrees(self._offset):g} degrees"
-        info.facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        info.facts["IMU"] = describe_imu(imu)
         if "imu.lidar_t_imu" in self.sensor:
             info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, "calib_imu_to_velo.txt")
         info.facts["reference poses"] = str(len(self.truth)) if self.truth is not None else "none"

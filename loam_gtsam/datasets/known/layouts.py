@@ -21,8 +21,6 @@ _COLLECTION = re.compile(
     r"\d{4}(-\d\d){5}(_(?P<part>\d+))?-"
     r"(?P<name>(quad|math)-(easy|medium|hard)|stairs|cloister|park)"
 )
-_SPIRES_TRUTH = "gt-tum.txt"
-_SPIRES_BAGS = ("", "raw/rosbag", "raw/ros2bag")
 
 
 def known_loader(path: Path) -> str | None:
@@ -82,12 +80,12 @@ def newer_college_sequences(root: Path) -> Mapping[str, list[Path]]:
 
 def spires_truth(root: Path) -> Path | None:
     """Reference poses of an Oxford Spires sequence."""
-    return first_existing(root, [_SPIRES_TRUTH, f"processed/trajectory/{_SPIRES_TRUTH}"])
+    return first_existing(root, ["gt-tum.txt", "processed/trajectory/gt-tum.txt"])
 
 
 def spires_bags(root: Path) -> list[Path]:
     """ROS 1 files, ROS 2 folders, or the folder itself if it is one."""
-    for folder in (root / name for name in _SPIRES_BAGS):
+    for folder in (root, root / "raw/rosbag", root / "raw/ros2bag"):
         if (folder / "metadata.yaml").is_file():
             return [folder]
         if files := sorted(folder.glob("*.bag")):

@@ -105,7 +105,7 @@ class StampedFiles(SweepFiles):
                 f"from the order of the points, {COLUMNS} firings in {PERIOD:g} s, stamp at sweep "
                 f"{self._stamp_is}"
             )
-        info.facts["IMU"] = describe_imu(imu) if imu is not None else "none"
+        info.facts["IMU"] = describe_imu(imu)
         if imu is not None:
             info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._rig.source)
         info.facts["reference poses"] = str(len(truth)) if truth is not None else "none"

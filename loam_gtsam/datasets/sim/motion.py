@@ -38,11 +38,6 @@ class Motion:
     differentiable); heading follows the path, roll and pitch follow the ground, and a sway is
     added that starts with the motion.
 
-    Parameters
-    ----------
-    scene : way points, ground, height of the sensor, sway
-    speed : m/s on a straight
-
     Attributes
     ----------
     duration : seconds to the end of an open path, or once round a closed one
@@ -51,8 +46,7 @@ class Motion:
     _lidar_T_moved: FloatArray | None = None
 
     def __init__(self, scene: Scene, speed: float) -> None:
-        self._scene = scene
-        self._speed = speed
+        self._scene, self._speed = scene, speed
         points = scene.waypoints
         if scene.closed:
             points = np.vstack([points, points[:1]])
@@ -114,14 +108,7 @@ class Motion:
         return other
 
     def inertial(self, times: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Measurements of a perfect IMU at the lidar's origin, with the lidar's axes.
-
-        Returns
-        -------
-        world_T_lidar : (N, 4, 4)
-        gyro : (N, 3) rad/s, lidar frame
-        acceleration : (N, 3) specific force, m/s^2, lidar frame
-        """
+        """Poses (N, 4, 4), gyro (N, 3) and specific force (N, 3) of a perfect IMU in the lidar."""
         times = np.asarray(times, dtype=np.float64)
         before, here, after = (self.world_T_lidar(times + h) for h in (-_STEP, 0.0, _STEP))
         turned = np.einsum("nji,njk->nik", before[:, :3, :3], after[:, :3, :3])
@@ -144,10 +131,13 @@ class Motion:
         """Heave (m), roll, pitch and yaw (rad)."""
         x = np.clip(times / _START_UP, 0.0, 1.0)
         growth = x**3 * (6.0 * x * x - 15.0 * x + 10.0)
+
+        def wave(slow: float, fast: float) -> FloatArray:
+            first, second = (np.sin(2.0 * np.pi * hertz * times) for hertz in (slow, fast))
+            return 0.6 * first + 0.4 * second
+
         return [
-            amplitude
-            * growth
-            * (0.6 * np.sin(2.0 * np.pi * slow * times) + 0.4 * np.sin(2.0 * np.pi * fast * times))
+            amplitude * growth * wave(slow, fast)
             for amplitude, (slow, fast) in zip(self._scene.sway, _SWAY_HZ, strict=True)
         ]
 

@@ -93,7 +93,7 @@ class Solids:
 def cast_rays(
     solids: Solids, origins: FloatArray, directions: FloatArray, max_range: float
 ) -> tuple[FloatArray, BoolArray]:
-    """Distance along each ray to the first surface.
+    """Distance (C, B) along each ray to the first surface or inf, and (C, B) whether it is foliage.
 
     Parameters
     ----------
@@ -103,11 +103,6 @@ def cast_rays(
     directions : (3, C, B) unit vectors in the world frame, well away from the vertical. Azimuth
         must run monotonically over the columns, about once round.
     max_range : metres
-
-    Returns
-    -------
-    ranges : (C, B) metres, inf where nothing is hit
-    soft : (C, B) whether foliage was hit
     """
     ranges = np.full(directions.shape[1:], max_range)
     view = _View.of(origins, directions, max_range)
@@ -129,22 +124,19 @@ def cast_rays(
     for i, part in view.facing_discs(solids.cylinders[:, :2], solids.cylinders[:, 2]):
         cx, cy, radius, low, high = solids.cylinders[i]
         x, y, z = (origins[part] - (cx, cy, 0.0)).T[:, :, None]
-        near = _entry(
-            horizontal[part], x * dx[part] + y * dy[part], x * x + y * y - radius * radius
-        )
+        c = x * x + y * y - radius * radius
+        near = _entry(horizontal[part], x * dx[part] + y * dy[part], c)
         height = z + near * dz[part]
         near[(height < low) | (height > high)] = np.inf
         np.minimum(ranges[part], near, out=ranges[part])
     soft = np.zeros(ranges.shape, np.bool_)
-    for i, part in view.facing_discs(
-        solids.ellipsoids[:, :2], solids.ellipsoids[:, 3:5].max(axis=1, initial=0.0)
-    ):
+    widest = solids.ellipsoids[:, 3:5].max(axis=1, initial=0.0)
+    for i, part in view.facing_discs(solids.ellipsoids[:, :2], widest):
         scale = 1.0 / solids.ellipsoids[i, 3:]
         x, y, z = ((origins[part] - solids.ellipsoids[i, :3]) * scale).T[:, :, None]
         ex, ey, ez = dx[part] * scale[0], dy[part] * scale[1], dz[part] * scale[2]
-        near = _entry(
-            ex * ex + ey * ey + ez * ez, x * ex + y * ey + z * ez, x * x + y * y + z * z - 1.0
-        )
+        a, b = ex * ex + ey * ey + ez * ez, x * ex + y * ey + z * ez
+        near = _entry(a, b, x * x + y * y + z * z - 1.0)
         closer = near < ranges[part]
         ranges[part][closer] = near[closer]
         soft[part][closer] = solids.foliage[i]
@@ -252,15 +244,9 @@ class _View:
         cosine, sine = np.cos(boxes[:, 6]), np.sin(boxes[:, 6])
         offset = boxes[:, :2] - self.middle
         half = boxes[:, 3:5] + self.stray
-        local = np.stack(
-            [
-                cosine * offset[:, 0] + sine * offset[:, 1],
-                cosine * offset[:, 1] - sine * offset[:, 0],
-            ],
-            axis=1,
-        )
-        outside = np.maximum(np.abs(local) - half, 0.0)
-        distance = np.linalg.norm(outside, axis=1)
+        x, y = offset.T
+        local = np.stack([cosine * x + sine * y, cosine * y - sine * x], axis=1)
+        distance = np.linalg.norm(np.maximum(np.abs(local) - half, 0.0), axis=1)
         signs = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
         corners = local[:, None, :] + signs * half[:, None, :]
         middle = np.arctan2(local[:, 1], local[:, 0])
@@ -277,9 +263,8 @@ class _View:
         offset = centres - self.middle
         distance = np.linalg.norm(offset, axis=1)
         radii = radii + self.stray
-        half = np.where(
-            distance > radii, np.arcsin(radii / np.maximum(distance, radii + 1e-9)), np.pi
-        )
+        seen = np.arcsin(radii / np.maximum(distance, radii + 1e-9))
+        half = np.where(distance > radii, seen, np.pi)
         middle = np.arctan2(offset[:, 1], offset[:, 0])
         return self._columns(middle - half, middle + half, distance - radii)
 

@@ -55,7 +55,7 @@ Residual = Callable[[gtsam.Values], tuple[FloatArray, Sequence[FloatArray]]]
 def point_to_plane_residual(
     map_T_lidar: gtsam.Pose3, point: FloatArray, normal: FloatArray, offset: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Signed distance of a point from the plane ``normal . q + offset = 0``.
+    """Signed distance (1,) of a point from the plane ``normal . q + offset = 0``; Jacobian (1, 6).
 
     Parameters
     ----------
@@ -63,51 +63,29 @@ def point_to_plane_residual(
     point : (3,) metres, lidar frame
     normal : (3,) unit, map frame
     offset : metres
-
-    Returns
-    -------
-    residual : (1,) metres
-    jacobian : (1, 6)
     """
-    return _row_residuals(
-        map_T_lidar, point[None, :], normal[None, :], np.array([offset], dtype=np.float64)
-    )
+    offsets = np.array([offset], dtype=np.float64)
+    return _row_residuals(map_T_lidar, point[None, :], normal[None, :], offsets)
 
 
 def point_to_line_residual(
     map_T_lidar: gtsam.Pose3, point: FloatArray, centre: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Offset of a point from the line through ``centre`` along ``direction``, in two components.
+    """Offset (2,) of a point from a line, whose norm is the distance; Jacobian (2, 6).
 
     Parameters
     ----------
     map_T_lidar : pose
     point : (3,) metres, lidar frame
-    centre : (3,) metres, map frame
-    direction : (3,) unit, map frame
-
-    Returns
-    -------
-    residual : (2,) metres, its norm is the distance
-    jacobian : (2, 6)
+    centre, direction : (3,) a point on the line and its unit direction, map frame
     """
     basis = complement_basis(direction[None, :])[0]
     return _row_residuals(map_T_lidar, np.vstack([point, point]), basis, -basis @ centre)
 
 
 def complement_basis(directions: FloatArray) -> FloatArray:
-    """Two unit vectors orthogonal to each direction and to one another.
+    """Two unit vectors (N, 2, 3) orthogonal to each of (N, 3) unit directions and to one another.
 
-    Parameters
-    ----------
-    directions : (N, 3) unit
-
-    Returns
-    -------
-    (N, 2, 3)
-
-    Notes
-    -----
     Branch-free construction of Duff et al., Building an Orthonormal Basis, Revisited,
     JCGT 6(1), 2017; well conditioned for every direction.
     """
@@ -196,20 +174,9 @@ def line_rows(
 def plane_rows(
     points: ArrayLike, normals: ArrayLike, offsets: ArrayLike, weights: ArrayLike, sigmas: ArrayLike
 ) -> MatchRows:
-    """Rows of M point-to-plane matches.
+    """Rows of M point-to-plane matches; ``normals`` (M, 3) unit and ``offsets`` (M,) in metres.
 
-    Parameters
-    ----------
-    points : (M, 3) metres, lidar frame
-    normals : (M, 3) unit, map frame
-    offsets : (M,) metres
-    weights : (M,) multiply row and residual, as LOAM's s does
-    sigmas : standard deviations of the distances, metres; (M,) or one for all
-
-    Raises
-    ------
-    InputError
-        If a shape is wrong or a value not finite.
+    For the other parameters and the errors see :func:`line_rows`.
     """
     p, n = np.asarray(points, np.float64), np.asarray(normals, np.float64)
     check_array(p, "points", ("N", 3))
@@ -220,12 +187,8 @@ def plane_rows(
 
 def concatenate_rows(parts: Sequence[MatchRows]) -> MatchRows:
     """All rows of several sets of matches."""
-    return MatchRows(
-        *(
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("points", "normals", "offsets", "scales")
-        )
-    )
+    names = ("points", "normals", "offsets", "scales")
+    return MatchRows(*(np.concatenate([getattr(part, n) for part in parts]) for n in names))
 
 
 def checked_factor(
@@ -293,9 +256,8 @@ def point_to_plane_factor(
     if not np.isfinite(offset):
         raise InputError(f"offset: expected a finite number, got {offset}")
     _noise_dimension(noise, 1)
-    return _pose_factor(
-        key, noise, partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
-    )
+    residual = partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
+    return _pose_factor(key, noise, residual)
 
 
 def point_to_line_factor(
@@ -314,10 +276,7 @@ def point_to_line_factor(
     centre, direction : (3,) a point on the line and its unit direction, map frame
     noise : 2-dimensional; may be robust
 
-    Raises
-    ------
-    InputError
-        If a shape is wrong, a value not finite, or the direction not of unit length.
+    Errors are those of :func:`point_to_plane_factor`.
     """
     p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
     _noise_dimension(noise, 2)
@@ -344,11 +303,8 @@ def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
     if len(rows.points) == 0:
         raise InputError("scan_match_factor: expected at least one match, got none")
     anchor, root = _compressed(rows)
-    return _pose_factor(
-        key,
-        gtsam.noiseModel.Unit.Create(len(root)),
-        partial(_compressed_residual, anchor=anchor, root=root),
-    )
+    residual = partial(_compressed_residual, anchor=anchor, root=root)
+    return _pose_factor(key, gtsam.noiseModel.Unit.Create(len(root)), residual)
 
 
 def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:

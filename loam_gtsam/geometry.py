@@ -79,21 +79,11 @@ def inverse_pose(a_T_b: FloatArray) -> FloatArray:
 def move_points(
     points: NDArray[np.floating], twist: FloatArray, times: NDArray[np.floating]
 ) -> FloatArray:
-    """Move each point by the screw motion ``Exp(twist * time)``.
+    """Points (N, 3), each moved by the screw motion ``Exp(twist * time)``.
 
-    With ``twist`` the body velocity and ``times`` counted from the reference time, this maps
-    points measured at their own time into the lidar frame at the reference time: the de-skew of a
-    sweep under constant velocity.
-
-    Parameters
-    ----------
-    points : (N, 3) metres
-    twist : (6,) rad/s and m/s
-    times : (N,) seconds
-
-    Returns
-    -------
-    (N, 3) float64
+    With ``twist`` (6,) the body velocity, rad/s and m/s, and ``times`` (N,) in seconds from the
+    reference time, this maps points measured at their own time into the lidar frame at the
+    reference time: the de-skew of a sweep under constant velocity.
 
     Notes
     -----
@@ -198,17 +188,10 @@ def symmetric_eigenvector(matrices: FloatArray, eigenvalues: FloatArray) -> Floa
 
 
 def fit_lines(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Least-squares line through each group of points.
+    """Least-squares line through each of (N, k, 3) groups of points.
 
-    Parameters
-    ----------
-    neighbours : (N, k, 3) metres
-
-    Returns
-    -------
-    centres : (3, N) a point on each line (the mean)
-    directions : (3, N) unit
-    eigenvalues : (3, N) of the covariance, ascending; a line has the last far above the second
+    Returns (3, N) each: the means, which are on the lines; unit directions; and the eigenvalues of
+    the covariance, ascending, of which a line has the last far above the second.
     """
     centres, covariance = moments(neighbours)
     eigenvalues = symmetric_eigenvalues(covariance)
@@ -216,19 +199,11 @@ def fit_lines(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArra
 
 
 def fit_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Least-squares plane through each group of points, about its centroid.
+    """Least-squares plane through each of (N, k, 3) groups of points, about its centroid.
 
-    Parameters
-    ----------
-    neighbours : (N, k, 3) metres
-
-    Returns
-    -------
-    centres : (3, N) a point on each plane (the mean)
-    normals : (3, N) unit
-    directions : (3, N) unit, in the plane, along its widest extent
-    eigenvalues : (3, N) of the covariance, ascending: across the plane, along its narrow and its
-        wide extent
+    Returns (3, N) each: the means, which are on the planes; unit normals; unit directions in the
+    plane along its widest extent; and the eigenvalues of the covariance, ascending: across the
+    plane, along its narrow and its wide extent.
     """
     centres, covariance = moments(neighbours)
     eigenvalues = symmetric_eigenvalues(covariance)
@@ -239,11 +214,8 @@ def fit_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArr
 def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
     """One integer per voxel of edge length ``size``, metres; keys sort by x, then y, then z.
 
-    Raises
-    ------
-    InputError
-        If a point of (N, 3) or more columns is outside the grid of 2^20 voxels on either side of
-        the origin, whose keys are distinct.
+    InputError if a point of (N, 3) or more columns is outside the grid of 2^20 voxels on either
+    side of the origin, whose keys are distinct.
     """
     cells = _voxel_cells(points, size)
     if not _within_grid(cells):
@@ -272,17 +244,13 @@ def _packed_cells(cells: IntArray) -> IntArray:
 
 
 def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
-    """Centroid of the points in each voxel, ordered by voxel.
+    """Centroids (M, C) of the points in each voxel, ordered by voxel.
 
     Parameters
     ----------
     points : (N, C) with C >= 3: metres in the first three columns, anything that can be averaged
         (e.g. times) in the others
     size : edge length of a voxel, metres; 0 returns the points as they are
-
-    Returns
-    -------
-    (M, C) float64, M <= N
     """
     if size <= 0.0 or len(points) == 0:
         return np.asarray(points, dtype=np.float64)

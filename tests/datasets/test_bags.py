@@ -40,17 +40,13 @@ def test_bag_round_trip(tmp_path: Path, kind: str) -> None:
     assert len(dataset) == 4
     scans = list(dataset)
     for index, scan in enumerate(scans):
-        assert isinstance(scan, Scan)
         assert scan.stamp == START + index * 100_000_000  # the header's, not the receive time
         np.testing.assert_array_equal(scan.points, sweep_points(index))
-        assert scan.times is not None
         np.testing.assert_allclose(scan.times, np.linspace(0, 0.1, 300), atol=1e-8)
         np.testing.assert_array_equal(scan.rings, np.arange(300) % 16)
     for scan, again in zip(scans, dataset, strict=True):
-        assert isinstance(again, Scan)
         np.testing.assert_array_equal(scan.points, again.points)
     samples = dataset.imu
-    assert samples is not None
     assert samples.orientation is not None
     np.testing.assert_array_equal(samples.stamps, START + np.arange(9) * 5_000_000)
     np.testing.assert_allclose(samples.gyro[0], [0.1, 0.2, 0.3])
@@ -101,7 +97,6 @@ def test_imu_without_orientation(tmp_path: Path) -> None:
     recording = sweeps("ros1")
     recording += [("/imu", START + i, imu(ROS1, START + i, unknown=True)) for i in range(3)]
     dataset = BagDataset(write_bag(tmp_path / "run", "ros1", recording))
-    assert dataset.imu is not None
     assert dataset.imu.orientation is None
     assert any("no orientation" in text for text in dataset.info().problems)
 
@@ -133,12 +128,10 @@ def test_undecodable_messages_are_bad_sweeps(tmp_path: Path, kind: str) -> None:
     dataset = open_dataset(write_bag(tmp_path / "run", kind, recording))
     got = list(dataset)
     assert [type(sweep) for sweep in got] == [Scan, Scan, BadSweep, BadSweep, Scan]
-    assert isinstance(got[2], BadSweep)
-    assert isinstance(got[3], BadSweep)
     assert "no field x" in got[2].message
     assert "/points" in got[3].message
     # receive times are led back to the clock of the stamps
-    assert [sweep.stamp for sweep in got[2:4]] == [stamp, START + 300_000_000]  # type: ignore[union-attr]
+    assert [sweep.stamp for sweep in got[2:4]] == [stamp, START + 300_000_000]
 
 
 def test_truncated_bags_cannot_be_opened(tmp_path: Path) -> None:
@@ -185,7 +178,6 @@ def test_damage_inside_keeps_what_came_before(tmp_path: Path) -> None:
     dataset = BagDataset(path)
     got = list(dataset)
     assert [type(sweep) for sweep in got] == [Scan] * 4 + [BadSweep]
-    assert isinstance(got[4], BadSweep)
     assert "the rest is lost" in got[4].message
     assert got[4].stamp == START + 400_000_000  # when the next sweep was due
     list(dataset)

@@ -104,7 +104,6 @@ def test_a_raw_drive_has_its_gps_imu_as_truth_of_the_scanner_and_as_imu(tmp_path
         dataset = open_dataset(path)
         assert isinstance(dataset, KittiDataset)
         truth = dataset.truth
-        assert truth is not None
         expected = write.room(**WORLD).truth_at(truth.stamps)
         # The earth is not flat: 1e-6 of a few metres.
         assert absolute_error(truth, expected).maximum < 1e-4
@@ -119,7 +118,6 @@ def test_a_raw_drive_has_its_gps_imu_as_truth_of_the_scanner_and_as_imu(tmp_path
     assert "position -0.809, 0.320, -0.800 m (calib_imu_to_velo.txt)" in facts["IMU to lidar"]
     result = run(dataset)
     assert absolute_error(result.trajectory, truth).rmse < 0.03
-    assert result.imu is not None
     assert (result.imu.gyro_trusted, result.imu.problem) == (True, "")
     assert result.imu.sweep_motions["gyro"] >= write.COUNT - 1
 
@@ -131,7 +129,6 @@ def test_a_gps_imu_at_the_rate_of_the_sweeps_is_told(tmp_path: Path) -> None:
     wide = Config(imu=ImuConfig(max_gap=0.25))
     for config, used in ((Config(), False), (wide, True)):
         result = run(open_dataset(root), config)
-        assert result.imu is not None
         assert (result.imu.sweep_motions["gyro"] > 0) is used
 
 
@@ -155,9 +152,7 @@ def test_files_of_the_user_win_over_the_gps_imu(tmp_path: Path) -> None:
     (root / "gt.tum").write_text("0 1 2 3 0 0 0 1\n")
     (root / "imu.csv").write_text("0,0,0,0,1,0,0,0,0,0,9.81\n")
     dataset = open_dataset(root)
-    assert dataset.truth is not None
     assert len(dataset.truth) == 1
-    assert dataset.imu is not None
     assert len(dataset.imu.stamps) == 1
     assert "imu.lidar_t_imu" not in dataset.sensor
 
@@ -218,7 +213,6 @@ def write_odometry(root: Path) -> Path:
     truth = write.room(**WORLD).truth_at(stamps).map_T_lidar
     for number, sweep in enumerate(write.sweeps(**WORLD)):
         # Freed of the motion: every point as if it had been measured at the stamp.
-        assert sweep.times is not None
         own = np.rint(sweep.times * 1e9).astype(np.int64)
         moments, which = np.unique(own, return_inverse=True)
         poses = np.linalg.inv(truth[number]) @ (
@@ -246,7 +240,6 @@ def test_a_sequence_of_the_odometry_benchmark_is_not_de_skewed_again(tmp_path: P
     for path in (sequence, sequence / "velodyne"):
         dataset = open_dataset(path)
         assert dataset.sensor["times"] == "none"
-        assert dataset.truth is not None
         expected = write.room(**WORLD).truth_at(write.stamps(**WORLD)).map_T_lidar
         np.testing.assert_allclose(
             dataset.truth.map_T_lidar, np.linalg.inv(expected[0]) @ expected, atol=1e-6

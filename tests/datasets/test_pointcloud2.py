@@ -38,7 +38,6 @@ def test_ring_fields(name: str, code: str) -> None:
     rings = (np.arange(N) % 64).astype(code)
     scan = decode_pointcloud2(make_message({**xyz(), name: rings}))
     np.testing.assert_array_equal(scan.rings, np.arange(N) % 64)
-    assert scan.rings is not None
     assert scan.rings.dtype.kind in "iu"
 
 
@@ -64,13 +63,8 @@ SWEEP = np.linspace(0.0, 0.1, N)
 )
 def test_units(name: str, values: np.ndarray, unit: str, clock: str) -> None:
     decoded = decode_with_times(with_time(name, values))
-    assert decoded.decision is not None
-    assert (decoded.decision.field, decoded.decision.unit, decoded.decision.clock) == (
-        name,
-        unit,
-        clock,
-    )
-    assert decoded.scan.times is not None
+    decision = decoded.decision
+    assert (decision.field, decision.unit, decision.clock) == (name, unit, clock)
     # float64 holds present-day nanoseconds to 256 ns only
     np.testing.assert_allclose(decoded.scan.times, SWEEP, atol=1.5e-6)
 
@@ -101,7 +95,6 @@ def test_moment_of_the_stamp(
 ) -> None:
     values = SWEEP + shift + (STAMP * 1e-9 if absolute else 0.0)
     scan = decode_pointcloud2(with_time("time", values), stamp_is=stamp_is)
-    assert scan.times is not None
     np.testing.assert_allclose(scan.times, SWEEP + first, atol=1e-6)
 
 
@@ -112,24 +105,14 @@ def test_simulated_clock_near_zero() -> None:
     assert decide_times(SWEEP, stamp, field="time").clock == "offset"
 
 
-@pytest.mark.parametrize("wild", [1e6, -3.0, np.nan, np.inf])
+@pytest.mark.parametrize("wild", [1e6, -3.0, np.nan, np.inf, 2**32 - 1])
 def test_one_wild_time(wild: float) -> None:
-    values = SWEEP.copy()
+    values = (SWEEP * 1e9).astype("u4") if wild == 2**32 - 1 else SWEEP.copy()
     values[17] = wild
     decoded = decode_with_times(with_time("time", values))
     assert decoded.outliers == 1
-    assert decoded.scan.times is not None
     assert len(decoded.scan.points) == N - 1
-    np.testing.assert_allclose(decoded.scan.times, np.delete(SWEEP, 17), atol=1e-12)
-
-
-def test_one_wild_unsigned_time() -> None:
-    values = (SWEEP * 1e9).astype("u4")
-    values[17] = 2**32 - 1
-    decoded = decode_with_times(with_time("t", values))
-    assert decoded.outliers == 1
-    assert decoded.decision is not None
-    assert decoded.decision.unit == "ns"
+    np.testing.assert_allclose(decoded.scan.times, np.delete(SWEEP, 17), atol=1e-9)
 
 
 def test_clean_times_lose_nothing() -> None:
@@ -153,21 +136,14 @@ def test_times_that_fit_nothing(values: np.ndarray) -> None:
     assert decode_pointcloud2(message, time_field="none").times is None
 
 
-def test_all_times_nan() -> None:
-    with pytest.raises(DatasetError, match="NaN"):
-        decode_pointcloud2(with_time("time", np.full(N, np.nan)))
-
-
 def test_unit_override_and_earlier_decision() -> None:
     short = np.linspace(0.0, 0.004, N)  # a packet, not a sweep: undecidable alone
     with pytest.raises(DatasetError, match="fit no unit"):
         decode_pointcloud2(with_time("time", short))
     scan = decode_pointcloud2(with_time("time", short), time_unit="s")
-    assert scan.times is not None
     np.testing.assert_allclose(scan.times, short)
     decision = decide_times(SWEEP, STAMP, field="time")
     again = decode_with_times(with_time("time", short), decision=decision).scan
-    assert again.times is not None
     np.testing.assert_allclose(again.times, short)
 
 
@@ -175,6 +151,35 @@ def test_sweep_that_breaks_the_decision() -> None:
     decision = decide_times(SWEEP, STAMP, field="time")
     with pytest.raises(DatasetError, match="from its stamp"):
         decode_with_times(with_time("time", SWEEP + 50.0), decision=decision)
+
+
+def changed(attribute: str, value: Any) -> Any:
+    message = make_message(xyz())
+    setattr(message.fields[1], attribute, value)
+    return message
+
+
+def stamped(**stamp: Any) -> Any:
+    message = make_message(xyz())
+    message.header.stamp = SimpleNamespace(**stamp)
+    return message
+
+
+@pytest.mark.parametrize(
+    ("message", "match"),
+    [
+        (make_message({"x": SWEEP, "z": SWEEP}), "no field y; the message has: x, z"),
+        (make_message({**xyz(), "x": np.arange(N, dtype="i4")}), "'x': expected float32"),
+        (changed("datatype", 9), "unknown datatype 9"),
+        (changed("count", 3), "expected count 1, got 3"),
+        (stamped(sec="now", nanosec=0), r"header\.stamp"),
+        (with_time("time", np.full(N, np.nan)), "NaN"),
+        (3, "expected a PointCloud2 message, got int"),
+    ],
+)
+def test_a_message_that_is_no_cloud_says_why(message: Any, match: str) -> None:
+    with pytest.raises(DatasetError, match=match):
+        decode_pointcloud2(message)
 
 
 @pytest.mark.parametrize("options", [{"time_unit": "sec"}, {"stamp_is": "begin"}])
@@ -186,7 +191,6 @@ def test_unknown_time_options(options: dict[str, str]) -> None:
 def test_asked_time_field() -> None:
     columns = {**xyz(), "t": np.zeros(N), "my_time": SWEEP}
     scan = decode_pointcloud2(make_message(columns), time_field="my_time")
-    assert scan.times is not None
     np.testing.assert_allclose(scan.times, SWEEP)
     with pytest.raises(DatasetError, match=r"no time field 'other'.*my_time"):
         decode_pointcloud2(make_message(columns), time_field="other")
@@ -201,7 +205,6 @@ def test_nan_points_take_their_columns_along() -> None:
     keep = np.arange(N) % 7 != 0
     assert decoded.outliers == 0
     np.testing.assert_array_equal(decoded.scan.rings, np.flatnonzero(keep))
-    assert decoded.scan.times is not None
     np.testing.assert_allclose(decoded.scan.times, SWEEP[keep])
     assert np.isfinite(decoded.scan.points).all()
 
@@ -214,7 +217,6 @@ def test_range_image_keeps_its_rows() -> None:
     assert scan.rows == 8
     assert len(scan.points) == N
     assert np.flatnonzero(np.isnan(scan.points[:, 0])).tolist() == [5]
-    assert scan.times is not None
     assert np.isfinite(scan.times).all()
 
 
@@ -223,7 +225,6 @@ def test_column_major_range_image_is_turned() -> None:
     scan = decode_pointcloud2(make_message(columns, height=N // 8))
     assert scan.rows == 8
     np.testing.assert_array_equal(scan.points[: N // 8, 0], columns["x"][::8])
-    assert scan.times is not None
     np.testing.assert_allclose(
         scan.times.reshape(8, -1), np.tile(np.linspace(0, 0.1, N // 8), (8, 1))
     )
@@ -236,20 +237,7 @@ def test_empty_and_all_nan_clouds() -> None:
     nothing = {name: np.full(N, np.nan, "f4") for name in "xyz"}
     scan = decode_pointcloud2(make_message({**nothing, "time": SWEEP}))
     assert scan.points.shape == (0, 3)
-    assert scan.times is not None
     assert scan.times.shape == (0,)
-
-
-def test_missing_coordinate_lists_fields() -> None:
-    columns = xyz()
-    del columns["y"]
-    with pytest.raises(DatasetError, match="no field y; the message has: x, z"):
-        decode_pointcloud2(make_message(columns))
-
-
-def test_integer_coordinate() -> None:
-    with pytest.raises(DatasetError, match="'x': expected float32"):
-        decode_pointcloud2(make_message({**xyz(), "x": np.arange(N, dtype="i4")}))
 
 
 @pytest.mark.parametrize(
@@ -277,17 +265,6 @@ def test_damaged_layout(change: dict[str, Any], match: str) -> None:
         decode_pointcloud2(message)
 
 
-@pytest.mark.parametrize(
-    ("attribute", "value", "match"),
-    [("datatype", 9, "unknown datatype 9"), ("count", 3, "expected count 1, got 3")],
-)
-def test_damaged_field(attribute: str, value: int, match: str) -> None:
-    message = make_message(xyz())
-    setattr(message.fields[1], attribute, value)
-    with pytest.raises(DatasetError, match=match):
-        decode_pointcloud2(message)
-
-
 def test_tolerated_oddities() -> None:
     expected = decode_pointcloud2(make_message(xyz())).points
     message = make_message(xyz())
@@ -296,8 +273,7 @@ def test_tolerated_oddities() -> None:
     for field in message.fields:
         field.count = 0
     np.testing.assert_array_equal(decode_pointcloud2(message).points, expected)
-    message.header.stamp = SimpleNamespace(secs=3, nsecs=4)
-    assert decode_pointcloud2(message).stamp == 3_000_000_004
+    assert decode_pointcloud2(stamped(secs=3, nsecs=4)).stamp == 3_000_000_004
 
 
 def test_values_that_no_cast_survives_warn_of_nothing() -> None:
@@ -310,17 +286,4 @@ def test_values_that_no_cast_survives_warn_of_nothing() -> None:
         warnings.simplefilter("error")
         scan = decode_pointcloud2(make_message(columns))
     assert len(scan.points) == N - 2
-    assert scan.rings is not None
     assert scan.rings.max() == 2**31 == -scan.rings.min()
-
-
-def test_a_stamp_that_is_no_number_is_refused() -> None:
-    message = make_message(xyz())
-    message.header.stamp = SimpleNamespace(sec="now", nanosec=0)
-    with pytest.raises(DatasetError, match=r"header\.stamp"):
-        decode_pointcloud2(message)
-
-
-def test_not_a_cloud() -> None:
-    with pytest.raises(DatasetError, match="expected a PointCloud2 message, got int"):
-        decode_pointcloud2(3)

@@ -22,7 +22,6 @@ def test_imu_samples_are_put_in_order() -> None:
     values[:, 4] = np.arange(5)
     values[4, 5] = np.nan
     samples = clean_imu(np.array([20, 10, 10, 30, 40]), values, problems)
-    assert samples is not None
     assert samples.stamps.tolist() == [10, 20, 30]
     assert samples.gyro[:, 0].tolist() == [1.0, 0.0, 3.0]
     assert len(problems) == 2
@@ -36,7 +35,6 @@ def test_imu_in_g_is_converted_and_an_empty_one_is_none() -> None:
     values = imu_values(4)
     values[:, 9] = 1.0
     samples = clean_imu(np.arange(4), values, problems)
-    assert samples is not None
     np.testing.assert_allclose(samples.acceleration[:, 2], 9.80665)
     assert "in g" in problems[0]
     assert clean_imu(np.zeros(0, np.int64), np.zeros((0, 10)), problems) is None

@@ -48,7 +48,6 @@ def cloud(store: Any, stamp: int, points: np.ndarray, **columns: np.ndarray) -> 
     fields = []
     for name, array in zip(names, arrays, strict=True):
         packed[name] = array
-        assert packed.dtype.fields is not None
         fields.append(
             types["sensor_msgs/msg/PointField"](
                 name=name,

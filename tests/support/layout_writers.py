@@ -43,7 +43,7 @@ def lidar_truth(sensor: str = "os1-64", columns: int | None = None) -> Trajector
 
 
 def body_truth(body_T_lidar: np.ndarray, **world: object) -> Trajectory:
-    truth = lidar_truth(**world)  # type: ignore[arg-type]
+    truth = lidar_truth(**world)
     return Trajectory(truth.stamps, truth.map_T_lidar @ np.linalg.inv(body_T_lidar))
 
 
@@ -52,7 +52,6 @@ def imu_rows(lidar_R_imu: np.ndarray) -> tuple[np.ndarray, ...]:
     samples = room().imu
     at = stamps()
     use = (samples.stamps >= at[0] - 100_000_000) & (samples.stamps <= at[-1] + 150_000_000)
-    assert samples.orientation is not None
     world_R_imu = Rotation.from_quat(samples.orientation[use]) * Rotation.from_matrix(lidar_R_imu)
     turn = np.asarray(lidar_R_imu)  # rows times R is R^T times columns
     return (
@@ -65,8 +64,6 @@ def imu_rows(lidar_R_imu: np.ndarray) -> tuple[np.ndarray, ...]:
 
 def firings(sweep: Scan, beams: int, columns: int) -> np.ndarray:
     """(beams * columns, 4) float32, firing by firing, zero where nothing came back."""
-    assert sweep.times is not None
-    assert sweep.rings is not None
     column = np.rint(sweep.times * 10.0 * columns).astype(np.int64)
     values = np.zeros((beams * columns, 4), "<f4")
     # Ouster's beams are numbered from the top.
@@ -85,7 +82,7 @@ def write_rows(
 ) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [header] if header else []
-    for stamp, row in zip(stamps, rows, strict=True):  # type: ignore[call-overload]
+    for stamp, row in zip(stamps, rows, strict=True):
         lines.append(separator.join([str(stamp), *(repr(float(value)) for value in row)]))
     path.write_text("\n".join(lines) + "\n")
 

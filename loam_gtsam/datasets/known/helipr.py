@@ -17,9 +17,8 @@ from loam_gtsam.datasets.known.layouts import (
     helipr_truth,
 )
 from loam_gtsam.datasets.known.stamped_files import StampedFiles
-from loam_gtsam.datasets.known.xsens import read_xsens
 from loam_gtsam.geometry import inverse_pose
-from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
+from loam_gtsam.types import DatasetError, Trajectory
 
 _XYZI = ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")
 RECORDS = {
@@ -102,9 +101,6 @@ class HeLiPRDataset(StampedFiles):
             stamp_is=stamp_is,
         )
         self._look_for_missing(first_existing(root, ["stamp.csv"]), name.lower())
-
-    def _read_imu(self, path: Path) -> ImuSamples | None:
-        return read_xsens(path, self._problems)
 
     def _read_truth(self, path: Path) -> Trajectory:
         stamps, poses = read_pose_table(path, "ns x y z qx qy qz qw", None)

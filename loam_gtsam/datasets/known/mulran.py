@@ -13,8 +13,7 @@ from loam_gtsam.datasets.decode.packed_points import XYZI, read_records
 from loam_gtsam.datasets.decode.tables import read_table, sorted_trajectory
 from loam_gtsam.datasets.known.layouts import MULRAN_FOLDERS, first_existing
 from loam_gtsam.datasets.known.stamped_files import StampedFiles
-from loam_gtsam.datasets.known.xsens import read_xsens
-from loam_gtsam.types import DatasetError, ImuSamples, Trajectory
+from loam_gtsam.types import DatasetError, Trajectory
 
 RIG = Rig(
     kind="MulRan sequence",
@@ -81,9 +80,6 @@ class MulRanDataset(StampedFiles):
                 "stamp_is=middle or end overrides"
             )
         self._look_for_missing(first_existing(folder.parent, ["data_stamp.csv"]), "ouster")
-
-    def _read_imu(self, path: Path) -> ImuSamples | None:
-        return read_xsens(path, self._problems)
 
     def _read_truth(self, path: Path) -> Trajectory:
         names = "ns r11 r12 r13 x r21 r22 r23 y r31 r32 r33 z"

@@ -22,6 +22,7 @@ from loam_gtsam.datasets.decode.packed_points import PackedCloud, firing_by_firi
 from loam_gtsam.datasets.decode.point_times import ANCHORS, TimeDecision, check_time_options
 from loam_gtsam.datasets.decode.pointcloud2 import decode_with_times, describe_fields
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps, read_lines, read_poses
+from loam_gtsam.datasets.known.xsens import read_xsens
 from loam_gtsam.types import MAX_STAMP, DatasetError, ImuSamples, Scan, Trajectory
 
 _NAMES = {
@@ -46,7 +47,8 @@ class StampedFiles(SweepFiles):
     read : makes the cloud of a file with its stamp
     name : of a file, without suffix: ``NANOSECONDS``, ``SECONDS.NANOSECONDS`` or
         ``cloud_SECONDS_NANOSECONDS``
-    imu, truth : files of the IMU and of the reference poses, or None
+    imu, truth : files of the IMU (``xsens_imu.csv``, unless a subclass reads another one) and of
+        the reference poses, or None
     in_order : whether sweeps without times of points are complete ones of an OS1-64, firing by
         firing
     time_unit, stamp_is : see :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
@@ -113,7 +115,7 @@ class StampedFiles(SweepFiles):
         return info
 
     def _read_imu(self, path: Path) -> ImuSamples | None:
-        raise NotImplementedError
+        return read_xsens(path, self._problems)
 
     def _read_truth(self, path: Path) -> Trajectory:
         return read_poses(path, self._problems)

@@ -25,7 +25,8 @@ def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
     The 17 columns are nanoseconds, quaternion x y z w, Euler angles, then gyro, accelerometer and
     magnetometer. The file players of both data sets read the gyro from columns 9 to 11. evalio
     (0.6) reads HeLiPR's from columns 15 to 17, which are the players' magnetometer; all agree that
-    12 to 14 are the accelerometer. The rates at which the orientation in the same file turns decide.
+    12 to 14 are the accelerometer. The rates at which the orientation of the same file turns
+    decide.
     """
     lines = read_lines(path)
     if lines and len(lines[0].split(",")) == 8:

@@ -1,12 +1,14 @@
-"""The avenue: as long as asked, clear to drive, and always new ground."""
+"""The avenue and the city: as long as asked, clear to drive, built once."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
+from loam_gtsam.datasets import build_city
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, build_avenue
-from loam_gtsam.types import ConfigError, FloatArray
+from loam_gtsam.types import ConfigError, FloatArray, InputError
 
 
 def way_of(scene: Scene) -> FloatArray:
@@ -75,3 +77,49 @@ def test_it_is_a_built_in_scene() -> None:
 def test_a_way_without_room_for_start_and_end_is_refused(metres: float) -> None:
     with pytest.raises(ConfigError, match="metres: expected at least 100"):
         build_avenue(0, metres)
+
+
+# -- a city around a way of one's own ------------------------------------------------------------
+
+
+def eight(laps=1.0, count=200):
+    angle = np.linspace(0.0, 2.0 * np.pi * laps, int(count * laps))
+    return np.stack([80.0 * np.sin(angle), 50.0 * np.sin(2.0 * angle)], axis=1)
+
+
+def test_a_way_that_crosses_itself_stays_free():
+    scene = build_city(eight())
+    assert len(scene.solids.boxes) > 60
+    assert len(scene.solids.cylinders) > 10
+    assert distance_to_boxes(scene, scene.waypoints).min() > 2.0
+    way = cKDTree(scene.waypoints)
+    assert way.query(scene.solids.cylinders[:, :2])[0].min() > 2.5
+
+
+def test_a_second_time_round_nothing_is_built_anew():
+    once, twice = build_city(eight()), build_city(eight(2.0))
+    houses = [np.count_nonzero(scene.solids.boxes[:, 4] == 5.0) for scene in (once, twice)]
+    assert houses[1] <= 1.1 * houses[0]
+    assert len(twice.waypoints) > 1.9 * len(once.waypoints)
+
+
+def test_it_is_a_world_like_others_and_the_same_every_time():
+    scenes = [build_city(eight(), seed=2) for _ in range(2)]
+    first, second = (SimulatedWorld(scene, frames=3, columns=100)[2] for scene in scenes)
+    np.testing.assert_array_equal(first.points, second.points)
+    other = SimulatedWorld(build_city(eight(), seed=3), frames=3, columns=100)[2]
+    assert other.points.shape != first.points.shape or (other.points != first.points).any()
+
+
+@pytest.mark.parametrize(
+    ("way", "said"),
+    [
+        (np.zeros((5, 3)), r"\(N, 2\)"),
+        (np.zeros((0, 2)), "100 m"),
+        (np.zeros((9, 2)), "100 m"),
+        (np.full((4, 2), np.nan), "finite"),
+    ],
+)
+def test_a_way_that_is_none_is_refused(way, said):
+    with pytest.raises(InputError, match=said):
+        build_city(way)

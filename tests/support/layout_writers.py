@@ -5,12 +5,15 @@ from __future__ import annotations
 import struct
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import lzf
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.pipeline import RunResult, run
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Scan, Trajectory
 
 FIRST, COUNT = 22, 6
@@ -60,6 +63,30 @@ def imu_rows(lidar_R_imu: np.ndarray) -> tuple[np.ndarray, ...]:
         samples.gyro[use] @ turn,
         samples.acceleration[use] @ turn,
     )
+
+
+def expect_truth(dataset: Any, **world: object) -> None:
+    """Its reference poses are those of the lidar."""
+    expected = lidar_truth(**world)
+    np.testing.assert_array_equal(dataset.truth.stamps, expected.stamps)
+    np.testing.assert_allclose(dataset.truth.map_T_lidar, expected.map_T_lidar, atol=1e-8)
+
+
+def expect_sweeps(dataset: Any, expected: list[Scan]) -> None:
+    for scan, wanted in zip(dataset, expected, strict=True):
+        assert scan.stamp == wanted.stamp
+        np.testing.assert_array_equal(scan.points, wanted.points)
+        np.testing.assert_array_equal(scan.rings, wanted.rings)
+        np.testing.assert_allclose(scan.times, wanted.times, atol=1e-6)
+
+
+def expect_mapped(dataset: Any, limit: float = 0.02, imu: bool = True) -> RunResult:
+    """A run follows the reference poses and, if there is an IMU, trusts its gyro."""
+    result = run(dataset)
+    assert absolute_error(result.trajectory, dataset.truth).rmse < limit
+    if imu:
+        assert (result.imu.gyro_trusted, result.imu.problem) == (True, "")
+    return result
 
 
 def firings(sweep: Scan, beams: int, columns: int) -> np.ndarray:

@@ -18,9 +18,8 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.decode.cloud_stream import CloudStream
-from loam_gtsam.datasets.decode.imu_messages import decode_imu
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
+from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, decode_imu
 from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.pipeline import Observer, Pipeline

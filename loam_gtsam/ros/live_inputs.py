@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.config import Config, ImuConfig
-from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.loam_messages import (
     CLOUD,
     ODOMETRY,
@@ -21,7 +20,7 @@ from loam_gtsam.datasets.decode.loam_messages import (
     directions_spread,
     finite_points,
 )
-from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
+from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, message_stamp
 from loam_gtsam.datasets.decode.tables import STANDARD_GRAVITY, UNIT_TOLERANCE, is_in_g
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import (

@@ -14,9 +14,9 @@ from importlib import import_module
 from typing import Any
 
 from loam_gtsam.config import Config, load_config, preset
-from loam_gtsam.datasets.decode.cloud_stream import CloudStream
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.decode.loam_messages import ODOMETRY as LOAM_ODOMETRY
+from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
 from loam_gtsam.io.atomic import make_folder
 from loam_gtsam.io.run_files import write_run
 from loam_gtsam.pipeline import Pipeline

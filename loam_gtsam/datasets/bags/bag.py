@@ -21,12 +21,12 @@ from loam_gtsam.datasets.bags.bag_reader import (
     topic_types,
 )
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo
-from loam_gtsam.datasets.decode.imu_messages import decode_imu
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
 from loam_gtsam.datasets.decode.pointcloud2 import (
     NO_TIMES,
     Decoded,
     TimeOptions,
+    decode_imu,
     decode_with_times,
     describe_fields,
 )

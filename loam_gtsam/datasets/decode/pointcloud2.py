@@ -1,4 +1,4 @@
-"""One decoder for every ``sensor_msgs/PointCloud2``."""
+"""One decoder for every ``sensor_msgs/PointCloud2``, one by one or as a stream; and for ``Imu``."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from loam_gtsam.datasets.decode.point_times import (
     check_time_options,
     decide_times,
 )
-from loam_gtsam.types import DatasetError, Scan
+from loam_gtsam.types import DatasetError, LoamError, Scan
 
 RING_FIELDS = ("ring", "channel", "line")
 TIME_FIELDS = ("t", "time", "timestamp", "timestamps", "stamps", "time_stamp", "offset_time")
@@ -23,6 +23,10 @@ NO_TIMES = "none"
 
 _WILD_RING = 2.0**31
 """Bound of beam numbers; larger floats, which no integer holds, are clipped to it."""
+
+_OPEN = 10
+"""Sweeps that decide for themselves: near time zero an absolute time can still look like an
+offset. A bag decides once, on the last of as many."""
 
 DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Numbers of ``sensor_msgs/PointField``, by numpy's codes."""
@@ -129,6 +133,51 @@ def decode_with_times(
     return Decoded(scan, decision if values is not None else None, outliers)
 
 
+class CloudStream:
+    """Decodes PointCloud2 messages in the order in which they come.
+
+    Parameters
+    ----------
+    options : ``time_field``, ``time_unit``, ``stamp_is``: see :func:`decode_pointcloud2`
+
+    Attributes
+    ----------
+    decision : how the times are read, None before the first that could be
+
+    Raises
+    ------
+    DatasetError
+        If an option is unknown.
+    """
+
+    def __init__(self, **options: Unpack[TimeOptions]) -> None:
+        check_time_options(options.get("time_unit"), options.get("stamp_is"))
+        self._options = options
+        self.decision: TimeDecision | None = None
+        self._decided = 0
+
+    def decode(self, message: Any) -> Scan:
+        """The next sweep.
+
+        Raises
+        ------
+        DatasetError
+            If its layout, a field or its times cannot be understood.
+        """
+        if self._decided >= _OPEN:
+            return decode_with_times(message, decision=self.decision, **self._options).scan
+        try:
+            decoded = decode_with_times(message, **self._options)
+        except LoamError:
+            if self.decision is None:
+                raise
+            return decode_with_times(message, decision=self.decision, **self._options).scan
+        if decoded.decision is not None:
+            self.decision = decoded.decision
+            self._decided += 1
+        return decoded.scan
+
+
 def message_stamp(msg: Any) -> int:
     """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message."""
     try:
@@ -140,6 +189,24 @@ def message_stamp(msg: Any) -> int:
         raise DatasetError(
             f"expected a message with header.stamp, got {type(msg).__name__}: {error}"
         ) from error
+
+
+def decode_imu(msg: Any) -> tuple[int, tuple[float, ...]]:
+    """Stamp and numbers of one Imu message, as rosbags, rclpy or rospy hand it out.
+
+    The numbers are (10,) quaternion x y z w (zero if the message says that there is none), rad/s,
+    m/s^2.
+    """
+    stamp = message_stamp(msg)
+    try:
+        q, w, a = msg.orientation, msg.angular_velocity, msg.linear_acceleration
+        # sensor_msgs/Imu: a first covariance element of -1 says there is no orientation
+        unknown = msg.orientation_covariance[0] == -1.0
+        orientation = (0.0, 0.0, 0.0, 0.0) if unknown else (q.x, q.y, q.z, q.w)
+        values = tuple(map(float, (*orientation, w.x, w.y, w.z, a.x, a.y, a.z)))
+    except (AttributeError, IndexError, TypeError, ValueError) as error:
+        raise DatasetError(f"expected an Imu message, got {type(msg).__name__}: {error}") from error
+    return stamp, values
 
 
 def describe_fields(msg: Any) -> str:

@@ -38,8 +38,7 @@ class RestWindow:
 
     Attributes
     ----------
-    first, last : stamps of the first and the last sample, nanoseconds
-    samples : number of samples
+    first, last, samples : stamps of the first and the last sample, nanoseconds, and their number
     gyro : (3,) mean rate, rad/s: the bias of the gyro
     acceleration : (3,) mean acceleration, m/s^2: it points up
     world_R_lidar : mean orientation, None if there is none
@@ -70,12 +69,8 @@ def find_rest(
     At rest means: gyro and acceleration scatter little (:data:`REST_GYRO`,
     :data:`REST_ACCELERATION`) and do not drift (:data:`REST_DRIFT`), the mean rate is a possible
     bias (:data:`REST_TURN`), the mean acceleration is gravity (:data:`REST_GRAVITY`), and there
-    are enough samples without a gap (:data:`REST_LEAST`, :data:`REST_SAMPLES`).
-
-    Parameters
-    ----------
-    config : section ``imu``
-    samples : in order of time, in lidar axes, the orientation NaN where unknown
+    are enough samples without a gap (:data:`REST_LEAST`, :data:`REST_SAMPLES`). Samples are in
+    order of time and in lidar axes, their orientation is NaN where unknown.
     """
     stamps, gyro = samples.stamps[:count], samples.gyro[:count]
     acceleration, orientation = samples.acceleration[:count], samples.orientation

@@ -132,22 +132,16 @@ class SampleStore:
 class ImuBuffer:
     """IMU samples in lidar axes, in order of time, to be asked about any time.
 
-    Asked twice the same with the same samples in it, the buffer gives the same answer to the last
-    bit, however the samples came in.
+    The answers for the same samples are the same to the last bit, however the samples came in.
 
     Parameters
     ----------
     config : section ``imu``
-    samples : the first samples, if there are some already
+    samples : the first samples, if there are some already; errors as of :meth:`add`
 
     Attributes
     ----------
     lidar_R_imu : the configured rotation from IMU into lidar axes
-
-    Raises
-    ------
-    InputError
-        If an array has the wrong shape or dtype.
     """
 
     def __init__(self, config: ImuConfig, samples: ImuSamples | None = None) -> None:
@@ -285,9 +279,7 @@ class ImuBuffer:
         earliest, latest = seconds.min(initial=0.0), seconds.max(initial=0.0)
         first, last = stamp + round(earliest * 1e9), stamp + round(latest * 1e9)
         found = self._rates(first, last, stamp)
-        if found is None:
-            return None
-        return _rotation_vectors(seconds, earliest, latest, *found)
+        return None if found is None else _rotation_vectors(seconds, earliest, latest, *found)
 
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps from the gyro; None as for :meth:`rotations_since`."""
@@ -344,16 +336,16 @@ class ImuBuffer:
 
     def _rest_at_start(self) -> RestWindow | None:
         """The rest at the start of all samples, dropped ones included."""
-        if not self._start_is_held or len(self._store.samples.stamps) == 0:
-            return self._rest
-        return rest_at_start(self._config, self._store.samples)
+        samples = self._store.samples
+        held = self._start_is_held and len(samples.stamps)
+        return rest_at_start(self._config, samples) if held else self._rest
 
     def _orientations(self) -> FloatArray | None:
         """(N, 4) quaternions of ``world_R_lidar``, NaN where unknown; None if all are."""
         self._merge()
-        if len(self._store.samples.stamps) == 0:
-            return None
         samples = self._store.samples
+        if len(samples.stamps) == 0:
+            return None
         return samples.orientation if self._quality.measured else self._filter.orientations(samples)
 
 
@@ -377,8 +369,7 @@ def _rotation_vectors(
     ``earliest`` <= 0 <= ``latest`` are the ends of ``seconds``; ``times`` (N,) are those of
     ``rates`` (3, N).
     """
-    begin = int(np.floor(earliest / _FINE))
-    end = int(np.ceil(latest / _FINE)) + 2
+    begin, end = int(np.floor(earliest / _FINE)), int(np.ceil(latest / _FINE)) + 2
     nodes: FloatArray = _FINE * np.arange(begin, end, dtype=np.float64)
     steps = rotation_steps(nodes, _interpolate(nodes, times, rates))
     angles = np.concatenate([[0.0], np.cumsum(np.sqrt((steps * steps).sum(axis=0)))])

@@ -139,10 +139,8 @@ class InertialOdometry:
         along = np.outer(gravity, gravity) / size**2
         across = (size * sigmas.gravity) ** 2 * (np.eye(3) - along)
         covariance[GRAVITY, GRAVITY] = _MAGNITUDE_SIGMA**2 * along + across
-        bias = as_vector(gyro_bias, "gyro_bias")
-        state = InertialState(
-            stamp, gtsam.Pose3(), np.zeros(3), np.zeros(3), bias, gravity, covariance
-        )
+        bias, still = as_vector(gyro_bias, "gyro_bias"), np.zeros(3)
+        state = InertialState(stamp, gtsam.Pose3(), still, still, bias, gravity, covariance)
         self._start_at(state, map_T_lidar, velocity)
 
     def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
@@ -235,10 +233,9 @@ class InertialOdometry:
         """Begin a window at a pose of the lidar, with stamp, biases and gravity of ``state``."""
         from_lidar = np.linalg.inv(self._to_lidar)
         known = from_lidar * np.repeat(np.square(self._sigmas.pose), 3) @ from_lidar.T
-        free = self._sigmas.velocity**2 * np.eye(3)
         map_T_imu = map_T_lidar.compose(self._lidar_T_imu)
         state = replace(state, map_T_imu=map_T_imu, velocity=as_vector(velocity, "velocity"))
-        self._start(_uncorrelated(state, known, free))
+        self._start(_uncorrelated(state, known, self._sigmas.velocity**2 * np.eye(3)))
 
     def _start(self, state: InertialState, restarts: int = 0) -> None:
         self.restarts += restarts

@@ -31,8 +31,7 @@ _RANK = 1e-9
 _MOST = 1e18
 """1 nm: larger ones are no measurement, and leave no digits for the rest of the graph."""
 _BLOCK = 1e-6
-"""Rotation and translation of a scan are not told apart in scale further than this (rad/m): a
-whole block may be zero up to rounding."""
+"""rad/m; largest ratio of scale of rotation and translation: a block may be zero up to rounding."""
 _ITERATIONS = 3
 _SMALL_STEP = 1e-2
 """Gauss-Newton stops below this (rad, m, m/s, m/s^2): what is left is about its square, and the
@@ -200,12 +199,8 @@ def scan_residual(
 ) -> tuple[FloatArray, FloatArray]:
     """Pose error of the lidar against the scan's, equation (3), and its Jacobian by the IMU's pose.
 
-    Rotation is ``Log(R_m' R)`` and translation ``R_m' (t - t_m)``, along the *measured* axes. The
-    blind direction of a corridor is then fixed in the map. In the logarithm of the whole pose
-    it would turn with every estimate of the rotation, and a milliradian of noise in that would let
-    the walls tell a little of the way along them.
-
-    Error (6,) in rad and m, and derivative (6, 6).
+    The error (6,) is ``Log(R_m' R)`` in rad and ``R_m' (t - t_m)`` in m, along the *measured* axes:
+    the blind direction of a corridor is then fixed in the map, and does not turn with the estimate.
     """
     # Relative pose: its translation is already along the measured axes.
     apart = measured.between(map_T_imu.compose(lidar_T_imu.inverse()))

@@ -111,12 +111,8 @@ def test_orientation_is_interpolated_through_every_wrap():
     assert np.abs(np.diff(yaw)).max() > 6.0  # it does pass +-pi
     errors = [angle(buffer.orientation(int(s)), r) for s, r in zip(ns(times), exact, strict=True)]
     assert max(errors) < 2e-5  # 3 rad/s^2 h^2 / 8, and more of it
-    assert (
-        angle(
-            buffer.orientation(int(samples.stamps[77])), Rotation.from_quat(samples.orientation[77])
-        )
-        < 1e-12
-    )
+    at = buffer.orientation(int(samples.stamps[77]))
+    assert angle(at, Rotation.from_quat(samples.orientation[77])) < 1e-12
     assert buffer.report.orientation == "ahrs"
     assert buffer.report.problems == ()
 
@@ -173,9 +169,8 @@ def test_everything_comes_out_in_lidar_axes(orientation):
     expected, found = ImuBuffer(CONFIG, samples), ImuBuffer(config, there)
     stamp = int(ns(1.01))
     assert angle(found.orientation(stamp), expected.orientation(stamp)) < 1e-9
-    assert (
-        angle(found.rotation_between(START, stamp), expected.rotation_between(START, stamp)) < 1e-9
-    )
+    turned = [buffer.rotation_between(START, stamp) for buffer in (found, expected)]
+    assert angle(*turned) < 1e-9
     a, b = found.samples_between(START, stamp), expected.samples_between(START, stamp)
     assert len(a.stamps) == 203
     for name in ("gyro", "acceleration"):
@@ -243,9 +238,8 @@ def test_the_way_samples_come_in_does_not_matter(source):
 
 def test_of_equal_stamps_the_first_to_come_is_kept():
     samples = moving(1.0)
-    other = dataclasses.replace(samples, gyro=samples.gyro + 1.0)
     buffer = ImuBuffer(CONFIG, samples)
-    buffer.add(other)
+    buffer.add(dataclasses.replace(samples, gyro=samples.gyro + 1.0))
     assert np.array_equal(buffer.samples_between(START, START + 10**9).gyro, samples.gyro)
     assert (len(buffer), buffer.report.duplicates) == (200, 200)
     assert "200 samples repeat a stamp" in " ".join(buffer.report.problems)
@@ -280,8 +274,7 @@ def test_wrong_arrays_are_named(change, message):
 
 # -- forgetting ------------------------------------------------------------------------------------
 
-SHORT = 2.0
-"""Seconds of memory in these tests, so that runs can be short too."""
+SHORT = 2.0  # seconds of memory in these tests, so that runs can be short too
 
 
 @pytest.fixture
@@ -289,7 +282,7 @@ def short_memory(monkeypatch):
     monkeypatch.setattr("loam_gtsam.imu.buffer.MEMORY", SHORT)
 
 
-def fed_live(samples, forgetful=True):
+def fed_live(samples):
     """Buffers as in a live run of frames of 0.1 s: with all samples so far, and with few."""
     whole, live = ImuBuffer(CONFIG), ImuBuffer(CONFIG)
     for begin in range(0, len(samples.stamps), 20):
@@ -336,8 +329,7 @@ def test_a_live_run_forgets_and_says_the_same_as_if_it_did_not(kind, short_memor
             assert pair[0] is pair[1] is None or pair[0].equals(pair[1], 0.0)
         between = live.rotation_between(first, frame), whole.rotation_between(first, frame)
         assert between[0] is between[1] is None or between[0].equals(between[1], 0.0)
-        seconds = np.linspace(-0.1, 0.0, 5)
-        turned = live.rotations_since(frame, seconds), whole.rotations_since(frame, seconds)
+        turned = (one.rotations_since(frame, np.linspace(-0.1, 0.0, 5)) for one in (live, whole))
         np.testing.assert_array_equal(*turned)
         assert (live.rest_at(frame) is None) is (whole.rest_at(frame) is None)
         held.append(len(live))
@@ -348,20 +340,14 @@ def test_a_live_run_forgets_and_says_the_same_as_if_it_did_not(kind, short_memor
     assert reports[0].orientation == SOURCES[kind]
 
 
-def test_samples_that_come_after_they_were_forgotten_are_counted_and_left_out(short_memory):
+def test_forgotten_samples_are_left_out_and_taken_again_after_the_clock_was_set_back(short_memory):
     samples = stream("no orientation")
     *_, (frame, _, live) = fed_live(samples)
-    before = live.orientation(frame).matrix()
-    count = len(live)
+    before, count = live.orientation(frame).matrix(), len(live)
     live.add(part(samples, slice(0, 50)))
     assert len(live) == count
     np.testing.assert_array_equal(live.orientation(frame).matrix(), before)
     assert "50 samples came too late: left out" in " ".join(live.report.problems)
-
-
-def test_after_the_clock_was_set_back_samples_are_taken_again(short_memory):
-    samples = stream("no orientation")
-    *_, (_, _, live) = fed_live(samples)
     back = part(samples, slice(0, 600))
     back = dataclasses.replace(back, stamps=back.stamps - 3600 * 10**9)
     last = int(back.stamps[-1])

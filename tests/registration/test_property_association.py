@@ -43,37 +43,40 @@ def cubes_of(points: Any) -> CubeMap:
     return cubes
 
 
-def expected_line(query: Any, pose: Any, points: Any, config: MatchingConfig) -> Any:
-    """Centre, direction, distance, weight, or None; as LOAM says it, written out for one point."""
+def fit(query: Any, points: Any, config: MatchingConfig) -> Any:
+    """The neighbours of a query, their mean, and the eigenvalues and -vectors of their scatter."""
     order = np.argsort(((points - query) ** 2).sum(axis=1), kind="stable")[: config.neighbours]
     near = points[order]
-    if len(near) < config.neighbours:
-        return None
     if ((near[-1] - query) ** 2).sum() >= config.max_distance**2:
         return None
     centre = near.mean(axis=0)
-    values, vectors = np.linalg.eigh((near - centre).T @ (near - centre) / len(near))
+    return near, centre, *np.linalg.eigh((near - centre).T @ (near - centre) / len(near))
+
+
+def expected_line(query: Any, pose: Any, points: Any, config: MatchingConfig) -> Any:
+    """Direction, centre, distance, weight and margins of the gates for one point, or None."""
+    found = fit(query, points, config)
+    if found is None:
+        return None
+    _, centre, values, vectors = found
     direction = vectors[:, 2]
     ring = np.cross(pose[:3, 2], query - pose[:3, 3])
-    along = abs(direction @ ring) / np.linalg.norm(ring)
     distance = np.linalg.norm(np.cross(query - centre, direction))
     weight = 1.0 - config.weight_slope * distance
     margins = [
         values[2] / max(config.line_ratio * values[1], 1e-12) - 1.0,
-        config.max_ring_cosine - along,
+        config.max_ring_cosine - abs(direction @ ring) / np.linalg.norm(ring),
         weight - config.min_weight,
     ]
-    return centre, direction, distance, weight, margins
+    return direction, centre, distance, weight, margins
 
 
 def expected_plane(query: Any, pose: Any, points: Any, config: MatchingConfig) -> Any:
-    """Normal, offset, distance, weight, or None."""
-    order = np.argsort(((points - query) ** 2).sum(axis=1), kind="stable")[: config.neighbours]
-    near = points[order]
-    if ((near[-1] - query) ** 2).sum() >= config.max_distance**2:
+    """Normal, offset, distance, weight and margins of the gates for one point, or None."""
+    found = fit(query, points, config)
+    if found is None:
         return None
-    centre = near.mean(axis=0)
-    values, vectors = np.linalg.eigh((near - centre).T @ (near - centre) / len(near))
+    near, centre, values, vectors = found
     normal = vectors[:, 0]
     offset = -normal @ centre
     ray = query - pose[:3, 3]
@@ -127,18 +130,15 @@ def test_association_is_brute_force_with_gates(
             if min(want[4]) < 1e-6:
                 continue  # too close to call
             row = rows[number]
-            first, second, distance, weight, _ = want
-            if reference is expected_line:
-                np.testing.assert_allclose(matches.centres[row], first, atol=1e-9)
-                assert abs(matches.directions[row] @ second) > 1.0 - 1e-6
-                assert matches.distances[row] == pytest.approx(distance, abs=1e-5)
-                assert matches.weights[row] == pytest.approx(weight, abs=1e-4)
-            else:
-                sign = np.sign(matches.normals[row] @ first)
-                assert abs(matches.normals[row] @ first) > 1.0 - 1e-6
-                assert matches.distances[row] * sign == pytest.approx(distance, abs=1e-5)
-                assert matches.offsets[row] * sign == pytest.approx(second, abs=1e-4)
-                assert matches.weights[row] == pytest.approx(weight, abs=1e-4)
+            axis, place, distance, weight, _ = want
+            line = reference is expected_line
+            axes = matches.directions if line else matches.normals
+            sign = 1.0 if line else np.sign(axes[row] @ axis)
+            assert abs(axes[row] @ axis) > 1.0 - 1e-6
+            places, limit = (matches.centres, 1e-9) if line else (matches.offsets, 1e-4)
+            np.testing.assert_allclose(sign * places[row], place, rtol=1e-6, atol=limit)
+            assert sign * matches.distances[row] == pytest.approx(distance, abs=1e-5)
+            assert matches.weights[row] == pytest.approx(weight, abs=1e-4)
             assert matches.sigmas[row] >= config.point_sigma
 
 

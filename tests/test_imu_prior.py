@@ -75,16 +75,6 @@ def check_jacobian(factor, pose, tolerance):
 # -- angles and Jacobians --------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "rotation",
-    [FLAT, rot3(1e-4, 0, 0), rot3(20, -35, 100), rot3(-179.9, 60, 3), rot3(120, 84, -90)],
-)
-def test_the_jacobian_of_roll_and_pitch_is_the_numerical_one(rotation):
-    pose = gtsam.Pose3(rotation, np.array([5.0, -3.0, 1.0]))
-    expected = numerical(lambda near: roll_pitch(near.rotation()), pose)
-    np.testing.assert_allclose(roll_pitch_jacobian(rotation), expected, atol=1e-7)
-
-
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("pull", [1e-3, 1.0])
 def test_the_jacobian_of_the_roll_pitch_factor_is_the_numerical_one(seed, pull):

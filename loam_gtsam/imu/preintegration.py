@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.geometry import as_array, as_vector
+from loam_gtsam.geometry import as_array, as_vector, cross
 from loam_gtsam.imu.preintegration_window import (
     BIASES,
     GRAVITY,
@@ -155,7 +155,7 @@ class InertialOdometry:
         """
         frame = WindowFrame(self.config, self._window.newest + 1, self.state, stamp, samples)
         # The IMU goes round the lidar as the platform turns.
-        lever = np.cross(frame.rate - self.state.gyro_bias, self._lidar_T_imu.translation())
+        lever = cross(frame.rate - self.state.gyro_bias, self._lidar_T_imu.translation())
         map_T_imu = frame.predicted.map_T_imu
         prediction = Prediction(
             map_T_imu.compose(self._lidar_T_imu.inverse()),

@@ -99,8 +99,7 @@ class ImuTracker:
     def first_pose(self, stamp: int, given: gtsam.Pose3 | None = None) -> gtsam.Pose3:
         """Pose of the first sweep: the origin of a map whose z axis points up, if configured.
 
-        ``given`` is the pose that a user wants, in a map of the user's own; up is then found in
-        that map. ``stamp`` is in nanoseconds.
+        ``given`` is the pose that a user wants, in a map of the user's own; up is found in that.
         """
         rest = self.buffer.rest_at(stamp)
         if rest is not None:

@@ -6,14 +6,14 @@ window of 21 x 21 x 11 around the sensor are in use (LOAM, laserMapping); what l
 archived and comes back with it.
 
 Points of a cube are sorted by voxel. An insert then finds the voxels it hits by bisection, and a
-kd-tree builds in half the time that it takes on unordered points. One tree holds all cubes that
-are searched together: a sweep touches a dozen, most of them with a handful of points. The cubes
-and the trees themselves are in :mod:`loam_gtsam.voxels`.
+kd-tree builds in half the time. One tree holds all cubes that are searched together: a sweep
+touches a dozen, most of them with a handful of points. See :mod:`loam_gtsam.voxels`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -135,7 +135,7 @@ class CubeMap:
                 self._restored += 1
         self._trees.forget(leaving)
         for index in leaving:
-            self._archive.store(index, self._cubes.pop(index))
+            self._archive.store(index, self._cubes.pop(index).content)
         self._evicted += len(leaving)
         return len(leaving)
 
@@ -204,10 +204,7 @@ class CubeMap:
 
     def moved_points(self, moves: Mapping[int, FloatArray]) -> FloatArray:
         """Points of the whole map as they would be after :meth:`move`; the map does not change."""
-        copy = CubeMap(self._config.changed(archive_dir=None), self._grid.voxel_size)
-        copy._window = self._window
-        copy._cubes = {i: Cube.of(cube.content, self._grid) for i, cube in self._cubes.items()}
-        copy._archive = self._archive.copy()
+        copy = deepcopy(self)
         copy.move(moves)
         return copy.points(archived=True)
 
@@ -290,7 +287,7 @@ class CubeMap:
         return np.concatenate([NO_POINTS, *(held[index] for index in sorted(held))])
 
     def thinned(self, factor: float) -> CubeMap:
-        """The points of the window in a map of their own, with voxels this times as large."""
+        """A map of the points of the window, with voxels ``factor`` times as large."""
         config = self._config.changed(insertion="centroid", archive_dir=None)
         thin = CubeMap(config, factor * self._grid.voxel_size)
         thin._window = self._window

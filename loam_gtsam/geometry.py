@@ -277,6 +277,11 @@ def find_in_sorted(sorted_keys: IntArray, keys: IntArray) -> tuple[IntArray, Boo
     return positions, present
 
 
+def run_starts(changes: BoolArray) -> IntArray:
+    """Where the runs of a non-empty sequence begin, from ``sequence[1:] != sequence[:-1]``."""
+    return np.flatnonzero(np.concatenate(([True], changes)))
+
+
 def symmetric(matrix: FloatArray) -> FloatArray:
     """The symmetric part of a square matrix: what rounding made of a symmetric one is removed."""
     part: FloatArray = 0.5 * (matrix + matrix.T)

@@ -1,7 +1,7 @@
 """Measures along the rings of a sweep: how bent, how rough and how trustworthy each point is.
 
 Equations: docs/maths/features.md. Throughout, ``xyz`` is (3, N) float32 in metres, ring after ring
-in firing order, and ``ring_starts`` (R + 1,) says where each ring begins, its last entry being N.
+in firing order, and ring i begins at ``ring_starts[i]``; the last of these (R + 1,) entries is N.
 """
 
 from __future__ import annotations
@@ -131,27 +131,18 @@ def unreliable_points(
     ring_starts: IntArray,
     settings: FeatureConfig,
 ) -> BoolArray:
-    """Points LOAM never picks: on the rim of an occluded surface, or on a grazed one.
+    """(N,) points LOAM never picks: on the rim of an occluded surface, or on a grazed one.
 
-    Parameters
-    ----------
-    xyz : (3, N) points of the sweep
-    gaps : (N,) from :func:`squared_gaps`
-    ring_starts : (R + 1,) first point of each ring, and N
-    settings : ``occlusion_gap``, ``occlusion_ratio``, ``grazing_ratio`` and ``half_window`` are
-        used
-
-    Returns
-    -------
-    (N,) true for a point to leave out
-
-    Notes
-    -----
     Two neighbours lie on almost the same ray if they are far apart, and close once the farther one
     is drawn in to the range of the nearer one. The nearer surface then cuts off the farther one,
     whose end is no edge: that point and the five behind it are left out (figure 4b of the paper).
     Where both gaps of a point are large for its range, the surface is seen at a grazing angle
     (figure 4a).
+
+    Parameters
+    ----------
+    xyz, gaps, ring_starts : the sweep, with its gaps from :func:`squared_gaps`
+    settings : the occlusion and grazing limits and ``half_window`` are used
     """
     squared = _squared_norm(xyz)
     limit = squared * np.float32(settings.grazing_ratio)

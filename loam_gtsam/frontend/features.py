@@ -5,13 +5,12 @@ The rules are those of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping i
 raw sweep, rejection of occluded and grazing points, and picks by sector. Four things differ from
 the published code:
 
-* Picks are made for all sectors at once, edges of the whole sweep before its plane points. The
-  published code goes sector by sector, so that near a border (within half a window) which of two
-  neighbouring points is picked can differ. Counts and spacing hold all the same: of two picks
-  that would suppress each other, the one in the earlier sector stays.
+* Picks are made for all sectors at once, edges before plane points. The published code goes sector
+  by sector, so that which of two neighbours is picked can differ within half a window of a border.
+  Of two picks that would suppress each other, the one in the earlier sector stays.
 * A plane point must lie where its ring is smooth (:func:`roughness`, ``features.range_noise``). In
-  foliage, which is not smooth, five neighbours make a plane only by chance; matches with such
-  planes pull the pose towards the pose from which the map was first seen.
+  foliage five neighbours make a plane only by chance, and matches with such planes pull the pose
+  towards the pose from which the map was first seen.
 * Poles, which are too thin for the curvature, are edges (:mod:`loam_gtsam.frontend.poles`).
 * Flat picks stand in ``Features.planes`` as they were measured, before the rest, which is
   voxel-filtered; the published code puts them into the filter too.
@@ -35,7 +34,7 @@ from loam_gtsam.frontend.curvature import (
 )
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.frontend.poles import Poles, find_poles
-from loam_gtsam.geometry import voxel_filter
+from loam_gtsam.geometry import run_starts, voxel_filter
 from loam_gtsam.types import (
     BoolArray,
     Features,
@@ -55,8 +54,8 @@ _KEY_BITS = 18
 def extract_features(scan: Scan, config: Config) -> Features:
     """Edge and plane points of a sweep, at the positions they were measured.
 
-    Points that are not finite or out of range are dropped. Positions stay raw, and every feature
-    keeps its time: :func:`loam_gtsam.geometry.move_points` de-skews them.
+    Positions stay raw, and every feature keeps its time, so that
+    :func:`loam_gtsam.geometry.move_points` can de-skew them.
 
     Parameters
     ----------
@@ -134,7 +133,6 @@ def thinned(features: Features, config: MapConfig) -> Features:
     edges = np.column_stack([features.edges, features.edge_times, stands_out])
     planes = np.column_stack([features.planes, features.plane_times])
     edges, planes = map(voxel_filter, (edges, planes), sizes)
-    none: IntArray = np.empty(0, np.int64)
     return replace(
         features,
         edges=edges[:, :3].copy(),
@@ -143,8 +141,8 @@ def thinned(features: Features, config: MapConfig) -> Features:
         plane_times=planes[:, 3].copy(),
         edge_rings=np.zeros(len(edges), np.int64),
         plane_rings=np.zeros(len(planes), np.int64),
-        sharp=none,
-        flat=none,
+        sharp=np.empty(0, np.int64),
+        flat=np.empty(0, np.int64),
         edge_prominence=edges[:, 4].copy(),
         voxel_sizes=sizes,
     )
@@ -235,15 +233,9 @@ def pick_by_sector(
 
 
 def _assemble(
-    scan: Scan,
-    config: Config,
-    sweep: OrganisedSweep,
-    edges: IntArray,
-    n_sharp: int,
-    flat: IntArray,
-    rest: IntArray,
-    poles: Poles,
-) -> Features:
+    scan: Scan, config: Config, sweep: OrganisedSweep, edges: IntArray, n_sharp: int,
+    flat: IntArray, rest: IntArray, poles: Poles,
+) -> Features:  # fmt: skip
     """Gather positions, times from the reference time, and rings; poles are the last edges."""
     span = sweep.span
     moments = {"start": span[0], "middle": 0.5 * sum(span), "end": span[1], "stamp": 0.0}
@@ -256,11 +248,10 @@ def _assemble(
 
     size = config.features.plane_voxel
     if size > 0.0 and len(rest):
-        rest_points, rest_times, rest_rings = voxel_filter_by_ring(
-            sweep.xyz.take(rest, axis=1), times[rest], ring[rest], size
-        )
+        rest_of = voxel_filter_by_ring(sweep.xyz.take(rest, axis=1), times[rest], ring[rest], size)
     else:
-        rest_points, rest_times, rest_rings = positions(rest), times[rest], ring[rest]
+        rest_of = positions(rest), times[rest], ring[rest]
+    rest_points, rest_times, rest_rings = rest_of
     stands_out = prominence(sweep.xyz, config.features.half_window, edges)
     with_poles = np.concatenate((edges, poles.middles))
     return Features(
@@ -293,20 +284,14 @@ def voxel_filter_by_ring(
 
     Returns
     -------
-    points : (M, 3) metres, ordered by ring and voxel
-    times : (M,) seconds
-    rings : (M,)
-
-    Notes
-    -----
-    A ring crosses a voxel in one run of points, mostly. Runs are summed first, so that only they
-    need sorting.
+    points, times, rings : (M, 3), (M,) and (M,), ordered by ring and voxel
     """
+    # A ring crosses a voxel mostly in one run of points: runs are summed first, then sorted.
     cells = np.floor(xyz * np.float32(1.0 / size))
     change = rings[1:] != rings[:-1]
     for axis in cells:
         change |= axis[1:] != axis[:-1]
-    runs = np.concatenate(([0], np.flatnonzero(change) + 1))
+    runs = run_starts(change)
     cells = cells.take(runs, axis=1)
     if np.abs(cells).max() < 1 << (_KEY_BITS - 1):
         key = rings[runs]
@@ -315,11 +300,10 @@ def voxel_filter_by_ring(
     else:  # two voxels would share such a key
         rows = np.concatenate((rings[None, runs], cells))
         key = np.unique(rows, axis=1, return_inverse=True)[1].ravel()
-    # Not stable, five times faster: the sums below are of float32 values of one voxel in float64,
-    # whose order does not matter.
+    # Not stable, five times faster: the order of float32 values does not matter in a float64 sum.
     order = np.argsort(key)
     key = key[order]
-    heads = np.flatnonzero(np.concatenate(([True], key[1:] != key[:-1])))
+    heads = run_starts(key[1:] != key[:-1])
 
     def gather(values: NDArray[np.floating]) -> FloatArray:
         sums = np.add.reduceat(values.astype(np.float64), runs)

@@ -1,8 +1,6 @@
-"""Organised sweeps: the beam and the time of each point, and the points in firing order.
+"""Organised sweeps: ring after ring, each ring in firing order, with the time of each point.
 
-LOAM's features need the order in which one beam met the world. So feature extraction works on an
-:class:`OrganisedSweep`: ring after ring, each in firing order. How rings and times were found is
-part of the result (``method``, ``note``), for people to check.
+LOAM's features compare consecutive measurements of one beam, so they need this order.
 """
 
 from __future__ import annotations
@@ -17,30 +15,28 @@ from loam_gtsam.config import Config, SensorConfig
 from loam_gtsam.frontend.rings import (
     MAX_RINGS,
     RingAssignment,
+    azimuth_steps,
     rings_from_elevation,
     rings_from_file_order,
     rings_from_labels,
     rings_from_rows,
 )
+from loam_gtsam.geometry import run_starts
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, Scan, SweepError, SweepFault
 
 MIN_POINTS = 11
-"""One window of LOAM's curvature: a point and five neighbours on either side."""
-
+"""Points in one window of LOAM's curvature: a point and five neighbours on either side."""
 _MAX_SPAN = 2.0
-"""Seconds of a sweep: no spinning sensor in use turns slower than 0.5 Hz; more is a wrong unit."""
-
+"""Seconds: longest sweep. No spinning sensor turns slower than 0.5 Hz; more is a wrong unit."""
 _MAX_OFFSET = 10.0
-"""Seconds between a stamp and its sweep: beyond that, the pose would be an extrapolation."""
-
+"""Seconds: largest distance of a sweep from its stamp, beyond which its pose is extrapolated."""
 _MAX_OUTLIERS = 0.01
-"""Fraction of points that may carry a nonsense time and be dropped."""
-
+"""Largest fraction of points with implausible times that are dropped without an error."""
 _ONE_WAY = 0.8
-"""Fraction of azimuth steps of one sign from which the sense of rotation is taken as known."""
-
+"""Least fraction of azimuth steps with the same sign that shows the sense of rotation."""
 _SEAM = 0.9
-"""Fraction of a turn: a step back this large, in firing order, passes the start of the sweep."""
+"""Fraction of a turn: between consecutive points of a ring, a larger step crosses the start of the
+sweep."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,7 +48,7 @@ class TimeAssignment:
     times : (N,) seconds from the scan's stamp
     span : (first, last) seconds from the stamp covered by the sweep
     method : "field", "azimuth" or "none"
-    note : one sentence for people
+    note : one sentence for the user
     """
 
     times: FloatArray
@@ -63,7 +59,7 @@ class TimeAssignment:
 
 @dataclass(frozen=True, eq=False)
 class SweepColumns:
-    """The usable points of a scan, one row per coordinate, and what came with them.
+    """The usable points of a scan, with their ring labels, image rows and times.
 
     Attributes
     ----------
@@ -71,8 +67,8 @@ class SweepColumns:
     index : (N,) position of each point in the scan
     labels, row_of, times : (N,) of the same points, or None
     span : as in :class:`~loam_gtsam.types.Scan`
-    dropped : number of points left out
-    not_finite : of them, those that are NaN or infinite
+    dropped : number of points that are not usable
+    not_finite : number of points that are NaN or infinite
     """
 
     xyz: NDArray[np.float32]
@@ -106,9 +102,9 @@ class OrganisedSweep:
     ring_of_start : (R,) number of each of those rings
     times : (N,) seconds from the scan's stamp
     span : (first, last) seconds from the stamp
-    rings, timing : how both were decided; their arrays are in the order of ``columns``
-    dropped : points left out (not finite, out of range, nonsense time)
-    not_finite : of them, those that are NaN or infinite
+    rings, timing : sources of rings and times; their arrays are in the order of the scan
+    dropped : number of points left out (not finite, out of range, implausible time)
+    not_finite : number of points that are NaN or infinite
     """
 
     xyz: NDArray[np.float32]
@@ -124,7 +120,7 @@ class OrganisedSweep:
 
 
 def usable_columns(scan: Scan, config: Config) -> SweepColumns:
-    """Drop points that are not finite, out of range, or (a few) far off in time.
+    """Drop points that are not finite, out of range, or have implausible times.
 
     Raises
     ------
@@ -132,7 +128,6 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
         If fewer than 11 points remain, or the times cannot be seconds.
     """
     sensor = config.sensor
-    # One mask for all columns: dropping points but not their times is a well-known bug.
     # NaN compares false; the square of an infinity is above any finite bound.
     with np.errstate(over="ignore", invalid="ignore"):
         xyz = np.ascontiguousarray(scan.points.T, dtype=np.float32)
@@ -182,10 +177,11 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
 
 
 def _plausible_times(times: NDArray[np.floating], keep: BoolArray) -> BoolArray:
-    """Mask of times that can belong to this sweep; refuses times that are not seconds."""
+    """(N,) whether a time can belong to this sweep; SweepError if times are not in seconds."""
     good: BoolArray = np.isfinite(times)
     used = times[good & keep]
-    if len(used) == 0 or float(used.max()) - float(used.min()) <= _MAX_SPAN:
+    span = float(used.max()) - float(used.min()) if len(used) else 0.0
+    if span <= _MAX_SPAN:
         return good
     middle = float(np.median(used))
     with np.errstate(invalid="ignore"):
@@ -193,9 +189,9 @@ def _plausible_times(times: NDArray[np.floating], keep: BoolArray) -> BoolArray:
     outside = int(np.count_nonzero(good & keep & ~near))
     if outside > _MAX_OUTLIERS * len(used):
         raise SweepError(
-            f"point times span {float(used.max()) - float(used.min()):.6g} s in one sweep, "
-            f"more than {_MAX_SPAN:g} s: they are probably not in seconds from the stamp; fix "
-            "their unit, or set sensor.times to azimuth or none",
+            f"point times span {span:.6g} s in one sweep, more than {_MAX_SPAN:g} s: they are "
+            "probably not in seconds from the stamp; fix their unit, or set sensor.times to "
+            "azimuth or none",
             SweepFault.BAD_TIMES,
         )
     good &= near
@@ -205,13 +201,13 @@ def _plausible_times(times: NDArray[np.floating], keep: BoolArray) -> BoolArray:
 def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
     """Find the beam of each point.
 
-    ``sensor.rings`` chooses the source; ``auto`` tries the ring field, row order (of a range
-    image, or of a file written ring after ring), and elevation.
+    ``sensor.rings`` selects the source; ``auto`` tries the ring field, the order of the points (in
+    a range image, or in a file written ring after ring), and the elevations.
 
     Raises
     ------
     SweepError
-        If no source gives at least two rings; says what was tried.
+        If no source gives at least two rings; the message lists the sources.
     """
     tried: list[str] = []
     found: RingAssignment | None = None
@@ -246,28 +242,27 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
 
 
 def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -> TimeAssignment:
-    """Find when each point was measured.
+    """Find the time at which each point was measured.
 
-    ``config.sensor.times`` chooses the source; ``auto`` takes the times of the points, else, if
-    they are needed for de-skew, the azimuth.
+    ``config.sensor.times`` selects the source; ``auto`` takes the times of the points or, where
+    de-skewing needs times, the azimuth.
 
     Parameters
     ----------
-    columns : in the order of the scan, which tells the sense of rotation
+    columns : in the order of the scan, which shows the sense of rotation
     rings : of the same points
     config : ``sensor`` and ``deskew.enabled`` are used
 
     Raises
     ------
     SweepError
-        If the source has no times; says what to set.
+        If the source has no times; the message says what to set.
     """
     sensor = config.sensor
     source: str = sensor.times
-    if source == "auto" and columns.times is not None:
-        source = "field"
-    elif source == "auto":
-        source = "azimuth" if config.deskew.enabled else "none"
+    if source == "auto":
+        needed = "azimuth" if config.deskew.enabled else "none"
+        source = needed if columns.times is None else "field"
     if source == "none":
         zeros = np.zeros(len(columns))
         return TimeAssignment(zeros, (0.0, 0.0), "none", "no times: the sweep is not de-skewed")
@@ -318,14 +313,12 @@ def _times_from_azimuth(
 def _sense(
     azimuth: NDArray[np.float32], same_ring: BoolArray, rings: RingAssignment, sensor: SensorConfig
 ) -> tuple[bool, bool, str]:
-    """(clockwise, the order of the points is that of firing, why)."""
-    step = np.diff(azimuth)[same_ring]
-    step -= np.float32(2.0 * np.pi) * np.rint(step * np.float32(0.5 / np.pi))
+    """Whether the sensor turns clockwise, whether points are in firing order, and the reason."""
+    step = azimuth_steps(azimuth)[same_ring]
     back, forth = int(np.count_nonzero(step < 0.0)), int(np.count_nonzero(step > 0.0))
     one_way = max(back, forth) >= _ONE_WAY * max(back + forth, 1) and back + forth > 0
-    # A file written ring after ring tells the writer's order, not the sensor's: KITTI's raw
-    # sweeps ascend in azimuth although the scanner turned clockwise (de-skewing them clockwise
-    # brings sweeps closer together, counterclockwise drives them apart).
+    # A file stored ring after ring shows the order of the writer, not of the sensor: KITTI's raw
+    # sweeps ascend in azimuth although the scanner turned clockwise.
     in_order = one_way and not rings.ring_major
     if sensor.spin != "auto":
         clockwise = sensor.spin == "clockwise"
@@ -342,28 +335,27 @@ def _sense(
 
 
 def _seam_turns(fraction: FloatArray, same_ring: BoolArray) -> FloatArray:
-    """Whole turns to add, so that a sweep that overlaps its own start keeps its order.
+    """Whole turns to add to the fractions of a sweep that overlaps its own start.
 
-    Drivers cut sweeps at packets: the first points may lie just before the start azimuth and
-    the last ones just behind it. In firing order such a seam is a step of almost a whole turn.
+    Drivers cut sweeps at packets: the first points may lie just before the start azimuth and the
+    last ones just behind it. In firing order this is a step of almost a whole turn.
     """
     step = np.diff(fraction) * same_ring
     wraps = (step < -_SEAM).astype(np.float64) - (step > _SEAM)
     if not wraps.any():
         return np.zeros(len(fraction))
     turns = np.concatenate(([0.0], np.cumsum(wraps)))
-    first = np.flatnonzero(np.concatenate(([True], ~same_ring)))
-    counts = np.diff(np.append(first, len(fraction)))
-    ends = np.append(first[1:], len(fraction)) - 1
+    first = run_starts(~same_ring)
+    after = np.append(first[1:], len(fraction))
     base = turns[first]
     # A ring that begins just before the start azimuth and passes it began a turn early.
-    base = base + ((fraction[first] > _SEAM) & (turns[ends] > base))
-    turns -= np.repeat(base, counts)
+    base = base + ((fraction[first] > _SEAM) & (turns[after - 1] > base))
+    turns -= np.repeat(base, after - first)
     return turns
 
 
 def organise(scan: Scan, config: Config) -> OrganisedSweep:
-    """The points of a sweep, ring after ring in firing order, with rings and times.
+    """Put the points of a sweep ring after ring in firing order, and find their times.
 
     Parameters
     ----------
@@ -380,7 +372,7 @@ def organise(scan: Scan, config: Config) -> OrganisedSweep:
     timing = assign_times(columns, rings, config)
     order = _firing_order(columns, rings, timing)
     number = rings.rings if order is None else rings.rings[order]
-    starts = np.flatnonzero(np.concatenate(([True], number[1:] != number[:-1])))
+    starts = run_starts(number[1:] != number[:-1])
     return OrganisedSweep(
         xyz=columns.xyz if order is None else columns.xyz.take(order, axis=1),
         index=columns.index if order is None else columns.index[order],
@@ -398,16 +390,15 @@ def organise(scan: Scan, config: Config) -> OrganisedSweep:
 def _firing_order(
     columns: SweepColumns, rings: RingAssignment, timing: TimeAssignment
 ) -> IntArray | None:
-    """Order by ring and time, or None if the points are in that order.
+    """Order of the points by ring and time; None if they are in that order.
 
-    A stable sort by 16-bit keys is a radix sort, far cheaper than sorting the times. The keys are
-    ring and a coarse time, which is exact for data that was stored in time order (or against it)
-    but cut elsewhere; what is still out of order is sorted in full.
+    A stable sort by 16-bit keys (ring and coarse time) is a radix sort, far cheaper than a sort by
+    time. It suffices for points that were stored in time order, or against it.
     """
     number = rings.rings
     clock = timing.times
     if timing.method == "none":
-        # Without times the azimuth is the order along a ring.
+        # Without times, the points of a ring are ordered by azimuth.
         clock = -columns.azimuth.astype(np.float64)
     if _in_order(number, clock):
         return None
@@ -427,6 +418,6 @@ def _firing_order(
 
 
 def _in_order(number: NDArray[np.uint16], clock: FloatArray) -> bool:
-    """True if rings ascend, and times ascend within each."""
+    """Whether the ring numbers ascend, and the times within each ring."""
     up, same = number[1:] > number[:-1], number[1:] == number[:-1]
     return bool(np.all(up | (same & (clock[1:] >= clock[:-1]))))

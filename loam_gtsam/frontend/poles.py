@@ -1,8 +1,8 @@
 """Pole features: poles, trunks and table legs, which are thin and stand alone.
 
-LOAM judges a point by five neighbours on either side of it on the same surface, which a pole of
-ten centimetres does not offer: most points of a pole count as grazed or occluded. On open ground
-poles are nevertheless all that holds the pose.
+LOAM compares a point with five neighbours on either side on the same surface. A pole of ten
+centimetres has fewer points, and most of them count as grazed or occluded. On open ground poles are
+nevertheless all that fixes the pose.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ _LINKED_BEAMS = 2.5
 _LINKED = 0.2
 """Metres between two neighbours of a run that are always allowed."""
 _ROUND = 0.25 * np.pi
-"""Mean of ``sqrt(1 - x^2)`` over the width: the points seen on a cylinder lie on average this part
-of its radius before its axis."""
+"""Distance of a cylinder's axis from the mean of the points seen on it, as a share of the radius:
+the mean of ``sqrt(1 - x^2)`` over the width."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,11 +57,7 @@ class Poles:
 
 
 def find_poles(
-    xyz: NDArray[np.float32],
-    ring_starts: IntArray,
-    depth: float,
-    width: float,
-    most: int,
+    xyz: NDArray[np.float32], ring_starts: IntArray, depth: float, width: float, most: int
 ) -> Poles:
     """Find the runs of a ring that are narrow, and nearer than what is on either side of them.
 
@@ -74,10 +70,9 @@ def find_poles(
     width : metres across a run at most
     most : points of a run at most
     """
-    nothing = np.zeros(0, np.int64)
-    none = Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
     if depth <= 0.0:
-        return none
+        nothing = np.zeros(0, np.int64)
+        return Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
     count = int(ring_starts[-1])
     own = ring_starts[1:] > ring_starts[:-1]
     heads, tails = ring_starts[:-1][own], ring_starts[1:][own] - 1
@@ -89,10 +84,10 @@ def find_poles(
     turn = np.sqrt((turn * turn).sum(axis=0))
     spacing = float(np.median(turn))
     farther = ranges[following] - ranges
-    reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
     apart = turn > _LINKED_BEAMS * spacing
     # On a ring of a few points the last may lie beside the first, and still be a turn away.
     apart[tails[tails - heads < most]] = True
+    reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
     cut = apart | (np.hypot(farther, turn * ranges) > reach)
     # A run does not go on from the end of a ring to its start: it is cut there.
     ends = cut.copy()
@@ -100,18 +95,13 @@ def find_poles(
     last = np.flatnonzero(ends)
     first = np.concatenate(([0], last[:-1] + 1))
     gap_after = np.where(apart, np.inf, farther)
-    gap_before = np.empty(count)
+    gap_before, start_cut = np.empty(count), np.empty(count, np.bool_)
     gap_before[following] = np.where(apart, np.inf, -farther)
-    length = last - first + 1
-    chosen = (length <= most) & cut[last]
-    start_cut = np.empty(count, np.bool_)
     start_cut[following] = cut
-    chosen &= start_cut[first]
+    length = last - first + 1
     depths = np.minimum(gap_before[first], gap_after[last])
-    chosen &= depths > depth
+    chosen = (length <= most) & cut[last] & start_cut[first] & (depths > depth)
     first, last, depths, length = first[chosen], last[chosen], depths[chosen], length[chosen]
-    if len(first) == 0:
-        return none
     sums = np.concatenate([np.zeros((3, 1)), np.cumsum(xyz, axis=1, dtype=np.float64)], axis=1)
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)

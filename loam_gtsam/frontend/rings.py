@@ -7,11 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import FloatArray, IntArray
 
 MAX_RINGS = 256
-"""Above this number of rings, which no spinning sensor has, a field holds no beam numbers."""
-
+"""Largest number of rings; a field with more distinct values holds no beam numbers."""
 ELEVATIONS: dict[str, FloatArray] = {
     # Velodyne VLP-16 user manual, table of laser angles.
     "vlp16": np.linspace(-15.0, 15.0, 16),
@@ -28,17 +27,13 @@ _OUSTER_BEAMS = {"os1-16": 16, "os1-32": 32, "os1-64": 64, "os1-128": 128}
 _BEAM_HEIGHTS = (0.0, 0.03618)
 """Metres of the beams' origin above that of the points: 0, or the z of Ouster's
 ``lidar_to_sensor_transform`` if the driver reports points in the sensor's own frame."""
-
 _BIN = 0.02
-"""Degrees. Histogram bin; the nearest beams in use (OS1-128) are 0.28 degrees apart."""
-
+"""Degrees: bin of the histogram; beams in use are at least 0.28 degrees apart (OS1-128)."""
 _CORE = 0.25
-"""Fraction of the beam spacing around a beam that counts as hit. Elevations that have nothing to
-do with the beams fall there half of the time."""
-
+"""Fraction of the spacing of the beams within which a point counts as on a beam. Elevations that
+have nothing to do with the beams lie there half of the time."""
 _CORE_SHARE = 0.9
-"""Least share of points in the cores for a set of beams to be believed."""
-
+"""Least share of points on the beams for a set of beams to be believed."""
 _STRAY = 0.1
 """A peak in the histogram of elevations is a beam if it has this share of the height of the
 typical peak (the one the median point belongs to); lower ones are stray returns."""
@@ -50,12 +45,11 @@ class RingAssignment:
 
     Attributes
     ----------
-    rings : (N,) uint16 beam numbers, 0 to ``count - 1``; neighbours in number are neighbours in
-        elevation
-    count : number of beams seen
+    rings : (N,) uint16 beam numbers, 0 to ``count - 1``, in the order of the elevations
+    count : number of beams that measured anything
     method : "field", "rows", "file order" or "elevation"
-    note : one sentence for people
-    ring_major : the points came ring after ring
+    note : one sentence for the user
+    ring_major : whether the points are stored ring after ring
     """
 
     rings: NDArray[np.uint16]
@@ -74,19 +68,19 @@ def _assignment(rings: NDArray[np.integer], count: int, method: str, note: str) 
 def rings_from_labels(labels: NDArray[np.integer], xyz: NDArray[np.float32]) -> RingAssignment:
     """Number the rings of a ring field by their mean elevation, lowest first.
 
-    Scan-to-scan odometry looks for neighbours in adjacent rings, but numbers in a field need not
-    follow elevation: those of the HDL-64 do not.
+    Scan-to-scan odometry searches adjacent rings, but the numbers in a field need not follow the
+    elevation (those of the HDL-64 do not).
     """
     low, high = int(labels.min()), int(labels.max())
     if high - low < 65536:
-        # modulo 2^64, for labels of 64 bits without sign
+        # unsigned labels of 64 bits wrap around, and their differences are right
         lowest = labels.min().astype(np.int64)
         compact = (labels.astype(np.int64) - lowest).astype(np.uint16)
     else:
         compact = np.unique(labels, return_inverse=True)[1].astype(np.int64)
     counts = np.bincount(compact)
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
-        # fmin: a point at the origin, where sensor.min_range lets it in, has the slope zero
+        # fmin gives a point at the origin (sensor.min_range 0 admits it) the slope zero.
         slope = np.fmin(np.abs(xyz[2]) / np.hypot(xyz[0], xyz[1]), 1e6) * np.sign(xyz[2])
     mean = np.bincount(compact, weights=slope) / np.maximum(counts, 1)
     mean[counts == 0] = np.inf
@@ -98,12 +92,23 @@ def rings_from_labels(labels: NDArray[np.integer], xyz: NDArray[np.float32]) -> 
 
 def rings_from_rows(row_of: NDArray[np.integer]) -> RingAssignment:
     """Rings of a range image; empty rows are left out."""
-    filled = np.bincount(row_of) > 0
-    rank = np.cumsum(filled) - 1
-    count = int(filled.sum())
-    return _assignment(
-        rank[row_of], count, "rows", f"{count} rings from the rows of the range image"
-    )
+    rings, count = _without_gaps(row_of)
+    note = f"{count} rings from the rows of the range image"
+    return _assignment(rings, count, "rows", note)
+
+
+def _without_gaps(numbers: NDArray[np.integer]) -> tuple[IntArray, int]:
+    """The same numbers without those that no point has, and how many there are."""
+    filled = np.bincount(numbers) > 0
+    rank = np.cumsum(filled)
+    return rank[numbers] - 1, int(rank[-1])
+
+
+def azimuth_steps(azimuth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N - 1,) radians from each point to the next, -pi to pi."""
+    step = np.diff(azimuth)
+    step -= np.float32(2.0 * np.pi) * np.rint(step * np.float32(0.5 / np.pi))
+    return step
 
 
 def rings_from_file_order(
@@ -120,11 +125,9 @@ def rings_from_file_order(
 
     Returns
     -------
-    assignment : None if the points are not written ring after ring
-    reason : one clause for people
+    assignment, reason : None and one sentence why, if the points are not written ring after ring
     """
-    step = np.diff(azimuth)
-    step -= np.float32(2.0 * np.pi) * np.rint(step * np.float32(0.5 / np.pi))
+    step = azimuth_steps(azimuth)
     sign = 1.0 if np.count_nonzero(step > 0.0) >= np.count_nonzero(step < 0.0) else -1.0
     forward = float(np.mean(step * np.float32(sign) > 0.0))
     if forward < 0.95:
@@ -151,13 +154,12 @@ def rings_from_elevation(xyz: NDArray[np.float32], model: str) -> tuple[RingAssi
     Parameters
     ----------
     xyz : (3, N) metres, lidar frame
-    model : ``sensor.model``; "auto" takes the Velodyne table that fits, else the beams that
-        stand out in the histogram of elevations
+    model : ``sensor.model``; "auto" takes the Velodyne table that fits, else the beams that stand
+        out in the histogram of elevations
 
     Returns
     -------
-    assignment : None if nothing fits
-    reason : one clause for people
+    assignment, reason : None and one sentence why, if nothing fits
     """
     distance = np.hypot(xyz[0], xyz[1])
     elevation = np.rad2deg(np.arctan2(xyz[2], distance))
@@ -196,14 +198,12 @@ def rings_from_elevation(xyz: NDArray[np.float32], model: str) -> tuple[RingAssi
 
 
 def _by_table(elevation: NDArray[np.float32], model: str) -> tuple[RingAssignment, str]:
-    nearest = _nearest(elevation, ELEVATIONS[model])
-    filled = np.bincount(nearest, minlength=len(ELEVATIONS[model])) > 0
-    count = int(filled.sum())
+    rings, count = _without_gaps(_nearest(elevation, ELEVATIONS[model]))
     note = (
         f"{count} rings from elevation by the table of {model}, "
         f"{_core_share(elevation, ELEVATIONS[model]):.0%} of the points well on a beam"
     )
-    return _assignment((np.cumsum(filled) - 1)[nearest], count, "elevation", note), note
+    return _assignment(rings, count, "elevation", note), note
 
 
 def _nearest(elevation: NDArray[np.float32], beams: FloatArray) -> NDArray[np.integer]:

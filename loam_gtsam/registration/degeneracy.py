@@ -21,7 +21,6 @@ from loam_gtsam.types import FloatArray
 
 _CLEAR = 3.0
 """Standard deviations of a normal by which a displacement must leave its surface to be seen."""
-
 _MOVED = 0.1
 """Share of the root mean square displacement by which a point must move to count in full: points on
 a pole move by millimetres in a turn about the pole, and say nothing about this turn."""
@@ -99,14 +98,13 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     """
     rotation = map_T_lidar.rotation().matrix()
     e, p = matches.edges, matches.planes
-    own = np.ones(len(e), np.bool_) if e.distinct is None else e.distinct
-    line_tilts = np.zeros(len(e)) if e.tilts is None else e.tilts
-    plane_tilts = np.zeros(len(p)) if p.tilts is None else p.tilts
-    basis = complement_basis(e.directions[own]).reshape(-1, 3)
-    points = np.concatenate([np.repeat(e.points[own], 2, axis=0), p.points])
-    normals = np.concatenate([basis, p.normals]) @ rotation
-    tilts = np.concatenate([np.repeat(line_tilts[own], 2), plane_tilts])
-    weights = np.concatenate([np.repeat(e.weights[own] / e.sigmas[own], 2), p.weights / p.sigmas])
+    if e.distinct is not None:
+        e = subset(e, e.distinct)
+    points, normals, tilts = _planes_through(e)
+    points, normals = np.concatenate([points, p.points]), np.concatenate([normals, p.normals])
+    normals = normals @ rotation
+    tilts = np.concatenate([tilts, np.zeros(len(p)) if p.tilts is None else p.tilts])
+    weights = np.concatenate([np.repeat(e.weights / e.sigmas, 2), p.weights / p.sigmas])
 
     rows = np.hstack([cross(points.T, normals.T).T, normals])
     information = rows.T @ (rows * (weights**2)[:, None])
@@ -164,15 +162,19 @@ def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatAr
     map_T_lidar : the pose at which they were made
     directions : (W, 6), see :class:`Localizability`
     """
-    tilts = np.zeros(len(edges)) if edges.tilts is None else edges.tilts
-    rotation = map_T_lidar.rotation().matrix()
-    normals = complement_basis(edges.directions).reshape(-1, 3) @ rotation
-    points = np.repeat(edges.points, 2, axis=0)
-    sight = _sight(points, normals, np.repeat(tilts, 2), directions)
+    points, normals, tilts = _planes_through(edges)
+    sight = _sight(points, normals @ map_T_lidar.rotation().matrix(), tilts, directions)
     sight = sight[0::2] + sight[1::2]
     if edges.distinct is not None:
         sight[~edges.distinct] = 0.0
     return sight
+
+
+def _planes_through(lines: EdgeMatches) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points, normals in the map frame and tilts of two planes through each line."""
+    tilts = np.zeros(len(lines)) if lines.tilts is None else lines.tilts
+    normals = complement_basis(lines.directions).reshape(-1, 3)
+    return np.repeat(lines.points, 2, axis=0), normals, np.repeat(tilts, 2)
 
 
 def _sight(

@@ -58,19 +58,19 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     InputError
         If a frame was not solved, or ``later`` is not later than ``earlier``.
     """
-    parts = []
     for name, update in (("earlier", earlier), ("later", later)):
         if update.uncertainty is None:
             raise InputError(
                 f"{name}: expected a frame that was solved, got one with status {update.status}; "
                 "choose another one"
             )
-        parts.append(update.uncertainty)
     if later.stamp <= earlier.stamp:
         raise InputError(
             f"later: expected a stamp after {earlier.stamp}, got {later.stamp}; swap the two"
         )
-    first, second = parts
+    first, second = earlier.uncertainty, later.uncertainty
+    assert first is not None
+    assert second is not None
     to_later = later.map_T_lidar.between(earlier.map_T_lidar).AdjointMap()
     from_map = later.map_T_lidar.inverse().AdjointMap()
     covariance = second.own + to_later @ first.own @ to_later.T
@@ -83,22 +83,13 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Middle:
-    """A solved frame at the middle of its sweep.
+    """A solved frame at the middle of its sweep."""
 
-    Attributes
-    ----------
-    stamp, map_T_lidar : nanoseconds and pose of the middle
-    covariance : (6, 6) of the scan's own error
-    kept : (6,) share of the scan's own error in the pose at the reference time
-    to_reference : (6, 6) adjoint from the middle to the reference time
-    reference_stamp : nanoseconds of the reference time
-    """
-
-    stamp: int
+    stamp: int  # nanoseconds of the middle
     map_T_lidar: gtsam.Pose3
-    covariance: FloatArray
-    kept: FloatArray
-    to_reference: FloatArray
+    covariance: FloatArray  # (6, 6) of the scan's own error
+    kept: FloatArray  # (6,) share of the scan's own error in the pose at the reference time
+    to_reference: FloatArray  # (6, 6) adjoint from the middle to the reference time
     reference_stamp: int
 
 
@@ -135,13 +126,9 @@ class PoseErrors:
         """
         first = self._seen.is_empty
         scan = scan_error(
-            solution,
-            self._kernel_width,
-            self._seen,
-            self.config,
-            kernel=self._kernel,
-            with_priors=self._with_priors,
-        )
+            solution, self._kernel_width, self._seen, self.config,
+            kernel=self._kernel, with_priors=self._with_priors,
+        )  # fmt: skip
         if scan is None:
             self._last = None
             return update
@@ -172,13 +159,9 @@ class PoseErrors:
         self._last = None
 
     def _own(
-        self,
-        reference_stamp: int,
-        sweep: MovingSweep,
-        middle: gtsam.Pose3,
-        covariance: FloatArray,
-        to_reference: FloatArray,
-    ) -> tuple[FloatArray, FloatArray, _Middle]:
+        self, reference_stamp: int, sweep: MovingSweep, middle: gtsam.Pose3,
+        covariance: FloatArray, to_reference: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, _Middle]:  # fmt: skip
         """The frame's own error at the reference time, and what it shares with the last frame's.
 
         The pose at the reference time follows from the pose at the middle of the sweep by the
@@ -304,14 +287,9 @@ class SeenGround:
 
 
 def scan_error(
-    solution: Solution,
-    kernel_width: float,
-    seen: SeenGround,
-    config: CovarianceConfig,
-    *,
-    kernel: str = "huber",
-    with_priors: bool = True,
-) -> ScanError | None:
+    solution: Solution, kernel_width: float, seen: SeenGround, config: CovarianceConfig,
+    *, kernel: str = "huber", with_priors: bool = True,
+) -> ScanError | None:  # fmt: skip
     """The error of one solved frame from its residuals; None if its information is singular.
 
     The sandwich ``B S B`` of robust statistics, with B the inverse information and S the scatter of
@@ -347,14 +325,12 @@ def scan_error(
     meat: FloatArray = cells * scatter.T @ scatter + _PRIOR_CELLS * variance * information
     meat = meat / (cells + _PRIOR_CELLS)
     renewed: FloatArray = fresh.T @ fresh
-    inflation = float(np.trace(_solve(information, meat))) / 6.0
+    # Least squares, because the matches alone may leave a direction free.
+    inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
     effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
 
-    priors = user = np.zeros((6, 6))
-    total = information
-    if with_priors:
-        total = solution.information
-        priors = user = _positive(total - information)
+    total = solution.information if with_priors else information
+    priors = user = _positive(total - information)
     try:
         bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
     except np.linalg.LinAlgError:
@@ -377,11 +353,6 @@ def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:
     """(count, C) sums of the rows (N, C) that have the same number."""
     columns = [np.bincount(numbers, column, minlength=count) for column in rows.T]
     return np.stack(columns, axis=1)
-
-
-def _solve(information: FloatArray, right: FloatArray) -> FloatArray:
-    """Least squares: the matches alone may leave a direction free."""
-    return np.linalg.lstsq(information, right, rcond=None)[0].astype(np.float64, copy=False)
 
 
 def _positive(matrix: FloatArray) -> FloatArray:

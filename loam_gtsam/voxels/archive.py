@@ -38,9 +38,8 @@ class Archive:
     """
 
     def __init__(self, grid: Grid, megabytes: float, folder: str | None) -> None:
+        self._given = grid, megabytes, folder
         self._grid = grid
-        self._megabytes, self._root = megabytes, folder
-        self._budget = megabytes * 1e6
         self._bytes = 0
         self._memory: dict[CubeIndex, CubePoints] = {}  # oldest first
         self._disk: dict[CubeIndex, int] = {}  # number of points
@@ -58,7 +57,7 @@ class Archive:
 
     def __getstate__(self) -> dict[str, Any]:
         return {
-            "given": (self._grid, self._megabytes, self._root),
+            "given": self._given,
             "cubes": list(self.contents()),
             "in_memory": len(self._memory),
             "dropped": (self.dropped_cubes, self.dropped_points),
@@ -71,17 +70,17 @@ class Archive:
             self._bytes += content.nbytes
             self._spill(index, content)
         for index, content in state["cubes"][:in_memory]:
-            self._keep(index, content)
+            self.store(index, content)
         self.dropped_cubes, self.dropped_points = state["dropped"]
 
     def __len__(self) -> int:
         return len(self._memory) + len(self._disk)
 
-    def copy(self) -> Archive:
-        """An archive of the same cubes, all of them in memory."""
+    def __deepcopy__(self, _: object) -> Archive:
+        # All cubes in memory: a copy needs no folder of its own.
         copy = Archive(self._grid, np.inf, None)
         for index, content in self.contents():
-            copy._keep(index, content)
+            copy.store(index, content)
         return copy
 
     def indices(self) -> list[CubeIndex]:
@@ -92,9 +91,13 @@ class Archive:
         """Points in the archive."""
         return sum(len(held.points) for held in self._memory.values()) + sum(self._disk.values())
 
-    def store(self, index: CubeIndex, cube: Cube) -> None:
+    def store(self, index: CubeIndex, content: CubePoints) -> None:
         """Keep a cube that is not in the archive; the oldest cubes make room for it."""
-        self._keep(index, cube.content)
+        self._memory[index] = content
+        self._bytes += content.nbytes
+        while self._bytes > self._given[1] * 1e6:
+            oldest = next(iter(self._memory))
+            self._spill(oldest, self._memory.pop(oldest))
 
     def read(self, index: CubeIndex) -> CubePoints | None:
         """Points of an archived cube; None, and the cube counts as dropped, if unreadable."""
@@ -138,31 +141,18 @@ class Archive:
             if np.isin(content.owners, owners).any():
                 cube = self.take(index) or Cube()
                 taken.append(cube.take_out(owners))
-                self.store(index, cube)
+                self.store(index, cube.content)
         return taken
 
     def settle(self, points: FloatArray, owners: Owners) -> None:
-        """Add points to archived cubes where their voxels are free.
-
-        Parameters
-        ----------
-        points : (N, 3) metres, within the limit of the grid
-        owners : (N,)
-        """
+        """Add points (N, 3) within the grid's limit to archived cubes where voxels are free."""
         if len(points) == 0:
             return
         new = SortedPoints.of(points, owners, self._grid.cells(points.T), self._grid)
         for index, part in zip(new.cubes, new.firsts(), strict=True):
             cube = self.take(index) or Cube()
             cube.settle(part)
-            self.store(index, cube)
-
-    def _keep(self, index: CubeIndex, content: CubePoints) -> None:
-        self._memory[index] = content
-        self._bytes += content.nbytes
-        while self._bytes > self._budget:
-            oldest = next(iter(self._memory))
-            self._spill(oldest, self._memory.pop(oldest))
+            self.store(index, cube.content)
 
     def _spill(self, index: CubeIndex, content: CubePoints) -> None:
         """Write a cube to disk; without a folder it is lost."""

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.geometry import find_in_sorted
-from loam_gtsam.types import BoolArray, FloatArray, IntArray
+from loam_gtsam.geometry import find_in_sorted, run_starts
+from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
-from loam_gtsam.voxels.key_table import KeyTable
+from loam_gtsam.voxels.key_table import Columns, KeyTable
 
 Owners = NDArray[np.int32]
 """Numbers that points carry: points of one number can be moved together."""
@@ -112,12 +112,8 @@ class Cube:
         out = np.isin(columns[2], owners)
         if not out.any():
             return CubePoints(NO_POINTS, _NO_OWNERS)
-        gone, kept = (
-            [column.take(rows, axis=0) for column in columns]
-            for rows in (np.flatnonzero(out), np.flatnonzero(~out))
-        )
-        self._table = KeyTable(*kept)
-        return CubePoints(*gone[1:])
+        self._table = KeyTable(*(column[~out] for column in columns))
+        return CubePoints(columns[1][out], columns[2][out])
 
 
 class SortedPoints(NamedTuple):
@@ -141,14 +137,9 @@ class SortedPoints(NamedTuple):
 
     @classmethod
     def of(cls, points: FloatArray, owners: Owners, cells: FloatArray, grid: Grid) -> SortedPoints:
-        """Sort points; points of one voxel stay in the order in which they are given.
+        """Sort points, (N, 3) with N > 0; those of one voxel stay in the order given.
 
-        Parameters
-        ----------
-        points : (N, 3) metres, N > 0
-        owners : (N,)
-        cells : (3, N) indices of the cubes of the points
-        grid : of the voxels
+        ``cells`` (3, N) are the indices of the cubes of the points.
         """
         low = cells.min(axis=1, keepdims=True)
         steps = (cells - low).astype(np.int64)
@@ -157,9 +148,9 @@ class SortedPoints(NamedTuple):
         keys = grid.keys(points)
         order = np.lexsort((keys, numbers))  # stable
         keys, numbers = keys[order], numbers[order]
-        starts = _run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))
+        starts = run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))
         numbers = numbers[starts]
-        heads = _run_starts(numbers[1:] != numbers[:-1])
+        heads = run_starts(numbers[1:] != numbers[:-1])
         ends = zip(heads.tolist(), np.append(heads[1:], len(numbers)).tolist(), strict=True)
         return cls(
             points.take(order, axis=0),  # several times faster than an index on rows
@@ -173,27 +164,12 @@ class SortedPoints(NamedTuple):
     def firsts(self) -> Iterator[VoxelPoints]:
         """The first point of each voxel, cube by cube."""
         firsts = self.points.take(self.starts, axis=0)
-        for part in self.parts:
-            yield self.keys[part], firsts[part], self.owners[part]
+        return ((self.keys[part], firsts[part], self.owners[part]) for part in self.parts)
 
     def sums(self) -> Iterator[VoxelSums]:
         """Sums over the points of each voxel, cube by cube."""
-        sums, lows, highs = (
-            how.reduceat(self.points, self.starts, axis=0)
-            for how in (np.add, np.minimum, np.maximum)
-        )
+        hows = np.add, np.minimum, np.maximum
+        sums = (how.reduceat(self.points, self.starts, axis=0) for how in hows)
         counts = np.diff(np.append(self.starts, len(self.points))).astype(np.float64)
-        for part in self.parts:
-            yield VoxelSums(
-                self.keys[part],
-                self.owners[part],
-                sums[part],
-                lows[part],
-                highs[part],
-                counts[part],
-            )
-
-
-def _run_starts(changes: BoolArray) -> IntArray:
-    """Where the runs of a non-empty sequence begin, from ``sequence[1:] != sequence[:-1]``."""
-    return np.flatnonzero(np.concatenate(([True], changes)))
+        columns: Columns = self.keys, self.owners, *sums, counts
+        return (VoxelSums(*(column[part] for column in columns)) for part in self.parts)

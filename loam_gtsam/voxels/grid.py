@@ -120,11 +120,7 @@ def cubes_in_view(
 
     LOAM (laserMapping) writes this with the law of cosines; A-LOAM has no such test.
 
-    Parameters
-    ----------
-    cubes : at least one
-    map_T_lidar : (4, 4) sensor pose
-    cube_size : metres
+    At least one cube must be given.
     """
     corners = cube_size * (np.array(cubes).T[:, :, None] + _CORNERS)
     rays = corners - map_T_lidar[:3, 3, None, None]

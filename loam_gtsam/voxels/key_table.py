@@ -19,8 +19,7 @@ _WAITING = 0.1
 class KeyTable:
     """Rows in ascending order of their keys, at most one row a key.
 
-    A merge takes time in proportion to all rows of the table. So new rows wait beside the others
-    until they are 10 % of them.
+    A merge takes time in proportion to all rows, so new rows wait until they are 10 % of them.
 
     Parameters
     ----------
@@ -55,12 +54,7 @@ class KeyTable:
         return held
 
     def add(self, keys: IntArray, *columns: NDArray[Any]) -> IntArray:
-        """Add the rows whose keys the table does not hold yet.
-
-        Parameters
-        ----------
-        keys : (N,) ascending and distinct
-        columns : (N, ...) each, as many as the table has
+        """Add rows, of ascending distinct keys, whose keys the table does not hold yet.
 
         Returns
         -------
@@ -75,18 +69,14 @@ class KeyTable:
 
     def append(self, *rows: NDArray[Any]) -> None:
         """Add rows none of whose keys the table holds; like :meth:`add`, without the search."""
-        if len(rows[0]) == 0:
-            return
         self._waiting = _joined(self._waiting, rows)
         if self.n_waiting > _WAITING * len(self._merged[0]):
             self.merge()
 
     def merge(self) -> None:
         """Put the new rows in their places among the others."""
-        if not self.n_waiting:
-            return
-        self._merged = self.columns
-        self._waiting = tuple(column[:0] for column in self._merged)
+        if self.n_waiting:
+            self.__init__(*self.columns)  # type: ignore[misc]
 
 
 def _joined(held: Columns, new: Columns) -> Columns:

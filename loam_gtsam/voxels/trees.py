@@ -22,12 +22,7 @@ _TREE = {"leafsize": 32, "balanced_tree": False, "compact_nodes": False}
 
 
 class Tree:
-    """A kd-tree of points, which answers with the points themselves.
-
-    Parameters
-    ----------
-    parts : (N, 3) each, metres
-    """
+    """A kd-tree of points, given in parts (N, 3), which answers with the points themselves."""
 
     def __init__(self, parts: Sequence[FloatArray]) -> None:
         # The last row stands for a neighbour that is missing.
@@ -55,11 +50,6 @@ class CubeTrees:
     """kd-trees over the points of a set of cubes, while the points in these cubes do not change.
 
     Points added later are searched in a small tree of their own, until there are too many.
-
-    Parameters
-    ----------
-    cubes : the cubes that are searched
-    parts : (N, 3) each, their points, metres
     """
 
     def __init__(self, cubes: set[CubeIndex], parts: Sequence[FloatArray]) -> None:
@@ -113,13 +103,7 @@ class TreeCache:
         self._kept: list[CubeTrees] = []  # the one used last comes last
 
     def over(self, chosen: set[CubeIndex], cubes: Mapping[CubeIndex, Cube]) -> CubeTrees:
-        """Trees over the points of the chosen cubes: kept ones if they fit.
-
-        Parameters
-        ----------
-        chosen : which of ``cubes`` to search
-        cubes : all cubes of the map
-        """
+        """Trees over the points of the chosen ones of all cubes: kept trees if they fit."""
         for trees in reversed(self._kept):
             if trees.cubes <= chosen:  # with others it would find points of cubes not asked for
                 self._kept.remove(trees)

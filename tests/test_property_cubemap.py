@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.cubes import SMALL
 from support.strategies import FEW, generators
 
 from loam_gtsam.config import MapConfig
@@ -22,14 +23,6 @@ Cell = tuple[int, int, int]
 Point = tuple[float, float, float]
 
 CUBE, VOXEL = 4.0, 0.5
-
-
-def settings(insertion: str, megabytes: float, folder: Path) -> MapConfig:
-    return MapConfig(
-        cube_size=CUBE, window=(5, 5, 3), window_margin=1, neighbourhood=(3, 3, 3),
-        insertion=insertion, archive_megabytes=megabytes, archive_dir=str(folder),
-        field_of_view=True,
-    )  # fmt: skip
 
 
 class Reference:
@@ -72,33 +65,22 @@ class Reference:
             held[voxel] = (np.mean(everything, axis=0), by)
 
     def move(self, moves: dict[int, Any]) -> int:
-        taken: dict[int, list[tuple[Cell, Cell, Any]]] = {owner: [] for owner in moves}
-        for cube, held in self.cubes.items():
+        taken: dict[int, list[Any]] = {owner: [] for owner in moves}
+        for held in self.cubes.values():
             for voxel in [v for v, (_, owner) in held.items() if owner in moves]:
                 point, owner = held.pop(voxel)
-                taken[owner].append((cube, voxel, point))
-        count = 0
+                taken[owner].append(transform(moves[owner], point[None])[0])
         for owner in sorted(moves):
-            # In the order of the window's cubes first, then of the archive, as they were stored:
-            # of two that come into one voxel either may stay, so only the voxels are compared.
-            for _, _, point in taken[owner]:
-                moved = transform(moves[owner], point[None])[0]
-                self.cubes.setdefault(cube_of(moved), {}).setdefault(
-                    voxel_of(moved), (moved, owner)
-                )
-                count += 1
-        return count
+            for point in taken[owner]:
+                held = self.cubes.setdefault(cube_of(point), {})
+                held.setdefault(voxel_of(point), (point, owner))
+        return sum(map(len, taken.values()))
 
     def neighbourhood(self, pose: Any) -> list[Cell]:
         centre = cube_of(pose[:3, 3])
-        around = [
-            cube
-            for cube, held in self.cubes.items()
-            if held
-            and self.inside(cube)
-            and max(abs(a - b) for a, b in zip(cube, centre, strict=True)) <= 1
-        ]
-        return sorted(cube for cube in around if self.visible(cube, pose))
+        around = (cube for cube, held in self.cubes.items() if held and self.inside(cube))
+        near = (c for c in around if np.abs(np.subtract(c, centre)).max() <= 1)
+        return sorted(cube for cube in near if self.visible(cube, pose))
 
     def visible(self, cube: Cell, pose: Any) -> bool:
         """Whether a corner is 30 to 150 degrees off the up axis, by the law of cosines (LOAM)."""
@@ -154,7 +136,10 @@ WEIGHTS = np.array([25, 15, 15, 25, 8, 2, 10])
 def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
     insertion: str, megabytes: float, steps: int, tmp_path: Path
 ) -> None:
-    config = settings(insertion, megabytes, tmp_path)
+    config = SMALL.changed(
+        insertion=insertion, archive_megabytes=megabytes, archive_dir=str(tmp_path),
+        field_of_view=True,
+    )  # fmt: skip
     rng = np.random.default_rng(steps + int(megabytes))
     cubes, reference = CubeMap(config, VOXEL), Reference(config)
     position, around = np.zeros(3), ()
@@ -213,10 +198,7 @@ def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
 @given(rng=generators(), insertion=st.sampled_from(["settled", "centroid"]))
 def test_moved_points_are_those_of_a_dictionary(rng: np.random.Generator, insertion: str) -> None:
     """Whole voxels and turns by a quarter, so that no point comes to lie in that of another."""
-    config = MapConfig(
-        cube_size=CUBE, window=(5, 5, 3), window_margin=1, neighbourhood=(3, 3, 3),
-        insertion=insertion, field_of_view=False,
-    )  # fmt: skip
+    config = SMALL.changed(insertion=insertion)
     cubes, reference = CubeMap(config, VOXEL), Reference(config)
     for _ in range(10):
         position = rng.normal(0.0, 6.0, 3)
@@ -248,7 +230,11 @@ def test_a_window_that_comes_back_finds_everything_where_it_was(
     rng: np.random.Generator, insertion: str, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     folder = tmp_path_factory.mktemp("archive")
-    cubes = CubeMap(settings(insertion, float(rng.choice([0.0, 1e-3, 1.0])), folder), VOXEL)
+    megabytes = float(rng.choice([0.0, 1e-3, 1.0]))
+    config = SMALL.changed(
+        insertion=insertion, archive_megabytes=megabytes, archive_dir=str(folder)
+    )
+    cubes = CubeMap(config, VOXEL)
     cubes.insert(rng.normal(0.0, 3.0, (200, 3)))
     before = cubes.points()
     for _ in range(4):
@@ -261,29 +247,3 @@ def test_a_window_that_comes_back_finds_everything_where_it_was(
     assert inside.any()
     _, squared = cubes.nearest(before[inside], 1, 0.1, product(range(-9, 10), repeat=3))
     np.testing.assert_array_equal(squared, 0.0)
-
-
-@given(rng=generators())
-def test_inserting_the_same_again_changes_nothing_that_is_settled(rng: np.random.Generator) -> None:
-    cubes = CubeMap(MapConfig(field_of_view=False), 0.4)
-    points = rng.normal(0.0, 20.0, (300, 3))
-    cubes.insert(points)
-    before = cubes.points()
-    for part in (points, points[::-1], points[::3]):
-        cubes.insert(part)
-    np.testing.assert_array_equal(cubes.points(), before)
-
-
-@given(rng=generators())
-def test_cubes_that_meet_are_searched_as_one(rng: np.random.Generator) -> None:
-    config = MapConfig(field_of_view=False)
-    points = np.array([25.0, 25.0, 25.0]) + rng.normal(0.0, 2.0, (80, 3))
-    shifted = points - 25.0  # all of them in one cube
-    apart, together = CubeMap(config, 0.01), CubeMap(config, 0.01)
-    apart.insert(points)
-    together.insert(shifted)
-    queries = points[:20] + rng.normal(0.0, 0.5, (20, 3))
-    one = apart.nearest(queries, 5, 3.0, apart.neighbourhood(np.eye(4)))
-    other = together.nearest(queries - 25.0, 5, 3.0, together.neighbourhood(np.eye(4)))
-    np.testing.assert_allclose(one[1], other[1], rtol=1e-9, atol=1e-12)
-    np.testing.assert_allclose(one[0], other[0] + 25.0, rtol=0, atol=1e-12)

@@ -5,9 +5,11 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from support.cubes import SMALL, moved_by
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
@@ -15,25 +17,21 @@ from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ConfigError
 
-SMALL = MapConfig(
-    cube_size=4.0, window=(5, 5, 3), window_margin=1, neighbourhood=(3, 3, 3), field_of_view=False
-)
 
-
-def moved_by(x):
-    move = np.eye(4)
-    move[0, 3] = x
-    return move
+@pytest.fixture
+def small(tmp_path: Path) -> MapConfig:
+    """All that leaves the window goes to disk."""
+    return SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0)
 
 
 @pytest.mark.parametrize("megabytes", [10.0, 0.0])
 @pytest.mark.parametrize("insertion", ["centroid", "settled"])
-def test_round_trip_is_bit_identical(tmp_path: Path, megabytes: float, insertion: str) -> None:
+def test_round_trip_is_bit_identical(
+    tmp_path: Path, small: MapConfig, megabytes: float, insertion: str
+) -> None:
     """A map that was archived in between goes on exactly as one that was not."""
     rng = np.random.default_rng(1)
-    config = SMALL.changed(
-        archive_dir=str(tmp_path), archive_megabytes=megabytes, insertion=insertion
-    )
+    config = small.changed(archive_megabytes=megabytes, insertion=insertion)
     travelled, stayed = CubeMap(config, 0.5), CubeMap(config, 0.5)
     first, second = rng.normal(0.0, 3.0, (2, 800, 3))
     for cube_map in (travelled, stayed):
@@ -52,10 +50,9 @@ def test_round_trip_is_bit_identical(tmp_path: Path, megabytes: float, insertion
         cube_map.insert(second)
     np.testing.assert_array_equal(travelled.points(), stayed.points())
     cubes = stayed.neighbourhood(np.eye(4))
-    for got, want in zip(
-        travelled.nearest(first, 5, 2.0, cubes), stayed.nearest(first, 5, 2.0, cubes), strict=True
-    ):
-        np.testing.assert_array_equal(got, want)
+    got, want = (cube_map.nearest(first, 5, 2.0, cubes) for cube_map in (travelled, stayed))
+    np.testing.assert_array_equal(got[0], want[0])
+    np.testing.assert_array_equal(got[1], want[1])
     left = len(list(tmp_path.glob("cubes_*/*")))
     assert left == (travelled.stats.archived + stayed.stats.archived if megabytes == 0.0 else 0)
 
@@ -112,9 +109,9 @@ def test_restoring_goes_before_dropping() -> None:
     ],
 )
 def test_unreadable_archive_is_counted(
-    tmp_path: Path, damage: Callable[[Path], None], caplog: pytest.LogCaptureFixture
+    tmp_path: Path, small: MapConfig, damage: Callable[[Path], None], caplog: Any
 ) -> None:
-    cube_map = CubeMap(SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+    cube_map = CubeMap(small, 0.5)
     cube_map.insert(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 4.0, 0.0]]))
     cube_map.recenter(np.array([100.0, 0.0, 0.0]))
     damage(next(tmp_path.glob("cubes_*/cube_0_0_0.npy")))
@@ -126,9 +123,9 @@ def test_unreadable_archive_is_counted(
 
 
 def test_archive_that_cannot_be_written_is_counted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, small: MapConfig, caplog: pytest.LogCaptureFixture
 ) -> None:
-    cube_map = CubeMap(SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+    cube_map = CubeMap(small, 0.5)
     cube_map.insert(np.zeros((1, 3)))
     next(tmp_path.glob("cubes_*")).rmdir()
     cube_map.recenter(np.array([100.0, 0.0, 0.0]))
@@ -143,10 +140,9 @@ def test_bad_archive_dir(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("megabytes", [100.0, 0.0])
-def test_moved_points_join_those_of_a_cube_in_the_archive(tmp_path, megabytes):
+def test_moved_points_join_those_of_a_cube_in_the_archive(small, megabytes):
     """Of the moved ones too a voxel keeps one, and those that were there stay."""
-    config = SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=megabytes)
-    cubes = CubeMap(config, 0.5)
+    cubes = CubeMap(small.changed(archive_megabytes=megabytes), 0.5)
     there = np.array([[100.1, 0.1, 0.1], [100.6, 0.1, 0.1], [101.1, 0.1, 0.1]])
     cubes.recenter(there[0])
     cubes.insert(there)
@@ -172,8 +168,8 @@ def test_moved_points_join_those_of_a_cube_in_the_archive(tmp_path, megabytes):
     np.testing.assert_allclose(cubes.points(), there, atol=1e-12)
 
 
-def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path):
-    cubes = CubeMap(SMALL.changed(archive_dir=str(tmp_path), archive_megabytes=0.0), 0.5)
+def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path, small):
+    cubes = CubeMap(small, 0.5)
     for owner, x in enumerate((0.0, 100.0, 200.0, 300.0)):
         cubes.recenter(np.array([x, 0.0, 0.0]))
         cubes.owner = owner
@@ -192,13 +188,11 @@ def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path):
 @pytest.mark.parametrize("insertion", ["centroid", "settled"])
 @pytest.mark.parametrize("megabytes", [100.0, 1e-3, 0.0])
 def test_a_restored_map_goes_on_with_the_archive_it_had(
-    tmp_path: Path, megabytes: float, insertion: str
+    small: MapConfig, megabytes: float, insertion: str
 ) -> None:
     """In memory, part of it on disk, or all of it."""
     rng = np.random.default_rng(2)
-    config = SMALL.changed(
-        archive_dir=str(tmp_path), archive_megabytes=megabytes, insertion=insertion
-    )
+    config = small.changed(archive_megabytes=megabytes, insertion=insertion)
     going, resumed = CubeMap(config, 0.5), CubeMap(config, 0.5)
     for stop in range(4):
         going.recenter(np.array([20.0 * stop, 0.0, 0.0]))

@@ -24,14 +24,11 @@ def brute_force(
 ) -> tuple[FloatArray, FloatArray]:
     squared = ((queries[:, None, :] - points) ** 2).sum(axis=2)
     squared[squared >= max_distance**2] = np.inf
-    missing = max(0, k - len(points))
-    squared = np.pad(squared, ((0, 0), (0, missing)), constant_values=np.inf)
-    points = np.pad(points, ((0, missing), (0, 0)), constant_values=np.nan)
+    squared = np.pad(squared, ((0, 0), (0, k)), constant_values=np.inf)
+    points = np.pad(points, ((0, k), (0, 0)), constant_values=np.nan)
     order = np.argsort(squared, axis=1, kind="stable")[:, :k]
     squared = np.take_along_axis(squared, order, axis=1)
-    found = points[order]
-    found[np.isinf(squared)] = np.nan
-    return found, squared
+    return np.where(np.isinf(squared)[:, :, None], np.nan, points[order]), squared
 
 
 class Cubes(dict):
@@ -124,10 +121,9 @@ def test_restored_trees_are_due_when_those_before_would_have_been() -> None:
     thaw(freeze({"trees": cubes.trees}, {}), {"trees": restored}, {})
     again = restored.over({MIDDLE, RIGHT}, cubes)
     assert again is not trees
-    for one, other in zip(
-        trees.nearest(queries, 5, 1.0), again.nearest(queries, 5, 1.0), strict=True
-    ):
-        np.testing.assert_array_equal(one, other)
+    one, other = (either.nearest(queries, 5, 1.0) for either in (trees, again))
+    np.testing.assert_array_equal(one[0], other[0])
+    np.testing.assert_array_equal(one[1], other[1])
     assert not trees.is_stale
     more = {MIDDLE: rng.uniform(-2.0, 2.0, (51, 3))}
     for either in (trees, again):

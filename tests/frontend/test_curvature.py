@@ -25,6 +25,13 @@ def one_ring(azimuth: np.ndarray, distance: np.ndarray) -> np.ndarray:
     return xyz.astype(np.float32)
 
 
+def unreliable(xyz: np.ndarray, starts: list[int] | None = None, **changes: float) -> np.ndarray:
+    """Indices of the points that LOAM would leave out, by the tests that ``changes`` leaves on."""
+    bounds = np.array(starts or [0, xyz.shape[1]])
+    gaps = squared_gaps(xyz, bounds)
+    return np.flatnonzero(unreliable_points(xyz, gaps, bounds, LOAM.changed(**changes)))
+
+
 @pytest.mark.parametrize("half_window", [1, 5])
 def test_curvature_is_the_squared_sum_of_differences(half_window: int) -> None:
     xyz = np.random.default_rng(0).uniform(-50, 50, (3, 60)).astype(np.float32)
@@ -43,49 +50,30 @@ def test_windows_stay_in_their_ring() -> None:
 def test_occlusion_rejects_the_six_points_behind_on_either_side() -> None:
     azimuth = np.deg2rad(np.arange(-50.1, 50.2, 0.2))
     xyz = one_ring(azimuth, np.where(np.abs(azimuth - 0.2) < 0.023, 5.0, 10.0 / np.cos(azimuth)))
-    starts = np.array([0, xyz.shape[1]])
-    gaps = squared_gaps(xyz, starts)
-    rejected = unreliable_points(xyz, gaps, starts, LOAM.changed(grazing_ratio=1e9))
     pole = np.flatnonzero(np.hypot(xyz[0], xyz[1]) < 6.0)
     expected = np.concatenate((pole[0] - 1 - np.arange(6), pole[-1] + 1 + np.arange(6)))
-    assert np.array_equal(np.flatnonzero(rejected), np.sort(expected))
+    assert np.array_equal(unreliable(xyz, grazing_ratio=1e9), np.sort(expected))
 
 
 @pytest.mark.parametrize(
-    ("change", "count"),
-    [({}, 6), ({"occlusion_gap": 2.3}, 0), ({"occlusion_gap": 2.2}, 6)],
+    ("turn", "gap", "count"),
+    [(0.0, 0.1, 6), (0.0, 2.2, 6), (0.0, 2.3, 0), (0.09, 0.1, 6), (0.11, 0.1, 0)],
 )
-def test_occlusion_gap(change: dict[str, float], count: int) -> None:
-    # 20 points at 5 m, then 20 at 6.5 m on almost the same ray: squared gap 2.25.
-    azimuth = 0.001 * np.arange(40)
-    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
-    xyz = one_ring(azimuth, distance)
-    starts = np.array([0, 40])
-    settings = LOAM.changed(grazing_ratio=1e9, **change)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    assert np.array_equal(np.flatnonzero(rejected), 20 + np.arange(count))
-
-
-@pytest.mark.parametrize(("turn", "one_ray"), [(0.09, True), (0.11, False)])
-def test_occlusion_needs_the_two_on_one_ray(turn: float, one_ray: bool) -> None:
-    azimuth = 0.001 * np.arange(40) + np.where(np.arange(40) < 20, 0.0, turn)
-    distance = np.where(np.arange(40) < 20, 5.0, 6.5)
-    xyz = one_ring(azimuth, distance)
-    starts = np.array([0, 40])
-    settings = LOAM.changed(grazing_ratio=1e9)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    assert rejected.any() == one_ray
+def test_occlusion_needs_a_gap_and_two_points_on_one_ray(
+    turn: float, gap: float, count: int
+) -> None:
+    """20 points at 5 m, then 20 at 6.5 m on almost the same ray: squared gap 2.25."""
+    behind = np.arange(40) >= 20
+    xyz = one_ring(0.001 * np.arange(40) + turn * behind, np.where(behind, 6.5, 5.0))
+    rejected = unreliable(xyz, grazing_ratio=1e9, occlusion_gap=gap)
+    assert np.array_equal(rejected, 20 + np.arange(count))
 
 
 def test_occlusion_does_not_reach_into_the_next_ring() -> None:
     # The ring ends three points behind the occlusion; the next ring starts elsewhere.
     distance = np.concatenate((np.full(20, 5.0), np.full(3, 6.5), np.full(20, 30.0)))
-    azimuth = 0.001 * np.arange(43)
-    xyz = one_ring(azimuth, distance)
-    starts = np.array([0, 23, 43])
-    settings = LOAM.changed(grazing_ratio=1e9)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
-    assert np.array_equal(np.flatnonzero(rejected), [20, 21, 22])
+    xyz = one_ring(0.001 * np.arange(43), distance)
+    assert np.array_equal(unreliable(xyz, [0, 23, 43], grazing_ratio=1e9), [20, 21, 22])
 
 
 def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
@@ -93,9 +81,7 @@ def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
     azimuth = np.deg2rad(np.arange(4.0, 90.0, 0.2))
     xyz = np.stack((1 / np.tan(azimuth), np.ones(len(azimuth)), np.zeros(len(azimuth))))
     xyz = xyz.astype(np.float32)
-    starts = np.array([0, len(azimuth)])
-    settings = LOAM.changed(occlusion_gap=1e9)
-    rejected = unreliable_points(xyz, squared_gaps(xyz, starts), starts, settings)
+    rejected = np.isin(np.arange(len(azimuth)), unreliable(xyz, occlusion_gap=1e9))
     distance = np.hypot(xyz[0], xyz[1])
     bound = np.sqrt(LOAM.grazing_ratio) / np.deg2rad(0.2)
     assert rejected[1:-1][distance[1:-1] > 1.05 * bound].all()
@@ -104,9 +90,7 @@ def test_grazing_rejects_where_both_gaps_are_large_for_the_range() -> None:
     step = np.zeros((3, 30), np.float32)
     step[0] = np.where(np.arange(30) < 15, 5.0, 9.0)
     step[1] = 0.01 * np.arange(30)
-    assert not unreliable_points(
-        step, squared_gaps(step, np.array([0, 30])), np.array([0, 30]), settings
-    ).any()
+    assert len(unreliable(step, occlusion_gap=1e9)) == 0
 
 
 def along_wall(distance: float, azimuths: np.ndarray, noise: np.ndarray | float = 0.0):

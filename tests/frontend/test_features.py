@@ -10,12 +10,7 @@ import numpy as np
 import pytest
 
 from loam_gtsam.config import Config, DeskewConfig, FeatureConfig, SensorConfig
-from loam_gtsam.frontend.curvature import (
-    curvature,
-    squared_gaps,
-    unreliable_points,
-    window_fits,
-)
+from loam_gtsam.frontend.curvature import curvature, squared_gaps, unreliable_points, window_fits
 from loam_gtsam.frontend.features import (
     extract_features,
     pick_by_sector,
@@ -166,33 +161,32 @@ def sequential_picks(
     return sharp, sharp + edges, flat
 
 
-def rows_of(features: np.ndarray, scan: Scan, index: np.ndarray) -> set[int]:
-    """Where, in organised order, features stand; exact, for edges and flat points are raw."""
-    where = {tuple(point): i for i, point in enumerate(scan.points[index])}
-    return {where[tuple(point)] for point in features}
+class Picked:
+    """Where, in organised order, the edge, sharp and flat points of a scan are."""
+
+    def __init__(self, scan: Scan, config: Config) -> None:
+        self.sweep = organise(scan, config)
+        self.features = extract_features(scan, config)
+        where = {tuple(point): i for i, point in enumerate(scan.points[self.sweep.index])}
+        rows = lambda points: sorted(where[tuple(point)] for point in points)  # noqa: E731
+        self.edges = rows(self.features.edges)
+        self.sharp = rows(self.features.edges[self.features.sharp])
+        self.flat = rows(self.features.planes[self.features.flat])
 
 
 def test_picks_of_one_sector_are_those_of_the_sequential_algorithm() -> None:
     settings = FeatureConfig(sectors=1, edges_per_sector=12, post_depth=0.0)
     config = Config(features=settings)
     for seed in range(5):
-        scan = noisy_scan(seed)
-        sweep = organise(scan, config)
-        features = extract_features(scan, config)
-        sharp, edges, flat = sequential_picks(sweep.xyz, sweep.ring_starts, settings)
-        assert rows_of(features.edges[features.sharp], scan, sweep.index) == set(sharp)
-        assert rows_of(features.edges, scan, sweep.index) == set(edges)
-        assert rows_of(features.planes[features.flat], scan, sweep.index) == set(flat)
+        found = Picked(noisy_scan(seed), config)
+        expected = sequential_picks(found.sweep.xyz, found.sweep.ring_starts, settings)
+        assert (found.sharp, found.edges, found.flat) == tuple(map(sorted, expected))
 
 
 def test_picks_of_six_sectors_differ_only_near_borders() -> None:
-    config = Config(features=LOAM)
-    scan = noisy_scan(3)
-    sweep = organise(scan, config)
-    features = extract_features(scan, config)
-    _, edges, _ = sequential_picks(sweep.xyz, sweep.ring_starts, LOAM)
-    found = rows_of(features.edges, scan, sweep.index)
-    assert len(found ^ set(edges)) < 0.1 * len(edges)
+    found = Picked(noisy_scan(3), Config(features=LOAM))
+    _, edges, _ = sequential_picks(found.sweep.xyz, found.sweep.ring_starts, LOAM)
+    assert len(set(found.edges) ^ set(edges)) < 0.1 * len(edges)
 
 
 def counts_by_sector(rows: list[int], sweep_starts: np.ndarray) -> np.ndarray:
@@ -204,18 +198,12 @@ def counts_by_sector(rows: list[int], sweep_starts: np.ndarray) -> np.ndarray:
 def test_counts_and_spacing(points_per_ring: int) -> None:
     # Suppression never stops early, and nothing but spacing and counts rejects.
     settings = FeatureConfig(max_gap=1e9, occlusion_gap=1e9, grazing_ratio=1e9)
-    config = Config(features=settings)
-    scan = noisy_scan(1, points_per_ring)
-    sweep = organise(scan, config)
-    features = extract_features(scan, config)
-    edges = sorted(rows_of(features.edges, scan, sweep.index))
-    sharp = sorted(rows_of(features.edges[features.sharp], scan, sweep.index))
-    flat = sorted(rows_of(features.planes[features.flat], scan, sweep.index))
-    assert counts_by_sector(edges, sweep.ring_starts).max() <= 20
-    assert counts_by_sector(sharp, sweep.ring_starts).max() <= 2
-    assert counts_by_sector(flat, sweep.ring_starts).max() <= 4
+    found = Picked(noisy_scan(1, points_per_ring), Config(features=settings))
+    edges, flat = found.edges, found.flat
+    for rows, most in ((edges, 20), (found.sharp, 2), (flat, 4)):
+        assert counts_by_sector(rows, found.sweep.ring_starts).max() <= most
     assert np.diff(sorted(edges + flat)).min() > 5
-    bend = curvature(sweep.xyz, 5)
+    bend = curvature(found.sweep.xyz, 5)
     assert bend[edges].min() > 0.1
     assert max(bend[flat], default=0.0) < 0.1
 
@@ -223,16 +211,10 @@ def test_counts_and_spacing(points_per_ring: int) -> None:
 def test_every_sector_with_edges_has_a_sharp_one() -> None:
     # Sectors of a few points: many wait for a neighbour's pick before they get their first.
     settings = FeatureConfig(sectors=150, sharp_per_sector=1, edges_per_sector=3)
-    scan, config = noisy_scan(), Config(features=settings)
-    sweep = organise(scan, config)
-    features = extract_features(scan, config)
-    edges, sharp = (
-        np.array(sorted(rows_of(points, scan, sweep.index)))
-        for points in (features.edges, features.edges[features.sharp])
-    )
-    bounds = sector_bounds(sweep.ring_starts, 5, 150)
+    found = Picked(noisy_scan(), Config(features=settings))
+    bounds = sector_bounds(found.sweep.ring_starts, 5, 150)
     sector_of = lambda rows: np.searchsorted(bounds[:, 0], rows, side="right")  # noqa: E731
-    assert np.array_equal(sector_of(sharp), np.unique(sector_of(edges)))
+    assert np.array_equal(sector_of(found.sharp), np.unique(sector_of(found.edges)))
 
 
 def test_suppression_stops_at_a_gap() -> None:
@@ -261,11 +243,8 @@ def test_limit_of_zero_picks_nothing() -> None:
 
 
 def test_rest_is_the_voxel_filtered_remainder_of_each_ring() -> None:
-    scan, config = noisy_scan(2), ROUGH_TOO
-    sweep = organise(scan, config)
-    features = extract_features(scan, config)
-    used = rows_of(features.edges, scan, sweep.index)
-    used |= rows_of(features.planes[features.flat], scan, sweep.index)
+    found = Picked(noisy_scan(2), ROUGH_TOO)
+    sweep, features, used = found.sweep, found.features, {*found.edges, *found.flat}
     ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
     first = sweep.span[0]  # the reference time
     groups: dict[tuple[int, ...], list[int]] = {}
@@ -273,16 +252,10 @@ def test_rest_is_the_voxel_filtered_remainder_of_each_ring() -> None:
         if row not in used:
             cell = np.floor(sweep.xyz[:, row] * np.float32(1 / 0.2)).astype(int)
             groups.setdefault((int(ring[row]), *cell.tolist()), []).append(int(row))
-    expected = np.array(
-        [
-            [
-                *sweep.xyz[:, rows].mean(axis=1, dtype=float),
-                sweep.times[rows].mean() - first,
-                key[0],
-            ]
-            for key, rows in sorted(groups.items())
-        ]
-    )
+    expected = np.array([
+        [*sweep.xyz[:, rows].mean(axis=1, dtype=float), sweep.times[rows].mean() - first, key[0]]
+        for key, rows in sorted(groups.items())
+    ])  # fmt: skip
     assert len(features.flat) > 20
     rest = slice(len(features.flat), None)
     assert features.planes[rest] == pytest.approx(expected[:, :3], abs=1e-5)
@@ -307,12 +280,8 @@ def test_voxels_two_hundred_thousand_apart_are_not_taken_for_one() -> None:
 @pytest.mark.parametrize("bound", [0.1, 1e-3])
 def test_flat_points_are_below_the_bound(bound: float) -> None:
     settings = FeatureConfig(plane_curvature=bound, flat_per_sector=100)
-    scan, config = noisy_scan(), Config(features=settings)
-    sweep = organise(scan, config)
-    features = extract_features(scan, config)
-    bend = curvature(sweep.xyz, 5)
-    flat = rows_of(features.planes[features.flat], scan, sweep.index)
-    assert 0.1 * bound < bend[list(flat)].max() < bound
+    found = Picked(noisy_scan(), Config(features=settings))
+    assert 0.1 * bound < curvature(found.sweep.xyz, 5)[found.flat].max() < bound
 
 
 def test_voxel_of_zero_keeps_every_point() -> None:
@@ -365,12 +334,6 @@ def test_rings_too_short_for_a_window_are_refused_and_one_long_one_is_enough() -
         extract_features(scan, Config())
     longer = noisy_scan(0, points_per_ring=11)
     assert len(extract_features(longer, ROUGH_TOO).planes) > 0
-
-
-def test_one_ring_is_refused() -> None:
-    scan = noisy_scan(0, rings=1)
-    with pytest.raises(SweepError, match=r"1 ring\(s\) from field.*expected 2 to 256"):
-        extract_features(scan, Config())
 
 
 # --- noise and surfaces -----------------------------------------------------------------------

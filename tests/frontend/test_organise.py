@@ -34,14 +34,8 @@ def firing(
     distance = 10.0 + 3.0 * np.sin(3 * azimuth)
     azimuth, elevation = np.meshgrid(azimuth, np.deg2rad(elevations), indexing="ij")
     horizontal = distance[:, None] * np.cos(elevation)
-    points = np.stack(
-        (
-            horizontal * np.cos(azimuth),
-            horizontal * np.sin(azimuth),
-            distance[:, None] * np.sin(elevation),
-        ),
-        axis=-1,
-    ).reshape(-1, 3)
+    x, y = horizontal * np.cos(azimuth), horizontal * np.sin(azimuth)
+    points = np.stack((x, y, distance[:, None] * np.sin(elevation)), axis=-1).reshape(-1, 3)
     rings = np.tile(np.arange(len(elevations)), columns)
     return points.astype(np.float32), rings, np.repeat(fraction, len(elevations))
 
@@ -205,10 +199,19 @@ def test_model_with_fewer_beams_than_the_data_is_refused() -> None:
         rings_of(Scan(points, 0), sensor(model="os1-32"))
 
 
-def test_velodyne_model_whose_span_does_not_hold_the_data_is_refused() -> None:
-    points, _, _ = firing(ELEVATIONS["hdl32"])
-    with pytest.raises(SweepError, match=r"points lie between .* of vlp16 \(-15 to 15 degrees\)"):
-        rings_of(Scan(points, 0), sensor(model="vlp16"))
+def test_sources_without_rings_are_refused_with_the_reason() -> None:
+    points, rings, _ = firing(VLP16)
+    for given, config, says in (
+        (points, sensor(rings="field"), "ring field: the scan has none"),
+        (points[rings == 3], sensor(rings="rows"), r"runs around 1 time\(s\)"),
+        (
+            firing(ELEVATIONS["hdl32"])[0],
+            sensor(model="vlp16"),
+            r"points lie between .* of vlp16 \(-15 to 15 degrees\)",
+        ),
+    ):
+        with pytest.raises(SweepError, match=says):
+            rings_of(Scan(given, 0), config)
 
 
 def test_elevations_without_beams_are_refused_with_what_was_tried() -> None:
@@ -222,24 +225,12 @@ def test_elevations_without_beams_are_refused_with_what_was_tried() -> None:
         assert part in str(caught.value)
 
 
-def test_missing_ring_field_is_refused_when_asked_for() -> None:
-    points, _, _ = firing(VLP16)
-    with pytest.raises(SweepError, match="ring field: the scan has none"):
-        organise(Scan(points, 0), sensor(rings="field"))
-
-
 @pytest.mark.parametrize("count", [1, 300])
 def test_too_few_and_too_many_rings_are_refused(count: int) -> None:
     points, _, _ = firing(VLP16)
     labels = np.arange(len(points)) % count
     with pytest.raises(SweepError, match=f"{count} ring.*expected 2 to 256"):
         organise(Scan(points, 0, rings=labels), Config())
-
-
-def test_one_turn_in_file_order_is_one_ring_and_refused() -> None:
-    points, rings, _ = firing(VLP16)
-    with pytest.raises(SweepError, match=r"runs around 1 time\(s\)"):
-        rings_of(Scan(points[rings == 3], 0), sensor(rings="rows"))
 
 
 # --- times ------------------------------------------------------------------------------------

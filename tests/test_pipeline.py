@@ -170,49 +170,32 @@ def test_an_empty_data_set_is_an_empty_result():
 # -- bad sweeps in the middle of a run ---------------------------------------------------------
 
 
-def broken_sweep(kind, scan):
-    points = scan.points
-    if kind == "empty":
-        return replace(scan, points=points[:0], times=scan.times[:0], rings=scan.rings[:0])
-    if kind == "all NaN":
-        return replace(scan, points=np.full_like(points, np.nan))
-    if kind == "one ring":
-        one = scan.rings == 3
-        return replace(scan, points=points[one], times=scan.times[one], rings=scan.rings[one])
-    if kind == "10 points":
-        return replace(scan, points=points[:10], times=scan.times[:10], rings=scan.rings[:10])
-    if kind == "too near":
-        return replace(scan, points=points * np.float32(1e-4))
-    if kind == "unreadable":
-        return BadSweep(scan.stamp, "000003.bin: 7 bytes left over")
-    if kind == "duplicate stamp":
-        return replace(scan, stamp=scan.stamp - 100_000_000)
-    if kind == "stamp in the past":
-        return replace(scan, stamp=0)
-    raise AssertionError(kind)
+def part(scan, keep):
+    return replace(scan, points=scan.points[keep], times=scan.times[keep], rings=scan.rings[keep])
 
 
-@pytest.mark.parametrize(
-    ("kind", "status", "says"),
-    [
-        ("empty", "unusable_scan", "0 points"),
-        ("all NaN", "unusable_scan", "0 finite"),
-        ("one ring", "unusable_scan", "ring"),
-        ("10 points", "unusable_scan", "10"),
-        ("too near", "unusable_scan", "range"),
-        ("unreadable", "unusable_scan", "000003.bin"),
-        ("duplicate stamp", "bad_stamp", "not later"),
-        ("stamp in the past", "bad_stamp", "not later"),
-    ],
-)
-def test_a_bad_sweep_has_a_status_and_the_run_goes_on(kind, status, says):
+BROKEN = {
+    "0 points": lambda scan: part(scan, slice(0)),
+    "0 finite": lambda scan: replace(scan, points=np.full_like(scan.points, np.nan)),
+    "1 ring": lambda scan: part(scan, scan.rings == 3),
+    "sweep of 10 points": lambda scan: part(scan, slice(10)),
+    "range": lambda scan: replace(scan, points=scan.points * np.float32(1e-4)),
+    "000003.bin": lambda scan: BadSweep(scan.stamp, "000003.bin: 7 bytes left over"),
+    "is not later": lambda scan: replace(scan, stamp=scan.stamp - 100_000_000),
+    "0 ns is not later": lambda scan: replace(scan, stamp=0),
+}
+"""What may be wrong with a sweep, by what the message says."""
+
+
+@pytest.mark.parametrize("says", BROKEN)
+def test_a_bad_sweep_has_a_status_and_the_run_goes_on(says):
     world = SimulatedWorld("street_loop", frames=26, columns=900)
     scans = [world[i] for i in range(20, 26)]
-    scans[3] = broken_sweep(kind, scans[3])
+    scans[3] = BROKEN[says](scans[3])
     result = run(ListDataset(scans))
     bad = result.updates[3]
-    assert bad.status == status
-    assert says.lower() in bad.message.lower()
+    assert says in bad.message
+    assert bad.status == ("bad_stamp" if "later" in says else "unusable_scan")
     assert np.isnan(bad.covariance).all()
     truth = world.truth.map_T_lidar[20:26]
     truth = np.linalg.inv(truth[0]) @ truth
@@ -220,7 +203,7 @@ def test_a_bad_sweep_has_a_status_and_the_run_goes_on(kind, status, says):
         assert result.updates[i].status.solved
         error = np.linalg.norm(result.updates[i].map_T_lidar.translation() - truth[i][:3, 3])
         assert error < 0.12
-    if status == "unusable_scan":  # predicted where it was
+    if bad.status == "unusable_scan":  # predicted where it was
         predicted = bad.map_T_lidar.translation()
         assert np.linalg.norm(predicted - truth[3][:3, 3]) < 0.15
         assert len(result.trajectory) == 6
@@ -229,10 +212,10 @@ def test_a_bad_sweep_has_a_status_and_the_run_goes_on(kind, status, says):
     assert (np.diff(result.trajectory.stamps) > 0).all()
 
 
-@pytest.mark.parametrize("kind", ["empty", "all NaN", "10 points", "unreadable"])
-def test_a_run_may_begin_with_bad_sweeps(kind):
+@pytest.mark.parametrize("says", ["0 points", "0 finite", "sweep of 10 points", "000003.bin"])
+def test_a_run_may_begin_with_bad_sweeps(says):
     scans = list(SimulatedWorld("room", frames=4, columns=900))
-    scans[0] = broken_sweep(kind, scans[0])
+    scans[0] = BROKEN[says](scans[0])
     statuses = [update.status for update in run(ListDataset(scans)).updates]
     assert statuses[:2] == [FrameStatus.UNUSABLE_SCAN, FrameStatus.FIRST]
     assert statuses[2].solved
@@ -420,22 +403,10 @@ def test_a_solver_without_a_graph_cannot_have_a_prior(shaken, sweeps, method, pr
     assert run(without, config).updates[1].status.solved
 
 
-def test_with_an_imu_too_same_input_same_bits(shaken, sweeps):
-    a, b = (run(data_of(shaken, sweeps[:12])) for _ in range(2))
-    assert np.array_equal(a.trajectory.map_T_lidar, b.trajectory.map_T_lidar)
-    assert np.array_equal(a.plane_points, b.plane_points)
-    assert np.array_equal(a.imu.gyro_bias, b.imu.gyro_bias)
-    for one, other in zip(a.updates, b.updates, strict=True):
-        assert np.array_equal(one.information, other.information)
-
-
 def test_recorded_features_are_levelled_too(shaken, sweeps):
     """Features of another front end: no de-skew, the prior all the same."""
-    items = []
-    for i in range(3):
-        features = replace(extract_features(sweeps[i], Config()), span=(0.0, 0.0))
-        items.append(FeatureSweep(features, gtsam.Pose3()))
-    data = ListDataset(items)
+    features = [replace(extract_features(scan, Config()), span=(0.0, 0.0)) for scan in sweeps[:3]]
+    data = ListDataset([FeatureSweep(one, gtsam.Pose3()) for one in features])
     data.imu = tilted(shaken.imu, gtsam.Rot3.RzRyRx(0.2, -0.1, 0.0))
     result = run(data)
     found = roll_pitch(result.updates[0].map_T_lidar.rotation())
@@ -447,9 +418,9 @@ def test_recorded_features_are_levelled_too(shaken, sweeps):
 # -- own factors -----------------------------------------------------------------------------------
 
 
-def tight(translation):
+def tight(translation, key=POSE_KEY):
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 1e-5)
-    return gtsam.GPSFactor(POSE_KEY, np.asarray(translation), noise)
+    return gtsam.GPSFactor(key, np.asarray(translation), noise)
 
 
 def test_own_factors_are_asked_for_once_a_frame_and_act(shaken, sweeps):
@@ -488,9 +459,7 @@ def test_a_run_without_own_factors_may_say_so_with_an_empty_list(shaken, sweeps)
         (lambda context: tight(np.zeros(3)), "expected a list of factors.* got GPSFactor"),
         (lambda context: ["barometer"], r"got str on the keys \[\]"),
         (
-            lambda context: [
-                gtsam.GPSFactor(7, np.zeros(3), gtsam.noiseModel.Isotropic.Sigma(3, 1.0))
-            ],
+            lambda context: [tight(np.zeros(3), key=7)],
             rf"context.key, .*{POSE_KEY}.*; got GPSFactor on the keys \[7\]",
         ),
     ],

@@ -21,6 +21,12 @@ def sweeps():
     return list(world)
 
 
+def kill_all():
+    for child in multiprocessing.active_children():
+        child.kill()
+        child.join()
+
+
 def numbered(sweeps):
     return [(sweep, float(number)) for number, sweep in enumerate(sweeps)]
 
@@ -66,9 +72,8 @@ def test_an_error_of_the_data_comes_after_the_sweeps_before_it(sweeps):
 
 def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog):
     def kill(number, update):
-        for child in multiprocessing.active_children() if number == 1 else []:
-            child.kill()
-            child.join()
+        if number == 1:
+            kill_all()
 
     with caplog.at_level(logging.WARNING, "loam_gtsam.frontend.workers"):
         killed = run(ListDataset(sweeps), workers=1, on_frame=kill)
@@ -92,9 +97,7 @@ def test_the_sweeps_of_a_process_that_died_are_left_to_others(sweeps):
     found = []
     for _, number, extraction in extract_ahead(numbered(sweeps), Config(), 1):
         found.append((number, extraction is None))
-        for child in multiprocessing.active_children():
-            child.kill()
-            child.join()
+        kill_all()
     assert [number for number, _ in found] == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert not found[0][1]
     assert all(missing for _, missing in found[3:])

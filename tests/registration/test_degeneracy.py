@@ -53,13 +53,33 @@ def angle(direction, axis):
     return np.degrees(np.arccos(abs(unit[axis]) / np.linalg.norm(unit)))
 
 
+def whole_room():
+    """Points on all six sides."""
+    return room(((0, 15.0), (1, 6.0), (2, 2.0)))
+
+
+def ground(count=400):
+    points, normals = room(((2, 2.0),), count, extent=(15.0, 15.0, 2.0))
+    points[:, 2] = -2.0
+    return points, normals
+
+
+def lines(points, distinct=None):
+    """Matches seen from POSE with upright lines through the points."""
+    rotation = POSE.rotation().matrix()
+    there = points @ rotation.T + POSE.translation()
+    ones = np.ones(len(points))
+    up = np.tile(rotation[:, 2], (len(points), 1))
+    rest = 0 * ones, 0.05 * ones, ones, np.arange(len(points)), 0.02 * ones
+    return EdgeMatches(points, there, up, *rest, None if distinct is None else distinct * ones > 0)
+
+
 def found(planes, edges=NO_EDGES):
     return localizability(ScanMatches(edges, planes), POSE)
 
 
 def test_a_room_has_no_weak_direction():
-    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
-    seen = found(surfaces(points, normals, noise=0.05))
+    seen = found(surfaces(*whole_room(), noise=0.05))
     assert len(seen.weak(LEAST)) == 0
     assert seen.projector(LEAST) is None
     assert np.all(np.diff(seen.aligned) >= 0)
@@ -86,9 +106,7 @@ def test_enough_of_an_end_wall_lifts_it():
 
 
 def test_on_one_plane_three_directions_are_weak():
-    points, normals = room(((2, 2.0),), extent=(15.0, 15.0, 2.0))
-    points[:, 2] = -2.0
-    weak = found(surfaces(points, normals)).weak(LEAST)
+    weak = found(surfaces(*ground())).weak(LEAST)
     assert len(weak) == 3
     # x, y and yaw: none of them lifts or tilts.
     assert np.abs(weak[:, [0, 1, 5]]).max() < 0.02 * np.abs(weak).max()
@@ -110,26 +128,17 @@ def poles(count, distinct):
     feet = rng.uniform(-12, 12, (6, 3))
     points = np.repeat(feet, count // 6, axis=0)
     points[:, 2] = rng.uniform(-1, 3, len(points))
-    rotation = POSE.rotation().matrix()
-    up = np.tile(rotation[:, 2], (len(points), 1))
-    there = points @ rotation.T + POSE.translation()
-    ones = np.ones(len(points))
-    rest = 0 * ones, 0.05 * ones, ones, np.arange(len(points)), 0.02 * ones, distinct * ones > 0
-    return EdgeMatches(points, there, up, *rest)
+    return lines(points, distinct)
 
 
 @pytest.mark.parametrize(("distinct", "weak"), [(True, 0), (False, 3)])
 def test_poles_lift_an_open_field_if_they_are_distinct(distinct, weak):
-    points, normals = room(((2, 2.0),), extent=(15.0, 15.0, 2.0))
-    points[:, 2] = -2.0
-    seen = found(surfaces(points, normals), poles(120, distinct))
-    assert len(seen.weak(LEAST)) == weak
+    assert len(found(surfaces(*ground()), poles(120, distinct)).weak(LEAST)) == weak
 
 
 def ground_and_poles(distinct=True):
     """Planes that hold the guess along x and y by noise, and poles where they truly stand."""
-    points, normals = room(((2, 2.0),), count=1500, extent=(15.0, 15.0, 2.0))
-    points[:, 2] = -2.0
+    points, normals = ground(1500)
     planes = surfaces(points, normals, noise=0.05)
     held = GUESS.matrix()[:3, :3] @ points.T + GUESS.translation()[:, None]
     offsets = -np.einsum("ij,ij->i", planes.normals, held.T)
@@ -151,10 +160,10 @@ def test_poles_say_where_they_see_and_planes_do_not(policy, distinct, off):
 
 
 def test_planes_are_believed_where_lines_see_too_little():
-    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
-    seen = found(surfaces(points, normals), poles(6, True))
-    args = ScanMatches(poles(6, True), surfaces(points, normals)), POSE, seen
-    assert unseen_by_planes(*args, LEAST) is None  # they see everything
+    planes = surfaces(*whole_room())
+    seen = found(planes, poles(6, True))
+    # They see everything.
+    assert unseen_by_planes(ScanMatches(poles(6, True), planes), POSE, seen, LEAST) is None
     thin = surfaces(*room(((1, 6.0), (2, 2.0), (0, 15.0)), count=7))
     few = ScanMatches(poles(6, True), thin)
     both = localizability(few, POSE)
@@ -216,8 +225,7 @@ def test_a_users_factor_decides_along_the_weak_direction():
 
 
 def test_in_a_room_the_motion_prior_does_nothing():
-    points, normals = room(((0, 15.0), (1, 6.0), (2, 2.0)))
-    matches = ScanMatches(NO_EDGES, surfaces(points, normals))
+    matches = ScanMatches(NO_EDGES, surfaces(*whole_room()))
     solver = GtsamSolver(SolverConfig())
     alone = solver.solve(lambda _: matches, GUESS)
     beside = solver.solve(lambda _: matches, GUESS, (), MotionPrior(GUESS, 1e9 * np.eye(6)))
@@ -230,7 +238,7 @@ def test_per_axis_a_corridor_leaves_x_open_and_nothing_else():
     axes = found(surfaces(points, normals, noise=0.05)).axes()
     assert axes[3] < LEAST
     assert np.delete(axes, 3).min() > 5 * LEAST
-    whole = found(surfaces(*room(((0, 15.0), (1, 6.0), (2, 2.0))), noise=0.05)).axes()
+    whole = found(surfaces(*whole_room(), noise=0.05)).axes()
     assert whole.min() > 5 * LEAST
 
 
@@ -278,16 +286,10 @@ def test_seen_from_another_place_on_the_vehicle_the_same_points_move_by_as_much(
 
 @pytest.mark.parametrize(("off", "weak"), [(0.02, 1), (4.0, 0)])
 def test_round_one_pole_a_turn_is_weak_and_round_two_it_is_not(off, weak):
-    points, normals = room(((2, 2.0),), extent=(15.0, 15.0, 2.0))
-    points[:, 2] = -2.0
     rng = np.random.default_rng(5)
     at = np.tile([6.0, 1.0, 0.0], (60, 1)) + off * rng.normal(size=(60, 3)) * (1, 1, 0)
     at[:, 2] = rng.uniform(-1, 3, 60)
-    rotation = POSE.rotation().matrix()
-    up, ones = np.tile(rotation[:, 2], (60, 1)), np.ones(60)
-    there = at @ rotation.T + POSE.translation()
-    edges = EdgeMatches(at, there, up, 0 * ones, 0.05 * ones, ones, np.arange(60), 0.02 * ones)
-    seen = found(surfaces(points, normals), edges).weak(LEAST)
+    seen = found(surfaces(*ground()), lines(at)).weak(LEAST)
     assert len(seen) == weak
     if weak:
         turn = seen[0] / seen[0][2]

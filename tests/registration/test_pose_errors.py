@@ -29,27 +29,20 @@ def some_pose(rng):
     return gtsam.Pose3.Expmap(np.concatenate([rng.normal(0, 0.5, 3), rng.normal(0, 20.0, 3)]))
 
 
-def room(map_T_lidar, stamp, rng, noise=0.02, low=-6.0, high=6.0):
-    """Features of a room from ``low`` to ``high`` along x, seen from a pose."""
-    points = rng.uniform(-1, 1, (4000, 3)) * (1.0, 4.0, 2.0)
-    points[:, 0] = rng.uniform(low, high, 4000)
-    axis = rng.integers(0, 3, 4000)
-    side = rng.random(4000) < 0.5
-    walls = np.stack([np.where(side, high, low), np.where(side, 4.0, -4.0),
-                      np.where(side, 2.0, -2.0)], axis=1)  # fmt: skip
-    rows = np.arange(4000)
-    points[rows, axis] = walls[rows, axis]
-    points[rows, axis] += rng.normal(0.0, noise, 4000)
-    local = map_T_lidar.transformTo(points.T).T
-    return Features.from_points(stamp, np.zeros((0, 3)), local)
+def room(number, rng, noise=0.02, ends=6.0):
+    """Features of frame ``number`` of a sensor at rest in a room from -ends to ends along x."""
+    sides = np.array([ends, 4.0, 2.0])
+    points = rng.uniform(-1, 1, (4000, 3)) * sides
+    rows, axis = np.arange(4000), rng.integers(0, 3, 4000)
+    points[rows, axis] = sides[axis] * rng.choice([-1.0, 1.0], 4000) + rng.normal(0.0, noise, 4000)
+    return Features.from_points(number * FRAME, np.zeros((0, 3)), points)
 
 
 @pytest.fixture(scope="module")
 def moving():
     """A run through the built-in street that is under way."""
     world = SimulatedWorld("street_loop", frames=66, columns=900)
-    mapped = run(part(world, 40, 66), no_imu())
-    return mapped.updates
+    return run(part(world, 40, 66), no_imu()).updates
 
 
 def part(world, first, last):
@@ -105,13 +98,14 @@ def test_frames_must_be_solved_and_in_order():
     zero = np.zeros((6, 6))
     one, two = (made_up(stamp, some_pose(rng), some_covariance(rng), zero) for stamp in (1, 2))
     predicted = MapUpdate(3, gtsam.Pose3(), FrameStatus.UNUSABLE_SCAN)
-    with pytest.raises(InputError, match=r"later: expected .* solved.*unusable_scan"):
-        relative_covariance(one, predicted)
-    with pytest.raises(InputError, match="earlier: expected a frame that was solved"):
-        relative_covariance(predicted, two)
-    for pair in ((two, one), (one, one)):
-        with pytest.raises(InputError, match="later: expected a stamp after"):
-            relative_covariance(*pair)
+    for first, second, says in (
+        (one, predicted, r"later: expected .* solved.*unusable_scan"),
+        (predicted, two, "earlier: expected a frame that was solved"),
+        (two, one, "later: expected a stamp after"),
+        (one, one, "later: expected a stamp after"),
+    ):
+        with pytest.raises(InputError, match=says):
+            relative_covariance(first, second)
     assert relative_covariance(one, two).shape == (6, 6)
 
 
@@ -150,13 +144,13 @@ def test_drift_is_a_matter_of_the_way(moving):
 def test_who_stands_still_does_not_drift():
     rng = np.random.default_rng(1)
     mapper = Mapper()
-    updates = [mapper.register(room(gtsam.Pose3(), i * FRAME, rng)) for i in range(40)]
+    updates = [mapper.register(room(i, rng)) for i in range(40)]
     drifts = [np.trace(u.uncertainty.drift[3:, 3:]) for u in updates[1:]]
     late = drifts[-1] - drifts[19]
     assert 0.0 <= late < 0.1 * drifts[0]
     assert drifts[0] > 0.0  # the first sweep's noise stays in the map
     # Walls that were not there before
-    changed = mapper.register(room(gtsam.Pose3(), 40 * FRAME, rng, low=-6.3, high=6.3))
+    changed = mapper.register(room(40, rng, ends=6.6))
     assert np.trace(changed.uncertainty.drift[3:, 3:]) - drifts[-1] > 5.0 * late / 20
 
 
@@ -185,12 +179,12 @@ def test_a_prior_of_ones_own_holds_the_pose_in_spite_of_drift():
     rng = np.random.default_rng(1)
     mapper = Mapper()
     for i in range(5):
-        mapper.register(room(gtsam.Pose3(), i * FRAME, rng))
+        mapper.register(room(i, rng))
     sigmas = np.array([1.0, 1.0, 1.0, 1.0, 1.0, 1e-6])
     noise = gtsam.noiseModel.Diagonal.Sigmas(sigmas)
     height = gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)
-    free = mapper.register(room(gtsam.Pose3(), 5 * FRAME, rng))
-    held = mapper.register(room(gtsam.Pose3(), 6 * FRAME, rng), priors=[height])
+    free = mapper.register(room(5, rng))
+    held = mapper.register(room(6, rng), priors=[height])
     assert held.covariance[5, 5] < 1e-11  # as the axes of lidar and map allow
     assert free.covariance[5, 5] > 1e-8
 
@@ -199,8 +193,7 @@ def test_a_prior_of_ones_own_holds_the_pose_in_spite_of_drift():
 def test_classical_solvers_have_covariances_of_the_same_size(name):
     world = SimulatedWorld("room", frames=8, columns=900)
     ours = run(world, no_imu()).updates[-1]
-    config = preset(name)
-    theirs = run(world, config.changed("imu.enabled=false")).updates[-1]
+    theirs = run(world, preset(name).changed("imu.enabled=false")).updates[-1]
     ratio = np.sqrt(np.diag(theirs.uncertainty.own) / np.diag(ours.uncertainty.own))
     assert ratio.min() > 0.2
     assert ratio.max() < 5.0
@@ -211,8 +204,7 @@ def test_classical_solvers_have_covariances_of_the_same_size(name):
 
 @pytest.mark.parametrize(("reference", "share"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])
 def test_the_reference_has_its_share_in_two_sweeps(reference, share):
-    config = no_imu()
-    config = config.changed({"deskew.reference": reference})
+    config = no_imu().changed({"deskew.reference": reference})
     world = SimulatedWorld("room", frames=12, columns=900)
     both = run(part(world, 6, 12), config).updates[-1].uncertainty
     ratio = np.trace(both.shared[3:, 3:]) / np.trace(both.own[3:, 3:])

@@ -18,9 +18,7 @@ SIGMA = 0.05
 POSE = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.4, 3.0, -2.0, 0.5]))
 
 
-def no_edges():
-    nothing = np.zeros((0, 3))
-    return EdgeMatches(nothing, nothing, nothing, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
+NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
 
 
 def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
@@ -30,7 +28,7 @@ def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
     offsets = errors - np.einsum("ij,ij->i", normals, there)
     planes = PlaneMatches(points, normals, offsets, errors, np.full(count, SIGMA), np.ones(count),
                           np.arange(count))  # fmt: skip
-    matches = ScanMatches(no_edges(), planes)
+    matches = ScanMatches(NO_EDGES, planes)
     residuals, jacobian = match_rows(matches).residuals(pose)
     keep = np.eye(6) if weak is None else np.eye(6) - weak
     information = keep.T @ jacobian.T @ jacobian @ keep
@@ -48,6 +46,13 @@ def surroundings(rng, count=1500, axes=3):
     normals = np.eye(3)[rng.integers(0, axes, count) + 3 - axes]
     there = rng.uniform(-15.0, 15.0, (count, 3)) + POSE.translation()
     return POSE.transformTo(there.T).T, normals, there
+
+
+def noisy_walls(**changes):
+    """The optimum of matches that are off by 2 cm, independently."""
+    rng = np.random.default_rng(0)
+    points, normals, there = surroundings(rng)
+    return solved(points, normals, rng.normal(0.0, 0.02, len(there)), **changes)[0]
 
 
 def error_of(solution, **changes):
@@ -119,12 +124,8 @@ def test_matches_without_any_error_leave_a_covariance():
 
 
 def test_a_prior_of_its_own_is_believed():
-    rng = np.random.default_rng(0)
-    points, normals, there = surroundings(rng)
-    errors = rng.normal(0.0, 0.02, len(there))
     prior = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, 1e12])
-    found = error_of(solved(points, normals, errors, prior=prior)[0])
-    free = error_of(solved(points, normals, errors)[0])
+    found, free = error_of(noisy_walls(prior=prior)), error_of(noisy_walls())
     assert found.covariance[5, 5] == pytest.approx(1e-12, rel=1e-3)
     assert free.covariance[5, 5] > 1e-8
     assert found.user[5, 5] == pytest.approx(1.0, abs=1e-4)
@@ -133,9 +134,7 @@ def test_a_prior_of_its_own_is_believed():
 
 def test_information_of_another_scale_is_no_prior():
     """The classical solvers count rows as measured to 1 m."""
-    rng = np.random.default_rng(0)
-    points, normals, there = surroundings(rng)
-    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    solution = noisy_walls()
     scaled = dataclasses.replace(solution, information=solution.information * SIGMA**2)
     results = [
         scan_error(one, np.inf, SeenGround(0.8), CONFIG, with_priors=False)
@@ -183,9 +182,7 @@ def test_singular_information_gives_no_covariance():
 
 
 def test_only_new_ground_is_renewed():
-    rng = np.random.default_rng(0)
-    points, normals, there = surroundings(rng)
-    solution, _ = solved(points, normals, rng.normal(0.0, 0.02, len(there)))
+    solution = noisy_walls()
     seen = SeenGround(CONFIG.ground_cell)
     first = scan_error(solution, np.inf, seen, CONFIG)
     again = scan_error(solution, np.inf, seen, CONFIG)

@@ -129,10 +129,8 @@ def rng() -> np.random.Generator:
     return np.random.default_rng(5)
 
 
-def truth(drive: list[Scan]) -> np.ndarray:
-    world = SimulatedWorld("street_loop", frames=52, columns=450)
-    poses = world.truth.map_T_lidar[28:52]
-    assert [scan.stamp for scan in drive] == world.truth.stamps[28:52].tolist()
+def truth() -> np.ndarray:
+    poses = SimulatedWorld("street_loop", frames=52, columns=450).truth.map_T_lidar[28:52]
     return np.linalg.inv(poses[0]) @ poses
 
 
@@ -143,7 +141,7 @@ def test_a_run_goes_on_where_it_is_when_the_clock_is_set_ahead(drive):
     for number in range(15 + IN_A_ROW, len(drive)):
         update = result.updates[number]
         assert update.status is FrameStatus.OK
-        away = update.map_T_lidar.translation() - truth(drive)[number, :3, 3]
+        away = update.map_T_lidar.translation() - truth()[number, :3, 3]
         assert np.linalg.norm(away) < 0.15
         assert np.sqrt(np.diag(update.covariance)).max() < 0.1
     first = result.updates[15 + IN_A_ROW]
@@ -196,12 +194,12 @@ def test_recorded_odometry_of_a_late_sweep_is_not_counted_twice(rng):
     asked: list[gtsam.Pose3] = []
     pipeline = Pipeline()
     register = pipeline.mapper.register
-    pipeline.mapper.register = lambda features, guess=None: (
+
+    def watched(features: Features, guess: gtsam.Pose3 | None = None) -> MapUpdate:
         asked.append(guess)
-        or register(  # type: ignore[method-assign]
-            features, guess
-        )
-    )
+        return register(features, guess)
+
+    pipeline.mapper.register = watched  # type: ignore[method-assign]
     for number in (0, 1, 3, 2, 4):
         pipeline.process(sweep(number))
     np.testing.assert_allclose(asked[-1].translation(), [3.2, 0.0, 0.0], atol=0.05)

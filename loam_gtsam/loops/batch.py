@@ -37,7 +37,7 @@ class SavedGraph:
     Attributes
     ----------
     factors : between factors are loop closures unless their poses follow one another
-    poses : Pose3 by key, ``gtsam.symbol("x", number)``; a user's own variables may be among them
+    poses : Pose3 by key; a user's own variables may be among them
     stamps : nanoseconds by key, as far as known
     """
 
@@ -52,7 +52,7 @@ class SavedGraph:
 
     @property
     def loops(self) -> tuple[int, ...]:
-        """Positions in ``factors`` of the loop closures: between poses that are not neighbours."""
+        """Positions of the loop closures in ``factors``."""
         rank = {key: place for place, key in enumerate(self.keys)}
         found = []
         for place in range(self.factors.size()):
@@ -89,8 +89,7 @@ class OptimizedGraph:
     ----------
     poses : Pose3 by key, and a user's own variables if there are any
     loops : reports in the order of the factors
-    error_before, error_after : cost of the factors that were used, at the start and at the end
-    factors : those that were used
+    error_before, error_after : cost of ``factors``, those that were used, at the start and the end
     """
 
     poses: gtsam.Values

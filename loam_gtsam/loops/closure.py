@@ -1,9 +1,8 @@
 """Loop closers: they find earlier keyframes at the same place, and the motion in between.
 
-A loop closer is any object with the method :meth:`LoopCloser.detect`. The loop closer of this
-package looks for keyframes that are near enough, given the drift, and that look alike. It registers
-the new keyframe with the factor graph of the mapper, against the features of the keyframes around
-the old one.
+The loop closer of this package looks for keyframes that are near enough, given the drift, and that
+look alike. It registers the new keyframe with the factor graph of the mapper, against the features
+of the keyframes around the old one.
 """
 
 from __future__ import annotations
@@ -80,13 +79,12 @@ class Rejection(StrEnum):
 
 @dataclass(slots=True)
 class LoopStatistics:
-    """Counts of what a loop closer did with keyframes and candidates.
+    """Counts of what a loop closer did since its beginning or last reset.
 
     Attributes
     ----------
-    keyframes : for which loop closures were looked for
+    keyframes, verified : for which loop closures were looked for, and found
     candidates : earlier keyframes that were registered, or rejected by their descriptor
-    verified : loop closures that were returned
     rejected : keyframes and candidates, by the reason
     """
 
@@ -102,10 +100,6 @@ class ScanLoopCloser:
     Parameters
     ----------
     config : ``loops``; ``map``, ``matching``, ``solver`` and ``covariance`` for the registration
-
-    Attributes
-    ----------
-    statistics : counts since the beginning or the last :meth:`reset`
     """
 
     def __init__(self, config: Config | None = None) -> None:
@@ -171,7 +165,7 @@ class ScanLoopCloser:
         def fit(found: Solution) -> Fit:
             most = matching.max_edges or np.inf, matching.max_planes or np.inf
             offered = min(len(features[0]), most[0]) + min(len(features[1]), most[1])
-            return standing_fit(found.matches, int(offered)) if found.solved else Fit(0.0, 0.0)
+            return _standing_fit(found.matches, int(offered)) if found.solved else Fit(0.0, 0.0)
 
         known = history.pose(candidate).between(history.pose(keyframe.index))
         solution = self._solver.solve(matches_at, known)
@@ -192,8 +186,7 @@ class ScanLoopCloser:
         if not solution.solved:
             return Rejection.FEW_MATCHES
         final = fit(solution)
-        rejection = self._judged(final)
-        if rejection is not None:
+        if (rejection := self._judged(final)) is not None:
             return rejection
         covariance = self._covariance(solution, history.keyframes[candidate], keyframe)
         if covariance is None:
@@ -304,16 +297,11 @@ class ScanLoopCloser:
         return covariance
 
 
-def standing_fit(matches: ScanMatches, offered: int) -> Fit:
-    """Fit of the edges and of the planes that are not level.
+def _standing_fit(matches: ScanMatches, offered: int) -> Fit:
+    """Fit of the edges and of the planes that are not level, of so many features in a level frame.
 
     Level ground fits everywhere at any heading: where there is much of it, nearly all matches of a
     wrong registration agree.
-
-    Parameters
-    ----------
-    matches : matches in a frame whose z axis points up, roughly
-    offered : number of features that could have been matched
     """
     standing = np.abs(matches.planes.normals[:, 2]) < _LEVEL
     level = int(np.count_nonzero(~standing))

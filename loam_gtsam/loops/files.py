@@ -46,7 +46,7 @@ def write_graph(path: str | Path, saved: SavedGraph) -> None:
         If a file cannot be written, or the graph holds a factor that GTSAM cannot serialise.
     """
     path = Path(path)
-    _by_suffix(path, _write_g2o, _write_gtsam)(path, saved)
+    (_write_g2o if _is_g2o(path) else _write_gtsam)(path, saved)
 
 
 def read_graph(path: str | Path) -> SavedGraph:
@@ -60,19 +60,16 @@ def read_graph(path: str | Path) -> SavedGraph:
         If the file cannot be read, naming the line that does not fit.
     """
     path = Path(path)
-    saved: SavedGraph = _by_suffix(path, _read_g2o, _read_gtsam)(path)
-    return saved
+    return _read_g2o(path) if _is_g2o(path) else _read_gtsam(path)
 
 
-def _by_suffix(path: Path, g2o: Callable[..., Any], own: Callable[..., Any]) -> Callable[..., Any]:
-    if path.suffix == G2O_SUFFIX:
-        return g2o
-    if path.suffix == GTSAM_SUFFIXES[0]:
-        return own
-    raise InputError(
-        f"{path}: expected a name that ends in {G2O_SUFFIX}, or in {GTSAM_SUFFIXES[0]} for GTSAM's "
-        f"own format; got {path.suffix or 'none'}"
-    )
+def _is_g2o(path: Path) -> bool:
+    if path.suffix not in (G2O_SUFFIX, GTSAM_SUFFIXES[0]):
+        raise InputError(
+            f"{path}: expected a name that ends in {G2O_SUFFIX}, or in {GTSAM_SUFFIXES[0]} for "
+            f"GTSAM's own format; got {path.suffix or 'none'}"
+        )
+    return path.suffix == G2O_SUFFIX
 
 
 # -- g2o -------------------------------------------------------------------------------------------

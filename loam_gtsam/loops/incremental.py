@@ -72,13 +72,11 @@ class IncrementalGraph:
     def add(
         self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values, settle: bool = True
     ) -> None:
-        """Add factors that are no loop closures.
+        """Add factors that are no loop closures, and start values of new variables.
 
         Parameters
         ----------
-        values : start values of the variables that are new
-        settle : update until the estimate stays; not needed for a new pose at the end of a chain,
-            which moves no other one
+        settle : update until the estimate stays; not needed for a new pose at the end of a chain
 
         Raises
         ------

@@ -28,7 +28,7 @@ class Keyframe:
 
     Attributes
     ----------
-    index : number of the keyframe; ``gtsam.symbol("x", index)`` is the key of its pose
+    index : number of the keyframe
     update : result of the mapper for the frame; its ``map_T_lidar`` is :attr:`odom_T_lidar`
     travelled : metres travelled from keyframe to keyframe until here
     edges, planes : (E, 3) and (P, 3) metres, de-skewed to the stamp, lidar frame, voxel-filtered
@@ -91,12 +91,12 @@ class LoopClosure:
 
 
 def pose_key(index: int) -> int:
-    """Key of the pose of a keyframe: ``gtsam.symbol("x", index)``."""
+    """Key of the pose of a keyframe."""
     return gtsam.symbol("x", index)
 
 
 def is_pose_key(key: int) -> bool:
-    """Whether a key is ``gtsam.symbol("x", index)`` for some index."""
+    """Whether a key is one of :func:`pose_key`."""
     return gtsam.symbolChr(key) == ord("x")
 
 

@@ -25,30 +25,25 @@ class LoopMapping:
     Parameters
     ----------
     mapper : the mapper whose frames are given to :meth:`add`
-    config : ``pose_graph`` and ``loops``, and what :class:`PoseGraph` and
-        :class:`ScanLoopCloser` use
+    config : of :class:`PoseGraph` and :class:`ScanLoopCloser`
     closer : finds the loop closures; a :class:`ScanLoopCloser` if None
 
     Attributes
     ----------
     graph : keyframes and loop closures
-    closer : finds the loop closures
     points_moved : how many map points were moved so far
     """
 
     def __init__(
-        self,
-        mapper: Mapper,
-        config: Config | None = None,
-        closer: LoopCloser | None = None,
+        self, mapper: Mapper, config: Config | None = None, closer: LoopCloser | None = None
     ) -> None:
         self._config = config or Config()
         self._mapper = mapper
         self.graph = PoseGraph(self._config)
         self.closer: LoopCloser = closer or ScanLoopCloser(self._config)
         self.points_moved = 0
+        # odom_T_lidar of the keyframes, to which their map points are fixed.
         self._placed: list[gtsam.Pose3] = []
-        """``odom_T_lidar`` of the keyframes, to which their map points are fixed."""
 
     def reset(self) -> None:
         """Forget everything, as the mapper's reset does; a ``reset()`` of the closer is called."""
@@ -109,7 +104,6 @@ class LoopMapping:
         return found
 
     def _moves(self, there: dict[int, gtsam.Pose3]) -> dict[int, FloatArray]:
-        """(4, 4) transforms of the points of keyframes to where these belong."""
         return {
             index: pose.compose(self._placed[index].inverse()).matrix()
             for index, pose in there.items()

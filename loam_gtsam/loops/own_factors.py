@@ -64,8 +64,7 @@ class FactorGraph:
 
         Parameters
         ----------
-        position : (3,) metres, in the frame of the map
-        covariance : (3, 3) m^2
+        position, covariance : (3,) metres in the frame of the map, (3, 3) m^2
 
         Raises
         ------

@@ -37,7 +37,7 @@ from loam_gtsam.types import (
 )
 
 _ANYWHERE = np.repeat([np.pi, 100.0], 3)
-"""rad and m: standard deviations of the first pose of another run."""
+"""rad and m: standard deviations of the first pose of another run, put where that run has it."""
 
 
 class PoseGraph(FactorGraph):
@@ -50,7 +50,6 @@ class PoseGraph(FactorGraph):
 
     Attributes
     ----------
-    imu : as given
     loops : all loop closures that were added
     """
 
@@ -84,7 +83,6 @@ class PoseGraph(FactorGraph):
 
         Parameters
         ----------
-        update : result of the mapper, in the order of time
         features : those of the frame's sweep; without them no loop closure can be found
 
         Returns
@@ -120,10 +118,7 @@ class PoseGraph(FactorGraph):
         return keyframe
 
     def new_session(self) -> None:
-        """Begin another run: nothing but loop closures ties its keyframes to those before.
-
-        Its first keyframe is put where its own run has it, within a hundred metres and any heading.
-        """
+        """Begin another run: nothing but loop closures ties its keyframes to those before."""
         if self.keyframes and self.keyframes[-1].session == self._session:
             self._session += 1
 

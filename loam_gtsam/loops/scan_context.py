@@ -2,8 +2,7 @@
 
 The descriptor (Kim and Kim, Scan Context: Egocentric Spatial Descriptor for Place Recognition
 within 3D Point Cloud Map, IROS 2018) holds the height of the highest point in each cell of a polar
-grid around the lidar; here, of features instead of all points. A turn of the lidar shifts the
-columns of the grid and does not change the means of its rows.
+grid around the lidar; here, of features. A turn of the lidar shifts the columns of the grid.
 """
 
 from __future__ import annotations
@@ -26,7 +25,6 @@ def scan_context(points: FloatArray, config: LoopConfig) -> FloatArray:
     Parameters
     ----------
     points : (N, 3) metres, lidar frame, de-skewed
-    config : ``rings``, ``sectors`` and ``reach``
 
     Returns
     -------
@@ -55,10 +53,6 @@ def heading_free_key(descriptor: FloatArray) -> FloatArray:
 
 def compare_descriptors(one: FloatArray, other: FloatArray) -> tuple[float, float]:
     """Distance of two descriptors at the heading at which they are most alike.
-
-    Parameters
-    ----------
-    one, other : (rings, sectors)
 
     Returns
     -------

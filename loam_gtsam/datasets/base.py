@@ -104,14 +104,10 @@ class ChangedDataset:
 
 
 class SweepFiles(ABC):
-    """The sweeps of a data set with one file each; one that cannot be read is a bad sweep.
-
-    Attributes
-    ----------
-    stamps : (N,) nanoseconds
-    """
+    """The sweeps of a data set with one file each; one that cannot be read is a bad sweep."""
 
     stamps: IntArray
+    """(N,) nanoseconds."""
     _files: list[Path]
 
     def __len__(self) -> int:

@@ -48,7 +48,7 @@ def test_frames_of_the_bags_agree_with_evalio(
 def test_helipr_agrees_with_evalio(tmp_path: Path) -> None:
     sequence = datasets.HeLiPR.kaist_05
     theirs = sequence.imu_T_lidar().to_mat()
-    metres, angle = difference(helipr.IMU_T_LIDAR["Ouster"], theirs)
+    metres, angle = difference(np.array(helipr.IMU_T_LIDAR["Ouster"]), theirs)
     assert metres < 1e-4
     assert angle < 1e-6
     from evalio._cpp.helpers import helipr_bin_to_evalio

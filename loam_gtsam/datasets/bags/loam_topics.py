@@ -74,8 +74,7 @@ class LoamTopicsDataset:
         self._problems: list[str] = []
         with closing(open_bag(self._path)) as reader:
             self._types = topic_types(reader)
-        missing = [topic for topic in REQUIRED if topic not in self._types]
-        if missing:
+        if missing := [topic for topic in REQUIRED if topic not in self._types]:
             listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in self._types.items())
             raise DatasetError(
                 f"{self._path}: no topic {', '.join(missing)}; the bag has: {listing or 'none'}"

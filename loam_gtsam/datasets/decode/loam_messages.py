@@ -32,15 +32,10 @@ _LIDAR_T_LOAM: FloatArray = np.eye(4)[[2, 0, 1, 3]]
 
 
 class StampMatcher:
-    """Groups messages of several topics whose stamps agree.
-
-    Attributes
-    ----------
-    unmatched : topic -> messages given up so far
-    """
+    """Groups messages of several topics whose stamps agree."""
 
     def __init__(self, topics: Collection[str]) -> None:
-        self.unmatched = dict.fromkeys(topics, 0)
+        self.unmatched = dict.fromkeys(topics, 0)  # messages given up so far
         self._waiting: dict[str, dict[int, Any]] = {topic: {} for topic in topics}
 
     def add(self, topic: str, stamp: int, message: Any) -> dict[str, Any] | None:
@@ -71,12 +66,7 @@ class StampMatcher:
 
 
 class FeatureDecoder:
-    """Decodes groups of messages into lidar axes.
-
-    Parameters
-    ----------
-    axes : ``lidar`` (A-LOAM) or ``loam`` (the original's camera-like axes)
-    """
+    """Decodes groups of messages from ``lidar`` (A-LOAM) or ``loam`` axes into lidar axes."""
 
     def __init__(self, axes: Literal["lidar", "loam"]) -> None:
         self._loam = axes == "loam"

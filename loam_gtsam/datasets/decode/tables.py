@@ -74,22 +74,9 @@ def read_stamps(path: Path) -> IntArray:
 def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
     """Rows of a time and finite numbers; blank lines and those that start with ``#`` do not count.
 
-    Parameters
-    ----------
-    path : file
-    columns : their names. The time is ``t`` (seconds), ``ns`` (whole nanoseconds), or the two
-        columns ``secs nsecs``. A line of just these names is skipped.
-    separator : as for ``str.split``
-
-    Returns
-    -------
-    stamps : (N,) nanoseconds
-    values : (N, C), the other columns
-
-    Raises
-    ------
-    DatasetError
-        Naming the line that does not fit.
+    ``columns`` are their names. The time is ``t`` (seconds), ``ns`` (whole nanoseconds), or the two
+    columns ``secs nsecs``. A line of just these names is skipped. Stamps (N,) are nanoseconds,
+    values (N, C) the other columns. A DatasetError names the line that does not fit.
     """
     width = len(columns.split()) - (2 if columns.startswith("secs") else 1)
     stamps, rows = _read_rows(path, columns, separator, _finite)
@@ -194,11 +181,7 @@ def _later_than_before(stamps: IntArray) -> BoolArray:
 def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:
     """IMU samples in order of time, in SI units; what had to be put right goes to ``problems``.
 
-    Parameters
-    ----------
-    stamps : (N,) nanoseconds
-    values : (N, 10) quaternion x y z w (zero where unknown), rad/s, m/s^2
-    problems : is appended to
+    ``values`` (N, 10) are quaternion x y z w (zero where unknown), rad/s, m/s^2.
     """
     keep = np.flatnonzero((np.abs(values) < _ABSURD).all(axis=1))  # NaN compares false
     order = keep[np.argsort(stamps[keep], kind="stable")]

@@ -74,11 +74,10 @@ class KittiDataset(SweepFiles):
     """
 
     def __init__(self, path: str | Path, *, vertical_angle_offset_deg: float = 0.0) -> None:
-        given = Path(path)
+        self._path = given = Path(path)
         folder = _sweep_folder(given)
         self._root = _root_of(folder, given)
         self.name = given.resolve().name or "sweeps"
-        self._path = given
         self._files = sorted(folder.glob("*.bin"), key=_natural_order)
         self._offset = float(np.radians(vertical_angle_offset_deg))
         if not np.isfinite(self._offset):
@@ -209,11 +208,8 @@ def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.fl
 
 def find_sweeps(path: Path) -> Path | None:
     """The folder in or below ``path`` that holds ``.bin`` sweeps, None if there is none."""
-    for name in _FOLDERS:
-        folder = path / name
-        if folder.is_dir() and next(folder.glob("*.bin"), None) is not None:
-            return folder
-    return None
+    folders = (path / name for name in _FOLDERS if (path / name).is_dir())
+    return next((folder for folder in folders if any(folder.glob("*.bin"))), None)
 
 
 def _sweep_folder(path: Path) -> Path:
@@ -234,11 +230,8 @@ def _root_of(folder: Path, given: Path) -> Path:
     if folder != given:
         return given
     folder = folder.resolve()
-    if folder.name in ("velodyne", "scans"):
-        return folder.parent
-    if folder.name == "data" and folder.parent.name == "velodyne_points":
-        return folder.parent.parent
-    return given
+    inner = next((name for name in _FOLDERS[1:] if folder.match(name)), None)
+    return given if inner is None else folder.parents[inner.count("/")]
 
 
 def _natural_order(file: Path) -> tuple[int, str]:

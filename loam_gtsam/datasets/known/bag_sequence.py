@@ -22,15 +22,9 @@ from loam_gtsam.types import Trajectory
 
 
 class BagSequence(BagDataset):
-    """Bags recorded by a known rig, with reference poses beside them.
+    """Bags (``parts``) recorded by a known rig, with a file of reference poses (``truth``) or None.
 
-    Parameters
-    ----------
-    path : as the user gave it
-    parts : the bags
-    rig : of the data set
-    truth : file of the reference poses, or None
-    options : see :class:`~loam_gtsam.datasets.base.BagOptions`; topics default to the rig's
+    For the options see :class:`~loam_gtsam.datasets.base.BagOptions`; topics default to the rig's.
     """
 
     def __init__(
@@ -43,8 +37,7 @@ class BagSequence(BagDataset):
     ) -> None:
         with closing(open_bag(path, parts)) as reader:
             known = set(reader.topics)
-        if not options.get("topic") and rig.topic in known:
-            options["topic"] = rig.topic
+        options["topic"] = options.get("topic") or (rig.topic if rig.topic in known else None)
         if not options.get("imu_topic") and rig.imu_topic in known:
             options["imu_topic"] = rig.imu_topic
         super().__init__(path, parts=parts, **options)

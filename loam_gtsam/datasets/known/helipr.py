@@ -29,22 +29,16 @@ RECORDS = {
 }
 """Fields of a point, without padding (the data set's file player)."""
 IMU_T_LIDAR = {
-    "Ouster": np.array(
-        [
-            [0.999715495593027, 0.0223448061210468, -0.00834490926264448, -0.417],
-            [-0.0224514077723064, 0.999664614804883, -0.0129070599303583, -0.003],
-            [0.00805370475188661, 0.0130907427756056, 0.999881878170293, 0.2996],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    ),
-    "Velodyne": np.array(
-        [
-            [0.999995760375673, 0.000773891425480788, -0.00280719125478291, -1.372],
-            [-0.000825966811080870, 0.999826715354752, -0.0185972320992637, 0.0668],
-            [0.00279231257318289, 0.0185994719007949, 0.999823115673720, 0.0297],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    ),
+    "Ouster": [
+        [0.999715495593027, 0.0223448061210468, -0.00834490926264448, -0.417],
+        [-0.0224514077723064, 0.999664614804883, -0.0129070599303583, -0.003],
+        [0.00805370475188661, 0.0130907427756056, 0.999881878170293, 0.2996],
+    ],
+    "Velodyne": [
+        [0.999995760375673, 0.000773891425480788, -0.00280719125478291, -1.372],
+        [-0.000825966811080870, 0.999826715354752, -0.0185972320992637, 0.0668],
+        [0.00279231257318289, 0.0185994719007949, 0.999823115673720, 0.0297],
+    ],
 }
 """Extrinsics of the data set's Pointcloud-Toolbox (``transformINStoLiDAR.py``)."""
 
@@ -84,14 +78,11 @@ class HeLiPRDataset(StampedFiles):
         root = Path(path)
         folder = _lidar_folder(root, lidar)
         name = folder.name
+        lidar_T_imu = inverse_pose(np.array([*IMU_T_LIDAR[name], [0.0, 0.0, 0.0, 1.0]]))
+        kind, source = f"HeLiPR sequence, {name}", "HeLiPR-Pointcloud-Toolbox"
         super().__init__(
             root,
-            Rig(
-                kind=f"HeLiPR sequence, {name}",
-                lidar_T_imu=inverse_pose(IMU_T_LIDAR[name]),
-                source="HeLiPR-Pointcloud-Toolbox",
-                body_T_lidar=np.eye(4),
-            ),
+            Rig(kind, lidar_T_imu, source, body_T_lidar=np.eye(4)),
             folder,
             "*.bin",
             partial(read_records, record=RECORDS[name]),

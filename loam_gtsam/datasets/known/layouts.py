@@ -88,10 +88,9 @@ def spires_bags(root: Path) -> list[Path]:
     for folder in (root, root / "raw/rosbag", root / "raw/ros2bag"):
         if (folder / "metadata.yaml").is_file():
             return [folder]
-        if files := sorted(folder.glob("*.bag")):
-            return files
-        if inner := sorted(file.parent for file in folder.glob("*/metadata.yaml")):
-            return inner
+        inner = sorted(file.parent for file in folder.glob("*/metadata.yaml"))
+        if found := sorted(folder.glob("*.bag")) or inner:
+            return found
     return []
 
 

@@ -81,13 +81,8 @@ class NewerCollegeBags(BagSequence):
     ) -> None:
         root = Path(path)
         name, parts = _choose(root, sequence)
-        super().__init__(
-            root,
-            parts,
-            RIG_2020 if name == "rooster" else RIG_2021,
-            _truth_file(parts[0].parent, name),
-            **options,
-        )
+        rig = RIG_2020 if name == "rooster" else RIG_2021
+        super().__init__(root, parts, rig, _truth_file(parts[0].parent, name), **options)
 
 
 class NewerCollegeClouds(StampedFiles):
@@ -144,19 +139,12 @@ def _choose(root: Path, sequence: str | None) -> tuple[str, list[Path]]:
 
 
 def _truth_file(folder: Path, name: str) -> Path | None:
+    difficulty = name.removeprefix("math-")
+    files = [f"gt-nc-{name}.csv"]
     if name == "rooster":
         files = ["registered_poses.csv"]
-    elif name.startswith("math-"):
-        difficulty = name.removeprefix("math-")
+    elif name != difficulty:
         files = [f"gt_state_{difficulty}.csv", f"gt_math_{difficulty}.csv"]
-    else:
-        files = [f"gt-nc-{name}.csv"]
-    return first_existing(
-        folder,
-        [
-            f"{up}{inner}{file}"
-            for up in ("", "../")
-            for inner in ("", "ground_truth/", "ground_truth/tum_format/")
-            for file in files
-        ],
-    )
+    inside = ("", "ground_truth/", "ground_truth/tum_format/")
+    places = [f"{up}{inner}" for up in ("", "../") for inner in inside]
+    return first_existing(folder, [place + file for place in places for file in files])

@@ -63,8 +63,7 @@ class StampedFiles(SweepFiles):
 
     Parameters
     ----------
-    path : as the user gave it
-    rig : of the data set
+    path, rig : as the user gave it; of the data set
     folder, pattern : of the files
     read : makes the cloud of a file with its stamp
     name : of a file, without suffix: ``NANOSECONDS``, ``SECONDS.NANOSECONDS`` or

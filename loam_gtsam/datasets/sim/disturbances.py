@@ -168,10 +168,7 @@ class MovingObjects(Disturbance):
     def covering(self, share: float, scan: Scan) -> MovingObjects:
         """Moving objects so long that they hide a share of a sweep's points, averaged in time.
 
-        Raises
-        ------
-        ConfigError
-            If boxes without a gap between them hide less.
+        ConfigError if boxes without a gap between them hide less.
         """
         _check_share(share)
         # Once past the slower column: the other one is then seen at as many places.
@@ -180,9 +177,8 @@ class MovingObjects(Disturbance):
 
         def hidden(length: float) -> float:
             boxes = replace(self, length=length)
-            return float(
-                np.mean([np.isfinite(boxes._ranges(scan, at)).mean() for at in moments.tolist()])
-            )
+            shares = [np.isfinite(boxes._ranges(scan, at)).mean() for at in moments.tolist()]
+            return float(np.mean(shares))
 
         low, high = 0.0, self.spacing
         if hidden(high) < share:
@@ -288,12 +284,7 @@ class SkippedAhead(ChangedDataset):
     Parameters
     ----------
     dataset : of raw sweeps; they are read up to the cut at once
-    first, count : the sweeps to cut out
-
-    Raises
-    ------
-    InputError
-        If there is nothing before or after the cut.
+    first, count : the sweeps to cut out, with others before and after them
     """
 
     def __init__(self, dataset: Dataset, first: int, count: int) -> None:
@@ -355,14 +346,9 @@ class Kidnapped(ChangedDataset):
     Parameters
     ----------
     world : the drive
-    number : of the first sweep elsewhere
+    number : of the first sweep elsewhere, from 1
     move : metres, lidar frame
     turn_deg : about the lidar's z axis, after the move
-
-    Raises
-    ------
-    InputError
-        If the drive has no sweep before and at ``number``.
     """
 
     def __init__(

@@ -27,16 +27,12 @@ _HILL = 390.0
 """Metres from crest to crest of the road over the slopes."""
 _AVENUE_STREAM, _CITY_STREAM = 8, 9
 """Numbers of the streams of random numbers; other scenes have lower ones."""
-_EAST, _ACROSS = (150.0, 380.0), (90.0, 200.0)
-"""Metres of the avenue's streets that lead east and of those that lead north or south."""
-_START = 20.0
-"""Metres into the first street at which the avenue's way begins."""
-_STEP = 1.0
-"""Metres between the points at which a city's way is looked at."""
-_CLEAR = 5.0
-"""Metres that a city's houses keep from the way at least."""
-_KERB = 2.8
-"""Metres that a city's cars, posts and trees keep from the way at least."""
+_EAST, _ACROSS, _START = (150.0, 380.0), (90.0, 200.0), 20.0
+"""Metres of the avenue's streets to the east, and of those to the north or south; metres into the
+first street at which its way begins."""
+_STEP, _CLEAR, _KERB = 1.0, 5.0, 2.8
+"""Metres between the points at which a city's way is looked at; metres that its houses, and that
+its cars, posts and trees, keep from the way at least."""
 
 Rows = list[list[float]]
 """Rows as :class:`~loam_gtsam.datasets.sim.raycast.Solids` has them."""
@@ -303,16 +299,16 @@ class _Roadside(Street):
 
     def build(self, kerb: Kerb) -> None:
         """A house, a post or tree, and a parked car along a kerb, as far as there is room."""
-        width, setback, top = (self._between(*r) for r in ((8.0, 13.0), (8.0, 12.5), (5.0, 16.0)))
+        size = [self._between(*r) for r in ((8.0, 13.0), (8.0, 12.5), (5.0, 16.0))]
         chance = float(self._rng.random())
         middle = 0.5 * kerb.length
-        self._add_house(kerb, middle, width, setback, top)
+        self._add_house(kerb, middle, *size)
         x, y, z = at = kerb.place(middle, self._between(5.8, 7.0))
         if chance < 0.5 and self._is_free([x, y, 0.0, 0.3, 0.3, 1.0, 0.0], _KERB):
             self.add_post(at, self._between(0.1, 0.22), 5.0)
             if chance < 0.25:
-                size = self._between(1.2, 1.9)
-                self.crowns.append([x, y, z + 3.2 + size, size, size, size])
+                wide = self._between(1.2, 1.9)
+                self.crowns.append([x, y, z + 3.2 + wide, wide, wide, wide])
         car = kerb.box(middle - 2.1, middle + 2.1, 4.2, 6.0, 0.25, 1.3)
         if 0.3 < chance < 0.6 and self._is_free(car, _KERB):
             self.boxes.append(car)
@@ -388,9 +384,8 @@ def rolling_ground(
     direction = rng.uniform(0.0, 2.0 * np.pi, len(amplitudes))
     number = 2.0 * np.pi / np.array(wavelengths)
     phase = rng.uniform(0.0, 2.0 * np.pi, len(amplitudes))
-    return Ground(
-        np.column_stack([amplitudes, number * np.cos(direction), number * np.sin(direction), phase])
-    )
+    u, v = number * np.cos(direction), number * np.sin(direction)
+    return Ground(np.column_stack([amplitudes, u, v, phase]))
 
 
 def distances_along(way: FloatArray) -> FloatArray:

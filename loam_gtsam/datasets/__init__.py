@@ -76,12 +76,10 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
 
     Parameters
     ----------
-    path : a folder with ``.bin`` sweeps, a ROS 1 or ROS 2 bag, an MCAP file, a sequence of Newer
-        College, MulRan, HeLiPR or Oxford Spires, or the name of a built-in world
-        (``sim:room?frames=50&seed=3``)
-    options : for the loader, e.g. ``topic``, ``imu_topic``, ``time_field``, ``time_unit``,
-        ``stamp_is`` (bags), ``axes`` (LOAM's topics), ``vertical_angle_offset_deg`` (KITTI),
-        ``sequence`` (Newer College), ``lidar`` (HeLiPR). Those that are None count as not given.
+    path : a folder with ``.bin`` sweeps, a ROS 1 or ROS 2 bag, an MCAP file, a sequence of a known
+        data set, or the name of a built-in world (``sim:room?frames=50&seed=3``)
+    options : for the loader, e.g. ``topic`` (bags), ``axes`` (LOAM's topics), ``sequence`` (Newer
+        College). Those that are None count as not given.
 
     Notes
     -----
@@ -131,11 +129,10 @@ def _suggestion(path: Path) -> str:
     inside: list[str] = []
     for folder, names, files in islice(os.walk(path), _LOOKED_AT):
         names.sort()
-        found = Path(folder)
         if "metadata.yaml" in files or any(name.endswith(".bin") for name in files):
-            inside.append(str(found))
+            inside.append(folder)
             names.clear()
-        inside += [str(found / name) for name in sorted(files) if name.endswith(_BAG_FILES)]
+        inside += [f"{folder}/{name}" for name in sorted(files) if name.endswith(_BAG_FILES)]
     if inside:
         more = ", ..." if len(inside) > 3 else ""
         return f"There may be sweeps in {', '.join(inside[:3])}{more}"
@@ -163,17 +160,14 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
 def _open_world(text: str, options: dict[str, Any]) -> Dataset:
     scene, _, query = text.removeprefix("sim:").partition("?")
     try:
-        settings = {
-            key: _number_or_text(value)
-            for key, value in parse_qsl(query, strict_parsing=bool(query))
-        }
+        pairs = parse_qsl(query, strict_parsing=bool(query))
     except ValueError as error:
         raise DatasetError(
             f"{text}: expected sim:SCENE?frames=NUMBER&seed=NUMBER&sensor=NAME: {error}"
         ) from error
     from loam_gtsam.datasets.sim.world import SimulatedWorld
 
-    settings |= options
+    settings = {key: _number_or_text(value) for key, value in pairs} | options
     numbers = set(inspect.signature(SimulatedWorld).parameters) - {"sensor"}
     for key, value in settings.items():
         if key in numbers and isinstance(value, str):
@@ -194,8 +188,7 @@ def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> Data
     known = list(inspect.signature(loader).parameters)[1:]
     if "options" in known:
         known[known.index("options") :] = BagOptions.__annotations__
-    unknown = [key for key in options if key not in known]
-    if unknown:
+    if unknown := [key for key in options if key not in known]:
         raise DatasetError(
             f"{source}: {loader.__name__} takes no option {', '.join(unknown)}; "
             f"it takes {', '.join(known)}"

@@ -73,16 +73,11 @@ class ArrayDataset:
             if not isinstance(entry, np.ndarray) or entry.ndim != 2 or entry.shape[1] not in (3, 4):
                 got = entry.shape if isinstance(entry, np.ndarray) else type(entry).__name__
                 raise InputError(f"scans[{index}]: expected an (N, 3) or (N, 4) array, got {got}")
+            own = None if times is None else times[index], None if rings is None else rings[index]
             try:
-                scan = Scan(
-                    points=entry[:, :3],
-                    stamp=int(nanoseconds[index]),
-                    times=times[index] if times is not None else None,
-                    rings=rings[index] if rings is not None else None,
-                )
+                self._scans.append(Scan(entry[:, :3], int(nanoseconds[index]), *own))
             except InputError as error:
                 raise InputError(f"scans[{index}]: {error}") from error
-            self._scans.append(scan)
 
     def __len__(self) -> int:
         return len(self._scans)

@@ -36,9 +36,8 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
     ``parts`` are the bags of a recording that was split; ``path`` then only names them.
     """
     bags = list(parts or [path])
-    for bag in bags:
-        if not bag.exists():
-            raise DatasetError(f"{bag}: no such bag")
+    if missing := [bag for bag in bags if not bag.exists()]:
+        raise DatasetError(f"{missing[0]}: no such bag")
     store = Stores.ROS1_NOETIC if bags[0].suffix == ".bag" else Stores.LATEST
     try:
         reader = AnyReader(bags, default_typestore=get_typestore(store))

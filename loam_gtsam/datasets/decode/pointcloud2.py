@@ -136,18 +136,8 @@ def decode_with_times(
 class CloudStream:
     """Decodes PointCloud2 messages in the order in which they come.
 
-    Parameters
-    ----------
-    options : ``time_field``, ``time_unit``, ``stamp_is``: see :func:`decode_pointcloud2`
-
-    Attributes
-    ----------
-    decision : how the times are read, None before the first that could be
-
-    Raises
-    ------
-    DatasetError
-        If an option is unknown.
+    For the options see :func:`decode_pointcloud2`. ``decision`` is how the times are read, None
+    before the first that could be.
     """
 
     def __init__(self, **options: Unpack[TimeOptions]) -> None:
@@ -157,25 +147,18 @@ class CloudStream:
         self._decided = 0
 
     def decode(self, message: Any) -> Scan:
-        """The next sweep.
-
-        Raises
-        ------
-        DatasetError
-            If its layout, a field or its times cannot be understood.
-        """
-        if self._decided >= _OPEN:
-            return decode_with_times(message, decision=self.decision, **self._options).scan
-        try:
-            decoded = decode_with_times(message, **self._options)
-        except LoamError:
-            if self.decision is None:
-                raise
-            return decode_with_times(message, decision=self.decision, **self._options).scan
-        if decoded.decision is not None:
-            self.decision = decoded.decision
-            self._decided += 1
-        return decoded.scan
+        """The next sweep; DatasetError if it cannot be understood."""
+        if self._decided < _OPEN:
+            try:
+                decoded = decode_with_times(message, **self._options)
+            except LoamError:
+                if self.decision is None:
+                    raise
+            else:
+                self._decided += decoded.decision is not None
+                self.decision = decoded.decision or self.decision
+                return decoded.scan
+        return decode_with_times(message, decision=self.decision, **self._options).scan
 
 
 def message_stamp(msg: Any) -> int:

@@ -159,9 +159,8 @@ def oxts_truth(
     poses[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + values[:, _LATITUDE]) / 2.0))
     poses[:, 2, 3] = values[:, _ALTITUDE]
     poses[:, :3, 3] -= poses[0, :3, 3].copy()
-    return moved_to_lidar(
-        sorted_trajectory(stamps, poses, "oxts", problems), inverse_pose(lidar_T_imu)
-    )
+    truth = sorted_trajectory(stamps, poses, "oxts", problems)
+    return moved_to_lidar(truth, inverse_pose(lidar_T_imu))
 
 
 def lidar_T_imu_of(root: Path) -> FloatArray | None:

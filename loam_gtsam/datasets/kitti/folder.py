@@ -166,8 +166,7 @@ class KittiDataset(SweepFiles):
             return Scan(points=points, stamp=stamp)
         values = self._read_point_times(file, len(points))
         times, outlier = apply_times(values, stamp, self._decision)
-        if outlier.any():
-            points[outlier] = np.nan
+        points[outlier] = np.nan
         return Scan(points=points, stamp=stamp, times=times)
 
     def _read_point_times(self, file: Path, count: int | None = None) -> NDArray[np.uint64]:
@@ -185,8 +184,7 @@ class KittiDataset(SweepFiles):
         message = ""
         for file, stamp in zip(self._files, self.stamps.tolist(), strict=True):
             try:
-                values = self._read_point_times(file)
-                return decide_times(values, stamp, field="t_ns", unit="ns")
+                return decide_times(self._read_point_times(file), stamp, field="t_ns", unit="ns")
             except DatasetError as error:
                 message = message or str(error)
         raise DatasetError(f"{self._times_folder}: no usable point times; {message}")
@@ -198,12 +196,10 @@ def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.fl
     cosine, sine = np.cos(angle), np.sin(angle)
     with np.errstate(invalid="ignore", divide="ignore"):
         scale = np.where(horizontal > 0.0, cosine - sine * points[:, 2] / horizontal, 1.0)
-    raised = np.empty_like(points)
-    raised[:, :2] = points[:, :2] * scale[:, None]
-    raised[:, 2] = np.where(
-        horizontal > 0.0, cosine * points[:, 2] + sine * horizontal, points[:, 2]
-    )
-    return raised
+    raised = points * scale[:, None]
+    up = cosine * points[:, 2] + sine * horizontal
+    raised[:, 2] = np.where(horizontal > 0.0, up, points[:, 2])
+    return raised.astype(points.dtype)
 
 
 def find_sweeps(path: Path) -> Path | None:

@@ -188,10 +188,7 @@ class SimulatedWorld:
         return self.sweep(i + self._frames if i < 0 else i)
 
     def sweep(self, i: int) -> Scan:
-        """Sweep ``i``: float32 points at their own times, ``times``, ``rings``, ``span``.
-
-        Independent of all others, so several processes can share the work.
-        """
+        """Sweep ``i``, independent of all others, so that several processes can share the work."""
         if not 0 <= i < self._frames:
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
         stamp = self._stamp(i)
@@ -215,10 +212,7 @@ class SimulatedWorld:
         )
 
     def seen_from(self, lidar_T_moved: FloatArray) -> SimulatedWorld:
-        """The same drive, of a lidar mounted at another place of the platform, (4, 4).
-
-        Poses stay relative to the start of this drive.
-        """
+        """The same drive of a lidar at another place (4, 4); poses count from this one's start."""
         other = copy.copy(self)
         for cached in ("truth", "imu"):
             other.__dict__.pop(cached, None)
@@ -233,10 +227,7 @@ class SimulatedWorld:
     def truth_at(self, stamps: IntArray) -> Trajectory:
         """Exact poses at any ``stamps`` (N,) in nanoseconds, relative to the first sweep's.
 
-        Raises
-        ------
-        InputError
-            If the stamps are no row of integers, or later than the end of an open path.
+        InputError if the stamps are no row of integers, or later than the end of an open path.
         """
         stamps = as_stamps(stamps, "stamps")
         end = _EPOCH + int(self._motion.duration * 1e9) + _IMU_MARGIN
@@ -288,10 +279,10 @@ class SimulatedWorld:
 
     def _count(self, frames: int | None) -> int:
         """Number of sweeps, checked against the end of an open path."""
-        # A closed path is driven a little past its start, for the loop to be seen to close.
         available = math.floor(self._motion.duration * self._rate)
-        once = available + round(2.0 * self._rate) if self.scene.closed else available
-        count = frames if frames is not None else self.scene.frames or once
+        # A closed path is driven a little past its start, for the loop to be seen to close.
+        once = available + self.scene.closed * round(2.0 * self._rate)
+        count = frames or self.scene.frames or once
         if not self.scene.closed and count > available:
             raise ConfigError(
                 f"frames: the path of {self.scene.name!r} ends after {available} sweeps at this "

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -47,10 +47,8 @@ def read_all(path: Path, **options: Any) -> int:
             count += 1
             assert isinstance(sweep, (Scan, BadSweep, FeatureSweep))
             if isinstance(sweep, Scan):
-                try:
+                with suppress(LoamError):
                     extract_features(sweep, Config())
-                except LoamError:
-                    continue
         assert dataset.imu is None or len(dataset.imu.stamps)
         assert dataset.truth is None or len(dataset.truth) >= 0
     except LoamError:
@@ -182,10 +180,8 @@ def test_no_word_in_a_table_ends_a_run_with_a_traceback(name: str, word: str) ->
             (place / name).write_text("\n".join(lines), encoding="utf-8")
             read_all(place)
             if name == "gt.tum":
-                try:
+                with suppress(LoamError):
                     read_tum(place / name)
-                except LoamError:
-                    continue
 
 
 GRAPH = (
@@ -198,10 +194,8 @@ GRAPH = (
 def test_a_damaged_graph_is_read_or_refused(content: bytes) -> None:
     with folder() as place:
         (place / "graph.g2o").write_bytes(content)
-        try:
+        with suppress(LoamError):
             read_graph(place / "graph.g2o")
-        except LoamError:
-            return
 
 
 def pcd(kind: str) -> str:

@@ -7,7 +7,17 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.bags import ROS1, START, cloud, imu, loam_recording, odometry, sweep_points, write_bag
+from support.bags import (
+    ROS1,
+    START,
+    Recording,
+    cloud,
+    imu,
+    loam_recording,
+    odometry,
+    sweep_points,
+    write_bag,
+)
 
 from loam_gtsam.datasets import BagDataset, LoamTopicsDataset, open_dataset
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
@@ -86,9 +96,8 @@ def test_topics_without_a_partner_keep_memory_bounded(tmp_path: Path) -> None:
 
 def test_loam_bag_without_cloud_or_with_a_broken_pose(tmp_path: Path) -> None:
     recording = [e for e in loam_recording() if e[0] != "/velodyne_cloud_3"]
-    index = next(i for i, e in enumerate(recording) if e[0] == "/laser_odom_to_init")
-    stamp = recording[index][1]
-    recording[index] = ("/laser_odom_to_init", stamp, odometry(ROS1, stamp, (0, 0, 0), (0,) * 4))
+    no_pose = odometry(ROS1, START, (0, 0, 0), (0,) * 4)
+    recording = damaged(recording, {("/laser_odom_to_init", 0): no_pose})
     dataset = open_dataset(write_bag(tmp_path / "topics", "ros1", recording))
     got = list(dataset)
     assert [type(sweep) for sweep in got] == [BadSweep, FeatureSweep, FeatureSweep]
@@ -103,20 +112,25 @@ def without_x(stamp: int) -> Any:
     return message
 
 
+def damaged(recording: Recording, damages: dict[tuple[str, int], Any]) -> Recording:
+    """The recording with other messages of some topics and sweeps."""
+    return [
+        (topic, stamp, damages.get((topic, (stamp - START) // 100_000_000), message))
+        for topic, stamp, message in recording
+    ]
+
+
 GARBAGE = b"\x00\x01\x00\x00garbage" * 3
 
 
 def test_damaged_messages_of_loam_topics_are_bad_sweeps_and_the_rest_goes_on(
     tmp_path: Path,
 ) -> None:
-    recording = loam_recording(count=4)
-    for topic, sweep, damage in (
-        ("/laser_cloud_surf_last", 0, without_x(START)),
-        ("/laser_cloud_corner_last", 2, GARBAGE),
-    ):
-        stamp = START + sweep * 100_000_000
-        index = next(i for i, entry in enumerate(recording) if entry[:2] == (topic, stamp))
-        recording[index] = (topic, stamp, damage)
+    damages = {
+        ("/laser_cloud_surf_last", 0): without_x(START),
+        ("/laser_cloud_corner_last", 2): GARBAGE,
+    }
+    recording = damaged(loam_recording(count=4), damages)
     dataset = LoamTopicsDataset(write_bag(tmp_path / "topics", "ros1", recording))
     got = list(dataset)
     assert [type(sweep) for sweep in got] == [BadSweep, FeatureSweep, BadSweep, FeatureSweep]
@@ -144,12 +158,8 @@ def test_a_loam_topic_of_a_type_without_stamp_is_a_bad_sweep_each_time(tmp_path:
 def test_the_axes_are_those_of_the_first_cloud_that_can_be_read(tmp_path: Path) -> None:
     few = cloud(ROS1, START + 2 * 100_000_000, np.random.default_rng(0).normal(size=(99, 3)))
     faulty = [GARBAGE, without_x(START + 100_000_000), few]
-    recording = loam_recording(loam_axes=True, count=4)
-    for topic, stamp, _ in list(recording):
-        sweep = (stamp - START) // 100_000_000
-        if topic == "/velodyne_cloud_3" and sweep < 3:
-            index = next(i for i, entry in enumerate(recording) if entry[:2] == (topic, stamp))
-            recording[index] = (topic, stamp, faulty[sweep])
+    damages = {("/velodyne_cloud_3", sweep): damage for sweep, damage in enumerate(faulty)}
+    recording = damaged(loam_recording(loam_axes=True, count=4), damages)
     assert LoamTopicsDataset(write_bag(tmp_path / "all", "ros1", recording)).axes == "loam"
     short = [entry for entry in recording if entry[1] < START + 300_000_000]
     with pytest.raises(DatasetError, match=r"cannot tell the axes .*unknown"):
@@ -159,11 +169,8 @@ def test_the_axes_are_those_of_the_first_cloud_that_can_be_read(tmp_path: Path) 
 def test_recorded_poses_of_loam_are_optional_and_broken_ones_are_left_out(tmp_path: Path) -> None:
     mapped = "/aft_mapped_to_init"
     recording = loam_recording(count=4)
-    damages = (odometry(ROS1, START, (0, 0, 0), (0,) * 4), None, GARBAGE, None)
-    broken = []
-    for topic, stamp, message in recording:
-        damage = damages[(stamp - START) // 100_000_000] if topic == mapped else None
-        broken.append((topic, stamp, message if damage is None else damage))
+    damages = {(mapped, 0): odometry(ROS1, START, (0, 0, 0), (0,) * 4), (mapped, 2): GARBAGE}
+    broken = damaged(recording, damages)
     broken.append(("/imu", START, imu(ROS1, START)))
     dataset = LoamTopicsDataset(write_bag(tmp_path / "broken", "ros1", broken))
     np.testing.assert_array_equal(dataset.recorded.stamps - START, [100_000_000, 300_000_000])

@@ -42,31 +42,11 @@ def header(store: Any, stamp: int) -> Any:
 
 def cloud(store: Any, stamp: int, points: np.ndarray, **columns: np.ndarray) -> Any:
     types = store.types
-    names = ["x", "y", "z", *columns]
-    arrays = [*points.T.astype("f4"), *columns.values()]
-    packed = np.zeros(len(points), [(n, a.dtype.str) for n, a in zip(names, arrays, strict=True)])
-    fields = []
-    for name, array in zip(names, arrays, strict=True):
-        packed[name] = array
-        fields.append(
-            types["sensor_msgs/msg/PointField"](
-                name=name,
-                offset=packed.dtype.fields[name][1],
-                datatype=DATATYPES[array.dtype.str[1:]],
-                count=1,
-            )
-        )
-    return types["sensor_msgs/msg/PointCloud2"](
-        header=header(store, stamp),
-        height=1,
-        width=len(points),
-        fields=fields,
-        is_bigendian=False,
-        point_step=packed.itemsize,
-        row_step=packed.nbytes,
-        data=packed.view(np.uint8).reshape(-1),
-        is_dense=True,
-    )
+    coordinates = dict(zip("xyz", points.T.astype("f4"), strict=True))
+    parts = vars(make_message(coordinates | columns, stamp=stamp))
+    fields = [types["sensor_msgs/msg/PointField"](**vars(field)) for field in parts["fields"]]
+    parts |= {"header": header(store, stamp), "fields": fields}
+    return types["sensor_msgs/msg/PointCloud2"](**parts)
 
 
 def imu(

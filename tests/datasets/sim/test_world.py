@@ -245,16 +245,11 @@ def test_motion_starts_at_rest_and_is_gentle():
         assert at_rest[0, 2] > 9.0
         assert np.linalg.norm(imu.acceleration, axis=1).max() < GRAVITY + 6.0
         assert np.abs(imu.gyro).max() < (1.5 if scene != "shaken" else 2.5)
-
-
-def test_shaken_turns_fast_about_every_axis():
-    world = SimulatedWorld("shaken", **PERFECT_IMU)
-    fastest = np.abs(world.imu.gyro).max(axis=0)
-    assert fastest[:2].min() > 0.9
-    assert fastest[2] == pytest.approx(2.0, abs=0.15)
-    roll, pitch = roll_pitch(world)
-    assert np.abs(roll).max() == pytest.approx(0.15, abs=0.02)
-    assert np.abs(pitch).max() == pytest.approx(0.15, abs=0.02)
+        if scene == "shaken":  # fast, about every axis
+            assert np.abs(imu.gyro).max(axis=0) == pytest.approx([1.4, 1.4, 2.0], abs=0.5)
+            assert [np.abs(angle).max() for angle in roll_pitch(world)] == pytest.approx(
+                [0.15, 0.15], abs=0.02
+            )
 
 
 @pytest.mark.parametrize("seed", [0, 5])

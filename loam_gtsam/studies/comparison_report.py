@@ -148,9 +148,6 @@ def _median_95_max(values: FloatArray) -> tuple[float, float, float]:
     return float(median), float(high), float(values.max())
 
 
-# -- files -----------------------------------------------------------------------------------------
-
-
 def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> list[str]:
     """Write all files; returns their names."""
     comparison = results.comparison
@@ -261,9 +258,6 @@ def _settings(run: SolverRun) -> str:
         if value != default[section][key]
     ]
     return f"{run.version}; differs from the default in: {', '.join(changed) or 'nothing'}"
-
-
-# -- pictures --------------------------------------------------------------------------------------
 
 
 def _draw(results: ScoredComparison, folder: Path) -> list[str]:

@@ -77,9 +77,6 @@ def find_contender(name: str) -> Contender:
     return Contender(name, PRESETS[preset])
 
 
-# -- results ---------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class SolverRun:
     """The result of one contender on all sweeps.
@@ -109,13 +106,9 @@ class SolverRun:
             placed = [n for n, update in enumerate(updates) if update.status.has_pose]
             for number, pose in zip(placed, result.trajectory.map_T_lidar, strict=True):
                 updates[number] = replace(updates[number], map_T_lidar=gtsam.Pose3(pose))
-        return cls(
-            name=name,
-            version=f"loam_gtsam {installed_version()}",
-            config=result.config,
-            updates=tuple(updates),
-            map_points=len(result.edge_points) + len(result.plane_points),
-        )
+        version = f"loam_gtsam {installed_version()}"
+        points = len(result.edge_points) + len(result.plane_points)
+        return cls(name, version, result.config, tuple(updates), points)
 
     @property
     def used(self) -> tuple[int, ...]:
@@ -132,9 +125,6 @@ class SolverRun:
         """The poses of the frames ``used``."""
         good = [self.updates[number] for number in self.used]
         return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
-
-
-# -- runners ---------------------------------------------------------------------------------------
 
 
 def extract_for_all(sweep: Sweep, config: Config) -> Extraction | None:

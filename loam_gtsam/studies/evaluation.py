@@ -133,15 +133,9 @@ def absolute_error(
         rotations = align_rotations(rotations, truth[:, :3, :3]) @ rotations
         positions = transform(align_positions(positions, truth[:, :3, 3]), positions)
     errors = np.linalg.norm(positions - truth[:, :3, 3], axis=1)
-    difference = np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations
-    return AbsoluteError(
-        rmse=_rms(errors),
-        median=float(np.median(errors)),
-        maximum=float(errors.max()),
-        rotation_rmse_deg=_rms(_angles_deg(difference)),
-        translations=errors,
-        stamps=stamps,
-    )
+    angles = _angles_deg(np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations)
+    median, maximum = float(np.median(errors)), float(errors.max())
+    return AbsoluteError(_rms(errors), median, maximum, _rms(angles), errors, stamps)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -29,7 +29,6 @@ _POLL = 0.2
 _CONNECT_SECONDS = 10
 _DEATHS = 4
 """Number of worker processes that may die of one trial before the trial counts as failed."""
-
 Work = Callable[[Trial], Row]
 """What a worker does with a trial: :func:`loam_gtsam.studies.trials.run_trial`, except in tests."""
 

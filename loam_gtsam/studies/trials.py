@@ -132,7 +132,7 @@ def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
     started = time.perf_counter()
     try:
         dataset = datasets.open_dataset(trial.path, **trial.dataset_options)
-        finished = (_run_pipeline if trial.peer is None else _run_peer)(trial, dataset, on_frame)
+        finished = _run_solver(trial, dataset, on_frame)
         row |= _numbers(finished, dataset.truth)
         row["error"] = _unusable(dataset.name, finished)
     except LoamError as error:
@@ -158,15 +158,12 @@ def empty_row(trial: Trial) -> Row:
     return dict.fromkeys(COLUMNS) | dict(versions()) | known
 
 
-def _run_pipeline(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
-    result = run(dataset, trial.config, max_frames=trial.frames, on_frame=on_frame)
-    if result.interrupted:
-        raise KeyboardInterrupt
-    return SolverRun.of_result(trial.config_name, result)
-
-
-def _run_peer(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
-    assert trial.peer is not None
+def _run_solver(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
+    if trial.peer is None:
+        result = run(dataset, trial.config, max_frames=trial.frames, on_frame=on_frame)
+        if result.interrupted:
+            raise KeyboardInterrupt
+        return SolverRun.of_result(trial.config_name, result)
     runner = PeerRunner(make_peer(trial.peer), effective_config(trial.config, dataset))
     for number, sweep in enumerate(islice(dataset, trial.frames)):
         runner.register(sweep)

@@ -16,7 +16,6 @@ from support.contenders import FakePeer
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.studies.comparison_report import PICTURES, REPORT_FILE, TABLE_FILES
 from loam_gtsam.studies.evaluation import absolute_error
-from loam_gtsam.studies.peers import PEERS
 from loam_gtsam.studies.report_html import picture_html
 from loam_gtsam.types import BadSweep, DatasetError, OutputError
 from loam_gtsam.view import plots
@@ -106,14 +105,6 @@ def test_an_earlier_comparison_is_kept_unless_told(command):
     assert command(*arguments, "--overwrite").exit_code == 0
     assert not left.exists()
     assert len(list(Path("loam_gtsam_output").iterdir())) == 2
-
-
-def test_a_missing_peer_is_one_line(command, monkeypatch):
-    monkeypatch.setattr(PEERS["kiss-icp"], "module", "no_such_module_of_a_peer")
-    result = command("--solver", "gtsam", "--solver", "kiss-icp")
-    assert result.exit_code == 1
-    assert "pip install kiss-icp" in result.output
-    assert "Traceback" not in result.output
 
 
 def test_an_error_on_the_way_leaves_what_was_computed(command, dataset):

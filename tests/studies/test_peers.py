@@ -23,13 +23,9 @@ def test_a_peer_that_is_not_installed_is_told_how(name, monkeypatch):
         raise ModuleNotFoundError(f"No module named {module!r}")
 
     monkeypatch.setattr(peers.importlib, "import_module", missing)
-    with pytest.raises(
-        PeerError, match=rf"{name} cannot be imported .*pip install {PEERS[name].package}"
-    ):
+    told = rf"{name} cannot be imported .*pip install {PEERS[name].package}"
+    with pytest.raises(PeerError, match=told):
         peers.make_peer(name)
-
-
-def test_an_unknown_peer_is_refused():
     with pytest.raises(PeerError, match=r"unknown peer 'x' \(known: genz-icp, "):
         peers.make_peer("x")
 

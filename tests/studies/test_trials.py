@@ -69,13 +69,12 @@ def test_a_row_has_the_numbers_of_the_run():
 def test_loops_correct_the_poses_that_are_scored():
     """The updates of a run with loops are odometry; its trajectory is corrected."""
     truth = SimulatedWorld("room", frames=5, speed=5).truth
-    wrong = [MapUpdate(int(stamp), gtsam.Pose3(), FrameStatus.OK) for stamp in truth.stamps]
+    updates = [MapUpdate(int(stamp), gtsam.Pose3(), FrameStatus.OK) for stamp in truth.stamps]
     bad = MapUpdate(0, gtsam.Pose3(), FrameStatus.BAD_STAMP)
-    graph = SimpleNamespace(trajectory=lambda updates: truth)
+    updates.insert(2, bad)
+    loops = SimpleNamespace(graph=SimpleNamespace(trajectory=lambda updates: truth))
     none = np.zeros((0, 3))
-    updates = (*wrong[:2], bad, *wrong[2:])
-    loops = SimpleNamespace(graph=graph)
-    result = RunResult(Config(), updates, none, none, {}, interrupted=False, loops=loops)
+    result = RunResult(Config(), tuple(updates), none, none, {}, interrupted=False, loops=loops)
     found = SolverRun.of_result("x", result)
     np.testing.assert_allclose(found.trajectory.map_T_lidar, truth.map_T_lidar, atol=1e-12)
     assert found.updates[2] is bad

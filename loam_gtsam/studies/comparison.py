@@ -125,12 +125,8 @@ def compare_solvers(
     shared_guess : whether all solvers of this package start from the guesses of the first of them
         (:class:`~loam_gtsam.studies.contenders.SharedGuess`)
     on_frame : called with the number of each sweep and the first contender's result; a
-        KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far
-
-    Returns
-    -------
-    Comparison
-        An error that ends it after the first sweeps is in ``error``.
+        KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far, as
+        it has after an error later than the first sweep
 
     Raises
     ------
@@ -143,8 +139,7 @@ def compare_solvers(
     """
     _check_names(contenders)
     runners, first, notes = _make_runners(contenders, dataset, shared_guess)
-    error: Exception | None = None
-    interrupted = False
+    ended: BaseException | None = None
     done = 0
     try:
         for sweep in islice(dataset, max_frames):
@@ -154,14 +149,10 @@ def compare_solvers(
             done += 1
             if on_frame is not None:
                 on_frame(done - 1, runners[0].updates[-1])
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, Exception) as caught:
         if not done:
             raise
-        interrupted = True
-    except Exception as caught:
-        if not done:
-            raise
-        error = caught
+        ended = caught
     if not done:
         raise DatasetError(
             f"{dataset.name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
@@ -171,8 +162,8 @@ def compare_solvers(
         runs=tuple(runner.result(done) for runner in runners),
         truth=dataset.truth,
         notes=tuple(notes),
-        interrupted=interrupted,
-        error=error,
+        interrupted=isinstance(ended, KeyboardInterrupt),
+        error=ended if isinstance(ended, Exception) else None,
         shared_guess=shared_guess,
     )
 

@@ -53,10 +53,9 @@ class LoamGtsam(EvalioPipeline):
 
     Notes
     -----
-    evalio stamps a sweep with its start and may hand the sweep out before the IMU samples of the
-    same time. A sweep therefore waits for the first sample after its end, but no longer than until
-    two more sweeps have come. evalio does not tell a pipeline that a sequence is over: the last two
-    sweeps may stay without a pose.
+    evalio may hand a sweep out before the IMU samples of the same time. A sweep therefore waits for
+    the first sample after its end, but no longer than until two more sweeps have come. evalio does
+    not tell a pipeline that a sequence is over: the last two sweeps may stay without a pose.
     """
 
     def __init__(self) -> None:

@@ -1,7 +1,7 @@
 """Peers: other registration systems, run through their own Python packages, all of them optional.
 
-Every peer runs with its own defaults and gets the raw points and their times. The docstring of a
-peer says which settings are not its defaults, and which moment of the sweep its pose belongs to.
+Every peer runs with its own defaults and gets the raw points and their times; its docstring says
+what is not a default, and which moment of the sweep its pose belongs to.
 """
 
 from __future__ import annotations
@@ -144,10 +144,8 @@ class KissIcp(_IcpPeer):
 
     Notes
     -----
-    Version 1.3 de-skews to the time of the *last* point (a point at the end of the sweep is left
-    where it was), so the pose belongs to that time and is compared with the truth of that time.
-    Without de-skew a pose fits the whole sweep best at the middle of the sweep. KISS-ICP uses all
-    cores.
+    Version 1.3 de-skews to the time of the *last* point, so the pose belongs to that time. Without
+    de-skew a pose fits the whole sweep best at the middle of the sweep.
     """
 
     name, package, module = "kiss-icp", "kiss-icp", "kiss_icp"
@@ -170,8 +168,7 @@ class GenzIcp(_IcpPeer):
     -----
     The de-skew of GenZ-ICP is off by default, for data that are de-skewed already; here it is on.
     Version 0.3 takes times from 0 to 1 and de-skews to 0.5, so that the pose belongs to the middle
-    of the sweep, as it does without de-skew. Two instances that take turns in one process disturb
-    each other: on 40 sweeps of KITTI the ATE of each became several times larger or smaller.
+    of the sweep, as it does without de-skew. Two instances in one process disturb each other.
     """
 
     name, package, module = "genz-icp", "genz-icp", "genz_icp"
@@ -196,8 +193,7 @@ class SmallGicp(Peer):
     -----
     small_gicp is a registration library; this class adds a simple odometry. The motion between the
     last two poses de-skews the points to the middle of the sweep and predicts the pose; each
-    registered sweep is added to the map. The sizes are the defaults of small_gicp's functions and
-    examples: downsampling to 0.25 m, voxels of 1 m. It uses one thread, which is its default.
+    registered sweep is added to the map. The sizes are the defaults of small_gicp.
     """
 
     name, package, module = "small-gicp", "small_gicp", "small_gicp"

@@ -119,14 +119,10 @@ def versions() -> Mapping[str, str]:
 def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
     """Run one trial; an error during the trial becomes the ``error`` of its row.
 
-    Parameters
-    ----------
-    on_frame : called after each frame; a KeyboardInterrupt raised there ends the trial
-
     Raises
     ------
     KeyboardInterrupt
-        If the trial was stopped: half a trial is no result.
+        If ``on_frame``, which is called after each frame, raised it: half a trial is no result.
     """
     row = empty_row(trial) | {"host": socket.gethostname()}
     started = time.perf_counter()
@@ -250,11 +246,7 @@ class TrialStore:
 
 
 def write_table(path: Path, rows: Iterable[Row], text: str, trials: Iterable[Trial]) -> None:
-    """Write the table of a study.
-
-    Parameters
-    ----------
-    text, trials : specification of the study; the text and all configurations become metadata
+    """Write the table of a study; text and configurations of its specification become metadata.
 
     Raises
     ------
@@ -271,13 +263,7 @@ def write_table(path: Path, rows: Iterable[Row], text: str, trials: Iterable[Tri
 
 
 def read_table(path: Path) -> tuple[list[Row], Mapping[str, Any]]:
-    """The rows of a table, and the full configurations by their ``config_hash``.
-
-    Raises
-    ------
-    OutputError
-        If pyarrow is missing.
-    """
+    """The rows of a table, and the full configurations by their ``config_hash``."""
     _, parquet = import_pyarrow()
     table = parquet.read_table(path)
     return table.to_pylist(), json.loads(table.schema.metadata[b"loam_gtsam.configs"])

@@ -1,7 +1,4 @@
-"""A run as a ROS bag with LOAM's topics, written frame by frame; ROS itself is not needed.
-
-What it holds is said in :mod:`loam_gtsam.ros.messages`.
-"""
+"""A run as a ROS bag with LOAM's topics (:mod:`loam_gtsam.ros.messages`), frame by frame."""
 
 from __future__ import annotations
 
@@ -32,10 +29,10 @@ counts them in, and ``rosbag reindex`` would then write over the first 8 bytes o
 
 
 class BagWriter(ClosingWriter):
-    """Writes a run into a new bag while it goes on.
+    """Writes a run into a new bag while the run goes on.
 
     Until it is closed the bag is called ``PATH.active``, as ``rosbag record`` has it. Leaving the
-    block closes it, after an error or Ctrl-C too: it then holds what was written until there.
+    block closes the bag, after an error or Ctrl-C too: it then holds all frames until there.
 
     Parameters
     ----------
@@ -141,50 +138,45 @@ class BagWriter(ClosingWriter):
 
     def _make_room(self, overwrite: bool) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        if self.path.exists() and not overwrite:
-            raise OutputError(
-                f"{self.path}: the bag exists; add overwrite=True (--overwrite) or choose another "
-                "name"
-            )
-        if self.path.is_dir() and not (self._kind == "" and _is_ros2_bag(self.path)):
-            raise OutputError(f"{self.path}: not a bag, so it is not replaced; choose another name")
-        if self._active.exists() and not overwrite:
-            raise OutputError(
-                f"{self._active}: a recording that was cut off, or is still going on; repair "
-                "it (rosbag reindex, ros2 bag reindex, mcap recover) or delete it"
-            )
-        if self._active.is_dir() and not _is_cut_off(self._active):
-            raise OutputError(
-                f"{self._active}: not a bag, so it is not replaced; choose another name"
-            )
+        existing = "the bag exists; add overwrite=True (--overwrite) or choose another name"
+        cut_off = (
+            "a recording that was cut off, or is still going on; repair it (rosbag reindex, ros2 "
+            "bag reindex, mcap recover) or delete it"
+        )
+        for path, problem, is_bag in (
+            (self.path, existing, lambda folder: self._kind == "" and _is_ros2_bag(folder)),
+            (self._active, cut_off, _is_cut_off),
+        ):
+            if path.exists() and not overwrite:
+                raise OutputError(f"{path}: {problem}")
+            if path.is_dir() and not is_bag(path):
+                raise OutputError(f"{path}: not a bag, so it is not replaced; choose another name")
         _remove(self._active)
 
     def _open(self) -> Any:
-        writer: Any
         if self._kind == ".bag":
-            writer = rosbag1.Writer(self._active)
-        else:
-            storage = rosbag2.StoragePlugin.MCAP if self._kind else rosbag2.StoragePlugin.SQLITE3
-            self._active.mkdir()
-            # The file inside gets the name of this folder.
-            writer = rosbag2.Writer(
-                self._active / self.path.stem, version=_ROS2_VERSION, storage_plugin=storage
-            )
+            bag: Any = rosbag1.Writer(self._active)
+            bag.open()
+            bag.bio.flush()
+            bag.bio.write(b" " * _pad_header(self._active))
+            return bag
+        storage = rosbag2.StoragePlugin.MCAP if self._kind else rosbag2.StoragePlugin.SQLITE3
+        self._active.mkdir()
+        folder = self._active / self.path.stem  # the file inside gets the name of this folder
+        writer = rosbag2.Writer(folder, version=_ROS2_VERSION, storage_plugin=storage)
         writer.open()
-        if self._kind == ".bag":
-            writer.bio.flush()
-            writer.bio.write(b" " * _pad_header(self._active))
         return writer
 
     def _give_name(self) -> None:
+        source = self._active
         if self._kind == ".bag":
             _pad_header(self._active)
-            os.replace(self._active, self.path)
         elif self._kind == ".mcap":
-            os.replace(self._active / self.path.stem / self.path.name, self.path)
+            source = self._active / self.path.stem / self.path.name
         else:
+            source = self._active / self.path.stem
             _remove(self.path)
-            os.replace(self._active / self.path.stem, self.path)
+        os.replace(source, self.path)
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
@@ -210,10 +202,9 @@ def _pad_header(bag: Path) -> int:
 
 
 def _is_ros2_bag(folder: Path) -> bool:
-    names = [entry.name for entry in folder.iterdir()]
-    return "metadata.yaml" in names and all(
-        Path(name).suffix in (".yaml", ".db3", ".mcap") for name in names
-    )
+    files = list(folder.iterdir())
+    known = all(path.suffix in (".yaml", ".db3", ".mcap") for path in files)
+    return known and folder / "metadata.yaml" in files
 
 
 def _is_cut_off(folder: Path) -> bool:

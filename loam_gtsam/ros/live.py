@@ -184,11 +184,10 @@ class LiveMapper:
             try:
                 checked_stamp(message)
                 stamp, values = decode_imu(message)
+                if not np.isfinite(values).all():
+                    raise DatasetError("NaN or infinity")
             except DatasetError as error:
                 self._log.fault(f"imu: {error}")
-                return
-            if not np.isfinite(values).all():
-                self._log.fault("imu: NaN or infinity")
                 return
             self._imu.add((stamp, values))
         self._news.set()

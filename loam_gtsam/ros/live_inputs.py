@@ -43,36 +43,16 @@ Row = tuple[int, tuple[float, ...]]
 
 @dataclass(frozen=True, slots=True)
 class ReadySweep:
-    """A decoded sweep.
-
-    Attributes
-    ----------
-    sweep : may be a bad one
-    received : nanoseconds of the clock
-    needs : until when the mapper asks the IMU about the sweep, nanoseconds of the stamps; None if
-        it never does
-    """
+    """A decoded sweep, good or bad, and when it was received, in nanoseconds of the clock."""
 
     sweep: Sweep
     received: int
     needs: int | None
+    """Until when the mapper asks the IMU about the sweep, nanoseconds of the stamps; None: never"""
 
 
 class SweepDecoder:
-    """Decodes clouds, or groups of LOAM's messages, as the readers of bags do.
-
-    Parameters
-    ----------
-    config : what the sensor is like, and what the IMU is asked
-    features : LOAM's topics, none for clouds
-    axes : of those
-    clouds : decodes the clouds
-
-    Raises
-    ------
-    ConfigError
-        If one of LOAM's three topics is missing, or ``axes`` is unknown.
-    """
+    """Decodes clouds, or groups of LOAM's messages (``features``), as the readers of bags do."""
 
     def __init__(
         self,
@@ -145,14 +125,9 @@ class SweepDecoder:
 class LiveImu:
     """Collects samples and puts them into an :class:`~loam_gtsam.imu.buffer.ImuBuffer`.
 
-    They are read as those of a bag: acceleration in g is converted, and quaternions that are not
-    of unit length are no orientation. A bag decides on the unit from all of its samples, this
-    class from those before the first sweep.
-
-    Parameters
-    ----------
-    config : section ``imu``
-    capacity : samples that may wait; None is no limit
+    The samples are read as those of a bag: acceleration in g is converted, and quaternions that are
+    not of unit length are no orientation. A bag decides on the unit from all of its samples, this
+    class from those before the first sweep. At most ``capacity`` samples wait; None is no limit.
 
     Attributes
     ----------
@@ -214,13 +189,7 @@ class LiveImu:
 
 
 def checked_stamp(message: Any) -> int:
-    """The header stamp in nanoseconds.
-
-    Raises
-    ------
-    DatasetError
-        If there is none, or no message of ROS 2 could say it.
-    """
+    """Header stamp, ns; DatasetError if there is none, or no message of ROS 2 could say it."""
     stamp = message_stamp(message)
     if not 0 <= stamp < 2**31 * 10**9:
         raise DatasetError(f"stamp of {stamp} ns: expected 0 to 2^31 s")

@@ -1,20 +1,13 @@
 """The ROS messages of a run, frame by frame, for a bag or a live node. ROS itself is not needed.
 
-| topic | type | when |
-|---|---|---|
-| ``/tf`` | ``tf2_msgs/TFMessage`` | every frame |
-| ``/aft_mapped_to_init`` | ``nav_msgs/Odometry`` | every frame |
-| ``/velodyne_cloud_registered`` | ``sensor_msgs/PointCloud2`` | every frame with a sweep |
-| ``/laser_cloud_surround`` | ``sensor_msgs/PointCloud2`` | every fifth frame |
-| ``/aft_mapped_path`` | ``nav_msgs/Path`` | whenever the path has grown by a tenth |
-
 Names, types and frames are those of LOAM (J. Zhang and S. Singh) and A-LOAM; the path is A-LOAM's.
 Axes are those of the map and of the lidar (x forward, y left, z up), as in A-LOAM.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import gtsam
@@ -38,7 +31,7 @@ TYPES = {
     SURROUND: "sensor_msgs/msg/PointCloud2",
     PATH: "nav_msgs/msg/Path",
 }
-"""Topic -> type of its messages."""
+"""Topic -> type of its messages; docs/bags_out.md says when each is due."""
 
 _PATH_STEP = 10
 """Poses by which the path grows at least before it is written again; later a tenth of its length,
@@ -125,12 +118,8 @@ class FrameMessages:
         """Topic and message, the pose first; each is made when its turn comes.
 
         A frame with a bad stamp has none. One whose messages are not all asked for does not count.
-
-        Parameters
-        ----------
-        update : of the frame
-        cloud : gives the de-skewed points of the sweep, in the map frame
-        surround : gives the map points around the sensor; called when they are due
+        ``cloud`` and ``surround`` give the points that ``BagWriter.write`` takes; each is called
+        when its message is due.
 
         Raises
         ------
@@ -158,7 +147,7 @@ class FrameMessages:
         """The whole path, if it has grown since it was last made."""
         if len(self._poses) > self._path_length:
             self._path_length = len(self._poses)
-            yield PATH, self._path(self._poses)
+            yield PATH, self._path()
 
     def _odometry(self, update: MapUpdate) -> bytes:
         """The pose, and the twist in the lidar's own axes."""
@@ -197,28 +186,21 @@ class FrameMessages:
         )
         return self._serialised(TF, transforms=[stamped])
 
-    def _path(self, poses: Sequence[tuple[int, gtsam.Pose3]]) -> bytes:
-        """One pose at least; the stamp of the path is that of its last pose."""
-        stamped = [
-            self._make(
-                "geometry_msgs/msg/PoseStamped", header=self._header(stamp), pose=self._pose(pose)
-            )
-            for stamp, pose in poses
+    def _path(self) -> bytes:
+        """All poses, one at least; the stamp of the path is that of its last pose."""
+        stamped = partial(self._make, "geometry_msgs/msg/PoseStamped")
+        poses = [
+            stamped(header=self._header(at), pose=self._pose(pose)) for at, pose in self._poses
         ]
-        return self._serialised(PATH, header=self._header(poses[-1][0]), poses=stamped)
+        return self._serialised(PATH, header=poses[-1].header, poses=poses)
 
     def _cloud(self, stamp: int, points_map: Points) -> bytes:
         """float32 fields x, y, z, intensity."""
         check_array(points_map, "points_map", ("N", len(_FIELDS)))
         rows = np.ascontiguousarray(points_map, dtype="<f4")
         step = rows.itemsize * len(_FIELDS)
-        fields = [
-            self._make(
-                "sensor_msgs/msg/PointField",
-                name=name, offset=number * rows.itemsize, datatype=_FLOAT32, count=1,
-            )
-            for number, name in enumerate(_FIELDS)
-        ]  # fmt: skip
+        field = partial(self._make, "sensor_msgs/msg/PointField", datatype=_FLOAT32, count=1)
+        fields = [field(name=n, offset=i * rows.itemsize) for i, n in enumerate(_FIELDS)]
         return self._serialised(
             REGISTERED,
             header=self._header(stamp),

@@ -183,13 +183,7 @@ class LiveNode:
 
 
 def config_of(values: Mapping[str, Any]) -> Config:
-    """The configuration that the parameters of a node ask for.
-
-    Raises
-    ------
-    ConfigError
-        If they are wrong.
-    """
+    """The configuration that the parameters of a node ask for; ConfigError if they are wrong."""
     if values["config"] and values["preset"] != "default":
         raise ConfigError("give preset or config, not both; a file names its preset itself")
     config = load_config(values["config"]) if values["config"] else preset(values["preset"])
@@ -200,15 +194,7 @@ def config_of(values: Mapping[str, Any]) -> Config:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Run the node until it is interrupted.
-
-    Raises
-    ------
-    ImportError
-        If there is no ROS 2.
-    LoamError
-        If a parameter is wrong.
-    """
+    """Run the node until it is interrupted; LoamError if a parameter is wrong."""
     try:
         import rclpy
         from rclpy.executors import ExternalShutdownException

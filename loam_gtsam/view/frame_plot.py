@@ -12,14 +12,14 @@ from loam_gtsam.view.frame_view import LARGE_RESIDUAL, RESIDUAL_COLOURS, FrameVi
 from loam_gtsam.view.plots import INK, PATH, empty_figure, save_figure
 
 _REACH = (6.0, 50.0)
-"""Metres around the sensor that are drawn, at least and at most; between, so far as ..."""
+"""Metres around the sensor that are drawn, at least and at most."""
 _SHARE = 0.88
-"""... this share of the sweep is."""
+"""Share of the sweep that is drawn, where that is between these limits."""
 _ASIDE_DEG, _ABOVE_DEG = 28.0, 33.0
-"""From where it is looked at: aside of the sensor's back, and above the ground."""
+"""Direction of the view: aside of the sensor's back, and above the ground."""
 _MAP, _SWEEP = "#b9c3cc", "#6b7a88"
 _ENLARGED = 10.0
-"""Times as large as they are residuals and the ellipse of the covariance are drawn."""
+"""Factor by which residuals and the ellipse of the covariance are enlarged."""
 _SIGMAS = 3.0
 
 
@@ -30,7 +30,7 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     ----------
     path : of the PNG file
     frame : to be drawn
-    around : the map around it, and the way it came
+    around : the map around the frame, and the path of the sensor
 
     Raises
     ------
@@ -55,12 +55,13 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
         "clim": (0.0, LARGE_RESIDUAL),
     }
     ends = points + _ENLARGED * (feet - points)
-    axes.add_collection(LineCollection([*camera.segments(points, ends)], lw=0.9, **scale))
+    lines = np.stack([camera(points), camera(ends)], axis=1)
+    axes.add_collection(LineCollection([*lines], lw=0.9, **scale))
     dots = axes.scatter(*camera(points).T, s=9.0, lw=0)
     dots.set(**scale)
-    way = camera(camera.near(around.path))
-    axes.plot(*way.T, color="white", lw=3.5)
-    axes.plot(*way.T, color=PATH, lw=2.0)
+    path_seen = camera(camera.near(around.path)).T
+    axes.plot(*path_seen, color="white", lw=3.5)
+    axes.plot(*path_seen, color=PATH, lw=2.0)
     axes.fill(*camera.ellipse(frame.position_covariance).T, color=INK, lw=0)
     axes.plot(0.0, 0.0, "o", color=PATH, mec="white", ms=8)
     bar = figure.colorbar(
@@ -97,10 +98,6 @@ class _Camera:
         """(N, 2) metres to the right of the sensor and upwards."""
         across: FloatArray = (points - self._centre) @ self._axes.T
         return across
-
-    def segments(self, starts: FloatArray, ends: FloatArray) -> FloatArray:
-        """(N, 2, 2) lines."""
-        return np.stack([self(starts), self(ends)], axis=1)
 
     def ellipse(self, covariance: FloatArray) -> FloatArray:
         """(N, 2) outline of 3 sigma, enlarged, around the sensor; empty if it is not known."""

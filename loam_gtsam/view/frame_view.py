@@ -1,4 +1,4 @@
-"""What there is to see of a frame: taken by the live viewer and by the pictures."""
+"""What there is to see of a frame, for the live viewer and the pictures."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ RESIDUAL_COLOURS = ("#2166ac", "#4fb3a9", "#f2cf4a", "#ee8a34", "#c2222f")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameView:
-    """One frame of a run. Everything is in ``map``, corrected by the loops if there are any.
+    """One frame of a run. All points are in ``map``, corrected by the loops if there are any.
 
     Attributes
     ----------
     number : of the frame, from 0
     update : what the mapper says about it
-    map_T_lidar : (4, 4) its pose
+    map_T_lidar : (4, 4) pose of the frame
     position_covariance : (3, 3) m^2 of the position, along the axes of the map; NaN where the
         frame was not solved
     sweep : (N, 3) metres, de-skewed
-    edges, planes : (E, 3) and (P, 3) metres, the features as they went into the map; empty where
+    edges, planes : (E, 3) and (P, 3) metres, the features as they went into the map; empty if
         they did not
     points : (M, 3) metres, the matched features, those of edges first
     feet : (M, 3) metres, the nearest point on the line or plane that each was matched with

@@ -124,9 +124,7 @@ def plot_errors(path: str | Path, stamps: IntArray, errors: FloatArray) -> None:
 
 
 def plot_loops(
-    path: str | Path,
-    panels: Mapping[str, tuple[FloatArray, FloatArray]],
-    loops: FloatArray,
+    path: str | Path, panels: Mapping[str, tuple[FloatArray, FloatArray]], loops: FloatArray
 ) -> None:
     """Draw maps of one run beside each other from above, e.g. without loops and with them.
 

@@ -1,20 +1,6 @@
 """A run in the Rerun viewer: live in a window, or saved as an ``.rrd`` file. ``viewer`` extra.
 
-| entity | what |
-|---|---|
-| ``map/surroundings/edges``, ``/planes`` | map points of the cubes around the sensor * |
-| ``map/trajectory`` | where the sensor was * |
-| ``map/loops/used``, ``/switched_off`` | from keyframe to keyframe * |
-| ``map/lidar`` | pose |
-| ``map/covariance`` | ellipsoid of 3 sigma of the position, enlarged |
-| ``map/sweep`` | all points, de-skewed |
-| ``map/features/edges``, ``/planes`` | what was picked of them |
-| ``map/matches/points`` | matched features, coloured by their residuals |
-| ``map/matches/residuals`` | from there to the line or plane, enlarged |
-| ``frame/...`` | numbers over time, and messages |
-
-Those with * are drawn every tenth frame and at the end, the others every frame.
-Time lines are ``frame``, the number, and ``stamp``.
+docs/seeing.md lists the entities. Time lines are ``frame``, the number, and ``stamp``.
 """
 
 from __future__ import annotations
@@ -155,34 +141,31 @@ class RerunViewer(ClosingWriter):
         rr, pose = self._rr, frame.map_T_lidar
         self._log("map/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         self._log("map/covariance", self._ellipsoid(pose[:3, 3], frame.position_covariance))
-        self._log("map/sweep", self._points(_thinned(frame.sweep, self._most_sweep), _SWEEP, 1.5))
-        self._log("map/features/edges", self._points(frame.edges, _EDGE, 2.0))
-        self._log("map/features/planes", self._points(frame.planes, _PLANE, 2.0))
+        sweep = _thinned(frame.sweep, self._most_sweep)
+        self._draw("map/sweep", rr.Points3D, sweep, _SWEEP, 0.75)
+        self._draw("map/features/edges", rr.Points3D, frame.edges, _EDGE, 1.0)
+        self._draw("map/features/planes", rr.Points3D, frame.planes, _PLANE, 1.0)
         colours = residual_colours(frame.residuals)
         ends = frame.points + self._exaggerate * (frame.feet - frame.points)
         lines = np.stack([frame.points, ends], axis=1)
-        self._log("map/matches/points", self._points(frame.points, colours, 3.0))
-        self._log("map/matches/residuals", self._lines(lines, colours, 1.0))
+        self._draw("map/matches/points", rr.Points3D, frame.points, colours, 1.5)
+        self._draw("map/matches/residuals", rr.LineStrips3D, lines, colours, 1.0)
 
     def _draw_map(self) -> None:
         """The last view of the map, if it has not been drawn."""
         if self._around is None:
             return
-        view, self._around = self._around(), None
+        rr, view, self._around = self._rr, self._around(), None
         total = max(len(view.edges) + len(view.planes), 1)
-        for name, points, colour in (
-            ("edges", view.edges, _MAP_EDGE),
-            ("planes", view.planes, _MAP_PLANE),
-        ):
+        surroundings = ("edges", view.edges, _MAP_EDGE), ("planes", view.planes, _MAP_PLANE)
+        for name, points, colour in surroundings:
             some = _thinned(points, self._most_map * len(points) // total)
-            self._log(f"map/surroundings/{name}", self._points(some, colour, 1.0))
+            self._draw(f"map/surroundings/{name}", rr.Points3D, some, colour, 0.5)
         path = [_thinned(view.path, _MOST_PATH)]
-        self._log("map/trajectory", self._lines(path, _PATH, 2.0))
-        for name, on, colour in (
-            ("used", view.loops_on, _LOOP_ON),
-            ("switched_off", ~view.loops_on, _LOOP_OFF),
-        ):
-            self._log(f"map/loops/{name}", self._lines(view.loops[on], colour, 1.5))
+        self._draw("map/trajectory", rr.LineStrips3D, path, _PATH, 2.0)
+        used, unused = view.loops[view.loops_on], view.loops[~view.loops_on]
+        self._draw("map/loops/used", rr.LineStrips3D, used, _LOOP_ON, 1.5)
+        self._draw("map/loops/switched_off", rr.LineStrips3D, unused, _LOOP_OFF, 1.5)
 
     def _plot(self, frame: FrameView) -> None:
         """Numbers over time, and what went wrong in words."""
@@ -216,19 +199,10 @@ class RerunViewer(ClosingWriter):
             colors=[_ELLIPSOID],
         )
 
-    def _points(self, points: FloatArray, colours: Any, size: float) -> Any:
-        """Points of one colour or of one each, of a size on the screen."""
+    def _draw(self, entity: str, kind: Any, shapes: Any, colours: Any, radius: float) -> None:
+        """Points or lines of one colour or of one each, of a size on the screen."""
         colours = [colours] if isinstance(colours, tuple) else colours
-        return self._rr.Points3D(
-            points, colors=colours, radii=self._rr.Radius.ui_points(0.5 * size)
-        )
-
-    def _lines(self, strips: Any, colours: Any, radius: float) -> Any:
-        """Lines of one colour or of one each, of a width on the screen."""
-        colours = [colours] if isinstance(colours, tuple) else colours
-        return self._rr.LineStrips3D(
-            strips, colors=colours, radii=self._rr.Radius.ui_points(radius)
-        )
+        self._log(entity, kind(shapes, colors=colours, radii=self._rr.Radius.ui_points(radius)))
 
     def _log(self, entity: str, what: Any, *, static: bool = False) -> None:
         for stream in self._streams:
@@ -281,24 +255,20 @@ def _check_screen() -> None:
 
 def _blueprint() -> Any:
     """The layout in which the viewer opens."""
-    from rerun import blueprint
+    from rerun import blueprint as bp
 
-    plots = [
-        blueprint.TimeSeriesView(origin=f"frame/{name}", name=title)
-        for name, title in (
-            ("matches", "Matches"),
-            ("residual", "Median residual [sigma]"),
-            ("sigma_mm", "Sigma of the position [mm]"),
-            ("milliseconds", "Time of the frame [ms]"),
-        )
-    ]
-    eye = blueprint.EyeControls3D(tracking_entity="map/lidar")
-    return blueprint.Blueprint(
-        blueprint.Horizontal(
-            blueprint.Spatial3DView(origin="map", name="Map", eye_controls=eye),
-            blueprint.Vertical(*plots, blueprint.TextLogView(origin="frame/messages")),
-            column_shares=[3, 1],
-        ),
-        blueprint.TimePanel(timeline="frame", state="collapsed"),
+    titles = {
+        "matches": "Matches",
+        "residual": "Median residual [sigma]",
+        "sigma_mm": "Sigma of the position [mm]",
+        "milliseconds": "Time of the frame [ms]",
+    }
+    plots = [bp.TimeSeriesView(origin=f"frame/{name}", name=titles[name]) for name in titles]
+    eye = bp.EyeControls3D(tracking_entity="map/lidar")
+    scene = bp.Spatial3DView(origin="map", name="Map", eye_controls=eye)
+    panel = bp.Vertical(*plots, bp.TextLogView(origin="frame/messages"))
+    return bp.Blueprint(
+        bp.Horizontal(scene, panel, column_shares=[3, 1]),
+        bp.TimePanel(timeline="frame", state="collapsed"),
         collapse_panels=True,
     )

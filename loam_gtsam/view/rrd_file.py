@@ -25,16 +25,7 @@ _PATIENCE = 60.0
 
 
 class RrdFile:
-    """Copies what is written to :attr:`sink` into a file, in a thread.
-
-    Parameters
-    ----------
-    path : of the file
-    overwrite : replace an earlier file
-
-    Attributes
-    ----------
-    sink : the path to write to; whoever opens it must have done so before :meth:`opened`
+    """Copies what is written to the path :attr:`sink` into a file, in a thread.
 
     Raises
     ------
@@ -50,12 +41,12 @@ class RrdFile:
             raise OutputError(
                 f"{path}: the file exists; add overwrite=True (--overwrite) or choose another name"
             )
+        self._problem: OSError | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             file = open(path, "wb", buffering=0)  # noqa: SIM115 - the thread closes it
         except OSError as error:
             raise self._unwritable(error) from error
-        self._problem: OSError | None = None
         source, self._write_end = os.pipe()
         self.sink = f"/dev/fd/{self._write_end}"
 
@@ -73,7 +64,7 @@ class RrdFile:
         self._thread.start()
 
     def opened(self) -> None:
-        """The other side has opened :attr:`sink`: when it closes that, the file ends."""
+        """Rerun has opened :attr:`sink`: when it closes that, the file ends."""
         os.close(self._write_end)
 
     def check(self) -> None:

@@ -11,7 +11,6 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise
 from typing import Any, Literal
 
@@ -52,11 +51,11 @@ class LiveResult:
     published: int
 
     @property
-    def seconds(self) -> tuple[float, float, float, float]:
+    def seconds(self) -> tuple[float, ...]:
         """Waiting, mapping, publishing, and all of it."""
         moments = (self.received, self.started, self.mapped, self.published)
-        waiting, mapping, publishing = ((end - start) * 1e-9 for start, end in pairwise(moments))
-        return waiting, mapping, publishing, (self.published - self.received) * 1e-9
+        steps = [end - start for start, end in pairwise(moments)]
+        return tuple(step * 1e-9 for step in (*steps, self.published - self.received))
 
 
 class LiveMapper:
@@ -114,11 +113,9 @@ class LiveMapper:
         self._imu: LiveImu | None = None
         if imu and config.imu.enabled:
             self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
-        # fmt: off
-        self._new_pipeline = partial(Pipeline, config, solver=solver, odometry=odometry,
-                                     extra_factors=extra_factors, loop_closer=loop_closer)
-        # fmt: on
-        self.pipeline = self._new_pipeline(imu=None if self._imu is None else self._imu.buffer)
+        own = {"extra_factors": extra_factors, "loop_closer": loop_closer}
+        self._parts: dict[str, Any] = {"solver": solver, "odometry": odometry} | own
+        self._begin()
         self._matcher = StampMatcher(features)
         self._features = frozenset(features)
         self._observe, self._clock = observe, clock
@@ -129,7 +126,6 @@ class LiveMapper:
         self._queue: deque[tuple[int, Any]] = deque()
         # Below: of the thread that maps.
         self._current: ReadySweep | None = None
-        self._no_level = False
 
     # -- from any thread ---------------------------------------------------------------------------
 
@@ -235,8 +231,7 @@ class LiveMapper:
         self.pipeline.reset()  # parts of the user's own forget too
         if self._imu is not None:
             self._imu.forget()
-        self.pipeline = self._new_pipeline(imu=None if self._imu is None else self._imu.buffer)
-        self._no_level = False
+        self._begin()
 
     def wait(self, seconds: float) -> None:
         """Wait until a message comes, but not longer than this."""
@@ -247,6 +242,11 @@ class LiveMapper:
         while not stop.is_set():
             if self.step() is None:
                 self.wait(_POLL)
+
+    def _begin(self) -> None:
+        buffer = None if self._imu is None else self._imu.buffer
+        self.pipeline = Pipeline(self._config, imu=buffer, **self._parts)
+        self._no_level = False
 
     def _enqueue(self, received: int, content: Any) -> None:
         live, queue = self._config.live, self._queue

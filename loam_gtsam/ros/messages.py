@@ -152,45 +152,34 @@ class FrameMessages:
     def _odometry(self, update: MapUpdate) -> bytes:
         """The pose, and the twist in the lidar's own axes."""
         pose, (turn, velocity) = update.map_T_lidar, np.split(update.twist, 2)
-        twist = self._make(
-            "geometry_msgs/msg/Twist",
-            linear=self._xyz("Vector3", velocity),
-            angular=self._xyz("Vector3", turn),
-        )
+        linear, angular = self._xyz("Vector3", velocity), self._xyz("Vector3", turn)
+        twist = self._geometry("Twist", linear=linear, angular=angular)
+        covariance = ros_covariance(update.covariance, pose)
         return self._serialised(
             ODOMETRY,
             header=self._header(update.stamp),
             child_frame_id=self._config.lidar_frame,
-            pose=self._make(
-                "geometry_msgs/msg/PoseWithCovariance",
-                pose=self._pose(pose),
-                covariance=ros_covariance(update.covariance, pose),
-            ),
-            twist=self._make(
-                "geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=_UNKNOWN
-            ),
+            pose=self._geometry("PoseWithCovariance", pose=self._pose(pose), covariance=covariance),
+            twist=self._geometry("TwistWithCovariance", twist=twist, covariance=_UNKNOWN),
         )
 
     def _transform(self, update: MapUpdate) -> bytes:
         """The one transform from the lidar's frame to the map's."""
-        pose = update.map_T_lidar
-        stamped = self._make(
-            "geometry_msgs/msg/TransformStamped",
+        position = self._xyz("Vector3", update.map_T_lidar.translation())
+        turn = self._quaternion(update.map_T_lidar)
+        stamped = self._geometry(
+            "TransformStamped",
             header=self._header(update.stamp),
             child_frame_id=self._config.lidar_frame,
-            transform=self._make(
-                "geometry_msgs/msg/Transform",
-                translation=self._xyz("Vector3", pose.translation()),
-                rotation=self._quaternion(pose),
-            ),
+            transform=self._geometry("Transform", translation=position, rotation=turn),
         )
         return self._serialised(TF, transforms=[stamped])
 
     def _path(self) -> bytes:
         """All poses, one at least; the stamp of the path is that of its last pose."""
-        stamped = partial(self._make, "geometry_msgs/msg/PoseStamped")
         poses = [
-            stamped(header=self._header(at), pose=self._pose(pose)) for at, pose in self._poses
+            self._geometry("PoseStamped", header=self._header(stamp), pose=self._pose(pose))
+            for stamp, pose in self._poses
         ]
         return self._serialised(PATH, header=poses[-1].header, poses=poses)
 
@@ -217,6 +206,9 @@ class FrameMessages:
     def _make(self, name: str, /, **values: Any) -> Any:
         return self.store.types[name](**values)
 
+    def _geometry(self, name: str, /, **values: Any) -> Any:
+        return self._make(f"geometry_msgs/msg/{name}", **values)
+
     def _serialised(self, topic: str, **values: Any) -> bytes:
         name = TYPES[topic]
         serialise = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
@@ -236,16 +228,13 @@ class FrameMessages:
         return self._make("std_msgs/msg/Header", **counter, stamp=time, frame_id=frame)
 
     def _pose(self, pose: gtsam.Pose3) -> Any:
-        return self._make(
-            "geometry_msgs/msg/Pose",
-            position=self._xyz("Point", pose.translation()),
-            orientation=self._quaternion(pose),
-        )
+        position, turn = self._xyz("Point", pose.translation()), self._quaternion(pose)
+        return self._geometry("Pose", position=position, orientation=turn)
 
     def _xyz(self, name: str, values: NDArray[np.floating]) -> Any:
         x, y, z = values.tolist()
-        return self._make(f"geometry_msgs/msg/{name}", x=x, y=y, z=z)
+        return self._geometry(name, x=x, y=y, z=z)
 
     def _quaternion(self, pose: gtsam.Pose3) -> Any:
         q: Any = pose.rotation().toQuaternion()
-        return self._make("geometry_msgs/msg/Quaternion", x=q.x(), y=q.y(), z=q.z(), w=q.w())
+        return self._geometry("Quaternion", x=q.x(), y=q.y(), z=q.z(), w=q.w())

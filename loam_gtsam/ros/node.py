@@ -116,10 +116,7 @@ class LiveNode:
     def stop(self) -> None:
         """End the thread between two sweeps, and write the run if there is a folder for it.
 
-        Raises
-        ------
-        Exception
-            What ended the thread earlier.
+        The error that ended the thread earlier, if any, is raised again.
         """
         self._stop.set()
         self._thread.join()

@@ -26,12 +26,6 @@ _SIGMAS = 3.0
 def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     """Draw a frame from behind and above: map, sweep, and matches by their residuals.
 
-    Parameters
-    ----------
-    path : of the PNG file
-    frame : to be drawn
-    around : the map around the frame, and the path of the sensor
-
     Raises
     ------
     OutputError

@@ -110,15 +110,7 @@ class LastFrame:
 
 
 def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> FrameView:
-    """A frame that a pipeline has just processed.
-
-    Parameters
-    ----------
-    number : of the frame
-    sweep : as it was processed
-    update : the result
-    pipeline : as it is right after that frame
-    """
+    """The frame that a pipeline has just processed, its number, sweep and result."""
     map_T_odom = _correction(pipeline)
     map_T_lidar = map_T_odom @ update.map_T_lidar.matrix()
     cloud = registered_cloud(sweep, update, pipeline.mapper)
@@ -149,11 +141,8 @@ def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline)
 def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) -> MapView:
     """The map around the sensor, the path of the sensor, and the loops.
 
-    Parameters
-    ----------
-    update : of the last frame
-    pipeline : as it is right after that frame
-    path : (3,) positions of all frames so far, in the frame of the mapper
+    ``update`` is that of the frame that the pipeline has just processed, and ``path`` has the (3,)
+    positions of all frames so far, in the frame of the mapper.
     """
     map_T_odom = _correction(pipeline)
     cloud = surrounding_cloud(update, pipeline.mapper)
@@ -193,11 +182,7 @@ def matched_points(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray
 def registered_cloud(sweep: Sweep, update: MapUpdate, mapper: Mapper) -> FloatArray | None:
     """All usable points of a sweep, de-skewed with its final motion, in the map frame.
 
-    Parameters
-    ----------
-    sweep : as it was processed
-    update : the result
-    mapper : that made it; the sensor and the de-skew are read as it does
+    The sensor and the de-skew are read as the mapper does, which made ``update`` of the sweep.
 
     Returns
     -------

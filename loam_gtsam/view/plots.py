@@ -148,12 +148,7 @@ def plot_loops(
 
 
 def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
-    """Draw the time per stage over the frames, stacked.
-
-    Parameters
-    ----------
-    updates : of a run
-    """
+    """Draw the time per stage over the frames of a run, stacked."""
     figure = empty_figure(9.0, 4.0)
     axes = figure.subplots()
     names, seconds = stage_seconds(updates)

@@ -117,10 +117,7 @@ class RerunViewer(ClosingWriter):
     def close(self) -> None:
         """Show the map as it is in the end, and close the file. Calling it again does nothing.
 
-        Raises
-        ------
-        OutputError
-            If the file could not be written.
+        OutputError is raised if the file could not be written.
         """
         if not self._streams:
             return
@@ -192,11 +189,9 @@ class RerunViewer(ClosingWriter):
         variances, axes = np.linalg.eigh(covariance)
         axes[:, 0] *= np.sign(np.linalg.det(axes))  # a rotation, no mirror image
         half = _SIGMAS * self._exaggerate * np.sqrt(np.maximum(variances, 0.0))
+        turn = Rotation.from_matrix(axes).as_quat()
         return self._rr.Ellipsoids3D(
-            centers=[centre],
-            half_sizes=[half],
-            quaternions=[Rotation.from_matrix(axes).as_quat()],
-            colors=[_ELLIPSOID],
+            centers=[centre], half_sizes=[half], quaternions=[turn], colors=[_ELLIPSOID]
         )
 
     def _draw(self, entity: str, kind: Any, shapes: Any, colours: Any, radius: float) -> None:

@@ -42,7 +42,6 @@ from loam_gtsam.config import (
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.bags.bag_reader import Message
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
-from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.pipeline import Pipeline, RunResult, imu_buffer, run

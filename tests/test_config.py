@@ -23,7 +23,7 @@ from loam_gtsam.config import (
     parse_config,
     preset,
 )
-from loam_gtsam.types import ConfigError, LoamError
+from loam_gtsam.types import ConfigError
 
 FIELDS = [
     (type(section.default), name, field)
@@ -32,10 +32,11 @@ FIELDS = [
 ]
 
 
-def bounds(hint, metadata):
+def bounds(field):
     """(low, high) of a number, or of the entries of a tuple; None where it has none."""
-    if typing.get_origin(hint) is tuple:
-        metadata = typing.get_args(hint)[0].__metadata__
+    metadata = field.metadata
+    if typing.get_origin(field.annotation) is tuple:
+        metadata = typing.get_args(field.annotation)[0].__metadata__
     low = next((item.ge for item in metadata if hasattr(item, "ge")), None)
     high = next((item.le for item in metadata if hasattr(item, "le")), None)
     return low, None if high == 2**63 - 1 else high
@@ -48,7 +49,7 @@ def name_of(value):
 BOUNDS = [
     (owner, name, limit, beyond)
     for owner, name, field in FIELDS
-    for limit, beyond in zip(bounds(field.annotation, field.metadata), (-1, 1), strict=True)
+    for limit, beyond in zip(bounds(field), (-1, 1), strict=True)
     if limit is not None
 ]
 
@@ -104,26 +105,21 @@ def test_the_description_of_every_parameter_is_made_of_whole_sentences(owner, na
         assert sentence.split()[-1].strip(".,;") not in ("and", "or", "of", "the", "than", "to")
 
 
-def test_an_empty_file_is_the_default_and_absent_keys_keep_it(tmp_path):
+def test_absent_keys_keep_the_default_an_integer_serves_as_a_float_and_null_as_none(tmp_path):
     assert parse_config("") == parse_config("# only a comment\n") == Config()
     file = tmp_path / "some.yaml"
-    file.write_text("solver: {iterations: 3}\nmap:\n  window: [9, 9, 5]\n")
+    file.write_text(
+        "solver: {iterations: 3}\nmap: {window: [9, 9, 5], cube_size: 40, archive_dir: null}"
+    )
     config = load_config(file)
     assert config.solver == SolverConfig(iterations=3)
-    assert config.map == MapConfig(window=(9, 9, 5))
+    assert config.map == MapConfig(window=(9, 9, 5), cube_size=40.0)
+    assert isinstance(config.map.cube_size, float)
     assert config.matching == MatchingConfig()
 
 
-def test_an_integer_serves_as_a_float_and_null_as_none():
-    config = parse_config("map: {cube_size: 40, archive_dir: null}")
-    assert config.map.cube_size == 40.0
-    assert isinstance(config.map.cube_size, float)
-    assert config.map.archive_dir is None
-
-
 def test_the_tree_is_frozen():
-    for section in (Config(), Config().solver):
-        name = next(iter(type(section).model_fields))
+    for section, name in ((Config(), "solver"), (Config().solver, "iterations")):
         with pytest.raises(ValueError, match="frozen"):
             setattr(section, name, getattr(section, name))
 
@@ -135,29 +131,22 @@ def test_the_tree_is_frozen():
     ("text", "words"),
     [
         ("solver:\n  iterationz: 3", ("here.yaml:2", "solver.iterationz", "'iterations'")),
-        ("\nsolvr: {}", ("here.yaml:2: solvr: unknown key", "'solver'")),
-        ("qqq: 1", ("here.yaml:1: qqq: unknown key", "known:", "matching")),
+        ("\nsolvr: {}", ("here.yaml:2: solvr: unknown key", "'solver'", "known:", "matching")),
         ("map:\n  cube_size: wide", ("here.yaml:2", "map.cube_size", "expected float", "'wide'")),
         ("solver:\n\n  iterations: 2.5", ("here.yaml:3", "expected int", "2.5")),
         ("solver: {iterations: true}", ("expected int", "True")),
-        ("map: {cube_size: true}", ("expected float", "True")),
         ("map: {field_of_view: 1}", ("expected bool", "1")),
         ("map: {archive_dir: 3}", ("map.archive_dir", "expected str", "3")),
-        ("map: {cube_size: null}", ("expected float", "None")),
         ("map: {cube_size: .nan}", ("map.cube_size", "at least 1.0", "nan")),
-        ("sensor: {start_azimuth_deg: .nan}", ("start_azimuth_deg", "nan")),
         ("map: {window: [9, 9]}", ("map.window", "expected 3 values")),
         ("map: {window: 9}", ("map.window", "expected 3 values", "9")),
-        ("map: {window: [9, 9, 5.5]}", ("map.window", "expected int", "5.5")),
         ("map: {window: [9, 9, 0]}", ("map.window", "at least 1", "0")),
         ("sensor: {model: vlp17}", ("sensor.model", "expected one of", "did you mean 'vlp16'")),
         ("sensor: {model: [vlp16]}", ("sensor.model", "expected one of")),
         ("solver: 3", ("here.yaml:1: solver: expected a mapping", "3")),
-        ("solver:", ("solver: expected a mapping", "None")),
-        ("preset: defualt", ("here.yaml:1", "unknown preset 'defualt'", "'default'")),
+        ("preset: defualt", ("here.yaml:1", "preset 'defualt'; did you mean 'default'")),
         ("preset: [default]", ("unknown preset",)),
         ("- solver", ("expected a mapping", "here.yaml")),
-        ("just words", ("expected a mapping", "here.yaml")),
         ("solver: [unclosed", ("here.yaml", "not valid YAML")),
         ("solver: {}\nsolver: {}", ("here.yaml", "not valid YAML", "duplicate")),
         ("a: \0", ("here.yaml", "not valid YAML")),
@@ -168,9 +157,6 @@ def test_the_tree_is_frozen():
         ("imu: &a [*a]", ("here.yaml:1: imu: expected a mapping",)),
         ("? [a, b]\n: 3", ("here.yaml:1", "unknown key")),
         ("1: 2", ("here.yaml:1", "unknown key")),
-        ("imu: {lidar_R_imu_deg: [0, 90]}", ("imu.lidar_R_imu_deg", "expected 3 values")),
-        ("imu: {lidar_t_imu: 0.1}", ("imu.lidar_t_imu", "expected 3 values")),
-        ("imu: {weight: 1.0}", ("imu.weight", "at most 0.999")),
         ("deskew: {rotation: gyro}", ("deskew.rotation", "auto, orientation, constant_velocity")),
     ],
 )
@@ -184,15 +170,9 @@ def test_a_wrong_file_is_refused_with_key_and_line(text, words):
 @pytest.mark.parametrize("place", ["map: {0}", "map: {{archive_dir: {0}}}", "preset: {0}"])
 def test_aliases_that_multiply_do_not_make_an_endless_message(place):
     laughs = "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 60))
-    text = place.format("&z [*a59]") + "\nloops: {enabled: &b [1]}\n"
+    data = YAML().load(f"a0: &a0 [x, x]\n{laughs}{place.format('&z [*a59]')}\n")
     with pytest.raises(ConfigError) as caught:
-        config_from_dict(
-            {
-                key: value
-                for key, value in YAML().load(f"a0: &a0 [x, x]\n{laughs}{text}").items()
-                if key in ("map", "preset")
-            }
-        )
+        config_from_dict({key: data[key] for key in ("map", "preset") if key in data})
     assert len(str(caught.value)) < 1000
 
 
@@ -222,17 +202,18 @@ def test_every_bound_accepts_itself_and_refuses_what_lies_beyond(owner, name, li
         owner(**{name: beyond})
 
 
-def test_a_constructor_refuses_too():
-    with pytest.raises(ConfigError, match=r"SolverConfig\.iterations: expected int"):
-        SolverConfig(iterations=True)
-    with pytest.raises(ConfigError, match=r"MapConfig\.window: expected 3 values"):
-        MapConfig(window=(1, 2))
-    with pytest.raises(
-        ConfigError, match=r"Config\.solver: SolverConfig\.iterations: expected int"
-    ):
-        Config(solver={"iterations": 2.5})
-    with pytest.raises(ConfigError, match=r"SolverConfig\.iteration: unknown key; did you mean"):
-        SolverConfig(iteration=5)
+@pytest.mark.parametrize(
+    ("section", "values", "message"),
+    [
+        (SolverConfig, {"iterations": True}, r"SolverConfig\.iterations: expected int"),
+        (MapConfig, {"window": (1, 2)}, r"MapConfig\.window: expected 3 values"),
+        (Config, {"solver": {"iterations": 2.5}}, r"Config\.solver: SolverConfig\.iterations: exp"),
+        (SolverConfig, {"iteration": 5}, r"SolverConfig\.iteration: unknown key; did you mean"),
+    ],
+)
+def test_a_constructor_refuses_too(section, values, message):
+    with pytest.raises(ConfigError, match=message):
+        section(**values)
 
 
 PAIRS = [(owner, *pair) for owner in dict.fromkeys(f[0] for f in FIELDS) for pair in owner.in_order]
@@ -248,7 +229,6 @@ def test_a_lower_limit_may_not_exceed_the_upper_one(owner, lower, upper):
 
 
 def test_a_file_with_limits_in_the_wrong_order_is_refused_at_the_line_of_the_limit():
-    assert PAIRS
     with pytest.raises(ConfigError, match=r"x\.yaml:3: sensor\.min_range: .* 50\.0 and 1\.0"):
         parse_config("sensor:\n  rings: auto\n  min_range: 50\n  max_range: 1", "x.yaml")
     with pytest.raises(ConfigError, match=r"x\.yaml:2: sensor\.max_range: .* 0\.5 and 0\.1"):
@@ -286,7 +266,6 @@ def test_values_change_by_text_mapping_or_section_all_at_once():
     ("change", "words"),
     [
         ("solver.iterations=2.5", ("test: solver.iterations: expected int, got 2.5",)),
-        ({"solver.iterations": True}, ("solver.iterations: expected int, got True",)),
         ("solver.iterationz=5", ("solver.iterationz: unknown key; did you mean 'iterations'",)),
         ("solver.kernel.width=5", ("solver.kernel: expected one of",)),
         ("solver=5", ("solver: expected a mapping, for it is a section, got 5",)),
@@ -302,11 +281,6 @@ def test_a_wrong_change_is_refused_as_a_wrong_file_is(change, words):
         assert word in str(caught.value)
 
 
-def test_an_unknown_preset_names_the_nearest():
-    with pytest.raises(ConfigError, match=r"unknown preset 'defaults'; did you mean 'default'"):
-        preset("defaults")
-
-
 def test_an_unreadable_file_is_a_config_error(tmp_path):
     latin = tmp_path / "latin.yaml"
     latin.write_bytes(b"map: {archive_dir: \xe9\xe8}")
@@ -314,5 +288,3 @@ def test_an_unreadable_file_is_a_config_error(tmp_path):
         with pytest.raises(ConfigError, match="cannot read the configuration") as caught:
             load_config(path)
         assert str(path) in str(caught.value)
-    assert issubclass(ConfigError, LoamError)
-    assert issubclass(ConfigError, ValueError)

@@ -19,7 +19,7 @@ from typer.testing import Result
 from loam_gtsam.cli import run as run_command
 from loam_gtsam.cli.console import stop_requests
 from loam_gtsam.cli.results import ERROR_PLOT, PLOT_FILES
-from loam_gtsam.config import Config, config_to_dict, load_config
+from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -89,16 +89,17 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
 
 
 def test_run_opens_built_in_worlds_and_uses_every_option():
+    Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
     result = loam(
         "run", "sim:room?frames=9", "--frames", 3, "--output", "out", "--no-plot",
-        "--sensor", "vlp16", "--set", "solver.iterations=7", "--set", "map.window=[11, 11, 5]",
-        "--set", "deskew.enabled=false", "--option", "seed=3",
+        "--config", "mine.yaml", "--sensor", "vlp16", "--set", "solver.iterations=7",
+        "--set", "map.window=[11, 11, 5]", "--set", "deskew.enabled=false", "--option", "seed=3",
     )  # fmt: skip
     assert result.exit_code == 0, result.output
     assert files_in("out") == {*RUN_FILES, "truth.tum"}
     config = load_config("out/config.yaml")
     assert config.sensor.model == "vlp16"
-    assert config.solver.iterations == 7
+    assert (config.solver.iterations, config.solver.min_matches) == (7, 20)
     assert config.map.window == (11, 11, 5)
     assert config.deskew.enabled is False
     assert len(read_tum("out/trajectory.tum")) == 3
@@ -116,17 +117,10 @@ def test_a_process_extracts_features_where_it_is_worth_its_start(
     assert run_command.worker_count(asked, sweeps) == expected
 
 
-def test_a_configuration_file_is_used_and_set_wins_over_it():
-    Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
-    arguments = ["run", "sim:room", "--frames", 1, "--no-plot", "--output", "out"]
-    result = loam(*arguments, "--config", "mine.yaml", "--set", "solver.iterations=4")
-    assert result.exit_code == 0, result.output
-    solver = load_config("out/config.yaml").solver
-    assert (solver.iterations, solver.min_matches) == (4, 20)
-
-
 def test_an_earlier_run_is_kept_unless_overwrite_is_given(opens, scans):
     opens(scans[:2])
+    Path("out").mkdir()
+    Path("out/notes.md").write_text("mine")
     for folder in ("out", "out-2", "out-3"):
         result = loam("run", "x", "--no-plot", "--output", "out")
         assert result.exit_code == 0
@@ -136,16 +130,8 @@ def test_an_earlier_run_is_kept_unless_overwrite_is_given(opens, scans):
     assert loam("run", "x", "--no-plot", "--output", "out", "--overwrite").exit_code == 0
     assert len(read_tum("out/trajectory.tum")) == 3
     assert len(read_tum("out-2/trajectory.tum")) == 2
-    assert files_in("out") == set(RUN_FILES)
-    assert not Path("out-4").exists()
-
-
-def test_a_folder_with_other_files_is_used_as_it_is(opens, scans):
-    opens(scans[:1])
-    Path("out").mkdir()
-    Path("out/notes.md").write_text("mine")
-    assert loam("run", "x", "--no-plot", "--output", "out").exit_code == 0
     assert files_in("out") == {*RUN_FILES, "notes.md"}
+    assert not Path("out-4").exists()
 
 
 def test_quiet_prints_nothing(opens, scans):
@@ -178,20 +164,21 @@ def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
         assert data["messages"][-1] == "damaged 6"
 
 
-def test_a_run_in_which_no_sweep_is_usable_fails(opens):
-    opens([BadSweep(n, f"damaged {n}") for n in range(3)])
+@pytest.mark.parametrize(
+    ("items", "message", "folder"),
+    [
+        ([BadSweep(n, f"damaged {n}") for n in range(3)],
+         "none of the 3 sweeps could be used; the first: damaged 0", True),
+        ([], "no sweeps", False),
+        ([DatasetError("the bag is damaged")], "error: the bag is damaged", False),
+    ],
+)  # fmt: skip
+def test_a_run_without_a_usable_sweep_fails(opens, items, message, folder):
+    opens(items)
     result = loam("run", "x", "--no-plot", "--output", "out")
     assert result.exit_code == 1
-    assert "none of the 3 sweeps could be used; the first: damaged 0" in one_line(result)
-    assert "run.npz" in files_in("out")
-
-
-def test_an_empty_data_set_fails(opens):
-    opens([])
-    result = loam("run", "x", "--output", "out")
-    assert result.exit_code == 1
-    assert "no sweeps" in result.output
-    assert not Path("out").exists()
+    assert message in one_line(result)
+    assert Path("out").exists() == folder
 
 
 def test_a_truth_that_cannot_be_compared_is_told_and_costs_nothing(opens, scans, monkeypatch):
@@ -235,13 +222,6 @@ def test_an_error_in_the_middle_keeps_what_was_computed(opens, scans, error):
         assert result.exception is error
 
 
-def test_an_error_before_the_first_frame_is_told(opens):
-    opens([DatasetError("the bag is damaged")])
-    result = loam("run", "x", "--output", "out")
-    assert result.exit_code == 1
-    assert "error: the bag is damaged" in result.output
-
-
 def test_errors_are_one_message_and_debug_shows_the_traceback():
     result = loam("run", "missing/folder")
     assert result.exit_code == 1
@@ -277,7 +257,6 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
     [
         (["--set", "solver.iteratons=3"], 1, "did you mean 'iterations'"),
         (["--set", "solver.iterations=many"], 1, "--set: solver.iterations: expected int"),
-        (["--set", "solver.iterations.x=1"], 1, "expected int"),
         (["--set", "solver=1"], 2, "expected SECTION.KEY=VALUE"),
         (["--set", "min_range=2"], 2, "SECTION.KEY=VALUE, for example sensor.min_range=2"),
         (["--set", "solver.iterations"], 2, "expected KEY=VALUE"),
@@ -290,7 +269,6 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
         (["--config", "absent.yaml"], 1, "absent.yaml: cannot read"),
         (["--preset", "default", "--config", "x.yaml"], 2, "not both"),
         (["--frames", "0"], 2, "--frames"),
-        (["--nonsense"], 2, "nonsense"),
     ],
 )
 def test_wrong_options_say_what_was_expected(arguments, code, message):
@@ -300,18 +278,6 @@ def test_wrong_options_say_what_was_expected(arguments, code, message):
 
 
 # -- the other commands ------------------------------------------------------------------------
-
-
-def test_inspect_shows_what_was_understood():
-    result = loam("inspect", "sim:room")
-    assert result.exit_code == 0, result.output
-    for text in (
-        "simulated world",
-        "16 rings from the ring field",
-        "per-point times",
-        "can be run",
-    ):
-        assert text in one_line(result)
 
 
 def test_inspect_looks_past_a_bad_first_sweep(opens, scans):
@@ -339,23 +305,19 @@ def test_inspect_fails_on_what_cannot_be_run(opens, items, problem):
     assert "damaged 5" not in result.output
 
 
-def test_config_prints_and_writes_what_can_be_loaded():
+def test_config_prints_and_writes_what_can_be_loaded_and_replaces_no_file_unasked():
     result = loam("config")
     assert result.exit_code == 0
     assert "# Every cube of the map has this edge length. Unit: m. Source: LOAM." in result.output
     assert loam("config", "--output", "c.yaml").exit_code == 0
     assert Path("c.yaml").read_text() == result.output
-    assert config_to_dict(load_config("c.yaml")) == config_to_dict(Config())
-
-
-def test_config_does_not_replace_a_file_unasked():
+    assert load_config("c.yaml") == Config()
     Path("c.yaml").write_text("mine")
-    result = loam("config", "--output", "c.yaml")
-    assert result.exit_code == 1
-    assert "c.yaml: the file exists" in result.output
-    assert Path("c.yaml").read_text() == "mine"
+    refused = loam("config", "--output", "c.yaml")
+    assert (refused.exit_code, Path("c.yaml").read_text()) == (1, "mine")
+    assert "c.yaml: the file exists" in refused.output
     assert loam("config", "--output", "c.yaml", "--overwrite").exit_code == 0
-    assert Path("c.yaml").read_text() != "mine"
+    assert Path("c.yaml").read_text() == result.output
 
 
 def test_version_names_what_matters_in_a_bug_report():
@@ -395,8 +357,7 @@ main()
 
 def start_endless_run(pause: float, workers: int = 0) -> subprocess.Popen[str]:
     """A run that goes on for ever; returns when it reads its fourth sweep, ``pause`` s long."""
-    workers_option = ["--workers", str(workers)]
-    command = ["run", "x", "--output", "out", "--no-plot", *workers_option, str(pause)]
+    command = ["run", "x", "--output", "out", "--no-plot", "--workers", str(workers), str(pause)]
     process = subprocess.Popen(
         [sys.executable, "-c", _ENDLESS, *command],
         stdout=subprocess.PIPE,
@@ -443,20 +404,15 @@ def test_a_second_signal_ends_the_process_at_once():
     assert files_in("out") == set()
 
 
-def test_handlers_are_put_back():
-    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with stop_requests() as stop:
-        os.kill(os.getpid(), signal.SIGTERM)
-        assert stop.signum == signal.SIGTERM
-    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
-
-
-def test_an_ignored_signal_stays_ignored(monkeypatch):
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+@pytest.mark.parametrize("ignored", [False, True])
+def test_a_signal_is_noted_unless_it_is_ignored_and_handlers_are_put_back(ignored):
+    handler = signal.SIG_IGN if ignored else signal.default_int_handler
+    before = signal.signal(signal.SIGINT, handler)
     try:
         with stop_requests() as stop:
             os.kill(os.getpid(), signal.SIGINT)
-            assert stop.signum is None
+            assert stop.signum == (None if ignored else signal.SIGINT)
+        assert signal.getsignal(signal.SIGINT) == handler
     finally:
         signal.signal(signal.SIGINT, before)
 
@@ -467,21 +423,15 @@ def test_an_ignored_signal_stays_ignored(monkeypatch):
 def test_run_says_what_was_made_of_the_imu():
     result = loam("run", "sim:room", "--frames", 3, "--no-plot", "--output", "out")
     said = one_line(result)
-    assert "IMU, level roll -" in said.replace("roll 0", "roll -0")
-    assert "samples, at rest" in said
-    assert "IMU, orientation its own" in said
-    assert "IMU, roll and pitch priors: 1 none, 2 equivalent" in said
-    assert "IMU, de-skew 3 gyro" in said
-    assert "mrad/s" in said
+    for text in ("IMU, level roll", "samples, at rest", "IMU, orientation its own", "mrad/s",
+                 "IMU, roll and pitch priors: 1 none, 2 equivalent", "IMU, de-skew 3 gyro"):  # fmt: skip
+        assert text in said
     assert "given up" not in said
-
-
-def test_run_without_an_imu_says_nothing_of_it():
     off = ["--set", "imu.enabled=false"]
-    result = loam("run", "sim:room", "--frames", 2, "--no-plot", "--output", "out", *off)
+    result = loam("run", "sim:room", "--frames", 2, "--no-plot", "--output", "off", *off)
     assert result.exit_code == 0
     assert "IMU" not in result.output
-    assert json.loads(Path("out/summary.json").read_text())["imu"] is None
+    assert json.loads(Path("off/summary.json").read_text())["imu"] is None
 
 
 def test_run_closes_loops_and_writes_the_graph():
@@ -511,9 +461,12 @@ def test_run_says_that_the_imu_is_mounted_otherwise():
     assert re.search(r"fit those of the scans better by (179|180) degrees", said)
 
 
-def test_inspect_says_what_is_understood_of_the_imu(opens, scans, monkeypatch):
-    said = one_line(loam("inspect", "sim:room"))
-    assert "samples at 200 Hz, orientation its own" in said
+def test_inspect_shows_what_was_understood_of_sweeps_and_imu(opens, scans, monkeypatch):
+    result = loam("inspect", "sim:room")
+    assert result.exit_code == 0, result.output
+    for text in ("simulated world", "16 rings from the ring field", "per-point times",
+                 "samples at 200 Hz, orientation its own", "can be run"):  # fmt: skip
+        assert text in one_line(result)
     assert "IMU, used" not in loam("inspect", "sim:room", "--set", "imu.enabled=false").output
     opens(scans[:1])
     assert "IMU, used" not in loam("inspect", "x").output
@@ -599,10 +552,7 @@ def test_no_help_of_a_command_is_cut_off(monkeypatch):
 
 
 _HELP = """
-import sys, types
-package = types.ModuleType("loam_gtsam")  # what its own __init__ imports is another matter
-package.__path__ = [sys.argv.pop()]
-sys.modules["loam_gtsam"] = package
+import sys
 from loam_gtsam.cli import main
 try:
     main()
@@ -613,9 +563,8 @@ finally:
 
 @pytest.mark.parametrize("command", ["run", "compare", "study", "optimize"])
 def test_the_help_of_a_command_imports_neither_gtsam_nor_scipy(command):
-    package = Path(__file__).parents[2] / "loam_gtsam"
     done = subprocess.run(
-        [sys.executable, "-c", _HELP, command, "--help", package], capture_output=True, text=True
+        [sys.executable, "-c", _HELP, command, "--help"], capture_output=True, text=True
     )
     assert "--quiet" in done.stdout
     assert done.stdout.splitlines()[-1] == "[]", done.stderr

@@ -12,27 +12,16 @@ def _temporary_files_here(tmp_path, monkeypatch):
     monkeypatch.setattr("tempfile.tempdir", None)
 
 
-def test_results_that_cannot_be_written_go_elsewhere(tmp_path):
+@pytest.mark.parametrize("problem", ["disk full", "cannot write there"])
+def test_results_that_cannot_be_written_or_moved_to_their_places_go_elsewhere(problem, tmp_path):
     def write(there):
-        if "wanted" in there.parts:
-            raise OutputError("disk full")
-        (there / "results").write_text("all of it")
-        return ["results"]
-
-    (tmp_path / "wanted").mkdir()
-    with pytest.raises(OutputError, match=r"disk full. The results were written to .*instead"):
-        write_results(tmp_path / "wanted", ["results"], "results", write)
-    written = [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")]
-    assert written == ["all of it"]
-
-
-def test_results_that_cannot_be_moved_to_their_places_go_elsewhere(tmp_path):
-    def write(there):
+        if problem == "disk full" and "wanted" in there.parts:
+            raise OutputError(problem)
         (there / "results").write_text("all of it")
         return ["results"]
 
     (tmp_path / "wanted" / "results").mkdir(parents=True)  # a folder in the place of the file
-    with pytest.raises(OutputError, match=r"cannot write there.* written to .* instead"):
+    with pytest.raises(OutputError, match=rf"{problem}.* The results were written to .*instead"):
         write_results(tmp_path / "wanted", [], "results", write)
     written = [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")]
     assert written == ["all of it"]

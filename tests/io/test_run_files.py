@@ -34,11 +34,8 @@ def read_ply(path: Path) -> tuple[list[str], np.ndarray]:
     header, _, body = path.read_bytes().partition(b"end_header\n")
     lines = header.decode("ascii").splitlines()
     kinds = {"double": "<f8", "uchar": "u1"}
-    fields = [
-        (words[2], kinds[words[1]])
-        for words in (line.split() for line in lines)
-        if words[0] == "property"
-    ]
+    properties = [line.split() for line in lines if line.startswith("property")]
+    fields = [(name, kinds[kind]) for _, kind, name in properties]
     return lines, np.frombuffer(body, np.dtype(fields))
 
 
@@ -137,12 +134,12 @@ def test_ply_is_exact_and_tells_edges_from_planes(tmp_path):
     header, points = read_ply(tmp_path / "map.ply")
     assert header[0] == "ply"
     assert "element vertex 3" in header
-    xyz = np.stack([points["x"], points["y"], points["z"]], axis=1)
+    xyz, colours = (np.stack([points[name] for name in names], axis=1)
+                    for names in (("x", "y", "z"), ("red", "green", "blue")))  # fmt: skip
     np.testing.assert_array_equal(xyz, np.concatenate((edges, planes)))
     assert points["label"].tolist() == [0, 1, 1]
-    colours = np.stack([points["red"], points["green"], points["blue"]], axis=1)
-    np.testing.assert_array_equal(colours[0], run_files.EDGE_COLOUR)
-    np.testing.assert_array_equal(colours[1:], [run_files.PLANE_COLOUR] * 2)
+    plane = run_files.PLANE_COLOUR
+    np.testing.assert_array_equal(colours, [run_files.EDGE_COLOUR, plane, plane])
 
 
 def test_ply_refuses_other_shapes(tmp_path):
@@ -166,14 +163,10 @@ def test_write_run_writes_all_files(result, tmp_path):
     assert "incomplete" not in (folder / "trajectory.tum").read_text()
 
 
-def test_a_run_that_ended_early_says_so(result, tmp_path):
-    run_files.write_run(replace(result, error=ValueError("broken")), tmp_path)
+def test_a_run_that_ended_before_its_first_frame_can_be_written_and_says_so(result, tmp_path):
+    run_files.write_run(replace(result, updates=(), error=ValueError("broken")), tmp_path)
     assert json.loads((tmp_path / "summary.json").read_text())["error"] == "ValueError: broken"
     assert "# incomplete" in (tmp_path / "trajectory.tum").read_text()
-
-
-def test_a_run_without_frames_can_be_written(result, tmp_path):
-    run_files.write_run(replace(result, updates=()), tmp_path)
     assert len(read_tum(tmp_path / "trajectory.tum")) == 0
     with np.load(tmp_path / "run.npz") as data:
         assert data["covariances"].shape == (0, 6, 6)

@@ -55,8 +55,5 @@ def test_read_tum_names_the_bad_line(tmp_path, text, message):
     (tmp_path / "t.tum").write_text(text)
     with pytest.raises(DatasetError, match=message):
         read_tum(tmp_path / "t.tum")
-
-
-def test_read_tum_of_a_missing_file(tmp_path):
     with pytest.raises(DatasetError, match="cannot read"):
         read_tum(tmp_path / "none.tum")

@@ -108,12 +108,10 @@ def test_the_description_of_every_parameter_is_made_of_whole_sentences(owner, na
 def test_absent_keys_keep_the_default_an_integer_serves_as_a_float_and_null_as_none(tmp_path):
     assert parse_config("") == parse_config("# only a comment\n") == Config()
     file = tmp_path / "some.yaml"
-    file.write_text(
-        "solver: {iterations: 3}\nmap: {window: [9, 9, 5], cube_size: 40, archive_dir: null}"
-    )
+    file.write_text("solver: {iterations: 3}\nmap: {cube_size: 40, archive_dir: null}")
     config = load_config(file)
     assert config.solver == SolverConfig(iterations=3)
-    assert config.map == MapConfig(window=(9, 9, 5), cube_size=40.0)
+    assert config.map == MapConfig(cube_size=40.0)
     assert isinstance(config.map.cube_size, float)
     assert config.matching == MatchingConfig()
 

@@ -98,8 +98,7 @@ class PoseErrors:
 
     Parameters
     ----------
-    config : ``covariance`` is used, and from ``solver`` and ``imu`` the weights of the matches and
-        the noise of the gyro
+    config : ``covariance``, the weights of matches in ``solver`` and ``imu.gyro_noise`` are used
     """
 
     def __init__(self, config: Config) -> None:
@@ -257,7 +256,7 @@ class SeenGround:
     ----------
     size : edge length of a cell, metres
     remembered : cells of a generation. When the younger generation is full, it becomes the older
-        one, and the older one is forgotten: if the sensor comes back to it, it counts as new.
+        one, and the older one is forgotten.
     """
 
     def __init__(self, size: float, remembered: int = _REMEMBERED) -> None:

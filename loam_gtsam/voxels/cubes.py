@@ -48,51 +48,44 @@ class VoxelSums(NamedTuple):
     counts: FloatArray
 
 
-class Cube:
+class Cube(KeyTable):
     """Points of a cube in the order of their voxels, at most one a voxel."""
 
-    __slots__ = ("_table",)
+    __slots__ = ()
 
-    def __init__(self) -> None:
-        self._table = KeyTable(_NO_KEYS, NO_POINTS, _NO_OWNERS)
+    def __init__(
+        self, keys: IntArray = _NO_KEYS, points: FloatArray = NO_POINTS, owners: Owners = _NO_OWNERS
+    ) -> None:
+        super().__init__(keys, points, owners)
 
     @classmethod
     def of(cls, content: CubePoints, grid: Grid) -> Cube:
         """A cube that holds these points, of which no two are in one voxel."""
         keys = grid.keys(content.points)
         order = np.argsort(keys, kind="stable")
-        cube = cls()
-        cube._table = KeyTable(keys[order], content.points[order], content.owners[order])
-        return cube
-
-    def __len__(self) -> int:
-        return len(self._table)
+        return cls(keys[order], content.points[order], content.owners[order])
 
     @property
     def points(self) -> FloatArray:
         """(N, 3) metres, in the order of their voxels."""
-        points: FloatArray = self._table.columns[1]
+        points: FloatArray = self.columns[1]
         return points
-
-    def merge(self) -> None:
-        """Put new points in their places among the others, for those who ask for points often."""
-        self._table.merge()
 
     @property
     def content(self) -> CubePoints:
         """All that is kept of the cube in an archive."""
-        return CubePoints(*self._table.columns[1:])
+        return CubePoints(*self.columns[1:])
 
     def settle(self, new: VoxelPoints) -> FloatArray:
         """Add the points whose voxels are free, and return them."""
-        return new[1].take(self._table.add(*new), axis=0)
+        return new[1].take(self.add(*new), axis=0)
 
     def average(self, new: VoxelSums) -> None:
         """Put into each voxel the mean of its point, if it has one, and the new ones.
 
         A voxel that has a point keeps the owner of that point. The arrays of ``new`` are changed.
         """
-        keys, held, _ = self._table.columns
+        keys, held, _ = self.columns
         at, taken = find_in_sorted(keys, new.keys)
         old = held[at[taken]]
         new.sums[taken] += old
@@ -103,16 +96,16 @@ class Cube:
         means = np.clip(new.sums / new.counts[:, None], new.lows, new.highs)
         held[at[taken]] = means[taken]
         free = np.flatnonzero(~taken)
-        self._table.append(*(column.take(free, axis=0) for column in (new.keys, means, new.owners)))
-        self._table.merge()  # the next call changes points in place
+        self.append(*(column.take(free, axis=0) for column in (new.keys, means, new.owners)))
+        self.merge()  # the next call changes points in place
 
     def take_out(self, owners: Owners) -> CubePoints:
         """Remove the points of some owners, and return them."""
-        columns = self._table.columns
+        columns = self.columns
         out = np.isin(columns[2], owners)
         if not out.any():
             return CubePoints(NO_POINTS, _NO_OWNERS)
-        self._table = KeyTable(*(column[~out] for column in columns))
+        self._put(*(column[~out] for column in columns))
         return CubePoints(columns[1][out], columns[2][out])
 
 

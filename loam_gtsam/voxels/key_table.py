@@ -30,8 +30,11 @@ class KeyTable:
     __slots__ = ("_merged", "_waiting")
 
     def __init__(self, keys: IntArray, *columns: NDArray[Any]) -> None:
-        self._merged: Columns = (keys, *columns)
-        self._waiting: Columns = tuple(column[:0] for column in self._merged)
+        self._put(keys, *columns)
+
+    def _put(self, *rows: NDArray[Any]) -> None:
+        self._merged: Columns = rows
+        self._waiting: Columns = tuple(column[:0] for column in rows)
 
     def __len__(self) -> int:
         return len(self._merged[0]) + len(self._waiting[0])
@@ -74,9 +77,9 @@ class KeyTable:
             self.merge()
 
     def merge(self) -> None:
-        """Put the new rows in their places among the others."""
+        """Put the new rows in their places among the others, for many calls of :attr:`columns`."""
         if self.n_waiting:
-            self.__init__(*self.columns)  # type: ignore[misc]
+            self._put(*self.columns)
 
 
 def _joined(held: Columns, new: Columns) -> Columns:

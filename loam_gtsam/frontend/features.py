@@ -35,15 +35,7 @@ from loam_gtsam.frontend.curvature import (
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.frontend.poles import Poles, find_poles
 from loam_gtsam.geometry import run_starts, voxel_filter
-from loam_gtsam.types import (
-    BoolArray,
-    Features,
-    FloatArray,
-    IntArray,
-    Scan,
-    SweepError,
-    SweepFault,
-)
+from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError, SweepFault
 
 _ROUGH = 4.0
 """Standard deviations of range noise: no smooth surface scatters by that much."""

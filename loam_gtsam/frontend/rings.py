@@ -111,9 +111,7 @@ def azimuth_steps(azimuth: NDArray[np.float32]) -> NDArray[np.float32]:
     return step
 
 
-def rings_from_file_order(
-    azimuth: NDArray[np.float32],
-) -> tuple[RingAssignment | None, str]:
+def rings_from_file_order(azimuth: NDArray[np.float32]) -> tuple[RingAssignment | None, str]:
     """Rings of points written ring after ring, from the azimuth's jumps back.
 
     KITTI's raw HDL-64E files carry no ring numbers, and their elevations are too irregular for a

@@ -103,10 +103,9 @@ class CubeMap:
         )
 
     def recenter(self, position: FloatArray) -> int:
-        """Shift the window if the sensor is within ``window_margin`` cubes of its edge.
+        """Shift the window, no farther than needed, if its edge is within ``window_margin`` cubes.
 
-        Cubes that fall out are archived, archived ones that fall in are restored. The window moves
-        no farther than needed.
+        Cubes that fall out are archived, archived ones that fall in are restored.
 
         Parameters
         ----------
@@ -163,10 +162,9 @@ class CubeMap:
 
         With the policy ``centroid`` a voxel holds the mean of the point it had and the new ones,
         the old one counting once: what LOAM's voxel filter does to a cube after each sweep. With
-        ``settled`` the first point of a voxel stays, a cube in which no new voxel got occupied is
-        unchanged, and search trees are kept while few of their points are new. Points outside the
-        window, or beyond the voxel grid (about 2^20 voxels from the origin), are not taken and
-        counted in ``stats.outside``.
+        ``settled`` the first point of a voxel stays, and search trees are kept while few of their
+        points are new. Points outside the window, or beyond the voxel grid (about 2^20 voxels from
+        the origin), are not taken and counted in ``stats.outside``.
 
         Parameters
         ----------

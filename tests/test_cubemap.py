@@ -82,22 +82,6 @@ def test_window_follows_in_every_direction(axis: int, sign: int) -> None:
         assert cube_map.window[0][axis] == start + sign * max(0, step - slack)
 
 
-def test_jump_of_ten_kilometres_and_back() -> None:
-    cube_map = CubeMap(MapConfig(), 0.4)
-    points = np.random.default_rng(0).uniform(-80, 80, (500, 3))
-    cube_map.insert(points)
-    before, n_cubes = cube_map.points(), cube_map.stats.cubes
-    assert cube_map.recenter(np.array([10e3, -10e3, 0.0])) == n_cubes
-    assert cube_map.window[0] == (200 - 17, -203, -5)
-    assert cube_map.count() == 0
-    assert cube_map.stats.archived == n_cubes
-    cube_map.insert(np.array([[10e3, -10e3, 0.0]]))
-    assert cube_map.recenter(np.zeros(3)) == 1
-    np.testing.assert_array_equal(cube_map.points(), before)
-    assert len(cube_map.points(archived=True)) == len(before) + 1
-    assert cube_map.stats.restored == n_cubes
-
-
 def test_margin_wider_than_the_window_is_cut() -> None:
     cube_map = CubeMap(SMALL.changed(window=(3, 3, 1), window_margin=3), 0.5)
     cube_map.recenter(np.array([40.0, 0.0, 8.0]))

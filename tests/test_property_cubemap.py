@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -222,28 +221,3 @@ def test_moved_points_are_those_of_a_dictionary(rng: np.random.Generator, insert
             found, expected = cubes.points(archived=True), reference.points(archived=True)
             order = [np.lexsort(np.round(part, 6).T) for part in (found, expected)]
             np.testing.assert_allclose(found[order[0]], expected[order[1]], rtol=0, atol=1e-9)
-
-
-@FEW
-@given(rng=generators(), insertion=st.sampled_from(["settled", "centroid"]))
-def test_a_window_that_comes_back_finds_everything_where_it_was(
-    rng: np.random.Generator, insertion: str, tmp_path_factory: pytest.TempPathFactory
-) -> None:
-    folder = tmp_path_factory.mktemp("archive")
-    megabytes = float(rng.choice([0.0, 1e-3, 1.0]))
-    config = SMALL.changed(
-        insertion=insertion, archive_megabytes=megabytes, archive_dir=str(folder)
-    )
-    cubes = CubeMap(config, VOXEL)
-    cubes.insert(rng.normal(0.0, 3.0, (200, 3)))
-    before = cubes.points()
-    for _ in range(4):
-        cubes.recenter(rng.normal(0.0, 60.0, 3))
-    cubes.recenter(np.array([0.0, 0.0, 0.0]))
-    np.testing.assert_array_equal(cubes.points(archived=True), before)
-    assert cubes.stats.dropped_points == 0
-    low, high = (CUBE * np.array(end) for end in cubes.window)
-    inside = ((before >= low - 0.5 * CUBE) & (before < high + 0.5 * CUBE)).all(axis=1)
-    assert inside.any()
-    _, squared = cubes.nearest(before[inside], 1, 0.1, product(range(-9, 10), repeat=3))
-    np.testing.assert_array_equal(squared, 0.0)

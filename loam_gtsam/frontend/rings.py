@@ -100,8 +100,8 @@ def rings_from_rows(row_of: NDArray[np.integer]) -> RingAssignment:
 def _without_gaps(numbers: NDArray[np.integer]) -> tuple[IntArray, int]:
     """The same numbers without those that no point has, and how many there are."""
     filled = np.bincount(numbers) > 0
-    rank = np.cumsum(filled)
-    return rank[numbers] - 1, int(rank[-1])
+    rank = np.cumsum(filled) - 1
+    return rank[numbers], int(rank[-1]) + 1
 
 
 def azimuth_steps(azimuth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -58,6 +58,8 @@ def test_depth_width_and_number_decide(change, count):
 
 
 def test_a_hole_in_a_wall_and_a_step_are_no_poles():
+    assert found(ring(wall())).points.shape == (0, 3)
+    assert not found(ring(wall())).members(200).any()
     hole = wall()
     hole[100:105] = 15.0
     assert len(found(ring(hole))) == 0
@@ -92,12 +94,6 @@ def test_rings_do_not_touch():
     poles = found(both, starts=[0, 200, 400])
     # The three are cut from the next ring; their own ring goes on, a turn later, at its start.
     assert poles.members(400)[200:].sum() == 0
-
-
-def test_no_points_of_a_kind_is_no_error():
-    assert len(found(ring(wall()))) == 0
-    assert found(ring(wall())).points.shape == (0, 3)
-    assert not found(ring(wall())).members(200).any()
 
 
 def scene():

@@ -47,17 +47,13 @@ def extract_features(scan: Scan, config: Config) -> Features:
     """Edge and plane points of a sweep, at the positions they were measured.
 
     Positions stay raw, and every feature keeps its time, so that
-    :func:`loam_gtsam.geometry.move_points` can de-skew them.
+    :func:`loam_gtsam.geometry.move_points` can de-skew them. ``sharp`` and ``flat`` are the first
+    rows of ``edges`` and ``planes``.
 
     Parameters
     ----------
     scan : one sweep, not de-skewed
     config : ``sensor``, ``features`` and ``deskew`` are used
-
-    Returns
-    -------
-    Features
-        ``sharp`` and ``flat`` are the first rows of ``edges`` and ``planes``.
 
     Raises
     ------

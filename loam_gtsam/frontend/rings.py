@@ -112,7 +112,7 @@ def azimuth_steps(azimuth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def rings_from_file_order(azimuth: NDArray[np.float32]) -> tuple[RingAssignment | None, str]:
-    """Rings of points written ring after ring, from the azimuth's jumps back.
+    """Rings of points stored ring after ring: a ring begins where the azimuth jumps back.
 
     KITTI's raw HDL-64E files carry no ring numbers, and their elevations are too irregular for a
     nominal table, but the azimuth runs once around per ring.
@@ -130,8 +130,8 @@ def rings_from_file_order(azimuth: NDArray[np.float32]) -> tuple[RingAssignment 
     forward = float(np.mean(step * np.float32(sign) > 0.0))
     if forward < 0.95:
         return None, f"azimuth does not run one way in file order ({forward:.0%} of steps do)"
-    # Where rings are cut: at a quarter turn if the file begins near one (its first point need not
-    # be the first column), else just before the first point.
+    # Rings begin at a quarter turn if the file begins near one, for its first point need not be in
+    # the first column; otherwise just before the first point.
     first = float(np.rad2deg(azimuth[0]))
     quarter = 90.0 * round(first / 90.0)
     cut = quarter if abs(first - quarter) < 5.0 else first - sign * 0.5
@@ -147,7 +147,7 @@ def rings_from_file_order(azimuth: NDArray[np.float32]) -> tuple[RingAssignment 
 
 
 def rings_from_elevation(xyz: NDArray[np.float32], model: str) -> tuple[RingAssignment | None, str]:
-    """Rings from elevation: by a nominal table, or by the beams the data itself shows.
+    """Rings by elevation, from a nominal table or from the peaks in a histogram of elevations.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def _nearest(elevation: NDArray[np.float32], beams: FloatArray) -> NDArray[np.in
 
 
 def _core_share(elevation: NDArray[np.float32], beams: FloatArray) -> float:
-    """Share of points within a quarter of the beam spacing of a beam."""
+    """Share of points within a quarter of the beam spacing from a beam."""
     if len(beams) < 2:
         return 0.0
     sample = elevation[:: max(1, len(elevation) // 8192)]
@@ -223,18 +223,18 @@ def _core_share(elevation: NDArray[np.float32], beams: FloatArray) -> float:
 
 
 def _beams_in(elevation: NDArray[np.float32]) -> FloatArray:
-    """Peaks of the histogram of elevations, degrees, ascending."""
+    """Elevations of the peaks of the histogram of elevations, degrees, ascending."""
     low = float(elevation.min()) - 10 * _BIN
     histogram = np.bincount(((elevation - low) / _BIN).astype(np.int64))
     padded = np.pad(histogram.astype(np.float64), 10)
     smooth = np.convolve(padded, np.ones(5), "same")
     highest = np.lib.stride_tricks.sliding_window_view(np.pad(smooth, 8), 17).max(axis=1)
     peaks = np.flatnonzero((smooth == highest) & (smooth > 0.0))
-    peaks = peaks[np.diff(peaks, prepend=-100) > 8]  # the first bin of a flat top
+    peaks = peaks[np.diff(peaks, prepend=-100) > 8]  # of a flat top only the first bin
     heights = np.sort(smooth[peaks])
     half = heights[np.searchsorted(np.cumsum(heights), 0.5 * heights.sum())]
     peaks = peaks[smooth[peaks] >= _STRAY * half]
-    # The mean around a peak, for a flat top begins off its centre.
+    # The mean of the bins around a peak, because a flat top begins off its centre.
     window = peaks[:, None] + np.arange(-5, 6)
     weight = np.pad(padded, 5)[window + 5]
     centre = (weight * window).sum(axis=1) / weight.sum(axis=1)

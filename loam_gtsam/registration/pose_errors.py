@@ -41,8 +41,8 @@ _NO_KEYS: IntArray = np.empty(0, np.int64)
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     """Covariance of ``earlier.map_T_lidar.between(later.map_T_lidar)``.
 
-    A factor between two poses needs this covariance. It holds the own errors of both frames and
-    the drift of the map between them. The drift before is common to both poses and cancels.
+    The covariance for a factor between two poses: the own errors of both frames and the drift of
+    the map between them. The drift before is common to both poses and cancels.
 
     Parameters
     ----------

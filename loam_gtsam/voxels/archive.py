@@ -30,11 +30,6 @@ class Archive:
     Attributes
     ----------
     dropped_cubes, dropped_points : lost for good
-
-    Raises
-    ------
-    ConfigError
-        If no folder can be made in ``folder``.
     """
 
     def __init__(self, grid: Grid, megabytes: float, folder: str | None) -> None:
@@ -106,10 +101,9 @@ class Archive:
         try:
             # Mapped, so that a damaged header cannot claim more memory than the file has bytes.
             rows = np.load(self._path(index), mmap_mode="r", allow_pickle=False)
-            if rows.shape != (self._disk[index], 4) or rows.dtype != np.float64:
-                raise ValueError(
-                    f"expected ({self._disk[index]}, 4) float64, got {rows.shape} {rows.dtype}"
-                )
+            expected = (self._disk[index], 4)
+            if rows.shape != expected or rows.dtype != np.float64:
+                raise ValueError(f"expected {expected} float64, got {rows.shape} {rows.dtype}")
         except (OSError, ValueError) as error:
             self._drop(self._disk.pop(index), f"cannot read {self._path(index)}: {error}")
             return None

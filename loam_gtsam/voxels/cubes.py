@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.geometry import find_in_sorted, run_starts
+from loam_gtsam.geometry import find_in_sorted, run_starts, voxel_keys
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
 from loam_gtsam.voxels.key_table import Columns, KeyTable
@@ -61,7 +61,7 @@ class Cube(KeyTable):
     @classmethod
     def of(cls, content: CubePoints, grid: Grid) -> Cube:
         """A cube that holds these points, of which no two are in one voxel."""
-        keys = grid.keys(content.points)
+        keys = voxel_keys(content.points, grid.voxel_size)
         order = np.argsort(keys, kind="stable")
         return cls(keys[order], content.points[order], content.owners[order])
 
@@ -138,7 +138,7 @@ class SortedPoints(NamedTuple):
         steps = (cells - low).astype(np.int64)
         box = tuple((steps.max(axis=1) + 1).tolist())
         numbers = np.ravel_multi_index(tuple(steps), box)
-        keys = grid.keys(points)
+        keys = voxel_keys(points, grid.voxel_size)
         order = np.lexsort((keys, numbers))  # stable
         keys, numbers = keys[order], numbers[order]
         starts = run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))

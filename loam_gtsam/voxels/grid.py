@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loam_gtsam.geometry import as_vector, voxel_keys
-from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray
+from loam_gtsam.geometry import as_vector
+from loam_gtsam.types import BoolArray, FloatArray, InputError
 
 CubeIndex = tuple[int, int, int]
 
@@ -52,10 +52,6 @@ class Grid(NamedTuple):
                 "larger voxel"
             )
         return cube_index(self.cells(position))
-
-    def keys(self, points: FloatArray) -> IntArray:
-        """(N,) one integer per voxel, of points (N, 3) within :attr:`limit`."""
-        return voxel_keys(points, self.voxel_size)
 
     def reaches(self, axes: FloatArray) -> BoolArray:
         """(N,) which points, (3, N), lie within :attr:`limit`."""

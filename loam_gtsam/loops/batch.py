@@ -17,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from loam_gtsam.config import PoseGraphConfig
-from loam_gtsam.loops.incremental import relative_pose_covariance
+from loam_gtsam.loops.incremental import relative_pose
 from loam_gtsam.loops.keyframes import is_pose, pose_number
 from loam_gtsam.loops.loop_selection import chi_squared, loop_to_switch
 from loam_gtsam.types import BoolArray, FloatArray, InputError
@@ -220,10 +220,7 @@ class _Problem:
         distances = []
         for place, on in zip(self.loops, active.tolist(), strict=True):
             factor: Any = _without_kernel(self.saved.factors.at(place))
-            first, second = factor.keys()
-            between = poses.atPose3(first).between(poses.atPose3(second))
-            joint = marginals.jointMarginalCovariance([first, second])
-            known = between, relative_pose_covariance(between, joint, first, second)
+            known = relative_pose(poses, marginals, *factor.keys())
             noise = factor.noiseModel().covariance()
             distances.append(chi_squared(factor.measured(), noise, *known, included=on))
         return graph, poses, np.array(distances)

@@ -144,10 +144,8 @@ class IncrementalGraph:
         return found
 
     def relative(self, earlier: int, later: int) -> tuple[gtsam.Pose3, FloatArray]:
-        """``earlier_T_later`` of the poses of two keys and its (6, 6) covariance."""
-        between = self.values.atPose3(earlier).between(self.values.atPose3(later))
-        joint = self._isam.jointMarginalCovariance([earlier, later])
-        return between, relative_pose_covariance(between, joint, earlier, later)
+        """See :func:`relative_pose`."""
+        return relative_pose(self.values, self._isam, earlier, later)
 
     def _settle(self) -> None:
         """Update iSAM2 until the variables stay."""
@@ -160,15 +158,16 @@ class IncrementalGraph:
             before = self.values
 
 
-def relative_pose_covariance(
-    between: gtsam.Pose3, joint: gtsam.JointMarginal, earlier: int, later: int
-) -> FloatArray:
-    """(6, 6) covariance of ``earlier_T_later`` from the joint covariance of both poses."""
+def relative_pose(
+    poses: gtsam.Values, marginals: gtsam.ISAM2 | gtsam.Marginals, earlier: int, later: int
+) -> tuple[gtsam.Pose3, FloatArray]:
+    """``earlier_T_later`` of the poses of two keys and its (6, 6) covariance."""
+    between = poses.atPose3(earlier).between(poses.atPose3(later))
+    joint = marginals.jointMarginalCovariance([earlier, later])
     to_later = between.inverse().AdjointMap()
     own, other = joint.at(earlier, earlier), joint.at(later, later)
     crossed = to_later @ joint.at(earlier, later)
-    covariance: FloatArray = to_later @ own @ to_later.T + other - crossed - crossed.T
-    return covariance
+    return between, to_later @ own @ to_later.T + other - crossed - crossed.T
 
 
 def _new_isam() -> gtsam.ISAM2:

@@ -43,15 +43,8 @@ def test_command_writes_tables_pictures_and_report(command, fake, world):
                      "solver.iterations=3")  # fmt: skip
     assert result.exit_code == 0, result.output
     names = {path.name for path in Path("out").iterdir()}
-    pictures = set(PICTURES) if PLOTS else set()
-    assert names == {
-        *TABLE_FILES,
-        *pictures,
-        REPORT_FILE,
-        "trajectory_gtsam.tum",
-        "trajectory_fake.tum",
-        "truth.tum",
-    }
+    trajectories = {"trajectory_gtsam.tum", "trajectory_fake.tum", "truth.tum"}
+    assert names == {*TABLE_FILES, REPORT_FILE} | trajectories | set(PICTURES if PLOTS else ())
     table = rows("out/comparison.csv")
     assert [row["solver"] for row in table] == ["gtsam", "fake"]
     expected = absolute_error(read_tum("out/trajectory_gtsam.tum"), world.truth)

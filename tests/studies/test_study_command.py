@@ -53,12 +53,6 @@ def quick(monkeypatch) -> list[Trial]:
     return ran
 
 
-def test_a_specification_that_is_not_there_is_told():
-    result = study("absent.yaml")
-    assert result.exit_code == 1
-    assert "absent.yaml: cannot read" in result.output
-
-
 def test_only_what_is_missing_or_has_changed_is_run_again(tmp_path, quick):
     file = write_spec(tmp_path, SPEC)
     assert study(file, "--output", "out").exit_code == 0
@@ -113,9 +107,13 @@ def test_the_table_at_the_end_shows_medians_of_what_did_not_fail(tmp_path, quick
 def test_wrong_options_and_missing_packages_are_told(tmp_path, monkeypatch):
     file = write_spec(tmp_path, SPEC)
     assert study(file, "--workers", 2, "--scheduler", "tcp://x:1").exit_code == 2
-    result = study(file, "--scheduler", "nonsense")
-    assert result.exit_code == 1
-    assert "--scheduler nonsense: cannot reach a Dask scheduler" in one_line(result)
+    for arguments, message in (
+        (("absent.yaml",), "absent.yaml: cannot read"),
+        ((file, "--scheduler", "nonsense"), "--scheduler nonsense: cannot reach a Dask scheduler"),
+    ):
+        result = study(*arguments)
+        assert result.exit_code == 1
+        assert message in one_line(result)
     for module, arguments in (("distributed", ("--scheduler", "tcp://x:1")), ("pyarrow", ())):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, module, None)

@@ -33,14 +33,9 @@ from loam_gtsam.types import MapUpdate
 def cluster() -> Iterator[Any]:
     """A Dask cluster of two worker processes with one thread each."""
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=2,
-        threads_per_worker=1,
-        processes=True,
-        memory_limit=0,
-        dashboard_address=None,
-        silence_logs=logging.ERROR,
-    ) as cluster:
+    settings = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "memory_limit": 0}
+    quiet = {"dashboard_address": None, "silence_logs": logging.ERROR}
+    with distributed.LocalCluster(**settings, **quiet) as cluster:
         yield cluster
 
 

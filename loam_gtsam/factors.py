@@ -284,21 +284,11 @@ def point_to_line_factor(
 
 
 def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
-    """All matches of a scan as one 13-row factor on the pose ``key``.
+    """All matches of a scan, at least one, as one 13-row factor on the pose ``key``.
 
     Its error, gradient, Gauss-Newton Hessian and optimum are those of the sum of the per-match
     factors with sigma ``1 / scale`` (module docstring), at a cost per evaluation that does not
-    depend on the number of matches.
-
-    Parameters
-    ----------
-    key : of a Pose3 ``map_T_lidar``
-    rows : the whitened matches, at least one
-
-    Raises
-    ------
-    InputError
-        If there are no rows.
+    depend on the number of matches. InputError if there are no rows.
     """
     if len(rows.points) == 0:
         raise InputError("scan_match_factor: expected at least one match, got none")

@@ -17,10 +17,7 @@ _GRID = 1 << 20
 
 
 def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:
-    """Anything that numpy makes an array of, as float64, if it is of that shape and finite.
-
-    See :func:`check_array` for the parameters and the errors.
-    """
+    """Anything that numpy makes a finite array of, as float64; checked by :func:`check_array`."""
     try:
         array = np.asarray(value)
     except ValueError as error:
@@ -28,10 +25,8 @@ def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> Float
     check_array(array, name, shape, "numbers")
     finite = np.isfinite(array)
     if not finite.all():
-        bad = array.size - np.count_nonzero(finite)
-        raise InputError(
-            f"{name}: expected finite numbers, got {bad} NaN or infinite ones of {array.size}"
-        )
+        got = f"{array.size - np.count_nonzero(finite)} NaN or infinite ones of {array.size}"
+        raise InputError(f"{name}: expected finite numbers, got {got}")
     return array.astype(np.float64, copy=False)
 
 

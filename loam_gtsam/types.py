@@ -40,13 +40,10 @@ _FARTHEST = 1e5
 def check_array(
     value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
 ) -> None:
-    """Raise InputError unless a value is an array of a given shape and kind of numbers.
+    """Raise InputError, ``name: expected (N, 3) floats, got ...``, unless an array has a shape.
 
-    Parameters
-    ----------
-    value, name : the value, and its name in ``name: expected (N, 3) floats, got shape (7, 4) ...``
-    shape : of the array; a letter stands for any length, as in ``("N", 3)``
-    numbers : for the message; only integers, or only floats, if it says so
+    A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
+    integers or floats, the array must hold these.
     """
     kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
     got = type(value).__name__

@@ -89,11 +89,9 @@ def choose_topic(
     if asked is not None:
         if asked not in topics:
             raise DatasetError(f"{path}: no topic {asked!r}; the bag has: {listing or 'none'}")
-        if topics[asked][0] != kind:
-            raise DatasetError(
-                f"{path}: topic {asked!r} is {topics[asked][0]}, expected {kind}; "
-                f"the bag has: {listing}"
-            )
+        if (what := topics[asked][0]) != kind:
+            problem = f"topic {asked!r} is {what}, expected {kind}; the bag has: {listing}"
+            raise DatasetError(f"{path}: {problem}")
         return asked
     candidates = [name for name, (what, _) in topics.items() if what == kind]
     if not candidates:
@@ -111,10 +109,10 @@ def choose_topic(
             f"{chosen}: its sweeps are de-skewed and lie in a map; do not map them again"
         )
     if len(candidates) > 1:
+        counts = ", ".join(f"{name}: {topics[name][1]}" for name in candidates)
         problems.append(
-            f"{len(candidates)} {kind.rsplit('/', 1)[-1]} topics ("
-            + ", ".join(f"{name}: {topics[name][1]}" for name in candidates)
-            + f"); took {chosen}, {option} chooses another"
+            f"{len(candidates)} {kind.rsplit('/', 1)[-1]} topics ({counts}); took {chosen}, "
+            f"{option} chooses another"
         )
     return chosen
 

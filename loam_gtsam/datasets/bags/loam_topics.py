@@ -62,6 +62,11 @@ class LoamTopicsDataset:
         If the bag cannot be opened, a topic is missing or the axes cannot be told.
     """
 
+    imu: ImuSamples | None = None
+    """Always None: the front end of LOAM has used the IMU already."""
+    truth: Trajectory | None = None
+    """Always None: the result of LOAM itself is ``recorded``."""
+
     def __init__(
         self, path: str | Path, *, axes: Literal["auto", "lidar", "loam"] = "auto"
     ) -> None:
@@ -101,16 +106,6 @@ class LoamTopicsDataset:
             if group is not None:
                 yield self._sweep(group)
         self.unmatched = matcher.finish()
-
-    @property
-    def imu(self) -> ImuSamples | None:
-        """Always None: the front end of LOAM has used the IMU already."""
-        return None
-
-    @property
-    def truth(self) -> Trajectory | None:
-        """Always None: the result of LOAM itself is ``recorded``."""
-        return None
 
     @cached_property
     def recorded(self) -> Trajectory | None:

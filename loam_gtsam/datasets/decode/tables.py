@@ -243,13 +243,12 @@ def describe_stamps(stamps: IntArray, facts: dict[str, str], problems: list[str]
             "and only the first can be mapped; each needs a stamp of its own"
         )
         return
+    # half a period late is jitter, a whole one is a missing sweep
+    gap = 1.8 * max(float(np.median(steps)), 1.0) if len(steps) > 2 else np.inf
     for what, which in (
-        ("equal the one before", np.flatnonzero(steps == 0)),
-        ("are earlier than the one before", np.flatnonzero(steps < 0)),
-        # half a period late is jitter, a whole one is a missing sweep
-        ("come after a gap", np.flatnonzero(steps > 1.8 * max(float(np.median(steps)), 1.0)))
-        if len(steps) > 2
-        else ("", np.zeros(0, np.int64)),
+        ("equal the one before", steps == 0),
+        ("are earlier than the one before", steps < 0),
+        ("come after a gap", steps > gap),
     ):
-        if len(which):
-            problems.append(f"{len(which)} stamps {what}, first at sweep {which[0] + 1}")
+        if which.any():
+            problems.append(f"{which.sum()} stamps {what}, first at sweep {which.argmax() + 1}")

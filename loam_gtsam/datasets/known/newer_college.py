@@ -8,11 +8,11 @@ from typing import Unpack
 
 from scipy.spatial.transform import Rotation
 
+from loam_gtsam.datasets.bags.bag import BagSequence
 from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.decode.extrinsics import Rig, rigid_transform
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import pose_matrix
-from loam_gtsam.datasets.known.bag_sequence import BagSequence
 from loam_gtsam.datasets.known.layouts import (
     NEWER_COLLEGE_SCANS,
     first_existing,

@@ -8,11 +8,11 @@ from typing import Unpack
 
 import numpy as np
 
+from loam_gtsam.datasets.bags.bag import BagSequence
 from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.decode.extrinsics import Rig
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import clean_imu, pose_matrix, read_table
-from loam_gtsam.datasets.known.bag_sequence import BagSequence
 from loam_gtsam.datasets.known.layouts import (
     SPIRES_CLOUDS,
     first_existing,

@@ -86,14 +86,12 @@ def build_trees(seed: int) -> Scene:
     rocks_at = clear(rng.uniform(-100.0, 100.0, (150, 2)), 3.5)
     rock_size = rng.uniform(0.3, 1.2, (len(rocks_at), 3))
     rocks = np.column_stack([rocks_at, ground.height(*rocks_at.T), rock_size])
-    foliage = np.zeros(len(crowns) + len(rocks), np.bool_)
-    foliage[: len(crowns)] = True
     return Scene(
         name="trees",
         solids=Solids(
             cylinders=np.column_stack([trunks, thick, z - DEEP, z + bole + tall]),
             ellipsoids=np.vstack([crowns, rocks]),
-            foliage=foliage,
+            foliage=np.arange(len(crowns) + len(rocks)) < len(crowns),
             ground=ground,
         ),
         waypoints=path,

@@ -170,6 +170,9 @@ def test_newer_college_as_pcd_files(tmp_path: Path, timed: bool) -> None:
     assert dataset.imu is None
     assert "the bags have one" in " ".join(dataset.info().problems)
     if not timed:
+        late = NewerCollegeClouds(tmp_path, stamp_is="end")
+        np.testing.assert_allclose(next(iter(late)).times, scan.times - 0.1, atol=1e-9)
+        assert late.info().facts["point times"].endswith("firings in 0.1 s, stamp at sweep end")
         write.write_pcd(folder / name, {key: values[:-64] for key, values in columns.items()})
         last = list(dataset)[-1]
         assert "65472 points, expected 1024 firings of 64" in last.message

@@ -61,9 +61,8 @@ def decode_pointcloud2(
     DatasetError
         If the layout, a field or the times cannot be understood.
     """
-    return decode_with_times(
-        msg, time_field=time_field, time_unit=time_unit, stamp_is=stamp_is
-    ).scan
+    options: TimeOptions = {"time_field": time_field, "time_unit": time_unit, "stamp_is": stamp_is}
+    return decode_with_times(msg, **options).scan
 
 
 class TimeOptions(TypedDict, total=False):
@@ -261,13 +260,8 @@ class _Layout:
                 f"PointCloud2 field {name!r}: {dtype.itemsize} bytes at offset {field.offset} "
                 f"do not fit into point_step {self.point_step}"
             )
-        view: NDArray[Any] = np.ndarray(
-            (self.height, self.width),
-            dtype,
-            self.data,
-            field.offset,
-            (self.row_step, self.point_step),
-        )
+        shape, strides = (self.height, self.width), (self.row_step, self.point_step)
+        view: NDArray[Any] = np.ndarray(shape, dtype, self.data, field.offset, strides)
         return view.astype(dtype.newbyteorder("=")).reshape(-1)
 
 

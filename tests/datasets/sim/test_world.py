@@ -23,6 +23,10 @@ from loam_gtsam.datasets.sim.world import (
 from loam_gtsam.types import ConfigError, InputError
 
 EXACT = {"range_noise": 0.0, "dropout": 0.0, "foliage_noise": 0.0}
+NOT_NEGATIVE = (
+    *("seed", "range_noise", "foliage_noise", "imu_noise", "gyro_noise", "acceleration_noise"),
+    *("rate", "speed"),
+)
 BARE = ("open_field", "single_plane", "single_pole", "sparse_terrain")
 PERFECT_IMU = {
     "imu_noise": 0.0,
@@ -294,14 +298,9 @@ def test_integrated_imu_gives_the_true_motion(scene):
 def test_imu_noise_and_bias_have_the_asked_size():
     perfect = SimulatedWorld("street_loop", **PERFECT_IMU).imu
     bias = np.array([0.01, -0.02, 0.03])
-    noisy = SimulatedWorld(
-        "street_loop",
-        gyro_noise=0.01,
-        gyro_bias=tuple(bias),
-        acceleration_noise=0.1,
-        acceleration_bias=tuple(10.0 * bias),
-        imu_noise=0.004,
-    ).imu
+    gyro = {"gyro_noise": 0.01, "gyro_bias": tuple(bias)}
+    acceleration = {"acceleration_noise": 0.1, "acceleration_bias": tuple(10.0 * bias)}
+    noisy = SimulatedWorld("street_loop", imu_noise=0.004, **gyro, **acceleration).imu
     gyro, acceleration = noisy.gyro - perfect.gyro, noisy.acceleration - perfect.acceleration
     assert np.allclose(gyro.mean(axis=0), bias, atol=5e-4)
     assert np.allclose(gyro.std(axis=0), 0.01, rtol=0.05)
@@ -330,18 +329,11 @@ def test_street_loop_closes_after_500_metres_and_goes_on():
         ({"scene": "moon"}, "scene: expected one of room, .*'moon'"),
         ({"sensor": "vlp17"}, "sensor: expected one of vlp16, .*'vlp17'"),
         ({"frames": 0}, "frames: expected at least 1, got 0"),
-        ({"seed": -1}, "seed"),
-        ({"range_noise": -0.1}, "range_noise"),
-        ({"range_noise": float("nan")}, "range_noise"),
-        ({"foliage_noise": -1.0}, "foliage_noise"),
         ({"dropout": 1.0}, "dropout"),
-        ({"rate": 0.0}, "rate"),
-        ({"speed": 0.0}, "speed"),
         ({"columns": 4}, "columns"),
         ({"max_range": 0.1}, "max_range"),
-        ({"imu_noise": -1.0}, "imu_noise"),
-        ({"gyro_noise": -1.0}, "gyro_noise"),
-        ({"acceleration_noise": -1.0}, "acceleration_noise"),
+        ({"range_noise": float("nan")}, "range_noise"),
+        *(({name: -1}, f"{name}: expected at least") for name in NOT_NEGATIVE),
     ],
 )
 def test_wrong_arguments_are_named(arguments, message):
@@ -368,15 +360,8 @@ def test_a_scene_of_ones_own():
         foliage=np.zeros(1, bool),
         ground=Ground(level=-1.0),
     )
-    scene = Scene(
-        name="ball",
-        solids=ball,
-        waypoints=np.array([[x, 0.0] for x in np.arange(0.0, -40.0, -4.0)]),
-        closed=False,
-        speed=1.0,
-        height=2.0,
-        sway=(0.0, 0.0, 0.0, 0.0),
-    )
+    way = np.array([[x, 0.0] for x in np.arange(0.0, -40.0, -4.0)])
+    scene = Scene("ball", ball, way, speed=1.0, height=2.0, sway=(0.0, 0.0, 0.0, 0.0))
     world = SimulatedWorld(scene, frames=5, **EXACT)
     points = world[0].points
     behind = np.linalg.norm(points[points[:, 2] > -1.0], axis=1)  # it drives away from the ball

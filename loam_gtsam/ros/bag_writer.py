@@ -43,7 +43,7 @@ class BagWriter(ClosingWriter):
 
     Attributes
     ----------
-    frames : written so far
+    frames : number of frames written so far
 
     Raises
     ------

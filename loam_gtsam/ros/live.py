@@ -66,14 +66,14 @@ class LiveMapper:
     If nothing is dropped and no sweep waits in vain, poses and map are those of
     :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
 
-    Nothing here grows with the run but what the pipeline keeps: the map, and loops' keyframes.
+    Memory grows with the map and the keyframes of the loops only, not with the time of the run.
 
     Parameters
     ----------
     config : section ``live`` says how long the queues are
-    imu : IMU samples will come
+    imu : whether IMU samples will come
     features : topics of LOAM's front end that will come, in place of clouds
-    axes : of those, see :class:`loam_gtsam.datasets.bags.loam_topics.LoamTopicsDataset`
+    axes : of those topics, see :class:`loam_gtsam.datasets.bags.loam_topics.LoamTopicsDataset`
     clouds : decodes the clouds; None takes a new one without options
     observe : called after each sweep, e.g. to publish it; its time counts as publishing
     solver, odometry, extra_factors, loop_closer : see :class:`loam_gtsam.pipeline.Pipeline`
@@ -81,8 +81,8 @@ class LiveMapper:
 
     Attributes
     ----------
-    pipeline : the mapper and what is around it; not to be touched while ``step`` runs, and another
-        one after :meth:`reset`
+    pipeline : maps the sweeps; not to be touched while ``step`` runs, and another one after
+        :meth:`reset`
 
     Raises
     ------

@@ -15,6 +15,8 @@ _LATEST = 1000
 """Sweeps of which the latencies are kept."""
 _REASONS = 30
 """Different reasons that are counted one by one: they may quote numbers of the message."""
+_LETTERS = 300
+"""Letters of a reason that are kept."""
 OTHER_REASONS = "other reasons"
 
 
@@ -34,15 +36,15 @@ class LiveReport:
     Attributes
     ----------
     received : messages by kind: ``cloud``, ``imu``, or a topic of LOAM
-    dropped : because a queue was full: ``sweep``, ``imu``
+    dropped : messages dropped because a queue was full: ``sweep``, ``imu``
     unmatched : messages of LOAM's topics given up without partners within 5 ms, by topic
     faults : messages and sweeps that could not be used, by reason
-    late : ``sweep``: stamp not after that of one mapped before; ``imu``: sample of a time that has
-        been mapped
+    late : ``sweep``: sweeps whose stamp is not after that of one mapped before; ``imu``: samples of
+        a time that has been mapped
     without_imu : sweeps mapped although their IMU samples had not all come
     statuses : sweeps mapped, by status
     waiting : sweeps in the queue now
-    deepest : most there were
+    deepest : most sweeps that were in the queue
     latency : of the last 1000 sweeps, by stage: ``waiting`` from its reception to the start,
         ``mapping``, ``publishing``, and ``total``. Empty before the first one.
     """
@@ -93,6 +95,7 @@ class LiveLog:
 
     def fault(self, reason: str) -> None:
         """Count a message that cannot be used."""
+        reason = reason[:_LETTERS]
         new = reason not in self.faults and len(self.faults) >= _REASONS
         self.faults[OTHER_REASONS if new else reason] += 1
 

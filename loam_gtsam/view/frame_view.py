@@ -24,7 +24,7 @@ class FrameView:
     Attributes
     ----------
     number : of the frame, from 0
-    update : what the mapper says about it
+    update : result of the mapper
     map_T_lidar : (4, 4) pose of the frame
     position_covariance : (3, 3) m^2 of the position, along the axes of the map; NaN where the
         frame was not solved
@@ -33,7 +33,7 @@ class FrameView:
         they did not
     points : (M, 3) metres, the matched features, those of edges first
     feet : (M, 3) metres, the nearest point on the line or plane that each was matched with
-    residuals : (M,) distances between the two over their standard deviations
+    residuals : (M,) distances from ``points`` to ``feet`` over their standard deviations
     """
 
     number: int
@@ -50,14 +50,14 @@ class FrameView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MapView:
-    """What a run has made so far, in ``map``.
+    """Map, path and loops of a run so far, in ``map``.
 
     Attributes
     ----------
     edges, planes : (E, 3) and (P, 3) metres, map points of the cubes around the sensor
-    path : (N, 3) metres, where the sensor was; with loops, at the keyframes and now
-    loops : (L, 2, 3) metres, where the loops begin and end
-    loops_on : (L,) which of them are used; the others are switched off
+    path : (N, 3) metres, positions of the sensor; with loops, those of the keyframes and the last
+    loops : (L, 2, 3) metres, both ends of each loop
+    loops_on : (L,) which loops are used; the others are switched off
     """
 
     edges: FloatArray
@@ -68,10 +68,10 @@ class MapView:
 
 
 class FrameWatcher(Protocol):
-    """What is shown the frames; :class:`loam_gtsam.view.rerun_viewer.RerunViewer` is one."""
+    """A viewer of frames, such as :class:`loam_gtsam.view.rerun_viewer.RerunViewer`."""
 
     def show(self, frame: FrameView, around: Callable[[], MapView]) -> None:
-        """Look at a frame; ``around`` makes the map's view, which takes longer."""
+        """Show a frame; ``around`` makes the view of the map, which takes longer."""
 
 
 def residual_colours(residuals: NDArray[np.floating]) -> NDArray[np.uint8]:

@@ -30,7 +30,7 @@ _NO_ROWS = np.zeros(0, np.int64)
 
 
 class Recording(Protocol):
-    """What takes the frames; :class:`loam_gtsam.ros.bag_writer.BagWriter` does."""
+    """A file of frames, such as :class:`loam_gtsam.ros.bag_writer.BagWriter`."""
 
     def write(
         self,
@@ -79,7 +79,7 @@ def watch(*watchers: FrameWatcher) -> Observer:
 
 
 class LastFrame:
-    """Remembers the last frame of a run, to be looked at when that is wanted."""
+    """Remembers the last frame of a run, and makes its view when that is asked for."""
 
     def __init__(self) -> None:
         self._number = -1
@@ -157,12 +157,12 @@ def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) 
 
 
 def matched_points(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Matched features, the feet of their distances, and these over their standard deviations.
+    """Matched features, the nearest points of their matches, and the residuals.
 
     Returns
     -------
-    (M, 3) and (M, 3) metres in the frame of the mapper, and (M,); edges first. Empty if the sweep
-    was not solved.
+    (M, 3) and (M, 3) metres in the frame of the mapper, and (M,) distances over their standard
+    deviations; edges first. Empty if the sweep was not solved.
     """
     if seen.matches is None:
         return _NONE, _NONE, np.zeros(0)

@@ -633,6 +633,9 @@ def test_reasons_stay_few_however_many_there_are() -> None:
     assert faults[OTHER_REASONS] == 70
     log.fault("needs 3 bytes")
     assert log.report(0, {}).faults["needs 3 bytes"] == 2
+    log = LiveLog()
+    log.fault("no number: " + 10_000 * "9")
+    assert [len(reason) for reason in log.faults] == [300]
 
 
 # --- LOAM's topics --------------------------------------------------------------------------

@@ -10,17 +10,17 @@ from loam_gtsam.io.atomic import ClosingWriter, atomic_file, make_folder, staged
 from loam_gtsam.types import OutputError
 
 
+def break_off(block, write, error):
+    with block as place:
+        write(place)
+        raise error
+
+
 def test_an_interrupted_write_leaves_the_old_file(tmp_path):
     path = tmp_path / "file"
     path.write_text("old")
-
-    def interrupted() -> None:
-        with atomic_file(path) as file:
-            file.write(b"half of the n")
-            raise KeyboardInterrupt
-
     with pytest.raises(KeyboardInterrupt):
-        interrupted()
+        break_off(atomic_file(path), lambda file: file.write(b"half"), KeyboardInterrupt())
     assert path.read_text() == "old"
     with atomic_file(path) as file:
         file.write(b"new")
@@ -85,14 +85,9 @@ def test_new_files_replace_old_ones_together_and_those_of_a_killed_process(tmp_p
 
 def test_an_error_while_writing_leaves_the_old_files(tmp_path):
     write(tmp_path, ["a", "last"], "old")
-
-    def fill_the_disk():
-        with staged_files(tmp_path, ("a", "last"), last="last") as new:
-            (new / "a").write_text("half")
-            raise OSError(28, "no space left on this disk")
-
+    staged = staged_files(tmp_path, ("a", "last"), last="last")
     with pytest.raises(OutputError, match="disk"):
-        fill_the_disk()
+        break_off(staged, lambda new: (new / "a").write_text("half"), OSError(28, "full disk"))
     assert content(tmp_path) == {"a": "old", "last": "old"}
 
 

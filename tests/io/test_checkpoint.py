@@ -12,11 +12,9 @@ import pytest
 from support.cli import loam
 from support.list_dataset import ListDataset
 
-from loam_gtsam.config import Config, MapConfig, preset
-from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.io.checkpoint import Checkpoint
-from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.closure import ScanLoopCloser
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.pipeline import Pipeline, run
@@ -121,41 +119,14 @@ def test_an_own_solver_is_given_again(tmp_path):
         return Pipeline(solver=OwnSolver(Config().solver))
 
     scans = list(open_dataset("sim:room?frames=4&columns=400"))
-    first, again = pipeline(), pipeline()
+    first, again, checkpoint = pipeline(), pipeline(), Checkpoint(tmp_path)
     updates = [first.process(scan) for scan in scans[:2]]
-    checkpoint = Checkpoint(tmp_path)
     checkpoint.begin({}, *first.state())
     checkpoint.save([scan.stamp for scan in scans[:2]], updates, *first.state())
     assert len(Checkpoint(tmp_path, resume=True).begin({}, *again.state())[1]) == 2
     for scan in scans[2:]:
         poses = [pipeline.process(scan).map_T_lidar.matrix() for pipeline in (first, again)]
         np.testing.assert_array_equal(*poses)
-
-
-def test_a_map_with_cubes_in_memory_and_on_disk_goes_on_as_it_was(tmp_path):
-    config = MapConfig(
-        archive_megabytes=0.01, archive_dir=str(tmp_path), window=(3, 3, 3), window_margin=0
-    )
-    rng = np.random.default_rng(0)
-
-    def drive(cubes, start, end, rng):
-        for step in range(start, end):
-            here = np.array([40.0 * step, 0.0, 0.0])
-            cubes.recenter(here)
-            cubes.insert(here + rng.uniform(-60.0, 60.0, (400, 3)))
-            around = cubes.neighbourhood(np.eye(4) + np.pad(here[:, None], ((0, 1), (3, 0))))
-            cubes.nearest(here + rng.uniform(-20.0, 20.0, (50, 3)), 5, 10.0, around)
-
-    cubes, again = CubeMap(config, 0.5), CubeMap(config, 0.5)
-    drive(cubes, 0, 12, rng)
-    assert 0 < len(list(tmp_path.rglob("cube_*.npy"))) < cubes.stats.archived
-    thaw(freeze({"map": cubes}, {"config": config}), {"map": again}, {"config": config})
-    for same in (cubes, again):
-        drive(same, 12, 14, np.random.default_rng(1))
-        drive(same, 8, 12, np.random.default_rng(2))  # back, to cubes of the archive
-    assert again.stats == cubes.stats
-    assert again.stats.restored > 0
-    np.testing.assert_array_equal(again.points(archived=True), cubes.points(archived=True))
 
 
 def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):

@@ -12,9 +12,7 @@ from loam_gtsam.types import DatasetError, Trajectory
 
 
 @settings(deadline=None)  # a busy machine is no fault
-@given(
-    st.lists(st.integers(min_value=-(2**62), max_value=2**62), min_size=1, max_size=5, unique=True)
-)
+@given(st.lists(st.integers(-(2**62), 2**62), min_size=1, max_size=5, unique=True))
 def test_tum_stamps_survive_to_the_nanosecond(tmp_path_factory, stamps):
     path = tmp_path_factory.mktemp("tum") / "t.tum"
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))

@@ -144,9 +144,8 @@ class SimulatedWorld:
             ("frames", frames, 1),
             ("columns", columns, 8),
         ):
-            if whole is not None and not isinstance(whole, (int, np.integer)):
-                raise ConfigError(f"{label}: expected a whole number, got {whole!r}")
-            _at_least(label, least if whole is None else whole, least)
+            if whole is not None:
+                _whole_at_least(label, whole, least)
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
@@ -166,8 +165,7 @@ class SimulatedWorld:
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
         self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
         self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
-        self._imu_noise = imu_noise
-        self._gyro = gyro_noise, gyro_bias
+        self._imu_noise, self._gyro = imu_noise, (gyro_noise, gyro_bias)
         self._acceleration = acceleration_noise, acceleration_bias
         self._motion = Motion(self.scene, speed)
         self._frames = self._count(frames)
@@ -301,6 +299,12 @@ def _beam_directions(turns: FloatArray, elevations_deg: FloatArray) -> FloatArra
 def _seconds(stamps: IntArray) -> FloatArray:
     """Seconds since the first sweep; the difference is taken in integers."""
     return (stamps - _EPOCH).astype(np.float64) * 1e-9
+
+
+def _whole_at_least(name: str, value: int, least: int) -> None:
+    if not isinstance(value, (int, np.integer)):
+        raise ConfigError(f"{name}: expected a whole number, got {value!r}")
+    _at_least(name, value, least)
 
 
 def _at_least(name: str, value: float, least: float) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 
 from loam_gtsam.config import Config
-from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker
@@ -29,12 +29,7 @@ from loam_gtsam.registration.relocalization import (
     rebuild_start,
     search,
 )
-from loam_gtsam.registration.report import (
-    Clock,
-    make_update,
-    problem_of,
-    status_of,
-)
+from loam_gtsam.registration.report import Clock, make_update, problem_of, status_of
 from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors, PoseContext, own_factors
 from loam_gtsam.registration.stamp_check import StampCheck
@@ -174,12 +169,13 @@ class Mapper:
         except InputError as error:
             return self._unused(features.stamp, str(error), None)
         clock.lap("prepare")
+        placed = predicted.posed, predicted.map_T_lidar
         if self.last is None:
             self._first = predicted if self.config.deskew.refine else None
-            update = self._insert(predicted, FrameStatus.FIRST, "the map starts here", clock)
+            update = self._insert(*placed, FrameStatus.FIRST, "the map starts here", clock)
         elif sparse := not self.monitor.lost and self.maps.too_sparse(predicted, self.config):
             self._first = None
-            update = self._insert(predicted, FrameStatus.SPARSE_MAP, sparse, clock)
+            update = self._insert(*placed, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
             frame = self._frame(predicted, priors, clock)
             solution = frame.solve(self.solver)
@@ -197,10 +193,9 @@ class Mapper:
     def skip(
         self, stamp: int, message: str, fault: SweepFault | None = SweepFault.UNREADABLE
     ) -> MapUpdate:
-        """Account for a sweep that cannot be used: the pose is predicted, the map unchanged.
+        """Account for a sweep that cannot be used, for a reason: the pose is predicted.
 
-        The status is ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp, nanoseconds, cannot be used
-        either; ``message`` and ``fault`` say why.
+        The status is ``UNUSABLE_SCAN``, or ``BAD_STAMP`` if the stamp cannot be used either.
         """
         self.registered = None
         return self._refused(stamp) or self._unused(stamp, message, fault)
@@ -273,9 +268,8 @@ class Mapper:
             pose = solution.map_T_lidar.compose(posed.middle_T_reference)
         else:
             solution, pose, tilt = self.imu.add_scan(posed, frame.matcher.last, solution)
-        result = Prediction(posed, pose, posed.map_T_middle(pose), frame.predicted.motion)
         status, message = status_of(solution, found.message)
-        update = self._insert(result, status, message, clock, solution, tilt)
+        update = self._insert(posed, pose, status, message, clock, solution, tilt)
         update = self._errors.calibrated(update, frame.sweep, solution)
         clock.lap("covariance")
         return update
@@ -301,7 +295,8 @@ class Mapper:
 
     def _insert(
         self,
-        result: Prediction,
+        posed: PosedSweep,
+        map_T_lidar: gtsam.Pose3,
         status: FrameStatus,
         message: str,
         clock: Clock,
@@ -310,13 +305,13 @@ class Mapper:
     ) -> MapUpdate:
         """Add the sweep to the map; its update."""
         clock.lap("solve")
-        posed, middle = result.posed, result.map_T_middle
+        middle = posed.map_T_middle(map_T_lidar)
         self.maps.insert(posed, middle, self.keyframe)
         self._moment = Moment(posed.sweep.stamp, middle, status is not FrameStatus.SPARSE_MAP)
         matches = None if solution is None else solution.matches
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")
-        return make_update(posed, result.map_T_lidar, status, message, solution, tilt)
+        return make_update(posed, map_T_lidar, status, message, solution, tilt)
 
 
 def _check_factors_have_a_place(

@@ -276,7 +276,10 @@ def point_to_line_factor(
     centre, direction : (3,) a point on the line and its unit direction, map frame
     noise : 2-dimensional; may be robust
 
-    Errors are those of :func:`point_to_plane_factor`.
+    Raises
+    ------
+    InputError
+        As :func:`point_to_plane_factor` does.
     """
     p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
     _noise_dimension(noise, 2)

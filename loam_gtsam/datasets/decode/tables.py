@@ -61,7 +61,7 @@ def convert_lines(path: Path, convert: Callable[[str], _Row], expected: str) -> 
             rows.append(convert(line))
         except ValueError as error:
             raise DatasetError(
-                f"{path}:{number}: expected {expected}, got {line[:80]!r}: {error}"
+                f"{path}:{number}: expected {expected}, got {line[:80]!r}: {str(error)[:80]}"
             ) from error
     return rows
 

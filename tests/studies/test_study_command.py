@@ -138,6 +138,7 @@ def test_a_signal_keeps_what_is_finished_and_the_next_call_goes_on(tmp_path, mon
         return Interrupting(scans)
 
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", open_dataset)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # background jobs ignore it
     file = write_spec(tmp_path, SPEC)
     result = study(file, "--output", "out")
     assert result.exit_code == 130, result.output

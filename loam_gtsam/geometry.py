@@ -1,7 +1,6 @@
-"""Closed-form geometry on arrays of points: checks, rigid motion, fits, voxels.
+"""Closed-form geometry on arrays of points: checks, rigid motion, fits, voxels; free of state.
 
-Everything here is vectorised over points and free of state. Tangent order is
-``[rotation, translation]`` (see :mod:`loam_gtsam.types`).
+Tangent order is ``[rotation, translation]`` (see :mod:`loam_gtsam.types`).
 """
 
 from __future__ import annotations
@@ -80,8 +79,6 @@ def move_points(
     reference time, this maps points measured at their own time into the lidar frame at the
     reference time: the de-skew of a sweep under constant velocity.
 
-    Notes
-    -----
     The screw axis is the same for all points: along k, the direction of w, and through
     ``c = k x v / |w|``. With ``a = |w| t`` Rodrigues' formula about it needs one sine and cosine
     per point and no matrices: ``p' = p + sin(a) k x (p - c) + (1 - cos(a)) k x (k x (p - c)) +
@@ -223,7 +220,6 @@ def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
 
 
 def _voxel_cells(points: NDArray[np.floating], size: float) -> IntArray:
-    """(N, 3) numbers of the voxels, counted from the corner of the grid."""
     cells: IntArray = np.floor(points[:, :3] / size).astype(np.int64) + _GRID
     return cells
 
@@ -233,7 +229,6 @@ def _within_grid(cells: IntArray) -> bool:
 
 
 def _packed_cells(cells: IntArray) -> IntArray:
-    """(N,) keys of 21 bits an axis."""
     keys: IntArray = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
     return keys
 

@@ -1,7 +1,7 @@
 """Measures along the rings of a sweep: how bent, how rough and how trustworthy each point is.
 
-Equations: docs/maths/features.md. Throughout, ``xyz`` is (3, N) float32 in metres, ring after ring
-in firing order, and ring i begins at ``ring_starts[i]``; the last of these (R + 1,) entries is N.
+Throughout, ``xyz`` is (3, N) float32 in metres, ring after ring in firing order, and ring i begins
+at ``ring_starts[i]``; the last of these (R + 1,) entries is N. See docs/maths/features.md.
 """
 
 from __future__ import annotations
@@ -30,14 +30,8 @@ def window_fits(ring_starts: IntArray, half_window: int) -> BoolArray:
 def curvature(xyz: NDArray[np.float32], half_window: int) -> NDArray[np.float32]:
     """LOAM's curvature: squared norm of the sum of differences to the neighbours on the ring.
 
-    Parameters
-    ----------
-    xyz : (3, N) points of the sweep
-    half_window : neighbours on either side
-
-    Returns
-    -------
-    (N,) square metres. Meaningless where :func:`window_fits` is false.
+    Returns (N,) square metres, meaningless where :func:`window_fits` is false; ``half_window`` is
+    the number of neighbours on either side.
     """
     width = 2 * half_window + 1
     inner = xyz.shape[1] - width + 1
@@ -88,15 +82,8 @@ def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
 
     A straight line is fitted to the inverse ranges (see :func:`prominence`); its residuals have
     three degrees of freedom, the second differences. Of the windows that end at, are centred on and
-    begin at a point the smoothest counts, so that points next to an edge are not rough.
-
-    Parameters
-    ----------
-    xyz : (3, N) points of the sweep
-
-    Returns
-    -------
-    (N,) metres, a standard deviation; infinite within two points of the ends
+    begin at a point the smoothest counts, so that points next to an edge are not rough. Returns
+    (N,) metres, a standard deviation; infinite within two points of the ends.
     """
     squared = _squared_norm(xyz)
     inverse = 1.0 / np.sqrt(squared)
@@ -137,12 +124,7 @@ def unreliable_points(
     is drawn in to the range of the nearer one. The nearer surface then cuts off the farther one,
     whose end is no edge: that point and the five behind it are left out (figure 4b of the paper).
     Where both gaps of a point are large for its range, the surface is seen at a grazing angle
-    (figure 4a).
-
-    Parameters
-    ----------
-    xyz, gaps, ring_starts : the sweep, with its gaps from :func:`squared_gaps`
-    settings : the occlusion and grazing limits and ``half_window`` are used
+    (figure 4a). ``gaps`` are those of :func:`squared_gaps`.
     """
     squared = _squared_norm(xyz)
     limit = squared * np.float32(settings.grazing_ratio)

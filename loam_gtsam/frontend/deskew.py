@@ -1,7 +1,5 @@
-"""De-skewing: the features of a sweep as seen from the middle of that sweep.
-
-At the *middle* of the sweep an error of the motion cancels to first order; at the start or the end
-the same error would shift the whole sweep.
+"""De-skewing: the features of a sweep as seen from its middle, where an error of the motion cancels
+to first order; at the start or the end the same error would shift the whole sweep.
 """
 
 from __future__ import annotations
@@ -102,12 +100,9 @@ class MovingSweep:
         return gtsam.Pose3(gtsam.Rot3(rotation), rotation @ twist[3:] * -self.middle)
 
     def twist_since(self, last: tuple[int, gtsam.Pose3], map_T_middle: gtsam.Pose3) -> FloatArray:
-        """(6,) body velocity at the reference time, from the poses of two sweeps.
+        """(6,) body velocity at the reference time, from the poses of the middles of two sweeps.
 
-        Parameters
-        ----------
-        last : stamp, nanoseconds, and pose of the middle of an earlier sweep
-        map_T_middle : pose of the middle of this sweep
+        ``last`` is the stamp, nanoseconds, and the pose of an earlier one.
         """
         seconds = (self.stamp - last[0]) * 1e-9
         if self._turned is None:
@@ -118,13 +113,7 @@ class MovingSweep:
         return np.concatenate([self._rate, map_R_reference.T @ away / seconds])
 
     def twist_at_reference(self, rate: FloatArray, velocity: FloatArray) -> FloatArray:
-        """(6,) body velocity at the reference time.
-
-        Parameters
-        ----------
-        rate : (3,) rad/s
-        velocity : (3,) m/s at the middle of the sweep, in the axes of the lidar at the middle
-        """
+        """(6,) body velocity at the reference time, from (3,) rad/s and (3,) m/s at the middle."""
         if self._turned is not None:
             velocity = self._middle_R_reference.T @ velocity
         return np.concatenate([rate, velocity])
@@ -135,17 +124,11 @@ class MovingSweep:
         edge_rows: IntArray | None = None,
         plane_rows: IntArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Edges and planes seen from the middle of the sweep, (N, 3) metres each.
-
-        Parameters
-        ----------
-        twist : (6,) body velocity at the reference time
-        edge_rows, plane_rows : rows of the wanted features; None for all
-        """
+        """Edges and planes seen from the middle of the sweep, (N, 3) metres each; None is all."""
         return self._part(0, twist, edge_rows), self._part(1, twist, plane_rows)
 
     def _part(self, which: int, twist: FloatArray, rows: IntArray | None) -> FloatArray:
-        """Edges (0) or planes (1), de-skewed."""
+        """Edges (0) or planes (1)."""
         points, seconds = (self._turned or self._points)[which], self._seconds[which]
         if rows is not None:
             points, seconds = points.take(rows, axis=0), seconds.take(rows)
@@ -158,13 +141,7 @@ class MovingSweep:
 
 @dataclass(frozen=True, eq=False)
 class PosedSweep:
-    """A sweep that is de-skewed for one motion: an immutable value.
-
-    Attributes
-    ----------
-    sweep : the sweep with its features as measured
-    twist : (6,) body velocity at the reference time, rad/s and m/s
-    """
+    """A sweep de-skewed for one ``twist``, the (6,) body velocity at the reference time."""
 
     sweep: MovingSweep
     twist: FloatArray

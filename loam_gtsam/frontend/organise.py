@@ -41,14 +41,9 @@ sweep."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimeAssignment:
-    """When each point was measured.
+    """When each point was measured: seconds from the scan's stamp, (N,) and (first, last).
 
-    Attributes
-    ----------
-    times : (N,) seconds from the scan's stamp
-    span : (first, last) seconds from the stamp covered by the sweep
-    method : "field", "azimuth" or "none"
-    note : one sentence for the user
+    ``method`` is "field", "azimuth" or "none", ``note`` one sentence for the user.
     """
 
     times: FloatArray
@@ -61,14 +56,9 @@ class TimeAssignment:
 class SweepColumns:
     """The usable points of a scan, with their ring labels, image rows and times.
 
-    Attributes
-    ----------
-    xyz : (3, N) float32, metres, lidar frame
-    index : (N,) position of each point in the scan
-    labels, row_of, times : (N,) of the same points, or None
-    span : as in :class:`~loam_gtsam.types.Scan`
-    dropped : number of points that are not usable
-    not_finite : number of points that are NaN or infinite
+    ``xyz`` is (3, N) float32, metres, lidar frame, ``index`` (N,) the position of each point in the
+    scan; ``labels``, ``row_of`` and ``times`` are (N,) or None, ``span`` as in
+    :class:`~loam_gtsam.types.Scan`; ``dropped`` and ``not_finite`` are numbers of points.
     """
 
     xyz: NDArray[np.float32]
@@ -122,10 +112,7 @@ class OrganisedSweep:
 def usable_columns(scan: Scan, config: Config) -> SweepColumns:
     """Drop points that are not finite, out of range, or have implausible times.
 
-    Raises
-    ------
-    SweepError
-        If fewer than 11 points remain, or the times cannot be seconds.
+    SweepError if fewer than 11 points remain, or the times cannot be seconds.
     """
     sensor = config.sensor
     # NaN compares false; the square of an infinity is above any finite bound.
@@ -202,12 +189,8 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
     """Find the beam of each point.
 
     ``sensor.rings`` selects the source; ``auto`` tries the ring field, the order of the points (in
-    a range image, or in a file written ring after ring), and the elevations.
-
-    Raises
-    ------
-    SweepError
-        If no source gives at least two rings; the message lists the sources.
+    a range image, or in a file written ring after ring), and the elevations. SweepError if no
+    source gives at least two rings; the message lists the sources.
     """
     tried: list[str] = []
     found: RingAssignment | None = None
@@ -245,18 +228,8 @@ def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -
     """Find the time at which each point was measured.
 
     ``config.sensor.times`` selects the source; ``auto`` takes the times of the points or, where
-    de-skewing needs times, the azimuth.
-
-    Parameters
-    ----------
-    columns : in the order of the scan, which shows the sense of rotation
-    rings : of the same points
-    config : ``sensor`` and ``deskew.enabled`` are used
-
-    Raises
-    ------
-    SweepError
-        If the source has no times; the message says what to set.
+    de-skewing needs times, the azimuth. SweepError if the source has no times; the message says
+    what to set. ``columns`` are in the order of the scan, which shows the sense of rotation.
     """
     sensor = config.sensor
     source: str = sensor.times
@@ -335,11 +308,7 @@ def _sense(
 
 
 def _seam_turns(fraction: FloatArray, same_ring: BoolArray) -> FloatArray:
-    """Whole turns to add to the fractions of a sweep that overlaps its own start.
-
-    Drivers cut sweeps at packets: the first points may lie just before the start azimuth and the
-    last ones just behind it. In firing order this is a step of almost a whole turn.
-    """
+    """Whole turns to add where drivers, which cut at packets, let a sweep overlap its own start."""
     step = np.diff(fraction) * same_ring
     wraps = (step < -_SEAM).astype(np.float64) - (step > _SEAM)
     if not wraps.any():
@@ -357,15 +326,7 @@ def _seam_turns(fraction: FloatArray, same_ring: BoolArray) -> FloatArray:
 def organise(scan: Scan, config: Config) -> OrganisedSweep:
     """Put the points of a sweep ring after ring in firing order, and find their times.
 
-    Parameters
-    ----------
-    scan : one sweep, not de-skewed
-    config : ``sensor`` and ``deskew.enabled`` are used
-
-    Raises
-    ------
-    SweepError
-        If too few points are usable, or rings or times cannot be found.
+    SweepError if too few points are usable, or rings or times cannot be found.
     """
     columns = usable_columns(scan, config)
     rings = assign_rings(columns, config.sensor)
@@ -390,11 +351,7 @@ def organise(scan: Scan, config: Config) -> OrganisedSweep:
 def _firing_order(
     columns: SweepColumns, rings: RingAssignment, timing: TimeAssignment
 ) -> IntArray | None:
-    """Order of the points by ring and time; None if they are in that order.
-
-    A stable sort by 16-bit keys (ring and coarse time) is a radix sort, far cheaper than a sort by
-    time. It suffices for points that were stored in time order, or against it.
-    """
+    """Order of the points by ring and time; None if they are in that order."""
     number = rings.rings
     clock = timing.times
     if timing.method == "none":
@@ -406,6 +363,7 @@ def _firing_order(
     bins = 65536 // rings.count
     coarse = (clock - first).astype(np.float32)
     coarse *= np.float32((bins - 1) / max(last - first, 1e-12))
+    # A stable sort by 16-bit keys is a radix sort, far cheaper than a sort by time.
     key = number * np.uint16(bins) + coarse.astype(np.uint16)
     against = np.count_nonzero(clock[1:] < clock[:-1]) > len(clock) // 2
     if against:
@@ -418,6 +376,5 @@ def _firing_order(
 
 
 def _in_order(number: NDArray[np.uint16], clock: FloatArray) -> bool:
-    """Whether the ring numbers ascend, and the times within each ring."""
     up, same = number[1:] > number[:-1], number[1:] == number[:-1]
     return bool(np.all(up | (same & (clock[1:] >= clock[:-1]))))

@@ -1,8 +1,7 @@
 """Pole features: poles, trunks and table legs, which are thin and stand alone.
 
-LOAM compares a point with five neighbours on either side on the same surface. A pole of ten
-centimetres has fewer points, and most of them count as grazed or occluded. On open ground poles are
-nevertheless all that fixes the pose.
+A pole of ten centimetres has too few points for LOAM's windows, and most of them count as grazed or
+occluded. On open ground poles are nevertheless all that fixes the pose.
 """
 
 from __future__ import annotations

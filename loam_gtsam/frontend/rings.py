@@ -115,15 +115,8 @@ def rings_from_file_order(azimuth: NDArray[np.float32]) -> tuple[RingAssignment 
     """Rings of points stored ring after ring: a ring begins where the azimuth jumps back.
 
     KITTI's raw HDL-64E files carry no ring numbers, and their elevations are too irregular for a
-    nominal table, but the azimuth runs once around per ring.
-
-    Parameters
-    ----------
-    azimuth : (N,) radians, in file order
-
-    Returns
-    -------
-    assignment, reason : None and one sentence why, if the points are not written ring after ring
+    nominal table, but the azimuth runs once around per ring. ``azimuth`` is (N,) radians, in file
+    order. Returns None and one sentence why, if the points are not written ring after ring.
     """
     step = azimuth_steps(azimuth)
     sign = 1.0 if np.count_nonzero(step > 0.0) >= np.count_nonzero(step < 0.0) else -1.0
@@ -149,15 +142,8 @@ def rings_from_file_order(azimuth: NDArray[np.float32]) -> tuple[RingAssignment 
 def rings_from_elevation(xyz: NDArray[np.float32], model: str) -> tuple[RingAssignment | None, str]:
     """Rings by elevation, from a nominal table or from the peaks in a histogram of elevations.
 
-    Parameters
-    ----------
-    xyz : (3, N) metres, lidar frame
-    model : ``sensor.model``; "auto" takes the Velodyne table that fits, else the beams that stand
-        out in the histogram of elevations
-
-    Returns
-    -------
-    assignment, reason : None and one sentence why, if nothing fits
+    Returns None and one sentence why, if nothing fits. ``sensor.model`` "auto" takes the Velodyne
+    table that fits, else the beams that stand out in the histogram.
     """
     distance = np.hypot(xyz[0], xyz[1])
     elevation = np.rad2deg(np.arctan2(xyz[2], distance))

@@ -34,14 +34,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extraction:
-    """Features of a sweep, or why there are none.
-
-    Attributes
-    ----------
-    features : None if the sweep cannot be used
-    problem, fault : why not, as a sentence and typed
-    seconds : time that the extraction took
-    """
+    """Features of a sweep, or why there are none: a sentence and typed; seconds that it took."""
 
     features: Features | None
     problem: str
@@ -119,16 +112,13 @@ def extract_ahead(
 
 
 class _Worker:
-    """A process that extracts the features of sweeps in the order in which they are sent.
-
-    Sweeps and features are handed over in shared memory; the pipe only tells the number of bytes.
-    Through the pipe, or a pool of ``concurrent.futures``, it took 2 of the 15 ms of a frame.
-    """
+    """A process that extracts the features of sweeps in the order in which they are sent."""
 
     def __init__(self, config: Config) -> None:
         context = get_context("spawn")  # a forked child of a process with threads may hang
         self._pipe, far = context.Pipe()
         memory = context.RawArray(ctypes.c_byte, _IN_FLIGHT * _SLOT)
+        # The pipe only tells numbers of bytes: through it sweeps took 2 of the 15 ms of a frame.
         self._outgoing, self._incoming = _slots(memory), _slots(memory)
         self._process = context.Process(target=_serve, args=(far, memory, config), daemon=True)
         self._process.start()
@@ -178,7 +168,7 @@ def _slots(memory: Any) -> Iterator[memoryview]:
 
 
 def _serve(pipe: Connection, memory: Any, config: Config) -> None:
-    """In the process: answer each sweep with its features, until the caller closes the pipe."""
+    """In the process: answer each sweep, until the caller closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the caller to handle
     with suppress(EOFError, OSError):
         for slot in _slots(memory):

@@ -60,6 +60,7 @@ def filter_block(
 
     The gyro is integrated; accelerations turned into that slowly drifting frame are averaged by a
     first-order filter; the frame is then turned the shortest way so that the average points up.
+    Returns ``world_R_body``, (4, N) quaternions, and the state at the last sample.
 
     Parameters
     ----------
@@ -69,10 +70,6 @@ def filter_block(
     seconds : time constant. Until so much time has passed since ``state.since``, or since a gap
         longer than this, the filter is a plain average.
     max_step : seconds; over a longer gap the rates count for so long only
-
-    Returns
-    -------
-    ``world_R_body``, (4, N) quaternions, and the state at the last sample.
     """
     steps = np.diff(stamps, prepend=state.stamp).astype(np.float64) * 1e-9
     lost = steps > seconds
@@ -167,12 +164,8 @@ class GravityFilter:
         self._start_end = int(stamps[0]) + round(config.still_seconds * 1e9)
         rest = rest_at_start(config, samples)
         if rest is not None:
-            bias, force, hold, learnt = (
-                rest.gyro,
-                rest.acceleration,
-                rest.last,
-                config.filter_seconds,
-            )
+            bias, force, hold = rest.gyro, rest.acceleration, rest.last
+            learnt = config.filter_seconds
         else:
             part = slice(0, int(np.searchsorted(stamps, self._start_end, side="right")))
             steps = rotation_steps((stamps[part] - stamps[0]) * 1e-9, gyro[part].T)

@@ -1,7 +1,7 @@
 """The IMU buffer: samples in any order go in, orientation and rotation at any time come out.
 
-Everything that leaves the buffer is in lidar axes: the configured ``lidar_R_imu_deg`` is applied
-when samples enter. Stamps are subtracted as integers before they become seconds.
+Everything that leaves it is in lidar axes: ``lidar_R_imu_deg`` is applied when samples enter.
+Stamps are subtracted as integers before they become seconds.
 """
 
 from __future__ import annotations
@@ -49,13 +49,8 @@ _UNIT = 1e-3
 class SampleStore:
     """Stamps and values of IMU samples, sorted by stamp, one sample for each stamp.
 
-    Parameters
-    ----------
-    counts : "duplicates", "out_of_order" and "too_late" are counted here
-
-    Attributes
-    ----------
-    accepts_from : older samples are dropped, nanoseconds; None accepts all
+    Samples before ``accepts_from``, nanoseconds, are dropped; None accepts all. In ``counts``
+    "duplicates", "out_of_order" and "too_late" are counted.
     """
 
     def __init__(self, counts: Counter[str]) -> None:
@@ -133,15 +128,12 @@ class ImuBuffer:
     """IMU samples in lidar axes, in order of time, to be asked about any time.
 
     The answers for the same samples are the same to the last bit, however the samples came in.
+    ``lidar_R_imu`` is the configured rotation from IMU into lidar axes.
 
     Parameters
     ----------
     config : section ``imu``
     samples : the first samples, if there are some already; errors as of :meth:`add`
-
-    Attributes
-    ----------
-    lidar_R_imu : the configured rotation from IMU into lidar axes
     """
 
     def __init__(self, config: ImuConfig, samples: ImuSamples | None = None) -> None:
@@ -171,10 +163,7 @@ class ImuBuffer:
     def add(self, samples: ImuSamples) -> None:
         """Put in one or many samples, in any order, overlapping others or not.
 
-        Raises
-        ------
-        InputError
-            If an array has the wrong shape or dtype.
+        InputError if an array has the wrong shape or dtype.
         """
         counts = self._counts
         stamps, values = _checked(samples)
@@ -315,7 +304,6 @@ class ImuBuffer:
         return find_rest(self._config, self.samples_between(first, stamp + round(REST_AHEAD * 1e9)))
 
     def _merge(self) -> None:
-        """Sort in what was added since the last question."""
         changed = self._store.merge()
         if changed is not None:
             self._filter.changed_from(*changed)
@@ -364,11 +352,7 @@ def _checked(samples: ImuSamples) -> tuple[IntArray, FloatArray]:
 def _rotation_vectors(
     seconds: FloatArray, earliest: float, latest: float, times: FloatArray, rates: FloatArray
 ) -> FloatArray | None:
-    """(K, 3) rotation vectors from time 0 to ``seconds``, None if one is beyond :data:`WRAP`.
-
-    ``earliest`` <= 0 <= ``latest`` are the ends of ``seconds``; ``times`` (N,) are those of
-    ``rates`` (3, N).
-    """
+    """(K, 3) rotation vectors from time 0 to ``seconds``, None if one is beyond :data:`WRAP`."""
     begin, end = int(np.floor(earliest / _FINE)), int(np.ceil(latest / _FINE)) + 2
     nodes: FloatArray = _FINE * np.arange(begin, end, dtype=np.float64)
     steps = rotation_steps(nodes, _interpolate(nodes, times, rates))

@@ -42,14 +42,9 @@ def find_level(
 ) -> Level | None:
     """Find up from the samples of ``still_seconds`` before a moment and as long after it.
 
-    None if there is no orientation at that moment.
-
-    Parameters
-    ----------
-    buffer, config : the IMU's samples, and section ``imu``
-    stamp, map_T_lidar : nanoseconds and pose of the moment, of which only the rotation counts
-    levelled : whether the map is to have its z axis up: ``level_R_map`` is then the identity, and
-        ``roll`` and ``pitch`` say how the lidar stands in the map
+    None if there is no orientation at that moment, ``stamp`` in nanoseconds. If the map is to be
+    ``levelled``, have its z axis up, ``level_R_map`` is the identity, and ``roll`` and ``pitch``
+    say how the lidar stands in the map.
     """
     found = mean_orientation(buffer, stamp, config.still_seconds)
     if found is None:

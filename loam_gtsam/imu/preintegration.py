@@ -1,13 +1,7 @@
-"""Motion from a gyro and an accelerometer between scan-matched poses.
+"""Motion from gyro and accelerometer between scan-matched poses; see docs/maths/inertial.md.
 
-A window of the last frames (pose, velocity and biases each, and one gravity vector) is a factor
-graph of GTSAM's pre-integrated IMU factors and of what the scans said. It predicts the next pose
-with a covariance that grows only as fast as the IMU drifts, so that the prediction can stand in
-for the scan along directions in which the scan says nothing. See docs/maths/inertial.md.
-
-Inside, states are those of the *IMU*, at ``lidar_t_imu`` and with the axes of the lidar. Only the
-way in and out is in the lidar frame. (GTSAM's own lever arm, ``body_P_sensor``, leaves out the
-angular acceleration.)
+Inside, states are those of the *IMU*, at ``lidar_t_imu`` and with the axes of the lidar. (GTSAM's
+own lever arm, ``body_P_sensor``, leaves out the angular acceleration.)
 """
 
 from __future__ import annotations
@@ -67,14 +61,9 @@ class StartSigmas:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:
-    """Pose of the next frame by the IMU.
+    """Pose of the next frame by the IMU, and (3,) m/s of the lidar, map frame.
 
-    Attributes
-    ----------
-    map_T_lidar : predicted pose
-    velocity : (3,) m/s of the lidar, map frame
-    covariance : (6, 6) of the pose, ``[rotation, translation]``, right perturbation; it has an
-        inverse
+    The (6, 6) covariance of the pose, ``[rotation, translation]``, right perturbation, is regular.
     """
 
     map_T_lidar: gtsam.Pose3
@@ -86,7 +75,8 @@ class InertialOdometry:
     """Predicts the pose of every frame from the IMU, and learns from what the scan then said.
 
     For every frame: :meth:`predict`, then :meth:`update`. A prediction that no update follows is
-    forgotten, and the next one reaches back to the same frame.
+    forgotten, and the next one reaches back to the same frame. InputError if a shape or a value is
+    wrong.
 
     Parameters
     ----------
@@ -104,11 +94,6 @@ class InertialOdometry:
     restarts : how often the window was begun anew by itself: at the scan's pose, because the scan
         contradicts the prediction (more than 30 standard deviations); or at the predicted pose,
         because the graph could not be solved. Biases and gravity are kept.
-
-    Raises
-    ------
-    InputError
-        If a shape or a value is wrong.
     """
 
     state: InertialState
@@ -146,12 +131,9 @@ class InertialOdometry:
     def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
         """Pose at ``stamp``, nanoseconds, from the newest frame and the samples since, lidar axes.
 
-        Raises
-        ------
-        SweepError
-            If there is no prediction: the samples do not cover the time between, are not in order,
-            have a gap above ``config.max_gap``, or add up to a motion without a finite covariance.
-            Nothing has changed then; :meth:`restart` at a pose known otherwise.
+        SweepError if there is no prediction: the samples do not cover the time between, are not in
+        order, have a gap above ``config.max_gap``, or add up to a motion without a finite
+        covariance. Nothing has changed then; :meth:`restart` at a pose known otherwise.
         """
         frame = WindowFrame(self.config, self._window.newest + 1, self.state, stamp, samples)
         # The IMU goes round the lidar as the platform turns.
@@ -170,19 +152,15 @@ class InertialOdometry:
     def update(self, measured: gtsam.Pose3, information: FloatArray) -> None:
         """Take in what the scan said about the predicted frame.
 
+        InputError if a value is wrong, or nothing has been predicted. SweepError if no window can
+        begin here; make a new object then.
+
         Parameters
         ----------
         measured : ``map_T_lidar`` at the optimum of the scan alone
         information : (6, 6) of the tangent there, positive semi-definite; singular or zero where
             the scan says nothing. It is believed; errors that last over frames are to be allowed
             for.
-
-        Raises
-        ------
-        InputError
-            If a value is wrong, or nothing has been predicted.
-        SweepError
-            If no window can begin here; make a new object then.
         """
         root = information_root(as_array(information, "information", (6, 6)))
         if self._pending is None:

@@ -1,9 +1,7 @@
-"""The window of frames behind pre-integration: a graph that forgets its oldest frame.
+"""The window of frames behind pre-integration; equations are those of docs/maths/inertial.md.
 
-Pose and velocity of a state are those of the IMU, in the map; see docs/maths/inertial.md, to which
-the equation numbers refer. GTSAM's own fixed-lag smoothers were tried and are as accurate. They do
-not give the joint covariance of the newest frame, which the next prediction needs, and the
-incremental one keeps a slot for every factor it ever had.
+GTSAM's own fixed-lag smoothers, as accurate, do not give the joint covariance of the newest frame,
+which the next prediction needs; the incremental one keeps a slot for every factor it ever had.
 """
 
 from __future__ import annotations
@@ -64,7 +62,7 @@ class InertialState:
 
     @property
     def bias(self) -> gtsam.imuBias.ConstantBias:
-        """Both biases as GTSAM has them."""
+        """Both biases."""
         return gtsam.imuBias.ConstantBias(self.acceleration_bias, self.gyro_bias)
 
     def values(self, n: int) -> gtsam.Values:
@@ -78,11 +76,6 @@ class InertialState:
 
 class WindowFrame:
     """The prediction of a frame, and the factors between the frame before and this one.
-
-    Parameters
-    ----------
-    made_of : section ``imu``, number of the frame, state of the frame before, stamp of the frame in
-        nanoseconds, and the IMU samples between the two and around them
 
     Attributes
     ----------
@@ -111,7 +104,6 @@ class WindowFrame:
             self.add_scan(*state[1])
 
     def add_scan(self, *scan: *tuple[gtsam.Pose3, gtsam.Pose3, FloatArray]) -> None:
-        """Add what the scan says."""
         self.scan = scan
         self.graph.add(scan_factor(X(self.number), *scan))
 
@@ -172,11 +164,7 @@ def _predict(
 
 
 def _propagated_covariance(factor: gtsam.GaussianFactor, covariance: FloatArray) -> FloatArray:
-    """Covariance (18, 18) of the next state from that of the last one, equation (2).
-
-    The whitened factor says ``A e + C e_next = w`` with unit normal w, where ``e`` holds the last
-    state and gravity. C is square and regular, so that ``e_next = C^-1 (w - A e)``.
-    """
+    """Covariance (18, 18) of the next state from that of the last one, equation (2)."""
     jacobian = factor.jacobian()[0]
     # Columns as the factor has its keys: X, V, next X, next V, B, next B, G.
     x, v, next_x, next_v, b, next_b, g = np.split(jacobian, [6, 9, 15, 18, 24, 30], axis=1)
@@ -261,10 +249,6 @@ class Window:
     state : the only frame at first, with its covariance as prior. Pose, velocity and the rest are
         taken as independent of each other.
     lag : largest number of frames
-
-    Attributes
-    ----------
-    newest : number of the newest frame
     """
 
     def __init__(self, state: InertialState, lag: int) -> None:

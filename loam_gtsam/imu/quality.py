@@ -73,10 +73,7 @@ class QualityLog:
 
     ``counts`` are the samples by what is wrong with them, in the words of :class:`ImuReport`;
     "too_late" are those dropped because they are older than what the buffer still holds.
-
-    Attributes
-    ----------
-    constant : no orientation has differed from the first one so far; also if there was none
+    ``constant`` is true until an orientation differs from the first one.
     """
 
     def __init__(self, config: ImuConfig, counts: Counter[str]) -> None:

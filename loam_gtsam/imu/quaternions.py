@@ -1,8 +1,7 @@
 """Many rotations at once, and the rotations that angular rates add up to.
 
-Quaternions are x y z w, component first: (4, N), so that every operation is one pass over
-contiguous memory. Nothing walks the samples one by one; products of many rotations are taken by
-doubling (Hillis and Steele, Data parallel algorithms, CACM 29, 1986).
+Quaternions are x y z w, component first: (4, N), one pass over contiguous memory an operation.
+Long products are taken by doubling (Hillis and Steele, Data parallel algorithms, CACM 29, 1986).
 """
 
 from __future__ import annotations
@@ -60,17 +59,11 @@ def logarithm(q: FloatArray) -> FloatArray:
 
 
 def rotation_steps(seconds: FloatArray, rates: FloatArray) -> FloatArray:
-    """Rotation vectors (3, N - 1) from each time to the next.
+    """Rotation vectors (3, N - 1) from each time (N,) to the next.
 
-    Parameters
-    ----------
-    seconds : (N,) ascending
-    rates : (3, N) rad/s about the axes of the moving body, linear in between
-
-    Notes
-    -----
-    Two terms of the Magnus expansion, whose second is the coning correction
-    (Iserles and Norsett, On the solution of linear differential equations in Lie groups, 1999).
+    ``rates`` (3, N) are rad/s about the axes of the moving body, linear in between. Two terms of
+    the Magnus expansion, whose second is the coning correction (Iserles and Norsett, On the
+    solution of linear differential equations in Lie groups, 1999).
     """
     step = np.diff(seconds)
     before, after = rates[:, :-1], rates[:, 1:]

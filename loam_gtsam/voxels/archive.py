@@ -21,15 +21,13 @@ _log = logging.getLogger(__name__)
 class Archive:
     """Points of cubes outside the window: the newest in memory, older ones on disk or dropped.
 
+    ``dropped_cubes`` and ``dropped_points`` are lost for good.
+
     Parameters
     ----------
     grid : of the map
     megabytes : memory for points; when it is used up, the oldest cubes go to disk
     folder : in which a folder of this archive's own is made; None to drop cubes instead
-
-    Attributes
-    ----------
-    dropped_cubes, dropped_points : lost for good
     """
 
     def __init__(self, grid: Grid, megabytes: float, folder: str | None) -> None:

@@ -29,7 +29,7 @@ class CubePoints(NamedTuple):
 
     @property
     def nbytes(self) -> int:
-        """Bytes of memory."""
+        """Bytes."""
         return self.points.nbytes + self.owners.nbytes
 
 
@@ -117,8 +117,7 @@ class SortedPoints(NamedTuple):
     points : (N, 3) metres
     keys, owners : (V,) key of each voxel, and owner of its first point
     starts : (V,) the point with which each voxel begins
-    cubes : the C cubes
-    parts : the voxels of each cube
+    parts : the voxels of each of ``cubes``
     """
 
     points: FloatArray

@@ -24,9 +24,7 @@ _MOST_VOXELS = (1 << 20) - 1
 class Grid(NamedTuple):
     """Cubes, of which (0, 0, 0) is centred on the map origin, and voxels, anchored there.
 
-    Attributes
-    ----------
-    cube_size, voxel_size : edge lengths, metres
+    ``cube_size`` and ``voxel_size`` are edge lengths, metres.
     """
 
     cube_size: float
@@ -112,11 +110,9 @@ def cube_index(cell: FloatArray) -> CubeIndex:
 def cubes_in_view(
     cubes: Sequence[CubeIndex], map_T_lidar: FloatArray, cube_size: float
 ) -> tuple[CubeIndex, ...]:
-    """Those cubes of which a corner is seen 30 to 150 degrees off the sensor's up axis.
+    """Those, of at least one, cubes of which a corner is seen 30 to 150 degrees off the up axis.
 
     LOAM (laserMapping) writes this with the law of cosines; A-LOAM has no such test.
-
-    At least one cube must be given.
     """
     corners = cube_size * (np.array(cubes).T[:, :, None] + _CORNERS)
     rays = corners - map_T_lidar[:3, 3, None, None]

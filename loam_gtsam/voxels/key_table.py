@@ -59,9 +59,7 @@ class KeyTable:
     def add(self, keys: IntArray, *columns: NDArray[Any]) -> IntArray:
         """Add rows, of ascending distinct keys, whose keys the table does not hold yet.
 
-        Returns
-        -------
-        (M,) indices of the rows that were added, ascending
+        Returns (M,) indices of the rows that were added, ascending.
         """
         new = np.flatnonzero(~self.holds(keys))
         rows: Columns = (keys, *columns)

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import product
 
@@ -54,8 +52,7 @@ def test_empty_map_and_empty_arrays() -> None:
     assert cube_map.points().shape == (0, 3)
     assert cube_map.neighbourhood(np.eye(4)) == ()
     points, squared = cube_map.nearest(np.zeros((2, 3)), 5, 1.0, [(0, 0, 0)])
-    assert points.shape == (2, 5, 3)
-    assert np.isnan(points).all()
+    np.testing.assert_array_equal(points, np.full((2, 5, 3), np.nan))
     assert np.isinf(squared).all()
     cube_map.insert(np.zeros((1, 3)))
     points, squared = cube_map.nearest(np.empty((0, 3)), 5, 1.0, [(0, 0, 0)])
@@ -119,10 +116,7 @@ def test_centroid_equals_the_voxel_filter_of_the_union() -> None:
 
 @pytest.mark.parametrize("x", [1.4, 1.6])
 def test_rounding_cannot_move_a_centroid_out_of_its_voxel(x: float) -> None:
-    """The plain mean of six times 1.4 is one bit above it, that of six times 1.6 one bit below.
-
-    Either is then in the next voxel of 0.2 m.
-    """
+    """The plain mean of six times x is one bit off, and so in the next voxel of 0.2 m."""
     points = np.full((6, 3), x)
     plain = np.add.reduce(points, axis=0)[None] / 6.0
     assert voxel_keys(plain, 0.2) != voxel_keys(points[:1], 0.2)
@@ -198,7 +192,6 @@ def test_bad_voxel_size(voxel_size: float) -> None:
 
 @pytest.mark.parametrize("archive", ["memory", "disk"])
 def test_points_move_with_their_owner_and_nothing_else_does(tmp_path, archive):
-    """Also those in the archive, out of it and into it."""
     config = MapConfig(
         cube_size=10.0, window=(3, 3, 3), window_margin=0,
         archive_dir=str(tmp_path) if archive == "disk" else None,

@@ -71,9 +71,8 @@ def test_residuals_in_closed_form():
     point = np.array([1.0, 0.0, 0.0])
     residual, _ = factors.point_to_plane_residual(turn, point, np.array([0.0, 1.0, 0.0]), -0.25)
     np.testing.assert_allclose(residual, [0.75], atol=1e-12)
-    residual, _ = factors.point_to_line_residual(
-        turn, point, np.array([0.0, 1.0, 50.0]), np.array([0.0, 0.0, 1.0])
-    )
+    centre, direction = np.array([0.0, 1.0, 50.0]), np.array([0.0, 0.0, 1.0])
+    residual, _ = factors.point_to_line_residual(turn, point, centre, direction)
     np.testing.assert_allclose(np.linalg.norm(residual), 1.0)
 
 
@@ -124,9 +123,8 @@ def test_stacked_factor_equals_sum_of_match_factors(pose):
         expected_hessian, expected_gradient = theirs.hessian()
         scale = np.abs(expected_hessian).max()
         np.testing.assert_allclose(hessian, expected_hessian, atol=1e-10 * scale)
-        np.testing.assert_allclose(
-            gradient, expected_gradient, atol=1e-9 * np.abs(expected_gradient).max() + 1e-7
-        )
+        atol = 1e-9 * np.abs(expected_gradient).max() + 1e-7
+        np.testing.assert_allclose(gradient, expected_gradient, atol=atol)
     start = pose.retract(np.array([0.02, -0.02, 0.03, 0.1, 0.2, -0.1]))
     difference = solve(single, start).localCoordinates(solve(stacked, start))
     assert np.abs(difference).max() < 1e-8
@@ -171,9 +169,8 @@ def test_nearly_parallel_planes_do_not_send_the_anchor_away():
 def test_a_scan_is_one_factor_of_13_rows_however_many_matches_it_has():
     for count in (1, 5, 50):
         lines, centres, directions, weights, *_ = make_matches(np.random.default_rng(8), POSES[2])
-        rows = factors.line_rows(
-            lines[:count], centres[:count], directions[:count], weights[:count], 0.1
-        )
+        some = (part[:count] for part in (lines, centres, directions, weights))
+        rows = factors.line_rows(*some, 0.1)
         assert factors.scan_match_factor(KEY, rows).dim() == 13
 
 

@@ -27,9 +27,7 @@ AXES = [*np.eye(3), np.array([1.0, -2.0, 2.0]) / 3.0]
 
 def packed(matrices):
     """(N, 3, 3) as the (6, N) of the geometry module."""
-    return np.stack(
-        [matrices[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))]
-    )
+    return matrices[:, [0, 1, 2, 0, 1, 0], [0, 1, 2, 1, 2, 2]].T
 
 
 def random_rotation(rng):
@@ -41,9 +39,6 @@ def same_axis(a, b):
     return np.linalg.norm(np.cross(a, b, axis=0), axis=0)
 
 
-# -- rigid motion ----------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("rate", RATES)
 def test_move_points_equals_the_exponential_map_point_by_point(rate):
     rng = np.random.default_rng(1)
@@ -51,16 +46,10 @@ def test_move_points_equals_the_exponential_map_point_by_point(rate):
     times[0] = 0.0
     for axis in AXES:
         twist = np.concatenate([rate * axis, [20.0, -3.0, 1.0]])
-        expected = [
-            gtsam.Pose3.Expmap(twist * t).transformFrom(p)
-            for p, t in zip(points, times, strict=True)
-        ]
-        np.testing.assert_allclose(
-            move_points(points, twist, times),
-            expected,
-            rtol=0,
-            atol=2e-11 + 25 * (rate < 1e-9) * rate,
-        )
+        moves = (gtsam.Pose3.Expmap(twist * t) for t in times)
+        expected = [move.transformFrom(p) for move, p in zip(moves, points, strict=True)]
+        atol = 2e-11 + 25 * (rate < 1e-9) * rate
+        np.testing.assert_allclose(move_points(points, twist, times), expected, rtol=0, atol=atol)
 
 
 @pytest.mark.parametrize("rate", [1.01e-9, 1e-8, 1e-7, 1e-6])
@@ -92,9 +81,6 @@ def test_the_inverse_of_a_pose_undoes_it_for_one_and_for_many():
         np.testing.assert_allclose(inverse, pose.inverse().matrix(), atol=1e-14)
 
 
-# -- checks ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("check", "value", "message"),
     [
@@ -120,9 +106,6 @@ def test_a_right_array_becomes_float64_or_int64_and_is_not_copied_if_it_is_so_al
     assert as_points([[1, 2, 3]], "scan").dtype == np.float64
     assert as_stamps([], "stamps").dtype == np.int64
     assert as_vector(np.arange(5), "values", 5).tolist() == [0.0, 1.0, 2.0, 3.0, 4.0]
-
-
-# -- eigenvalues -----------------------------------------------------------------------------------
 
 
 def matrices_of(kind, rng):
@@ -161,9 +144,6 @@ def test_eigenvalues_and_vectors_equal_eigh(kind, scale):
         gap = np.abs(expected[:, which] - expected[:, 1]) > 0.05 * size
         assert gap.any() or kind in ("isotropic", "zero", "rank 1")
         assert (same_axis(vector[:, gap], vectors[gap, :, which].T) < 1e-6).all()
-
-
-# -- lines and planes ------------------------------------------------------------------------------
 
 
 def test_moments_are_those_of_numpy_and_leave_the_input_alone():
@@ -211,9 +191,6 @@ def test_identical_points_and_no_groups_give_finite_unit_vectors():
     np.testing.assert_array_equal(eigenvalues, 0.0)
     np.testing.assert_allclose(np.linalg.norm(directions, axis=0), 1.0)
     assert [part.shape for part in fit_planes(np.empty((0, 5, 3)))] == [(3, 0)] * 4
-
-
-# -- voxels ----------------------------------------------------------------------------------------
 
 
 def reference_filter(points, size):

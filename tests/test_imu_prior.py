@@ -72,9 +72,6 @@ def check_jacobian(factor, pose, tolerance):
     return -right
 
 
-# -- angles and Jacobians --------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("pull", [1e-3, 1.0])
 def test_the_jacobian_of_the_roll_pitch_factor_is_the_numerical_one(seed, pull):
@@ -116,9 +113,6 @@ def test_too_steep_is_85_degrees_of_any_of_them():
     assert not too_steep(rot3(170, 84.9, 10), rot3(0, -84.9, 0))
     assert too_steep(rot3(0, 85.1, 0))
     assert too_steep(rot3(0, 0, 0), rot3(10, -85.1, 0))
-
-
-# -- the blend -------------------------------------------------------------------------------------
 
 
 def test_the_blend_is_loams_formula_to_the_last_bit():
@@ -195,9 +189,6 @@ def test_the_blend_of_equal_directions_is_the_pose_itself():
     measured = gtsam.Rot3.Yaw(1.0).compose(pose.rotation())
     found = blend_direction(pose, measured, 0.5, UP)
     assert found.equals(pose, 1e-12)
-
-
-# -- the prior that equals the blend ---------------------------------------------------------------
 
 
 @pytest.mark.parametrize("weight", WEIGHTS)
@@ -281,9 +272,6 @@ def test_no_information_is_a_share_of_the_largest_whatever_its_unit(largest):
     expected = largest * np.diag([1e-12, 1e-3])
     found = tilt_information(information, FLAT)
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-300)
-
-
-# -- steep -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("side", [1.0, -1.0])

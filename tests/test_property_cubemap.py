@@ -1,7 +1,5 @@
 """The cube map against the slow and obvious way: 10,000 random operations, and laws of its own."""
 
-from __future__ import annotations
-
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -25,11 +23,7 @@ CUBE, VOXEL = 4.0, 0.5
 
 
 class Reference:
-    """All points in one plain dictionary, by their voxel; the window is a question, not a place.
-
-    A point is ``(position, owner)``. There is no archive: what is outside the window is just
-    neither found nor inserted to.
-    """
+    """All (position, owner) in a dictionary, by their voxel; the window is a question."""
 
     def __init__(self, config: MapConfig) -> None:
         self.config = config

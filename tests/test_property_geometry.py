@@ -1,7 +1,5 @@
 """Laws of the geometry that hold for every input: rigid motions, fits, voxels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gtsam
@@ -39,24 +37,16 @@ def pose(twist: Any) -> gtsam.Pose3:
     return gtsam.Pose3.Expmap(twist)
 
 
-# -- groups ----------------------------------------------------------------------------------------
-
-
 @given(a=twists(), b=twists(), points=clouds())
 def test_transforms_compose_and_invert(a: Any, b: Any, points: Any) -> None:
     A, B = pose(a).matrix(), pose(b).matrix()
     tolerance = {"rtol": 0, "atol": 1e-12 * (100.0 + np.abs(points).max())}
-    np.testing.assert_allclose(transform(A @ B, points), transform(A, transform(B, points)),
-                               **tolerance)  # fmt: skip
-    np.testing.assert_allclose(transform(np.linalg.inv(A), transform(A, points)), points,
-                               **tolerance)  # fmt: skip
+    twice, moved = transform(A, transform(B, points)), transform(A, points)
+    np.testing.assert_allclose(transform(A @ B, points), twice, **tolerance)
+    np.testing.assert_allclose(transform(np.linalg.inv(A), moved), points, **tolerance)
     np.testing.assert_array_equal(transform(np.eye(4), points), points)
-    moved = transform(A, points)
     before, after = (np.linalg.norm(p[1:] - p[:-1], axis=1) for p in (points, moved))
     np.testing.assert_allclose(after, before, **tolerance)
-
-
-# -- fits ------------------------------------------------------------------------------------------
 
 
 @st.composite
@@ -102,9 +92,6 @@ def test_eigenvalues_scale_and_shift_with_the_matrix(
                                rtol=1e-9, atol=1e-9 * scale)  # fmt: skip
     shifted = matrices + np.array([1.0, 1.0, 1.0, 0.0, 0.0, 0.0])[:, None]
     np.testing.assert_allclose(symmetric_eigenvalues(shifted), values + 1.0, atol=1e-9)
-
-
-# -- voxels ----------------------------------------------------------------------------------------
 
 
 @given(points=clouds(most=200), size=st.sampled_from([0.05, 0.4, 7.0]), rng=generators())

@@ -12,10 +12,7 @@ POINTS = np.zeros((6, 3), np.float32)
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        (
-            {"points": np.zeros((6, 4), np.float32)},
-            r"Scan.points: expected \(N, 3\) floats.*\(6, 4\)",
-        ),
+        ({"points": np.zeros((6, 4))}, r"Scan.points: expected \(N, 3\) floats.*\(6, 4\)"),
         ({"points": np.zeros(3)}, r"Scan.points.*\(3,\)"),
         ({"points": [[0.0, 0.0, 0.0]]}, "Scan.points.*list"),
         ({"points": np.zeros((6, 3), np.int64)}, "Scan.points: expected .* floats, got .*int64"),

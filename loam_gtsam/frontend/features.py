@@ -1,5 +1,6 @@
 """Feature extraction by the rules of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in
-Real-time, RSS 2014, section V.A, and the published code); docs/maths/deviations.md says what differs.
+Real-time, RSS 2014, section V.A, and the published code); docs/maths/deviations.md has what
+differs.
 """
 
 from __future__ import annotations

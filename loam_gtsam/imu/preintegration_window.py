@@ -104,6 +104,7 @@ class WindowFrame:
             self.add_scan(*state[1])
 
     def add_scan(self, *scan: *tuple[gtsam.Pose3, gtsam.Pose3, FloatArray]) -> None:
+        """Add what the scan says."""
         self.scan = scan
         self.graph.add(scan_factor(X(self.number), *scan))
 

@@ -1,7 +1,5 @@
 """Measures along a ring against closed forms: curvature, occlusion, grazing, roughness."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -37,12 +37,8 @@ def imu_samples(first=0.0, end=1.2):
     times = np.arange(round(200 * first), round(200 * end)) / 200.0
     step = 1e-5
     gyro = (attitude(times - step).inv() * attitude(times + step)).as_rotvec() / (2 * step)
-    return ImuSamples(
-        START + np.round(times * 1e9).astype(np.int64),
-        attitude(times).as_quat(),
-        gyro,
-        np.zeros((len(times), 3)),
-    )
+    stamps = START + np.round(times * 1e9).astype(np.int64)
+    return ImuSamples(stamps, attitude(times).as_quat(), gyro, np.zeros((len(times), 3)))
 
 
 def config(rotation="auto", **deskew):
@@ -106,7 +102,6 @@ def test_a_known_motion_is_undone(rotation, reference):
 
 
 def test_a_posed_sweep_stays_what_it_is():
-    """Another motion of the same sweep is another value."""
     moving = MovingSweep(sweep()[0], config(), buffer())
     first = moving.at(twist_at(0.5))
     before = first.points[1].copy()
@@ -155,9 +150,6 @@ def test_a_bias_of_the_gyro_is_taken_off():
         errors.append(largest_error(moving, truth, twist_at(0.5)))
     assert errors[0] > 0.1
     assert errors[1] < LIMITS["auto"]
-
-
-# -- constant velocity -----------------------------------------------------------------------------
 
 
 def without_imu(features, wanted=None):

@@ -1,7 +1,5 @@
 """Scan registration against closed forms, a sequential reference, and real sweeps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -67,9 +65,6 @@ def noisy_scan(seed: int = 0, points_per_ring: int = 1200, rings: int = 4) -> Sc
     return replace(scan, points=scan.points * scale[:, None])
 
 
-# --- closed forms -----------------------------------------------------------------------------
-
-
 def test_square_room_has_edges_at_its_corners_and_planes_on_its_walls() -> None:
     features = extract_features(world(room), Config())
     horizontal = np.abs(features.edges[:, :2])
@@ -105,17 +100,11 @@ def test_grazed_wall_gives_no_edges() -> None:
     assert far(extract_features(scan, Config())) == 0
 
 
-# --- sectors --------------------------------------------------------------
-
-
 def test_sectors_split_what_has_a_window() -> None:
     bounds = sector_bounds(np.array([0, 12, 15, 57]), 5, 3)
     assert bounds[:3].tolist() == [[5, 5], [5, 6], [6, 7]]
     assert np.all(bounds[3:6, 0] == bounds[3:6, 1])  # the ring of three points
     assert bounds[6:].tolist() == [[20, 30], [30, 41], [41, 52]]
-
-
-# --- picks ------------------------------------------------------------------------------------
 
 
 def sequential_picks(
@@ -239,9 +228,6 @@ def test_limit_of_zero_picks_nothing() -> None:
     assert len(features.planes) > 100
 
 
-# --- planes, times, reference -----------------------------------------------------------------
-
-
 def test_rest_is_the_voxel_filtered_remainder_of_each_ring() -> None:
     found = Picked(noisy_scan(2), ROUGH_TOO)
     sweep, features, used = found.sweep, found.features, {*found.edges, *found.flat}
@@ -304,9 +290,6 @@ def test_reference_time(reference: str, shift: float) -> None:
     assert features.edge_times == pytest.approx(measured - shift, abs=1e-9)
 
 
-# --- order and repeatability ------------------------------------------------------------------
-
-
 def assert_same(one: Features, two: Features) -> None:
     for name in Features.__slots__:
         assert np.array_equal(getattr(one, name), getattr(two, name)), name
@@ -325,18 +308,12 @@ def test_order_of_the_points_does_not_matter_and_runs_repeat() -> None:
     assert_same(extract_features(shuffled, Config()), expected)
 
 
-# --- refusals ---------------------------------------------------------------------------------
-
-
 def test_rings_too_short_for_a_window_are_refused_and_one_long_one_is_enough() -> None:
     scan = noisy_scan(0, points_per_ring=10)
     with pytest.raises(SweepError, match="longest of 4 rings has 10 points, at least 11"):
         extract_features(scan, Config())
     longer = noisy_scan(0, points_per_ring=11)
     assert len(extract_features(longer, ROUGH_TOO).planes) > 0
-
-
-# --- noise and surfaces -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("noise", "kept"), [(0.02, True), (0.3, False)])
@@ -348,9 +325,6 @@ def test_foliage_gives_no_planes_and_a_noisy_wall_does(noise: float, kept: bool)
     bare = len(extract_features(scan, ROUGH_TOO).planes)
     share = len(extract_features(scan, Config()).planes) / bare
     assert share > 0.9 if kept else share < 0.4
-
-
-# --- real data --------------------------------------------------------------------------------
 
 
 def real_scan(folder: Path, number: int = 0) -> Scan:

@@ -1,7 +1,5 @@
 """Rings and times of a sweep: every source, every refusal."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,10 +22,7 @@ def sensor(**fields: object) -> Config:
 def firing(
     elevations: np.ndarray, clockwise: bool = True, start_deg: float = 180.0, turn: float = 1.0
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(points, rings, fraction of the sweep) in firing order: column after column.
-
-    Half a step off the start azimuth, so that rounding decides nothing.
-    """
+    """(points, rings, fraction of the sweep) in firing order, half a step off the start azimuth."""
     columns = round(COLUMNS * turn)
     fraction = (np.arange(columns) + 0.5) / COLUMNS
     azimuth = np.deg2rad(start_deg) + (-1 if clockwise else 1) * 2 * np.pi * fraction
@@ -42,9 +37,6 @@ def firing(
 
 def rings_of(scan: Scan, config: Config) -> np.ndarray:
     return assign_rings(usable_columns(scan, config), config.sensor).rings
-
-
-# --- usable points ----------------------------------------------------------------------------
 
 
 def test_drops_points_with_all_their_columns() -> None:
@@ -80,9 +72,6 @@ def test_a_sweep_in_millimetres_is_asked_about_its_unit() -> None:
         SweepError, match=r"0 of them within .*; half are farther than \d+ m: are they in"
     ):
         organise(Scan(points * 1e3, 0), Config())
-
-
-# --- rings ------------------------------------------------------------------------------------
 
 
 def test_all_sources_agree() -> None:
@@ -233,9 +222,6 @@ def test_too_few_and_too_many_rings_are_refused(count: int) -> None:
         organise(Scan(points, 0, rings=labels), Config())
 
 
-# --- times ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("clockwise", [True, False])
 @pytest.mark.parametrize("start_deg", [180.0, 0.0, 90.0])
 @pytest.mark.parametrize(("stamp", "offset"), [("start", 0.0), ("middle", -0.5), ("end", -1.0)])
@@ -320,9 +306,6 @@ def test_a_few_nonsense_times_are_dropped_but_wrong_units_are_refused() -> None:
         organise(Scan(points, 0, rings=rings, times=1e9 * fraction), Config())
 
 
-# --- order ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("times", ["field", "none"])
 def test_order_is_ring_by_ring_in_firing_order(times: str) -> None:
     points, rings, fraction = firing(VLP16)
@@ -334,9 +317,6 @@ def test_order_is_ring_by_ring_in_firing_order(times: str) -> None:
         assert np.array_equal(order[sweep.index], reference)
         assert np.array_equal(sweep.ring_starts, np.arange(17) * COLUMNS)
         assert np.array_equal(sweep.ring_of_start, np.arange(16))
-
-
-# --- real data --------------------------------------------------------------------------------
 
 
 def read_bin(path: Path) -> np.ndarray:

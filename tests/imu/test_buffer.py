@@ -97,9 +97,6 @@ def test_between_is_exact_and_its_own_inverse():
     assert buffer.rotation_between(int(ns(-0.01)), int(ns(1.0))) is None
 
 
-# -- orientation -----------------------------------------------------------------------------------
-
-
 def test_orientation_is_interpolated_through_every_wrap():
     samples = moving()
     signs = np.where(np.arange(len(samples.stamps)) % 3 == 0, -1.0, 1.0)
@@ -177,9 +174,6 @@ def test_everything_comes_out_in_lidar_axes(orientation):
         assert np.allclose(getattr(a, name), getattr(b, name), atol=1e-12)
     assert np.allclose(np.abs((a.orientation * b.orientation).sum(axis=1)), 1.0)
     assert angle(found.lidar_R_imu, rot(*degrees)) < 1e-12
-
-
-# -- in any order ----------------------------------------------------------------------------------
 
 
 def answers(buffer, samples):

@@ -28,9 +28,8 @@ def test_up_is_found_in_any_map_and_yaw_is_left_alone():
     np.testing.assert_allclose(np.degrees([level.roll, level.pitch]), [12, -7], atol=1e-9)
     found = level.level_R_map.compose(pose.rotation())
     np.testing.assert_allclose(np.degrees(found.rpy()), [12, -7, 0], atol=1e-9)
-    np.testing.assert_allclose(
-        level.map_up, pose.rotation().matrix() @ attitude.matrix()[2], atol=1e-9
-    )
+    up = pose.rotation().matrix() @ attitude.matrix()[2]
+    np.testing.assert_allclose(level.map_up, up, atol=1e-9)
     assert level.source == "still"
     in_level = level_of(samples_of(attitude), levelled=True)
     assert in_level.level_R_map.equals(gtsam.Rot3(), 0.0)
@@ -80,7 +79,6 @@ def test_where_the_gyro_cannot_bring_samples_together_one_orientation_counts():
         assert level.samples == 1
         assert [level.roll, level.pitch] == pytest.approx(alone.rpy()[:2], abs=1e-12)
     # Between two samples none may be within reach.
-    level = level_of(
-        samples_of(rot3(0, 0, 0)), ImuConfig(still_seconds=0.001), stamp=START + 1_002_500_000
-    )
+    near = ImuConfig(still_seconds=0.001)
+    level = level_of(samples_of(rot3(0, 0, 0)), near, stamp=START + 1_002_500_000)
     assert level.samples == 1

@@ -44,9 +44,6 @@ def pose(rotation, translation):
     return gtsam.Pose3(gtsam.Rot3(rotation), np.asarray(translation, dtype=float))
 
 
-# -- closed forms ----------------------------------------------------------------------------------
-
-
 FORCE = UP + np.array([1.5, -0.5, 0.2])
 FORWARD = np.array([2.0, 0.0, 0.0])
 
@@ -114,9 +111,6 @@ def test_the_ends_are_cut_and_interpolated(offset):
     assert found.velocity[0] == pytest.approx(expected, abs=1e-9)
 
 
-# -- the covariance of a prediction ----------------------------------------------------------------
-
-
 @pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (0.5, -0.3, 0.2)])
 @pytest.mark.parametrize("scale", [1.0, 1e-3], ids=["unsure", "known"])
 def test_covariance_is_that_of_the_errors(arm, scale):
@@ -159,9 +153,6 @@ def test_a_covariance_is_that_of_the_lidar():
     sigmas = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(sigmas, np.repeat([0.05, 0.001], 3), rtol=0.01)
     assert odo.state.covariance[3, 3] == pytest.approx(0.025**2, rel=0.01)
-
-
-# -- what the scan says ----------------------------------------------------------------------------
 
 
 def test_the_scan_residual_against_numerical_derivatives():
@@ -248,9 +239,6 @@ def test_without_information_the_prediction_is_the_frame_and_the_one_before_is_f
     np.testing.assert_array_equal(odo.state.covariance[:6, :6], found.covariance)
     expected = odometry().predict(START + 2 * FRAME, data)
     np.testing.assert_array_equal(found.covariance, expected.covariance)
-
-
-# -- over many frames ------------------------------------------------------------------------------
 
 
 def turning_on_the_spot(frames, gyro_bias, acceleration_bias, noise=0.0, config=None, **known):
@@ -346,9 +334,6 @@ def test_a_featureless_corridor():
     assert 0.15 < sigma < 1.0
     across = np.array(errors[150:]) @ (np.eye(3) - np.outer(axis, axis))
     assert np.sqrt((across**2).mean()) < 0.01
-
-
-# -- trouble ---------------------------------------------------------------------------------------
 
 
 def broken(rows=slice(None), row=0, **put):

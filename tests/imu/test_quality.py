@@ -37,9 +37,6 @@ def test_a_placeholder_is_not_taken_for_an_orientation():
         assert ImuBuffer(CONFIG, still).report.orientation == "ahrs"
 
 
-# -- mounting --------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def walk():
     """Rotations from frame to frame of a walk through the room, as a scan matcher and a gyro see

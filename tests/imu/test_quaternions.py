@@ -45,11 +45,8 @@ def test_rotation_steps_follow_a_moving_axis():
     """Rates that change evenly but not about one axis: the trapezoid alone is off by coning."""
     start, change = np.array([[2.0], [0.5], [-1.0]]), np.array([[-3.0], [4.0], [2.0]])
     rough, fine = np.linspace(0.0, 0.1, 6), np.linspace(0.0, 0.1, 20_001)
-    exact = Rotation.from_quat(
-        quaternions.running_product(
-            quaternions.exponential(quaternions.rotation_steps(fine, start + change * fine))
-        )[:, -1]
-    )
+    turns = quaternions.exponential(quaternions.rotation_steps(fine, start + change * fine))
+    exact = Rotation.from_quat(quaternions.running_product(turns)[:, -1])
     rates = start + change * rough
     steps = quaternions.rotation_steps(rough, rates)
     plain = 0.5 * np.diff(rough) * (rates[:, 1:] + rates[:, :-1])

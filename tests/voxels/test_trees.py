@@ -1,7 +1,5 @@
 """Trees over cubes: exact whatever was added since, and kept as long as they can be used."""
 
-from __future__ import annotations
-
 from itertools import pairwise, product
 
 import numpy as np

@@ -236,8 +236,8 @@ def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
     """All matches of a scan, at least one, as one 13-row factor on the pose ``key``.
 
     Its error, gradient, Gauss-Newton Hessian and optimum are those of the sum of the per-match
-    factors with sigma ``1 / scale``, at a cost per evaluation that does not
-    depend on the number of matches. InputError if there are no rows.
+    factors with sigma ``1 / scale``, at a cost per evaluation that does not depend on the number of
+    matches. InputError if there are no rows.
     """
     if len(rows.points) == 0:
         raise InputError("scan_match_factor: expected at least one match, got none")

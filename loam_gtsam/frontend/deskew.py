@@ -113,7 +113,10 @@ class MovingSweep:
         return np.concatenate([self._rate, map_R_reference.T @ away / seconds])
 
     def twist_at_reference(self, rate: FloatArray, velocity: FloatArray) -> FloatArray:
-        """(6,) body velocity at the reference time, from (3,) rad/s and (3,) m/s at the middle."""
+        """(6,) body velocity at the reference time.
+
+        ``velocity`` (3,) m/s is that at the middle of the sweep, in the axes of the lidar there.
+        """
         if self._turned is not None:
             velocity = self._middle_R_reference.T @ velocity
         return np.concatenate([rate, velocity])
@@ -124,7 +127,7 @@ class MovingSweep:
         edge_rows: IntArray | None = None,
         plane_rows: IntArray | None = None,
     ) -> tuple[FloatArray, FloatArray]:
-        """Edges and planes seen from the middle of the sweep, (N, 3) metres each; None is all."""
+        """Edges and planes seen from the middle of the sweep, (N, 3) metres; rows None are all."""
         return self._part(0, twist, edge_rows), self._part(1, twist, plane_rows)
 
     def _part(self, which: int, twist: FloatArray, rows: IntArray | None) -> FloatArray:
@@ -141,7 +144,7 @@ class MovingSweep:
 
 @dataclass(frozen=True, eq=False)
 class PosedSweep:
-    """A sweep de-skewed for one ``twist``, the (6,) body velocity at the reference time."""
+    """A sweep de-skewed for one ``twist``, as of :meth:`MovingSweep.at`: an immutable value."""
 
     sweep: MovingSweep
     twist: FloatArray

@@ -62,7 +62,7 @@ class InertialState:
 
     @property
     def bias(self) -> gtsam.imuBias.ConstantBias:
-        """Both biases."""
+        """Both, as GTSAM has them."""
         return gtsam.imuBias.ConstantBias(self.acceleration_bias, self.gyro_bias)
 
     def values(self, n: int) -> gtsam.Values:

@@ -117,7 +117,7 @@ class SortedPoints(NamedTuple):
     points : (N, 3) metres
     keys, owners : (V,) key of each voxel, and owner of its first point
     starts : (V,) the point with which each voxel begins
-    parts : the voxels of each of ``cubes``
+    cubes, parts : the C cubes, and the voxels of each
     """
 
     points: FloatArray

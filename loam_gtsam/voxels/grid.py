@@ -110,7 +110,7 @@ def cube_index(cell: FloatArray) -> CubeIndex:
 def cubes_in_view(
     cubes: Sequence[CubeIndex], map_T_lidar: FloatArray, cube_size: float
 ) -> tuple[CubeIndex, ...]:
-    """Those, of at least one, cubes of which a corner is seen 30 to 150 degrees off the up axis.
+    """Those cubes, of at least one, with a corner 30 to 150 degrees off the sensor's up axis.
 
     LOAM (laserMapping) writes this with the law of cosines; A-LOAM has no such test.
     """

@@ -22,12 +22,9 @@ from loam_gtsam.loops.keyframes import is_pose, pose_number
 from loam_gtsam.loops.loop_selection import chi_squared, loop_to_switch
 from loam_gtsam.types import BoolArray, FloatArray, InputError
 
-_INLIER = 0.5
-"""Weight of graduated non-convexity above which a loop closure is in the first choice."""
-_GNC_TOLERANCE = 1e-3
-"""Relative change of the cost that ends a round of GNC; its weights need no more."""
-_ANCHOR = 1e-4
-"""rad and m: standard deviation of the first pose of a graph without any unary factor."""
+_INLIER = 0.5  # weight of graduated non-convexity above which a loop closure is in the first choice
+_GNC_TOLERANCE = 1e-3  # relative change of the cost that ends a round of GNC
+_ANCHOR = 1e-4  # rad and m: sigma of the first pose of a graph without any unary factor
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,15 +30,11 @@ from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_fea
 from loam_gtsam.registration.solvers import GtsamSolver, Solution
 from loam_gtsam.types import FloatArray, IntArray
 
-_ALIKE = 10
-"""Number of keyframes with the most similar heading-free keys that are compared in full."""
-_NEAR = (0.03, 0.2)
-"""Metres and degrees: a smaller step ends a trial."""
-_STARTS = 3
-"""Number of poses from the search around a candidate at which a trial starts."""
+_ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full
+_NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
+_STARTS = 3  # number of poses from the search around a candidate at which a trial starts
 
-_LEVEL = 0.7
-"""Cosine between the normal of a plane and up, above which the plane is level; slopes are."""
+_LEVEL = 0.7  # cosine between normal and up above which a plane is level; slopes are
 
 
 class LoopCloser(Protocol):

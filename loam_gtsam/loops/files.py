@@ -25,11 +25,9 @@ G2O_SUFFIX, GTSAM_SUFFIXES = ".g2o", (".graph", ".values", ".stamps")
 _POSE, _EDGE, _FIX, _STAMP = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT", "FIX", "# stamp_ns"
 _NUMBERS = {_POSE: 8, _EDGE: 30, _FIX: 1}
 _UPPER = np.triu_indices(6)
-_SWAP = np.array([3, 4, 5, 0, 1, 2])
-"""Order of the axes: g2o has translation first, GTSAM rotation."""
+_SWAP = np.array([3, 4, 5, 0, 1, 2])  # order of the axes: g2o has translation first, GTSAM rotation
 _FIXED_SIGMA = 1e-4
-_NUMBERS_END = 1 << 56
-"""Keys from here on are those of ``gtsam.symbol``, smaller ones numbers of poses."""
+_NUMBERS_END = 1 << 56  # keys from here on are of ``gtsam.symbol``, smaller ones numbers of poses
 
 
 def write_graph(path: str | Path, saved: SavedGraph) -> None:

@@ -16,15 +16,11 @@ import numpy as np
 
 from loam_gtsam.types import BoolArray, FloatArray, InputError, OutputError
 
-_RELINEARIZE = 1e-3
-"""rad or m by which a pose moves before iSAM2 linearises anew: the error is of second order."""
-_ROUNDS = 20
-"""Largest number of updates of iSAM2 until the variables stay."""
-_STILL = 1e-5
-"""rad and m; a variable that moves less in an update stays."""
+_RELINEARIZE = 1e-3  # rad or m a pose moves before iSAM2 linearises anew: an error of second order
+_ROUNDS = 20  # largest number of updates of iSAM2 until the variables stay
+_STILL = 1e-5  # rad and m; a variable that moves less in an update stays
 
-_Step = tuple[Any, ...]
-"""Name of a method of :class:`IncrementalGraph` that changed it, and what it was given."""
+_Step = tuple[Any, ...]  # name of a method that changed the graph, and what it was given
 
 
 class IncrementalGraph:

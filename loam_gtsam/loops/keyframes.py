@@ -18,8 +18,7 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate
 
-_LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)
-"""rad and m added to every standard deviation: a factor must not be infinitely sure."""
+_LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)  # rad and m: no factor may be infinitely sure
 
 
 @dataclass(frozen=True, slots=True, eq=False)

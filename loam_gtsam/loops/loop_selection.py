@@ -20,10 +20,8 @@ from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, odometry_between, pose_key
 from loam_gtsam.types import BoolArray, FloatArray
 
-_LIKELY = 12.6
-"""Squared Mahalanobis distance that 95 % of right loop closures do not exceed."""
-_SWITCHES = 50
-"""Largest number of loop closures that are switched one by one after a new one."""
+_LIKELY = 12.6  # squared Mahalanobis distance that 95 % of right loop closures do not exceed
+_SWITCHES = 50  # largest number of loop closures that are switched one by one after a new one
 
 
 def chi_squared(

@@ -18,8 +18,7 @@ from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import Keyframe, is_pose_key, noise_model, pose_key
 from loam_gtsam.types import FloatArray, InputError
 
-_UNDETERMINED = 1e-9
-"""Smallest singular value of new variables, columns scaled to length one, that counts."""
+_UNDETERMINED = 1e-9  # least singular value that counts, columns of length one
 
 
 class FactorGraph:

@@ -27,17 +27,9 @@ from loam_gtsam.loops.keyframes import (
 )
 from loam_gtsam.loops.loop_selection import LoopSelection
 from loam_gtsam.loops.own_factors import FactorGraph
-from loam_gtsam.types import (
-    Features,
-    FloatArray,
-    InputError,
-    MapUpdate,
-    Trajectory,
-    stack_poses,
-)
+from loam_gtsam.types import Features, FloatArray, InputError, MapUpdate, Trajectory, stack_poses
 
-_ANYWHERE = np.repeat([np.pi, 100.0], 3)
-"""rad and m: standard deviations of the first pose of another run, put where that run has it."""
+_ANYWHERE = np.repeat([np.pi, 100.0], 3)  # rad and m: sigmas of the first pose of another run
 
 
 class PoseGraph(FactorGraph):

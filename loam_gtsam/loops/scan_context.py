@@ -13,10 +13,8 @@ from loam_gtsam.config import LoopConfig
 from loam_gtsam.geometry import as_points
 from loam_gtsam.types import FloatArray, InputError
 
-_BELOW = 3.0
-"""Heights count from a level that is so many metres below the lidar; lower points count as 0."""
-_HIGHEST = 20.0
-"""Largest height in metres: what is higher depends on the opening angle of the lidar."""
+_BELOW = 3.0  # heights count from so many metres below the lidar; lower points are 0
+_HIGHEST = 20.0  # metres: what is higher depends on the opening angle of the lidar
 
 
 def scan_context(points: FloatArray, config: LoopConfig) -> FloatArray:

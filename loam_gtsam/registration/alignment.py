@@ -9,7 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.config import Config, MatchingConfig
+from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import as_points, voxel_filter
 from loam_gtsam.registration.association import associate
@@ -86,8 +86,9 @@ def align(
             raise InputError(f"{name}: expected at least {least} points, got {len(cloud)}")
     points = voxel_filter(source, config.map.plane_voxel)
     pose = guess or gtsam.Pose3()
-    maps = CubeMap(config.map, config.map.edge_voxel), CubeMap(config.map, config.map.plane_voxel)
-    for cubes, cloud in zip(maps, (_NONE, target), strict=True):
+    edges = CubeMap(config.map, config.map.edge_voxel)
+    planes = CubeMap(config.map, config.map.plane_voxel)
+    for cubes, cloud in ((edges, _NONE), (planes, target)):
         cubes.recenter(pose.translation())
         cubes.insert(cloud)
     # Nothing is known before but that the clouds overlap.
@@ -97,7 +98,8 @@ def align(
     for reach in (first, config.matching.max_distance):
         matching = config.matching.changed(max_distance=reach, max_planes=0)
         prior = MotionPrior(pose, np.diag(sigmas**-2.0))
-        solution = solver.solve(partial(_matches, maps, points, matching), pose, (), prior)
+        match = partial(associate, _NONE, points, edge_map=edges, plane_map=planes, config=matching)
+        solution = solver.solve(match, pose, (), prior)
         pose = solution.map_T_lidar
     return Alignment(
         pose,
@@ -108,15 +110,6 @@ def align(
         solution.weak,
         solution.matches,
     )
-
-
-def _matches(
-    maps: tuple[CubeMap, CubeMap],
-    points: FloatArray,
-    matching: MatchingConfig,
-    map_T_lidar: gtsam.Pose3,
-) -> ScanMatches:
-    return associate(_NONE, points, map_T_lidar, *maps, matching)
 
 
 def _covariance(solution: Solution, config: Config) -> FloatArray:

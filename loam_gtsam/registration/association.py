@@ -34,8 +34,8 @@ def associate(
 ) -> ScanMatches:
     """Match de-skewed features with the cubes around a pose.
 
-    At most ``max_edges`` and ``max_planes`` features are matched, evenly spread over the rows.
-    Features are sorted by voxel, so that the matched ones are spread over the sweep.
+    At most ``max_edges`` and ``max_planes`` features are matched, evenly spread over the rows and,
+    as these are sorted by voxel, over the sweep.
 
     Parameters
     ----------
@@ -107,10 +107,8 @@ def match_features(
 
 
 def _fixed_by(planes: PlaneMatches) -> float:
-    """The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviation of a normal.
-
-    Planes that fix three translations face three ways, and then they fix the rotation as well.
-    """
+    """The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviation of a normal."""
+    # Planes that fix three translations face three ways, and then they fix the rotation as well.
     tilts = planes.tilts
     assert tilts is not None  # match_planes sets the tilts
     across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
@@ -125,10 +123,8 @@ def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntAr
         return np.arange(limit) * count // limit
     before, after = np.flatnonzero(first), np.flatnonzero(~first)
     before = before[spread_rows(len(before), limit)]
-    left = limit - len(before)
-    return (
-        np.sort(np.concatenate([before, after[spread_rows(len(after), left)]])) if left else before
-    )
+    after = after[spread_rows(len(after), left)] if (left := limit - len(before)) else after[:0]
+    return np.sort(np.concatenate([before, after]))
 
 
 def trial_matching(config: MatchingConfig) -> MatchingConfig:
@@ -146,7 +142,7 @@ def trial_matching(config: MatchingConfig) -> MatchingConfig:
 def rematched(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, config: MatchingConfig
 ) -> ScanMatches:
-    """At most ``limit`` of ``count`` rows, evenly spread; rows of ``first`` before others."""
+    """The matches with the same lines and planes at another pose."""
     pose = map_T_lidar.matrix()
     e, p = matches.edges, matches.planes
     away = (transform(pose, e.points) - e.centres).T
@@ -171,9 +167,8 @@ def _line_weights(distances: FloatArray, config: MatchingConfig) -> FloatArray:
 
 
 def _plane_weights(distances: FloatArray, ranges: FloatArray, config: MatchingConfig) -> FloatArray:
-    weights: FloatArray = 1.0 - config.weight_slope * np.abs(distances) / np.sqrt(
-        np.maximum(ranges, _TINY)
-    )
+    roots = np.sqrt(np.maximum(ranges, _TINY))
+    weights: FloatArray = 1.0 - config.weight_slope * np.abs(distances) / roots
     return weights
 
 
@@ -237,10 +232,9 @@ def match_planes(
 
     Notes
     -----
-    Two deliberate deviations from the published code: the plane is fitted about the centroid, so
-    that a plane through the map's origin is no special case, and the range in the weight is the
-    distance of the point from the sensor (as in LIO-SAM), not from the map's origin.
-    ``plane_fit: unit_offset`` and ``weight_range: map`` give the published forms.
+    Deviations from the published code: planes are fitted about the centroid, so that one through
+    the map's origin is no special case, and the range in the weight is that from the sensor (as in
+    LIO-SAM). ``plane_fit: unit_offset`` and ``weight_range: map`` give the published forms.
     """
     reach = config.max_distance if reach is None else reach
     near = np.flatnonzero(squared_distances[:, -1] < reach**2)
@@ -274,13 +268,9 @@ def match_planes(
 
 
 def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Planes by the least squares A n = -1 of LOAM and A-LOAM; unit normals (3, N), offsets (N,).
-
-    With mean m and covariance C of the points the solution is ``n = -a / (det C + m . a)`` with
-    ``a = adj(C) m`` (Sherman and Morrison on ``A^T A = k (C + m m^T)``), which needs no inverse.
-    Where ``a`` vanishes (the points lie in a plane through the map's origin, or on one line) there
-    is no such plane; the offset is then infinite and fails the plane test.
-    """
+    """Planes by the least squares A n = -1 of LOAM and A-LOAM; unit normals (3, N), offsets (N,)."""
+    # n = -a / (det C + m . a) with a = adj(C) m, mean m and covariance C (Sherman and Morrison on
+    # A^T A = k (C + m m^T)). Where a vanishes, an infinite offset fails the plane test.
     means, (xx, yy, zz, xy, yz, xz) = moments(neighbours)
     rows = (
         (yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy),
@@ -299,13 +289,11 @@ def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]
 
 
 def _dot(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Dot products along the first axis, of length three."""
     product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
     return product
 
 
 def _norm(vectors: FloatArray) -> FloatArray:
-    """Lengths of vectors along the first axis."""
     length: FloatArray = np.sqrt(_dot(vectors, vectors))
     return length
 
@@ -318,13 +306,9 @@ def _deviations(
     neighbours: int,
     config: MatchingConfig,
 ) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (M,) of the distance of a new point, m, and of the tilt of the fit, rad.
-
-    The first is the variance of prediction of a regression, ``s^2 (1 + (1 + leverage) / k)``
-    (Draper and Smith, Applied Regression Analysis, 3rd ed., section 3.1). ``roughness`` and
-    ``spread`` are variances of the k neighbours, m^2, across and along the fit; ``parameters`` are
-    those of the fit per direction across.
-    """
+    """Standard deviations (M,) of the distance of a new point, m, and of the tilt of the fit, rad."""
+    # ``roughness`` and ``spread`` are variances across and along the fit. Variance of prediction of
+    # a regression: Draper and Smith, Applied Regression Analysis, 3rd ed., section 3.1.
     least = config.point_sigma**2
     scatter, variance = np.full((2, len(roughness)), least)
     if config.fit_uncertainty:

@@ -1,10 +1,7 @@
 """Degenerate directions: the motions of the sensor about which the matches of a scan say nothing.
 
-The information matrix of a scan is never singular. A normal that is fitted to five noisy points is
-wrong by some degrees, and a thousand such normals on the bare walls of a corridor seem to fix the
-position along the corridor. They do not, since the map points behind them are matched anew at every
-pose. The noise of the normals tells this false information from the real one.
-Equations: docs/maths/degeneracy.md.
+A thousand noisy normals on the bare walls of a corridor seem to fix the position along it. The
+noise of the normals tells this false information from the real one: docs/maths/degeneracy.md.
 """
 
 from __future__ import annotations
@@ -19,13 +16,11 @@ from loam_gtsam.geometry import cross, cross_matrix
 from loam_gtsam.registration.matches import EdgeMatches, ScanMatches, subset
 from loam_gtsam.types import FloatArray
 
-_CLEAR = 3.0
-"""Standard deviations of a normal by which a displacement must leave its surface to be seen."""
+_CLEAR = 3.0  # sigmas of a normal by which a displacement must leave its surface to be seen
 _MOVED = 0.1
 """Share of the root mean square displacement by which a point must move to count in full: points on
 a pole move by millimetres in a turn about the pole, and say nothing about this turn."""
-_HELD = 0.5
-"""Share of ``min_aligned`` that the lines must reach on their own before planes are left out."""
+_HELD = 0.5  # share of ``min_aligned`` that lines alone must reach before planes are left out
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,18 +86,14 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     directions are the generalised eigenvectors of the two sums. Matches with
     ``|n . u| > 3 s |u|`` see the motion. A distinct line counts as two planes, others not at all.
 
-    Parameters
-    ----------
-    matches : of the scan
-    map_T_lidar : the pose at which they were made
+    ``map_T_lidar`` is the pose at which the matches were made.
     """
-    rotation = map_T_lidar.rotation().matrix()
     e, p = matches.edges, matches.planes
     if e.distinct is not None:
         e = subset(e, e.distinct)
     points, normals, tilts = _planes_through(e)
     points, normals = np.concatenate([points, p.points]), np.concatenate([normals, p.normals])
-    normals = normals @ rotation
+    normals = normals @ map_T_lidar.rotation().matrix()
     tilts = np.concatenate([tilts, np.zeros(len(p)) if p.tilts is None else p.tilts])
     weights = np.concatenate([np.repeat(e.weights / e.sigmas, 2), p.weights / p.sigmas])
 
@@ -130,15 +121,7 @@ def unseen_by_planes(
     On rough ground the few lines of poles show how far the pose is off. The thousand planes of the
     ground do not show it: by noise they hold the pose where it was, and they outweigh the poles.
 
-    Parameters
-    ----------
-    matches : of the scan
-    map_T_lidar : the pose at which they were made
-    seen : how well planes and lines together fix it
-    least : matches below which a direction is weak, see :meth:`Localizability.weak`
-
-    Returns
-    -------
+    ``seen`` is the same of planes and lines together, ``least`` that of :meth:`Localizability.weak`.
     None if planes alone fix all directions, or do so with lines that see too little on their own.
     """
     if seen.by_planes.min() >= least:
@@ -154,14 +137,7 @@ def unseen_by_planes(
 
 
 def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatArray) -> FloatArray:
-    """(E, W) what each line counts, for each motion, in ``Localizability.aligned``.
-
-    Parameters
-    ----------
-    edges : of the scan
-    map_T_lidar : the pose at which they were made
-    directions : (W, 6), see :class:`Localizability`
-    """
+    """(E, W) what each line counts, for each of (W, 6) motions, in ``Localizability.aligned``."""
     points, normals, tilts = _planes_through(edges)
     sight = _sight(points, normals @ map_T_lidar.rotation().matrix(), tilts, directions)
     sight = sight[0::2] + sight[1::2]
@@ -200,11 +176,10 @@ def _eigenvectors(form: FloatArray, noise: FloatArray) -> FloatArray:
 
 def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:
     """(6, 6) form: the weighted sum of the points' squared displacements by a motion."""
-    first = weights @ points
     second = (points * weights[:, None]).T @ points
     form = np.zeros((6, 6))
     form[:3, :3] = np.trace(second) * np.eye(3) - second
-    form[:3, 3:] = cross_matrix(first)
+    form[:3, 3:] = cross_matrix(weights @ points)
     form[3:, :3] = form[:3, 3:].T
     form[3:, 3:] = weights.sum() * np.eye(3)
     return form

@@ -29,10 +29,6 @@ from loam_gtsam.types import FloatArray
 class MapPair:
     """The map of edges and the map of planes.
 
-    Parameters
-    ----------
-    config : voxel sizes, window, ... of both
-
     Attributes
     ----------
     edges, planes : the maps
@@ -74,9 +70,8 @@ class MapPair:
     def too_sparse(self, predicted: Prediction, config: Config) -> str:
         """Why there are too few points around a sweep to solve in; empty if there are enough."""
         pose, solver = predicted.map_T_middle.matrix(), config.solver
-        edges, planes = (
-            cubes.count(cubes.neighbourhood(pose)) for cubes in (self.edges, self.planes)
-        )
+        maps = self.edges, self.planes
+        edges, planes = (cubes.count(cubes.neighbourhood(pose)) for cubes in maps)
         if edges >= solver.min_map_edges and planes >= solver.min_map_planes:
             return ""
         return (
@@ -89,24 +84,16 @@ class MapPair:
     ) -> tuple[FloatArray, FloatArray]:
         """All edge and plane points, archived ones included, (E, 3) and (P, 3) metres.
 
-        Parameters
-        ----------
-        moves : where :meth:`move` would bring the points first; the map does not change
+        They are where :meth:`move` would bring them with ``moves``; the map does not change.
         """
         if moves:
             return self.edges.moved_points(moves), self.planes.moved_points(moves)
         return self.edges.points(archived=True), self.planes.points(archived=True)
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
-        """Move points with the keyframes they belong to, after a loop closure.
+        """Move points with the keyframes they belong to; returns the number of points moved.
 
-        Parameters
-        ----------
-        moves : (4, 4) rigid transforms in the frame of the map, by number of the keyframe
-
-        Returns
-        -------
-        Number of points moved.
+        ``moves`` holds (4, 4) rigid transforms in the frame of the map, by number of the keyframe.
         """
         self._thinned = None
         return self.edges.move(moves) + self.planes.move(moves)
@@ -228,7 +215,6 @@ class FrameMatcher(Matcher):
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
-    """The features of a sweep that are matched with a configuration."""
     return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct)
 
 

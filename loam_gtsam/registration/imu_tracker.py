@@ -28,16 +28,12 @@ from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
 from loam_gtsam.types import FloatArray, SweepError, TiltPrior
 
-_BIAS_GAIN = 0.02
-"""Share of a frame's difference between gyro and scan that goes into the gyro's bias: 50 frames."""
+_BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
 """Gyro and scan disagree about a frame if they differ by more than this angle plus this share of
 the turn: far above the noise of either, below what a wrong axis or sign makes."""
-_DISTRUST = 5
-"""Number of frames in which gyro and scan disagree, less the number in which they agree, from which
-on the gyro is not used."""
-_PAIRS = 2000
-"""Number of pairs of frames, the newest, behind the check of the mounting."""
+_DISTRUST = 5  # frames of disagreement less those of agreement from which the gyro is not used
+_PAIRS = 2000  # number of pairs of frames, the newest, behind the check of the mounting
 _SCAN_VARIANCE = 4.0
 """By which the scan's information is divided before pre-integration believes it: errors of scans
 against one map last over frames (built-in scenes: mean squared errors of 1 to 4 times the

@@ -16,19 +16,13 @@ from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
-_LONGEST = 10.0
-"""Seconds for which a motion is extrapolated at most; after a longer gap, or with a wrong stamp,
-the extrapolated pose would be anywhere."""
+_LONGEST = 10.0  # seconds of extrapolation: after more the pose would be anywhere
 _SHORTEST = 1e-3  # least seconds between the middles of two sweeps
-_REASSOCIATE_EVERY = 5
-"""Gauss-Newton iterations per association of the scan-to-scan odometry (LOAM)."""
-_WEIGHT_SLOPE = 1.8
-"""Weight 1 - 1.8 |d| after the first association of the scan-to-scan odometry (LOAM)."""
+_REASSOCIATE_EVERY = 5  # gauss-Newton iterations per association of scan to scan (LOAM)
+_WEIGHT_SLOPE = 1.8  # weight 1 - 1.8 |d| after the first association of scan to scan (LOAM)
 _MIN_MATCHES = 10  # least matches of the scan-to-scan odometry; with fewer the twist stays (LOAM)
-_CONVERGED = 1e-5
-"""Change of the motion over a sweep, rad and m, below which the scan-to-scan odometry stops."""
-_RING_SPACING = 1e4
-"""Metres between rings in the four-dimensional search; more than the width of any sweep."""
+_CONVERGED = 1e-5  # change over a sweep, rad and m, below which scan to scan stops
+_RING_SPACING = 1e4  # metres between rings in the 4D search; more than the width of any sweep
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,10 +45,7 @@ class Odometry(Protocol):
     def guess(self, features: Features, last: MapUpdate | None) -> Guess:
         """Predict the pose of a sweep, without any change of the odometry.
 
-        Parameters
-        ----------
-        features : features of the new sweep
-        last : result of the mapper for the last sweep, None at the start
+        ``last`` is the result of the mapper for the last sweep, None at the start.
         """
         ...
 
@@ -118,10 +109,8 @@ class Moment(NamedTuple):
     solved: bool
 
     def seconds_to(self, stamp: int) -> float:
-        """Seconds to the middle of a later sweep, at least :data:`_SHORTEST`.
-
-        The middles of two sweeps of different length may coincide.
-        """
+        """Seconds to the middle of a later sweep."""
+        # The middles of two sweeps of different length may coincide.
         return max((stamp - self.stamp) * 1e-9, _SHORTEST)
 
 
@@ -195,10 +184,7 @@ def twist_to(
 ) -> FloatArray:
     """(6,) body velocity between the middles of the last sweep and of this sweep.
 
-    Parameters
-    ----------
-    otherwise : result if there is no last sweep, or if the middle of the last sweep is not earlier
-        (sweeps of different length)
+    ``otherwise`` without a last sweep, or if its middle is not earlier (sweeps of unlike length).
     """
     if last is None or sweep.stamp <= last.stamp:
         return otherwise
@@ -282,15 +268,12 @@ class ScanToScan(Odometry):
 
 
 class _RingSearch:
-    """Lines and planes through the points of a sweep that are nearest to a query.
-
-    The second tree is four-dimensional: rings are so far apart along the fourth axis that the
-    nearest neighbour of (x, y, z, ring) is the nearest point of exactly that ring.
-    """
+    """Lines and planes through the points of a sweep that are nearest to a query."""
 
     def __init__(self, points: FloatArray, rings: IntArray) -> None:
         self.points, self.rings = points, rings
         self._tree = cKDTree(points)
+        # Rings are so far apart along the fourth axis that the nearest is of exactly that ring.
         self._ring_tree = cKDTree(np.column_stack([points, rings * _RING_SPACING]))
 
     def lines(

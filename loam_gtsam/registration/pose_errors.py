@@ -1,9 +1,7 @@
 """How wrong a pose may be: covariances of poses in the map, and of the motion between two poses.
 
-The inverse of the information takes every match as independent, the standard deviation of a match
-as right, the motion within a sweep as known and the map as exact. Here the scatter is taken from
-the residuals themselves, matches close together count as one, and two errors are added: what a
-constant velocity misses, and the drift of the map. Equations: docs/maths/covariance.md.
+Unlike in the inverse of the information, the scatter is that of the residuals, matches close
+together count as one, and two errors are added: docs/maths/covariance.md.
 """
 
 from __future__ import annotations
@@ -31,10 +29,8 @@ from loam_gtsam.voxels.key_table import KeyTable
 _PRIOR_CELLS = 6.0
 """Weight, in cells, of the scatter of all residuals beside that of the cells: with fewer than six
 cells the scores alone do not span the six directions."""
-_LEAST_VARIANCE = 1e-6
-"""Least variance of whitened residuals: a covariance must not vanish on data without noise."""
-_REMEMBERED = 500_000
-"""Cells of one generation of :class:`SeenGround`: 4 MB."""
+_LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
+_REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
@@ -117,11 +113,7 @@ class PoseErrors:
     def calibrated(self, update: MapUpdate, sweep: MovingSweep, solution: Solution) -> MapUpdate:
         """The update of a solved frame with its covariance; to be called once for each, in order.
 
-        Parameters
-        ----------
-        update : of the frame
-        sweep : features of the frame, with the motion of the solution
-        solution : of the solve, at the middle of the sweep
+        The sweep has the motion of the solution, which is at its middle.
         """
         first = self._seen.is_empty
         scan = scan_error(
@@ -161,11 +153,9 @@ class PoseErrors:
         self, reference_stamp: int, sweep: MovingSweep, middle: gtsam.Pose3,
         covariance: FloatArray, to_reference: FloatArray,
     ) -> tuple[FloatArray, FloatArray, _Middle]:  # fmt: skip
-        """The frame's own error at the reference time, and what it shares with the last frame's.
-
-        The pose at the reference time follows from the pose at the middle of the sweep by the
-        velocity since the middle of the last sweep, and so has a share in the errors of both.
-        """
+        """The frame's own error at the reference time, and what it shares with the last frame's."""
+        # The pose at the reference time follows from that at the middle by the velocity since the
+        # last middle, and so has a share in the errors of both.
         last = self._last
         if last is not None and sweep.stamp <= last.stamp:  # sweeps of different length
             last = None
@@ -270,12 +260,7 @@ class SeenGround:
         return len(self._younger) + len(self._older) == 0
 
     def cells(self, points_map: FloatArray) -> tuple[IntArray, BoolArray]:
-        """Number of the cell of each point (N,), and which of the C cells are new; remembers them.
-
-        Parameters
-        ----------
-        points_map : (N, 3) metres
-        """
+        """Cell numbers (N,) of points (N, 3), metres, and which of C cells are new; adds them."""
         keys, numbers = np.unique(voxel_keys(points_map, self._size), return_inverse=True)
         added = self._younger.add(keys)
         new = np.zeros(len(keys), np.bool_)
@@ -319,8 +304,7 @@ def scan_error(
     cells = by_cell.max(initial=-1) + 1
     scatter = _sums(scores, by_cell, cells)
     information: FloatArray = jacobian.T @ jacobian
-    variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
-    variance = max(variance, _LEAST_VARIANCE)
+    variance = max(float(residuals @ residuals) / max(len(residuals) - 6, 1), _LEAST_VARIANCE)
     meat: FloatArray = cells * scatter.T @ scatter + _PRIOR_CELLS * variance * information
     meat = meat / (cells + _PRIOR_CELLS)
     renewed: FloatArray = fresh.T @ fresh

@@ -1,8 +1,7 @@
 """Relocalisation: detection of sweeps that do not fit the map, and the search for their pose.
 
-A solve always returns some pose. A wrong pose shows in its matches, which disagree with the lines
-and planes of the map. The usual share of agreement differs from place to place (grass, people, a
-bare hall), so that each sweep is compared with the sweeps before it.
+The matches of a wrong pose disagree with the map. How many usually do differs from place to place
+(grass, people, a bare hall), so that each sweep is compared with those before it.
 """
 
 from __future__ import annotations
@@ -24,23 +23,17 @@ from loam_gtsam.registration.report import distance_in_words
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, IntArray
 
-_AGREE = 3.0
-"""Standard deviations within which a match agrees with the pose: 99.7 % of normal noise."""
-_CELL = 0.5
-"""Size of a search cell, metres: half the reach of a match, which is then the neighbouring cell."""
+_AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
+_CELL = 0.5  # metres: half the reach of a match, which is then the neighbouring cell
 _SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
-_TURN = np.radians(5.0)
-"""Angle between trial headings: half of it moves a point at 15 m by little more than a cell."""
+_TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than a cell
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
-_START_ROUNDS = 2
-"""Number of times the first two sweeps are registered anew while their motion becomes known."""
+_START_ROUNDS = 2  # times the first two sweeps are registered anew, to learn their motion
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
-_CLEARLY = 1.02
-"""Ratio by which another motion within a sweep must fit better than the motion before."""
-_APART = (1.5, np.radians(12.0))
-"""Metres and rad below which two trial poses lead to the same solution."""
+_CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
+_APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,13 +119,9 @@ class FitMonitor:
     def jumped(self, step: FloatArray, seconds: float) -> bool:
         """Whether a pose is farther from its prediction than any acceleration explains.
 
-        Parameters
-        ----------
-        step : (6,) tangent from the predicted pose to the solved pose, rad and m
-        seconds : time since the last sweep
+        ``step`` is the (6,) tangent from the predicted pose to the solved one, rad and m.
         """
-        reach = 0.5 * seconds**2
-        config = self.config
+        reach, config = 0.5 * seconds**2, self.config
         return self.ready and bool(
             np.linalg.norm(step[:3]) > reach * config.max_turn_acceleration
             or np.linalg.norm(step[3:]) > reach * config.max_acceleration
@@ -177,9 +166,7 @@ class Lost:
 def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
     """Whether the solution of a sweep is doubtful, so that the sweep must be searched for.
 
-    Parameters
-    ----------
-    last_twist : (6,) body velocity of the last sweep; the predicted pose may be a user's guess
+    ``last_twist`` is the (6,) body velocity of the last sweep: the prediction may be a user's.
     """
     moment = frame.matcher.last
     if not monitor.config.enabled or moment is None:
@@ -201,15 +188,7 @@ def rebuild_start(
     """Rebuild the map of the first sweep with the motion that is known from the second sweep.
 
     Otherwise the map of a run that starts in motion would always hold a distorted first sweep.
-
-    Parameters
-    ----------
-    first : the first sweep and its pose
-    frame, found : the second sweep, and the outcome of its solve
-
-    Returns
-    -------
-    Frame and outcome of the second sweep in the rebuilt map.
+    ``frame`` and ``found`` are the second sweep and its solve; returned as in the rebuilt map.
     """
     pose, maps = first.map_T_lidar, frame.matcher.maps
     for _ in range(_START_ROUNDS):
@@ -236,11 +215,6 @@ def search(
     The motion of a lidar that was carried away between two sweeps says nothing about the motion
     within the sweeps. Three velocities are tried: the predicted one, rest, and the predicted one in
     axes that were turned on the vehicle.
-
-    Parameters
-    ----------
-    solution : the doubtful solution
-    monitor : the usual fit and the number of lost sweeps
     """
     matcher, guess = frame.matcher, frame.matcher.posed.twist
     usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
@@ -310,11 +284,8 @@ def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
 
 def sample_features(edges: FloatArray, planes: FloatArray) -> FloatArray:
     """(N, 3) a few evenly spread features of a sweep, metres."""
-    parts = [
-        points[spread_rows(len(points), most)]
-        for points, most in zip((edges, planes), _SAMPLE, strict=True)
-    ]
-    return np.concatenate(parts)
+    pairs = zip((edges, planes), _SAMPLE, strict=True)
+    return np.concatenate([points[spread_rows(len(points), most)] for points, most in pairs])
 
 
 def likely_poses(
@@ -347,8 +318,7 @@ def likely_poses(
     scores, moves = (np.concatenate(parts) for parts in zip(*tried, strict=True))
     owner = np.repeat(np.arange(len(tried)), [len(scored) for scored, _ in tried])
     best: list[gtsam.Pose3] = []
-    origins = np.array([pose.translation() for pose in around])
-    at = moves[:, :2] + origins[owner, :2]
+    at = moves[:, :2] + np.array([pose.translation() for pose in around])[owner, :2]
     while len(best) < count and len(scores) and scores.max() > 0.0:
         top = int(scores.argmax())
         x, y, turn = moves[top]

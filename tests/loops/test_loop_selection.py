@@ -20,12 +20,7 @@ from support.pose_graphs import (
 
 from loam_gtsam.loops.batch import optimize_graph
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
-from loam_gtsam.loops.loop_selection import (
-    chi_squared,
-    consistent,
-    consistent_set,
-    loop_to_switch,
-)
+from loam_gtsam.loops.loop_selection import chi_squared, consistent, consistent_set, loop_to_switch
 
 
 def test_chi_squared_is_the_same_before_and_after_the_loop_is_in():

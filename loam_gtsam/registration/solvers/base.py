@@ -26,8 +26,7 @@ class Matcher:
     """The matches of one sweep with one map, as a function of the pose.
 
     Every method is pure: the same arguments always give the same result. This base class wraps a
-    plain function; the matcher of the mapper,
-    :class:`~loam_gtsam.registration.frame_matcher.FrameMatcher`, overrides all methods.
+    plain function; the mapper's ``FrameMatcher`` overrides all methods.
     """
 
     def __init__(self, associate: Associate) -> None:
@@ -122,9 +121,7 @@ class MotionPrior:
     def factor(self, directions: FloatArray | None = None) -> gtsam.NonlinearFactor:
         """The expected pose as a factor on :data:`POSE_KEY`.
 
-        Parameters
-        ----------
-        directions : (6, 6) projector onto the directions in which the factor acts; all if None
+        ``directions`` is a (6, 6) projector onto those in which the factor acts; all if None.
         """
         information = self.information
         if directions is not None:

@@ -1,13 +1,7 @@
 """The classical solvers: LOAM's hand solve and A-LOAM's robust least squares, in numpy.
 
-Both have the interface of :class:`~loam_gtsam.registration.solvers.GtsamSolver`, so that the same
-matches can be given to all three. Two results differ in meaning:
-
-* As in the originals, rows have a standard deviation of 1 m. ``Solution.information`` is the
-  information of these rows; divide it by the variance of a residual, m^2, to compare it with the
-  information of ``GtsamSolver``.
-* Priors are refused with an error. The motion prior is not used: :class:`ClassicalSolver` has
-  LOAM's own projector.
+Rows have a standard deviation of 1 m, as in the originals: divide ``Solution.information`` by the
+variance of a residual, m^2, to compare it with that of ``GtsamSolver``. The motion prior is unused.
 """
 
 from __future__ import annotations
@@ -35,8 +29,7 @@ _LOAM_ORDER = [1, 2, 0]
 _START_RADIUS = 1e4
 _MAX_RADIUS = 1e16
 _DIAGONAL = (1e-6, 1e32)
-_MIN_DECREASE = 1e-3
-"""A step is taken if the cost falls by more than this share of the predicted fall."""
+_MIN_DECREASE = 1e-3  # share of the predicted fall of the cost from which a step is taken
 
 
 class _SolverWithoutPriors(ABC):
@@ -54,13 +47,7 @@ class _SolverWithoutPriors(ABC):
         priors: Sequence[gtsam.NonlinearFactor] = (),
         motion: MotionPrior | None = None,
     ) -> Solution:
-        """See :meth:`loam_gtsam.registration.solvers.ScanSolver.solve`.
-
-        Raises
-        ------
-        InputError
-            If priors are given.
-        """
+        """See :meth:`ScanSolver.solve`; InputError if priors are given."""
         if len(priors):
             raise InputError(
                 f"priors: the {self.config.method} solver has no place for them, got "
@@ -70,7 +57,7 @@ class _SolverWithoutPriors(ABC):
 
     @abstractmethod
     def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
-        """The optimisation of one frame on fixed matches."""
+        ...
 
 
 class ClassicalSolver(_SolverWithoutPriors):
@@ -177,23 +164,15 @@ def loam_rows(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> MatchRows:
     distance = np.linalg.norm(away, axis=1)
     normals = away / np.where(distance > 0.0, distance, 1.0)[:, None]
     offsets = -np.einsum("ij,ij->i", normals, e.centres)
-    return concatenate_rows(
-        [
-            plane_rows(e.points, normals, offsets, e.weights, 1.0),
-            plane_rows(p.points, p.normals, p.offsets, p.weights, 1.0),
-        ]
-    )
+    edges = plane_rows(e.points, normals, offsets, e.weights, 1.0)
+    return concatenate_rows([edges, plane_rows(p.points, p.normals, p.offsets, p.weights, 1.0)])
 
 
 def aloam_rows(matches: ScanMatches) -> MatchRows:
     """A-LOAM's rows, metres: two per edge, then one per plane, times the weight of the match."""
     e, p = matches.edges, matches.planes
-    return concatenate_rows(
-        [
-            line_rows(e.points, e.centres, e.directions, e.weights, 1.0),
-            plane_rows(p.points, p.normals, p.offsets, p.weights, 1.0),
-        ]
-    )
+    edges = line_rows(e.points, e.centres, e.directions, e.weights, 1.0)
+    return concatenate_rows([edges, plane_rows(p.points, p.normals, p.offsets, p.weights, 1.0)])
 
 
 def euler_jacobian(map_T_lidar: gtsam.Pose3) -> FloatArray:
@@ -271,11 +250,9 @@ def _turn(map_T_lidar: gtsam.Pose3) -> FloatArray:
 def _robust(
     rows: MatchRows, pairs: int, delta: float, map_T_lidar: gtsam.Pose3
 ) -> tuple[float, FloatArray, FloatArray]:
-    """Huber cost, J^T W J (6, 6) and J^T W r (6,) for steps along the map's axes.
-
-    Each edge has two of the first ``2 * pairs`` rows, and one common weight. W is the derivative of
-    the loss (Triggs et al., Bundle Adjustment, 2000, without the second-order term, as in Ceres).
-    """
+    """Huber cost, J^T W J (6, 6) and J^T W r (6,) for steps along the map's axes."""
+    # The two rows of an edge have one weight. W is the derivative of the loss (Triggs et al.,
+    # Bundle Adjustment, 2000, without the second-order term, as in Ceres).
     residual, jacobian = rows.residuals(map_T_lidar)
     squared = residual * residual
     edges = squared[: 2 * pairs].reshape(-1, 2).sum(axis=1)

@@ -115,15 +115,11 @@ class GtsamSolver:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """Localizability by the first matches of a frame: all of them, and the planes alone.
-
-    ``weak`` is the projector onto the degenerate directions. ``planes`` is None where the planes
-    fix all that the scan fixes.
-    """
+    """Localizability by the first matches of a frame: all of them, and the planes alone."""
 
     scan: Localizability | None = None
-    weak: FloatArray | None = None
-    planes: Localizability | None = None
+    weak: FloatArray | None = None  # projector onto the degenerate directions
+    planes: Localizability | None = None  # None where planes fix all that the scan fixes
 
 
 def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> _Sight:
@@ -164,16 +160,9 @@ def _without(
 def fuse(
     map_T_lidar: gtsam.Pose3, information: FloatArray, factors: Sequence[gtsam.NonlinearFactor]
 ) -> tuple[gtsam.Pose3, FloatArray]:
-    """Fuse a solution with further factors on the same pose.
+    """Fuse a solved pose and its (6, 6) information with further factors on :data:`POSE_KEY`.
 
-    Parameters
-    ----------
-    map_T_lidar, information : the solved pose and its (6, 6) information, which may be singular
-    factors : on :data:`POSE_KEY`
-
-    Returns
-    -------
-    pose, information : the optimum of all, and its (6, 6) information
+    Returns the optimum of all, and its (6, 6) information.
     """
     # No Cholesky root: the information may be singular.
     eigenvalues, vectors = np.linalg.eigh(information)
@@ -201,10 +190,7 @@ def within_tolerance(step: FloatArray, information: FloatArray, config: SolverCo
     more than LOAM's half millimetre, and the iteration would never stop. Such steps are far below
     the standard deviation in that direction.
 
-    Parameters
-    ----------
-    step : (6,) tangent, rad and m
-    information : (6, 6) of the pose
+    ``step`` is a (6,) tangent, rad and m, and ``information`` the pose's (6, 6).
     """
     rotation = np.degrees(np.linalg.norm(step[:3]))
     translation = np.linalg.norm(step[3:])
@@ -250,9 +236,6 @@ def match_rows(
         width = kernel_width * max(1.0, scatter)
         edge_weights = edge_weights * _kept(edge_units, width, kernel)
         plane_weights = plane_weights * _kept(plane_units, width, kernel)
-    return concatenate_rows(
-        [
-            line_rows(e.points, e.centres, e.directions, edge_weights, e.sigmas),
-            plane_rows(p.points, p.normals, p.offsets, plane_weights, p.sigmas),
-        ]
-    )
+    edges = line_rows(e.points, e.centres, e.directions, edge_weights, e.sigmas)
+    planes = plane_rows(p.points, p.normals, p.offsets, plane_weights, p.sigmas)
+    return concatenate_rows([edges, planes])

@@ -22,9 +22,8 @@ class PoseContext:
 
     Attributes
     ----------
-    key : key of the unknown pose ``map_T_lidar`` at the middle of the sweep
-    stamp : nanoseconds, of the middle of the sweep
-    guess : predicted ``map_T_lidar`` at the middle of the sweep
+    key : of the unknown pose ``map_T_lidar`` at the middle of the sweep
+    stamp, guess : nanoseconds and predicted ``map_T_lidar`` of the middle of the sweep
     last : stamp, nanoseconds, and pose of the middle of the last sweep
     last_key : key of the pose in ``last``, for factors between the two sweeps; that pose is known
         and does not change

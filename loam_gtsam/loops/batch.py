@@ -1,7 +1,6 @@
 """Optimisation of a whole pose graph at once, robust against wrong loop closures.
 
-Graduated non-convexity makes the first choice of loop closures (Yang, Antonante, Tzoumas and
-Carlone, Graduated Non-Convexity for Robust Spatial Perception, RA-L 2020), then each loop closure
+Graduated non-convexity (Yang et al., RA-L 2020) makes the first choice of loop closures, then each
 is tested against all the others. Equations: docs/maths/pose_graph.md.
 """
 
@@ -209,8 +208,7 @@ class _Problem:
         params = gtsam.LevenbergMarquardtParams()
         params.setVerbosityLM("SILENT")
         params.setRelativeErrorTol(1e-9)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, params)
-        poses = optimizer.optimize()
+        poses = gtsam.LevenbergMarquardtOptimizer(graph, self.saved.poses, params).optimize()
         if not self.loops:
             return graph, poses, np.empty(0)
         marginals = gtsam.Marginals(graph, poses)
@@ -223,11 +221,7 @@ class _Problem:
         return graph, poses, np.array(distances)
 
     def inliers(self) -> BoolArray:
-        """Which loop closures graduated non-convexity finds right, all other factors being right.
-
-        The loss is that of Geman and McClure: truncated least squares loses all loop closures where
-        most are wrong (ten right ones of sixty, measured).
-        """
+        """Which loop closures graduated non-convexity finds right, given all other factors."""
         poses = self.saved.poses
         graph = self.factors(np.ones(len(self.loops), np.bool_))
         params = gtsam.GncLMParams()
@@ -238,6 +232,7 @@ class _Problem:
                 linear = gtsam.LinearContainerFactor(factor.linearize(poses), poses)
                 graph.replace(place, linear)
         loops = set(self.loops)
+        # Truncated least squares loses all where most are wrong (ten right ones of 60, measured).
         params.setLossType(gtsam.GncLossType.GM)
         params.setRelativeCostTol(_GNC_TOLERANCE)
         params.setKnownInliers([place for place in range(graph.size()) if place not in loops])

@@ -1,8 +1,7 @@
 """Loop closers: they find earlier keyframes at the same place, and the motion in between.
 
-The loop closer of this package looks for keyframes that are near enough, given the drift, and that
-look alike. It registers the new keyframe with the factor graph of the mapper, against the features
-of the keyframes around the old one.
+That of this package looks for keyframes that are near enough, given the drift, and look alike, and
+registers the new one with the mapper's solver against the features around the old one.
 """
 
 from __future__ import annotations
@@ -44,9 +43,7 @@ class LoopCloser(Protocol):
     """
 
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
-        """Look for an earlier keyframe at the place of a new one.
-
-        The method is called once for each keyframe, in order.
+        """Look for an earlier keyframe at the place of a new one; called once for each, in order.
 
         Parameters
         ----------
@@ -126,14 +123,14 @@ class ScanLoopCloser:
         self.statistics.keyframes += 1
         near = self._near(keyframe, history)
         if isinstance(near, Rejection):
-            self._reject(near)
+            self.statistics.rejected[near] += 1
             return None
         for candidate, turn in self._alike(keyframe.index, near):
             found = self.verify(keyframe, candidate, history, turn)
             if isinstance(found, LoopClosure):
                 self.statistics.verified += 1
                 return found
-            self._reject(found)
+            self.statistics.rejected[found] += 1
         return None
 
     def verify(
@@ -152,8 +149,7 @@ class ScanLoopCloser:
         """
         whole, config = self._whole, self.config
         maps = self._submap(keyframe, candidate, history)
-        features = keyframe.edges, keyframe.planes
-        matching = whole.matching
+        features, matching = (keyframe.edges, keyframe.planes), whole.matching
 
         def matches_at(pose: gtsam.Pose3) -> ScanMatches:
             return associate(*features, pose, *maps, matching, keyframe.distinct)
@@ -174,8 +170,7 @@ class ScanLoopCloser:
             start = gtsam.Pose3(turned, np.zeros(3))
             held = np.concatenate([cubes.points() for cubes in maps])
             around = likely_poses(sample_features(*features), held, [start], config.search, _STARTS)
-            starts = start, *around
-            trials = [self._rough_solver.solve(matches_at, pose) for pose in starts]
+            trials = [self._rough_solver.solve(matches_at, pose) for pose in (start, *around)]
             best = max(trials, key=lambda tried: fit(tried).total)
             matching = whole.matching
             solution = self._solver.solve(matches_at, best.map_T_lidar)
@@ -190,8 +185,6 @@ class ScanLoopCloser:
         pose = solution.map_T_lidar
         return LoopClosure(candidate, keyframe.index, pose, covariance, *astuple(final))
 
-    # -- inside --------------------------------------------------------------------------------
-
     def _describe(self, history: PoseGraph) -> None:
         """Compute descriptor and standard deviation of the position of new keyframes."""
         for keyframe in history.keyframes[len(self._descriptors) :]:
@@ -200,9 +193,6 @@ class ScanLoopCloser:
             # Later loop closures make a pose surer: the standard deviation now is an upper bound.
             spread = np.linalg.eigvalsh(history.covariance(keyframe.index)[3:, 3:])[-1]
             self._spreads.append(float(np.sqrt(max(spread, 0.0))))
-
-    def _reject(self, reason: Rejection) -> None:
-        self.statistics.rejected[reason] += 1
 
     def _near(self, keyframe: Keyframe, history: PoseGraph) -> IntArray | Rejection:
         """Numbers of the keyframes that may be at the same place."""
@@ -238,7 +228,7 @@ class ScanLoopCloser:
                 continue
             self.statistics.candidates += 1
             if distance > self.config.max_unlike:
-                self._reject(Rejection.UNLIKE)
+                self.statistics.rejected[Rejection.UNLIKE] += 1
                 break
             chosen.append((other, turn))
         return chosen
@@ -294,11 +284,8 @@ class ScanLoopCloser:
 
 
 def _standing_fit(matches: ScanMatches, offered: int) -> Fit:
-    """Fit of the edges and of the planes that are not level, of so many features in a level frame.
-
-    Level ground fits everywhere at any heading: where there is much of it, nearly all matches of a
-    wrong registration agree.
-    """
+    """Fit of edges and of planes that are not level, of so many features in a level frame."""
+    # Level ground fits at any heading: with much of it, most matches of a wrong registration agree.
     standing = np.abs(matches.planes.normals[:, 2]) < _LEVEL
     level = int(np.count_nonzero(~standing))
     return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)

@@ -1,8 +1,7 @@
-"""Pose graphs as files: g2o, and GTSAM's own serialisation.
+"""Pose graphs as files: g2o (Kuemmerle et al., ICRA 2011), and GTSAM's own serialisation.
 
-g2o (Kuemmerle et al., g2o: A General Framework for Graph Optimization, ICRA 2011) knows poses and
-motions between them; GTSAM's text archives know every factor. In a file, the pose of keyframe ``i``
-has the number ``i``.
+g2o knows poses and motions between them; GTSAM's text archives know every factor. In a file, the
+pose of keyframe ``i`` has the number ``i``.
 """
 
 from __future__ import annotations
@@ -70,9 +69,6 @@ def _is_g2o(path: Path) -> bool:
     return path.suffix == G2O_SUFFIX
 
 
-# -- g2o -------------------------------------------------------------------------------------------
-
-
 def _write_g2o(path: Path, saved: SavedGraph) -> None:
     lines = ["# made by loam_gtsam; information: translation first, then rotation (rad)"]
     stamps = {pose_number(key): stamp for key, stamp in saved.stamps.items()}
@@ -102,8 +98,7 @@ def _write_g2o(path: Path, saved: SavedGraph) -> None:
 
 def _pose_text(pose: gtsam.Pose3) -> str:
     q: Any = pose.rotation().toQuaternion()
-    numbers = [*pose.translation(), q.x(), q.y(), q.z(), q.w()]
-    return " ".join(f"{value:.17g}" for value in numbers)
+    return " ".join(f"{v:.17g}" for v in [*pose.translation(), q.x(), q.y(), q.z(), q.w()])
 
 
 def _read_g2o(path: Path) -> SavedGraph:
@@ -208,9 +203,6 @@ def _text(path: Path) -> str:
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or error  # without the path again
         raise DatasetError(f"{path}: cannot read the graph: {reason}") from error
-
-
-# -- GTSAM -----------------------------------------------------------------------------------------
 
 
 def _write_gtsam(path: Path, saved: SavedGraph) -> None:

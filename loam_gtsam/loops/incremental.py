@@ -1,9 +1,7 @@
 """A factor graph in iSAM2, with loop closures that can be switched, kept as steps to repeat.
 
-iSAM2 (Kaess et al., iSAM2: Incremental Smoothing and Mapping Using the Bayes Tree, IJRR 2012)
-linearises each factor where its variables happen to be at the time, so its estimates depend in
-their last bits on the order of all updates, and GTSAM cannot serialise it. A graph that is to go on
-as if it had never been stopped is therefore built again by the same steps.
+iSAM2 (Kaess et al., IJRR 2012) cannot be serialised, and its last bits depend on the order of all
+updates. A graph that goes on as if never stopped is therefore built again by the same steps.
 """
 
 from __future__ import annotations
@@ -70,9 +68,7 @@ class IncrementalGraph:
     ) -> None:
         """Add factors that are no loop closures, and start values of new variables.
 
-        Parameters
-        ----------
-        settle : update until the estimate stays; not needed for a new pose at the end of a chain
+        ``settle`` updates until the estimate stays; a new pose at the end of a chain needs it not.
 
         Raises
         ------
@@ -112,12 +108,9 @@ class IncrementalGraph:
         active: BoolArray,
         factors: gtsam.NonlinearFactorGraph | None = None,
     ) -> None:
-        """Begin anew in iSAM2, from an estimate and with some of the loop closures.
+        """Begin anew in iSAM2, from an estimate and with the ``active`` (L,) loop closures.
 
-        Parameters
-        ----------
-        active : (L,) which loop closures are in the graph
-        factors : all factors but loop closures; those that the graph has if None
+        ``factors`` are all but loop closures; those that the graph has if None.
         """
         if factors is not None:
             self.factors = factors
@@ -144,7 +137,6 @@ class IncrementalGraph:
         return relative_pose(self.values, self._isam, earlier, later)
 
     def _settle(self) -> None:
-        """Update iSAM2 until the variables stay."""
         before = self.values
         for _ in range(_ROUNDS):
             self._isam.update()
@@ -161,9 +153,8 @@ def relative_pose(
     between = poses.atPose3(earlier).between(poses.atPose3(later))
     joint = marginals.jointMarginalCovariance([earlier, later])
     to_later = between.inverse().AdjointMap()
-    own, other = joint.at(earlier, earlier), joint.at(later, later)
-    crossed = to_later @ joint.at(earlier, later)
-    return between, to_later @ own @ to_later.T + other - crossed - crossed.T
+    own, crossed = joint.at(earlier, earlier), to_later @ joint.at(earlier, later)
+    return between, to_later @ own @ to_later.T + joint.at(later, later) - crossed - crossed.T
 
 
 def _new_isam() -> gtsam.ISAM2:

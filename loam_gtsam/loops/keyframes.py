@@ -129,11 +129,10 @@ def keyframe_points(
         raise InputError(
             f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
         )
-    sweep = MovingSweep(features, config, imu)
-    posed = sweep.at(update.twist)
+    posed = MovingSweep(features, config, imu).at(update.twist)
     to_reference = posed.middle_T_reference.inverse().matrix()
     edges, planes = (transform(to_reference, part) for part in posed.points)
-    return edges, planes, sweep.distinct
+    return edges, planes, posed.sweep.distinct
 
 
 def odometry_between(

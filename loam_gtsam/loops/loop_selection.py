@@ -1,10 +1,8 @@
 """Selection of the loop closures that are used: how each is tested, and what a new one changes.
 
-The squared Mahalanobis distance of each loop closure from what all other factors say decides, one
-by one: equations (1) and (2) of docs/maths/pose_graph.md. Of loop closures that contradict each
-other the larger number is believed that agree pairwise, equation (3) (Mangelson, Dominic, Eustice
-and Vasudevan, Pairwise Consistent Measurement Set Maximization for Robust Multi-Robot Map Merging,
-ICRA 2018).
+Their squared Mahalanobis distance from what all other factors say decides. Of those that contradict
+each other the larger set that agrees pairwise is believed (Mangelson et al., Pairwise Consistent
+Measurement Set Maximization, ICRA 2018). Equations (1) to (3): docs/maths/pose_graph.md.
 """
 
 from __future__ import annotations
@@ -52,16 +50,8 @@ def chi_squared(
 def loop_to_switch(active: BoolArray, distances: FloatArray, max_chi2: float) -> int | None:
     """The loop closure that greedy selection switches next, off or on.
 
-    Parameters
-    ----------
-    active : (L,) which loop closures are in the graph
-    distances : (L,) squared Mahalanobis distance of each from what all the others say
-    max_chi2 : largest distance of a loop closure that agrees with the others
-
-    Returns
-    -------
-    The active loop closure that contradicts the others most, or else the inactive one that fits
-    best; None if all active ones agree with the others and all inactive ones contradict them.
+    Of L loop closures the active one that contradicts the others most, by their ``chi_squared``, or
+    else the inactive one that fits best; None if active ones agree and inactive ones contradict.
     """
     if len(active) == 0:
         return None
@@ -113,8 +103,8 @@ class LoopSelection:
 
     Parameters
     ----------
-    graph : the loop closures are switched in it
-    keyframes, loops : lists of the graph, which grow; :meth:`add` appends the new loop closure
+    graph : in which they are switched
+    keyframes, loops : lists of the graph, which grow; :meth:`add` appends to ``loops``
     """
 
     def __init__(
@@ -130,10 +120,8 @@ class LoopSelection:
         self._compared: list[bytearray] = []
 
     def add(self, loop: LoopClosure) -> bool:
-        """Add a loop closure; returns whether it is active.
-
-        All are tested anew, since right ones make it easier to tell wrong ones.
-        """
+        """Add a loop closure; returns whether it is active."""
+        # All are tested anew, since right ones make it easier to tell wrong ones.
         number = len(self._loops)
         factor = gtsam.NonlinearFactorGraph()
         factor.add(loop.factor(self.config.kernel_width))

@@ -1,9 +1,7 @@
 """Loop closures during a run, and the map that follows them.
 
-The mapper stays in the frame it began in, ``odom``: continuous, for whoever steers by it (ROS
-REP-105). Where a loop closure says that older keyframes lie elsewhere, seen from the newest one,
-their map points move there, and the next sweep is matched with the corrected map. ``map_T_odom``
-leads from ``odom`` to the corrected frame.
+The mapper stays in its continuous frame ``odom`` (ROS REP-105). Where a loop closure says that
+older keyframes lie elsewhere, seen from the newest one, their map points move there.
 """
 
 from __future__ import annotations
@@ -24,9 +22,8 @@ class LoopMapping:
 
     Parameters
     ----------
-    mapper : the mapper whose frames are given to :meth:`add`
-    config : of :class:`PoseGraph` and :class:`ScanLoopCloser`
-    closer : finds the loop closures; a :class:`ScanLoopCloser` if None
+    mapper : whose frames are given to :meth:`add`
+    closer : a :class:`ScanLoopCloser` if None
 
     Attributes
     ----------
@@ -48,9 +45,7 @@ class LoopMapping:
     def reset(self) -> None:
         """Forget everything, as the mapper's reset does; a ``reset()`` of the closer is called."""
         self.graph.reset()
-        reset_closer = getattr(self.closer, "reset", None)
-        if reset_closer is not None:
-            reset_closer()
+        getattr(self.closer, "reset", lambda: None)()
         self.points_moved = self._mapper.keyframe = 0
         self._placed = []
 

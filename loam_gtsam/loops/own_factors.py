@@ -1,7 +1,6 @@
-"""Factors and variables of a user's own in a pose graph.
+"""Factors and variables of a user's own in a pose graph, checked before GTSAM sees them.
 
-They are checked before GTSAM sees them: GTSAM ends the process, or leaves iSAM2 broken, on some of
-what is refused here.
+GTSAM ends the process, or leaves iSAM2 broken, on some of what is refused here.
 """
 
 from __future__ import annotations
@@ -22,12 +21,7 @@ _UNDETERMINED = 1e-9  # least singular value that counts, columns of length one
 
 
 class FactorGraph:
-    """Poses of keyframes and variables of a user's own, and factors on them.
-
-    Attributes
-    ----------
-    keyframes : in the order of time
-    """
+    """Poses of keyframes, in order of time, and variables of a user's own, and factors on them."""
 
     keyframes: list[Keyframe]
     _graph: IncrementalGraph
@@ -139,7 +133,6 @@ class FactorGraph:
         return self._graph.covariance(key)
 
     def _key(self, index: int) -> int:
-        """Key of the pose of a keyframe that there is."""
         count = len(self.keyframes)
         if not 0 <= index < count:
             raise InputError(f"keyframe: expected one of the {count} there are, got {index}")

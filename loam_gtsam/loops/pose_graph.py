@@ -1,8 +1,7 @@
 """Keyframes of a run as a graph of poses, updated by iSAM2 as the run goes.
 
-Poses of a run drift. Keyframes, the motion between them with its covariance, and loop closures tell
-where they really are. A loop closure that contradicts the others is switched off. Equations:
-docs/maths/pose_graph.md. Frames and keys: :mod:`loam_gtsam.loops.keyframes`.
+A loop closure that contradicts the others is switched off. Equations: docs/maths/pose_graph.md.
+Frames and keys: :mod:`loam_gtsam.loops.keyframes`.
 """
 
 from __future__ import annotations
@@ -56,7 +55,6 @@ class PoseGraph(FactorGraph):
         self.__setstate__((0, [], [], IncrementalGraph()))
 
     def __getstate__(self) -> tuple[Any, ...]:
-        # For checkpoints.
         return self._session, self.keyframes, self.loops, self._graph
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -68,18 +66,11 @@ class PoseGraph(FactorGraph):
     def __len__(self) -> int:
         return len(self.keyframes)
 
-    # -- what goes in --------------------------------------------------------------------------
-
     def add(self, update: MapUpdate, features: Features | None = None) -> Keyframe | None:
         """Add a frame of the run, if it was solved and is far enough from the last keyframe.
 
-        Parameters
-        ----------
-        features : those of the frame's sweep; without them no loop closure can be found
-
-        Returns
-        -------
-        The new keyframe; None if the frame does not become one.
+        Without the ``features`` of its sweep no loop closure can be found. Returns the keyframe, or
+        None if the frame does not become one.
 
         Raises
         ------
@@ -115,11 +106,7 @@ class PoseGraph(FactorGraph):
             self._session += 1
 
     def add_loop(self, loop: LoopClosure) -> bool:
-        """Add a loop closure; those that contradict the rest of the graph are switched off.
-
-        Returns
-        -------
-        Whether the loop closure is active, see :mod:`loam_gtsam.loops.loop_selection`.
+        """Add a loop closure, which :mod:`.loop_selection` may switch off; whether it is active.
 
         Raises
         ------
@@ -136,8 +123,6 @@ class PoseGraph(FactorGraph):
             )
         noise_model(loop.covariance)
         return self._selection.add(loop)
-
-    # -- what comes out ------------------------------------------------------------------------
 
     def poses(self) -> FloatArray:
         """(N, 4, 4) ``map_T_lidar`` of all keyframes."""
@@ -217,8 +202,6 @@ class PoseGraph(FactorGraph):
         active = np.array([report.active for report in result.loops], np.bool_)
         self._graph.restart(result.poses, active)
         return result
-
-    # -- inside --------------------------------------------------------------------------------
 
     def _append(self, keyframe: Keyframe, last: Keyframe | None) -> None:
         """Add a keyframe's pose, tied to the last one of its session."""

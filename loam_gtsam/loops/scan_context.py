@@ -1,8 +1,7 @@
 """Scan Context: a descriptor of a place that can be compared at any heading.
 
-The descriptor (Kim and Kim, Scan Context: Egocentric Spatial Descriptor for Place Recognition
-within 3D Point Cloud Map, IROS 2018) holds the height of the highest point in each cell of a polar
-grid around the lidar; here, of features. A turn of the lidar shifts the columns of the grid.
+It (Kim and Kim, IROS 2018) holds the height of the highest point, here feature, in each cell of a
+polar grid around the lidar, whose columns shift with a turn of the lidar.
 """
 
 from __future__ import annotations
@@ -18,17 +17,9 @@ _HIGHEST = 20.0  # metres: what is higher depends on the opening angle of the li
 
 
 def scan_context(points: FloatArray, config: LoopConfig) -> FloatArray:
-    """Scan Context descriptor: heights in a polar grid around the lidar.
+    """(rings, sectors) metres above a level below the lidar; 0 where there is no point.
 
-    Parameters
-    ----------
-    points : (N, 3) metres, lidar frame, de-skewed
-
-    Returns
-    -------
-    (rings, sectors)
-        Metres above a level below the lidar; 0 where there is no point. Sectors count from x
-        towards y.
+    ``points`` are (N, 3) metres, lidar frame, de-skewed. Sectors count from x towards y.
     """
     points = as_points(points, "points")
     rings, sectors = config.rings, config.sectors

@@ -123,8 +123,9 @@ def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntAr
         return np.arange(limit) * count // limit
     before, after = np.flatnonzero(first), np.flatnonzero(~first)
     before = before[spread_rows(len(before), limit)]
-    after = after[spread_rows(len(after), left)] if (left := limit - len(before)) else after[:0]
-    return np.sort(np.concatenate([before, after]))
+    if len(before) == limit:
+        return before
+    return np.sort(np.concatenate([before, after[spread_rows(len(after), limit - len(before))]]))
 
 
 def trial_matching(config: MatchingConfig) -> MatchingConfig:
@@ -268,7 +269,7 @@ def match_planes(
 
 
 def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Planes by the least squares A n = -1 of LOAM and A-LOAM; unit normals (3, N), offsets (N,)."""
+    """Planes by the least squares A n = -1 of LOAM; unit normals (3, N), offsets (N,)."""
     # n = -a / (det C + m . a) with a = adj(C) m, mean m and covariance C (Sherman and Morrison on
     # A^T A = k (C + m m^T)). Where a vanishes, an infinite offset fails the plane test.
     means, (xx, yy, zz, xy, yz, xz) = moments(neighbours)
@@ -306,7 +307,7 @@ def _deviations(
     neighbours: int,
     config: MatchingConfig,
 ) -> tuple[FloatArray, FloatArray]:
-    """Standard deviations (M,) of the distance of a new point, m, and of the tilt of the fit, rad."""
+    """Standard deviations (M,) of the distance of a new point, m, and the tilt of the fit, rad."""
     # ``roughness`` and ``spread`` are variances across and along the fit. Variance of prediction of
     # a regression: Draper and Smith, Applied Regression Analysis, 3rd ed., section 3.1.
     least = config.point_sigma**2

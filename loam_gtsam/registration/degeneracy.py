@@ -121,7 +121,7 @@ def unseen_by_planes(
     On rough ground the few lines of poles show how far the pose is off. The thousand planes of the
     ground do not show it: by noise they hold the pose where it was, and they outweigh the poles.
 
-    ``seen`` is the same of planes and lines together, ``least`` that of :meth:`Localizability.weak`.
+    ``seen`` is the same of planes and lines together, ``least`` as in :meth:`Localizability.weak`.
     None if planes alone fix all directions, or do so with lines that see too little on their own.
     """
     if seen.by_planes.min() >= least:

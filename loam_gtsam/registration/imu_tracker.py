@@ -43,13 +43,8 @@ information's over 10 to 50 frames)."""
 class ImuTracker:
     """The IMU's part in mapping, and what it has learnt from the frames so far.
 
-    Two sweeps that are compared, ``last`` and ``now``, are the stamps and the solved poses of their
-    middles.
-
-    Parameters
-    ----------
-    config : section ``imu``
-    buffer : the samples; more may be added at any time
+    Two sweeps that are compared, ``last`` and ``now``, are the stamps and solved poses of their
+    middles. More samples may be added to ``buffer`` at any time.
 
     Attributes
     ----------
@@ -176,15 +171,9 @@ class ImuTracker:
     ) -> tuple[Solution, gtsam.Pose3, TiltPrior]:
         """Learn from a solved sweep, and bring roll and pitch into its pose.
 
-        Parameters
-        ----------
-        posed : the sweep with its final motion
-        last : middle of the last sweep; a predicted pose says nothing about the IMU
-        solution : at the middle of the sweep
-
-        Returns
-        -------
-        The solution, the pose ``map_T_lidar`` at the reference time, and how roll and pitch acted.
+        ``posed`` has the final motion; ``solution`` and ``last`` are of the middles of this and the
+        last sweep, of which a predicted pose says nothing about the IMU. Returns the solution, the
+        pose ``map_T_lidar`` at the reference time, and how roll and pitch acted.
         """
         stamp, reference_stamp = posed.sweep.stamp, posed.sweep.reference_stamp
         if last is not None and last.solved:

@@ -40,14 +40,8 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     The covariance for a factor between two poses: the own errors of both frames and the drift of
     the map between them. The drift before is common to both poses and cancels.
 
-    Parameters
-    ----------
-    earlier, later : solved frames of one run
-
-    Returns
-    -------
-    (6, 6)
-        Tangent order of the package, perturbation on the right: along the axes of the later frame.
+    Both are solved frames of one run. Returns (6, 6), tangent order of the package, perturbation on
+    the right: along the axes of the later frame.
 
     Raises
     ------
@@ -92,9 +86,7 @@ class _Middle:
 class PoseErrors:
     """Calibrates the covariances of a run, frame by frame.
 
-    Parameters
-    ----------
-    config : ``covariance``, the weights of matches in ``solver`` and ``imu.gyro_noise`` are used
+    Of ``config``, ``covariance``, the weights in ``solver`` and ``imu.gyro_noise`` are used.
     """
 
     def __init__(self, config: Config) -> None:

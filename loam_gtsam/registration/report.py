@@ -23,11 +23,8 @@ def make_update(
 ) -> MapUpdate:
     """The update of a frame, without covariance and timings.
 
-    Parameters
-    ----------
-    posed : the sweep, de-skewed with the final motion
-    map_T_lidar : pose at the reference time
-    solution : solution at the middle of the sweep; None if there was no solve
+    ``posed`` has the final motion, ``map_T_lidar`` is of the reference time, ``solution`` of the
+    middle of the sweep.
     """
     sweep = posed.sweep
     update = MapUpdate(

@@ -33,11 +33,9 @@ class Refusal:
 class StampCheck:
     """Comparison of each stamp with the stamp of the last sweep that was used.
 
-    A stamp must be later than the last one, by at most :data:`LARGEST_STEP`; otherwise the sweep is
-    not used, so that one wrong stamp costs one sweep. :data:`IN_A_ROW` such sweeps with consistent
-    stamps show that the clock was set, for instance after the computer booted. If the clock was set
-    ahead, the run continues as if no time had passed. If the clock was set back, the run cannot
-    continue, because the stamps of trajectories and graphs ascend; the refusal then says so.
+    A stamp must be later than the last one, by at most :data:`LARGEST_STEP`; one wrong stamp costs
+    one sweep. :data:`IN_A_ROW` of them that are consistent show that the clock was set. If ahead,
+    the run continues as if no time had passed; if back, it cannot, since trajectories ascend.
     """
 
     def __init__(self) -> None:
@@ -45,11 +43,9 @@ class StampCheck:
         self._doubted: tuple[int, int, int] | None = None  # first and newest stamp, and count
 
     def refuse(self, stamp: int, last: int) -> Refusal | None:
-        """The reason why a sweep cannot be used; None for a sweep that counts as used from now on.
+        """The reason why a sweep cannot be used, by its stamp and that of the last one used, ns.
 
-        Parameters
-        ----------
-        stamp, last : nanoseconds, of this sweep and of the last sweep that was used
+        None for a sweep that counts as used from now on.
         """
         step = stamp - last
         largest = max(round(LARGEST_STEP * 1e9), _STEPS * self._step)

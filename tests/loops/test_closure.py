@@ -57,9 +57,6 @@ def off(loop, poses):
     return np.linalg.norm(error[3:]), np.linalg.norm(error[:3])
 
 
-# -- places that are found -------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("heading", [0.0, 1.9, np.pi])
 def test_a_place_is_found_again_with_any_heading(heading):
     poses = there_and_back(heading)
@@ -118,9 +115,6 @@ def test_the_covariance_is_about_right():
         nees.append(error @ np.linalg.solve(loop.covariance, error))
     assert len(loops) > 8
     assert 0.05 < np.mean(nees) < 12.0  # of 6; the poses here have none of the error they claim
-
-
-# -- places that are not ---------------------------------------------------------------------------
 
 
 def test_a_corridor_is_no_place():

@@ -177,9 +177,6 @@ def test_other_bad_files_are_refused(tmp_path):
         write_graph(tmp_path / "c.graph", SavedGraph(graph, gtsam.Values()))
 
 
-# -- loam-gtsam optimize ---------------------------------------------------------------------------
-
-
 def command(*words):
     return loam("optimize", *words)
 

@@ -253,9 +253,6 @@ def test_the_map_of_a_graph_is_that_of_its_keyframes():
     assert planes.shape == (4, 3)
 
 
-# -- begun anew, and gone on with ------------------------------------------------------------------
-
-
 def eventful(graph):
     """Events of a drive: keyframes, loop closures, a landmark, positions, a batch solution."""
     truth, rng = square(6, 2), np.random.default_rng(1)

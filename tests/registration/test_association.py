@@ -58,9 +58,6 @@ def plane_group(wide=0.5 * Y, narrow=0.5 * Z, saddle=0.0 * X, centre=AHEAD):
     )
 
 
-# -- one match in closed form ----------------------------------------------------------------------
-
-
 def test_a_line_match_in_closed_form():
     matches = one(match_lines, [5.0, 0.1, 0.3], line_group())
     assert len(matches) == 1
@@ -148,9 +145,6 @@ def test_without_fit_uncertainty_every_sigma_is_that_of_a_point():
     config = changed(fit_uncertainty=False)
     assert one(match_lines, AHEAD + 3 * Z, line_group(aside=0.1 * Y), config).sigmas[0] == 0.03
     assert one(match_planes, AHEAD + 3 * Z, plane_group(saddle=0.1 * X), config).sigmas[0] == 0.03
-
-
-# -- every gate, from both sides -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("match", "group"), [(match_lines, line_group()),
@@ -271,9 +265,6 @@ def test_a_weight_at_the_limit_is_too_small():
     assert (len(renewed.edges), len(renewed.planes)) == (0, 0)
 
 
-# -- the published forms ---------------------------------------------------------------------------
-
-
 UNIT_OFFSET = changed(plane_fit="unit_offset", min_incidence_sine=0.0)
 
 
@@ -330,9 +321,6 @@ def test_the_range_in_the_weight_is_from_the_sensor_or_from_the_map_origin():
         stripped = dataclasses.replace(planes, weights=np.zeros(1))
         renewed = rematched(ScanMatches(edges, stripped), pose, config)
         np.testing.assert_allclose(renewed.planes.weights, [expected], atol=1e-9)
-
-
-# -- whole scenes ----------------------------------------------------------------------------------
 
 
 def map_of(points, voxel=0.01, **changes):
@@ -473,9 +461,6 @@ def test_no_features_give_no_matches():
     assert len(matches) == 0
     assert matches.edges.directions.shape == (0, 3)
     assert matches.planes.offsets.shape == (0,)
-
-
-# -- matches kept near by ----------------------------------------------------------------------
 
 
 def both():

@@ -90,9 +90,6 @@ def by_euler(pose, x):
     )
 
 
-# -- one step, and the optimum, are those of the factor graph --------------------------------------
-
-
 def faced(matches, pose):
     """The same matches with each line replaced by the plane through it that faces its point."""
     rows, p = loam_rows(matches, pose), matches.planes
@@ -203,9 +200,6 @@ def test_loam_stops_when_the_step_is_small_and_aloam_never():
         loam, aloam = solve(ClassicalSolver, **changes), solve(ALoamSolver, **changes)
         assert (loam.converged, loam.iterations) == (converged, loam_iterations)
         assert (aloam.converged, aloam.iterations) == (converged, 7)
-
-
-# -- LOAM's own ------------------------------------------------------------------------------------
 
 
 def test_euler_jacobian_is_the_derivative_in_loams_own_axes():
@@ -320,9 +314,6 @@ def test_a_direction_without_any_row_is_no_error():
     assert np.isfinite(solution.map_T_lidar.matrix()).all()
 
 
-# -- A-LOAM's own ----------------------------------------------------------------------------------
-
-
 def with_outliers(n_edges):
     matches = make_matches(n_edges=n_edges, noise=0.02)
     ones = np.ones(len(matches.planes))
@@ -397,9 +388,6 @@ def test_the_last_small_step_is_not_taken():
     assert solve(1.0).solver_iterations == 1
     assert not solve(1e-6).map_T_lidar.equals(TRUTH, 1e-5)
     assert 1 < solve(1e-6).solver_iterations < 20
-
-
-# -- in the mapper ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

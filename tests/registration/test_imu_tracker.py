@@ -58,9 +58,6 @@ def compare(tracker, poses):
         tracker.compare_gyro(last, now)
 
 
-# -- equivalent ------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("weight", [0.002, 0.5])
 @pytest.mark.parametrize("tilt", [(50, -60), (-170, 20), (3, 1)])
 def test_scan_and_imu_meet_at_the_mean_of_the_blend(weight, tilt):
@@ -85,9 +82,6 @@ def test_the_information_grows_by_that_of_the_prior():
     expected = solution.information + 0.25 * jacobian.T @ knows @ jacobian
     scale = 1e-3 * expected.max()
     np.testing.assert_allclose(found.information, expected, atol=scale)
-
-
-# -- where equivalent vanishes, sigma takes over ---------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -132,9 +126,6 @@ def test_a_scan_that_says_nothing_about_the_tilt_gets_it_from_gravity():
     np.testing.assert_allclose(found.map_T_lidar.translation(), 0.0, atol=1e-6)
 
 
-# -- sigma -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("sigma_deg", [0.02, 0.1, 1.0])
 def test_a_gravity_direction_moves_the_tilt_by_the_kalman_gain(sigma_deg):
     measured = rot3(0.02, -0.03, 0)
@@ -161,9 +152,6 @@ def test_only_sigma_is_a_factor_of_the_solve_and_off_leaves_the_pose():
     assert off.blend_tilt(NOW, solution.map_T_lidar) == (solution.map_T_lidar, TiltPrior.NONE)
 
 
-# -- off and blend ---------------------------------------------------------------------------------
-
-
 def test_blend_is_done_after_the_solve():
     level_R_map = rot3(-4, 3, 10)
     tracker = tracker_for(rot3(5, -2, 0), level_R_map, prior="blend", weight=0.1)
@@ -173,9 +161,6 @@ def test_blend_is_done_after_the_solve():
     assert tilt is TiltPrior.BLEND
     before, after = tilt_of(solution.map_T_lidar, level_R_map), tilt_of(pose, level_R_map)
     np.testing.assert_allclose(after, 0.9 * before + [0.5, -0.2], atol=1e-7)
-
-
-# -- steep -----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("seconds", "least", "most"), [(0.0, 6.0, 15.0), (0.1, 1.0, 4.0)])
@@ -228,9 +213,6 @@ def test_a_steep_pitch_counts_however_well_the_scan_knows_it(steep):
     assert tracker_for(rot3(20, 84.0, 0)).add_tilt(NOW, below)[1] is TiltPrior.EQUIVALENT
 
 
-# -- what is missing -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("prior", ["equivalent", "blend", "sigma"])
 @pytest.mark.parametrize("gap", [0.09, 0.11])
 def test_in_a_gap_the_prior_is_dropped(prior, gap):
@@ -266,9 +248,6 @@ def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_
     assert tracker.add_tilt(NOW + 3 * FRAME, solution)[1] is TiltPrior.EQUIVALENT
 
 
-# -- the start -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("tilt", [(4, -3), (180, 0), (-100, 60), (20, 90), (0, -90)])
 def test_the_first_pose_is_level_at_the_origin(tilt):
     attitude = rot3(*tilt, 77)
@@ -299,9 +278,6 @@ def test_a_rest_at_the_start_gives_the_bias_of_the_gyro(rate, bias):
     tracker.first_pose(NOW)
     np.testing.assert_allclose(tracker.buffer.gyro_bias, [0, 0, bias], atol=1e-12)
     assert tracker.level.source == ("moving" if rate else "still")
-
-
-# -- the gyro against the scans --------------------------------------------------------------------
 
 
 def frames(rate, count):
@@ -381,9 +357,6 @@ def test_the_check_of_the_mounting_sees_frames_whose_samples_are_forgotten():
     assert "[0, 0, 90]" in tracker.mounting_problem
     tracker.reset()
     assert tracker.mounting_problem == ""
-
-
-# -- pre-integration -------------------------------------------------------------------------------
 
 
 def accelerating(acceleration, seconds=2.0):

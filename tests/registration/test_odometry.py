@@ -40,9 +40,6 @@ def empty(stamp=STAMP + PERIOD, span=(0.0, 0.1)):
     return dataclasses.replace(Features.from_points(stamp, none, none), span=span)
 
 
-# -- constant velocity -----------------------------------------------------------------------------
-
-
 def test_the_first_guess_is_the_identity_at_rest():
     guess = ConstantVelocity().guess(empty(), None)
     assert difference(guess.map_T_lidar, gtsam.Pose3()) == 0.0
@@ -172,9 +169,6 @@ def test_by_pre_integration_the_pose_of_the_middle_is_the_predicted_one():
     assert difference(failed.map_T_lidar, advance(START, TWIST, 0.1)) < 1e-12
 
 
-# -- scan to scan ----------------------------------------------------------------------------------
-
-
 def room(rng, count=9000):
     """Points on the walls, floor and ceiling of a box and on its vertical corners."""
     size = np.array([9.0, 7.0, 3.0])
@@ -300,9 +294,6 @@ def test_falls_back_to_constant_velocity():
     start = guess(full, new, None)
     assert difference(start.map_T_lidar, gtsam.Pose3()) == 0.0
     np.testing.assert_array_equal(start.twist, np.zeros(6))
-
-
-# -- neighbours by ring ----------------------------------------------------------------------------
 
 
 def ring_points(seed=3):

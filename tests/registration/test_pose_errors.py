@@ -57,9 +57,6 @@ def no_imu(**covariance):
     return config.changed("imu.enabled=false", covariance=config.covariance.changed(**covariance))
 
 
-# -- the motion between two frames -----------------------------------------------------------------
-
-
 def made_up(stamp, pose, own, drift, shared=None, follows=None):
     shared = np.zeros((6, 6)) if shared is None else shared
     parts = Uncertainty(own, shared, follows, drift, 1.0, 100.0)
@@ -107,9 +104,6 @@ def test_frames_must_be_solved_and_in_order():
         with pytest.raises(InputError, match=says):
             relative_covariance(first, second)
     assert relative_covariance(one, two).shape == (6, 6)
-
-
-# -- frames of a run -------------------------------------------------------------------------------
 
 
 def test_every_solved_frame_has_its_covariances(moving):
@@ -199,9 +193,6 @@ def test_classical_solvers_have_covariances_of_the_same_size(name):
     assert ratio.max() < 5.0
 
 
-# -- the reference time ----------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("reference", "share"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])
 def test_the_reference_has_its_share_in_two_sweeps(reference, share):
     config = no_imu().changed({"deskew.reference": reference})
@@ -250,9 +241,6 @@ def test_a_gyro_leaves_its_noise():
     expected = Config().imu.gyro_noise ** 2 * 0.05
     np.testing.assert_allclose(np.diag(own)[:3], expected, rtol=1e-9)
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
-
-
-# -- frame by frame --------------------------------------------------------------------------------
 
 
 def calibrated(errors, number):

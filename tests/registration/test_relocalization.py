@@ -79,9 +79,6 @@ def errors(result, dataset):
     return np.linalg.norm(away, axis=1)
 
 
-# -- what fits -------------------------------------------------------------------------------------
-
-
 def matches(edge_distances, plane_distances, sigma=0.1):
     n, m = len(edge_distances), len(plane_distances)
     ones = lambda count: np.ones((count, 3))  # noqa: E731
@@ -173,9 +170,6 @@ def test_the_search_grows_and_remembers_where_it_fitted_last():
     assert monitor.lost == 0
 
 
-# -- where it would fit ----------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def corner():
     """An L of two unlike walls: looks different from everywhere."""
@@ -218,9 +212,6 @@ def test_a_few_points_stand_for_a_sweep():
     assert sample_features(edges, planes).sum() == 3 * 50
     assert 50 < len(sample_features(edges, planes)) < 200
     assert sample_features(edges[:0], planes[:0]).shape == (0, 3)
-
-
-# -- the search ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -281,9 +272,6 @@ def test_a_sweep_that_fits_keeps_its_solution_if_the_search_finds_nothing_better
     assert isinstance(found, Found)
     assert (found.solution, found.message) == (solution, "")
     np.testing.assert_array_equal(found.twist, frame.twist_to(solution.map_T_lidar))
-
-
-# -- whole runs ------------------------------------------------------------------------------------
 
 
 def test_an_ordinary_run_is_the_same_without_the_watch(calm):

@@ -35,9 +35,6 @@ def same(a, b):
     return bool((a.matrix() == b.matrix()).all())
 
 
-# -- what all three solvers promise ----------------------------------------------------------------
-
-
 def solver(method, **changes):
     """A solver; LOAM's projector is off, for it finds a few hundred matches too few."""
     return make_solver(SolverConfig(**{"method": method, "degeneracy_threshold": 0.0} | changes))
@@ -78,9 +75,6 @@ def test_too_few_matches_in_any_round_give_the_guess_back(method, lost_at):
     assert not refused.information.any()
     few = make_matches(n_edges=10, n_planes=40, sigma=1.0)
     assert solver(method, min_matches=50).solve(lambda pose: few, guess).solved
-
-
-# -- the loop --------------------------------------------------------------------------------------
 
 
 class Logged(Matcher):
@@ -142,9 +136,6 @@ def test_a_plain_function_is_asked_at_every_pose():
     assert asked == [0.0, 1.0, 2.0]
 
 
-# -- the default solver ----------------------------------------------------------------------------
-
-
 def test_noise_lowers_the_error_to_its_own_level():
     matches = make_matches(noise=0.02)
     solution = GtsamSolver(CONFIG).solve(lambda pose: matches, TRUTH.retract(OFFSET))
@@ -155,9 +146,6 @@ def test_noise_lowers_the_error_to_its_own_level():
     assert solution.error_before == pytest.approx(0.5 * residual_before @ residual_before, rel=1e-9)
     scale = np.linalg.norm(jacobian) * np.linalg.norm(residual)
     assert np.abs(jacobian.T @ residual).max() < 1e-6 * scale
-
-
-# -- when it stops ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -199,9 +187,6 @@ def test_the_iteration_limit_is_reported_as_not_converged():
     ).converged
     never = solve(changed(iterations=4, translation_tolerance=0.0, step_sigmas=0.0))
     assert (never.converged, never.iterations) == (False, 4)
-
-
-# -- priors and information ------------------------------------------------------------------------
 
 
 def test_a_prior_moves_the_pose_to_the_weighted_mean():
@@ -318,9 +303,6 @@ def test_both_kernels_are_as_efficient_on_normal_noise():
         slope = np.gradient(psi, u)
         efficiency = (slope @ density) ** 2 / (psi**2 @ density)
         assert efficiency == pytest.approx(0.95, abs=1e-3)
-
-
-# -- factors that come after the solve -------------------------------------------------------------
 
 
 def random_information(seed, rank=6):

@@ -115,9 +115,6 @@ def test_a_clock_set_back_is_said_and_not_followed():
     assert faults[4:] == ["stamp_back"] * (IN_A_ROW - 1) + ["clock_set_back"] * back + [""]
 
 
-# -- in a run --------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def drive() -> list[Scan]:
     world = SimulatedWorld("street_loop", frames=52, columns=450)

@@ -56,8 +56,7 @@ class _SolverWithoutPriors(ABC):
         return rematch(associate, guess, self.config, self._optimiser(), stop=self._stop)
 
     @abstractmethod
-    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
-        ...
+    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]: ...
 
 
 class ClassicalSolver(_SolverWithoutPriors):

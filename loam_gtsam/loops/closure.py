@@ -45,14 +45,8 @@ class LoopCloser(Protocol):
     def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
         """Look for an earlier keyframe at the place of a new one; called once for each, in order.
 
-        Parameters
-        ----------
-        keyframe : newest keyframe of ``history``
-        history : pose graph with all keyframes so far, which must not be changed
-
-        Returns
-        -------
-        A loop closure whose ``later`` is the number of the keyframe; None if there is none.
+        It is the newest of ``history``, the graph of all so far, which must not be changed. Returns
+        a loop closure whose ``later`` is the number of the keyframe; None if there is none.
         """
         ...
 
@@ -138,14 +132,8 @@ class ScanLoopCloser:
     ) -> LoopClosure | Rejection:
         """Register a keyframe against the features of the keyframes around a candidate.
 
-        Parameters
-        ----------
-        candidate : number of an earlier keyframe
-        turn : rad about z by which the lidar is turned against the candidate, as far as known
-
-        Returns
-        -------
-        The loop closure, or the reason why the registration is not believed.
+        ``turn`` is the rad about z by which the lidar is turned against the candidate, as far as
+        known. Returns the loop closure, or the reason why the registration is not believed.
         """
         whole, config = self._whole, self.config
         maps = self._submap(keyframe, candidate, history)

@@ -22,17 +22,11 @@ _Step = tuple[Any, ...]  # name of a method that changed the graph, and what it 
 
 
 class IncrementalGraph:
-    """Factors and the current estimate of their variables.
-
-    Attributes
-    ----------
-    factors : all factors but loop closures
-    values : current estimate
-    """
+    """Factors and the current estimate of their variables."""
 
     def __init__(self) -> None:
-        self.factors = gtsam.NonlinearFactorGraph()
-        self.values = gtsam.Values()
+        self.factors = gtsam.NonlinearFactorGraph()  # all but loop closures
+        self.values = gtsam.Values()  # current estimate
         self._loops: list[gtsam.NonlinearFactorGraph] = []  # each of one factor
         self._slots: list[int | None] = []  # place of each loop closure in iSAM2; None: inactive
         self._isam = _new_isam()

@@ -92,10 +92,8 @@ def consistent(
     by_start, by_loop = rest.inverse().AdjointMap(), end.inverse().AdjointMap()
     covariance = end_covariance + by_start @ start_covariance @ by_start.T
     covariance = covariance + by_loop @ two.covariance @ by_loop.T
-    distance = chi_squared(
-        one.earlier_T_later, one.covariance, start.compose(rest), covariance, included=False
-    )
-    return distance <= config.max_chi2
+    seen, said = (one.earlier_T_later, one.covariance), (start.compose(rest), covariance)
+    return chi_squared(*seen, *said, included=False) <= config.max_chi2
 
 
 class LoopSelection:

@@ -27,7 +27,6 @@ class LoopMapping:
 
     Attributes
     ----------
-    graph : keyframes and loop closures
     points_moved : how many map points were moved so far
     """
 
@@ -45,7 +44,8 @@ class LoopMapping:
     def reset(self) -> None:
         """Forget everything, as the mapper's reset does; a ``reset()`` of the closer is called."""
         self.graph.reset()
-        getattr(self.closer, "reset", lambda: None)()
+        if (reset_closer := getattr(self.closer, "reset", None)) is not None:
+            reset_closer()
         self.points_moved = self._mapper.keyframe = 0
         self._placed = []
 
@@ -71,13 +71,10 @@ class LoopMapping:
         return True
 
     def correct_map(self, metres: float = 0.0, degrees: float = 0.0) -> None:
-        """Move the map points of the keyframes that lie elsewhere by more than a limit.
+        """Move the map points of keyframes that lie elsewhere, seen from the newest, by more.
 
-        Parameters
-        ----------
-        metres, degrees : the limits, seen from the newest keyframe. A keyframe that is far from it
-            may be off by the angle's share of that distance more, for no sweep is matched with its
-            points now.
+        One that is far from it may be off by the angle's share of that distance more, for no sweep
+        is matched with its points now.
         """
         there = self._misplaced(metres, degrees)
         if there:

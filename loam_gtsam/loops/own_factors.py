@@ -53,11 +53,7 @@ class FactorGraph:
         self._graph.add(*_checked(factor, values, self._graph.values))
 
     def add_position(self, index: int, position: FloatArray, covariance: FloatArray) -> None:
-        """Add a measured position of a keyframe, as from GPS.
-
-        Parameters
-        ----------
-        position, covariance : (3,) metres in the frame of the map, (3, 3) m^2
+        """Add a measured position (3,) of a keyframe, as from GPS, metres, covariance (3, 3) m^2.
 
         Raises
         ------

@@ -40,8 +40,6 @@ def associate(
     Parameters
     ----------
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
-    map_T_lidar : pose of the association
-    edge_map, plane_map : the maps
     distinct : (E,) mask of :class:`EdgeMatches`; None if all edges are distinct. Distinct edges are
         matched before other edges. A distinct edge without a line near by is searched for more
         widely (``wide_search``) if the planes leave a translation open.

@@ -27,12 +27,7 @@ from loam_gtsam.types import FloatArray
 
 
 class MapPair:
-    """The map of edges and the map of planes.
-
-    Attributes
-    ----------
-    edges, planes : the maps
-    """
+    """The map of edges and the map of planes."""
 
     def __init__(self, config: MapConfig) -> None:
         self.config = config
@@ -107,28 +102,16 @@ class MapPair:
 
 @dataclass(frozen=True, eq=False)
 class FrameMatcher(Matcher):
-    """The matches of one sweep, de-skewed for one motion, with the maps as they are.
-
-    Parameters
-    ----------
-    posed : the de-skewed sweep
-    maps : the maps, which must not change while the matcher is in use
-    config : ``solver.min_matches`` is used
-    matching : parameters of the matching
-    rows : features that are matched
-    last : middle of the last sweep, from which :meth:`deskewed` takes the motion
-    refine : whether :meth:`deskewed` changes anything
-    clock : books the time of every call on the stage ``match``
-    """
+    """The matches of one sweep, de-skewed for one motion, with the maps as they are."""
 
     posed: PosedSweep
-    maps: MapPair
-    config: Config
+    maps: MapPair  # which must not change while the matcher is in use
+    config: Config  # of which ``solver.min_matches`` is used
     matching: MatchingConfig
     rows: ChosenRows
-    last: Moment | None
-    refine: bool
-    clock: Clock
+    last: Moment | None  # middle of the last sweep, from which ``deskewed`` takes the motion
+    refine: bool  # whether ``deskewed`` changes anything
+    clock: Clock  # books the time of every call on the stage ``match``
 
     @classmethod
     def of(
@@ -220,18 +203,11 @@ def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """A sweep that is to be solved for.
+    """A sweep that is to be solved for."""
 
-    Attributes
-    ----------
-    matcher : its matches, de-skewed with the predicted motion
-    predicted : where the sweep is expected
-    priors : further factors on the pose at the middle of the sweep
-    """
-
-    matcher: FrameMatcher
+    matcher: FrameMatcher  # de-skewed with the predicted motion
     predicted: Prediction
-    priors: Sequence[gtsam.NonlinearFactor]
+    priors: Sequence[gtsam.NonlinearFactor]  # on the pose at the middle of the sweep
 
     @property
     def sweep(self) -> MovingSweep:

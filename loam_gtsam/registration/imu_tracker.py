@@ -30,8 +30,7 @@ from loam_gtsam.types import FloatArray, SweepError, TiltPrior
 
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
-"""Gyro and scan disagree about a frame if they differ by more than this angle plus this share of
-the turn: far above the noise of either, below what a wrong axis or sign makes."""
+"""Angle and share of the turn by which gyro and scan must differ to disagree: above all noise."""
 _DISTRUST = 5  # frames of disagreement less those of agreement from which the gyro is not used
 _PAIRS = 2000  # number of pairs of frames, the newest, behind the check of the mounting
 _SCAN_VARIANCE = 4.0

@@ -71,13 +71,7 @@ class PlaneMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanMatches:
-    """All matches of one sweep at one pose.
-
-    Attributes
-    ----------
-    edges, planes : the matches
-    search : neighbour search that found the matches; None for matches without a search
-    """
+    """All matches of one sweep at one pose, and the neighbour search, if any, that found them."""
 
     edges: EdgeMatches
     planes: PlaneMatches
@@ -94,35 +88,21 @@ class ScanMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
-    """A search for neighbours, whose lines and planes may be kept at other poses near by.
-
-    Attributes
-    ----------
-    map_T_lidar : pose of the search
-    posed : de-skewed sweep whose points were searched for
-    found : all matches at that pose
-    wide : whether the map was thinned and the reach enlarged, because there were too few matches
-    """
+    """A search for neighbours, whose lines and planes may be kept at other poses near by."""
 
     map_T_lidar: gtsam.Pose3
-    posed: PosedSweep
+    posed: PosedSweep  # whose points were searched for
     found: ScanMatches
-    wide: bool
+    wide: bool  # whether, after too few matches, the map was thinned and the reach enlarged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChosenRows:
-    """The features of a sweep that are matched.
+    """The features of a sweep that are matched."""
 
-    Attributes
-    ----------
-    edges, planes : rows of the features among the edges and the planes of the sweep
-    distinct : mask of the distinct ones among ``edges``; None if all are distinct
-    """
-
-    edges: IntArray
-    planes: IntArray
-    distinct: BoolArray | None
+    edges: IntArray  # rows among the edges of the sweep
+    planes: IntArray  # rows among its planes
+    distinct: BoolArray | None  # mask of ``edges``; None if all are distinct
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)

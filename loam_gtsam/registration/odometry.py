@@ -27,13 +27,7 @@ _RING_SPACING = 1e4  # metres between rings in the 4D search; more than the widt
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Guess:
-    """A predicted pose at the reference time of a sweep, and the motion within that sweep.
-
-    Attributes
-    ----------
-    map_T_lidar : pose at the reference time
-    twist : (6,) body velocity at the reference time, rad/s and m/s
-    """
+    """The predicted pose and (6,) body velocity, rad/s and m/s, at a sweep's reference time."""
 
     map_T_lidar: gtsam.Pose3
     twist: FloatArray
@@ -96,17 +90,11 @@ class ConstantVelocity(Odometry):
 
 
 class Moment(NamedTuple):
-    """The middle of a registered sweep.
+    """The middle of a registered sweep."""
 
-    Attributes
-    ----------
-    stamp, map_T_lidar : nanoseconds and pose of the middle
-    solved : whether the pose was solved, or given for the first sweep; else it was predicted
-    """
-
-    stamp: int
+    stamp: int  # nanoseconds
     map_T_lidar: gtsam.Pose3
-    solved: bool
+    solved: bool  # or given for the first sweep; else the pose was predicted
 
     def seconds_to(self, stamp: int) -> float:
         """Seconds to the middle of a later sweep."""

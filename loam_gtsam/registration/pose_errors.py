@@ -315,13 +315,8 @@ def scan_error(
         renewed = renewed + solution.weak.T @ priors @ solution.weak
         keep = np.eye(6) - solution.weak
         user = keep.T @ user @ keep
-    return ScanError(
-        covariance=symmetric(bread @ (meat + priors) @ bread),
-        renewed=symmetric(bread @ renewed @ bread),
-        user=bread @ user,
-        residual_variance=variance,
-        effective_matches=effective,
-    )
+    covariance, renewed = (symmetric(bread @ part @ bread) for part in (meat + priors, renewed))
+    return ScanError(covariance, renewed, bread @ user, variance, effective)
 
 
 def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:

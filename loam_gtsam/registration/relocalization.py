@@ -38,16 +38,10 @@ _APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead t
 
 @dataclass(frozen=True, slots=True)
 class Fit:
-    """A measure of how well a sweep fits the map at a pose.
+    """A measure of how well a sweep fits the map at a pose."""
 
-    Attributes
-    ----------
-    share : matched share of the features
-    agreement : share of the matches within three of their standard deviations
-    """
-
-    share: float
-    agreement: float
+    share: float  # of the features that are matched
+    agreement: float  # share of the matches within three of their standard deviations
 
     @classmethod
     def of(cls, matches: ScanMatches, offered: int) -> Fit:
@@ -66,18 +60,12 @@ class Fit:
 
 
 class FitMonitor:
-    """Fits of the last sweeps, against which the next sweep is judged.
-
-    Attributes
-    ----------
-    lost : number of sweeps in a row that did not fit
-    last : pose of the last sweep that fitted
-    """
+    """Fits of the last sweeps, against which the next sweep is judged."""
 
     def __init__(self, config: RelocalizationConfig) -> None:
         self.config = config
-        self.lost = 0
-        self.last: gtsam.Pose3 | None = None
+        self.lost = 0  # sweeps in a row that did not fit
+        self.last: gtsam.Pose3 | None = None  # pose of the last sweep that fitted
         self._past: deque[Fit] = deque(maxlen=config.memory)
 
     @property
@@ -142,18 +130,11 @@ class FitMonitor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
-    """The outcome of a search that found the pose of the sweep.
+    """The outcome of a search that found the pose of the sweep."""
 
-    Attributes
-    ----------
-    solution : solution at the middle of the sweep
-    twist : (6,) body velocity with which the sweep was de-skewed
-    message : sentence for the user if the search moved the sweep, else empty
-    """
-
-    solution: Solution
-    twist: FloatArray
-    message: str = ""
+    solution: Solution  # at the middle of the sweep
+    twist: FloatArray  # (6,) body velocity with which the sweep was de-skewed
+    message: str = ""  # sentence for the user if the search moved the sweep
 
 
 @dataclass(frozen=True, slots=True)
@@ -304,15 +285,9 @@ def likely_poses(
 
     Parameters
     ----------
-    points : (N, 3) a few hundred points of the sweep, metres, lidar frame
-    map_points : (M, 3) metres, map frame
-    around : centres of the search, ``map_T_lidar``
-    radius : metres around each centre
-    count : largest number of poses
-
-    Returns
-    -------
-    Poses more than 1.5 m or 12 degrees apart from each other.
+    points, map_points : (N, 3), a few hundred of the sweep in the lidar frame, and (M, 3), metres
+    around, radius : centres of the search, ``map_T_lidar``, and metres around each
+    count : largest number of poses, which are more than 1.5 m or 12 degrees apart
     """
     tried = [_scores(points, map_points, pose, radius) for pose in around]
     scores, moves = (np.concatenate(parts) for parts in zip(*tried, strict=True))

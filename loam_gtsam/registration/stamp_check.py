@@ -18,11 +18,8 @@ _STEPS = 10  # intervals of the sensor between two sweeps above which a stamp is
 class Refusal:
     """The reason why a sweep is not used because of its stamp.
 
-    Attributes
-    ----------
-    fault, message : the reason as a value and as a sentence
-    clock_step : nanoseconds by which the clock was set ahead, if this sweep shows it, else 0. The
-        next sweep must be checked against the new clock.
+    ``clock_step`` is by how many nanoseconds the clock was set ahead, if this sweep shows it, else
+    0. The next sweep must be checked against the new clock.
     """
 
     fault: SweepFault

@@ -66,9 +66,8 @@ def test_gtsam_files_keep_every_factor(tmp_path):
     saved = saved_graph()
     up = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
     saved.factors.add(gtsam.GPSFactor(X(4), np.ones(3), gtsam.noiseModel.Isotropic.Sigma(3, 1.0)))
-    saved.factors.add(
-        gtsam.AttitudeFactorPose3(X(4), up, gtsam.noiseModel.Isotropic.Sigma(2, 0.1), up)
-    )
+    tilt = gtsam.noiseModel.Isotropic.Sigma(2, 0.1)
+    saved.factors.add(gtsam.AttitudeFactorPose3(X(4), up, tilt, up))
     write_graph(tmp_path / "g.graph", saved)
     assert read_graph(tmp_path / "g.graph").factors.equals(saved.factors, 1e-12)
     write_graph(tmp_path / "g.g2o", saved)
@@ -86,10 +85,8 @@ def test_gtsam_reads_the_g2o_file_too(tmp_path):
     assert all(poses.atPose3(n).equals(saved.poses.atPose3(X(n)), 1e-6) for n in range(20))
     assert poses.size() == 20
     assert graph.size() == saved.factors.size() - 1
-    read, written = (
-        factor.noiseModel().covariance() for factor in (graph.at(0), saved.factors.at(1))
-    )
-    np.testing.assert_allclose(read, written, rtol=1e-9)
+    read, written = graph.at(0).noiseModel(), saved.factors.at(1).noiseModel()
+    np.testing.assert_allclose(read.covariance(), written.covariance(), rtol=1e-9)
 
 
 POSES = (
@@ -170,9 +167,8 @@ def test_other_bad_files_are_refused(tmp_path):
     write_graph(tmp_path / "p.graph", SavedGraph(gtsam.NonlinearFactorGraph(), points))
     with pytest.raises(DatasetError, match="expected poses only"):
         read_graph(tmp_path / "p.graph")
-    python = gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), [0], lambda *_: np.zeros(6))
-    graph = gtsam.NonlinearFactorGraph()
-    graph.add(python)
+    graph, unit = gtsam.NonlinearFactorGraph(), gtsam.noiseModel.Unit.Create(6)
+    graph.add(gtsam.CustomFactor(unit, [0], lambda *_: np.zeros(6)))
     with pytest.raises(OutputError, match="cannot serialise"):
         write_graph(tmp_path / "c.graph", SavedGraph(graph, gtsam.Values()))
 

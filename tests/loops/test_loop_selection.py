@@ -30,10 +30,8 @@ def test_chi_squared_is_the_same_before_and_after_the_loop_is_in():
     for loop in right_loops(truth, rng, 3):
         graph.add_loop(loop)
     extra = right_loops(truth, rng, 7)[3]
-    between, covariance = graph.relative(extra.earlier, extra.later)
-    before = chi_squared(
-        extra.earlier_T_later, extra.covariance, between, covariance, included=False
-    )
+    known = graph.relative(extra.earlier, extra.later)
+    before = chi_squared(extra.earlier_T_later, extra.covariance, *known, included=False)
     graph.add_loop(extra)
     assert graph.chi_squared(3) == pytest.approx(before, rel=0.05)
     assert before < 40.0

@@ -201,13 +201,9 @@ class Drifting:
 
 def ring(laps, radius=35.0, step=2.0):
     angles = np.arange(0.0, 2.0 * np.pi * laps, step / radius)
-    return [
-        gtsam.Pose3(
-            gtsam.Rot3.Yaw(angle + np.pi / 2),
-            np.array([20.0 + radius * np.cos(angle), 20.0 + radius * np.sin(angle), 0.0]),
-        )
-        for angle in angles
-    ]
+    way = [np.array([20.0 + radius * np.cos(a), 20.0 + radius * np.sin(a), 0.0]) for a in angles]
+    headings = [gtsam.Rot3.Yaw(angle + np.pi / 2) for angle in angles]
+    return list(map(gtsam.Pose3, headings, way))
 
 
 def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():

@@ -117,13 +117,11 @@ def test_few_neighbours_leave_one_degree_of_freedom_at_least():
     """Four points leave a plane one, three leave it none: then the scatter counts in full."""
     square = plane_group(saddle=0.1 * X)[:4]
     config = changed(neighbours=4)
-    assert one(match_planes, AHEAD, square, config).sigmas[0] == pytest.approx(
-        np.sqrt(0.01 * 4 / 1 * (1 + 1 / 4)), rel=1e-6
-    )
+    plane = one(match_planes, AHEAD, square, config).sigmas[0]
+    assert plane == pytest.approx(np.sqrt(0.01 * 4 / 1 * (1 + 1 / 4)), rel=1e-6)
     three = AHEAD + np.array([[0.1, 0, -0.5], [-0.2, 0, 0], [0.1, 0, 0.5]])
-    assert one(match_lines, AHEAD, three, changed(neighbours=3, line_ratio=2.0)).sigmas[
-        0
-    ] == pytest.approx(np.sqrt(0.02 * 3 / 1 * (1 + 1 / 3)), rel=1e-6)
+    line = one(match_lines, AHEAD, three, changed(neighbours=3, line_ratio=2.0)).sigmas[0]
+    assert line == pytest.approx(np.sqrt(0.02 * 3 / 1 * (1 + 1 / 3)), rel=1e-6)
 
 
 def test_the_distance_from_a_plane_is_no_distance_within_it():
@@ -251,9 +249,8 @@ def test_a_weight_at_the_limit_is_too_small():
     config = changed(weight_slope=0.5, min_weight=0.5)
     edge, above = [5.0, 1.0, 0.0], [4.0, 0.0, 0.0]
     assert len(one(match_lines, edge, line_group(), config)) == 0
-    assert (
-        len(one(match_planes, above, plane_group(), changed(weight_slope=1.0, min_weight=0.5))) == 0
-    )
+    steep = changed(weight_slope=1.0, min_weight=0.5)
+    assert len(one(match_planes, above, plane_group(), steep)) == 0
     kept = ScanMatches(
         one(match_lines, edge, line_group(), changed(weight_slope=0.5)),
         one(match_planes, above, plane_group(), changed(weight_slope=1.0)),
@@ -261,7 +258,7 @@ def test_a_weight_at_the_limit_is_too_small():
     assert (len(kept.edges), len(kept.planes)) == (1, 1)
     renewed = rematched(kept, gtsam.Pose3(), config)
     assert (len(renewed.edges), len(renewed.planes)) == (0, 1)
-    renewed = rematched(kept, gtsam.Pose3(), changed(weight_slope=1.0, min_weight=0.5))
+    renewed = rematched(kept, gtsam.Pose3(), steep)
     assert (len(renewed.edges), len(renewed.planes)) == (0, 0)
 
 
@@ -427,15 +424,8 @@ def test_edges_are_searched_for_widely_where_planes_leave_a_translation_open(
     held = map_of(poles((5.0, 8.0), spacing=FAR_APART))
     points, features = zip(*(wall(across, count) for across in walls), strict=True)
     edges, distinct = np.array([[5, 8, 0.01], [0, -20, 0]]), np.array([True, False])
-    found = associate(
-        edges,
-        np.concatenate(features),
-        gtsam.Pose3(),
-        held,
-        map_of(np.concatenate(points)),
-        changed(wide_below=wide_below),
-        distinct,
-    )
+    maps, config = (held, map_of(np.concatenate(points))), changed(wide_below=wide_below)
+    found = associate(edges, np.concatenate(features), gtsam.Pose3(), *maps, config, distinct)
     assert len(found.planes) == count * len(walls)
     assert len(found.edges) == searched
 

@@ -34,18 +34,15 @@ SIX = np.eye(6)
 make_matches = partial(made.make_matches, n_planes=200, sigma=1.0)
 
 
-def edge_matches(points, centres, directions, weights):
-    count = len(points)
-    return EdgeMatches(
-        points, centres, directions, np.zeros(count), np.ones(count), weights, np.arange(count)
-    )
+def measured(weights):
+    """The distances, standard deviations, weights and indices of matches."""
+    count = len(weights)
+    return np.zeros(count), np.ones(count), weights, np.arange(count)
 
 
-def plane_matches(points, normals, offsets, weights):
-    count = len(points)
-    return PlaneMatches(
-        points, normals, offsets, np.zeros(count), np.ones(count), weights, np.arange(count)
-    )
+def planes_alone(points, normals, offsets, weights):
+    edges = EdgeMatches(*[np.empty((0, 3))] * 3, *measured(np.empty(0)))
+    return ScanMatches(edges, PlaneMatches(points, normals, offsets, *measured(weights)))
 
 
 def floor_and_wall(n_wall, seed=0):
@@ -54,11 +51,7 @@ def floor_and_wall(n_wall, seed=0):
     points = rng.uniform(-10, 10, (500 + n_wall, 3))
     normals = np.repeat(np.eye(3), [n_wall, 200, 300], axis=0)
     offsets = -np.einsum("ij,ij->i", normals, points)
-    nothing = np.empty((0, 3))
-    return ScanMatches(
-        edge_matches(nothing, nothing, nothing, np.empty(0)),
-        plane_matches(points, normals, offsets, np.ones(len(points))),
-    )
+    return planes_alone(points, normals, offsets, np.ones(len(points)))
 
 
 def solver(kind, **changes):
@@ -94,11 +87,7 @@ def faced(matches, pose):
     """The same matches with each line replaced by the plane through it that faces its point."""
     rows, p = loam_rows(matches, pose), matches.planes
     weights = np.concatenate([matches.edges.weights, p.weights])
-    nothing = np.empty((0, 3))
-    return ScanMatches(
-        edge_matches(nothing, nothing, nothing, np.empty(0)),
-        plane_matches(rows.points, rows.normals, rows.offsets, weights),
-    )
+    return planes_alone(rows.points, rows.normals, rows.offsets, weights)
 
 
 @pytest.mark.parametrize("n_edges", [0, 60])
@@ -227,7 +216,7 @@ def test_loam_rows_are_distances_with_their_gradients_times_s():
 def test_a_point_on_its_line_adds_nothing_and_divides_by_nothing():
     line = np.array([[0.0, 0.0, 1.0]])
     base = make_matches(n_edges=0).planes
-    on_line = edge_matches(line * 2.0, line, line, np.ones(1))
+    on_line = EdgeMatches(line * 2.0, line, line, *measured(np.ones(1)))
     residual, jacobian = loam_rows(ScanMatches(on_line, base), gtsam.Pose3()).residuals(
         gtsam.Pose3()
     )
@@ -348,7 +337,7 @@ def test_the_loss_is_on_the_distance_of_an_edge_not_on_its_two_rows():
     """(0.09, 0.09) is 0.127 from the line: above a delta of 0.1, though neither row is."""
     line = np.array([[0.0, 0.0, 1.0]])
     point = np.array([[0.09, 0.09, 3.0]])
-    far = edge_matches(point, np.zeros((1, 3)), line, np.ones(1))
+    far = EdgeMatches(point, np.zeros((1, 3)), line, *measured(np.ones(1)))
     planes = floor_and_wall(100).planes
     solution = solver(ALoamSolver, iterations=1).solve(
         lambda pose: ScanMatches(far, planes), gtsam.Pose3()

@@ -282,10 +282,8 @@ def test_a_rest_at_the_start_gives_the_bias_of_the_gyro(rate, bias):
 
 def frames(rate, count):
     """(stamp, pose) of a lidar that turns evenly."""
-    return [
-        (NOW + i * FRAME, gtsam.Pose3(gtsam.Rot3.Expmap(0.1 * i * np.array(rate)), np.zeros(3)))
-        for i in range(count)
-    ]
+    turns = [gtsam.Rot3.Expmap(0.1 * i * np.array(rate)) for i in range(count)]
+    return [(NOW + i * FRAME, gtsam.Pose3(turn, np.zeros(3))) for i, turn in enumerate(turns)]
 
 
 def turning_tracker(rate, bias=(0.0, 0.0, 0.0), seconds=25.0):

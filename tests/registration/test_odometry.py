@@ -339,9 +339,8 @@ def test_lines_and_planes_equal_brute_force(limit, gap):
     np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0)
     for corner in range(3):
         corners = np.array([triangle[corner] for triangle in planes.values()])
-        np.testing.assert_allclose(
-            np.einsum("ij,ij->i", normals, corners) + offsets, 0.0, atol=1e-12
-        )
+        off = np.einsum("ij,ij->i", normals, corners) + offsets
+        np.testing.assert_allclose(off, 0.0, atol=1e-12)
 
 
 def test_points_that_span_no_line_or_plane_are_left_out():

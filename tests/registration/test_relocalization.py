@@ -322,10 +322,7 @@ def test_a_jump_is_no_motion(drive, calm, move, turn_deg):
 
 def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
     """A search too narrow at first: some sweeps are lost."""
-    config = with_search(radius=0.0, radius_growth=1.0)
-    pipeline = Pipeline(config)
-    sizes = []
-    updates = []
+    pipeline, sizes, updates = Pipeline(with_search(radius=0.0, radius_growth=1.0)), [], []
     for sweep in kidnapped:
         updates.append(pipeline.process(sweep))
         sizes.append(pipeline.mapper.maps.planes.count())

@@ -109,10 +109,7 @@ class Solution:
 class MotionPrior:
     """The expected pose, which is used along the directions that a scan does not fix.
 
-    Attributes
-    ----------
-    map_T_lidar : expected pose
-    information : (6, 6) of the expectation, tangent order of the package
+    Its information is (6, 6), in the tangent order of the package.
     """
 
     map_T_lidar: gtsam.Pose3

@@ -1,7 +1,34 @@
 """Scan matching as GTSAM factors: point to line, point to plane, one by one or a scan at once.
 
-Every factor on a pose takes the key of a Pose3 ``map_T_lidar`` and the noise model that GTSAM's own
-factors take, robust ones included. For the residuals see docs/maths/factors.md.
+=========================================  ========================================================
+You look for                               It is called here
+=========================================  ========================================================
+``PointToPlaneFactor``, one per match      :func:`point_to_plane_factor`
+``PointToLineFactor`` (edge factor)        :func:`point_to_line_factor`
+a batched or scan factor                   :func:`scan_match_factor` of :class:`MatchRows`
+``CustomFactor`` with an own residual      :func:`checked_factor`, for variables of any type
+``evaluateError`` without a factor         :func:`point_to_plane_residual`,
+                                           :func:`point_to_line_residual`,
+                                           :meth:`MatchRows.residuals`
+=========================================  ========================================================
+
+The functions return a :class:`gtsam.CustomFactor`; every one on a pose takes the key of a Pose3
+``map_T_lidar`` and the noise model that GTSAM's own factors take, robust ones included.
+
+Residuals (``q = R p + t``, pose ``map_T_lidar = (R, t)``, right perturbation ``[rot, trans]``):
+
+* plane ``n . q + d = 0``: one row ``n . q + d``;
+* line through ``c`` along ``u``: two rows ``e_i . (q - c)`` with ``e_1, e_2`` an orthonormal basis
+  of the complement of ``u``. Their norm is LOAM's point-to-line distance, without its division by
+  zero on the line.
+
+A line match is thus two plane rows with normals ``e_i`` and offsets ``-e_i . c``, and every row
+reads ``r = n . (R p) + n . t + d`` with derivative ``[p x R^T n, R^T n]``.
+
+A row is *linear* in the 13 numbers ``z(T) = [vec(R), t, 1]``. A scan of M weighted rows is
+therefore ``r = L z(T)`` with a constant (M, 13) matrix L, and any S with ``S^T S = L^T L`` gives
+the same cost, gradient and Gauss-Newton Hessian at every pose: :func:`scan_match_factor` hands
+GTSAM 13 rows however many matches a scan has.
 """
 
 from __future__ import annotations
@@ -30,7 +57,12 @@ def point_to_plane_residual(
 ) -> tuple[FloatArray, FloatArray]:
     """Signed distance (1,) of a point from the plane ``normal . q + offset = 0``; Jacobian (1, 6).
 
-    ``point`` is (3,) metres, lidar frame; ``normal`` (3,) unit, map frame; ``offset`` in metres.
+    Parameters
+    ----------
+    map_T_lidar : pose
+    point : (3,) metres, lidar frame
+    normal : (3,) unit, map frame
+    offset : metres
     """
     offsets = np.array([offset], dtype=np.float64)
     return _row_residuals(map_T_lidar, point[None, :], normal[None, :], offsets)
@@ -41,8 +73,11 @@ def point_to_line_residual(
 ) -> tuple[FloatArray, FloatArray]:
     """Offset (2,) of a point from a line, whose norm is the distance; Jacobian (2, 6).
 
-    ``point`` is (3,) metres, lidar frame; ``centre`` and ``direction`` are (3,), a point on the
-    line and its unit direction, map frame.
+    Parameters
+    ----------
+    map_T_lidar : pose
+    point : (3,) metres, lidar frame
+    centre, direction : (3,) a point on the line and its unit direction, map frame
     """
     basis = complement_basis(direction[None, :])[0]
     return _row_residuals(map_T_lidar, np.vstack([point, point]), basis, -basis @ centre)
@@ -109,14 +144,17 @@ def line_rows(
 ) -> MatchRows:
     """Rows of M point-to-line matches (2 M rows).
 
-    InputError if a shape is wrong or a value not finite.
-
     Parameters
     ----------
     points : (M, 3) metres, lidar frame
     centres, directions : (M, 3) each; metres and unit, map frame
     weights : (M,) multiply row and residual, as LOAM's s does
     sigmas : standard deviations of the distances, metres; (M,) or one for all
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong or a value not finite.
     """
     p, c, u, w = (np.asarray(part, np.float64) for part in (points, centres, directions, weights))
     check_array(p, "points", ("N", 3))
@@ -162,9 +200,18 @@ def checked_factor(
     the wrong number of columns, so shapes, dtypes and finiteness are checked here. The variables
     may be of any type that :class:`gtsam.Values` holds (poses, rotations, points, vectors, numbers,
     IMU biases, navigation states, calibrations): a Jacobian has as many columns as the variable has
-    tangent directions. InputError from GTSAM's error and linearize calls, when ``residual`` returns
-    something unusable.
+    tangent directions.
 
+    Parameters
+    ----------
+    noise : model of the residual's dimension
+    keys : the variables, in the order of the Jacobians
+    residual : see :data:`Residual`
+
+    Raises
+    ------
+    InputError
+        From GTSAM's error and linearize calls, when ``residual`` returns something unusable.
     """
     keys = list(keys)
     rows = noise.dim()
@@ -193,14 +240,17 @@ def point_to_plane_factor(
 ) -> gtsam.CustomFactor:
     """One point-to-plane match as a factor on the pose ``key``.
 
-    InputError if a shape is wrong, a value not finite, or the normal not of unit length.
-
     Parameters
     ----------
     key : of a Pose3 ``map_T_lidar``
     point, normal : (3,) metres in the lidar frame, unit in the map frame
     offset : metres, the plane is ``normal . q + offset = 0``
     noise : 1-dimensional; may be robust
+
+    Raises
+    ------
+    InputError
+        If a shape is wrong, a value not finite, or the normal not of unit length.
     """
     p, n = as_vector(point, "point"), _unit(normal, "normal")
     if not np.isfinite(offset):
@@ -219,13 +269,17 @@ def point_to_line_factor(
 ) -> gtsam.CustomFactor:
     """One point-to-line match as a factor on the pose ``key``.
 
-    Errors are those of :func:`point_to_plane_factor`.
-
     Parameters
     ----------
     key : of a Pose3 ``map_T_lidar``
-    point, centre, direction : as for :func:`point_to_line_residual`
+    point : (3,) metres, lidar frame
+    centre, direction : (3,) a point on the line and its unit direction, map frame
     noise : 2-dimensional; may be robust
+
+    Raises
+    ------
+    InputError
+        As :func:`point_to_plane_factor` does.
     """
     p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
     _noise_dimension(noise, 2)
@@ -236,8 +290,8 @@ def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
     """All matches of a scan, at least one, as one 13-row factor on the pose ``key``.
 
     Its error, gradient, Gauss-Newton Hessian and optimum are those of the sum of the per-match
-    factors with sigma ``1 / scale``, at a cost per evaluation that does not depend on the number of
-    matches. InputError if there are no rows.
+    factors with sigma ``1 / scale`` (module docstring), at a cost per evaluation that does not
+    depend on the number of matches. InputError if there are no rows.
     """
     if len(rows.points) == 0:
         raise InputError("scan_match_factor: expected at least one match, got none")
@@ -247,13 +301,16 @@ def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
 
 
 def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:
-    """An anchor (3,) in the map and S (13, 13) with ``|S z|^2 = sum r^2``."""
+    """An anchor (3,) in the map and S (13, 13) with ``|S z|^2 = sum r^2``.
+
+    Map coordinates are taken from the anchor, a point on the planes, so that the entries of L stay
+    of the size of a scan however far the map extends, and the squared form loses no digits.
+    """
     normals = np.ascontiguousarray(rows.normals.T) * rows.scales
     offsets = rows.offsets * rows.scales
     across = normals @ normals.T
     # Where no plane fixes the anchor it stays near the origin.
     held = across + (_RIDGE * np.trace(across)) * np.eye(3)
-    # From there, not from the origin, L stays of the size of a scan: no digits are lost squaring.
     anchor: FloatArray = np.linalg.solve(held, -normals @ offsets).astype(np.float64, copy=False)
     matrix = np.empty((13, len(offsets)))
     np.multiply(normals[:, None], rows.points.T, out=matrix[:9].reshape(3, 3, -1))
@@ -287,6 +344,7 @@ def _compressed_residual(
 def _row_residuals(
     map_T_lidar: gtsam.Pose3, points: FloatArray, normals: FloatArray, offsets: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
+    """Residuals (M,) and Jacobian (M, 6) of plane rows."""
     rotation = map_T_lidar.rotation().matrix()
     local = normals @ rotation
     residual = np.einsum("ij,ij->i", local, points) + normals @ map_T_lidar.translation() + offsets
@@ -298,6 +356,7 @@ def _pose_factor(
     noise: gtsam.noiseModel.Base,
     residual: Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]],
 ) -> gtsam.CustomFactor:
+    """A factor on one pose whose residual is ours and needs no checking per call."""
 
     def call(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -311,6 +370,7 @@ def _pose_factor(
 
 
 def _dimension(values: gtsam.Values, key: int) -> int:
+    """Tangent dimension of a variable of any type."""
     try:
         values.atPose3(key)
     except RuntimeError:  # another type: looked up among all variables, which takes longer

@@ -1,7 +1,13 @@
 """The map of one feature class: points in cubes, a window that follows the sensor, an archive.
 
-A cube of 50 m is named by its index ``floor((x + 25) / 50)``, so nothing is moved when the sensor
-travels. What leaves the window comes back with it (LOAM, laserMapping). See docs/maths/cubemap.md.
+A cube of 50 m is named by its absolute index ``floor((x + 25) / 50)``, so cube (0, 0, 0) is
+centred on the map origin and nothing has to be moved when the sensor travels. The cubes of a
+window of 21 x 21 x 11 around the sensor are in use (LOAM, laserMapping); what leaves the window is
+archived and comes back with it.
+
+Points of a cube are sorted by voxel. An insert then finds the voxels it hits by bisection, and a
+kd-tree builds in half the time. One tree holds all cubes that are searched together: a sweep
+touches a dozen, most of them with a handful of points. See :mod:`loam_gtsam.voxels`.
 """
 
 from __future__ import annotations
@@ -49,13 +55,19 @@ class CubeMapStats:
 class CubeMap:
     """Map points of one feature class, at most one per voxel, searchable around the sensor.
 
-    Points inserted from now on carry the number ``owner``, see :meth:`move`. ConfigError if
-    ``voxel_size`` is not positive, or no folder can be made in ``config.archive_dir``.
-
     Parameters
     ----------
     config : cubes, window, neighbourhood, insertion policy and archive
     voxel_size : metres; the voxel grid is anchored at the map origin
+
+    Attributes
+    ----------
+    owner : number that points inserted from now on carry, see :meth:`move`
+
+    Raises
+    ------
+    ConfigError
+        If ``voxel_size`` is not positive, or no folder can be made in ``config.archive_dir``.
     """
 
     def __init__(self, config: MapConfig, voxel_size: float) -> None:
@@ -93,9 +105,20 @@ class CubeMap:
     def recenter(self, position: FloatArray) -> int:
         """Shift the window, no farther than needed, if its edge is within ``window_margin`` cubes.
 
-        Cubes that fall out are archived, archived ones that fall in are restored. ``position``
-        is (3,) metres, map frame. Returns the number of cubes evicted. InputError if the position
-        is not three finite numbers in range of the voxel grid.
+        Cubes that fall out are archived, archived ones that fall in are restored.
+
+        Parameters
+        ----------
+        position : (3,) sensor position, metres, map frame
+
+        Returns
+        -------
+        Cubes evicted by this call.
+
+        Raises
+        ------
+        InputError
+            If the position is not three finite numbers in range of the voxel grid.
         """
         window = self._window.following(self._grid.cube_of(position), self._config.window_margin)
         if window == self._window:
@@ -118,7 +141,14 @@ class CubeMap:
     def neighbourhood(self, map_T_lidar: FloatArray) -> tuple[CubeIndex, ...]:
         """Cubes around the sensor's that hold points and, if configured, are in view; ascending.
 
-        InputError if the sensor pose is not a finite (4, 4) array in range of the voxel grid.
+        Parameters
+        ----------
+        map_T_lidar : (4, 4) sensor pose
+
+        Raises
+        ------
+        InputError
+            If the pose is not a finite (4, 4) array in range of the voxel grid.
         """
         pose = as_array(map_T_lidar, "map_T_lidar", (4, 4))
         around = Window.around(self._grid.cube_of(pose[:3, 3]), self._config.neighbourhood)
@@ -134,8 +164,16 @@ class CubeMap:
         the old one counting once: what LOAM's voxel filter does to a cube after each sweep. With
         ``settled`` the first point of a voxel stays, and search trees are kept while few of their
         points are new. Points outside the window, or beyond the voxel grid (about 2^20 voxels from
-        the origin), are not taken and counted in ``stats.outside``. InputError, and no change,
-        if ``points_map``, metres in the map frame, is not (N, 3) floats, all finite.
+        the origin), are not taken and counted in ``stats.outside``.
+
+        Parameters
+        ----------
+        points_map : (N, 3) metres, map frame
+
+        Raises
+        ------
+        InputError
+            If the array is not (N, 3) floats, all finite; the map is then unchanged.
         """
         points = as_points(points_map, "points_map")
         self._put(points, np.full(len(points), self.owner, np.int32))
@@ -144,8 +182,11 @@ class CubeMap:
         """Move points of the window and of the archive, after a loop closure; return how many.
 
         Where a point comes to lie in the voxel of another, the one that was not moved stays; of two
-        that were moved, the one of the lower owner stays. ``moves`` are (4, 4) rigid transforms in
-        the map frame, by the owner of the points.
+        that were moved, the one of the lower owner stays.
+
+        Parameters
+        ----------
+        moves : (4, 4) rigid transforms in the map frame, by the owner of the points
         """
         owners = np.array(sorted(moves), np.int32)
         taken = [cube.take_out(owners) for cube in self._cubes.values()]
@@ -194,9 +235,6 @@ class CubeMap:
     ) -> tuple[FloatArray, FloatArray]:
         """The k nearest points of the given cubes to each query, exactly, also across borders.
 
-        Points at equal distance come in any order, but in the same one for the same calls.
-        InputError if ``queries`` is not (M, 3) finite floats, ``k`` < 1 or ``max_distance`` <= 0.
-
         Parameters
         ----------
         queries : (M, 3) metres, map frame
@@ -208,6 +246,15 @@ class CubeMap:
         -------
         points : (M, k, 3) metres, map frame, nearest first; NaN where there is no neighbour
         squared_distances : (M, k) square metres, ascending; infinite where there is none
+
+        Raises
+        ------
+        InputError
+            If ``queries`` is not (M, 3) finite floats, ``k`` < 1 or ``max_distance`` not positive.
+
+        Notes
+        -----
+        Points at equal distance come in any order, but in the same one for the same calls.
         """
         queries = as_points(queries, "queries")
         if k < 1:

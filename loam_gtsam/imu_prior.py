@@ -1,7 +1,9 @@
 """Roll and pitch of an IMU as information on the pose: LOAM's blend, and factors in its place.
 
 Angles are those of ``level_R_lidar = Rz(yaw) Ry(pitch) Rx(roll)``, where ``level`` is any frame
-with z up: :class:`~loam_gtsam.imu.level.Level` relates it to the map. See docs/maths/imu_prior.md.
+whose z axis points up. The map is such a frame once it is levelled; otherwise
+:class:`~loam_gtsam.imu.level.Level` holds the rotation between the two. The mathematics is in
+docs/maths/imu_prior.md.
 """
 
 from __future__ import annotations
@@ -51,11 +53,17 @@ def blend(
 ) -> gtsam.Pose3:
     """LOAM's blend: roll and pitch move by ``weight`` towards the IMU's; yaw and position stay.
 
+    Parameters
+    ----------
+    map_T_lidar : solved pose
+    measured : ``world_R_lidar`` of the IMU, z up; its yaw is not used
+    weight : share of the IMU, 0.002 in LOAM
+    level_R_map : see :class:`~loam_gtsam.imu.level.Level`
+
+    Notes
+    -----
     laserMapping, ``transformUpdate``: ``roll = 0.998 roll + 0.002 imuRoll``. Here the IMU's angles
     are first taken to the turn nearest to the pose's, so that nothing jumps at 180 degrees.
-
-    ``measured`` is ``world_R_lidar`` of the IMU, z up, its yaw is not used; ``weight`` is 0.002 in
-    LOAM; for ``level_R_map`` see :class:`~loam_gtsam.imu.level.Level`.
     """
     level_R_lidar = level_R_map.compose(map_T_lidar.rotation())
     target = blended_angles(level_R_lidar, measured, weight)
@@ -116,8 +124,13 @@ def equivalent_prior(
     order of the pull squared; the target is moved by as much, so that the mean is that of the
     blend exactly, and yaw and position go where the scan's own correlations take them. Where the
     way there leads past a pitch of 85 degrees or finds no end (a pull of 2 rad), the target stays
-    at the IMU's angles. ``level_R_lidar`` is the scan's solution, ``information`` (6, 6) that of
-    the scan there; ``measured`` and ``weight`` below 1 are those of :func:`blend`.
+    at the IMU's angles.
+
+    Parameters
+    ----------
+    level_R_lidar : the scan's solution
+    information : (6, 6) of the scan there, tangent order of the package
+    measured, weight : as in :func:`blend`; the weight is below 1
     """
     goal = blended_angles(level_R_lidar, measured, weight)
     moved = np.zeros(3)
@@ -172,6 +185,7 @@ def gravity_factor(
 
 
 def _wrapped(angles: FloatArray) -> FloatArray:
+    """The same angles between -pi and pi."""
     wrapped: FloatArray = angles - 2.0 * np.pi * np.round(angles / (2.0 * np.pi))
     return wrapped
 

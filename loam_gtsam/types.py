@@ -1,8 +1,11 @@
 """The values that travel through the package, and its errors.
 
-* ``lidar`` is x forward, y left, z up; ``map`` is fixed. ``map_T_lidar`` maps lidar coordinates
-  into map coordinates.
-* Tangent vectors are ``[rotation (rad), translation (m)]`` and perturb on the right, as in GTSAM.
+Conventions (the same everywhere):
+
+* Frames: ``lidar`` is x forward, y left, z up; ``map`` is fixed. A name says which frames it
+  relates: ``map_T_lidar`` maps lidar coordinates into map coordinates.
+* Poses are :class:`gtsam.Pose3`; tangent vectors are ordered ``[rotation (rad), translation (m)]``
+  and perturb on the right (body frame), as in GTSAM.
 * Stamps are integer nanoseconds; offsets inside a sweep are float seconds.
 """
 
@@ -57,8 +60,6 @@ def check_array(
 class Scan:
     """One sweep of the sensor, as it was measured (not de-skewed).
 
-    InputError if a shape or a dtype is wrong.
-
     Parameters
     ----------
     points : (N, 3) float array, metres, lidar frame. NaN and infinite rows are allowed.
@@ -69,6 +70,11 @@ class Scan:
         smallest and largest of ``times`` are used.
     rows : number of rows if the points are a full row-major range image (``rows`` x columns),
         else 0.
+
+    Raises
+    ------
+    InputError
+        If a shape or a dtype is wrong.
     """
 
     points: NDArray[np.floating]
@@ -137,8 +143,10 @@ class Features:
     ) -> Features:
         """Features, (E, 3) and (P, 3) floats, that are de-skewed already, by another front end.
 
-        InputError if a shape or a dtype is wrong, or a point is not finite or farther than any
-        lidar sees.
+        Raises
+        ------
+        InputError
+            If a shape or a dtype is wrong, or a point is not finite or farther than any lidar sees.
         """
         for name, points in {"edges": edges, "planes": planes}.items():
             check_array(points, name, ("N", 3))

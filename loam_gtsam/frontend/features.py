@@ -1,6 +1,19 @@
-"""Feature extraction by the rules of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in
-Real-time, RSS 2014, section V.A, and the published code); docs/maths/deviations.md has what
-differs.
+"""Feature extraction: the edge and plane points of one sweep.
+
+The rules are those of LOAM (Zhang and Singh, LOAM: Lidar Odometry and Mapping in Real-time, RSS
+2014, section V.A, and the published code's scan registration): curvature along each ring of the
+raw sweep, rejection of occluded and grazing points, and picks by sector. Four things differ from
+the published code:
+
+* Picks are made for all sectors at once, edges before plane points. The published code goes sector
+  by sector, so that which of two neighbours is picked can differ within half a window of a border.
+  Of two picks that would suppress each other, the one in the earlier sector stays.
+* A plane point must lie where its ring is smooth (:func:`roughness`, ``features.range_noise``). In
+  foliage five neighbours make a plane only by chance, and matches with such planes pull the pose
+  towards the pose from which the map was first seen.
+* Poles, which are too thin for the curvature, are edges (:mod:`loam_gtsam.frontend.poles`).
+* Flat picks stand in ``Features.planes`` as they were measured, before the rest, which is
+  voxel-filtered; the published code puts them into the filter too.
 """
 
 from __future__ import annotations
@@ -35,8 +48,18 @@ def extract_features(scan: Scan, config: Config) -> Features:
 
     Positions stay raw, and every feature keeps its time, so that
     :func:`loam_gtsam.geometry.move_points` can de-skew them. ``sharp`` and ``flat`` are the first
-    rows of ``edges`` and ``planes``. SweepError if too few points are usable, no ring is long
-    enough, or rings or times cannot be found; the message says what was found and what to set.
+    rows of ``edges`` and ``planes``.
+
+    Parameters
+    ----------
+    scan : one sweep, not de-skewed
+    config : ``sensor``, ``features`` and ``deskew`` are used
+
+    Raises
+    ------
+    SweepError
+        If too few points are usable, no ring is long enough, or rings or times cannot be found;
+        the message says what was found and what to set.
     """
     sweep = organise(scan, config)
     xyz, ring_starts, settings = sweep.xyz, sweep.ring_starts, config.features
@@ -83,6 +106,11 @@ def thinned(features: Features, config: MapConfig) -> Features:
     Features that were thinned to these voxels before are returned as they are. Otherwise the result
     knows neither beams (``edge_rings`` and ``plane_rings`` are 0) nor which features are the most
     pronounced (``sharp`` and ``flat`` are empty).
+
+    Parameters
+    ----------
+    features : of one sweep
+    config : ``edge_voxel`` and ``plane_voxel`` are used
     """
     sizes = config.edge_voxel, config.plane_voxel
     if features.voxel_sizes == sizes:
@@ -235,8 +263,16 @@ def voxel_filter_by_ring(
 ) -> tuple[FloatArray, FloatArray, IntArray]:
     """Centroid and mean time of the points that one ring has in each voxel.
 
-    ``xyz`` is (3, N) metres, ring after ring, N > 0, with ``times`` (N,) and ``rings`` (N,) below
-    512; ``size`` in metres. Returns (M, 3), (M,) and (M,), ordered by ring and voxel.
+    Parameters
+    ----------
+    xyz : (3, N) metres, ring after ring, N > 0
+    times : (N,) seconds
+    rings : (N,) beam numbers below 512
+    size : edge length of a voxel, metres
+
+    Returns
+    -------
+    points, times, rings : (M, 3), (M,) and (M,), ordered by ring and voxel
     """
     # A ring crosses a voxel mostly in one run of points: runs are summed first, then sorted.
     cells = np.floor(xyz * np.float32(1.0 / size))

@@ -12,31 +12,10 @@ from typing import Any, Unpack
 
 import numpy as np
 
-from loam_gtsam.datasets.bags.bag_reader import (
-    Message,
-    bag_kind,
-    choose_topic,
-    open_bag,
-    read_messages,
-    topic_types,
-)
+from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo
-from loam_gtsam.datasets.decode.extrinsics import (
-    Rig,
-    describe_extrinsics,
-    extrinsic_settings,
-    moved_to_lidar,
-)
+from loam_gtsam.datasets.decode import extrinsics, pointcloud2, tables
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
-from loam_gtsam.datasets.decode.pointcloud2 import (
-    NO_TIMES,
-    Decoded,
-    TimeOptions,
-    decode_imu,
-    decode_with_times,
-    describe_fields,
-)
-from loam_gtsam.datasets.decode.tables import clean_imu, describe_imu, describe_stamps, read_poses
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -72,14 +51,18 @@ class BagDataset:
         self._path, self._parts = Path(path), tuple(parts)
         self.name = self._path.stem
         self.sensor: Mapping[str, Any] = {}
-        self._options: TimeOptions = options
+        self._options: pointcloud2.TimeOptions = options
         self._problems: list[str] = []
-        with closing(open_bag(self._path, self._parts)) as reader:
-            topics = topic_types(reader)
-            self.topic = choose_topic(self._path, topics, POINT_CLOUD, topic, self._problems)
+        with closing(bag_reader.open_bag(self._path, self._parts)) as reader:
+            topics = bag_reader.topic_types(reader)
+            self.topic = bag_reader.choose_topic(
+                self._path, topics, POINT_CLOUD, topic, self._problems
+            )
             self.imu_topic = None
             if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
-                self.imu_topic = choose_topic(self._path, topics, IMU, imu_topic, self._problems)
+                self.imu_topic = bag_reader.choose_topic(
+                    self._path, topics, IMU, imu_topic, self._problems
+                )
             self._count = topics[self.topic][1]
         self._decision: TimeDecision | None = None
         self._peek()
@@ -89,7 +72,9 @@ class BagDataset:
 
     def __iter__(self) -> Iterator[Scan | BadSweep]:
         offset = self._clock_offset
-        for message in read_messages(self._path, [self.topic], self._problems, self._parts):
+        for message in bag_reader.read_messages(
+            self._path, [self.topic], self._problems, self._parts
+        ):
             if isinstance(message, BadSweep):
                 yield replace(message, stamp=message.stamp + offset)
                 continue
@@ -107,16 +92,18 @@ class BagDataset:
         if self.imu_topic is None:
             return None
         rows, lost = [], 0
-        for message in read_messages(self._path, [self.imu_topic], self._problems, self._parts):
+        for message in bag_reader.read_messages(
+            self._path, [self.imu_topic], self._problems, self._parts
+        ):
             if isinstance(message, BadSweep):
                 lost += 1
             else:
-                rows.append(decode_imu(message.content))
+                rows.append(pointcloud2.decode_imu(message.content))
         if lost:
             self._problems.append(f"IMU: {lost} messages cannot be read")
         stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
         values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 10)
-        return clean_imu(stamps, values, self._problems)
+        return tables.clean_imu(stamps, values, self._problems)
 
     @property
     def truth(self) -> Trajectory | None:
@@ -129,19 +116,21 @@ class BagDataset:
         facts = dict(self._facts)
         if self.imu_topic is not None:
             facts["IMU topic"] = self.imu_topic
-        facts["IMU"] = describe_imu(imu)
-        kind = bag_kind(self._parts[0] if self._parts else self._path)
+        facts["IMU"] = tables.describe_imu(imu)
+        kind = bag_reader.bag_kind(self._parts[0] if self._parts else self._path)
         return DatasetInfo(kind, str(self._path), facts, list(self._problems))
 
-    def _decode(self, message: Message) -> Decoded:
-        return decode_with_times(message.content, decision=self._decision, **self._options)
+    def _decode(self, message: bag_reader.Message) -> pointcloud2.Decoded:
+        return pointcloud2.decode_with_times(
+            message.content, decision=self._decision, **self._options
+        )
 
     def _peek(self) -> None:
         """Decide on the times, once for the whole run, and collect what there is to say."""
-        decoded: list[Decoded] = []
+        decoded: list[pointcloud2.Decoded] = []
         stamps: list[int] = []
         failure = fields = ""
-        stream = read_messages(self._path, [self.topic], [], self._parts)
+        stream = bag_reader.read_messages(self._path, [self.topic], [], self._parts)
         for message in islice(stream, _PEEK):
             if isinstance(message, BadSweep):
                 failure = failure or message.message
@@ -152,7 +141,7 @@ class BagDataset:
                 failure = failure or str(error)
                 continue
             if not stamps:
-                fields = describe_fields(message.content)
+                fields = pointcloud2.describe_fields(message.content)
                 # A sweep that cannot be read has only a receive time; this leads to the stamps'.
                 self._clock_offset = decoded[0].scan.stamp - message.received
             stamps.append(decoded[-1].scan.stamp)
@@ -164,7 +153,7 @@ class BagDataset:
         # The last one: near time zero an absolute time can still look like an offset.
         self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)
         self._facts = {"topic": self.topic, "sweeps": str(self._count)}
-        describe_stamps(np.array(stamps, dtype=np.int64), self._facts, self._problems)
+        tables.describe_stamps(np.array(stamps, dtype=np.int64), self._facts, self._problems)
         self._facts |= {
             "stamps": f"from {stamps[0] * 1e-9:.6f} s",
             "fields": fields,
@@ -172,7 +161,7 @@ class BagDataset:
             "point times": str(self._decision or "none recorded"),
             "rings": _describe_rings(decoded[0].scan),
         }
-        if self._decision is None and self._options.get("time_field") != NO_TIMES:
+        if self._decision is None and self._options.get("time_field") != pointcloud2.NO_TIMES:
             self._problems.append("no per-point time field: times can only come from the azimuth")
         if outliers := sum(d.outliers for d in decoded):
             self._problems.append(
@@ -191,11 +180,11 @@ class BagSequence(BagDataset):
         self,
         path: Path,
         parts: Sequence[Path],
-        rig: Rig,
+        rig: extrinsics.Rig,
         truth: Path | None,
         **options: Unpack[BagOptions],
     ) -> None:
-        with closing(open_bag(path, parts)) as reader:
+        with closing(bag_reader.open_bag(path, parts)) as reader:
             known = set(reader.topics)
         options["topic"] = options.get("topic") or (rig.topic if rig.topic in known else None)
         if not options.get("imu_topic") and rig.imu_topic in known:
@@ -204,7 +193,7 @@ class BagSequence(BagDataset):
         self._rig, self._truth_file = rig, truth
         self.name = path.resolve().name if path.is_dir() else path.stem
         if self.imu_topic == rig.imu_topic:
-            self.sensor: Mapping[str, Any] = extrinsic_settings(rig.lidar_T_imu)
+            self.sensor: Mapping[str, Any] = extrinsics.extrinsic_settings(rig.lidar_T_imu)
         elif self.imu_topic is not None:
             self._problems.append(
                 f"IMU: not the {rig.imu_topic} of {rig.kind}, so its rotation to the lidar is "
@@ -216,7 +205,9 @@ class BagSequence(BagDataset):
         """The reference poses, moved to the lidar; None without their file."""
         if self._truth_file is None:
             return None
-        return moved_to_lidar(read_poses(self._truth_file, self._problems), self._rig.body_T_lidar)
+        return extrinsics.moved_to_lidar(
+            tables.read_poses(self._truth_file, self._problems), self._rig.body_T_lidar
+        )
 
     def info(self) -> DatasetInfo:
         """Description of the bags, with their extrinsics and reference poses."""
@@ -226,7 +217,9 @@ class BagSequence(BagDataset):
         if len(self._parts) > 1:
             info.facts["bags"] = f"{self._parts[0].name} and {len(self._parts) - 1} more"
         if self.sensor:
-            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._rig.source)
+            info.facts["IMU to lidar"] = extrinsics.describe_extrinsics(
+                self.sensor, self._rig.source
+            )
         info.facts["reference poses"] = "none"
         if truth is not None and self._truth_file is not None:
             info.facts["reference poses"] = f"{len(truth)} ({self._truth_file.name})"

@@ -10,26 +10,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from loam_gtsam.datasets.bags.bag_reader import (
-    Message,
-    bag_kind,
-    open_bag,
-    read_messages,
-    topic_types,
-)
+from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import DatasetInfo
-from loam_gtsam.datasets.decode.loam_messages import (
-    CLOUD,
-    ODOMETRY,
-    PLANES,
-    REQUIRED,
-    STAMP_TOLERANCE_NS,
-    FeatureDecoder,
-    StampMatcher,
-    decide_axes,
-    directions_spread,
-    finite_points,
-)
+from loam_gtsam.datasets.decode import loam_messages
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.datasets.decode.tables import describe_stamps
 from loam_gtsam.types import BadSweep, DatasetError, FeatureSweep, ImuSamples, LoamError, Trajectory
@@ -77,24 +60,28 @@ class LoamTopicsDataset:
         self.sensor: Mapping[str, Any] = {}
         self.unmatched: dict[str, int] = {}
         self._problems: list[str] = []
-        with closing(open_bag(self._path)) as reader:
-            self._types = topic_types(reader)
-        if missing := [topic for topic in REQUIRED if topic not in self._types]:
+        with closing(bag_reader.open_bag(self._path)) as reader:
+            self._types = bag_reader.topic_types(reader)
+        if missing := [topic for topic in loam_messages.REQUIRED if topic not in self._types]:
             listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in self._types.items())
             raise DatasetError(
                 f"{self._path}: no topic {', '.join(missing)}; the bag has: {listing or 'none'}"
             )
-        self._topics = [*REQUIRED, CLOUD] if CLOUD in self._types else list(REQUIRED)
+        self._topics = (
+            [*loam_messages.REQUIRED, loam_messages.CLOUD]
+            if loam_messages.CLOUD in self._types
+            else list(loam_messages.REQUIRED)
+        )
         self.axes: Literal["lidar", "loam"] = axes if axes != "auto" else self._decide_axes()
-        self._decoder = FeatureDecoder(self.axes)
+        self._decoder = loam_messages.FeatureDecoder(self.axes)
 
     def __len__(self) -> int:
         """Most sweeps there can be: the count of the rarest topic."""
         return min(self._types[topic][1] for topic in self._topics)
 
     def __iter__(self) -> Iterator[FeatureSweep | BadSweep]:
-        matcher = StampMatcher(self._topics)
-        for message in read_messages(self._path, self._topics, self._problems):
+        matcher = loam_messages.StampMatcher(self._topics)
+        for message in bag_reader.read_messages(self._path, self._topics, self._problems):
             if isinstance(message, BadSweep):
                 yield message
                 continue
@@ -113,8 +100,8 @@ class LoamTopicsDataset:
         if MAPPED not in self._types:
             return None
         found = []
-        for message in read_messages(self._path, [MAPPED], self._problems):
-            if isinstance(message, Message):
+        for message in bag_reader.read_messages(self._path, [MAPPED], self._problems):
+            if isinstance(message, bag_reader.Message):
                 try:
                     pose = self._decoder.pose(MAPPED, message.content)
                     found.append((message_stamp(message.content), pose))
@@ -128,7 +115,7 @@ class LoamTopicsDataset:
         facts = {"sweeps": f"up to {len(self)}", "axes": self.axes}
         facts["topics"] = ", ".join(f"{topic} ({self._types[topic][1]})" for topic in self._topics)
         problems: list[str] = []
-        tolerance = f"{STAMP_TOLERANCE_NS * 1e-6:g} ms"
+        tolerance = f"{loam_messages.STAMP_TOLERANCE_NS * 1e-6:g} ms"
         if self.recorded is not None:
             facts["recorded result"] = f"{MAPPED}, {len(self.recorded)} poses"
             describe_stamps(self.recorded.stamps, facts, problems)
@@ -141,32 +128,34 @@ class LoamTopicsDataset:
                 "the topics have different numbers of messages; those without partners within "
                 f"{tolerance} are left out"
             )
-        if CLOUD not in self._topics:
-            problems.append(f"no {CLOUD}: no full-resolution cloud")
+        if loam_messages.CLOUD not in self._topics:
+            problems.append(f"no {loam_messages.CLOUD}: no full-resolution cloud")
         problems += [
             f"{count} messages of {topic} without partners within {tolerance}, left out"
             for topic, count in self.unmatched.items()
             if count
         ]
-        kind = f"{bag_kind(self._path)} with LOAM topics"
+        kind = f"{bag_reader.bag_kind(self._path)} with LOAM topics"
         return DatasetInfo(kind, str(self._path), facts, problems + self._problems)
 
     def _sweep(self, group: Mapping[str, Any]) -> FeatureSweep | BadSweep:
         try:
             return self._decoder.sweep(group)
         except LoamError as error:
-            return BadSweep(message_stamp(group[ODOMETRY]), f"{self._path}: {error}")
+            return BadSweep(message_stamp(group[loam_messages.ODOMETRY]), f"{self._path}: {error}")
 
     def _decide_axes(self) -> Literal["lidar", "loam"]:
-        topic = CLOUD if CLOUD in self._types else PLANES
+        topic = loam_messages.CLOUD if loam_messages.CLOUD in self._types else loam_messages.PLANES
         spread = None
-        for message in read_messages(self._path, [topic], []):
-            if isinstance(message, Message):
+        for message in bag_reader.read_messages(self._path, [topic], []):
+            if isinstance(message, bag_reader.Message):
                 with suppress(DatasetError):  # it becomes a bad sweep of the run
-                    spread = directions_spread(finite_points(topic, message.content))
+                    spread = loam_messages.directions_spread(
+                        loam_messages.finite_points(topic, message.content)
+                    )
             if spread is not None:
                 break
         try:
-            return decide_axes(topic, spread)
+            return loam_messages.decide_axes(topic, spread)
         except DatasetError as error:
             raise DatasetError(f"{self._path}: {error}") from error

@@ -15,17 +15,9 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from loam_gtsam.datasets.decode import tables
 from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.point_times import SWEEP_SECONDS
-from loam_gtsam.datasets.decode.tables import (
-    DEFAULT_PERIOD_NS,
-    clean_imu,
-    convert_lines,
-    describe_rate,
-    read_lines,
-    read_stamps,
-    sorted_trajectory,
-)
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import MAX_STAMP, DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
@@ -47,7 +39,7 @@ def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntA
     """Nanoseconds of each sweep, by ``times.txt`` or ``velodyne_points/timestamps.txt``."""
     path, raw = root / "times.txt", root / _RAW / "timestamps.txt"
     if path.is_file():
-        stamps = read_stamps(path)
+        stamps = tables.read_stamps(path)
     elif raw.is_file():
         path, listed = raw, read_dates(raw)
         stamps = _of_files(listed, files)
@@ -55,7 +47,7 @@ def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntA
             problems.append(f"{missing} sweeps of {path.name} have no file")
     else:
         problems.append("no times.txt: 10 Hz assumed")
-        return np.arange(len(files), dtype=np.int64) * DEFAULT_PERIOD_NS
+        return np.arange(len(files), dtype=np.int64) * tables.DEFAULT_PERIOD_NS
     if len(stamps) != len(files):
         raise DatasetError(
             f"{path}: {len(stamps)} stamps for {len(files)} sweeps; expected one line for each "
@@ -97,7 +89,7 @@ def read_dates(path: Path) -> IntArray:
             raise ValueError("out of range")
         return stamp
 
-    return np.array(convert_lines(path, nanoseconds, "a date and time"), dtype=np.int64)
+    return np.array(tables.convert_lines(path, nanoseconds, "a date and time"), dtype=np.int64)
 
 
 def _of_files(listed: IntArray, files: Sequence[Path]) -> IntArray:
@@ -122,7 +114,7 @@ def read_oxts(root: Path) -> tuple[IntArray, FloatArray] | None:
         )
     values = np.empty((len(files), _OXTS_VALUES))
     for row, file in enumerate(files):
-        words = " ".join(read_lines(file)).split()
+        words = " ".join(tables.read_lines(file)).split()
         try:
             if len(words) != _OXTS_VALUES:
                 raise ValueError(f"{len(words)} values")
@@ -136,10 +128,10 @@ def oxts_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSa
     """The unit as an IMU, its orientation in a world of east, north and up."""
     quaternions = Rotation.from_euler("xyz", values[:, _ANGLES]).as_quat()
     samples = np.hstack([quaternions, values[:, _GYRO], values[:, _ACCELERATION]])
-    imu = clean_imu(stamps, samples, problems)
+    imu = tables.clean_imu(stamps, samples, problems)
     if imu is not None and len(stamps) > 1 and np.median(np.diff(imu.stamps)) > 0.9 * _BRIDGED_NS:
         problems.append(
-            f"oxts: {describe_rate(imu.stamps)}; gaps above imu.max_gap (0.1 s) are not bridged. "
+            f"oxts: {tables.describe_rate(imu.stamps)}; gaps above imu.max_gap (0.1 s) are not bridged. "
             "imu.max_gap=0.25 uses it all the same; oxts of unsynced drives (_extract) have 100 Hz"
         )
     return imu
@@ -159,7 +151,7 @@ def oxts_truth(
     poses[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + values[:, _LATITUDE]) / 2.0))
     poses[:, 2, 3] = values[:, _ALTITUDE]
     poses[:, :3, 3] -= poses[0, :3, 3].copy()
-    truth = sorted_trajectory(stamps, poses, "oxts", problems)
+    truth = tables.sorted_trajectory(stamps, poses, "oxts", problems)
     return moved_to_lidar(truth, inverse_pose(lidar_T_imu))
 
 
@@ -197,7 +189,7 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
     def pose(line: str) -> FloatArray:
         return _homogeneous(np.reshape([float(word) for word in line.split()], (3, 4)))
 
-    poses = convert_lines(path, pose, "12 numbers")
+    poses = tables.convert_lines(path, pose, "12 numbers")
     if len(poses) != len(stamps):
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")
     moved = inverse_pose(camera_T_lidar) @ np.reshape(poses, (-1, 4, 4)) @ camera_T_lidar
@@ -212,7 +204,7 @@ def _homogeneous(rows: FloatArray) -> FloatArray:
 def _calibration(path: Path) -> dict[str, list[float]]:
     """Lines of ``name: numbers``; those that hold no numbers are left out."""
     found = {}
-    for line in read_lines(path):
+    for line in tables.read_lines(path):
         name, _, rest = line.partition(":")
         try:
             found[name.strip()] = [float(word) for word in rest.split()]

@@ -11,26 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
+from loam_gtsam.datasets.decode import tables
 from loam_gtsam.datasets.decode.extrinsics import describe_extrinsics, extrinsic_settings
 from loam_gtsam.datasets.decode.packed_points import XYZI, read_records
 from loam_gtsam.datasets.decode.point_times import TimeDecision, apply_times, decide_times
-from loam_gtsam.datasets.decode.tables import (
-    clean_imu,
-    describe_imu,
-    describe_stamps,
-    read_table,
-    read_tum,
-)
-from loam_gtsam.datasets.kitti.drive import (
-    camera_T_lidar_of,
-    lidar_T_imu_of,
-    odometry_truth,
-    oxts_imu,
-    oxts_truth,
-    read_oxts,
-    sweep_stamps,
-    turn_seconds,
-)
+from loam_gtsam.datasets.kitti import drive
 from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
 
 KITTI_SENSOR: Mapping[str, Any] = {
@@ -86,10 +71,10 @@ class KittiDataset(SweepFiles):
             )
         self._times_folder = self._root / "t_ns"
         self._problems: list[str] = []
-        self.stamps = sweep_stamps(self._root, self._files, self._problems)
-        self._camera_T_lidar = camera_T_lidar_of(self._root)
-        self._oxts = read_oxts(self._root)
-        self._lidar_T_imu = None if self._oxts is None else lidar_T_imu_of(self._root)
+        self.stamps = drive.sweep_stamps(self._root, self._files, self._problems)
+        self._camera_T_lidar = drive.camera_T_lidar_of(self._root)
+        self._oxts = drive.read_oxts(self._root)
+        self._lidar_T_imu = None if self._oxts is None else drive.lidar_T_imu_of(self._root)
         if self._oxts is not None and self._lidar_T_imu is None:
             self._problems.append(
                 "oxts left out: no calib_imu_to_velo.txt in the drive or above it says where the "
@@ -103,29 +88,29 @@ class KittiDataset(SweepFiles):
         """The IMU of ``imu.csv`` or ``oxts/``, or None."""
         path = self._root / "imu.csv"
         if path.is_file():
-            table = read_table(path, "t qx qy qz qw wx wy wz ax ay az", ",")
-            return clean_imu(*table, self._problems)
+            table = tables.read_table(path, "t qx qy qz qw wx wy wz ax ay az", ",")
+            return tables.clean_imu(*table, self._problems)
         if self._oxts is None or self._lidar_T_imu is None:
             return None
-        return oxts_imu(*self._oxts, self._problems)
+        return drive.oxts_imu(*self._oxts, self._problems)
 
     @cached_property
     def truth(self) -> Trajectory | None:
         """Poses of ``gt.tum``, of the odometry benchmark or of ``oxts/``, or None."""
         path = self._root / "gt.tum"
         if path.is_file():
-            return read_tum(path)
+            return tables.read_tum(path)
         if self._camera_T_lidar is not None:
-            return odometry_truth(self._root, self.stamps, self._camera_T_lidar)
+            return drive.odometry_truth(self._root, self.stamps, self._camera_T_lidar)
         if self._oxts is None or self._lidar_T_imu is None:
             return None
-        return oxts_truth(*self._oxts, self._lidar_T_imu, self._problems)
+        return drive.oxts_truth(*self._oxts, self._lidar_T_imu, self._problems)
 
     def info(self) -> DatasetInfo:
         """Description of the folder; reads no sweep."""
         imu = self.imu  # first: it may find problems
         info = DatasetInfo("KITTI folder", str(self._path), {"sweeps": str(len(self))})
-        describe_stamps(self.stamps, info.facts, info.problems)
+        tables.describe_stamps(self.stamps, info.facts, info.problems)
         info.facts["fields"] = "x, y, z, intensity (float32)"
         info.facts["point times"] = str(self._decision or "none recorded")
         sensor = {key: value for key, value in self.sensor.items() if not key.startswith("imu.")}
@@ -133,7 +118,7 @@ class KittiDataset(SweepFiles):
             info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in sensor.items())
         if self._offset:
             info.facts["elevation raised by"] = f"{np.degrees(self._offset):g} degrees"
-        info.facts["IMU"] = describe_imu(imu)
+        info.facts["IMU"] = tables.describe_imu(imu)
         if "imu.lidar_t_imu" in self.sensor:
             info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, "calib_imu_to_velo.txt")
         info.facts["reference poses"] = str(len(self.truth)) if self.truth is not None else "none"
@@ -151,7 +136,7 @@ class KittiDataset(SweepFiles):
                 "motion, so they are not de-skewed (sensor.times=azimuth would)"
             )
         elif folder.name == "velodyne" or folder.parent.name == "velodyne_points":
-            period = turn_seconds(self._root, self._files, self.stamps, self._problems)
+            period = drive.turn_seconds(self._root, self._files, self.stamps, self._problems)
             sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
         if self._lidar_T_imu is not None and not (self._root / "imu.csv").is_file():
             sensor.update(extrinsic_settings(self._lidar_T_imu))

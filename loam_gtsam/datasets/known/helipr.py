@@ -10,12 +10,7 @@ import numpy as np
 from loam_gtsam.datasets.decode.extrinsics import Rig
 from loam_gtsam.datasets.decode.packed_points import read_records
 from loam_gtsam.datasets.decode.tables import read_pose_table, sorted_trajectory
-from loam_gtsam.datasets.known.layouts import (
-    HELIPR_LIDARS,
-    HELIPR_OTHERS,
-    first_existing,
-    helipr_truth,
-)
+from loam_gtsam.datasets.known import layouts
 from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, Trajectory
@@ -86,12 +81,12 @@ class HeLiPRDataset(StampedFiles):
             folder,
             "*.bin",
             partial(read_records, record=RECORDS[name]),
-            imu=first_existing(root, ["Inertial_data/xsens_imu.csv", "xsens_imu.csv"]),
-            truth=helipr_truth(root, name),
+            imu=layouts.first_existing(root, ["Inertial_data/xsens_imu.csv", "xsens_imu.csv"]),
+            truth=layouts.helipr_truth(root, name),
             time_unit=time_unit,
             stamp_is=stamp_is,
         )
-        self._look_for_missing(first_existing(root, ["stamp.csv"]), name.lower())
+        self._look_for_missing(layouts.first_existing(root, ["stamp.csv"]), name.lower())
 
     def _read_truth(self, path: Path) -> Trajectory:
         stamps, poses = read_pose_table(path, "ns x y z qx qy qz qw", None)
@@ -99,14 +94,18 @@ class HeLiPRDataset(StampedFiles):
 
 
 def _lidar_folder(root: Path, lidar: str | None) -> Path:
-    if lidar is not None and lidar not in HELIPR_LIDARS:
-        reason = "it does not sweep rings" if lidar in HELIPR_OTHERS else "unknown"
-        raise DatasetError(f"lidar: expected {' or '.join(HELIPR_LIDARS)}, got {lidar!r}: {reason}")
-    for name in [lidar] if lidar else HELIPR_LIDARS:
-        folder = first_existing(root, [f"LiDAR/{name}", name])
+    if lidar is not None and lidar not in layouts.HELIPR_LIDARS:
+        reason = "it does not sweep rings" if lidar in layouts.HELIPR_OTHERS else "unknown"
+        raise DatasetError(f"lidar: expected {' or '.join(layouts.HELIPR_LIDARS)}, got {lidar!r}: {reason}")
+    for name in [lidar] if lidar else layouts.HELIPR_LIDARS:
+        folder = layouts.first_existing(root, [f"LiDAR/{name}", name])
         if folder is not None:
             return folder
-    others = [name for name in HELIPR_OTHERS if first_existing(root, [f"LiDAR/{name}", name])]
+    others = [
+        name
+        for name in layouts.HELIPR_OTHERS
+        if layouts.first_existing(root, [f"LiDAR/{name}", name])
+    ]
     hint = f"; {', '.join(others)} cannot be used: no rings" if others else ""
-    wanted = lidar or " or LiDAR/".join(HELIPR_LIDARS)
+    wanted = lidar or " or LiDAR/".join(layouts.HELIPR_LIDARS)
     raise DatasetError(f"{root}: no HeLiPR sequence: expected LiDAR/{wanted}{hint}")

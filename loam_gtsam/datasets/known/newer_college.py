@@ -13,12 +13,7 @@ from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.decode.extrinsics import Rig, rigid_transform
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import pose_matrix
-from loam_gtsam.datasets.known.layouts import (
-    NEWER_COLLEGE_SCANS,
-    first_existing,
-    newer_college_sequence,
-    newer_college_sequences,
-)
+from loam_gtsam.datasets.known import layouts
 from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError
@@ -107,7 +102,7 @@ class NewerCollegeClouds(StampedFiles):
         super().__init__(
             root,
             replace(RIG_2020, kind=f"{RIG_2020.kind}, PCD files"),
-            root / NEWER_COLLEGE_SCANS,
+            root / layouts.NEWER_COLLEGE_SCANS,
             "*.pcd",
             read_pcd,
             name="cloud_SECONDS_NANOSECONDS",
@@ -122,11 +117,11 @@ class NewerCollegeClouds(StampedFiles):
 
 def _choose(root: Path, sequence: str | None) -> tuple[str, list[Path]]:
     if root.is_file():
-        known = newer_college_sequence(root)
+        known = layouts.newer_college_sequence(root)
         if known is None:
             raise DatasetError(f"{root}: not named as a bag of the Newer College data sets")
         return known[0], [root]
-    found = newer_college_sequences(root)
+    found = layouts.newer_college_sequences(root)
     names = ", ".join(found)
     if not found:
         raise DatasetError(f"{root}: no bags of the Newer College data sets")
@@ -147,4 +142,4 @@ def _truth_file(folder: Path, name: str) -> Path | None:
         files = [f"gt_state_{difficulty}.csv", f"gt_math_{difficulty}.csv"]
     inside = ("", "ground_truth/", "ground_truth/tum_format/")
     places = [f"{up}{inner}" for up in ("", "../") for inner in inside]
-    return first_existing(folder, [place + file for place in places for file in files])
+    return layouts.first_existing(folder, [place + file for place in places for file in files])

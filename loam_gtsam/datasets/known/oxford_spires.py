@@ -13,12 +13,7 @@ from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.decode.extrinsics import Rig
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import clean_imu, pose_matrix, read_table
-from loam_gtsam.datasets.known.layouts import (
-    SPIRES_CLOUDS,
-    first_existing,
-    spires_bags,
-    spires_truth,
-)
+from loam_gtsam.datasets.known import layouts
 from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, ImuSamples
@@ -65,10 +60,10 @@ class OxfordSpiresBags(BagSequence):
 
     def __init__(self, path: str | Path, **options: Unpack[BagOptions]) -> None:
         root = Path(path)
-        parts = spires_bags(root)
+        parts = layouts.spires_bags(root)
         if not parts:
             raise DatasetError(f"{root}: no bags of an Oxford Spires sequence")
-        super().__init__(root, parts, RIG, spires_truth(root), **options)
+        super().__init__(root, parts, RIG, layouts.spires_truth(root), **options)
 
 
 class OxfordSpiresClouds(StampedFiles):
@@ -88,12 +83,12 @@ class OxfordSpiresClouds(StampedFiles):
         super().__init__(
             root,
             replace(RIG, kind=f"{RIG.kind}, PCD files"),
-            root / SPIRES_CLOUDS,
+            root / layouts.SPIRES_CLOUDS,
             "*.pcd",
             read_pcd,
             name="SECONDS.NANOSECONDS",
-            imu=first_existing(root, ["raw/imu.csv"]),
-            truth=spires_truth(root),
+            imu=layouts.first_existing(root, ["raw/imu.csv"]),
+            truth=layouts.spires_truth(root),
             time_unit=time_unit,
             stamp_is=stamp_is,
         )

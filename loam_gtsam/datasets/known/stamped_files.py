@@ -13,23 +13,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.base import DatasetInfo, SweepFiles
-from loam_gtsam.datasets.decode.extrinsics import (
-    Rig,
-    describe_extrinsics,
-    extrinsic_settings,
-    moved_to_lidar,
-)
+from loam_gtsam.datasets.decode import extrinsics, tables
 from loam_gtsam.datasets.decode.packed_points import PackedCloud, firing_by_firing
 from loam_gtsam.datasets.decode.point_times import ANCHORS, TimeDecision, check_time_options
 from loam_gtsam.datasets.decode.pointcloud2 import decode_with_times, describe_fields
-from loam_gtsam.datasets.decode.tables import (
-    clean_imu,
-    describe_imu,
-    describe_stamps,
-    read_lines,
-    read_poses,
-    read_table,
-)
 from loam_gtsam.types import (
     MAX_STAMP,
     DatasetError,
@@ -78,7 +65,7 @@ class StampedFiles(SweepFiles):
     def __init__(
         self,
         path: Path,
-        rig: Rig,
+        rig: extrinsics.Rig,
         folder: Path,
         pattern: str,
         read: Callable[[Path, int], PackedCloud],
@@ -96,7 +83,7 @@ class StampedFiles(SweepFiles):
         self._in_order, self._stamp_is = in_order, stamp_is or "start"
         self._decode = partial(decode_with_times, time_unit=time_unit, stamp_is=stamp_is)
         self.name = path.resolve().name or "sweeps"
-        self.sensor: Mapping[str, Any] = extrinsic_settings(rig.lidar_T_imu)
+        self.sensor: Mapping[str, Any] = extrinsics.extrinsic_settings(rig.lidar_T_imu)
         found = sorted((_stamp(file, name), file) for file in folder.glob(pattern))
         if not found:
             raise DatasetError(f"{folder}: no sweeps ({pattern})")
@@ -114,13 +101,13 @@ class StampedFiles(SweepFiles):
         """Reference poses, moved to the lidar; None without their file."""
         if self._truth_file is None:
             return None
-        return moved_to_lidar(self._read_truth(self._truth_file), self._rig.body_T_lidar)
+        return extrinsics.moved_to_lidar(self._read_truth(self._truth_file), self._rig.body_T_lidar)
 
     def info(self) -> DatasetInfo:
         """Description of the files; reads the first sweeps, the IMU and the reference poses."""
         imu, truth = self.imu, self.truth  # first: they may find problems
         info = DatasetInfo(self._rig.kind, str(self._path), {"sweeps": str(len(self))})
-        describe_stamps(self.stamps, info.facts, info.problems)
+        tables.describe_stamps(self.stamps, info.facts, info.problems)
         decision, info.facts["fields"] = self._first
         info.facts["point times"] = str(decision or "none")
         if decision is None and self._in_order:
@@ -128,9 +115,11 @@ class StampedFiles(SweepFiles):
                 f"from the order of the points, {COLUMNS} firings in {PERIOD:g} s, stamp at sweep "
                 f"{self._stamp_is}"
             )
-        info.facts["IMU"] = describe_imu(imu)
+        info.facts["IMU"] = tables.describe_imu(imu)
         if imu is not None:
-            info.facts["IMU to lidar"] = describe_extrinsics(self.sensor, self._rig.source)
+            info.facts["IMU to lidar"] = extrinsics.describe_extrinsics(
+                self.sensor, self._rig.source
+            )
         info.facts["reference poses"] = str(len(truth)) if truth is not None else "none"
         info.problems.extend(self._problems)
         return info
@@ -139,11 +128,11 @@ class StampedFiles(SweepFiles):
         return read_xsens(path, self._problems)
 
     def _read_truth(self, path: Path) -> Trajectory:
-        return read_poses(path, self._problems)
+        return tables.read_poses(path, self._problems)
 
     def _look_for_missing(self, listing: Path | None, sensor: str) -> None:
         """A problem if a list of ``stamp,sensor`` rows names sweeps that have no file."""
-        rows = (line.partition(",") for line in (read_lines(listing) if listing else []))
+        rows = (line.partition(",") for line in (tables.read_lines(listing) if listing else []))
         listed = [
             int(stamp)
             for stamp, _, name in rows
@@ -198,11 +187,11 @@ def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
     12 to 14 are the accelerometer. The rates at which the orientation of the same file turns
     decide.
     """
-    lines = read_lines(path)
+    lines = tables.read_lines(path)
     if lines and len(lines[0].split(",")) == 8:
         problems.append(f"{path.name}: without gyro and accelerometer (8 columns), left out")
         return None
-    stamps, values = read_table(path, _XSENS, ",")
+    stamps, values = tables.read_table(path, _XSENS, ",")
     where = _gyro_columns(stamps, values)
     if where is None:
         problems.append(
@@ -213,7 +202,7 @@ def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
     if where != next(iter(_TRIPLES)):
         problems.append(f"{path.name}: the gyro is in {where}, not where the file player reads it")
     samples = np.hstack([values[:, :4], values[:, _TRIPLES[where]], values[:, _ACCELERATION]])
-    return clean_imu(stamps, samples, problems)
+    return tables.clean_imu(stamps, samples, problems)
 
 
 def _gyro_columns(stamps: IntArray, values: FloatArray) -> str | None:

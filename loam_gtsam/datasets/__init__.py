@@ -1,7 +1,6 @@
-"""Loaders: whatever holds sweeps becomes a :class:`Dataset`.
+"""Loaders: whatever holds sweeps becomes a :class:`Dataset`; :func:`open_dataset` guesses which.
 
-:func:`open_dataset` guesses the loader from a path. The loaders themselves are imported when they
-are asked for, so that arrays and KITTI folders do not pay for the bag reader.
+They are imported when asked for: arrays and KITTI folders do not pay for the bag reader.
 """
 
 from __future__ import annotations
@@ -102,9 +101,8 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
     if path.is_file() and path.suffix not in _BAG_FILES:
         if path.suffix == ".bin":
             raise DatasetError(f"{path}: one sweep; give the folder that holds them: {path.parent}")
-        raise DatasetError(
-            f"{path}: unknown kind of file {path.suffix!r}; expected {_ACCEPTED}; {_OTHERS}"
-        )
+        kind = f"unknown kind of file {path.suffix!r}"
+        raise DatasetError(f"{path}: {kind}; expected {_ACCEPTED}; {_OTHERS}")
     known = known_loader(path)
     if known is not None:
         return _construct(__getattr__(known), path, options)
@@ -117,15 +115,14 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
     except DatasetError as error:
         if find_sweeps(path) is not None:
             raise
-        bags = [file for file in sorted(path.iterdir()) if file.suffix in _BAG_FILES]
+        bags = [file.name for file in sorted(path.iterdir()) if file.suffix in _BAG_FILES]
         if bags:
-            names = ", ".join(file.name for file in bags[:5])
+            names = ", ".join(bags[:5])
             raise DatasetError(f"{path}: open one of its bags instead: {names}") from error
         raise DatasetError(f"{error}. {_suggestion(path)}") from error
 
 
 def _suggestion(path: Path) -> str:
-    """A sentence on what to open instead of a folder without sweeps."""
     inside: list[str] = []
     for folder, names, files in islice(os.walk(path), _LOOKED_AT):
         names.sort()
@@ -150,11 +147,10 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
     from loam_gtsam.datasets.decode.loam_messages import REQUIRED
 
     with closing(open_bag(path)) as reader:
-        topics = set(reader.topics)
+        loam = reader.topics.keys() >= set(REQUIRED)
     plain = BagOptions.__annotations__.keys() & options.keys()
-    if "axes" in options or (topics.issuperset(REQUIRED) and not plain):
-        return _construct(LoamTopicsDataset, path, options)
-    return _construct(BagDataset, path, options)
+    own = "axes" in options or (loam and not plain)
+    return _construct(LoamTopicsDataset if own else BagDataset, path, options)
 
 
 def _open_world(text: str, options: dict[str, Any]) -> Dataset:
@@ -162,9 +158,8 @@ def _open_world(text: str, options: dict[str, Any]) -> Dataset:
     try:
         pairs = parse_qsl(query, strict_parsing=bool(query))
     except ValueError as error:
-        raise DatasetError(
-            f"{text}: expected sim:SCENE?frames=NUMBER&seed=NUMBER&sensor=NAME: {error}"
-        ) from error
+        form = "sim:SCENE?frames=NUMBER&seed=NUMBER&sensor=NAME"
+        raise DatasetError(f"{text}: expected {form}: {error}") from error
     from loam_gtsam.datasets.sim.world import SimulatedWorld
 
     settings = {key: _number_or_text(value) for key, value in pairs} | options
@@ -189,9 +184,9 @@ def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> Data
     if "options" in known:
         known[known.index("options") :] = BagOptions.__annotations__
     if unknown := [key for key in options if key not in known]:
+        name, takes = loader.__name__, ", ".join(known)
         raise DatasetError(
-            f"{source}: {loader.__name__} takes no option {', '.join(unknown)}; "
-            f"it takes {', '.join(known)}"
+            f"{source}: {name} takes no option {', '.join(unknown)}; it takes {takes}"
         )
     dataset: Dataset = loader(source, **options)
     return dataset

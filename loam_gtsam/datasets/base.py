@@ -14,7 +14,7 @@ from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, IntArray, Scan,
 
 @dataclass(slots=True)
 class DatasetInfo:
-    """Description of a data set for people: what its loader understood.
+    """What the loader of a data set understood, for people.
 
     Attributes
     ----------
@@ -35,10 +35,8 @@ class BagOptions(TimeOptions, total=False):
 
     Attributes
     ----------
-    topic : of the sweeps; None takes the topic of the known data set, else the PointCloud2 topic
-        with the most messages
-    imu_topic : None takes the topic of the known data set, else the Imu topic with the most
-        messages, if there is one
+    topic, imu_topic : of sweeps and IMU; None takes the one of the known data set, else the one of
+        its type with the most messages
     time_field, time_unit, stamp_is : see
         :func:`loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
     """
@@ -61,7 +59,7 @@ class Dataset(Protocol):
     def __iter__(self) -> Iterator[Sweep]: ...
 
     def info(self) -> DatasetInfo:
-        """Description of the data set; may read the first sweeps, never the whole data."""
+        """May read the first sweeps, never the whole data."""
         ...
 
     @property
@@ -76,10 +74,7 @@ class Dataset(Protocol):
 
 
 class ChangedDataset:
-    """A data set made of another one, whose sweeps, IMU or reference poses subclasses change.
-
-    What was done to the other one (``change``) is added to its name.
-    """
+    """A data set made of another one by a ``change``, which is added to its name."""
 
     def __init__(self, dataset: Dataset, change: str) -> None:
         self._dataset = dataset
@@ -97,7 +92,6 @@ class ChangedDataset:
         return self._dataset.truth
 
     def _info(self, **facts: str) -> DatasetInfo:
-        """Description of the other data set, with facts about the change."""
         info = self._dataset.info()
         more = {label.replace("_", " "): text for label, text in facts.items()}
         return replace(info, facts=info.facts | more)

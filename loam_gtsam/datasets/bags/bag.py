@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import islice
 from pathlib import Path
 from typing import Any, Unpack
@@ -55,15 +55,12 @@ class BagDataset:
         self._problems: list[str] = []
         with closing(bag_reader.open_bag(self._path, self._parts)) as reader:
             topics = bag_reader.topic_types(reader)
-            self.topic = bag_reader.choose_topic(
-                self._path, topics, POINT_CLOUD, topic, self._problems
-            )
-            self.imu_topic = None
-            if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
-                self.imu_topic = bag_reader.choose_topic(
-                    self._path, topics, IMU, imu_topic, self._problems
-                )
-            self._count = topics[self.topic][1]
+        choose = partial(bag_reader.choose_topic, self._path, topics, problems=self._problems)
+        self.topic = choose(POINT_CLOUD, topic)
+        self.imu_topic = None
+        if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
+            self.imu_topic = choose(IMU, imu_topic)
+        self._count = topics[self.topic][1]
         self._decision: TimeDecision | None = None
         self._peek()
 
@@ -72,9 +69,7 @@ class BagDataset:
 
     def __iter__(self) -> Iterator[Scan | BadSweep]:
         offset = self._clock_offset
-        for message in bag_reader.read_messages(
-            self._path, [self.topic], self._problems, self._parts
-        ):
+        for message in self._messages(self.topic, self._problems):
             if isinstance(message, BadSweep):
                 yield replace(message, stamp=message.stamp + offset)
                 continue
@@ -92,9 +87,7 @@ class BagDataset:
         if self.imu_topic is None:
             return None
         rows, lost = [], 0
-        for message in bag_reader.read_messages(
-            self._path, [self.imu_topic], self._problems, self._parts
-        ):
+        for message in self._messages(self.imu_topic, self._problems):
             if isinstance(message, BadSweep):
                 lost += 1
             else:
@@ -107,7 +100,7 @@ class BagDataset:
 
     @property
     def truth(self) -> Trajectory | None:
-        """A bag of sweeps carries no reference poses."""
+        """None: a bag of sweeps carries no reference poses."""
         return None
 
     def info(self) -> DatasetInfo:
@@ -120,18 +113,19 @@ class BagDataset:
         kind = bag_reader.bag_kind(self._parts[0] if self._parts else self._path)
         return DatasetInfo(kind, str(self._path), facts, list(self._problems))
 
+    def _messages(self, topic: str, problems: list[str]) -> Iterator[bag_reader.Message | BadSweep]:
+        return bag_reader.read_messages(self._path, [topic], problems, self._parts)
+
     def _decode(self, message: bag_reader.Message) -> pointcloud2.Decoded:
-        return pointcloud2.decode_with_times(
-            message.content, decision=self._decision, **self._options
-        )
+        cloud, how = message.content, self._decision
+        return pointcloud2.decode_with_times(cloud, decision=how, **self._options)
 
     def _peek(self) -> None:
         """Decide on the times, once for the whole run, and collect what there is to say."""
         decoded: list[pointcloud2.Decoded] = []
         stamps: list[int] = []
         failure = fields = ""
-        stream = bag_reader.read_messages(self._path, [self.topic], [], self._parts)
-        for message in islice(stream, _PEEK):
+        for message in islice(self._messages(self.topic, []), _PEEK):
             if isinstance(message, BadSweep):
                 failure = failure or message.message
                 continue
@@ -171,10 +165,7 @@ class BagDataset:
 
 
 class BagSequence(BagDataset):
-    """Bags (``parts``) recorded by a known rig, with a file of reference poses (``truth``) or None.
-
-    For the options see :class:`~loam_gtsam.datasets.base.BagOptions`; topics default to the rig's.
-    """
+    """Bags recorded by a known rig, whose topics are the default, with a file of its ``truth``."""
 
     def __init__(
         self,
@@ -205,9 +196,8 @@ class BagSequence(BagDataset):
         """The reference poses, moved to the lidar; None without their file."""
         if self._truth_file is None:
             return None
-        return extrinsics.moved_to_lidar(
-            tables.read_poses(self._truth_file, self._problems), self._rig.body_T_lidar
-        )
+        poses = tables.read_poses(self._truth_file, self._problems)
+        return extrinsics.moved_to_lidar(poses, self._rig.body_T_lidar)
 
     def info(self) -> DatasetInfo:
         """Description of the bags, with their extrinsics and reference poses."""
@@ -217,9 +207,8 @@ class BagSequence(BagDataset):
         if len(self._parts) > 1:
             info.facts["bags"] = f"{self._parts[0].name} and {len(self._parts) - 1} more"
         if self.sensor:
-            info.facts["IMU to lidar"] = extrinsics.describe_extrinsics(
-                self.sensor, self._rig.source
-            )
+            where = extrinsics.describe_extrinsics(self.sensor, self._rig.source)
+            info.facts["IMU to lidar"] = where
         info.facts["reference poses"] = "none"
         if truth is not None and self._truth_file is not None:
             info.facts["reference poses"] = f"{len(truth)} ({self._truth_file.name})"

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS
@@ -31,10 +30,7 @@ class Message:
 
 
 def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
-    """An opened reader; DatasetError if there is no bag, or it is damaged.
-
-    ``parts`` are the bags of a recording that was split; ``path`` then only names them.
-    """
+    """An opened reader of a bag, or of ``parts`` that ``path`` names; DatasetError if damaged."""
     bags = list(parts or [path])
     if missing := [bag for bag in bags if not bag.exists()]:
         raise DatasetError(f"{missing[0]}: no such bag")
@@ -49,16 +45,15 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
             raise
     # Damage surfaces as whatever its parser stumbles over (struct, sqlite3, yaml, assertions ...).
     except Exception as error:
-        hint = (
-            "; if the recording was cut off, `rosbag reindex` (ROS 1), `ros2 bag reindex` or "
-            "`mcap recover` may repair it"
-        )
-        raise DatasetError(f"{path}: cannot open the bag: {_reason(error)}{hint}") from error
+        raise DatasetError(
+            f"{path}: cannot open the bag: {_reason(error)}; if the recording was cut off, `rosbag "
+            "reindex` (ROS 1), `ros2 bag reindex` or `mcap recover` may repair it"
+        ) from error
     return reader
 
 
 def _check_metadata(reader: AnyReader) -> None:
-    """Raise ValueError unless names and numbers of messages, which a bag may state, make sense."""
+    """ValueError unless the names and numbers of messages that a bag states make sense."""
     for connection in reader.connections:
         name, count = connection.topic, connection.msgcount
         if not isinstance(name, str):
@@ -71,10 +66,8 @@ def _check_metadata(reader: AnyReader) -> None:
 
 def topic_types(reader: AnyReader) -> dict[str, tuple[str, int]]:
     """Topic -> (message type, number of messages)."""
-    return {
-        topic: (info.msgtype or "several types", info.msgcount)
-        for topic, info in sorted(reader.topics.items())
-    }
+    topics = sorted(reader.topics.items())
+    return {topic: (info.msgtype or "several types", info.msgcount) for topic, info in topics}
 
 
 def choose_topic(
@@ -98,16 +91,14 @@ def choose_topic(
         kinds = [what.lower() for what, _ in topics.values()]
         packets = any("packet" in k or (k.endswith("scan") and "laser" not in k) for k in kinds)
         hint = "; raw packets become PointCloud2 with the driver of the sensor" if packets else ""
-        raise DatasetError(
-            f"{path}: no topic of type {kind}; the bag has: {listing or 'no messages'}{hint}"
-        )
+        there = f"the bag has: {listing or 'no messages'}{hint}"
+        raise DatasetError(f"{path}: no topic of type {kind}; {there}")
     option = "--imu-topic" if kind.endswith("Imu") else "--topic"
     measured = [name for name in candidates if name not in MAPPED] or candidates
     chosen = max(measured, key=lambda name: topics[name][1])  # the first of equals
     if chosen in MAPPED:
-        problems.append(
-            f"{chosen}: its sweeps are de-skewed and lie in a map; do not map them again"
-        )
+        text = "its sweeps are de-skewed and lie in a map; do not map them again"
+        problems.append(f"{chosen}: {text}")
     if len(candidates) > 1:
         counts = ", ".join(f"{name}: {topics[name][1]}" for name in candidates)
         problems.append(
@@ -122,12 +113,10 @@ def read_messages(
 ) -> Iterator[Message | BadSweep]:
     """Messages in the order they were received; ``parts`` as for :func:`open_bag`.
 
-    A message that cannot be deserialised gives a :class:`BadSweep`. Where the file itself is
-    damaged the stream ends with one, after everything that came before.
+    One that cannot be deserialised is a :class:`BadSweep`; one ends the stream of a damaged file.
     """
     with closing(open_bag(path, parts)) as reader:
-        connections: list[Connection] = [c for c in reader.connections if c.topic in topics]
-        stream = reader.messages(connections)
+        stream = reader.messages([c for c in reader.connections if c.topic in topics])
         last, interval = reader.start_time, DEFAULT_PERIOD_NS
         while True:
             try:
@@ -135,8 +124,8 @@ def read_messages(
             except StopIteration:
                 return
             except Exception as error:  # as in open_bag
-                text = f"{path}: damaged after {last * 1e-9:.3f} s, the rest is lost: "
-                text += _reason(error)
+                when = f"damaged after {last * 1e-9:.3f} s"
+                text = f"{path}: {when}, the rest is lost: {_reason(error)}"
                 if text not in problems:
                     problems.append(text)
                 yield BadSweep(last + interval, text)  # when the next one was due

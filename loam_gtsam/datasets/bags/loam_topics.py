@@ -18,6 +18,7 @@ from loam_gtsam.datasets.decode.tables import describe_stamps
 from loam_gtsam.types import BadSweep, DatasetError, FeatureSweep, ImuSamples, LoamError, Trajectory
 
 MAPPED = "/aft_mapped_to_init"
+_Asked = Literal["auto", "lidar", "loam"]
 
 
 class LoamTopicsDataset:
@@ -37,7 +38,7 @@ class LoamTopicsDataset:
 
     Notes
     -----
-    Everything that comes out is in lidar axes (x forward, y left, z up).
+    Whatever comes out is in lidar axes (x forward, y left, z up).
 
     Raises
     ------
@@ -46,13 +47,11 @@ class LoamTopicsDataset:
     """
 
     imu: ImuSamples | None = None
-    """Always None: the front end of LOAM has used the IMU already."""
+    """The front end of LOAM has used it already."""
     truth: Trajectory | None = None
-    """Always None: the result of LOAM itself is ``recorded``."""
+    """The result of LOAM itself is ``recorded``."""
 
-    def __init__(
-        self, path: str | Path, *, axes: Literal["auto", "lidar", "loam"] = "auto"
-    ) -> None:
+    def __init__(self, path: str | Path, *, axes: _Asked = "auto") -> None:
         if axes not in ("auto", "lidar", "loam"):
             raise DatasetError(f"axes: expected one of auto, lidar, loam; got {axes!r}")
         self._path = Path(path)
@@ -64,14 +63,10 @@ class LoamTopicsDataset:
             self._types = bag_reader.topic_types(reader)
         if missing := [topic for topic in loam_messages.REQUIRED if topic not in self._types]:
             listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in self._types.items())
-            raise DatasetError(
-                f"{self._path}: no topic {', '.join(missing)}; the bag has: {listing or 'none'}"
-            )
-        self._topics = (
-            [*loam_messages.REQUIRED, loam_messages.CLOUD]
-            if loam_messages.CLOUD in self._types
-            else list(loam_messages.REQUIRED)
-        )
+            text = f"no topic {', '.join(missing)}; the bag has: {listing or 'none'}"
+            raise DatasetError(f"{self._path}: {text}")
+        self._topics = list(loam_messages.REQUIRED)
+        self._topics += [loam_messages.CLOUD] if loam_messages.CLOUD in self._types else []
         self.axes: Literal["lidar", "loam"] = axes if axes != "auto" else self._decide_axes()
         self._decoder = loam_messages.FeatureDecoder(self.axes)
 
@@ -119,11 +114,9 @@ class LoamTopicsDataset:
         if self.recorded is not None:
             facts["recorded result"] = f"{MAPPED}, {len(self.recorded)} poses"
             describe_stamps(self.recorded.stamps, facts, problems)
-        others = [name for name in self._types if name not in (*self._topics, MAPPED)]
-        if others:
+        if others := [name for name in self._types if name not in (*self._topics, MAPPED)]:
             facts["not used"] = ", ".join(others)
-        counts = {self._types[topic][1] for topic in self._topics}
-        if len(counts) > 1:
+        if len({self._types[topic][1] for topic in self._topics}) > 1:
             problems.append(
                 "the topics have different numbers of messages; those without partners within "
                 f"{tolerance} are left out"
@@ -150,9 +143,8 @@ class LoamTopicsDataset:
         for message in bag_reader.read_messages(self._path, [topic], []):
             if isinstance(message, bag_reader.Message):
                 with suppress(DatasetError):  # it becomes a bad sweep of the run
-                    spread = loam_messages.directions_spread(
-                        loam_messages.finite_points(topic, message.content)
-                    )
+                    points = loam_messages.finite_points(topic, message.content)
+                    spread = loam_messages.directions_spread(points)
             if spread is not None:
                 break
         try:

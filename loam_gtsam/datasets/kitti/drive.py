@@ -1,7 +1,5 @@
 """What lies beside KITTI's sweeps: stamps, the GPS/IMU (``oxts``), poses and calibration.
 
-References
-----------
 Geiger, Lenz, Stiller and Urtasun, Vision meets robotics: The KITTI dataset, IJRR 32(11), 2013, and
 the ``readme.txt`` and ``dataformat.txt`` of the development kits.
 """
@@ -65,15 +63,12 @@ def turn_seconds(
         return None
     first, last = (_of_files(read_dates(path), files) for path in paths)
     if not len(first) == len(last) == len(files):
-        raise DatasetError(
-            f"{paths[0]}, {paths[1].name}: {len(first)} and {len(last)} stamps for "
-            f"{len(files)} sweeps"
-        )
+        counts = f"{len(first)} and {len(last)} stamps for {len(files)} sweeps"
+        raise DatasetError(f"{paths[0]}, {paths[1].name}: {counts}")
     seconds = float(np.median(last - first)) * 1e-9
     if not SWEEP_SECONDS[0] <= seconds <= SWEEP_SECONDS[1]:
         raise DatasetError(f"{paths[1]}: sweeps of {seconds:g} s (median), expected about 0.1")
-    outside = int(np.count_nonzero((stamps < first) | (stamps > last)))
-    if outside:
+    if outside := int(np.count_nonzero((stamps < first) | (stamps > last))):
         problems.append(f"{outside} stamps lie outside their sweep's start and end")
     return round(seconds, 6)
 
@@ -131,8 +126,9 @@ def oxts_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSa
     imu = tables.clean_imu(stamps, samples, problems)
     if imu is not None and len(stamps) > 1 and np.median(np.diff(imu.stamps)) > 0.9 * _BRIDGED_NS:
         problems.append(
-            f"oxts: {tables.describe_rate(imu.stamps)}; gaps above imu.max_gap (0.1 s) are not bridged. "
-            "imu.max_gap=0.25 uses it all the same; oxts of unsynced drives (_extract) have 100 Hz"
+            f"oxts: {tables.describe_rate(imu.stamps)}; gaps above imu.max_gap (0.1 s) are not "
+            "bridged. imu.max_gap=0.25 uses it all the same; oxts of unsynced drives (_extract) "
+            "have 100 Hz"
         )
     return imu
 
@@ -151,8 +147,8 @@ def oxts_truth(
     poses[:, 1, 3] = scale * np.log(np.tan(np.radians(90.0 + values[:, _LATITUDE]) / 2.0))
     poses[:, 2, 3] = values[:, _ALTITUDE]
     poses[:, :3, 3] -= poses[0, :3, 3].copy()
-    truth = tables.sorted_trajectory(stamps, poses, "oxts", problems)
-    return moved_to_lidar(truth, inverse_pose(lidar_T_imu))
+    body = tables.sorted_trajectory(stamps, poses, "oxts", problems)
+    return moved_to_lidar(body, inverse_pose(lidar_T_imu))
 
 
 def lidar_T_imu_of(root: Path) -> FloatArray | None:

@@ -16,10 +16,9 @@ from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, Trajectory
 
 _XYZI = ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")
+_WORDS = ("reflectivity", "<u2"), ("ring", "<u2"), ("ambient", "<u2")
 RECORDS = {
-    "Ouster": np.dtype(
-        [*_XYZI, ("t", "<u4"), *((name, "<u2") for name in ("reflectivity", "ring", "ambient"))]
-    ),
+    "Ouster": np.dtype([*_XYZI, ("t", "<u4"), *_WORDS]),
     "Velodyne": np.dtype([*_XYZI, ("ring", "<u2"), ("time", "<f4")]),
 }
 """Fields of a point, without padding (the data set's file player)."""
@@ -53,7 +52,7 @@ class HeLiPRDataset(StampedFiles):
     ------
     DatasetError
         If there are no sweeps, a table cannot be understood, or another lidar is asked for: those
-        do not sweep rings around themselves, which the features of LOAM need.
+        do not sweep rings, which the features of LOAM need.
 
     References
     ----------
@@ -74,10 +73,10 @@ class HeLiPRDataset(StampedFiles):
         folder = _lidar_folder(root, lidar)
         name = folder.name
         lidar_T_imu = inverse_pose(np.array([*IMU_T_LIDAR[name], [0.0, 0.0, 0.0, 1.0]]))
-        kind, source = f"HeLiPR sequence, {name}", "HeLiPR-Pointcloud-Toolbox"
+        kind = f"HeLiPR sequence, {name}"
         super().__init__(
             root,
-            Rig(kind, lidar_T_imu, source, body_T_lidar=np.eye(4)),
+            Rig(kind, lidar_T_imu, "HeLiPR-Pointcloud-Toolbox", body_T_lidar=np.eye(4)),
             folder,
             "*.bin",
             partial(read_records, record=RECORDS[name]),
@@ -96,16 +95,14 @@ class HeLiPRDataset(StampedFiles):
 def _lidar_folder(root: Path, lidar: str | None) -> Path:
     if lidar is not None and lidar not in layouts.HELIPR_LIDARS:
         reason = "it does not sweep rings" if lidar in layouts.HELIPR_OTHERS else "unknown"
-        raise DatasetError(f"lidar: expected {' or '.join(layouts.HELIPR_LIDARS)}, got {lidar!r}: {reason}")
+        known = " or ".join(layouts.HELIPR_LIDARS)
+        raise DatasetError(f"lidar: expected {known}, got {lidar!r}: {reason}")
     for name in [lidar] if lidar else layouts.HELIPR_LIDARS:
         folder = layouts.first_existing(root, [f"LiDAR/{name}", name])
         if folder is not None:
             return folder
-    others = [
-        name
-        for name in layouts.HELIPR_OTHERS
-        if layouts.first_existing(root, [f"LiDAR/{name}", name])
-    ]
+    places = ((name, [f"LiDAR/{name}", name]) for name in layouts.HELIPR_OTHERS)
+    others = [name for name, place in places if layouts.first_existing(root, place)]
     hint = f"; {', '.join(others)} cannot be used: no rings" if others else ""
     wanted = lidar or " or LiDAR/".join(layouts.HELIPR_LIDARS)
     raise DatasetError(f"{root}: no HeLiPR sequence: expected LiDAR/{wanted}{hint}")

@@ -60,8 +60,7 @@ _ACCEPTED = (
     "'sim:room?frames=50&seed=3'"
 )
 _OTHERS = "sweeps of any other format: docs/own_sensor.md"
-_LOOKED_AT = 500
-"""Folders searched for a better path to suggest."""
+_LOOKED_AT = 500  # folders searched for a better path to suggest
 
 
 def __getattr__(name: str) -> Any:

@@ -20,8 +20,7 @@ from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 IMU = "sensor_msgs/msg/Imu"
-_PEEK = 10
-"""Sweeps looked at before the run, to decide on times and to describe the bag."""
+_PEEK = 10  # sweeps looked at before the run, to decide on times and to describe the bag
 
 
 class BagDataset:

@@ -19,7 +19,6 @@ class Rig:
     Attributes
     ----------
     kind : name of the data set
-    lidar_T_imu : extrinsics
     source : where the extrinsics are from, as text
     body_T_lidar : pose of the lidar in the frame of the reference poses
     topic, imu_topic : of the sweeps and of the IMU in its bags
@@ -59,7 +58,5 @@ def describe_extrinsics(sensor: Mapping[str, Any], source: str) -> str:
     """Angles and position of the extrinsics as text, with their source."""
     roll, pitch, yaw = sensor["imu.lidar_R_imu_deg"]
     x, y, z = sensor["imu.lidar_t_imu"]
-    return (
-        f"roll, pitch, yaw {roll:.2f}, {pitch:.2f}, {yaw:.2f} degrees, position {x:.3f}, {y:.3f}, "
-        f"{z:.3f} m ({source})"
-    )
+    angles, position = f"{roll:.2f}, {pitch:.2f}, {yaw:.2f}", f"{x:.3f}, {y:.3f}, {z:.3f}"
+    return f"roll, pitch, yaw {angles} degrees, position {position} m ({source})"

@@ -21,8 +21,7 @@ REQUIRED = (EDGES, PLANES, ODOMETRY)
 
 STAMP_TOLERANCE_NS = 5_000_000
 """Messages of one sweep agree to this (LOAM, laserMapping: 0.005 s)."""
-_WAITING = 100
-"""Messages of a topic kept while their partners are missing."""
+_WAITING = 100  # messages of a topic kept while their partners are missing
 _FLATNESS = 0.85
 """The vertical axis must spread this much less than the next: beams fan out by at most +-45
 degrees, so their directions vary by at most 0.7 of what the azimuth makes of the other two."""
@@ -47,10 +46,8 @@ class StampMatcher:
         own[stamp] = message
         if not all(self._waiting.values()):
             return None
-        nearest = {
-            other: min(stamps, key=lambda s: abs(s - stamp))
-            for other, stamps in self._waiting.items()
-        }
+        waiting = self._waiting.items()
+        nearest = {other: min(own, key=lambda s: abs(s - stamp)) for other, own in waiting}
         if max(nearest.values()) - min(nearest.values()) > STAMP_TOLERANCE_NS:
             return None
         group = {other: self._waiting[other].pop(best) for other, best in nearest.items()}
@@ -91,8 +88,7 @@ class FeatureDecoder:
             message_T = pose_matrix([p.x, p.y, p.z, q.x, q.y, q.z, q.w])
         except ValueError as error:
             raise DatasetError(f"topic {topic}: not a pose: {error}") from error
-        converted: FloatArray = self._lidar_T_message @ message_T @ self._lidar_T_message.T
-        return converted
+        return np.asarray(self._lidar_T_message @ message_T @ self._lidar_T_message.T)
 
     def _points(self, topic: str, message: Any) -> NDArray[np.floating]:
         points = finite_points(topic, message)
@@ -116,8 +112,7 @@ def directions_spread(points: NDArray[np.floating]) -> FloatArray | None:
     ranges = np.linalg.norm(points, axis=1)
     if (ranges > 0.0).sum() < 100:  # too few to speak of a spread
         return None
-    spread: FloatArray = (points[ranges > 0.0] / ranges[ranges > 0.0, None]).std(axis=0)
-    return spread
+    return np.asarray((points[ranges > 0.0] / ranges[ranges > 0.0, None]).std(axis=0))
 
 
 def decide_axes(topic: str, spread: FloatArray | None) -> Literal["lidar", "loam"]:

@@ -59,12 +59,8 @@ def read_records(path: Path, stamp: int, record: np.dtype[Any]) -> PackedCloud:
 def read_pcd(path: Path, stamp: int) -> PackedCloud:
     """A PCD file, ``DATA`` ascii, binary or binary_compressed; ``stamp`` in nanoseconds.
 
-    Fields named ``_`` are padding. DatasetError if the file cannot be understood or is cut off, or
-    if it is compressed and the package for that is missing.
-
-    References
-    ----------
-    The PCD file format, https://pointclouds.org/documentation/tutorials/pcd_file_format.html.
+    https://pointclouds.org/documentation/tutorials/pcd_file_format.html; fields named ``_`` are
+    padding. DatasetError if it is not understood, cut off, or needs a missing package.
     """
     data = _read_bytes(path)
     header, start = _pcd_header(path, data)
@@ -80,9 +76,8 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
     elif kind == "binary_compressed":
         body = _decompressed(path, body, record, width * height)
     elif kind != "binary":
-        raise DatasetError(
-            f"{path}: PCD with DATA {kind}; expected ascii, binary or binary_compressed"
-        )
+        kinds = "ascii, binary or binary_compressed"
+        raise DatasetError(f"{path}: PCD with DATA {kind}; expected {kinds}")
     needed = width * height * record.itemsize
     if len(body) < needed:
         raise DatasetError(
@@ -114,19 +109,14 @@ def _packed(
     stamp: int, record: np.dtype[Any], height: int, width: int, data: NDArray[np.uint8]
 ) -> PackedCloud:
     assert record.fields is not None
-    return PackedCloud(
-        header=SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9)),
-        height=height,
-        width=width,
-        fields=tuple(
-            Field(name, offset, _CODES[kind.str[1:]])
-            for name, (kind, offset, *_) in record.fields.items()
-            if kind.str[1:] in _CODES
-        ),
-        point_step=record.itemsize,
-        row_step=width * record.itemsize,
-        data=data,
+    header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9))
+    fields = tuple(
+        Field(name, offset, _CODES[kind.str[1:]])
+        for name, (kind, offset, *_) in record.fields.items()
+        if kind.str[1:] in _CODES
     )
+    step = record.itemsize
+    return PackedCloud(header, height, width, fields, step, width * step, data)
 
 
 def _pcd_header(path: Path, data: NDArray[np.uint8]) -> tuple[dict[str, list[str]], int]:
@@ -146,12 +136,11 @@ def _pcd_header(path: Path, data: NDArray[np.uint8]) -> tuple[dict[str, list[str
 
 
 def _pcd_record(header: dict[str, list[str]]) -> np.dtype[Any]:
-    names, kinds = header["FIELDS"], header["TYPE"]
+    names, kinds, sizes = header["FIELDS"], header["TYPE"], header["SIZE"]
     counts = header.get("COUNT", ["1"] * len(names))
     layout: list[tuple[Any, ...]] = []
-    for number, (name, kind, size, count) in enumerate(
-        zip(names, kinds, header["SIZE"], counts, strict=True)
-    ):
+    columns = zip(names, kinds, sizes, counts, strict=True)
+    for number, (name, kind, size, count) in enumerate(columns):
         base = f"<{ {'F': 'f', 'I': 'i', 'U': 'u'}[kind] }{int(size)}"
         padding = name == "_" or int(count) != 1
         layout.append((f"_{number}", base, (int(count),)) if padding else (name, base))
@@ -173,10 +162,8 @@ def _decompressed(
     try:
         import lzf
     except ImportError as error:
-        raise DatasetError(
-            f"{path}: PCD with DATA binary_compressed needs python-neo-lzf: "
-            'pip install "loam_gtsam[pcd]"'
-        ) from error
+        needs = 'DATA binary_compressed needs python-neo-lzf: pip install "loam_gtsam[pcd]"'
+        raise DatasetError(f"{path}: PCD with {needs}") from error
     needed = count * record.itemsize
     compressed, size = np.frombuffer(data[:8].tobytes().ljust(8, b"\0"), "<u4").tolist()
     columns = b""

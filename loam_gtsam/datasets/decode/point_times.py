@@ -1,8 +1,6 @@
 """Meaning of the per-point times of a driver: unit, clock, and moment of the stamp.
 
-Drivers agree on nothing here: Velodyne writes seconds from the stamp, Ouster nanoseconds,
-Hesai and Robosense absolute seconds, Livox absolute nanoseconds. The numbers themselves tell the
-unit, because a sweep lasts 0.02 to 1 s and the units are a thousand apart.
+Velodyne writes seconds from the stamp, Ouster nanoseconds, Hesai and Robosense absolute seconds.
 """
 
 from __future__ import annotations
@@ -26,8 +24,7 @@ _CLOCKS = {
     "stamp": "absolute",
     "own": "absolute, in another clock than the stamp",
 }
-_TRIM = 100
-"""One value in this many is set aside at either end before the span is measured."""
+_TRIM = 100  # one value in this many is set aside at either end before the span is measured
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +51,8 @@ class TimeDecision:
     def __str__(self) -> str:
         clock = _CLOCKS[self.clock]
         anchor = f", sweep {self.anchor} put at the stamp" if self.anchor else ""
-        first, last = self.span
-        return (
-            f"field {self.field!r} in {self.unit}, {clock}{anchor}: "
-            f"{first:+.4f} .. {last:+.4f} s from the stamp"
-        )
+        span = f"{self.span[0]:+.4f} .. {self.span[1]:+.4f} s from the stamp"
+        return f"field {self.field!r} in {self.unit}, {clock}{anchor}: {span}"
 
 
 def decide_times(
@@ -69,11 +63,9 @@ def decide_times(
     unit: str | None = None,
     stamp_is: str | None = None,
 ) -> TimeDecision:
-    """Decide from the numbers (N,) of one sweep what they mean.
+    """Decide from the numbers (N,) of one sweep what they mean, but for what is given.
 
-    ``field`` is what messages call them. A ``unit`` (``s``, ``ms``, ``us``, ``ns``) or the moment
-    that the stamp is (``start``, ``middle``, ``end``) is not decided where it is given.
-    DatasetError if the numbers fit no unit, or an option is unknown.
+    ``field`` is their name. DatasetError if they fit no unit, or an option is unknown.
     """
     check_time_options(unit, stamp_is)
     relative, base = _split(values)
@@ -92,8 +84,7 @@ def decide_times(
     elif abs(to_stamp) <= SWEEP_SECONDS[1]:
         clock = "stamp"
     else:
-        clock = "own"
-        anchor = anchor or "start"
+        clock, anchor = "own", anchor or "start"
     decision = TimeDecision(field, unit, clock, anchor, (0.0, 0.0))
     times, outlier = apply_times(values, stamp, decision)
     inliers = times[~outlier]
@@ -176,11 +167,9 @@ def _to_ns(base: int | float, unit: str) -> int:
 def _robust_bounds(relative: FloatArray, field: str) -> tuple[float, float]:
     """Smallest and largest finite value once the outermost ones are set aside."""
     finite = relative[np.isfinite(relative)]
-    count = len(finite)
-    if count == 0:
-        raise DatasetError(
-            f"point-time field {field!r}: all {len(relative)} values are NaN or infinite"
-        )
+    if (count := len(finite)) == 0:
+        wrong = f"all {len(relative)} values are NaN or infinite"
+        raise DatasetError(f"point-time field {field!r}: {wrong}")
     trim = max(1, count // _TRIM) if count > 4 else 0
     ordered = np.partition(finite, [trim, count - 1 - trim])
     return float(ordered[trim]), float(ordered[count - 1 - trim])

@@ -43,7 +43,7 @@ def decode_pointcloud2(
 
     Parameters
     ----------
-    msg : a message as rosbags, rclpy or rospy hand it out, or any object with its attributes
+    msg : a message as rosbags or rclpy hand it out, or any object with its attributes
     time_field : name of the per-point time field; None looks for the usual names, ``"none"``
         ignores it
     time_unit : ``s``, ``ms``, ``us`` or ``ns``; None decides from the numbers
@@ -89,8 +89,7 @@ def decode_with_times(
 ) -> Decoded:
     """Decode one PointCloud2 message and tell how its times were read.
 
-    ``decision`` is the one of an earlier sweep: a whole run then reads its times in one way, also
-    where a sweep has too few points to tell.
+    With the ``decision`` of an earlier sweep even one with too few points to tell is read alike.
     """
     unit, stamp_is = options.get("time_unit"), options.get("stamp_is")
     check_time_options(unit, stamp_is)
@@ -112,9 +111,8 @@ def decode_with_times(
         name, column = values
         # Only measured points: drivers leave anything in the time of a missing return.
         measured = column[finite]
-        decision = decision or decide_times(
-            measured, stamp, field=name, unit=unit, stamp_is=stamp_is
-        )
+        if decision is None:
+            decision = decide_times(measured, stamp, field=name, unit=unit, stamp_is=stamp_is)
         measured_times, outlier = apply_times(measured, stamp, decision)
         outliers = int(outlier.sum())
         times = np.full(len(points), measured_times.min())
@@ -133,10 +131,9 @@ def decode_with_times(
 
 
 class CloudStream:
-    """Decodes PointCloud2 messages in the order in which they come.
+    """Decodes messages in the order in which they come; options: :func:`decode_pointcloud2`.
 
-    For the options see :func:`decode_pointcloud2`. ``decision`` is how the times are read, None
-    before the first that could be.
+    ``decision`` is how the times are read, None before the first that could be.
     """
 
     def __init__(self, **options: Unpack[TimeOptions]) -> None:
@@ -161,24 +158,17 @@ class CloudStream:
 
 
 def message_stamp(msg: Any) -> int:
-    """Header stamp in nanoseconds, of a ROS 1 or ROS 2 message."""
+    """Header stamp in nanoseconds."""
     try:
         stamp = msg.header.stamp
-        if hasattr(stamp, "secs"):  # rospy
-            return int(stamp.secs) * 10**9 + int(stamp.nsecs)
         return int(stamp.sec) * 10**9 + int(stamp.nanosec)
     except (AttributeError, TypeError, ValueError, OverflowError) as error:
-        raise DatasetError(
-            f"expected a message with header.stamp, got {type(msg).__name__}: {error}"
-        ) from error
+        text = f"expected a message with header.stamp, got {type(msg).__name__}"
+        raise DatasetError(f"{text}: {error}") from error
 
 
 def decode_imu(msg: Any) -> tuple[int, tuple[float, ...]]:
-    """Stamp and numbers of one Imu message, as rosbags, rclpy or rospy hand it out.
-
-    The numbers are (10,) quaternion x y z w (zero if the message says that there is none), rad/s,
-    m/s^2.
-    """
+    """Stamp (ns) and (10,) quaternion x y z w (zero if there is none), rad/s, m/s^2 of an Imu."""
     stamp = message_stamp(msg)
     try:
         q, w, a = msg.orientation, msg.angular_velocity, msg.linear_acceleration
@@ -202,7 +192,7 @@ def describe_fields(msg: Any) -> str:
 
 
 class _Layout:
-    """Checked geometry of the byte buffer; hands out columns without copying."""
+    """Checked geometry of the byte buffer."""
 
     def __init__(self, msg: Any) -> None:
         try:
@@ -215,9 +205,8 @@ class _Layout:
                 data = np.asarray(data, dtype=np.uint8)
             self.data = np.frombuffer(data, dtype=np.uint8) if len(data) else np.zeros(0, np.uint8)
         except (AttributeError, TypeError, ValueError, OverflowError) as error:
-            raise DatasetError(
-                f"expected a PointCloud2 message, got {type(msg).__name__}: {error}"
-            ) from error
+            text = f"expected a PointCloud2 message, got {type(msg).__name__}"
+            raise DatasetError(f"{text}: {error}") from error
         if min(self.height, self.width, self.point_step, row_step) < 0:
             raise DatasetError(
                 f"PointCloud2: expected sizes from 0 on, got {self.height} x {self.width} points "
@@ -229,9 +218,8 @@ class _Layout:
         if self.size and self.point_step <= 0:
             raise DatasetError(f"PointCloud2: point_step is {self.point_step}, expected above 0")
         if self.row_step < tight:
-            raise DatasetError(
-                f"PointCloud2: row_step {self.row_step} is below width x point_step = {tight}"
-            )
+            below = f"row_step {self.row_step} is below width x point_step = {tight}"
+            raise DatasetError(f"PointCloud2: {below}")
         needed = (self.height - 1) * self.row_step + tight if self.size else 0
         if len(self.data) < needed:
             raise DatasetError(
@@ -247,9 +235,8 @@ class _Layout:
         """(height * width,) values of a field, in native byte order."""
         field = self.fields[name]
         if field.datatype not in DATATYPES:
-            raise DatasetError(
-                f"PointCloud2 field {name!r}: unknown datatype {field.datatype}, expected 1 to 8"
-            )
+            problem = f"unknown datatype {field.datatype}, expected 1 to 8"
+            raise DatasetError(f"PointCloud2 field {name!r}: {problem}")
         dtype = np.dtype(self.order + DATATYPES[field.datatype])
         if field.count > 1:  # 0 is what old PCL versions write for 1
             raise DatasetError(f"PointCloud2 field {name!r}: expected count 1, got {field.count}")
@@ -266,18 +253,14 @@ class _Layout:
 
 
 def _points(layout: _Layout) -> NDArray[Any]:
-    missing = [name for name in "xyz" if name not in layout.fields]
-    if missing:
-        raise DatasetError(
-            f"PointCloud2: no field {', '.join(missing)}; the message has: "
-            f"{', '.join(layout.fields) or 'no fields'}"
-        )
+    if missing := [name for name in "xyz" if name not in layout.fields]:
+        there = f"the message has: {', '.join(layout.fields) or 'no fields'}"
+        raise DatasetError(f"PointCloud2: no field {', '.join(missing)}; {there}")
     columns = {name: layout.column(name) for name in "xyz"}
     for name, column in columns.items():
         if column.dtype.kind != "f":
-            raise DatasetError(
-                f"PointCloud2 field {name!r}: expected float32 or float64, got {column.dtype}"
-            )
+            problem = f"expected float32 or float64, got {column.dtype}"
+            raise DatasetError(f"PointCloud2 field {name!r}: {problem}")
     with np.errstate(invalid="ignore"):  # some bit patterns of NaN do not survive a change of width
         return np.stack(list(columns.values()), axis=1)
 
@@ -289,8 +272,7 @@ def _rings(layout: _Layout) -> NDArray[Any] | None:
     column = layout.column(name)
     if column.dtype.kind == "f":  # a missing return may carry NaN; its point is NaN as well
         beams = np.clip(np.nan_to_num(column), -_WILD_RING, _WILD_RING)
-        whole: NDArray[np.int64] = np.rint(beams).astype(np.int64)
-        return whole
+        return np.asarray(np.rint(beams).astype(np.int64))
     return column
 
 
@@ -298,8 +280,7 @@ def _time_values(layout: _Layout, asked: str | None) -> tuple[str, NDArray[Any]]
     if asked == NO_TIMES:
         return None
     if asked is not None and asked not in layout.fields:
-        raise DatasetError(
-            f"PointCloud2: no time field {asked!r}; the message has: {', '.join(layout.fields)}"
-        )
+        there = f"the message has: {', '.join(layout.fields)}"
+        raise DatasetError(f"PointCloud2: no time field {asked!r}; {there}")
     name = asked or next((name for name in TIME_FIELDS if name in layout.fields), None)
     return None if name is None else (name, layout.column(name))

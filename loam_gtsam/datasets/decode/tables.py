@@ -23,10 +23,8 @@ from loam_gtsam.types import (
 
 DEFAULT_PERIOD_NS = 100_000_000
 """10 Hz, the usual rate of a spinning lidar."""
-STANDARD_GRAVITY = 9.80665
-"""m/s^2, CGPM 1901."""
-_ABSURD = 1e6
-"""rad/s and m/s^2 that no IMU measures."""
+STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
+_ABSURD = 1e6  # rad/s and m/s^2 that no IMU measures
 UNIT_TOLERANCE = 0.1
 """Limit by which the length of a quaternion may differ from one for it to be an orientation."""
 
@@ -72,11 +70,10 @@ def read_stamps(path: Path) -> IntArray:
 
 
 def read_table(path: Path, columns: str, separator: str | None) -> tuple[IntArray, FloatArray]:
-    """Rows of a time and finite numbers; blank lines and those that start with ``#`` do not count.
+    """Stamps (N,) in ns and the other values (N, C) of a table; lines of ``#`` are left out.
 
-    ``columns`` are their names. The time is ``t`` (seconds), ``ns`` (whole nanoseconds), or the two
-    columns ``secs nsecs``. A line of just these names is skipped. Stamps (N,) are nanoseconds,
-    values (N, C) the other columns. A DatasetError names the line that does not fit.
+    ``columns`` are the names, which may be a line of it: first ``t`` (seconds), ``ns`` or ``secs
+    nsecs``, then finite numbers. A DatasetError names the line that does not fit.
     """
     width = len(columns.split()) - (2 if columns.startswith("secs") else 1)
     stamps, rows = _read_rows(path, columns, separator, _finite)
@@ -92,12 +89,7 @@ def read_pose_table(path: Path, columns: str, separator: str | None) -> tuple[In
 def read_tum(path: str | Path) -> Trajectory:
     """Read a trajectory in TUM format: ``t x y z qx qy qz qw`` per line, seconds and metres.
 
-    Stamps are exact to the nanosecond.
-
-    Raises
-    ------
-    DatasetError
-        If the file cannot be read, naming the line that does not fit.
+    Stamps are exact to the nanosecond. A DatasetError names the line that does not fit.
     """
     return Trajectory(*read_pose_table(Path(path), "t x y z qx qy qz qw", None))
 
@@ -133,7 +125,6 @@ def _finite(numbers: Sequence[float]) -> Sequence[float]:
 def _read_rows(
     path: Path, columns: str, separator: str | None, convert: Callable[[Sequence[float]], _Row]
 ) -> tuple[IntArray, list[_Row]]:
-    """Stamps (N,), and what ``convert`` makes of the other numbers of each row."""
     names = columns.split()
 
     def split(line: str) -> tuple[int, _Row] | None:
@@ -151,7 +142,6 @@ def _read_rows(
 
 
 def _stamp(clock: str, cells: list[str]) -> int:
-    """Nanoseconds of a row, from its first cell or first two."""
     if clock == "t":
         return seconds_to_ns(cells[0])
     nanoseconds = int(cells[0]) if clock == "ns" else int(cells[0]) * 10**9 + int(cells[1])
@@ -174,8 +164,7 @@ def sorted_trajectory(
 
 
 def _later_than_before(stamps: IntArray) -> BoolArray:
-    later: BoolArray = np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0
-    return later
+    return np.asarray(np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0)
 
 
 def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:
@@ -187,9 +176,8 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     order = keep[np.argsort(stamps[keep], kind="stable")]
     later = _later_than_before(stamps[order])
     if dropped := len(stamps) - int(later.sum()):
-        problems.append(
-            f"IMU: {dropped} samples with NaN, absurd values or a repeated stamp left out"
-        )
+        what = "with NaN, absurd values or a repeated stamp"
+        problems.append(f"IMU: {dropped} samples {what} left out")
     if (np.diff(stamps) < 0).any():
         problems.append("IMU: stamps out of order, sorted")
     order = order[later]
@@ -218,9 +206,8 @@ def describe_imu(samples: ImuSamples | None) -> str:
     """Count and rate of IMU samples as text."""
     if samples is None:
         return "none"
-    orientation = "with" if samples.orientation is not None else "without"
-    rate = describe_rate(samples.stamps)
-    return f"{len(samples.stamps)} samples, {rate}, {orientation} orientation"
+    orientation = f"{'without' if samples.orientation is None else 'with'} orientation"
+    return f"{len(samples.stamps)} samples, {describe_rate(samples.stamps)}, {orientation}"
 
 
 def describe_rate(stamps: IntArray) -> str:

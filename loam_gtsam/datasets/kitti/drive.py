@@ -21,16 +21,13 @@ from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import MAX_STAMP, DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
 _RAW = "velodyne_points"
-_EARTH_RADIUS = 6378137.0
-"""Metres, as in the development kit."""
+_EARTH_RADIUS = 6378137.0  # metres, as in the development kit
 _LATITUDE, _LONGITUDE, _ALTITUDE = 0, 1, 2
-_ANGLES = slice(3, 6)
-"""Roll, pitch, yaw: radians; yaw 0 is east."""
+_ANGLES = slice(3, 6)  # roll, pitch, yaw: radians; yaw 0 is east
 _ACCELERATION, _GYRO = slice(11, 14), slice(17, 20)
 """Along x, y, z of the unit, m/s^2 with gravity, rad/s."""
 _OXTS_VALUES = 30
-_BRIDGED_NS = 100_000_000
-"""Default of ``imu.max_gap``."""
+_BRIDGED_NS = 100_000_000  # default of ``imu.max_gap``
 
 
 def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntArray:

@@ -66,9 +66,8 @@ class KittiDataset(SweepFiles):
         self._files = sorted(folder.glob("*.bin"), key=_natural_order)
         self._offset = float(np.radians(vertical_angle_offset_deg))
         if not np.isfinite(self._offset):
-            raise DatasetError(
-                f"vertical_angle_offset_deg: expected degrees, got {vertical_angle_offset_deg!r}"
-            )
+            got = f"got {vertical_angle_offset_deg!r}"
+            raise DatasetError(f"vertical_angle_offset_deg: expected degrees, {got}")
         self._times_folder = self._root / "t_ns"
         self._problems: list[str] = []
         self.stamps = drive.sweep_stamps(self._root, self._files, self._problems)
@@ -197,13 +196,10 @@ def _sweep_folder(path: Path) -> Path:
     if not path.is_dir():
         what = "not a folder" if path.exists() else "no such folder"
         raise DatasetError(f"{path}: {what}; expected a folder with .bin sweeps")
-    folder = find_sweeps(path)
-    if folder is not None:
+    if (folder := find_sweeps(path)) is not None:
         return folder
-    raise DatasetError(
-        f"{path}: no .bin sweeps; looked in the folder itself, "
-        f"{', '.join(name + '/' for name in _FOLDERS if name)}"
-    )
+    inner = ", ".join(f"{name}/" for name in _FOLDERS if name)
+    raise DatasetError(f"{path}: no .bin sweeps; looked in the folder itself, {inner}")
 
 
 def _root_of(folder: Path, given: Path) -> Path:
@@ -216,5 +212,4 @@ def _root_of(folder: Path, given: Path) -> Path:
 
 
 def _natural_order(file: Path) -> tuple[int, str]:
-    """2.bin before 10.bin."""
     return (int(file.stem) if file.stem.isdecimal() else -1, file.name)

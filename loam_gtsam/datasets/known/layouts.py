@@ -9,9 +9,7 @@ from pathlib import Path
 from loam_gtsam.types import DatasetError
 
 MULRAN_FOLDERS = ("Ouster", "sensor_data/Ouster")
-"""Folders in which the sweeps of MulRan lie."""
-HELIPR_LIDARS = ("Ouster", "Velodyne")
-"""Lidars of HeLiPR that sweep rings."""
+HELIPR_LIDARS = ("Ouster", "Velodyne")  # those that sweep rings
 HELIPR_OTHERS = ("Avia", "Aeva")
 NEWER_COLLEGE_SCANS = "raw_format/ouster_scan"
 SPIRES_CLOUDS = "raw/lidar-clouds"

@@ -40,9 +40,8 @@ class MulRanDataset(StampedFiles):
 
     Notes
     -----
-    The files hold neither times nor rings; both follow from the order of the points, which a sweep
-    of another size than 64 x 1024 cannot have: it becomes a
-    :class:`~loam_gtsam.types.BadSweep`.
+    The files hold neither times nor rings; both follow from the order of the points, 64 x 1024. A
+    sweep of another size becomes a :class:`~loam_gtsam.types.BadSweep`.
 
     Raises
     ------
@@ -59,9 +58,8 @@ class MulRanDataset(StampedFiles):
         root = Path(path)
         folder = first_existing(root, MULRAN_FOLDERS)
         if folder is None:
-            raise DatasetError(
-                f"{root}: no MulRan sequence: expected a folder Ouster with .bin files"
-            )
+            expected = "expected a folder Ouster with .bin files"
+            raise DatasetError(f"{root}: no MulRan sequence: {expected}")
         super().__init__(
             root,
             RIG,

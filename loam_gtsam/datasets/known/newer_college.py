@@ -18,9 +18,8 @@ from loam_gtsam.datasets.known.stamped_files import StampedFiles
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError
 
-_SENSOR_T_LIDAR = rigid_transform(
-    Rotation.from_euler("z", 180.0, degrees=True), [0.0, 0.0, 0.03618]
-)
+_HALF_TURN = Rotation.from_euler("z", 180.0, degrees=True)
+_SENSOR_T_LIDAR = rigid_transform(_HALF_TURN, [0.0, 0.0, 0.03618])
 _SENSOR_T_IMU = rigid_transform(Rotation.identity(), [0.006253, -0.011775, 0.007645])
 """Ouster's manual of the OS1, coordinate frames."""
 
@@ -117,8 +116,7 @@ class NewerCollegeClouds(StampedFiles):
 
 def _choose(root: Path, sequence: str | None) -> tuple[str, list[Path]]:
     if root.is_file():
-        known = layouts.newer_college_sequence(root)
-        if known is None:
+        if (known := layouts.newer_college_sequence(root)) is None:
             raise DatasetError(f"{root}: not named as a bag of the Newer College data sets")
         return known[0], [root]
     found = layouts.newer_college_sequences(root)
@@ -135,10 +133,8 @@ def _choose(root: Path, sequence: str | None) -> tuple[str, list[Path]]:
 
 def _truth_file(folder: Path, name: str) -> Path | None:
     difficulty = name.removeprefix("math-")
-    files = [f"gt-nc-{name}.csv"]
-    if name == "rooster":
-        files = ["registered_poses.csv"]
-    elif name != difficulty:
+    files = ["registered_poses.csv" if name == "rooster" else f"gt-nc-{name}.csv"]
+    if name != difficulty:
         files = [f"gt_state_{difficulty}.csv", f"gt_math_{difficulty}.csv"]
     inside = ("", "ground_truth/", "ground_truth/tum_format/")
     places = [f"{up}{inner}" for up in ("", "../") for inner in inside]

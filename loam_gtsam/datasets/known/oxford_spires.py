@@ -60,8 +60,7 @@ class OxfordSpiresBags(BagSequence):
 
     def __init__(self, path: str | Path, **options: Unpack[BagOptions]) -> None:
         root = Path(path)
-        parts = layouts.spires_bags(root)
-        if not parts:
+        if not (parts := layouts.spires_bags(root)):
             raise DatasetError(f"{root}: no bags of an Oxford Spires sequence")
         super().__init__(root, parts, RIG, layouts.spires_truth(root), **options)
 

@@ -34,13 +34,11 @@ _NAMES = {
 }
 BEAMS, COLUMNS, PERIOD = 64, 1024, 0.1
 """Ouster's OS1-64 at 10 Hz: points of a sweep come firing by firing, 64 each, in 0.1 s."""
-_TRIED = 10
-"""Sweeps looked at, at most, to decide on times."""
+_TRIED = 10  # sweeps looked at, at most, to decide on times
 _XSENS = "ns qx qy qz qw ex ey ez ax ay az bx by bz cx cy cz"
 _TRIPLES = {"columns 9 to 11": slice(7, 10), "columns 15 to 17": slice(13, 16)}
 _ACCELERATION = slice(10, 13)
-_WINDOW = 0.3
-"""Seconds over which the gyro is compared with the orientation."""
+_WINDOW = 0.3  # seconds over which the gyro is compared with the orientation
 _CLEARLY = 0.5
 """The gyro's distance from the rates of the orientation is below this share of the other's."""
 
@@ -93,7 +91,7 @@ class StampedFiles(SweepFiles):
 
     @cached_property
     def imu(self) -> ImuSamples | None:
-        """All IMU data if there is any."""
+        """Of its file, or None."""
         return None if self._imu_file is None else self._read_imu(self._imu_file)
 
     @cached_property
@@ -117,9 +115,8 @@ class StampedFiles(SweepFiles):
             )
         info.facts["IMU"] = tables.describe_imu(imu)
         if imu is not None:
-            info.facts["IMU to lidar"] = extrinsics.describe_extrinsics(
-                self.sensor, self._rig.source
-            )
+            where = extrinsics.describe_extrinsics(self.sensor, self._rig.source)
+            info.facts["IMU to lidar"] = where
         info.facts["reference poses"] = str(len(truth)) if truth is not None else "none"
         info.problems.extend(self._problems)
         return info
@@ -132,14 +129,13 @@ class StampedFiles(SweepFiles):
 
     def _look_for_missing(self, listing: Path | None, sensor: str) -> None:
         """A problem if a list of ``stamp,sensor`` rows names sweeps that have no file."""
-        rows = (line.partition(",") for line in (tables.read_lines(listing) if listing else []))
-        listed = [
-            int(stamp)
-            for stamp, _, name in rows
-            if name.strip() == sensor and stamp.strip().isdecimal()
-        ]
+        if listing is None:
+            return
+        rows = [line.partition(",") for line in tables.read_lines(listing)]
+        own = [stamp.strip() for stamp, _, name in rows if name.strip() == sensor]
+        listed = [int(stamp) for stamp in own if stamp.isdecimal()]
         missing = np.setdiff1d(np.array(listed, np.int64), self.stamps)
-        if listing and len(missing):
+        if len(missing):
             self._problems.append(
                 f"{listing.name} lists {len(missing)} sweeps without a file, the first {missing[0]}"
             )
@@ -181,11 +177,8 @@ def _stamp(file: Path, name: str) -> int:
 def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
     """Orientation, gyro and accelerometer, or None if the gyro cannot be told.
 
-    The 17 columns are nanoseconds, quaternion x y z w, Euler angles, then gyro, accelerometer and
-    magnetometer. The file players of both data sets read the gyro from columns 9 to 11. evalio
-    (0.6) reads HeLiPR's from columns 15 to 17, which are the players' magnetometer; all agree that
-    12 to 14 are the accelerometer. The rates at which the orientation of the same file turns
-    decide.
+    The players of both data sets read the gyro from columns 9 to 11 of 17, evalio (0.6) HeLiPR's
+    from the players' magnetometer, 15 to 17: the turning of the file's own orientation decides.
     """
     lines = tables.read_lines(path)
     if lines and len(lines[0].split(",")) == 8:
@@ -206,11 +199,7 @@ def read_xsens(path: Path, problems: list[str]) -> ImuSamples | None:
 
 
 def _gyro_columns(stamps: IntArray, values: FloatArray) -> str | None:
-    """Name of the three columns that are the gyro: their mean is nearest to the turn rate.
-
-    The turn rate is that of the orientation over a window: the noise of the orientation counts less
-    the longer the window is.
-    """
+    """The columns whose mean is nearest to the turn rate of the orientation over a window."""
     order = np.argsort(stamps, kind="stable")
     seconds = (stamps[order] - stamps[order[0]]) * 1e-9 if len(order) else np.zeros(0)
     last = np.searchsorted(seconds, seconds + _WINDOW)

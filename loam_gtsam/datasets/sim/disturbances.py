@@ -1,10 +1,7 @@
 """Sweeps as they should not be: passing objects, outliers, drop-outs, gaps, a kidnapped lidar.
 
-Any data set can be made harder, its truth and IMU are handed through:
 ``Disturbed(dataset, [Outliers(0.2), MissingSweeps(at=(40, 80))])``. Everything random comes from a
-seed and the number of the sweep: iterating twice gives the same sweeps twice. In
-:class:`SkippedAhead` and :class:`Kidnapped` the lidar is put somewhere else between two sweeps, and
-the truth jumps with it.
+seed and the number of the sweep: iterating twice gives the same sweeps twice.
 """
 
 from __future__ import annotations
@@ -35,10 +32,8 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
-_REACH = 60.0
-"""Metres ahead and behind that hold moving objects."""
-_CALIBRATIONS = 16
-"""Moments at which the share of points on moving objects is averaged."""
+_REACH = 60.0  # metres ahead and behind that hold moving objects
+_CALIBRATIONS = 16  # moments at which the share of points on moving objects is averaged
 
 
 class Disturbance:
@@ -74,8 +69,7 @@ class Outliers(Disturbance):
         """See :meth:`Disturbance.apply`."""
         rng = np.random.default_rng([self.seed, number])
         chosen = rng.permutation(len(scan.points))[: round(self.share * len(scan.points))]
-        ranges = rng.uniform(*self.ranges, len(chosen))
-        return _at_ranges(scan, chosen, ranges)
+        return _at_ranges(scan, chosen, rng.uniform(*self.ranges, len(chosen)))
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,8 +129,8 @@ class MissingSweeps(Disturbance):
 class MovingObjects(Disturbance):
     """Two columns of boxes that pass the lidar on either side and hide what is behind them.
 
-    They keep their speed in the frame of the lidar, as the traffic on the next lanes does: all
-    points on them agree with each other on a wrong motion. Beams without a return meet none.
+    They keep their speed in its frame, as traffic on the next lanes does: all points on them agree
+    with each other on a wrong motion. Beams without a return meet none.
 
     Parameters
     ----------
@@ -166,10 +160,7 @@ class MovingObjects(Disturbance):
             )
 
     def covering(self, share: float, scan: Scan) -> MovingObjects:
-        """Moving objects so long that they hide a share of a sweep's points, averaged in time.
-
-        ConfigError if boxes without a gap between them hide less.
-        """
+        """So long that they hide a share of a sweep's points; ConfigError if they never can."""
         _check_share(share)
         # Once past the slower column: the other one is then seen at as many places.
         period = self.spacing / min((abs(v) for v in self.speeds if v), default=self.spacing)
@@ -193,8 +184,7 @@ class MovingObjects(Disturbance):
 
     def hits(self, scan: Scan) -> BoolArray:
         """(N,) which points of a sweep lie on a box instead."""
-        hit: BoolArray = np.isfinite(self._ranges(scan))
-        return hit
+        return np.asarray(np.isfinite(self._ranges(scan)))
 
     def apply(self, number: int, scan: Scan) -> Scan:
         """See :meth:`Disturbance.apply`."""
@@ -209,7 +199,6 @@ class MovingObjects(Disturbance):
         points = scan.points.astype(np.float64)
         times = np.zeros(len(points)) if scan.times is None else scan.times
         seconds = scan.stamp * 1e-9 + later + times
-        measured = np.linalg.norm(points, axis=1)
         x, y, z = points.T
         count = math.ceil(_REACH / self.spacing)
         starts: FloatArray = np.arange(-count, count, dtype=np.float64) * self.spacing
@@ -225,25 +214,19 @@ class MovingObjects(Disturbance):
                 leave = np.minimum(np.minimum(rise[1], across[1]), along[1])
                 enter = np.where((enter < leave) & (enter > 0.0) & (enter < 1.0), enter, np.inf)
                 nearest = np.minimum(nearest, enter.min(axis=0))
-        ranges: FloatArray = nearest * measured
-        return ranges
+        return np.asarray(nearest * np.linalg.norm(points, axis=1))
 
 
 def _between(
     coordinate: FloatArray, low: float | FloatArray, high: float | FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Shares of the length of rays from the origin at which they are between two planes."""
+    """Shares of the length of rays from the origin at which they enter and leave two planes."""
     first, second = low / coordinate, high / coordinate
     return np.minimum(first, second), np.maximum(first, second)
 
 
 class Disturbed(ChangedDataset):
-    """A data set whose sweeps are disturbed, one disturbance after the other.
-
-    Parameters
-    ----------
-    dataset : of raw sweeps; its IMU and truth are handed through
-    disturbances : in the order in which they happen
+    """A data set of raw sweeps with ``disturbances``, one after the other.
 
     Raises
     ------
@@ -272,14 +255,14 @@ class Disturbed(ChangedDataset):
         return all(disturbance.keeps(number) for disturbance in self._disturbances)
 
     def info(self) -> DatasetInfo:
-        """Description of the data set, with what disturbs it."""
+        """Of the data set, with what disturbs it."""
         return self._info(disturbed_by=", ".join(map(str, self._disturbances)) or "nothing")
 
 
 class SkippedAhead(ChangedDataset):
     """A drive out of which some sweeps were cut, and the gap in time closed: a kidnapped lidar.
 
-    Works on any data; the lidar jumps to where it really went, at the speed it had there.
+    It jumps to where it really went, at the speed it had there; the truth jumps with it.
 
     Parameters
     ----------
@@ -289,10 +272,8 @@ class SkippedAhead(ChangedDataset):
 
     def __init__(self, dataset: Dataset, first: int, count: int) -> None:
         if not (first > 0 and count > 0 and first + count < len(dataset)):
-            raise InputError(
-                f"SkippedAhead: expected sweeps within 1 to {len(dataset) - 2} to cut out, got "
-                f"{count} from {first}"
-            )
+            within = f"within 1 to {len(dataset) - 2} to cut out"
+            raise InputError(f"SkippedAhead: expected sweeps {within}, got {count} from {first}")
         super().__init__(dataset, "skipped ahead")
         self._first, self._count = first, count
         ends = islice(dataset, first, first + count + 1, count)
@@ -345,7 +326,6 @@ class Kidnapped(ChangedDataset):
 
     Parameters
     ----------
-    world : the drive
     number : of the first sweep elsewhere, from 1
     move : metres, lidar frame
     turn_deg : about the lidar's z axis, after the move
@@ -374,8 +354,7 @@ class Kidnapped(ChangedDataset):
 
     def __getitem__(self, number: int) -> Scan:
         number += len(self) if number < 0 else 0
-        world = self._world if number < self._number else self._moved
-        return world.sweep(number)
+        return (self._world if number < self._number else self._moved).sweep(number)
 
     @cached_property
     def truth(self) -> Trajectory:
@@ -400,7 +379,6 @@ class Kidnapped(ChangedDataset):
 
 
 def _at_ranges(scan: Scan, chosen: IntArray | BoolArray, ranges: FloatArray) -> Scan:
-    """The sweep with its chosen points moved along their beams."""
     points = scan.points.astype(np.float64)
     with np.errstate(invalid="ignore", divide="ignore"):
         points[chosen] *= (ranges / np.linalg.norm(points[chosen], axis=1))[:, None]

@@ -15,28 +15,22 @@ from loam_gtsam.types import FloatArray
 GRAVITY = 9.81
 """m/s^2, along -z of the simulated world."""
 
-_START_UP = 3.0
-"""Seconds over which the platform gathers speed; it is at rest at t = 0."""
+_START_UP = 3.0  # seconds over which the platform gathers speed; it is at rest at t = 0
 _LATERAL_ACCELERATION = 2.5
 """m/s^2 at which the driver slows down in bends, a comfortable value for a car."""
-_BRAKING_LENGTH = 10.0
-"""Metres over which the slowing down is spread."""
-_SPEED_WAVE = (0.1, 60.0)
-"""Relative change of speed along the way, and its wavelength in metres."""
+_BRAKING_LENGTH = 10.0  # metres over which the slowing down is spread
+_SPEED_WAVE = (0.1, 60.0)  # relative change of speed along the way, and its wavelength in metres
 _SWAY_HZ = ((1.3, 2.1), (0.7, 1.7), (0.9, 1.9), (0.6, 1.1))
 """Frequencies of heave, roll, pitch and yaw sway: typical vehicle body and walking motion."""
-_RUN_OUT = 0.5
-"""Seconds of path kept beyond ``Motion.duration`` on an open path."""
-_STEP = 1e-3
-"""Seconds, for central differences of the analytic path (error below 1e-4 m/s^2)."""
+_RUN_OUT = 0.5  # seconds of path kept beyond ``Motion.duration`` on an open path
+_STEP = 1e-3  # seconds, for central differences of the analytic path (error below 1e-4 m/s^2)
 
 
 class Motion:
     """``world_T_lidar`` at any time, from rest at ``t = 0``, along the way points of a scene.
 
-    The path is a quintic spline of the nominal distance travelled (four times continuously
-    differentiable); heading follows the path, roll and pitch follow the ground, and a sway is
-    added that starts with the motion.
+    A quintic spline of the nominal distance travelled; heading follows the path, roll and pitch the
+    ground, and a sway starts with the motion.
 
     Attributes
     ----------
@@ -61,17 +55,15 @@ class Motion:
         lateral = curvature * speed * speed / _LATERAL_ACCELERATION
         slowness = _smooth((1.0 + lateral**2) ** 0.25, length, scene.closed)
         # Nominal distance: runs at constant speed on a straight, faster than metres in a bend.
-        nominal = np.concatenate(
-            [[0.0], np.cumsum(np.diff(length) * 0.5 * (slowness[1:] + slowness[:-1]))]
-        )
+        steps = np.diff(length) * 0.5 * (slowness[1:] + slowness[:-1])
+        nominal = np.concatenate([[0.0], np.cumsum(steps)])
         self._end = float(nominal[-1])
         knots = np.linspace(0.0, self._end, max(12, int(self._end / 2.0)))
         samples = rough(np.interp(knots, nominal, fine))
         if scene.closed:
             samples[-1] = samples[0]
-        self._path = make_interp_spline(
-            knots, samples, k=5, bc_type="periodic" if scene.closed else None
-        )
+        ends = "periodic" if scene.closed else None
+        self._path = make_interp_spline(knots, samples, k=5, bc_type=ends)
         self._heading = self._path.derivative()
         times = np.arange(0.0, 2.0 * self._end / speed + _START_UP, 0.01)
         # An open path is left before its very end, so that an IMU can look a little further.
@@ -124,17 +116,15 @@ class Motion:
         distance = self._speed * (ramp + np.maximum(times - _START_UP, 0.0))
         change, wavelength = _SPEED_WAVE
         wave = 2.0 * np.pi / wavelength
-        travelled: FloatArray = distance + change / wave * np.sin(wave * distance)
-        return travelled
+        return np.asarray(distance + change / wave * np.sin(wave * distance))
 
     def _sway(self, times: FloatArray) -> list[FloatArray]:
-        """Heave (m), roll, pitch and yaw (rad)."""
         x = np.clip(times / _START_UP, 0.0, 1.0)
         growth = x**3 * (6.0 * x * x - 15.0 * x + 10.0)
 
         def wave(slow: float, fast: float) -> FloatArray:
-            first, second = (np.sin(2.0 * np.pi * hertz * times) for hertz in (slow, fast))
-            return 0.6 * first + 0.4 * second
+            turns = 2.0 * np.pi
+            return 0.6 * np.sin(turns * slow * times) + 0.4 * np.sin(turns * fast * times)
 
         return [
             amplitude * growth * wave(slow, fast)
@@ -145,10 +135,8 @@ class Motion:
 def _smooth(values: FloatArray, length: FloatArray, closed: bool) -> FloatArray:
     """Gaussian average along the path (samples are close to evenly spaced)."""
     sigma = 0.5 * _BRAKING_LENGTH / (length[-1] / (len(length) - 1))
-    smoothed: FloatArray = gaussian_filter1d(
-        values, min(sigma, len(values) / 10), mode="wrap" if closed else "nearest"
-    )
-    return smoothed
+    mode = "wrap" if closed else "nearest"
+    return np.asarray(gaussian_filter1d(values, min(sigma, len(values) / 10), mode=mode))
 
 
 def _rotations(roll: FloatArray, pitch: FloatArray, yaw: FloatArray) -> FloatArray:

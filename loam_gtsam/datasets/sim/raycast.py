@@ -1,8 +1,7 @@
 """Exact ranges from a moving, spinning sensor to simple solids.
 
-A sweep is C columns of B beams; every column has its own sensor position, so motion distortion
-is exact. The loop runs over the few solids near the sensor, never over rays: a solid is tested
-only against the columns that can see it.
+A sweep is C columns of B beams; every column has its own sensor position. The loop runs over the
+few solids near the sensor, never over rays: each is tested against the columns that can see it.
 """
 
 from __future__ import annotations
@@ -16,10 +15,8 @@ from loam_gtsam.types import BoolArray, FloatArray
 
 _EPSILON = 1e-12
 """Added to ray directions so that none is exactly parallel to a slab (1e-10 m at 100 m)."""
-_TOUCH = 1e-7
-"""Metres above the ground that count as on it."""
-_GROUND_STEPS = 100
-"""Most steps of a ray; ten are typical, only rays that skim crests need many."""
+_TOUCH = 1e-7  # metres above the ground that count as on it
+_GROUND_STEPS = 100  # most steps of a ray; ten are typical, only rays that skim crests need many
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +94,6 @@ def cast_rays(
 
     Parameters
     ----------
-    solids : the world
     origins : (C, 3) sensor position of each column, metres, world frame; within metres of each
         other and outside all solids
     directions : (3, C, B) unit vectors in the world frame, well away from the vertical. Azimuth
@@ -176,13 +172,10 @@ def _entry(a: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
 def _cast_ground(
     ground: Ground, origins: FloatArray, directions: FloatArray, limits: FloatArray
 ) -> FloatArray:
-    """Distance to a height field by steps that cannot overshoot, so none misses the first crest.
-
-    The second derivative of the gap g above the ground along a ray is at most M, hence
-    ``g(t + s) >= g + g' s - M s^2 / 2``: the positive root in s of the right side is a safe step,
-    and close to the surface it is Newton's. Rays are given up at ``limits`` (C, B), and where
-    they rise above the highest crest.
-    """
+    """Distance to a height field by steps that cannot overshoot, so none misses the first crest."""
+    # The second derivative of the gap g above the ground along a ray is at most M, hence
+    # g(t + s) >= g + g' s - M s^2 / 2: the positive root in s of the right side is a safe step,
+    # and close to the surface it is Newton's.
     dx, dy, dz = directions.reshape(3, -1)
     ranges = np.full(dx.shape, np.inf)
     active = np.flatnonzero(dz < ground.max_slope)
@@ -209,9 +202,7 @@ def _cast_ground(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _View:
-    """Which columns of a sweep can see what: everything is judged from the sweep's middle and
-    grown by how far the sensor strays from it.
-    """
+    """Which columns can see what, from the sweep's middle; grown by how far the sensor strays."""
 
     middle: FloatArray
     stray: float
@@ -230,14 +221,9 @@ class _View:
         away = np.abs(azimuth - centre[:, None]) % (2.0 * np.pi)
         sense = 1.0 if centre[-1] > centre[0] else -1.0
         middle = origins[len(origins) // 2, :2]
-        return cls(
-            middle=middle,
-            stray=float(np.linalg.norm(origins[:, :2] - middle, axis=1).max()),
-            azimuths=sense * centre,
-            sense=sense,
-            spread=float(np.minimum(away, 2.0 * np.pi - away).max()) + 1e-6,
-            max_range=max_range,
-        )
+        stray = float(np.linalg.norm(origins[:, :2] - middle, axis=1).max())
+        spread = float(np.minimum(away, 2.0 * np.pi - away).max()) + 1e-6
+        return cls(middle, stray, sense * centre, sense, spread, max_range)
 
     def facing_boxes(self, boxes: FloatArray) -> Iterator[tuple[int, slice]]:
         """(index, columns) of the boxes in reach; a box may come twice."""

@@ -12,13 +12,10 @@ from loam_gtsam.datasets.sim import streets
 from loam_gtsam.datasets.sim.raycast import Solids
 from loam_gtsam.types import FloatArray
 
-_CORRIDOR = 320.0
-"""Metres."""
-_WAY: FloatArray = np.arange(0.0, 208.0, 8.0)
-"""Way points along x, metres."""
+_CORRIDOR = 320.0  # metres
+_WAY: FloatArray = np.arange(0.0, 208.0, 8.0)  # way points along x, metres
 _POLES = 25
-_TERRAIN = 300.0
-"""Metres of way between the first and the last pole of the sparse terrain."""
+_TERRAIN = 300.0  # metres of way between the first and the last pole of the sparse terrain
 
 
 def build_room(seed: int) -> streets.Scene:
@@ -66,8 +63,7 @@ def build_trees(seed: int) -> streets.Scene:
 
     def clear(candidates: FloatArray, margin: float) -> FloatArray:
         gaps = np.linalg.norm(candidates[:, None, :] - fine[None], axis=2).min(axis=1)
-        kept: FloatArray = candidates[gaps > margin]
-        return kept
+        return np.asarray(candidates[gaps > margin])
 
     trunks = clear(rng.uniform(-110.0, 110.0, (700, 2)), 4.0)
     thick = rng.uniform(0.08, 0.32, len(trunks))
@@ -122,9 +118,7 @@ def build_corridor_bare(seed: int) -> streets.Scene:
 
 
 def build_shaken(seed: int) -> streets.Scene:
-    """The room, its sensor shaken as in a careless hand: 2 rad/s in yaw, 0.15 rad of roll and pitch
-    at 1 to 2 Hz.
-    """
+    """The room, shaken as in a careless hand: 2 rad/s in yaw, roll, pitch 0.15 rad, 1 to 2 Hz."""
     return replace(build_room(seed), name="shaken", sway=(0.03, 0.15, 0.15, 0.31), frames=120)
 
 
@@ -135,9 +129,7 @@ def build_open_field(seed: int) -> streets.Scene:
 
 
 def build_single_plane(seed: int) -> streets.Scene:
-    """A blank facade that a drone flies along, too high for any beam to reach the ground or its
-    rims: x, z and the rotation in the plane (of the wall, pitch) show in no beam.
-    """
+    """A blank facade whose rims and ground no beam reaches: x, z and pitch show in none."""
     del seed
     solids = Solids(boxes=np.array([streets.box(-200.0, 400.0, 8.0, 10.0, 0.0, 130.0)]))
     sway = (0.02, 0.02, 0.02, 0.02)
@@ -161,9 +153,7 @@ def build_single_pole(seed: int) -> streets.Scene:
 
 
 def build_tunnel(seed: int) -> streets.Scene:
-    """A round tube of 3 m radius: neither the way along it nor a turn about its axis, which is
-    1.2 m above the sensor, shows in any beam.
-    """
+    """A round tube of 3 m radius: no beam tells the way along it or a turn about its axis."""
     del seed
     solids = Solids(tubes=np.array([[0.0, 0.0, 3.0, 0.0, 3.0]]))
     sway = (0.005, 0.006, 0.006, 0.004)
@@ -177,12 +167,10 @@ def build_sparse_terrain(seed: int) -> streets.Scene:
     along = np.arange(0.0, _TERRAIN, 8.0)
 
     def across(x: FloatArray) -> FloatArray:
-        way: FloatArray = 6.0 * np.sin(x / 35.0)
-        return way
+        return np.asarray(6.0 * np.sin(x / 35.0))
 
     x = np.linspace(-10.0, _TERRAIN + 10.0, _POLES) + rng.uniform(-4.0, 4.0, _POLES)
-    side = rng.choice([-1.0, 1.0], _POLES)
-    y = across(x) + side * rng.uniform(4.0, 15.0, _POLES)
+    y = across(x) + rng.choice([-1.0, 1.0], _POLES) * rng.uniform(4.0, 15.0, _POLES)
     z = ground.height(x, y)
     radius, top = rng.uniform(0.05, 0.12, _POLES), z + rng.uniform(2.5, 5.0, _POLES)
     return streets.Scene(
@@ -239,6 +227,5 @@ def _in_corridor(name: str, solids: Solids) -> streets.Scene:
 def _along_x(
     name: str, solids: Solids, along: FloatArray, wander: float, speed: float = 5.0, **rest: Any
 ) -> streets.Scene:
-    """A way along x that winds a little."""
     waypoints = np.stack([along, wander * np.sin(along / 13.0)], axis=1)
     return streets.Scene(name=name, solids=solids, waypoints=waypoints, speed=speed, **rest)

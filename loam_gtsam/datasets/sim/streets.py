@@ -17,14 +17,10 @@ DEEP = 3.0
 """Metres by which things reach below the ground they stand on, so that no slope shows a gap."""
 CAR = (0.01, 0.006, 0.006, 0.002)
 """Sway of a car on an even surface: heave (m), roll, pitch and yaw (rad)."""
-_RADIUS = 16.0
-"""Metres, of the way round a corner."""
-_SPACING = 8.0
-"""Metres between way points, about."""
-_SHORTEST = 100.0
-"""Metres, of a way with a start and an end."""
-_HILL = 390.0
-"""Metres from crest to crest of the road over the slopes."""
+_RADIUS = 16.0  # metres, of the way round a corner
+_SPACING = 8.0  # metres between way points, about
+_SHORTEST = 100.0  # metres, of a way with a start and an end
+_HILL = 390.0  # metres from crest to crest of the road over the slopes
 _AVENUE_STREAM, _CITY_STREAM = 8, 9
 """Numbers of the streams of random numbers; other scenes have lower ones."""
 _EAST, _ACROSS, _START = (150.0, 380.0), (90.0, 200.0), 20.0
@@ -34,7 +30,8 @@ _STEP, _CLEAR, _KERB = 1.0, 5.0, 2.8
 """Metres between the points at which a city's way is looked at; metres that its houses, and that
 its cars, posts and trees, keep from the way at least."""
 
-Rows = list[list[float]]
+_Row = list[float]
+Rows = list[_Row]
 """Rows as :class:`~loam_gtsam.datasets.sim.raycast.Solids` has them."""
 
 
@@ -67,9 +64,7 @@ class Scene:
 class Kerb:
     """One side of a street, from one corner to the next: s along it, d away from its middle."""
 
-    def __init__(
-        self, corner: FloatArray, following: FloatArray, left: bool, ground: Ground
-    ) -> None:
+    def __init__(self, corner: FloatArray, following: FloatArray, left: bool, ground: Ground):
         self.length = float(np.linalg.norm(following - corner))
         self._corner, self._ground = corner, ground
         self._along = (following - corner) / self.length
@@ -81,17 +76,13 @@ class Kerb:
         at = self._corner + s * self._along + d * self._away
         return float(at[0]), float(at[1]), float(self._ground.height(at[:1], at[1:])[0])
 
-    def box(
-        self, s0: float, s1: float, d0: float, d1: float, low: float, top: float
-    ) -> list[float]:
+    def box(self, s0: float, s1: float, d0: float, d1: float, low: float, top: float) -> _Row:
         """A box between these, its heights counted from the ground under its middle."""
         x, y, z = self.place(0.5 * (s0 + s1), 0.5 * (d0 + d1))
         half = [0.5 * (s1 - s0), 0.5 * (d1 - d0), 0.5 * (top - low)]
         return [x, y, z + 0.5 * (low + top), *half, self._yaw]
 
-    def bay(
-        self, s: float, end: float, setback: float, out: float, top: float, kind: int
-    ) -> list[float]:
+    def bay(self, s: float, end: float, setback: float, out: float, top: float, kind: int) -> _Row:
         """A pilaster, a porch or a bay window before a house."""
         low, high = ((-DEEP, top), (-DEEP, 2.6), (1.0, 4.5))[kind]
         return self.box(s, end, setback - out, setback, low, high)
@@ -108,14 +99,9 @@ class Street:
 
     def solids(self, ground: Ground) -> Solids:
         """All of them on the ground; only the crowns are foliage."""
-        count = len(self.crowns)
-        return Solids(
-            np.array(self.boxes),
-            np.array(self.cylinders),
-            np.array(self.crowns + self.stones),
-            np.arange(count + len(self.stones)) < count,
-            ground,
-        )
+        round_ones = np.array(self.crowns + self.stones)
+        foliage = np.arange(len(round_ones)) < len(self.crowns)
+        return Solids(np.array(self.boxes), np.array(self.cylinders), round_ones, foliage, ground)
 
     def add_post(self, at: tuple[float, float, float], radius: float, height: float) -> None:
         """A lamp post or a trunk."""
@@ -125,10 +111,7 @@ class Street:
     def add_houses(
         self, rng: np.random.Generator, kerb: Kerb, begins_inside: bool, ends_inside: bool
     ) -> None:
-        """Houses of different width, setback and height, with pilasters, porches and bay windows.
-
-        They stand from corner to corner, of which the kerb is on the inside or the outside.
-        """
+        """Houses of all sizes between two corners, inside or outside of which the kerb runs."""
         s = 15.0 if begins_inside else -14.0
         end = kerb.length - (15.0 if ends_inside else -14.0)
         while s < end - 6.0:
@@ -160,9 +143,7 @@ class Street:
 
 
 def build_street_loop(seed: int) -> Scene:
-    """Four streets round a city block (about 600 m): facades with bays, doors and gaps, parked
-    cars, lamp posts and trees on gently rolling ground. Driven at 10 m/s, slower in the bends.
-    """
+    """Four streets round a city block (about 600 m), driven at 10 m/s, slower in the bends."""
     rng = np.random.default_rng([seed, 0, 2])
     half_x, half_y = 105.0, 55.0
     ground, street = street_ground(rng), Street()
@@ -183,17 +164,14 @@ def build_street_loop(seed: int) -> Scene:
 def build_slopes(seed: int) -> Scene:
     """A winding road over a hill and through a dip 16 m below it, at grades up to 12 %.
 
-    Houses line its first half, trees and rocks the second. It starts on the slope, so that a map
-    in the frame of the first pose is tilted by 5 degrees.
+    It starts on the slope: a map in the frame of the first pose is tilted by 5 degrees.
     """
     rng = np.random.default_rng([seed, 0, 5])
     # The third harmonic makes the grade more even, and so the climb longer at the same grade.
     number, amplitude, phase = 2.0 * np.pi / _HILL, 7.2, -0.25 * np.pi
     waves = [[amplitude, number, 0.0, phase], [-amplitude / 9.0, 3.0 * number, 0.0, 3.0 * phase]]
     ground = Ground(np.vstack([waves, rolling_ground(rng, (0.25, 0.08), (130.0, 60.0)).waves]))
-    bends = np.array(
-        [[0, 0], [80, 14], [175, -6], [265, 16], [350, 0], [400, -4]], dtype=np.float64
-    )
+    bends = np.array([[0.0, 0], [80, 14], [175, -6], [265, 16], [350, 0], [400, -4]])
     legs = [(Kerb(a, b, left, ground), left) for a, b in pairwise(bends) for left in (True, False)]
     street = Street()
     for kerb, inside in legs[:4]:
@@ -222,17 +200,8 @@ def build_slopes(seed: int) -> Scene:
 def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
     """Streets of a town, each at right angles to the one before, two of three metres to the east.
 
-    No street is met twice. A longer way begins with the same streets.
-
-    Parameters
-    ----------
-    seed : of streets and houses
-    metres : length of the way, 100 or more
-
-    Raises
-    ------
-    ConfigError
-        If the way is too short for a start and an end.
+    No street is met twice; a way of more ``metres`` begins with the same streets. ConfigError if it
+    is shorter than 100 m.
     """
     if not _SHORTEST <= metres < np.inf:
         raise ConfigError(f"metres: expected at least {_SHORTEST:g}, got {metres!r}")
@@ -252,19 +221,9 @@ def build_avenue(seed: int, metres: float = 1000.0) -> Scene:
 
 
 def build_city(way: FloatArray, seed: int = 0) -> Scene:
-    """Houses, parked cars, lamp posts and trees on both sides of a way.
+    """Houses, parked cars, lamp posts and trees on both sides of a way, and nothing on it.
 
-    Nothing stands on the way, nor twice where it passes more than once.
-
-    Parameters
-    ----------
-    way : (N, 2) x y of the path, metres, in the order in which it is driven
-    seed : of the place
-
-    Raises
-    ------
-    InputError
-        If there are no two points 100 m apart along the way.
+    ``way`` is (N, 2) x y of the path, metres, as it is driven; InputError if below 100 m.
     """
     way = as_array(way, "way", ("N", 2))
     distances = distances_along(way)
@@ -302,7 +261,7 @@ class _Roadside(Street):
         size = [self._between(*r) for r in ((8.0, 13.0), (8.0, 12.5), (5.0, 16.0))]
         chance = float(self._rng.random())
         middle = 0.5 * kerb.length
-        self._add_house(kerb, middle, *size)
+        self._add_house(kerb, *size)
         x, y, z = at = kerb.place(middle, self._between(5.8, 7.0))
         if chance < 0.5 and self._is_free([x, y, 0.0, 0.3, 0.3, 1.0, 0.0], _KERB):
             self.add_post(at, self._between(0.1, 0.22), 5.0)
@@ -313,10 +272,8 @@ class _Roadside(Street):
         if 0.3 < chance < 0.6 and self._is_free(car, _KERB):
             self.boxes.append(car)
 
-    def _add_house(
-        self, kerb: Kerb, middle: float, width: float, setback: float, top: float
-    ) -> None:
-        half = 0.5 * width
+    def _add_house(self, kerb: Kerb, width: float, setback: float, top: float) -> None:
+        middle, half = 0.5 * kerb.length, 0.5 * width
         house = kerb.box(middle - half, middle + half, setback, setback + 10.0, -DEEP, top)
         place = np.array(house[:2])
         near = [np.linalg.norm(other - place) for other in self._houses]
@@ -330,7 +287,6 @@ class _Roadside(Street):
             self.boxes.append(kerb.bay(middle + at, end, setback, out, top, kind))
 
     def _is_free(self, box: list[float], margin: float) -> bool:
-        """Whether a box keeps away from the way."""
         x, y, _, half_x, half_y, _, yaw = box
         u, v = np.meshgrid(np.linspace(-half_x, half_x, 7), np.linspace(-half_y, half_y, 7))
         cosine, sine = np.cos(yaw), np.sin(yaw)
@@ -391,8 +347,7 @@ def rolling_ground(
 def distances_along(way: FloatArray) -> FloatArray:
     """(N,) metres from the first of (N, 2) points to each, along straight lines between them."""
     steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    distances: FloatArray = np.concatenate([[0.0], np.cumsum(steps)])
-    return distances
+    return np.concatenate([[0.0], np.cumsum(steps)])
 
 
 def points_along(way: FloatArray, metres: FloatArray) -> FloatArray:
@@ -417,5 +372,4 @@ def _rounded_rectangle(half_x: float, half_y: float, radius: float, wander: floa
     swing = wander * np.sin(2.0 * np.pi * 7.0 * step / length)
     tangent = np.roll(way, -1, axis=0) - np.roll(way, 1, axis=0)
     tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    shifted: FloatArray = way + swing[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1)
-    return shifted
+    return np.asarray(way + swing[:, None] * np.stack([-tangent[:, 1], tangent[:, 0]], axis=1))

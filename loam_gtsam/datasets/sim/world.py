@@ -1,8 +1,6 @@
 """A built-in world with exact truth: several places, a spinning lidar that moves, an IMU.
 
-Every beam is cast from the sensor's exact pose at its own time, so the sweeps carry real motion
-distortion and :attr:`SimulatedWorld.truth` has no error. Sweeps are independent of each other:
-``world[i]`` is the same whether or not the sweeps before it were made.
+Every beam is cast from the exact pose at its own time: sweeps carry real motion distortion.
 """
 
 from __future__ import annotations
@@ -44,8 +42,6 @@ __all__ = [
 ]
 
 SCENES: tuple[str, ...] = tuple(BUILDERS)
-"""Names of the built-in places."""
-
 SENSORS: dict[str, tuple[FloatArray, int]] = {
     "vlp16": (np.linspace(-15.0, 15.0, 16), 1800),
     "hdl32": (np.linspace(-30.67, 10.67, 32), 1800),
@@ -62,12 +58,9 @@ _EPOCH = 1_700_000_000_000_000_000
 """Nanoseconds of the first sweep: as large as real stamps are, which floats cannot hold."""
 _SPIN = {"rings": "field", "times": "field", "spin": "clockwise", "start_azimuth_deg": 180.0}
 """Settings that all sensors have in common."""
-_MIN_RANGE = 0.5
-"""Metres."""
-_IMU_PERIOD = 5_000_000
-"""Nanoseconds: 200 Hz."""
-_IMU_MARGIN = 200_000_000
-"""Nanoseconds of IMU data before the first and after the last sweep."""
+_MIN_RANGE = 0.5  # metres
+_IMU_PERIOD = 5_000_000  # nanoseconds: 200 Hz
+_IMU_MARGIN = 200_000_000  # nanoseconds of IMU data before the first and after the last sweep
 
 
 class SimulatedWorld:
@@ -98,8 +91,6 @@ class SimulatedWorld:
 
     Attributes
     ----------
-    name : scene and sensor
-    sensor : what the layout implies for ``SensorConfig``
     scene : the place
     world_T_start : (4, 4) pose of the first sweep in the gravity-aligned world (z up)
 
@@ -150,17 +141,14 @@ class SimulatedWorld:
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
-        for label, value, limit in (
-            ("range_noise", range_noise, 0.0),
-            ("foliage_noise", foliage_noise, 0.0),
-            ("imu_noise", imu_noise, 0.0),
-            ("gyro_noise", gyro_noise, 0.0),
-            ("acceleration_noise", acceleration_noise, 0.0),
-            ("rate", rate, 0.1),
-            ("speed", speed, 0.01),
-            ("max_range", max_range, _MIN_RANGE),
-        ):
-            _at_least(label, value, limit)
+        _at_least("range_noise", range_noise, 0.0)
+        _at_least("foliage_noise", foliage_noise, 0.0)
+        _at_least("imu_noise", imu_noise, 0.0)
+        _at_least("gyro_noise", gyro_noise, 0.0)
+        _at_least("acceleration_noise", acceleration_noise, 0.0)
+        _at_least("rate", rate, 0.1)
+        _at_least("speed", speed, 0.01)
+        _at_least("max_range", max_range, _MIN_RANGE)
         if not 0.0 <= dropout < 1.0:
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
         self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
@@ -186,7 +174,7 @@ class SimulatedWorld:
         return self.sweep(i + self._frames if i < 0 else i)
 
     def sweep(self, i: int) -> Scan:
-        """Sweep ``i``, independent of all others, so that several processes can share the work."""
+        """Sweep ``i``, the same whether or not others were made: processes can share the work."""
         if not 0 <= i < self._frames:
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
         stamp = self._stamp(i)
@@ -201,13 +189,9 @@ class SimulatedWorld:
         seen = np.isfinite(ranges) & ~lost & (ranges > _MIN_RANGE)
         column, ring = np.nonzero(seen)
         points = (self._beams[:, seen] * ranges[seen]).T
-        return Scan(
-            points=np.ascontiguousarray(points, dtype=np.float32),
-            stamp=stamp,
-            times=self._times[column],
-            rings=ring.astype(np.int32),
-            span=(0.0, 1.0 / self._rate),
-        )
+        points = np.ascontiguousarray(points, dtype=np.float32)
+        times, rings = self._times[column], ring.astype(np.int32)
+        return Scan(points, stamp, times=times, rings=rings, span=(0.0, 1.0 / self._rate))
 
     def seen_from(self, lidar_T_moved: FloatArray) -> SimulatedWorld:
         """The same drive of a lidar at another place (4, 4); poses count from this one's start."""
@@ -230,11 +214,9 @@ class SimulatedWorld:
         stamps = as_stamps(stamps, "stamps")
         end = _EPOCH + int(self._motion.duration * 1e9) + _IMU_MARGIN
         if not self.scene.closed and np.any(stamps > end):
-            raise InputError(
-                f"stamps: the path of {self.scene.name!r} ends at {end}, got {stamps.max()}"
-            )
-        world_T_lidar = self._motion.world_T_lidar(_seconds(stamps))
-        poses = inverse_pose(self.world_T_start) @ world_T_lidar
+            name = self.scene.name
+            raise InputError(f"stamps: the path of {name!r} ends at {end}, got {stamps.max()}")
+        poses = inverse_pose(self.world_T_start) @ self._motion.world_T_lidar(_seconds(stamps))
         if len(stamps) and stamps[0] == _EPOCH:
             poses[0] = np.eye(4)  # not only up to rounding
         return Trajectory(stamps=stamps, map_T_lidar=poses)
@@ -276,7 +258,6 @@ class SimulatedWorld:
         return _EPOCH + round(i * 1e9 / self._rate)
 
     def _count(self, frames: int | None) -> int:
-        """Number of sweeps, checked against the end of an open path."""
         available = math.floor(self._motion.duration * self._rate)
         # A closed path is driven a little past its start, for the loop to be seen to close.
         once = available + self.scene.closed * round(2.0 * self._rate)
@@ -297,7 +278,7 @@ def _beam_directions(turns: FloatArray, elevations_deg: FloatArray) -> FloatArra
 
 
 def _seconds(stamps: IntArray) -> FloatArray:
-    """Seconds since the first sweep; the difference is taken in integers."""
+    """Since the first sweep; the difference is taken in integers."""
     return (stamps - _EPOCH).astype(np.float64) * 1e-9
 
 

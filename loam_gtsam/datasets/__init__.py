@@ -74,8 +74,7 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
 
     Parameters
     ----------
-    path : a folder with ``.bin`` sweeps, a ROS 1 or ROS 2 bag, an MCAP file, a sequence of a known
-        data set, or the name of a built-in world (``sim:room?frames=50&seed=3``)
+    path : sweeps in a folder, a bag or a known data set, or ``sim:room?frames=50&seed=3``
     options : for the loader, e.g. ``topic`` (bags), ``axes`` (LOAM's topics), ``sequence`` (Newer
         College). Those that are None count as not given.
 

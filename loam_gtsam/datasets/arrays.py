@@ -55,8 +55,7 @@ class ArrayDataset:
         self.name, self.imu, self.truth = name, imu, truth
         self.sensor: Mapping[str, Any] = dict(sensor or {})
         self._scans: list[Scan] = []
-        ready = [entry for entry in entries if isinstance(entry, Scan)]
-        if ready:
+        if ready := [entry for entry in entries if isinstance(entry, Scan)]:
             columns = (stamps, stamps_s, times, rings)
             if len(ready) != len(entries) or any(column is not None for column in columns):
                 raise InputError(
@@ -103,22 +102,17 @@ class ArrayDataset:
 
 def _stamps(stamps: Any, stamps_s: Any) -> IntArray:
     if (stamps is None) == (stamps_s is None):
-        raise InputError(
-            "give the stamps of the sweeps once: stamps (integer nanoseconds) or stamps_s "
-            "(float seconds)"
-        )
+        kinds = "stamps (integer nanoseconds) or stamps_s (float seconds)"
+        raise InputError(f"give the stamps of the sweeps once: {kinds}")
     if stamps is not None:
         values = as_stamps(stamps, "stamps")
         step = float(np.median(np.diff(values))) if len(values) > 2 else 0.0
         if 0.0 < step < _SHORTEST:
-            raise InputError(
-                f"stamps: the sweeps are {step:g} ns apart; expected nanoseconds, stamps_s takes "
-                "seconds"
-            )
+            apart = f"the sweeps are {step:g} ns apart"
+            raise InputError(f"stamps: {apart}; expected nanoseconds, stamps_s takes seconds")
         return values
     seconds = as_array(stamps_s, "stamps_s", ("N",))
     # Whole and fractional seconds apart: their product with 1e9 would lose the last digits.
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)
-    nanoseconds: IntArray = whole.astype(np.int64) * 10**9 + fraction.astype(np.int64)
-    return nanoseconds
+    return np.asarray(whole.astype(np.int64) * 10**9 + fraction.astype(np.int64))

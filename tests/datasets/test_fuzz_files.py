@@ -223,9 +223,8 @@ def read_pcd_points(content: bytes) -> int:
     with folder() as place:
         (place / "a.pcd").write_bytes(content)
         try:
-            return len(
-                decode_pointcloud2(read_pcd(place / "a.pcd", START), time_field="none").points
-            )
+            cloud_of = read_pcd(place / "a.pcd", START)
+            return len(decode_pointcloud2(cloud_of, time_field="none").points)
         except LoamError:
             return -1
 

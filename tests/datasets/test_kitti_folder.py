@@ -118,8 +118,7 @@ def test_raised_elevation() -> None:
     raised = raise_elevation(points, float(angle))
 
     def elevation(p: np.ndarray) -> np.ndarray:
-        result: np.ndarray = np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1]))
-        return result
+        return np.asarray(np.arctan2(p[:, 2], np.hypot(p[:, 0], p[:, 1])))
 
     np.testing.assert_allclose(np.linalg.norm(raised, axis=1), np.linalg.norm(points, axis=1))
     np.testing.assert_allclose((elevation(raised) - elevation(points))[1:], angle, atol=1e-12)
@@ -170,17 +169,3 @@ def test_bad_files_next_to_the_sweeps(tmp_path: Path, name: str, text: str, matc
     (folder / name).write_text(text)
     with pytest.raises(DatasetError, match=match):
         KittiDataset(folder).info()
-
-
-def test_shared_folders(shared_data: Path) -> None:
-    town = open_dataset(shared_data / "sim_town")
-    assert len(town) == 60
-    assert len(town.truth) == 60
-    assert len(town.imu.stamps) == 1220
-    ouster = open_dataset(shared_data / "ouster_os1_128")
-    for sweep in ouster:
-        assert sweep.times.min() == 0.0
-        assert 0.09 < sweep.times.max() < 0.1
-    kitti = open_dataset(shared_data / "kitti_2011_09_26_0002")
-    assert kitti.sensor["spin"] == "clockwise"
-    assert kitti.info().facts["stamps"] == "0.000000 .. 4.020000 s"

@@ -71,10 +71,8 @@ def write_oxts(root: Path, period: int = 10_000_000) -> None:
     for number in range(len(stamps)):
         x, y, z = poses[number, :3, 3]
         values = np.zeros(30)
-        values[0] = np.degrees(
-            2.0 * np.arctan(np.exp(np.log(np.tan(np.radians(90.0 + LATITUDE) / 2)) + y / radius))
-            - np.pi / 2.0
-        )
+        north = np.log(np.tan(np.radians(90.0 + LATITUDE) / 2)) + y / radius
+        values[0] = np.degrees(2.0 * np.arctan(np.exp(north)) - np.pi / 2.0)
         values[1] = LONGITUDE + np.degrees(x / radius)
         values[2] = 112.0 + z
         values[3:6] = angles[number]
@@ -189,8 +187,6 @@ def test_stamps_outside_their_sweep_are_told(tmp_path: Path) -> None:
         open_dataset(root)
 
 
-# -- the odometry benchmark ------------------------------------------------------------------------
-
 CAMERA_T_LIDAR = np.array(
     [
         [4.276802385584e-04, -9.999672484946e-01, -8.084491683471e-03, -1.198459927713e-02],
@@ -211,17 +207,15 @@ def write_odometry(root: Path) -> Path:
         # Freed of the motion: every point as if it had been measured at the stamp.
         own = np.rint(sweep.times * 1e9).astype(np.int64)
         moments, which = np.unique(own, return_inverse=True)
-        poses = np.linalg.inv(truth[number]) @ (
-            write.room(**WORLD).truth_at(stamps[number] + moments).map_T_lidar
-        )
+        then = write.room(**WORLD).truth_at(stamps[number] + moments).map_T_lidar
+        poses = np.linalg.inv(truth[number]) @ then
         moved = np.einsum("nij,nj->ni", poses[which, :3, :3], sweep.points) + poses[which, :3, 3]
         order = np.lexsort((np.arctan2(moved[:, 1], moved[:, 0]), -np.asarray(sweep.rings)))
         values = np.column_stack([moved[order], np.zeros(len(order))]).astype("<f4")
         values.tofile(sequence / "velodyne" / f"{number:06d}.bin")
     first = stamps[0]
-    (sequence / "times.txt").write_text(
-        "".join(f"{(stamp - first) * 1e-9:e}\n" for stamp in stamps)
-    )
+    seconds = "".join(f"{(stamp - first) * 1e-9:e}\n" for stamp in stamps)
+    (sequence / "times.txt").write_text(seconds)
     numbers = " ".join(f"{value:.12e}" for value in CAMERA_T_LIDAR[:3].ravel())
     camera = "7.188560000000e+02 0 6.071928e+02 0 0 7.18856e+02 1.852157e+02 0 0 0 1 0"
     (sequence / "calib.txt").write_text(f"P0: {camera}\nTr: {numbers}\n")
@@ -237,9 +231,8 @@ def test_a_sequence_of_the_odometry_benchmark_is_not_de_skewed_again(tmp_path: P
         dataset = open_dataset(path)
         assert dataset.sensor["times"] == "none"
         expected = write.room(**WORLD).truth_at(write.stamps(**WORLD)).map_T_lidar
-        np.testing.assert_allclose(
-            dataset.truth.map_T_lidar, np.linalg.inv(expected[0]) @ expected, atol=1e-6
-        )
+        expected = np.linalg.inv(expected[0]) @ expected
+        np.testing.assert_allclose(dataset.truth.map_T_lidar, expected, atol=1e-6)
     assert "already freed of the motion" in " ".join(dataset.info().problems)
     write.expect_mapped(dataset, imu=False)
 

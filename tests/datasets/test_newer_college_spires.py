@@ -12,21 +12,12 @@ from scipy.spatial.transform import Rotation
 from support import layout_writers as write
 from support.bags import Recording, cloud, imu, store_of, write_bag
 
-from loam_gtsam.datasets import (
-    BagDataset,
-    NewerCollegeBags,
-    NewerCollegeClouds,
-    OxfordSpiresBags,
-    OxfordSpiresClouds,
-    open_dataset,
-)
+from loam_gtsam import datasets
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import pose_matrix
 from loam_gtsam.types import DatasetError, Scan
 
 WORLD = {"sensor": "os1-64", "columns": 512}
-
-
 CAMERA_T_OS1 = pose_matrix([-0.084, -0.025, 0.050, 0.0, 0.0, 0.924, 0.383])
 BASE_T_OS0 = pose_matrix([0.001, 0.0, 0.091, 0.0, 0.0, 0.0, 1.0])
 BASE_T_QT64 = pose_matrix([0.0, 0.0, 0.124, 0.0, 0.0, 1.0, 0.0])
@@ -82,8 +73,8 @@ def test_newer_college_2020_is_read_over_all_its_bags_and_mapped(tmp_path: Path)
     entries = recording("/os1_cloud_node/points", "/os1_cloud_node/imu", HALF_TURN)
     write_parts(tmp_path / "rosbag", names, entries)
     write_truth(tmp_path / "ground_truth" / "registered_poses.csv", CAMERA_T_OS1)
-    dataset = open_dataset(tmp_path)
-    assert isinstance(dataset, NewerCollegeBags)
+    dataset = datasets.open_dataset(tmp_path)
+    assert isinstance(dataset, datasets.NewerCollegeBags)
     assert [sweep.stamp for sweep in dataset] == write.stamps(**WORLD).tolist()
     assert dataset.imu_topic == "/os1_cloud_node/imu"  # not the one with more messages
     write.expect_truth(dataset, **WORLD)
@@ -103,9 +94,9 @@ def test_one_bag_of_newer_college_is_only_itself_and_finds_its_truth(tmp_path: P
     names = [f"2021-11-30-17-0{i}-49_{i}-park" for i in range(2)]
     write_parts(tmp_path, names, of_2021())
     write_truth(tmp_path / "ground_truth" / "tum_format" / "gt-nc-park.csv", BASE_T_OS0, tum=True)
-    first = open_dataset(tmp_path / f"{names[0]}.bag")
-    assert isinstance(first, NewerCollegeBags)
-    assert 0 < len(first) < len(open_dataset(tmp_path)) == write.COUNT
+    first = datasets.open_dataset(tmp_path / f"{names[0]}.bag")
+    assert isinstance(first, datasets.NewerCollegeBags)
+    assert 0 < len(first) < len(datasets.open_dataset(tmp_path)) == write.COUNT
     write.expect_truth(first, **WORLD)
     assert first.sensor["imu.lidar_R_imu_deg"] == ABOUT((0.0, 0.0, 0.0), abs=1.0)
     # evalio has the lidar in the IMU's axes at 13.801, -12.207, -15.14 mm.
@@ -118,35 +109,35 @@ def test_a_folder_of_several_sequences_asks_which_one(tmp_path: Path) -> None:
     write_parts(tmp_path, ["2021-07-01-10-40-50_0-stairs"], entries)
     write_truth(tmp_path / "gt-nc-quad-easy.csv", BASE_T_OS0)
     with pytest.raises(DatasetError, match=r"several sequences \(quad-easy, stairs\); give seq"):
-        open_dataset(tmp_path)
+        datasets.open_dataset(tmp_path)
     with pytest.raises(DatasetError, match=r"no sequence 'park'; there is quad-easy, stairs"):
-        open_dataset(tmp_path, sequence="park")
-    write.expect_truth(open_dataset(tmp_path, sequence="quad-easy"), **WORLD)
-    assert open_dataset(tmp_path, sequence="stairs").truth is None
+        datasets.open_dataset(tmp_path, sequence="park")
+    write.expect_truth(datasets.open_dataset(tmp_path, sequence="quad-easy"), **WORLD)
+    assert datasets.open_dataset(tmp_path, sequence="stairs").truth is None
     write_parts(tmp_path, ["2022-07-01-10-40-50_0-stairs"], entries)
     with pytest.raises(DatasetError, match=r"are both part 0: several recordings"):
-        open_dataset(tmp_path)
+        datasets.open_dataset(tmp_path)
 
 
 def test_a_maths_sequence_has_its_truth_under_another_name(tmp_path: Path) -> None:
     write_parts(tmp_path, ["2021-04-07-13-55-18-math-medium"], of_2021())
     write_truth(tmp_path / "ground_truth" / "gt_state_medium.csv", BASE_T_OS0)
-    write.expect_truth(open_dataset(tmp_path), **WORLD)
+    write.expect_truth(datasets.open_dataset(tmp_path), **WORLD)
 
 
 def test_another_imu_than_the_rig_s_has_no_known_extrinsics(tmp_path: Path) -> None:
     write_parts(tmp_path, ["2021-07-01-10-40-50_0-stairs"], of_2021())
-    dataset = open_dataset(tmp_path, imu_topic="/camera/imu")
+    dataset = datasets.open_dataset(tmp_path, imu_topic="/camera/imu")
     assert dataset.sensor == {}
     assert "rotation to the lidar is unknown" in " ".join(dataset.info().problems)
 
 
 def test_any_other_bag_stays_any_other_bag(tmp_path: Path) -> None:
     write_parts(tmp_path, ["2021-07-01-10-40-50-katzensee"], of_2021())
-    dataset = open_dataset(tmp_path / "2021-07-01-10-40-50-katzensee.bag")
-    assert type(dataset) is BagDataset
+    dataset = datasets.open_dataset(tmp_path / "2021-07-01-10-40-50-katzensee.bag")
+    assert type(dataset) is datasets.BagDataset
     with pytest.raises(DatasetError, match=r"open one of its bags instead"):
-        open_dataset(tmp_path)
+        datasets.open_dataset(tmp_path)
 
 
 @pytest.mark.parametrize("timed", [False, True])
@@ -161,8 +152,8 @@ def test_newer_college_as_pcd_files(tmp_path: Path, timed: bool) -> None:
             columns = dict(zip("xyz", write.firings(sweep, 64, 1024)[:, :3].T, strict=True))
         write.write_pcd(folder / name, columns)
     write_truth(tmp_path / "ground_truth" / "registered_poses.csv", CAMERA_T_OS1)
-    dataset = open_dataset(tmp_path)
-    assert isinstance(dataset, NewerCollegeClouds)
+    dataset = datasets.open_dataset(tmp_path)
+    assert isinstance(dataset, datasets.NewerCollegeClouds)
     write.expect_truth(dataset, **WORLD)
     scan = next(iter(dataset))
     seen = np.any(scan.points != 0.0, axis=1)
@@ -170,7 +161,7 @@ def test_newer_college_as_pcd_files(tmp_path: Path, timed: bool) -> None:
     assert dataset.imu is None
     assert "the bags have one" in " ".join(dataset.info().problems)
     if not timed:
-        late = NewerCollegeClouds(tmp_path, stamp_is="end")
+        late = datasets.NewerCollegeClouds(tmp_path, stamp_is="end")
         np.testing.assert_allclose(next(iter(late)).times, scan.times - 0.1, atol=1e-9)
         assert late.info().facts["point times"].endswith("firings in 0.1 s, stamp at sweep end")
         write.write_pcd(folder / name, {key: values[:-64] for key, values in columns.items()})
@@ -210,8 +201,8 @@ def spires_R_imu() -> np.ndarray:
 
 
 def test_oxford_spires_as_pcd_files_is_mapped_with_its_imu(tmp_path: Path) -> None:
-    dataset = open_dataset(write_spires_clouds(tmp_path))
-    assert isinstance(dataset, OxfordSpiresClouds)
+    dataset = datasets.open_dataset(write_spires_clouds(tmp_path))
+    assert isinstance(dataset, datasets.OxfordSpiresClouds)
     write.expect_truth(dataset, **WORLD)
     write.expect_sweeps(dataset, write.sweeps(**WORLD))
     assert dataset.sensor["imu.lidar_R_imu_deg"] == ABOUT((0.0, 0.0, -90.0), abs=1.0)
@@ -230,27 +221,24 @@ def test_oxford_spires_as_bags_in_either_layout(tmp_path: Path, kind: str) -> No
             write_bag(root / below / f"1710754066_{part}", kind, cut)
         truth = root / ("processed/trajectory/gt-tum.txt" if below else "gt-tum.txt")
         write_truth(truth, BASE_T_QT64, tum=True)
-        dataset = open_dataset(root)
-        assert isinstance(dataset, OxfordSpiresBags)
+        dataset = datasets.open_dataset(root)
+        assert isinstance(dataset, datasets.OxfordSpiresBags)
         assert [sweep.stamp for sweep in dataset] == write.stamps(**WORLD).tolist()
         assert (dataset.topic, dataset.imu_topic) == topics
         write.expect_truth(dataset, **WORLD)
         assert "absolute" in dataset.info().facts["point times"]
     if kind != "ros1":  # one bag whose own folder holds the reference poses
         alone = write_bag(tmp_path / "alone", kind, entries)
-        assert type(open_dataset(alone)) is BagDataset
+        assert type(datasets.open_dataset(alone)) is datasets.BagDataset
         write_truth(alone / "gt-tum.txt", BASE_T_QT64, tum=True)
-        write.expect_truth(open_dataset(alone), **WORLD)
+        write.expect_truth(datasets.open_dataset(alone), **WORLD)
 
 
 @pytest.mark.parametrize(
     ("broken", "match"),
     [
         (lambda data: data[:2000], r"need \d+ bytes, got \d+; the file is cut off"),
-        (
-            lambda data: data.replace(b"DATA binary", b"DATA binary_compressed"),
-            r"cut off or damaged",
-        ),
+        (lambda data: data.replace(b"binary", b"binary_compressed"), r"cut off or damaged"),
         (lambda data: data.replace(b"DATA binary", b"DATA zip"), r"PCD with DATA zip; expected"),
         (lambda data: data.replace(b"FIELDS x", b"FIELDS"), r"header cannot be understood"),
         (lambda data: b"ply\n" + data[4000:], r"no PCD file: expected a line DATA"),
@@ -262,7 +250,7 @@ def test_a_broken_pcd_file_says_what_is_wrong(tmp_path: Path, broken: Any, match
     root = write_spires_clouds(tmp_path)
     files = sorted((root / "raw" / "lidar-clouds").iterdir())
     files[1].write_bytes(broken(files[1].read_bytes()))
-    first, second, *_ = open_dataset(root)
+    first, second, *_ = datasets.open_dataset(root)
     assert isinstance(first, Scan)
     with pytest.raises(DatasetError, match=match):
         read_pcd(files[1], 0)
@@ -290,9 +278,8 @@ def test_a_compressed_pcd_file_names_the_extra_that_reads_it(
 
 
 def test_an_ascii_pcd_file_is_read_as_the_binary_one(tmp_path: Path) -> None:
-    header = (
-        "FIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\nWIDTH 2\nHEIGHT 1\n"
-    )
+    fields = "FIELDS x y z timestamp\nSIZE 4 4 4 8\nTYPE F F F F\nCOUNT 1 1 1 1\n"
+    header = f"{fields}WIDTH 2\nHEIGHT 1\n"
     file = tmp_path / "a.pcd"
     file.write_text(header + "POINTS 2\nDATA ascii\n1 2 3 10.25\n-1 0.5 nan 10.5\n")
     cloud_of = read_pcd(file, 5)
@@ -308,11 +295,11 @@ def test_tables_beside_the_sweeps_name_the_line_that_does_not_fit(tmp_path: Path
     lines = file.read_text().splitlines()
     file.write_text("\n".join(["secs,nsecs,ang_vel_x", *lines[1:]]) + "\n")
     with pytest.raises(DatasetError, match=r"imu.csv:1: expected 8 numbers \(secs nsecs acc_x"):
-        _ = open_dataset(root).imu
+        _ = datasets.open_dataset(root).imu
     truth = root / "processed" / "trajectory" / "gt-tum.txt"
     truth.write_text("# nothing\n")
     with pytest.raises(DatasetError, match=r"gt-tum.txt: no poses"):
-        _ = open_dataset(root).truth
+        _ = datasets.open_dataset(root).truth
     (root / "raw" / "lidar-clouds" / "first.pcd").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"first is not SECONDS.NANOSECONDS"):
-        open_dataset(root)
+        datasets.open_dataset(root)

@@ -229,9 +229,8 @@ def test_column_major_range_image_is_turned() -> None:
     scan = decode_pointcloud2(make_message(columns, height=N // 8))
     assert scan.rows == 8
     np.testing.assert_array_equal(scan.points[: N // 8, 0], columns["x"][::8])
-    np.testing.assert_allclose(
-        scan.times.reshape(8, -1), np.tile(np.linspace(0, 0.1, N // 8), (8, 1))
-    )
+    expected = np.tile(np.linspace(0, 0.1, N // 8), (8, 1))
+    np.testing.assert_allclose(scan.times.reshape(8, -1), expected)
 
 
 def test_empty_and_all_nan_clouds() -> None:

@@ -139,10 +139,8 @@ class BagDataset:
                 self._clock_offset = decoded[0].scan.stamp - message.received
             stamps.append(decoded[-1].scan.stamp)
         if not decoded:
-            raise DatasetError(
-                f"{self._path}, topic {self.topic}: no sweep can be decoded: "
-                f"{failure or 'it has no messages'}"
-            )
+            text = f"no sweep can be decoded: {failure or 'it has no messages'}"
+            raise DatasetError(f"{self._path}, topic {self.topic}: {text}")
         # The last one: near time zero an absolute time can still look like an offset.
         self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)
         self._facts = {"topic": self.topic, "sweeps": str(self._count)}

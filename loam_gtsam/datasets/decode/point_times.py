@@ -19,11 +19,8 @@ The ratio is below 1000, so at most one unit fits."""
 ANCHORS: dict[str, float] = {"start": 0.0, "middle": 0.5, "end": 1.0}
 """Share of the sweep before the moment that its stamp is."""
 _NANOSECONDS: dict[str, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
-_CLOCKS = {
-    "offset": "relative to the stamp",
-    "stamp": "absolute",
-    "own": "absolute, in another clock than the stamp",
-}
+_FOREIGN = "absolute, in another clock than the stamp"
+_CLOCKS = {"offset": "relative to the stamp", "stamp": "absolute", "own": _FOREIGN}
 _TRIM = 100  # one value in this many is set aside at either end before the span is measured
 
 
@@ -94,9 +91,8 @@ def decide_times(
 def apply_times(
     values: NDArray[Any], stamp: int, decision: TimeDecision
 ) -> tuple[FloatArray, BoolArray]:
-    """Seconds (N,) from the stamp for each point of a sweep, and (N,) which are outliers.
+    """Seconds (N,) from the stamp, and (N,) which are outliers, whose times are clipped.
 
-    Outliers are not finite or far outside the sweep; their times are clipped to the rest of it.
     DatasetError if the sweep does not lie where ``decision`` says it should.
     """
     if len(values) == 0:

@@ -197,6 +197,7 @@ class _Layout:
     def __init__(self, msg: Any) -> None:
         try:
             self.height, self.width = int(msg.height), int(msg.width)
+            self.size = self.height * self.width
             self.point_step, row_step = int(msg.point_step), int(msg.row_step)
             self.order = ">" if msg.is_bigendian else "<"
             self.fields = {field.name: field for field in msg.fields}
@@ -226,10 +227,6 @@ class _Layout:
                 f"PointCloud2: {self.height} x {self.width} points of {self.point_step} bytes "
                 f"need {needed} bytes of data, got {len(self.data)}; the message is damaged"
             )
-
-    @property
-    def size(self) -> int:
-        return self.height * self.width
 
     def column(self, name: str) -> NDArray[Any]:
         """(height * width,) values of a field, in native byte order."""

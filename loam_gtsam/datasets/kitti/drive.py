@@ -44,10 +44,8 @@ def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntA
         problems.append("no times.txt: 10 Hz assumed")
         return np.arange(len(files), dtype=np.int64) * tables.DEFAULT_PERIOD_NS
     if len(stamps) != len(files):
-        raise DatasetError(
-            f"{path}: {len(stamps)} stamps for {len(files)} sweeps; expected one line for each "
-            ".bin file"
-        )
+        counts = f"{len(stamps)} stamps for {len(files)} sweeps"
+        raise DatasetError(f"{path}: {counts}; expected one line for each .bin file")
     return stamps
 
 
@@ -100,10 +98,8 @@ def read_oxts(root: Path) -> tuple[IntArray, FloatArray] | None:
         return None
     stamps = read_dates(folder / "timestamps.txt")
     if len(stamps) != len(files):
-        raise DatasetError(
-            f"{folder / 'timestamps.txt'}: {len(stamps)} stamps for {len(files)} packets; expected "
-            "one line for each file of oxts/data"
-        )
+        text = f"{folder / 'timestamps.txt'}: {len(stamps)} stamps for {len(files)} packets"
+        raise DatasetError(f"{text}; expected one line for each file of oxts/data")
     values = np.empty((len(files), _OXTS_VALUES))
     for row, file in enumerate(files):
         words = " ".join(tables.read_lines(file)).split()
@@ -133,10 +129,7 @@ def oxts_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSa
 def oxts_truth(
     stamps: IntArray, values: FloatArray, lidar_T_imu: FloatArray, problems: list[str]
 ) -> Trajectory:
-    """Poses of the scanner from positions of the GPS/IMU, in metres from the first one.
-
-    The development kit's Mercator projection, scaled at the first latitude.
-    """
+    """Poses of the scanner, metres from the first: the kit's Mercator at the first latitude."""
     scale = np.cos(np.radians(values[0, _LATITUDE])) * _EARTH_RADIUS
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
     poses[:, :3, :3] = Rotation.from_euler("xyz", values[:, _ANGLES]).as_matrix()
@@ -190,7 +183,6 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
 
 
 def _homogeneous(rows: FloatArray) -> FloatArray:
-    """(4, 4) of the first three rows."""
     return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 

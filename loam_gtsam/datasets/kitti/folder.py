@@ -203,7 +203,7 @@ def _sweep_folder(path: Path) -> Path:
 
 
 def _root_of(folder: Path, given: Path) -> Path:
-    """Folder of ``times.txt`` and the like, also when the sweep folder itself was given."""
+    """Where ``times.txt`` and the like are, also when the sweep folder itself was given."""
     if folder != given:
         return given
     folder = folder.resolve()

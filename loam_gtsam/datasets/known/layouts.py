@@ -33,10 +33,8 @@ def known_loader(path: Path) -> str | None:
         return "OxfordSpiresClouds"
     if spires_truth(path) is not None and spires_bags(path):
         return "OxfordSpiresBags"
-    if any(
-        (path / "LiDAR" / lidar).is_dir() or helipr_truth(path, lidar) is not None
-        for lidar in (*HELIPR_LIDARS, *HELIPR_OTHERS)
-    ):
+    lidars = (*HELIPR_LIDARS, *HELIPR_OTHERS)
+    if any((path / "LiDAR" / lidar).is_dir() or helipr_truth(path, lidar) for lidar in lidars):
         return "HeLiPRDataset"
     return "MulRanDataset" if first_existing(path, MULRAN_FOLDERS) is not None else None
 
@@ -66,10 +64,9 @@ def newer_college_sequences(root: Path) -> Mapping[str, list[Path]]:
                 continue
             parts = found.setdefault(known[0], {})
             if known[1] in parts:
-                raise DatasetError(
-                    f"{folder}: {parts[known[1]].name} and {bag.name} are both part {known[1]}: "
-                    "several recordings; open one bag, or keep each recording in its own folder"
-                )
+                both = f"{parts[known[1]].name} and {bag.name} are both part {known[1]}"
+                hint = "several recordings; open one bag, or keep each recording in its own folder"
+                raise DatasetError(f"{folder}: {both}: {hint}")
             parts[known[1]] = bag
         if found:
             return {name: [parts[n] for n in sorted(parts)] for name, parts in found.items()}

@@ -315,7 +315,7 @@ class SkippedAhead(ChangedDataset):
         return keep, (stamps - after * (self._end - self._begin))[keep]
 
     def info(self) -> DatasetInfo:
-        """Description of the data set, with the cut."""
+        """Of the data set, with the cut."""
         return self._info(cut_out=f"{self._count} sweeps from {self._first}")
 
 

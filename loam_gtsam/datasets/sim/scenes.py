@@ -132,10 +132,8 @@ def build_single_plane(seed: int) -> streets.Scene:
     """A blank facade whose rims and ground no beam reaches: x, z and pitch show in none."""
     del seed
     solids = Solids(boxes=np.array([streets.box(-200.0, 400.0, 8.0, 10.0, 0.0, 130.0)]))
-    sway = (0.02, 0.02, 0.02, 0.02)
-    return _along_x(
-        "single_plane", solids, _WAY[:21], wander=1.0, speed=4.0, height=60.0, sway=sway
-    )
+    rest: dict[str, Any] = {"speed": 4.0, "height": 60.0, "sway": (0.02, 0.02, 0.02, 0.02)}
+    return _along_x("single_plane", solids, _WAY[:21], wander=1.0, **rest)
 
 
 def build_single_pole(seed: int) -> streets.Scene:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.base import DatasetInfo
-from loam_gtsam.datasets.sim.motion import GRAVITY, Motion
+from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.streets import Scene, build_avenue
@@ -30,16 +30,7 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
-__all__ = [
-    "GRAVITY",
-    "SCENES",
-    "SENSORS",
-    "Ground",
-    "Scene",
-    "SimulatedWorld",
-    "Solids",
-    "build_avenue",
-]
+__all__ = ["SCENES", "SENSORS", "Ground", "Scene", "SimulatedWorld", "Solids", "build_avenue"]
 
 SCENES: tuple[str, ...] = tuple(BUILDERS)
 SENSORS: dict[str, tuple[FloatArray, int]] = {
@@ -263,10 +254,9 @@ class SimulatedWorld:
         once = available + self.scene.closed * round(2.0 * self._rate)
         count = frames or self.scene.frames or once
         if not self.scene.closed and count > available:
-            raise ConfigError(
-                f"frames: the path of {self.scene.name!r} ends after {available} sweeps at this "
-                f"speed and rate, got {count}; ask for fewer or lower the speed"
-            )
+            ends = f"ends after {available} sweeps at this speed and rate"
+            text = f"{ends}, got {count}; ask for fewer or lower the speed"
+            raise ConfigError(f"frames: the path of {self.scene.name!r} {text}")
         return count
 
 

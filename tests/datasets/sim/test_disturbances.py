@@ -9,21 +9,17 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.datasets.sim.disturbances import (
-    Disturbance,
-    Disturbed,
-    Kidnapped,
-    MissingSweeps,
-    MovingObjects,
-    Outliers,
-    SectorDropouts,
-    SkippedAhead,
-)
+from loam_gtsam.datasets.sim import disturbances
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.types import BadSweep, ConfigError, Features, FeatureSweep, InputError, Scan
 
 SECOND = 1_000_000_000
-ALL = (Outliers(), SectorDropouts(), MissingSweeps((3,)), MovingObjects(lane=1.2))
+ALL = (
+    disturbances.Outliers(),
+    disturbances.SectorDropouts(),
+    disturbances.MissingSweeps((3,)),
+    disturbances.MovingObjects(lane=1.2),
+)
 
 
 @pytest.fixture(scope="module")
@@ -47,12 +43,9 @@ def same(first: Dataset, second: Dataset) -> bool:
     )
 
 
-# -- one sweep -------------------------------------------------------------------------------------
-
-
 def test_outliers_are_the_share_asked_for_and_stay_on_their_beams():
     scan = around(60.0)
-    found = Outliers(0.2, (1.0, 50.0)).apply(0, scan)
+    found = disturbances.Outliers(0.2, (1.0, 50.0)).apply(0, scan)
     ranges = np.linalg.norm(found.points, axis=1)
     moved = ranges < 59.0
     assert moved.sum() == 720
@@ -65,10 +58,10 @@ def test_outliers_are_the_share_asked_for_and_stay_on_their_beams():
 
 def test_outliers_differ_from_sweep_to_sweep_and_by_seed():
     scan = around(60.0)
-    first = Outliers().apply(0, scan).points
-    assert np.array_equal(first, Outliers().apply(0, scan).points)
-    assert not np.array_equal(first, Outliers().apply(1, scan).points)
-    assert not np.array_equal(first, Outliers(seed=1).apply(0, scan).points)
+    first = disturbances.Outliers().apply(0, scan).points
+    assert np.array_equal(first, disturbances.Outliers().apply(0, scan).points)
+    assert not np.array_equal(first, disturbances.Outliers().apply(1, scan).points)
+    assert not np.array_equal(first, disturbances.Outliers(seed=1).apply(0, scan).points)
 
 
 def test_lost_points_stay_lost():
@@ -82,7 +75,7 @@ def test_lost_points_stay_lost():
 
 @pytest.mark.parametrize("sectors", [1, 3])
 def test_sectors_are_lost_in_one_piece_and_move_with_time(sectors):
-    dropouts = SectorDropouts(0.25, sectors, seconds=0.5)
+    dropouts = disturbances.SectorDropouts(0.25, sectors, seconds=0.5)
 
     def lost(stamp):
         return np.isnan(dropouts.apply(0, around(10.0, stamp=stamp)).points[:, 0])
@@ -95,7 +88,9 @@ def test_sectors_are_lost_in_one_piece_and_move_with_time(sectors):
 
 
 def test_boxes_hide_what_is_behind_them_and_nothing_else():
-    boxes = MovingObjects(length=8.0, spacing=16.0, lane=2.5, speeds=(4.0, -9.0), range_noise=0.0)
+    boxes = disturbances.MovingObjects(
+        length=8.0, spacing=16.0, lane=2.5, speeds=(4.0, -9.0), range_noise=0.0
+    )
     far, near = around(30.0), around(2.4)
     hit = boxes.hits(far)
     assert 0.05 < hit.mean() < 0.95
@@ -115,14 +110,14 @@ def test_boxes_hide_what_is_behind_them_and_nothing_else():
 
 
 def test_boxes_move_on_with_time():
-    boxes = MovingObjects(speeds=(4.0, 4.0))
+    boxes = disturbances.MovingObjects(speeds=(4.0, 4.0))
     start = boxes.hits(around(30.0))
     assert not np.array_equal(start, boxes.hits(around(30.0, stamp=SECOND)))
     assert np.array_equal(start, boxes.hits(around(30.0, stamp=4 * SECOND)))  # one spacing on
 
 
 def test_boxes_are_made_to_hide_a_share(world):
-    boxes = MovingObjects(lane=1.2).covering(0.3, world[4])
+    boxes = disturbances.MovingObjects(lane=1.2).covering(0.3, world[4])
     shares = [
         boxes.hits(Scan(scan.points, scan.stamp + step * SECOND // 10, scan.times)).mean()
         for scan in world
@@ -130,19 +125,19 @@ def test_boxes_are_made_to_hide_a_share(world):
     ]
     assert np.mean(shares) == pytest.approx(0.3, abs=0.03)
     with pytest.raises(ConfigError, match="bring the lane nearer"):
-        MovingObjects(lane=50.0).covering(0.3, world[4])
+        disturbances.MovingObjects(lane=50.0).covering(0.3, world[4])
 
 
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: Outliers(1.1),
-        lambda: SectorDropouts(-0.1),
-        lambda: SectorDropouts(sectors=0),
-        lambda: SectorDropouts(seconds=0.0),
-        lambda: MovingObjects(length=20.0),
-        lambda: MovingObjects(lane=0.0),
-        lambda: MovingObjects().covering(2.0, around(30.0)),
+        lambda: disturbances.Outliers(1.1),
+        lambda: disturbances.SectorDropouts(-0.1),
+        lambda: disturbances.SectorDropouts(sectors=0),
+        lambda: disturbances.SectorDropouts(seconds=0.0),
+        lambda: disturbances.MovingObjects(length=20.0),
+        lambda: disturbances.MovingObjects(lane=0.0),
+        lambda: disturbances.MovingObjects().covering(2.0, around(30.0)),
     ],
 )
 def test_what_makes_no_sense_is_refused(make):
@@ -150,11 +145,8 @@ def test_what_makes_no_sense_is_refused(make):
         make()
 
 
-# -- a data set ------------------------------------------------------------------------------------
-
-
 def test_a_disturbed_data_set_is_a_data_set(world):
-    disturbed = Disturbed(world, ALL)
+    disturbed = disturbances.Disturbed(world, ALL)
     assert isinstance(disturbed, Dataset)
     assert len(disturbed) == len(list(disturbed)) == 7
     assert same(disturbed, disturbed)
@@ -162,27 +154,27 @@ def test_a_disturbed_data_set_is_a_data_set(world):
     assert disturbed.imu is world.imu
     assert disturbed.sensor == world.sensor
     assert "Outliers" in disturbed.info().facts["disturbed by"]
-    assert same(Disturbed(world, [Disturbance()]), world)
-    stamps = [sweep.stamp for sweep in Disturbed(world, [MissingSweeps((1, 5), 2)])]
+    assert same(disturbances.Disturbed(world, [disturbances.Disturbance()]), world)
+    stamps = [
+        sweep.stamp
+        for sweep in disturbances.Disturbed(world, [disturbances.MissingSweeps((1, 5), 2)])
+    ]
     assert stamps == [world[i].stamp for i in (0, 3, 4, 7)]
 
 
 def test_unreadable_sweeps_pass_and_features_are_refused(world):
     bad = BadSweep(1, "torn")
-    assert list(Disturbed(ListDataset([bad]), [Outliers()])) == [bad]
+    assert list(disturbances.Disturbed(ListDataset([bad]), [disturbances.Outliers()])) == [bad]
     nothing = np.zeros((0, 3))
     features = FeatureSweep(Features.from_points(0, nothing, nothing), None)
     with pytest.raises(InputError, match="raw sweeps"):
-        list(Disturbed(ListDataset([features]), [Outliers()]))
+        list(disturbances.Disturbed(ListDataset([features]), [disturbances.Outliers()]))
     with pytest.raises(InputError, match="raw sweeps"):
-        SkippedAhead(ListDataset([features] * 4), 1, 1)
-
-
-# -- a lidar somewhere else ------------------------------------------------------------------------
+        disturbances.SkippedAhead(ListDataset([features] * 4), 1, 1)
 
 
 def test_skipping_ahead_closes_the_gap_in_time(world):
-    cut = SkippedAhead(world, 3, 2)
+    cut = disturbances.SkippedAhead(world, 3, 2)
     assert isinstance(cut, Dataset)
     sweeps = list(cut)
     assert len(cut) == len(sweeps) == 6
@@ -199,7 +191,7 @@ def test_skipping_ahead_closes_the_gap_in_time(world):
 
 def test_skipping_ahead_goes_without_truth_and_imu():
     plain = ArrayDataset([around(5.0, stamp=i) for i in range(5)])
-    cut = SkippedAhead(plain, 1, 1)
+    cut = disturbances.SkippedAhead(plain, 1, 1)
     assert cut.truth is None
     assert cut.imu is None
 
@@ -207,11 +199,13 @@ def test_skipping_ahead_goes_without_truth_and_imu():
 @pytest.mark.parametrize("place", [(0, 1), (3, 0), (3, 5), (8, 1), (0,), (8,)])
 def test_a_cut_and_a_kidnapping_need_sweeps_on_both_sides(world, place):
     with pytest.raises(InputError, match=r"SkippedAhead|Kidnapped"):
-        SkippedAhead(world, *place) if len(place) == 2 else Kidnapped(world, *place)
+        disturbances.SkippedAhead(world, *place) if len(place) == 2 else disturbances.Kidnapped(
+            world, *place
+        )
 
 
 def test_a_kidnapped_lidar_is_where_the_truth_says(world):
-    moved = Kidnapped(world, 4, (0.0, 1.0, 0.0), 30.0)
+    moved = disturbances.Kidnapped(world, 4, (0.0, 1.0, 0.0), 30.0)
     assert isinstance(moved, Dataset)
     assert len(list(moved)) == len(moved) == 8
     assert np.array_equal(moved[3].points, world[3].points)
@@ -228,7 +222,7 @@ def test_a_kidnapped_lidar_is_where_the_truth_says(world):
 def test_a_kidnapped_lidar_sees_the_same_walls():
     """Points of both runs, put where the truths say, lie on the same walls."""
     world = SimulatedWorld("room", frames=8, columns=360, range_noise=0.0)
-    moved = Kidnapped(world, 4, (0.5, 0.5, 0.0), 30.0)
+    moved = disturbances.Kidnapped(world, 4, (0.5, 0.5, 0.0), 30.0)
     for dataset in (world, moved):
         scan = dataset[6]
         early = scan.times < 2e-3  # the truth is that of the start
@@ -240,7 +234,7 @@ def test_a_kidnapped_lidar_sees_the_same_walls():
 
 
 def test_the_imu_of_a_kidnapped_lidar_turns_along(world):
-    imu, calm = Kidnapped(world, 4, (0.0, 0.0, 0.0), 90.0).imu, world.imu
+    imu, calm = disturbances.Kidnapped(world, 4, (0.0, 0.0, 0.0), 90.0).imu, world.imu
     before = imu.stamps < world[4].stamp
     assert np.array_equal(imu.gyro[before], calm.gyro[before])
     # Its noise is the same, so that the turned x is the y of before, up to twice the noise.

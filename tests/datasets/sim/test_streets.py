@@ -67,12 +67,6 @@ def test_a_longer_way_begins_with_the_same_streets() -> None:
     assert not np.array_equal(build_avenue(1, 1000.0).solids.boxes[:same], short.boxes[:same])
 
 
-def test_it_is_a_built_in_scene() -> None:
-    world = SimulatedWorld("avenue", columns=90)
-    assert world.truth.path_length == pytest.approx(1000.0, abs=15.0)
-    np.testing.assert_array_equal(world.scene.solids.boxes, build_avenue(0).solids.boxes)
-
-
 @pytest.mark.parametrize("metres", [99.0, -1.0, float("inf"), float("nan")])
 def test_a_way_without_room_for_start_and_end_is_refused(metres: float) -> None:
     with pytest.raises(ConfigError, match="metres: expected at least 100"):

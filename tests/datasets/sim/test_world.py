@@ -10,31 +10,16 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.datasets.sim.world import (
-    GRAVITY,
-    SCENES,
-    SENSORS,
-    Ground,
-    Scene,
-    SimulatedWorld,
-    Solids,
-)
+from loam_gtsam.datasets.sim.motion import GRAVITY
+from loam_gtsam.datasets.sim.world import SCENES, SENSORS, Ground, Scene, SimulatedWorld, Solids
 from loam_gtsam.types import ConfigError, InputError
 
 EXACT = {"range_noise": 0.0, "dropout": 0.0, "foliage_noise": 0.0}
-NOT_NEGATIVE = (
-    *("seed", "range_noise", "foliage_noise", "imu_noise", "gyro_noise", "acceleration_noise"),
-    *("rate", "speed"),
-)
+NOISES = ("range_noise", "foliage_noise", "imu_noise", "gyro_noise", "acceleration_noise")
+NOT_NEGATIVE = (*NOISES, "seed", "rate", "speed")
 BARE = ("open_field", "single_plane", "single_pole", "sparse_terrain")
-PERFECT_IMU = {
-    "imu_noise": 0.0,
-    "gyro_noise": 0.0,
-    "gyro_bias": (0.0, 0.0, 0.0),
-    "acceleration_noise": 0.0,
-    "acceleration_bias": (0.0, 0.0, 0.0),
-}
+PERFECT_IMU = dict.fromkeys(("imu_noise", "gyro_noise", "acceleration_noise"), 0.0)
+PERFECT_IMU |= dict.fromkeys(("gyro_bias", "acceleration_bias"), (0.0, 0.0, 0.0))
 
 
 def signed_distances(solids: Solids, points: np.ndarray) -> np.ndarray:
@@ -113,14 +98,12 @@ def test_beams_without_a_return_meet_nothing_in_range(scene):
     missing = missing[:: max(1, len(missing) // 40)]
     azimuth = np.pi - 2.0 * np.pi * missing[:, 0] / 200
     elevation = elevations[missing[:, 1]]
-    beams = Rotation.from_euler("ZY", np.stack([azimuth, -elevation], axis=1)).apply(
-        [1.0, 0.0, 0.0]
-    )
+    turned = Rotation.from_euler("ZY", np.stack([azimuth, -elevation], axis=1))
+    beams = turned.apply([1.0, 0.0, 0.0])
     steps = np.arange(0.5, 59.9, 0.2)
     stamps = scan.stamp + np.round(missing[:, 0] / 200 * 1e8).astype(np.int64)
-    on_way = to_world(
-        world, (beams[:, None] * steps[:, None]).reshape(-1, 3), np.repeat(stamps, len(steps))
-    )
+    along = (beams[:, None] * steps[:, None]).reshape(-1, 3)
+    on_way = to_world(world, along, np.repeat(stamps, len(steps)))
     assert signed_distances(world.scene.solids, on_way).min() > 0.0
 
 
@@ -251,9 +234,8 @@ def test_motion_starts_at_rest_and_is_gentle():
         assert np.abs(imu.gyro).max() < (1.5 if scene != "shaken" else 2.5)
         if scene == "shaken":  # fast, about every axis
             assert np.abs(imu.gyro).max(axis=0) == pytest.approx([1.4, 1.4, 2.0], abs=0.5)
-            assert [np.abs(angle).max() for angle in roll_pitch(world)] == pytest.approx(
-                [0.15, 0.15], abs=0.02
-            )
+            largest = [np.abs(angle).max() for angle in roll_pitch(world)]
+            assert largest == pytest.approx([0.15, 0.15], abs=0.02)
 
 
 @pytest.mark.parametrize("seed", [0, 5])
@@ -341,25 +323,10 @@ def test_wrong_arguments_are_named(arguments, message):
         SimulatedWorld(**{"scene": "room", **arguments})
 
 
-def test_it_is_a_dataset_and_says_what_it_is():
-    world = SimulatedWorld("trees", sensor="os1-64", frames=20, columns=256, rate=20.0)
-    assert isinstance(world, Dataset)
-    info = world.info()
-    assert info.facts["scene"] == "trees"
-    assert info.facts["sensor"].startswith("os1-64: 64 beams x 256 columns")
-    assert info.facts["frames"] == "20 at 20 Hz"
-    assert float(info.facts["path"].split()[0]) == pytest.approx(world.truth.path_length, abs=0.06)
-    assert world.sensor["period"] == 0.05
-    assert world[1].stamp - world[0].stamp == 50_000_000
-
-
 def test_a_scene_of_ones_own():
     """A lone ball over a plane: one ring of rays sees it at the distance of its plan."""
-    ball = Solids(
-        ellipsoids=np.array([[5.0, 0.0, 1.0, 1.0, 1.0, 1.0]]),
-        foliage=np.zeros(1, bool),
-        ground=Ground(level=-1.0),
-    )
+    row, floor = np.array([[5.0, 0.0, 1.0, 1.0, 1.0, 1.0]]), Ground(level=-1.0)
+    ball = Solids(ellipsoids=row, foliage=np.zeros(1, bool), ground=floor)
     way = np.array([[x, 0.0] for x in np.arange(0.0, -40.0, -4.0)])
     scene = Scene("ball", ball, way, speed=1.0, height=2.0, sway=(0.0, 0.0, 0.0, 0.0))
     world = SimulatedWorld(scene, frames=5, **EXACT)

@@ -21,6 +21,7 @@ from support.bags import (
 
 from loam_gtsam.datasets import BagDataset, LoamTopicsDataset, open_dataset
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
+from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.types import BadSweep, DatasetError, FeatureSweep
 
 
@@ -212,3 +213,18 @@ def test_loam_topics_missing_or_overruled(tmp_path: Path) -> None:
         LoamTopicsDataset(path)
     whole = write_bag(tmp_path / "all", "ros1", loam_recording())
     assert isinstance(open_dataset(whole, topic="/velodyne_cloud_3"), BagDataset)
+
+
+@pytest.mark.parametrize(("name", "axes"), [("aloam_town", "lidar"), ("loam_town", "loam")])
+def test_recorded_loam_runs(shared_data: Path, name: str, axes: str) -> None:
+    dataset = LoamTopicsDataset(shared_data / name / "topics.bag")
+    assert dataset.axes == axes
+    got = [sweep for sweep in dataset if isinstance(sweep, FeatureSweep)]
+    assert len(got) == 60
+    expected = read_tum(shared_data / name / "odom.tum")
+    poses = np.array([sweep.odom_T_lidar.matrix() for sweep in got])
+    np.testing.assert_allclose(poses, expected.map_T_lidar, atol=2e-9)  # nine decimals there
+    stamps = np.array([sweep.features.stamp for sweep in got])
+    np.testing.assert_array_equal(stamps - stamps[0], expected.stamps)
+    mapped = read_tum(shared_data / name / "mapped.tum")
+    np.testing.assert_allclose(dataset.recorded.map_T_lidar, mapped.map_T_lidar, atol=2e-9)

@@ -91,10 +91,9 @@ class SectorDropouts(Disturbance):
     def __post_init__(self) -> None:
         _check_share(self.share)
         if self.sectors < 1 or not self.seconds > 0.0:
-            raise ConfigError(
-                "SectorDropouts: expected at least one sector and a time above 0 s, got "
-                f"{self.sectors} and {self.seconds!r}"
-            )
+            wanted = "at least one sector and a time above 0 s"
+            got = f"{self.sectors} and {self.seconds!r}"
+            raise ConfigError(f"SectorDropouts: expected {wanted}, got {got}")
 
     def apply(self, number: int, scan: Scan) -> Scan:
         """See :meth:`Disturbance.apply`."""
@@ -173,10 +172,9 @@ class MovingObjects(Disturbance):
 
         low, high = 0.0, self.spacing
         if hidden(high) < share:
-            raise ConfigError(
-                f"MovingObjects: boxes in a row hide {hidden(high):.2f} of this sweep, not "
-                f"{share:g}; bring the lane nearer or make the boxes higher"
-            )
+            hint = "bring the lane nearer or make the boxes higher"
+            row = f"boxes in a row hide {hidden(high):.2f} of this sweep, not {share:g}"
+            raise ConfigError(f"MovingObjects: {row}; {hint}")
         for _ in range(12):  # to a few millimetres
             middle = 0.5 * (low + high)
             low, high = (middle, high) if hidden(middle) < share else (low, middle)

@@ -179,8 +179,7 @@ class SimulatedWorld:
         ranges[soft] += self._foliage * rng.standard_exponential(int(soft.sum()))
         seen = np.isfinite(ranges) & ~lost & (ranges > _MIN_RANGE)
         column, ring = np.nonzero(seen)
-        points = (self._beams[:, seen] * ranges[seen]).T
-        points = np.ascontiguousarray(points, dtype=np.float32)
+        points = np.ascontiguousarray((self._beams[:, seen] * ranges[seen]).T, dtype=np.float32)
         times, rings = self._times[column], ring.astype(np.int32)
         return Scan(points, stamp, times=times, rings=rings, span=(0.0, 1.0 / self._rate))
 

@@ -14,8 +14,7 @@ from loam_gtsam.types import ConfigError, FloatArray, InputError
 def way_of(scene: Scene) -> FloatArray:
     """(N, 2) positions of the sensor in the world, one a sweep."""
     world = SimulatedWorld(scene)
-    positions: FloatArray = (world.world_T_start @ world.truth.map_T_lidar)[:, :2, 3]
-    return positions
+    return (world.world_T_start @ world.truth.map_T_lidar)[:, :2, 3]
 
 
 def distance_to_boxes(scene: Scene, points: FloatArray) -> FloatArray:
@@ -33,9 +32,8 @@ def distance_to_boxes(scene: Scene, points: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("metres", [100.0, 450.0, 3000.0])
 def test_way_is_as_long_as_asked(metres: float) -> None:
     # It is left half a second, five metres, before its end, and corners are cut a little.
-    assert SimulatedWorld(build_avenue(2, metres)).truth.path_length == pytest.approx(
-        metres, abs=15.0
-    )
+    world = SimulatedWorld(build_avenue(2, metres))
+    assert world.truth.path_length == pytest.approx(metres, abs=15.0)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -71,9 +69,6 @@ def test_a_longer_way_begins_with_the_same_streets() -> None:
 def test_a_way_without_room_for_start_and_end_is_refused(metres: float) -> None:
     with pytest.raises(ConfigError, match="metres: expected at least 100"):
         build_avenue(0, metres)
-
-
-# -- a city around a way of one's own ------------------------------------------------------------
 
 
 def eight(laps=1.0, count=200):

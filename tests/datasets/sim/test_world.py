@@ -323,6 +323,13 @@ def test_wrong_arguments_are_named(arguments, message):
         SimulatedWorld(**{"scene": "room", **arguments})
 
 
+def test_the_rate_sets_the_period_and_the_stamps():
+    world = SimulatedWorld("trees", sensor="os1-64", frames=20, columns=256, rate=20.0)
+    assert world.info().facts["frames"] == "20 at 20 Hz"
+    assert world.sensor["period"] == 0.05
+    assert world[1].stamp - world[0].stamp == 50_000_000
+
+
 def test_a_scene_of_ones_own():
     """A lone ball over a plane: one ring of rays sees it at the distance of its plan."""
     row, floor = np.array([[5.0, 0.0, 1.0, 1.0, 1.0, 1.0]]), Ground(level=-1.0)

@@ -16,14 +16,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.geometry import move_points
-from loam_gtsam.types import (
-    FloatArray,
-    FrameStatus,
-    InputError,
-    LoamError,
-    MapUpdate,
-    Trajectory,
-)
+from loam_gtsam.types import FloatArray, FrameStatus, InputError, LoamError, MapUpdate, Trajectory
 
 
 class PeerError(LoamError):

@@ -49,13 +49,7 @@ from loam_gtsam.registration.odometry import make_odometry
 from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.ros.live import LiveMapper, LiveResult
 from loam_gtsam.ros.live_report import OTHER_REASONS, LiveLog
-from loam_gtsam.types import (
-    ConfigError,
-    FrameStatus,
-    InputError,
-    MapUpdate,
-    SweepFault,
-)
+from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, SweepFault
 
 FRAMES = 12
 

@@ -166,8 +166,7 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     tables = [_table(info.kind, rows), *([_table("First usable sweep", facts)] if facts else [])]
     notes = [Text(f"problem: {problem}", style="yellow") for problem in problems]
     verdict = "can be run" if facts else "cannot be run: no usable sweep among the first few"
-    end = Text(verdict, style="green" if facts else "red")
-    return Group(*tables, *notes, end), bool(facts)
+    return Group(*tables, *notes, Text(verdict, style="green" if facts else "red")), bool(facts)
 
 
 def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:

@@ -32,7 +32,9 @@ class BagWriter(ClosingWriter):
     """Writes a run into a new bag while the run goes on.
 
     Until it is closed the bag is called ``PATH.active``, as ``rosbag record`` has it. Leaving the
-    block closes the bag, after an error or Ctrl-C too: it then holds all frames until there.
+    block closes the bag, after an error or Ctrl-C too: it then holds all frames until there. Raises
+    OutputError if the name fits none of these, or there is such a bag already, or it cannot be
+    written; ConfigError if the names of the frames are empty or equal.
 
     Parameters
     ----------
@@ -44,13 +46,6 @@ class BagWriter(ClosingWriter):
     Attributes
     ----------
     frames : number of frames written so far
-
-    Raises
-    ------
-    OutputError
-        If the name fits none of these, or there is such a bag already, or it cannot be written.
-    ConfigError
-        If the names of the frames are empty or equal.
     """
 
     def __init__(
@@ -80,19 +75,14 @@ class BagWriter(ClosingWriter):
     ) -> None:
         """Append one frame; one with a bad stamp is left out, as in trajectories.
 
+        Raises OutputError if the bag is closed or cannot be written (a full disk), or a message
+        cannot say the stamp; InputError if a cloud is not (N, 4).
+
         Parameters
         ----------
         update : of the frame
         cloud : de-skewed points of the sweep, in the map frame
         surround : gives the map points around the sensor; called when they are due
-
-        Raises
-        ------
-        OutputError
-            If the bag is closed or cannot be written (a full disk), or a message cannot say the
-            stamp.
-        InputError
-            If a cloud is not (N, 4).
         """
         if self._writer is None:
             raise OutputError(f"{self.path}: the bag is closed; nothing can be added to it")
@@ -110,12 +100,8 @@ class BagWriter(ClosingWriter):
     def close(self) -> None:
         """Write the whole path and the index, and give the bag its name.
 
-        Without a frame there is no bag. Calling it again does nothing.
-
-        Raises
-        ------
-        OutputError
-            If that fails; ``PATH.active`` then holds what could be written.
+        Without a frame there is no bag. Calling it again does nothing. Raises OutputError if that
+        fails; ``PATH.active`` then holds what could be written.
         """
         if self._writer is None:
             return

@@ -67,6 +67,8 @@ class LiveMapper:
     :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
 
     Memory grows with the map and the keyframes of the loops only, not with the time of the run.
+    Raises ConfigError if features come without one of LOAM's three topics, or with an IMU, or
+    ``axes`` is unknown.
 
     Parameters
     ----------
@@ -83,11 +85,6 @@ class LiveMapper:
     ----------
     pipeline : maps the sweeps; not to be touched while ``step`` runs, and another one after
         :meth:`reset`
-
-    Raises
-    ------
-    ConfigError
-        If features come without one of LOAM's three topics, or with an IMU, or ``axes`` is unknown.
     """
 
     def __init__(
@@ -132,12 +129,8 @@ class LiveMapper:
     def add_cloud(self, message: Any, received: int | None = None) -> None:
         """Queue a ``sensor_msgs/PointCloud2``; whatever is wrong with it is found when it is due.
 
-        ``received`` is in nanoseconds of the clock; None is now.
-
-        Raises
-        ------
-        InputError
-            If this run is one of LOAM's topics.
+        ``received`` is in nanoseconds of the clock; None is now. Raises InputError if this run is
+        one of LOAM's topics.
         """
         if self._features:
             raise InputError("add_cloud: this run expects LOAM's topics, see add_features")
@@ -149,10 +142,7 @@ class LiveMapper:
     def add_features(self, topic: str, message: Any, received: int | None = None) -> None:
         """Take a message of LOAM's front end; those whose stamps agree to 5 ms make a sweep.
 
-        Raises
-        ------
-        InputError
-            If it is none of this run's topics.
+        Raises InputError if it is none of this run's topics.
         """
         if topic not in self._features:
             raise InputError(

@@ -74,12 +74,8 @@ class SweepDecoder:
     def decode(self, received: int, content: Any) -> ReadySweep:
         """The sweep of a cloud, or of a group of LOAM's messages by topic.
 
-        A message that cannot be decoded becomes a bad sweep.
-
-        Raises
-        ------
-        DatasetError
-            If there is not even a stamp for a bad one: no cloud has been good yet.
+        A message that cannot be decoded becomes a bad sweep. Raises DatasetError if there is not
+        even a stamp for a bad one: no cloud has been good yet.
         """
         is_group = isinstance(content, dict)
         try:

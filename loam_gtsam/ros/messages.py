@@ -77,7 +77,8 @@ def ros_covariance(covariance: FloatArray, map_T_lidar: gtsam.Pose3) -> FloatArr
 class FrameMessages:
     """Serialised messages of one frame after the other.
 
-    The poses of all frames are kept, for the path: 14 MB in an hour at 10 Hz.
+    The poses of all frames are kept, for the path: 14 MB in an hour at 10 Hz. Raises ConfigError if
+    the names of the frames are empty or equal.
 
     Parameters
     ----------
@@ -87,11 +88,6 @@ class FrameMessages:
     Attributes
     ----------
     store : the types, as rosbags has them
-
-    Raises
-    ------
-    ConfigError
-        If the names of the frames are empty or equal.
     """
 
     def __init__(self, config: BagConfig, *, ros1: bool = False) -> None:
@@ -119,14 +115,8 @@ class FrameMessages:
 
         A frame with a bad stamp has none. One whose messages are not all asked for does not count.
         ``cloud`` and ``surround`` give the points that ``BagWriter.write`` takes; each is called
-        when its message is due.
-
-        Raises
-        ------
-        OutputError
-            If a message cannot say the stamp.
-        InputError
-            If a cloud is not (N, 4).
+        when its message is due. Raises OutputError if a message cannot say the stamp; InputError if
+        a cloud is not (N, 4).
         """
         if not update.status.has_pose:
             return
@@ -189,13 +179,12 @@ class FrameMessages:
         rows = np.ascontiguousarray(points_map, dtype="<f4")
         step = rows.itemsize * len(_FIELDS)
         field = partial(self._make, "sensor_msgs/msg/PointField", datatype=_FLOAT32, count=1)
-        fields = [field(name=n, offset=i * rows.itemsize) for i, n in enumerate(_FIELDS)]
         return self._serialised(
             REGISTERED,
             header=self._header(stamp),
             height=1,
             width=len(rows),
-            fields=fields,
+            fields=[field(name=n, offset=i * rows.itemsize) for i, n in enumerate(_FIELDS)],
             is_bigendian=False,
             point_step=step,
             row_step=step * len(rows),

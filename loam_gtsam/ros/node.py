@@ -56,6 +56,8 @@ _log = logging.getLogger(__name__)
 class LiveNode:
     """A live run between the subscriptions and publishers of a ROS 2 node.
 
+    Raises LoamError if a parameter is wrong, or the output folder cannot be made.
+
     Parameters
     ----------
     node : an ``rclpy.node.Node``; the constructor declares its parameters, subscribes, advertises
@@ -64,11 +66,6 @@ class LiveNode:
     Attributes
     ----------
     live : maps the sweeps
-
-    Raises
-    ------
-    LoamError
-        If a parameter is wrong, or the output folder cannot be made.
     """
 
     def __init__(self, node: Any, on_error: Callable[[], object] = lambda: None) -> None:

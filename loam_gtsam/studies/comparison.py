@@ -118,6 +118,9 @@ def compare_solvers(
 ) -> Comparison:
     """Run several solvers on one data set.
 
+    Raises InputError if there is no contender, two have the same name, or two peers cannot run side
+    by side; PeerError if a peer is not installed; DatasetError if the data set cannot be read.
+
     Parameters
     ----------
     contenders : the first one is the reference where there is no truth
@@ -127,15 +130,6 @@ def compare_solvers(
     on_frame : called with the number of each sweep and the first contender's result; a
         KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far, as
         it has after an error later than the first sweep
-
-    Raises
-    ------
-    InputError
-        If there is no contender, two have the same name, or two peers cannot run side by side.
-    PeerError
-        If a peer is not installed.
-    DatasetError
-        If the data set cannot be read.
     """
     _check_names(contenders)
     runners, first, notes = _make_runners(contenders, dataset, shared_guess)

@@ -59,10 +59,7 @@ def solver_names() -> tuple[str, ...]:
 def find_contender(name: str) -> Contender:
     """The contender called ``name``; a name that ends in .yaml or .yml is a configuration file.
 
-    Raises
-    ------
-    ConfigError
-        If no solver has this name, or the configuration file does not fit.
+    Raises ConfigError if no solver has this name, or the configuration file does not fit.
     """
     if name in PEERS:
         return Contender(name)
@@ -138,10 +135,7 @@ def extract_for_all(sweep: Sweep, config: Config) -> Extraction | None:
 def timed_points(scan: Scan, config: Config) -> TimedPoints:
     """The points and times of a sweep that features are extracted from, as a peer takes them.
 
-    Raises
-    ------
-    SweepError
-        If the sweep has too few points, or their times cannot be known.
+    Raises SweepError if the sweep has too few points, or their times cannot be known.
     """
     columns = usable_columns(scan, config)
     timing = assign_times(columns, assign_rings(columns, config.sensor), config)

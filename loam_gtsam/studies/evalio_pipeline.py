@@ -51,8 +51,6 @@ _LONGEST_QUEUE = 2
 class LoamGtsam(EvalioPipeline):
     """LOAM's scan-to-map estimator as a GTSAM factor graph.
 
-    Notes
-    -----
     evalio may hand a sweep out before the IMU samples of the same time. A sweep therefore waits for
     the first sample after its end, but no longer than until two more sweeps have come. evalio does
     not tell a pipeline that a sequence is over: the last two sweeps may stay without a pose.

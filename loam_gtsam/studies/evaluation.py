@@ -47,16 +47,14 @@ def align_positions(
 ) -> FloatArray:
     """Rigid transform ``reference_T_estimate`` (4, 4) that best maps positions to a reference.
 
+    See Umeyama, Least-squares estimation of transformation parameters, PAMI 13(4), 1991; no scale.
+
     Parameters
     ----------
     estimate, reference : (N, 3) metres
     rotation : (3, 3) decides what the positions leave open, the roll if they lie on a line or the
         whole rotation if they do not move; :func:`align_rotations` gives a good one; identity if
         None
-
-    References
-    ----------
-    Umeyama, Least-squares estimation of transformation parameters, PAMI 13(4), 1991; no scale.
     """
     mean_e, mean_r = estimate.mean(axis=0), reference.mean(axis=0)
     moments = (reference - mean_r).T @ (estimate - mean_e)
@@ -73,9 +71,7 @@ def align_positions(
 def align_rotations(estimate: FloatArray, reference: FloatArray) -> FloatArray:
     """Rotation ``reference_R_estimate`` (3, 3) that best maps orientations to a reference.
 
-    References
-    ----------
-    Hartley, Trumpf, Dai and Li, Rotation averaging, IJCV 103, 2013 (the chordal L2 mean).
+    See Hartley, Trumpf, Dai and Li, Rotation averaging, IJCV 103, 2013 (the chordal L2 mean).
     """
     return _nearest_rotation(np.einsum("nij,nkj->ik", reference, estimate))
 
@@ -89,10 +85,8 @@ def _nearest_rotation(matrix: FloatArray) -> FloatArray:
 def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
     """Poses of a trajectory at other times: linear in position, spherical linear in orientation.
 
-    Raises
-    ------
-    InputError
-        If a stamp lies outside the trajectory, or the trajectory's own stamps do not increase.
+    Raises InputError if a stamp lies outside the trajectory, or the trajectory's own stamps do not
+    increase.
     """
     _check_stamps("interpolate", trajectory)
     if len(stamps) and (
@@ -116,16 +110,14 @@ def absolute_error(
 ) -> AbsoluteError:
     """Absolute error (ATE) of the poses whose stamps lie inside the reference.
 
+    Raises InputError if fewer than three poses overlap in time, or the reference's stamps do not
+    increase.
+
     Parameters
     ----------
     reference : is interpolated at the stamps of the estimate
     aligned : fit positions by a rigid transform (SE(3), :func:`align_positions`) and orientations
         by a rotation (:func:`align_rotations`) first; else the poses are compared as they are
-
-    Raises
-    ------
-    InputError
-        If fewer than three poses overlap in time, or the reference's stamps do not increase.
     """
     stamps, poses, truth = _common("absolute_error", estimate, reference)
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
@@ -160,13 +152,9 @@ class RelativeError:
 def path_lengths(path: float) -> FloatArray:
     """Lengths in metres over which relative errors are taken on a path of ``path`` metres.
 
-    They are u, 2 u, ... 8 u, where u is the largest of 0.1, 0.2, 0.5, 1, ... 100 m with
-    16 u <= ``path``; from 1600 m on, KITTI's 100, 200, ... 800 m.
-
-    Raises
-    ------
-    InputError
-        If the path is shorter than 1.6 m.
+    They are u, 2 u, ... 8 u, where u is the largest of 0.1, 0.2, 0.5, 1, ... 100 m with 16 u <=
+    ``path``; from 1600 m on, KITTI's 100, 200, ... 800 m. Raises InputError if the path is shorter
+    than 1.6 m.
     """
     fitting = [unit for unit in _LENGTH_UNITS if 2 * _LENGTHS * unit <= path]
     if not fitting:
@@ -182,27 +170,17 @@ def relative_error(
 ) -> RelativeError:
     """Relative error (RPE) of the poses whose stamps lie inside the reference.
 
+    For each length d and each start i, the end j is the first pose more than d along the reference
+    after i. With the relative motions Q of the reference and P of the estimate, ``E = Q^-1 P``
+    counts ``|translation(E)| / d`` and ``angle(E) / d``. KITTI's development kit takes every tenth
+    pose as a start; here every pose is one. Raises InputError if fewer than three poses overlap in
+    time, the reference's stamps do not increase, or the path is too short for any pair. See Geiger,
+    Lenz and Urtasun, Are we ready for autonomous driving?, CVPR 2012, section 2.4.
+
     Parameters
     ----------
     reference : is interpolated at the stamps of the estimate
     lengths : (L,) metres along the reference; :func:`path_lengths` of its path if None
-
-    Raises
-    ------
-    InputError
-        If fewer than three poses overlap in time, the reference's stamps do not increase, or the
-        path is too short for any pair.
-
-    Notes
-    -----
-    For each length d and each start i, the end j is the first pose more than d along the
-    reference after i. With the relative motions Q of the reference and P of the estimate,
-    ``E = Q^-1 P`` counts ``|translation(E)| / d`` and ``angle(E) / d``. KITTI's development kit
-    takes every tenth pose as a start; here every pose is one.
-
-    References
-    ----------
-    Geiger, Lenz and Urtasun, Are we ready for autonomous driving?, CVPR 2012, section 2.4.
     """
     _, poses, truth = _common("relative_error", estimate, reference)
     travelled = distance_travelled(truth[:, :3, 3])
@@ -238,14 +216,12 @@ def pose_differences(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Distances between two trajectories, pose by pose, both seen from their first common moment.
 
+    Raises InputError if fewer than three poses overlap in time, or the reference's stamps do not
+    increase.
+
     Returns
     -------
     stamps, metres, degrees : (N,) each, of the poses inside the reference's time span
-
-    Raises
-    ------
-    InputError
-        If fewer than three poses overlap in time, or the reference's stamps do not increase.
     """
     stamps, poses, others = _common("pose_differences", estimate, reference)
     here, there = inverse_pose(poses[:1]) @ poses, inverse_pose(others[:1]) @ others

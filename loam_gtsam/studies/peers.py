@@ -60,15 +60,12 @@ class Peer(ABC):
     def register(self, stamp: int, sweep: TimedPoints) -> MapUpdate:
         """Register a sweep and measure the time of the registration itself.
 
+        Raises InputError if the peer cannot take this sweep.
+
         Parameters
         ----------
         stamp : nanoseconds from which the times of the points count; that of the result is the
             moment that the pose belongs to
-
-        Raises
-        ------
-        InputError
-            If the peer cannot take this sweep.
         """
         started = time.perf_counter()
         pose, moment = self._register(stamp, sweep)
@@ -135,8 +132,6 @@ class _IcpPeer(Peer):
 class KissIcp(_IcpPeer):
     """KISS-ICP (Vizzo et al., RA-L 2023).
 
-    Notes
-    -----
     Version 1.3 de-skews to the time of the *last* point, so the pose belongs to that time. Without
     de-skew a pose fits the whole sweep best at the middle of the sweep.
     """
@@ -157,8 +152,6 @@ class KissIcpNoDeskew(KissIcp):
 class GenzIcp(_IcpPeer):
     """GenZ-ICP (Lee et al., RA-L 2025).
 
-    Notes
-    -----
     The de-skew of GenZ-ICP is off by default, for data that are de-skewed already; here it is on.
     Version 0.3 takes times from 0 to 1 and de-skews to 0.5, so that the pose belongs to the middle
     of the sweep, as it does without de-skew. Two instances in one process disturb each other.
@@ -182,8 +175,6 @@ class GenzIcpNoDeskew(GenzIcp):
 class SmallGicp(Peer):
     """Odometry with small_gicp (Koide, JOSS 2024): each sweep against a map of Gaussian voxels.
 
-    Notes
-    -----
     small_gicp is a registration library; this class adds a simple odometry. The motion between the
     last two poses de-skews the points to the middle of the sweep and predicts the pose; each
     registered sweep is added to the map. The sizes are the defaults of small_gicp.
@@ -215,8 +206,7 @@ class SmallGicp(Peer):
             before, last = self._last
             seconds = (now - before) * 1e-9
             guess = last.compose(gtsam.Pose3.Expmap(self._twist * seconds))
-            found = self._gicp.align(self._map, cloud, guess.matrix())
-            pose = gtsam.Pose3(found.T_target_source)
+            pose = gtsam.Pose3(self._gicp.align(self._map, cloud, guess.matrix()).T_target_source)
             self._twist = gtsam.Pose3.Logmap(last.between(pose)) / seconds
         self._last = now, pose
         self._map.insert(cloud, pose.matrix())
@@ -232,10 +222,7 @@ PEERS: dict[str, type[Peer]] = {
 def make_peer(name: str) -> Peer:
     """The peer called ``name``, with its defaults.
 
-    Raises
-    ------
-    PeerError
-        If no peer has this name, or the peer is not installed.
+    Raises PeerError if no peer has this name, or the peer is not installed.
     """
     if name not in PEERS:
         raise PeerError(f"unknown peer {name!r} (known: {', '.join(sorted(PEERS))})")

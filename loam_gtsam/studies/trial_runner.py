@@ -45,20 +45,14 @@ def run_trials(
 ) -> Iterator[Row]:
     """Run trials; a row comes as soon as its trial is finished.
 
+    A trial whose worker process dies runs again. Workers get as many trials as they have slots and
+    no more: the scheduler of a cluster suspects every trial that a dying worker held. Raises
+    KeyboardInterrupt if the user asked to stop; trials under way are lost.
+
     Parameters
     ----------
     stopped : whether the user has asked to stop
     workers : None for this process, one trial after the other; a stop acts after each frame
-
-    Raises
-    ------
-    KeyboardInterrupt
-        If the user asked to stop; trials under way are lost.
-
-    Notes
-    -----
-    A trial whose worker process dies runs again. Workers get as many trials as they have slots and
-    no more: the scheduler of a cluster suspects every trial that a dying worker held.
     """
 
     def stop_if_asked(*_: object) -> None:
@@ -173,12 +167,8 @@ class ClusterWorkers:
 def cluster_workers(address: str) -> Iterator[ClusterWorkers]:
     """The workers of a running Dask cluster, by the address of its scheduler.
 
-    Raises
-    ------
-    OutputError
-        If Dask is not installed.
-    ClusterError
-        If the scheduler cannot be reached, or the connection is lost.
+    Raises OutputError if Dask is not installed; ClusterError if the scheduler cannot be reached, or
+    the connection is lost.
     """
     try:
         from distributed import Client

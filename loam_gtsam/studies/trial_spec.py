@@ -53,8 +53,7 @@ class _Sequence:
     @property
     def own_seed(self) -> int | None:
         """The seed in the address or among the options of a built-in world; None without one."""
-        query = dict(parse_qsl(self.path.partition("?")[2]))
-        seed = self.options.get("seed", query.get("seed"))
+        seed = self.options.get("seed", dict(parse_qsl(self.path.partition("?")[2])).get("seed"))
         try:
             return None if seed is None else int(seed)
         except (TypeError, ValueError) as error:
@@ -68,10 +67,7 @@ class _Sequence:
 def load_spec(path: str | Path) -> Spec:
     """Read a specification; the paths in the file are relative to the folder of the file.
 
-    Raises
-    ------
-    ConfigError
-        If the file cannot be read, is not YAML, or does not fit, naming the key.
+    Raises ConfigError if the file cannot be read, is not YAML, or does not fit, naming the key.
     """
     path = Path(path)
     try:

@@ -119,10 +119,8 @@ def versions() -> Mapping[str, str]:
 def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
     """Run one trial; an error during the trial becomes the ``error`` of its row.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        If ``on_frame``, which is called after each frame, raised it: half a trial is no result.
+    Raises KeyboardInterrupt if ``on_frame``, which is called after each frame, raised it: half a
+    trial is no result.
     """
     row = empty_row(trial) | {"host": socket.gethostname()}
     started = time.perf_counter()
@@ -248,10 +246,7 @@ class TrialStore:
 def write_table(path: Path, rows: Iterable[Row], text: str, trials: Iterable[Trial]) -> None:
     """Write the table of a study; text and configurations of its specification become metadata.
 
-    Raises
-    ------
-    OutputError
-        If pyarrow is missing or the file cannot be written.
+    Raises OutputError if pyarrow is missing or the file cannot be written.
     """
     arrow, parquet = import_pyarrow()
     kinds = {str: arrow.string(), int: arrow.int64(), float: arrow.float64()}

@@ -26,10 +26,7 @@ _SIGMAS = 3.0
 def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     """Draw a frame from behind and above: map, sweep, and matches by their residuals.
 
-    Raises
-    ------
-    OutputError
-        If matplotlib is missing or the file cannot be written.
+    Raises OutputError if matplotlib is missing or the file cannot be written.
     """
     figure = empty_figure(9.0, 6.0)
     from matplotlib.collections import LineCollection

@@ -90,8 +90,7 @@ def plot_map(
     points = np.concatenate((edges, planes)).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
     if len(points):
-        image = _top_view(axes, points)
-        bar = figure.colorbar(image, ax=axes, shrink=0.55, aspect=30, pad=0.02)
+        bar = figure.colorbar(_top_view(axes, points), ax=axes, shrink=0.55, aspect=30, pad=0.02)
         bar.set_label("height [m]")
         bar.outline.set_visible(False)
     if trajectory is not None and len(trajectory):
@@ -210,8 +209,7 @@ def plot_curves(
     rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (ylabel, curves) in zip(rows, panels.items(), strict=True):
         largest = max((float(np.nanmax(y)) for _, y in curves.values() if len(y)), default=0.0)
-        coloured = zip(curves.items(), cycle(_RUN_COLOURS), strict=False)
-        for (name, (x, y)), colour in coloured:
+        for (name, (x, y)), colour in zip(curves.items(), cycle(_RUN_COLOURS), strict=False):
             axes.plot(x, np.where(y > 1e-6 * largest, y, np.nan) if log else y, color=colour,
                       lw=1.4, label=name if len(x) else None)  # fmt: skip
         if log:

@@ -37,8 +37,9 @@ _FINE = (FrameStatus.OK, FrameStatus.FIRST)
 class RerunViewer(ClosingWriter):
     """Shows the frames of a run; :func:`loam_gtsam.view.observers.watch` makes them.
 
-    Leaving the block closes the file, after an error or Ctrl-C too; what a killed process wrote
-    can be opened as well. A window that is closed does not disturb the run.
+    Leaving the block closes the file, after an error or Ctrl-C too; what a killed process wrote can
+    be opened as well. A window that is closed does not disturb the run. Raises OutputError if Rerun
+    is missing, the file exists or cannot be written, or there is no screen.
 
     Parameters
     ----------
@@ -54,11 +55,6 @@ class RerunViewer(ClosingWriter):
     ----------
     path : as given
     frames : shown so far
-
-    Raises
-    ------
-    OutputError
-        If Rerun is missing, the file exists or cannot be written, or there is no screen.
     """
 
     def __init__(
@@ -95,10 +91,7 @@ class RerunViewer(ClosingWriter):
     def show(self, frame: FrameView, around: Callable[[], MapView]) -> None:
         """Draw a frame; every tenth with the map, which ``around`` makes.
 
-        Raises
-        ------
-        OutputError
-            If the viewer is closed, or the file cannot be written.
+        Raises OutputError if the viewer is closed, or the file cannot be written.
         """
         if not self._streams:
             raise OutputError("the viewer is closed; nothing can be shown in it")
@@ -138,8 +131,7 @@ class RerunViewer(ClosingWriter):
         rr, pose = self._rr, frame.map_T_lidar
         self._log("map/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         self._log("map/covariance", self._ellipsoid(pose[:3, 3], frame.position_covariance))
-        sweep = _thinned(frame.sweep, self._most_sweep)
-        self._draw("map/sweep", rr.Points3D, sweep, _SWEEP, 0.75)
+        self._draw("map/sweep", rr.Points3D, _thinned(frame.sweep, self._most_sweep), _SWEEP, 0.75)
         self._draw("map/features/edges", rr.Points3D, frame.edges, _EDGE, 1.0)
         self._draw("map/features/planes", rr.Points3D, frame.planes, _PLANE, 1.0)
         colours = residual_colours(frame.residuals)
@@ -158,8 +150,7 @@ class RerunViewer(ClosingWriter):
         for name, points, colour in surroundings:
             some = _thinned(points, self._most_map * len(points) // total)
             self._draw(f"map/surroundings/{name}", rr.Points3D, some, colour, 0.5)
-        path = [_thinned(view.path, _MOST_PATH)]
-        self._draw("map/trajectory", rr.LineStrips3D, path, _PATH, 2.0)
+        self._draw("map/trajectory", rr.LineStrips3D, [_thinned(view.path, _MOST_PATH)], _PATH, 2.0)
         used, unused = view.loops[view.loops_on], view.loops[~view.loops_on]
         self._draw("map/loops/used", rr.LineStrips3D, used, _LOOP_ON, 1.5)
         self._draw("map/loops/switched_off", rr.LineStrips3D, unused, _LOOP_OFF, 1.5)

@@ -27,10 +27,7 @@ _PATIENCE = 60.0
 class RrdFile:
     """Copies what is written to the path :attr:`sink` into a file, in a thread.
 
-    Raises
-    ------
-    OutputError
-        If the name does not end in ``.rrd``, the file exists or cannot be written.
+    Raises OutputError if the name does not end in ``.rrd``, the file exists or cannot be written.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:

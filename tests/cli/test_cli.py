@@ -152,8 +152,7 @@ def test_text_of_the_data_is_never_taken_for_markup_and_quiet_prints_nothing(ope
 
 
 def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
-    bad = [BadSweep(scans[2].stamp + n, f"damaged {n}") for n in range(1, 7)]
-    opens([*scans[:3], *bad])
+    opens([*scans[:3], *[BadSweep(scans[2].stamp + n, f"damaged {n}") for n in range(1, 7)]])
     text = mapped()
     assert "1 first, 2 ok, 6 unusable_scan" in text
     assert [n for n in range(1, 7) if f"damaged {n}" in text] == [1, 2, 3]
@@ -225,8 +224,7 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
     assert "No pictures without matplotlib" in said("run", "x", "--output", "a")
     assert files_in("a") == set(RUN_FILES)
     assert "No pictures" not in mapped()
-    asked = said("run", "x", "--output", "b", "--plot", code=1)
-    assert 'pip install "loam_gtsam[plot]"' in asked
+    assert 'pip install "loam_gtsam[plot]"' in said("run", "x", "--output", "b", "--plot", code=1)
     assert not Path("b").exists()
 
 

@@ -147,8 +147,7 @@ def test_every_message_reads_back(tmp_path: Path, name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_our_own_loader_reads_the_registered_sweeps(tmp_path: Path, name: str) -> None:
-    dataset = open_dataset(write(tmp_path / name, 3))
-    scans = list(dataset)
+    scans = list(open_dataset(write(tmp_path / name, 3)))
     assert [scan.stamp for scan in scans] == [make_update(n).stamp for n in range(3)]
     for number, scan in enumerate(scans):
         assert np.array_equal(scan.points, make_cloud(number)[:, :3].astype("f4"))
@@ -170,8 +169,7 @@ def test_frames_and_clouds_are_as_configured(tmp_path: Path) -> None:
     assert set(found) == {TF, ODOMETRY, PATH}
     odometry = found[ODOMETRY][0][1]
     assert (odometry.header.frame_id, odometry.child_frame_id) == ("map", "lidar")
-    every = BagConfig(surround_every=2)
-    assert len(read(write(tmp_path / "two.bag", 6, every))[SURROUND]) == 3
+    assert len(read(write(tmp_path / "two.bag", 6, BagConfig(surround_every=2)))[SURROUND]) == 3
 
 
 def test_the_surroundings_are_asked_for_only_when_they_are_due(tmp_path: Path) -> None:
@@ -324,8 +322,7 @@ def test_an_earlier_bag_is_replaced_only_if_asked_and_when_complete(
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_cut_off_recording_is_kept_unless_overwritten(tmp_path: Path, name: str) -> None:
-    left = BagWriter(tmp_path / name)
-    left.write(make_update(0))
+    BagWriter(tmp_path / name).write(make_update(0))
     with pytest.raises(OutputError, match=rf"{name}\.active: a recording that was cut off"):
         BagWriter(tmp_path / name)
     assert len(read(write(tmp_path / name, 2, overwrite=True))[ODOMETRY]) == 2

@@ -83,8 +83,7 @@ def assert_the_same(live: LiveMapper, results: list[LiveResult], offline: RunRes
     np.testing.assert_array_equal(result.edge_points, offline.edge_points)
     np.testing.assert_array_equal(result.plane_points, offline.plane_points)
     assert result.map_stats == offline.map_stats
-    trajectory = result.trajectory.map_T_lidar
-    np.testing.assert_array_equal(trajectory, offline.trajectory.map_T_lidar)
+    np.testing.assert_array_equal(result.trajectory.map_T_lidar, offline.trajectory.map_T_lidar)
 
 
 def lived(messages: list[Message], **options: Any) -> tuple[LiveMapper, list[LiveResult]]:
@@ -200,8 +199,7 @@ def test_no_message_is_lost_between_threads(bag: Path) -> None:
 
 
 def test_units_of_g_and_missing_orientations_are_read_as_those_of_a_bag(tmp_path: Path) -> None:
-    world = SimulatedWorld("shaken", frames=4, columns=240)
-    messages = recorded(world)
+    messages = recorded(SimulatedWorld("shaken", frames=4, columns=240))
     for message in messages:
         if message.topic == IMU:
             a, q = message.content.linear_acceleration, message.content.orientation
@@ -422,8 +420,7 @@ def test_without_an_imu_nothing_waits(bag: Path) -> None:
 def test_one_sample_from_the_future_opens_no_gate(bag: Path) -> None:
     messages = messages_of(bag)
     samples = [m for m in messages if m.topic == IMU]
-    clock = Clock()
-    live = LiveMapper(imu=True, clock=clock)
+    live = LiveMapper(imu=True, clock=Clock())
     hand_over(live, next(m for m in messages if m.topic == POINTS))
     wild = replace(samples[0], content=imu(ROS1, START + 10**15, np.eye(10)[3]))
     for message in (wild, samples[0]):
@@ -465,8 +462,7 @@ def test_what_makes_room_in_a_full_queue(
 @pytest.mark.parametrize("queue", [1, 3])
 def test_drops_and_latencies_are_exact(cost: int, queue: int) -> None:
     count = 40
-    rng = np.random.default_rng(cost)
-    jitter = rng.integers(0, 90, count)
+    jitter = np.random.default_rng(cost).integers(0, 90, count)
     received = [START + (100 * n + int(jitter[n])) * MS for n in range(count)]
     messages = [Message(POINTS, received[n], thin(n)) for n in range(count)]
     clock = Clock()
@@ -657,8 +653,7 @@ def test_a_live_run_of_loam_topics_is_that_of_the_bag(tmp_path: Path, loam_axes:
 
 @pytest.mark.parametrize(("offset", "matched"), [(5, True), (-5, True), (6, False), (-6, False)])
 def test_messages_make_a_sweep_if_their_stamps_agree_to_5_ms(offset: int, matched: bool) -> None:
-    recording = loam_recording(count=4, offsets={REQUIRED[1]: offset * MS})
-    _, results = replayed_topics(recording)
+    _, results = replayed_topics(loam_recording(count=4, offsets={REQUIRED[1]: offset * MS}))
     assert len(results) == (4 if matched else 0)
 
 

@@ -33,8 +33,7 @@ Raw = list[tuple[str, bytes]]
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     world = SimulatedWorld("shaken", frames=FRAMES, columns=240)
-    folder = tmp_path_factory.mktemp("node")
-    return bag_of(folder / "bag", recorded(world, "sqlite3"), "sqlite3")
+    return bag_of(tmp_path_factory.mktemp("node") / "bag", recorded(world, "sqlite3"), "sqlite3")
 
 
 @pytest.fixture(scope="module")
@@ -233,8 +232,7 @@ def test_a_stamp_that_no_message_can_say_is_not_published_and_the_run_goes_on(
             raise OutputError("stamp -1 ns")
 
     node.publish = publish  # type: ignore[method-assign]
-    clouds = [entry for entry in raw_messages(bag) if entry[0] == POINTS]
-    play(node, LiveNode(node), clouds[:2], 2)
+    play(node, LiveNode(node), [entry for entry in raw_messages(bag) if entry[0] == POINTS][:2], 2)
     assert published == [TF, TF, ODOMETRY, REGISTERED, SURROUND]
     assert caplog.messages == ["not published: stamp -1 ns"]
 

@@ -84,8 +84,7 @@ def test_without_truth_the_first_solver_is_the_reference(command, dataset, fake)
     ours, theirs = rows("out/comparison.csv")
     assert ours["ate_m"] == ""
     assert float(theirs["ate_m"]) > 0.0
-    names = {path.name for path in Path("out").iterdir()}
-    assert not names & {"truth.tum", *PICTURES}
+    assert not {path.name for path in Path("out").iterdir()} & {"truth.tum", *PICTURES}
 
 
 def test_an_earlier_comparison_is_kept_unless_told(command):

@@ -34,13 +34,11 @@ def as_trajectory(poses: ty.Trajectory) -> Trajectory:
 
 def imu_truth() -> Trajectory:
     truth = write.lidar_truth(**evalio_room.WORLD)
-    lidar_T_imu = np.linalg.inv(evalio_room.IMU_T_LIDAR)
-    return Trajectory(truth.stamps, truth.map_T_lidar @ lidar_T_imu)
+    return Trajectory(truth.stamps, truth.map_T_lidar @ np.linalg.inv(evalio_room.IMU_T_LIDAR))
 
 
 def set_up(**params: object) -> LoamGtsam:
-    experiment = ty.Experiment.from_pl_ds(LoamGtsam, ROOM, **params)
-    pipeline, _ = experiment.setup()
+    pipeline, _ = ty.Experiment.from_pl_ds(LoamGtsam, ROOM, **params).setup()
     return pipeline
 
 
@@ -103,14 +101,12 @@ def test_poses_are_the_same_whichever_way_sweeps_and_imu_are_interleaved() -> No
     received = estimates(set_up(), later)
     assert (len(waited), len(received)) == (write.COUNT - 2, write.COUNT)
     np.testing.assert_array_equal(received.map_T_lidar[:-2], waited.map_T_lidar)
-    motions = given._pipeline.mapper.last.sweep_motion
-    assert motions is SweepMotion.GYRO
+    assert given._pipeline.mapper.last.sweep_motion is SweepMotion.GYRO
 
 
 def test_an_imu_that_stops_holds_no_sweep_for_long() -> None:
     early = [m for m in evalio_room.imu() if m.stamp.to_nsec() < write.stamps()[1]]
-    pipeline = set_up()
-    trajectory = estimates(pipeline, [*early, *evalio_room.lidar()])
+    trajectory = estimates(set_up(), [*early, *evalio_room.lidar()])
     assert len(trajectory) == write.COUNT - 2
     assert absolute_error(trajectory, imu_truth()).rmse < 0.05
 
@@ -135,8 +131,7 @@ def test_parameters_are_those_of_the_configuration() -> None:
     assert config.imu.gyro_noise == pytest.approx(3e-4)
     assert config.imu.lidar_R_imu_deg == pytest.approx((0.0, 0.0, -90.0))
     assert config.imu.lidar_t_imu == pytest.approx((0.2, 0.3, -0.1))
-    mine = set_up(**{"sensor.min_range": 1.5})._pipeline.config
-    assert mine.sensor.min_range == 1.5
+    assert set_up(**{"sensor.min_range": 1.5})._pipeline.config.sensor.min_range == 1.5
     assert LoamGtsam().set_params({"sensor.min_rage": 1.0}) == {"sensor.min_rage": 1.0}
     with pytest.raises(ConfigError, match=r"min_range: expected at least 0.0, got -1.0"):
         set_up(**{"sensor.min_range": -1.0})

@@ -47,8 +47,7 @@ def test_peers_de_skew_to_the_moment_their_pose_is_said_to_belong_to(name, momen
     pytest.importorskip(PEERS[name].module)
     peer = peers.make_peer(name)
     package = PEERS[name].module
-    settings = peer._icp.config
-    preprocess = importlib.import_module(f"{package}.preprocess").get_preprocessor(settings)
+    preprocess = importlib.import_module(f"{package}.preprocess").get_preprocessor(peer._icp.config)
     forward = np.eye(4)
     forward[0, 3] = 1.0
     # The point at that share of the sweep is left where it was.

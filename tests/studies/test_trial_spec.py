@@ -37,8 +37,7 @@ def test_trials_are_sequences_times_configs_times_seeds_in_this_order(tmp_path):
             """,
         )
     )
-    found = [(t.sequence, t.config_name, t.seed, t.frames, t.peer) for t in spec.trials]
-    assert found == [
+    assert [(t.sequence, t.config_name, t.seed, t.frames, t.peer) for t in spec.trials] == [
         ("room", "mine", 3, 9, None),
         ("room", "mine", 1, 9, None),
         ("room", "kiss", 3, 9, "kiss-icp"),
@@ -122,5 +121,4 @@ def test_the_page_explains_every_column_and_its_example_can_be_read(tmp_path):
     assert [name for name in COLUMNS if f"`{name}`" not in text] == []
     spec = re.search(r"^```yaml\n(.*?)^```", text, re.M | re.S)
     (tmp_path / "robot.yaml").write_text("preset: loam\n")
-    trials = load_spec(write_spec(tmp_path, spec[1])).trials
-    assert len(trials) > 10
+    assert len(load_spec(write_spec(tmp_path, spec[1])).trials) > 10

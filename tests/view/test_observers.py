@@ -128,8 +128,7 @@ def test_feet_lie_on_the_lines_and_planes_of_the_matches(sweeps):
     matches, frame = pipeline.mapper.registered.matches, kept.frames[-1]
     edges, planes = matches.edges, matches.planes
     on_edges, on_planes = np.split(frame.feet, [len(edges)])
-    across = np.cross(on_edges - edges.centres, edges.directions)
-    np.testing.assert_allclose(across, 0.0, atol=1e-9)
+    np.testing.assert_allclose(np.cross(on_edges - edges.centres, edges.directions), 0.0, atol=1e-9)
     np.testing.assert_allclose((on_planes * planes.normals).sum(axis=1), -planes.offsets, atol=1e-9)
     # The residual belongs to the shortest way there, and the points to the sweep.
     lengths = np.linalg.norm(frame.points - frame.feet, axis=1)
@@ -138,8 +137,7 @@ def test_feet_lie_on_the_lines_and_planes_of_the_matches(sweeps):
     away = frame.points[: len(edges)] - on_edges
     np.testing.assert_allclose((away * edges.directions).sum(axis=1), 0.0, atol=1e-9)
     seen = np.concatenate([frame.edges, frame.planes])
-    nearest = np.linalg.norm(frame.points[::20, None] - seen[None], axis=2).min(axis=1)
-    assert nearest.max() < 0.02
+    assert np.linalg.norm(frame.points[::20, None] - seen[None], axis=2).min(axis=1).max() < 0.02
 
 
 def test_covariances_of_positions_are_along_the_axes_of_the_map(watched):
@@ -169,8 +167,7 @@ def test_with_loops_all_is_where_they_put_it(sweeps):
     outcome = run(ListDataset(sweeps), with_loops(), loop_closer=OneLoop(), observe=watch(kept))
     frame, view = kept.frames[-1], kept.maps[-1]
     corrected = outcome.trajectory.map_T_lidar[-1]
-    moved = np.linalg.norm(corrected[:3, 3] - outcome.updates[-1].map_T_lidar.translation())
-    assert moved > 1e-4
+    assert np.linalg.norm(corrected[:3, 3] - outcome.updates[-1].map_T_lidar.translation()) > 1e-4
     np.testing.assert_allclose(frame.map_T_lidar, corrected, atol=1e-9)
     np.testing.assert_allclose(view.path[-1], corrected[:3, 3], atol=1e-9)
     assert view.loops.shape == (1, 2, 3)
@@ -245,8 +242,7 @@ def test_a_moving_sweep_is_put_where_its_points_were(reference: Any, moment: flo
     cloud = registered_cloud(scan, update, Mapper(config))
     np.testing.assert_allclose(cloud[:, :3], there, atol=1e-4)
     np.testing.assert_allclose(cloud[:, 3], intensities, atol=1e-9)
-    still = registered_cloud(scan, result(moment), Mapper(config))
-    assert np.abs(still[:, :3] - there).max() > 0.3
+    assert np.abs(registered_cloud(scan, result(moment), Mapper(config))[:, :3] - there).max() > 0.3
 
 
 def turning_imu(rate: np.ndarray, config: Config) -> ImuBuffer:
@@ -269,8 +265,7 @@ def test_the_rotation_within_a_sweep_is_that_the_mapper_used() -> None:
 def test_a_sweep_without_deskew_is_only_moved() -> None:
     scan, _, _ = moving_sweep(np.zeros(6), 0.0)
     config = Config(deskew=DeskewConfig(enabled=False, reference="stamp"))
-    update = result(0.0, twist=np.ones(6))
-    cloud = registered_cloud(scan, update, Mapper(config))
+    cloud = registered_cloud(scan, result(0.0, twist=np.ones(6)), Mapper(config))
     expected = np.array([PLACE.transformFrom(point) for point in scan.points])
     np.testing.assert_allclose(cloud[:, :3], expected, atol=1e-5)
 
@@ -373,8 +368,7 @@ def test_a_run_that_breaks_off_leaves_a_whole_bag(monkeypatch: pytest.MonkeyPatc
     dataset = ListDataset([*scans, RuntimeError("the disk is gone")])
     dataset.info = lambda: DatasetInfo("list", "nowhere")
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: dataset)
-    done = run_command("x", "--bag", "a.mcap")
-    assert isinstance(done.exception, RuntimeError)
+    assert isinstance(run_command("x", "--bag", "a.mcap").exception, RuntimeError)
     assert topics(Path("a.mcap"))[ODOMETRY] == 2
 
 
@@ -386,7 +380,6 @@ def test_a_bag_that_cannot_be_written_costs_no_results(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(BagWriter, "_kept", BagWriter._append, raising=False)
     monkeypatch.setattr(BagWriter, "_append", fail)
-    done = run_command(ROOM, "--bag", "a.bag")
-    assert done.exit_code != 0
+    assert run_command(ROOM, "--bag", "a.bag").exit_code != 0
     assert len(read_tum("out/trajectory.tum")) == 3
     assert "No space left" in json.loads(Path("out/summary.json").read_text())["error"]

@@ -132,8 +132,7 @@ def test_a_frame_shows_its_matches_by_their_residuals(tmp_path):
         shown[name] = [has_colour(tmp_path / f"{name}.png", colour, 600) for colour in colours]
     assert shown == {"good": [True, False], "bad": [False, True]}
     assert has_colour(tmp_path / "bad.png", visualization.INK, 300)  # the ellipse
-    unknown = np.full((3, 3), np.nan)
-    bare = seen(np.zeros(0), sweep=np.zeros((0, 3)), position_covariance=unknown)
+    bare = seen(np.zeros(0), sweep=np.zeros((0, 3)), position_covariance=np.full((3, 3), np.nan))
     plot_frame(tmp_path / "bare.png", bare, NO_MAP)
     assert not has_colour(tmp_path / "bare.png", visualization.INK, 300)
 

@@ -166,16 +166,14 @@ def test_much_is_thinned_and_loops_are_told_apart(tmp_path, chunks):
     with RerunViewer(tmp_path / "run.rrd", most_sweep=20, most_map=90) as viewer:
         viewer.show(frame(0), around)
     _, found, _ = chunks(tmp_path / "run.rrd")
-    counts = {
+    assert {
         name: len(column(found, f"/map/{name}", "Points3D:positions")[0])
         for name in ("sweep", "surroundings/edges", "surroundings/planes")
-    }
-    assert counts == {"sweep": 20, "surroundings/edges": 30, "surroundings/planes": 60}
-    loops = [
+    } == {"sweep": 20, "surroundings/edges": 30, "surroundings/planes": 60}
+    assert [
         len(column(found, f"/map/loops/{name}", "LineStrips3D:strips")[0])
         for name in ("used", "switched_off")
-    ]
-    assert loops == [2, 1]
+    ] == [2, 1]
 
 
 def test_an_error_in_the_run_closes_the_file_and_no_frame_leaves_none(tmp_path, chunks):

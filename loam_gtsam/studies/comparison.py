@@ -1,8 +1,7 @@
 """The comparison of several solvers on the same sweeps, and its numbers.
 
-All contenders register a sweep before the next sweep is read, so that they run under the same
-conditions of the machine. Features are extracted once per sweep for all pipelines of this package;
-peers get the points and times that these features were extracted from.
+All contenders register a sweep before the next sweep is read: the conditions of the machine are the
+same for all. Pipelines share the features of a sweep; peers get the points these were taken from.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.pipeline import OnFrame, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
+from loam_gtsam.studies import evaluation
 from loam_gtsam.studies.contenders import (
     Contender,
     PeerRunner,
@@ -26,12 +26,6 @@ from loam_gtsam.studies.contenders import (
     SharedGuess,
     SolverRun,
     extract_for_all,
-)
-from loam_gtsam.studies.evaluation import (
-    absolute_error,
-    interpolate,
-    pose_differences,
-    relative_error,
 )
 from loam_gtsam.studies.peers import PEERS, make_peer
 from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray, Trajectory
@@ -43,11 +37,10 @@ _SHARED = ("sensor", "features")
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """The result of :func:`compare_solvers`.
+    """The result of :func:`compare_solvers` on the data set called ``name``.
 
     Attributes
     ----------
-    name, truth : of the data set
     runs : one per contender, in their order
     notes : sentences that a reader of the numbers must know
     interrupted : whether the user stopped the comparison before the data set ended
@@ -179,7 +172,6 @@ def _check_names(contenders: Sequence[Contender]) -> None:
 def _make_runners(
     contenders: Sequence[Contender], dataset: Dataset, shared_guess: bool
 ) -> tuple[list[PipelineRunner | PeerRunner], Config | None, list[str]]:
-    """A runner for each contender, the first configuration, and what had to be made equal to it."""
     configs = [entry.config and effective_config(entry.config, dataset) for entry in contenders]
     found = ((entry.name, c) for entry, c in zip(contenders, configs, strict=True) if c is not None)
     name, first = next(found, ("", None))
@@ -231,9 +223,7 @@ def score(
 ) -> Scores:
     """The scores of one run, without errors if there is no reference.
 
-    Parameters
-    ----------
-    lengths : metres, path lengths of the relative error; those that fit the path if None
+    ``lengths`` are those of the relative error, in metres; those that fit the path if None.
     """
     solved = [update for update in run.updates if update.status.solved]
     values: dict[str, Any] = {"map_points": run.map_points, "solved": len(solved)}
@@ -252,15 +242,15 @@ def score(
     problems = [run.problem] if run.problem else []
     try:
         if reference is not None:
-            absolute = absolute_error(run.trajectory, reference)
+            absolute = evaluation.absolute_error(run.trajectory, reference)
             values |= {
                 "ate_m": absolute.rmse,
                 "ate_max_m": absolute.maximum,
                 "rotation_deg": absolute.rotation_rmse_deg,
-                "path_m": interpolate(reference, absolute.stamps).path_length,
+                "path_m": evaluation.interpolate(reference, absolute.stamps).path_length,
             }
             given = None if lengths is None else np.array(lengths, np.float64)
-            relative = relative_error(run.trajectory, reference, given)
+            relative = evaluation.relative_error(run.trajectory, reference, given)
             values |= {
                 "rpe_percent": relative.translation_percent,
                 "rpe_deg_per_m": relative.rotation_deg_per_m,
@@ -292,7 +282,7 @@ def frame_differences(comparison: Comparison) -> dict[str, FrameDifferences]:
     found = {}
     for run in comparison.runs[1:]:
         with suppress(InputError):
-            stamps, *apart = pose_differences(run.trajectory, first)
+            stamps, *apart = evaluation.pose_differences(run.trajectory, first)
             frames = np.array(run.used, np.int64)[np.isin(run.trajectory.stamps, stamps)]
             found[run.name] = FrameDifferences(frames, *apart)
     return found

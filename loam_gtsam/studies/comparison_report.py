@@ -17,6 +17,7 @@ from loam_gtsam.config import Config, config_to_dict
 from loam_gtsam.io.atomic import write_json, write_text
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.io.trajectories import write_tum
+from loam_gtsam.studies import evaluation
 from loam_gtsam.studies.comparison import (
     Comparison,
     FrameDifferences,
@@ -25,12 +26,6 @@ from loam_gtsam.studies.comparison import (
     score_all,
 )
 from loam_gtsam.studies.contenders import SolverRun
-from loam_gtsam.studies.evaluation import (
-    absolute_error,
-    align_positions,
-    distance_travelled,
-    interpolate,
-)
 from loam_gtsam.studies.report_html import TextTable, list_html, page, picture_html, table_html
 from loam_gtsam.types import FloatArray, InputError, Trajectory
 from loam_gtsam.view import plots
@@ -178,16 +173,17 @@ def _summary(results: ScoredComparison) -> dict[str, Any]:
     solvers = []
     for run, scores in results.rows:
         difference = results.differences.get(run.name)
-        solver = {
-            "name": run.name,
-            "version": run.version,
-            "config": run.config and config_to_dict(run.config),
-            "scores": asdict(scores),
-            "stages_ms": _stages(run),
-            "difference_m": difference and _median_95_max(difference.metres),
-            "difference_deg": difference and _median_95_max(difference.degrees),
-        }
-        solvers.append(solver)
+        solvers.append(
+            {
+                "name": run.name,
+                "version": run.version,
+                "config": run.config and config_to_dict(run.config),
+                "scores": asdict(scores),
+                "stages_ms": _stages(run),
+                "difference_m": difference and _median_95_max(difference.metres),
+                "difference_deg": difference and _median_95_max(difference.degrees),
+            }
+        )
     comparison = results.comparison
     return {
         "dataset": comparison.name,
@@ -224,9 +220,7 @@ def _frame_rows(results: ScoredComparison) -> Iterable[list[Any]]:
 
 
 def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
-    """Write comma-separated values; a number that is not known is an empty field."""
-
-    def field(value: Any) -> Any:
+    def field(value: Any) -> Any:  # a number that is not known is an empty field
         if not isinstance(value, float):
             return value
         return f"{value:.9g}" if math.isfinite(value) else ""
@@ -246,10 +240,9 @@ def _stages(run: SolverRun) -> dict[str, float]:
 
 
 def _settings(run: SolverRun) -> str:
-    """Version and settings, from which the run can be repeated."""
     if run.config is None:
-        about = "its own defaults; see docs/compare.md for its de-skew and the moment of its poses"
-        return f"{run.version}; {about}"
+        where = "see docs/compare.md for its de-skew and the moment of its poses"
+        return f"{run.version}; its own defaults; {where}"
     default = config_to_dict(Config())
     changed = [
         f"{section}.{key} = {value}"
@@ -261,7 +254,6 @@ def _settings(run: SolverRun) -> str:
 
 
 def _draw(results: ScoredComparison, folder: Path) -> list[str]:
-    """Draw the pictures that the comparison has data for; returns the names of the files."""
     comparison = results.comparison
     first = comparison.runs[0].name
     drawn: list[str] = []
@@ -276,14 +268,14 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
     for run in comparison.runs:
         trajectory = run.trajectory
         try:
-            found = absolute_error(trajectory, reference)
+            found = evaluation.absolute_error(trajectory, reference)
         except InputError:  # too few poses
             continue
         here = trajectory.map_T_lidar[np.isin(trajectory.stamps, found.stamps)]
-        there = interpolate(reference, found.stamps).map_T_lidar[:, :3, 3]
-        reference_T_map = align_positions(here[:, :3, 3], there)
+        there = evaluation.interpolate(reference, found.stamps).map_T_lidar[:, :3, 3]
+        reference_T_map = evaluation.align_positions(here[:, :3, 3], there)
         aligned[run.name] = Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
-        errors[run.name] = distance_travelled(there), found.translations
+        errors[run.name] = evaluation.distance_travelled(there), found.translations
     if aligned and truth is not None:
         stamps = np.concatenate([trajectory.stamps for trajectory in aligned.values()])
         inside = (truth.stamps >= stamps.min()) & (truth.stamps <= stamps.max())

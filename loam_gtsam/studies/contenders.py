@@ -30,8 +30,7 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
-_PRESET_OF = {"gtsam": "default"}
-"""Solver names that are not the name of their preset."""
+_PRESET_OF = {"gtsam": "default"}  # solver names that are not the name of their preset
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +79,6 @@ class SolverRun:
 
     Attributes
     ----------
-    name : of the contender
     version : of the package that the contender comes from
     config : as used; None for a peer
     updates : one per sweep, corrected by loop closures if there are any
@@ -103,8 +101,8 @@ class SolverRun:
             placed = [n for n, update in enumerate(updates) if update.status.has_pose]
             for number, pose in zip(placed, result.trajectory.map_T_lidar, strict=True):
                 updates[number] = replace(updates[number], map_T_lidar=gtsam.Pose3(pose))
-        version = f"loam_gtsam {installed_version()}"
         points = len(result.edge_points) + len(result.plane_points)
+        version = f"loam_gtsam {installed_version()}"
         return cls(name, version, result.config, tuple(updates), points)
 
     @property
@@ -146,8 +144,7 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
 class SharedGuess:
     """An odometry for several pipelines: the first one predicts, the others take the same step.
 
-    The pipeline that asks first for a sweep gets the guess of ``odometry``, its own; every other
-    pipeline gets the same step from its own last pose, with the same twist.
+    The others take that step from their own last pose, with the same twist.
     """
 
     def __init__(self, odometry: Odometry) -> None:
@@ -197,9 +194,7 @@ class PipelineRunner:
 class PeerRunner:
     """A peer as a contender; if the peer fails, the other contenders go on without it.
 
-    Parameters
-    ----------
-    config : decides which points of a sweep are used, and their times
+    ``config`` decides which points of a sweep are used, and their times.
     """
 
     def __init__(self, peer: Peer, config: Config) -> None:

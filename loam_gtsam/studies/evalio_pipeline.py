@@ -5,9 +5,8 @@
     export EVALIO_CUSTOM=loam_gtsam.studies.evalio_pipeline
     evalio run -p loam_gtsam -d newer_college_2021/quad_easy
 
-With a file of experiments, evalio's option ``-M loam_gtsam.studies.evalio_pipeline`` does the same
-(evalio 0.6.1 checks the names after ``-p`` before it looks into the module). This module needs
-evalio, ``pip install "loam_gtsam[evalio]"``, and no other module imports it.
+With a file of experiments, ``-M loam_gtsam.studies.evalio_pipeline`` does the same (evalio 0.6.1
+checks the names after ``-p`` before it looks into the module). No other module imports this one.
 """
 
 from __future__ import annotations
@@ -44,8 +43,7 @@ except ModuleNotFoundError as error:
     ) from error
 
 _PRESET = "preset"
-_LONGEST_QUEUE = 2
-"""Number of sweeps that may wait for samples of the IMU."""
+_LONGEST_QUEUE = 2  # sweeps that may wait for samples of the IMU
 
 
 class LoamGtsam(EvalioPipeline):
@@ -187,8 +185,8 @@ class LoamGtsam(EvalioPipeline):
         self.save(stamp, SE3(SO3.from_mat(pose.rotation().matrix()), pose.translation()))
         features = extraction.features
         if self._shows and features is not None:
-            shown = {"edges": _as_points(features.edges), "planes": _as_points(features.planes)}
-            self.save(stamp, shown)
+            edges, planes = _as_points(features.edges), _as_points(features.planes)
+            self.save(stamp, {"edges": edges, "planes": planes})
 
 
 def _as_scan(sweep: LidarMeasurement) -> Scan:

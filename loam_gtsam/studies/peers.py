@@ -1,7 +1,7 @@
 """Peers: other registration systems, run through their own Python packages, all of them optional.
 
-Every peer runs with its own defaults and gets the raw points and their times; its docstring says
-what is not a default, and which moment of the sweep its pose belongs to.
+Every peer runs with its own defaults. Its docstring says what is not a default, and which moment of
+the sweep its pose belongs to.
 """
 
 from __future__ import annotations
@@ -92,10 +92,7 @@ class Peer(ABC):
 
 
 class _IcpPeer(Peer):
-    """A peer of the KISS-ICP family.
-
-    ``settings_class`` and ``system_class`` are names in the package of the peer.
-    """
+    """A peer of the KISS-ICP family, with the names of two classes in its package."""
 
     deskew: bool = True
     settings_class: str

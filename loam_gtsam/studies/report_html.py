@@ -46,9 +46,7 @@ _BEST = ' class="best"'
 class TextTable:
     """A table of texts, for the terminal and for the report.
 
-    Attributes
-    ----------
-    best : (row, column) of the cells to point out; column 0 is the name of the row
+    ``best`` are (row, column) of the cells to point out; column 0 is the name of the row.
     """
 
     header: Sequence[str]
@@ -57,12 +55,9 @@ class TextTable:
 
 
 def page(title: str, intro: Sequence[str], sections: Mapping[str, str]) -> str:
-    """The page as text.
+    """The page as text, with paragraphs at the top.
 
-    Parameters
-    ----------
-    intro : paragraphs at the top
-    sections : heading -> HTML of its content. Only this HTML is not escaped.
+    ``sections`` are heading -> HTML of its content. Only this HTML is not escaped.
     """
     return _PAGE.substitute(
         title=escape(title),

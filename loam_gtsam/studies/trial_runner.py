@@ -24,11 +24,9 @@ from typing import Any
 from loam_gtsam.studies.trials import Row, Trial, empty_row, run_trial, versions
 from loam_gtsam.types import LoamError, OutputError
 
-_POLL = 0.2
-"""Seconds between two checks whether the user has asked to stop."""
+_POLL = 0.2  # seconds between two checks whether the user has asked to stop
 _CONNECT_SECONDS = 10
-_DEATHS = 4
-"""Number of worker processes that may die of one trial before the trial counts as failed."""
+_DEATHS = 4  # worker processes that may die of one trial before the trial counts as failed
 Work = Callable[[Trial], Row]
 """What a worker does with a trial: :func:`loam_gtsam.studies.trials.run_trial`, except in tests."""
 
@@ -88,7 +86,6 @@ def run_trials(
 
 
 def _work_if_same_versions(work: Work, wanted: Mapping[str, str], trial: Trial) -> Row:
-    """On a worker: the row of a trial, an error unless the versions are those of the caller."""
     here = versions()
     if here != wanted:
         problem = ", ".join(f"{name} {here[name]}" for name in here if here[name] != wanted[name])
@@ -107,11 +104,8 @@ class LocalWorkers:
 
     def submit(self, work: Work, trial: Trial) -> Future[Row]:
         """Start a trial; at most ``slots`` trials may be under way."""
-        idle = (
-            executor
-            for executor, last in self.last.items()
-            if last.done() and not isinstance(last.exception(), BrokenExecutor)
-        )
+        done = ((executor, last) for executor, last in self.last.items() if last.done())
+        idle = (e for e, last in done if not isinstance(last.exception(), BrokenExecutor))
         executor = next(idle, None) or self._start()
         try:
             future = executor.submit(work, trial)

@@ -27,7 +27,7 @@ class Spec:
 
     Attributes
     ----------
-    name, text : of the file, without its ending, and its content
+    name, text : of the file: its name without the ending, and its content
     trials : sequences x configurations x seeds, in this order
     metrics : columns of the table that are shown at the end
     """
@@ -52,7 +52,6 @@ class _Sequence:
 
     @property
     def own_seed(self) -> int | None:
-        """The seed in the address or among the options of a built-in world; None without one."""
         seed = self.options.get("seed", dict(parse_qsl(self.path.partition("?")[2])).get("seed"))
         try:
             return None if seed is None else int(seed)
@@ -60,7 +59,6 @@ class _Sequence:
             raise ConfigError(f"{self.where}: seed: expected an integer, got {seed!r}") from error
 
     def seeds(self, given: list[int]) -> list[int | None]:
-        """The seeds of the specification, else of the address, else 0."""
         return [*(given or [self.own_seed or 0])] if self.is_world else [None]
 
 

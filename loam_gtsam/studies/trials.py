@@ -1,8 +1,7 @@
 """Trials of a parameter study: a trial is one run of one solver on one sequence, and gives a row.
 
-A row holds the numbers of the run, or the error that ended it. The row of a finished trial is
-written to a small file at once, so that an interrupted study can go on; the table of all trials is
-a Parquet file that is made of these files.
+The row of a finished trial is written to a small file at once, so that an interrupted study can go
+on; the table of all trials is a Parquet file that is made of these files.
 """
 
 from __future__ import annotations
@@ -190,7 +189,6 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
 
 
 def _unusable(name: str, finished: SolverRun) -> str | None:
-    """Why a run has no result; None if it has one."""
     if not finished.updates:
         return f"{name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
     if finished.config is None and finished.problem:
@@ -224,10 +222,7 @@ class TrialStore:
             file.write((json.dumps(row, indent=1, allow_nan=False) + "\n").encode("utf-8"))
 
     def load(self, trial: Trial) -> Row | None:
-        """The row of a trial if the installed versions have finished it; else None.
-
-        The row of a file that cannot be read is None as well: the trial runs again.
-        """
+        """The row of a trial that the installed versions have finished, in a readable file."""
         try:
             row = json.loads(self._file(trial.id).read_text(encoding="utf-8"))
         except (OSError, ValueError):

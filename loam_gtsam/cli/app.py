@@ -1,8 +1,7 @@
 """The commands of ``loam-gtsam``: demo, run, compare, study, inspect, optimize, config.
 
-Exit codes: 0 done, 1 an error (one message on stderr), 2 wrong usage, 130 stopped by Ctrl-C, 143 by
-SIGTERM. Everything that a command needs is imported when the command runs: ``--help`` and the
-completion of a shell answer at once.
+Exit codes: 0 done, 1 an error, 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM. What a command
+needs is imported when the command runs: ``--help`` and the completion of a shell answer at once.
 """
 
 from __future__ import annotations

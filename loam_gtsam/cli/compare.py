@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console, Group
@@ -50,12 +51,8 @@ def execute(options: CompareOptions) -> int:
         results = report.ScoredComparison.of(comparison)
         # Files of an earlier comparison, also those of solvers that did not run this time.
         left = (*known, *(path.name for path in folder.glob("trajectory_*.tum")))
-        files = console.write_results(
-            folder,
-            left,
-            report.REPORT_FILE,
-            lambda new: report.write_comparison(results, new, plot),
-        )
+        write = partial(report.write_comparison, results, plot=plot)
+        files = console.write_results(folder, left, report.REPORT_FILE, write)
     if not options.quiet:
         Console().print(_summary(results, seconds))
         console.print_written(stop, comparison.frames, total, folder, files)

@@ -187,7 +187,6 @@ def print_written(
 ) -> None:
     """Print the last lines of a command: whether it was stopped, and where its files are."""
     if stop.signum is not None:
-        name = signal.Signals(stop.signum).name
-        done = f"after frame {frames} of {total}"
-        typer.echo(f"Stopped by {name} {done}; what was computed until then is written.")
+        done = f"{signal.Signals(stop.signum).name} after frame {frames} of {total}"
+        typer.echo(f"Stopped by {done}; what was computed until then is written.")
     typer.echo(f"Written to {folder}: {', '.join(files)}")

@@ -51,11 +51,9 @@ def execute(options: OptimizeOptions) -> int:
 
 
 def _table(saved: SavedGraph, result: OptimizedGraph, keys: list[int]) -> Table:
-    before, after = (
-        np.array([poses.atPose3(key).translation() for key in keys])
-        for poses in (saved.poses, result.poses)
-    )
-    moved = np.linalg.norm(after - before, axis=1)
+    pairs = ((saved.poses.atPose3(key), result.poses.atPose3(key)) for key in keys)
+    moves = np.array([after.translation() - before.translation() for before, after in pairs])
+    moved = np.linalg.norm(moves, axis=1)
     off = [loop for loop in result.loops if not loop.active]
     table = Table(show_header=False, box=None)
     table.add_row("poses, factors", f"{len(keys)}, {saved.factors.size()}")
@@ -63,8 +61,8 @@ def _table(saved: SavedGraph, result: OptimizedGraph, keys: list[int]) -> Table:
     table.add_row("cost", f"{result.error_before:.6g} -> {result.error_after:.6g}")
     table.add_row("poses moved", f"{moved.mean():.3f} m on average, {moved.max():.3f} m at most")
     for loop in off[:_LISTED]:
-        said = f"{loop.earlier} - {loop.later}, chi squared {loop.chi_squared:.4g}"
-        table.add_row("switched off", said)
+        chi_squared = f"chi squared {loop.chi_squared:.4g}"
+        table.add_row("switched off", f"{loop.earlier} - {loop.later}, {chi_squared}")
     if len(off) > _LISTED:
         table.add_row("", f"and {len(off) - _LISTED} more")
     return table

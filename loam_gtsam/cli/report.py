@@ -74,7 +74,6 @@ def _loops(counts: dict[str, int]) -> str:
 
 
 def _imu_facts(imu: ImuSummary) -> dict[str, str]:
-    """Label -> value, of what was made of an IMU."""
     level = imu.level
     if level is None:
         known = imu.report.orientation != "none"
@@ -120,7 +119,6 @@ def _imu_problems(imu: ImuSummary) -> list[str]:
 
 
 def _odd_frames(updates: Sequence[MapUpdate]) -> list[str]:
-    """The messages of the first frames that were not fine."""
     odd = [f"frame {number}: {update.status}: {update.message}"
            for number, update in enumerate(updates) if update.status not in _EXPECTED]  # fmt: skip
     more = len(odd) - _MESSAGES
@@ -206,8 +204,8 @@ def _sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:
             "beams": rings.note,
             "times": assign_times(columns, rings, config).note,
         }
-    kinds = f"{len(features.edges)} edge and {len(features.planes)} plane points"
-    return facts | {"features": kinds}
+    counts = f"{len(features.edges)} edge and {len(features.planes)} plane points"
+    return facts | {"features": counts}
 
 
 def _table(title: str, rows: Mapping[str, str]) -> Table:

@@ -33,13 +33,10 @@ class Results:
     run: RunResult
     info: DatasetInfo
     truth: Trajectory | None
-    last: LastFrame | None
-    """For the pictures; None draws none."""
-    accuracy: Mapping[str, Any] = field(default_factory=dict)
-    """Errors against the truth, or ``problem``; empty without truth."""
+    last: LastFrame | None  # for the pictures; None draws none
+    accuracy: Mapping[str, Any] = field(default_factory=dict)  # or ``problem``; empty without truth
     error: evaluation.AbsoluteError | None = None
-    map_truth: Trajectory | None = None
-    """The truth in the map frame; None if it cannot be compared."""
+    map_truth: Trajectory | None = None  # in the map frame; None if it cannot be compared
 
     @staticmethod
     def of(run: RunResult, dataset: Dataset, last: LastFrame | None) -> Results:

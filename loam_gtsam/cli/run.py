@@ -23,8 +23,7 @@ from loam_gtsam.types import DatasetError, MapUpdate, Sweep
 from loam_gtsam.view import plots
 from loam_gtsam.view.observers import LastFrame, record, watch
 
-CHECKPOINT = "checkpoint"
-"""Folder among the results, until they are complete."""
+CHECKPOINT = "checkpoint"  # folder among the results, until they are complete
 _WORTH_A_PROCESS = 200  # sweeps, by which a process has saved the second that it takes to start
 
 
@@ -89,7 +88,6 @@ def worker_count(asked: int | None, sweeps: int) -> int:
 
 @contextmanager
 def _observers(options: RunOptions, config: Config, last: LastFrame) -> Iterator[Observer]:
-    """What takes every frame: ``last``, and the bag and the viewer if they were asked for."""
     with ExitStack() as stack:
         observers: list[Observer] = [last.observe]
         if options.view or options.rrd is not None:

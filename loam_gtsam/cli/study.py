@@ -73,7 +73,6 @@ def execute(options: StudyOptions) -> int:
 def _workers(
     options: StudyOptions, count: int
 ) -> AbstractContextManager[runner.LocalWorkers | runner.ClusterWorkers | None]:
-    """Where so many trials run; None stands for this process."""
     if options.scheduler is not None and count:
         return runner.cluster_workers(options.scheduler)
     if options.workers is not None and count:
@@ -95,18 +94,14 @@ def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[trials.R
 
 
 def _summary(spec: Spec, rows: Sequence[trials.Row], metric: str) -> Table:
-    """Medians over the seeds, one row per sequence and one column per configuration."""
     configs = list(dict.fromkeys(trial.config_name for trial in spec.trials))
     table = console.number_table("sequence", metric, configs)
     for sequence in dict.fromkeys(trial.sequence for trial in spec.trials):
         cells = []
         for config in configs:
-            values = [
-                row[metric]
-                for row in rows
-                if (row["sequence"], row["config"], row["error"]) == (sequence, config, None)
-                and row[metric] is not None
-            ]
+            wanted = (sequence, config, None)
+            own = (r for r in rows if (r["sequence"], r["config"], r["error"]) == wanted)
+            values = [row[metric] for row in own if row[metric] is not None]
             cells.append(Text(f"{statistics.median(values):.4g}" if values else "-"))
         table.add_row(Text(sequence), *cells)
     return table

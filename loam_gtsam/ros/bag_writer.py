@@ -21,8 +21,7 @@ from loam_gtsam.types import MapUpdate, OutputError
 _ROS2_VERSION: Literal[8] = 8
 """Of ``metadata.yaml``. Humble cannot parse version 9, and later releases read both
 (github.com/ros2/rosbag2, issue 1895)."""
-_COMMIT_EVERY = 50
-"""Frames between two commits of a database: what a killed process loses at most."""
+_COMMIT_EVERY = 50  # frames between two commits of a database: a killed process loses these at most
 _HEADER_RECORD = 4096
 """Bytes of the first record of a ROS 1 bag, as ``rosbag`` has it: without its two lengths. rosbags
 counts them in, and ``rosbag reindex`` would then write over the first 8 bytes of the messages."""
@@ -42,17 +41,13 @@ class BagWriter(ClosingWriter):
         ROS 2 folder with an SQLite database
     config : names of the frames, and which clouds to write
     overwrite : replace an earlier bag, once the new one is complete
-
-    Attributes
-    ----------
-    frames : number of frames written so far
     """
 
     def __init__(
         self, path: str | Path, config: BagConfig | None = None, *, overwrite: bool = False
     ) -> None:
         self.path = Path(path)
-        self.frames = 0
+        self.frames = 0  # written so far
         self._kind = self.path.suffix
         if self._kind not in (".bag", ".mcap", "") or not self.path.name:
             raise OutputError(
@@ -80,7 +75,6 @@ class BagWriter(ClosingWriter):
 
         Parameters
         ----------
-        update : of the frame
         cloud : de-skewed points of the sweep, in the map frame
         surround : gives the map points around the sensor; called when they are due
         """
@@ -194,7 +188,6 @@ def _is_ros2_bag(folder: Path) -> bool:
 
 
 def _is_cut_off(folder: Path) -> bool:
-    """Whether a folder holds what an unfinished recording leaves, and nothing else."""
     files = (path for path in folder.rglob("*") if not path.is_dir())
     return all(path.suffix.startswith((".yaml", ".db3", ".mcap")) for path in files)
 

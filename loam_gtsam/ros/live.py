@@ -1,7 +1,6 @@
 """A live run without ROS: messages come in as they are measured, poses come out.
 
-Here are the queues, what waits for what, and what is dropped when the mapper is too slow; the node
-only hands messages over (:mod:`loam_gtsam.ros.node`).
+Here are the queues, what waits for what, and what is dropped when the mapper is too slow.
 """
 
 from __future__ import annotations
@@ -29,19 +28,12 @@ from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checke
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
 from loam_gtsam.types import ConfigError, DatasetError, InputError, MapUpdate, Sweep
 
-_POLL = 0.02
-"""Seconds after which a worker looks whether a sweep has waited for long enough."""
+_POLL = 0.02  # seconds after which a worker looks whether a sweep has waited for long enough
 
 
 @dataclass(frozen=True, slots=True)
 class LiveResult:
-    """One sweep, mapped.
-
-    Attributes
-    ----------
-    sweep, update : as :meth:`loam_gtsam.pipeline.Pipeline.process` took and gave them
-    received, started, mapped, published : nanoseconds of the clock
-    """
+    """One sweep, mapped; ``received`` to ``published`` are in nanoseconds of the clock."""
 
     sweep: Sweep
     update: MapUpdate
@@ -110,8 +102,8 @@ class LiveMapper:
         self._imu: LiveImu | None = None
         if imu and config.imu.enabled:
             self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
-        own = {"extra_factors": extra_factors, "loop_closer": loop_closer}
-        self._parts: dict[str, Any] = {"solver": solver, "odometry": odometry} | own
+        self._parts: dict[str, Any] = {"solver": solver, "odometry": odometry}
+        self._parts |= {"extra_factors": extra_factors, "loop_closer": loop_closer}
         self._begin()
         self._matcher = StampMatcher(features)
         self._features = frozenset(features)
@@ -205,10 +197,9 @@ class LiveMapper:
                 self._current = self._decoder.decode(received, content)
             except DatasetError as error:
                 self.fault(str(error))
-        current = self._current
-        if self._must_wait(current):
+        if self._must_wait(self._current):
             return None
-        self._current = None
+        current, self._current = self._current, None
         return self._map(current)
 
     def reset(self) -> None:
@@ -250,7 +241,6 @@ class LiveMapper:
         self._news.set()
 
     def _must_wait(self, current: ReadySweep) -> bool:
-        """Whether samples of a sweep may still come."""
         imu, config, aid = self._imu, self._config, self.pipeline.mapper.imu
         if imu is None or aid is None or current.needs is None:
             return False

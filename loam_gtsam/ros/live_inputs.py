@@ -66,8 +66,7 @@ class SweepDecoder:
             raise ConfigError(f"features: expected {', '.join(missing)} among them")
         if axes not in ("auto", "lidar", "loam"):
             raise ConfigError(f"axes: expected one of auto, lidar, loam; got {axes!r}")
-        self._config = config
-        self._clouds = clouds
+        self._config, self._clouds = config, clouds
         self._features = FeatureDecoder(axes) if axes != "auto" else None
         self._clock_offset: int | None = None
 
@@ -85,12 +84,11 @@ class SweepDecoder:
             scan = self._clouds.decode(content)
         # Whatever a faulty message makes a decoder stumble over: the next one may be good.
         except Exception as error:
-            known = isinstance(error, LoamError)
-            reason = str(error) if known else f"{type(error).__name__}: {error}"
+            kind = "" if isinstance(error, LoamError) else f"{type(error).__name__}: "
+            reason = f"{kind}{error}"
             if is_group:
-                return ReadySweep(
-                    BadSweep(message_stamp(content[ODOMETRY]), reason), received, None
-                )
+                bad = BadSweep(message_stamp(content[ODOMETRY]), reason)
+                return ReadySweep(bad, received, None)
             # A bad cloud has only a receive time: that of the last good one leads to the stamps.
             if self._clock_offset is None:
                 raise DatasetError(reason) from error

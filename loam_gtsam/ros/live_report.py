@@ -11,12 +11,9 @@ import numpy as np
 from loam_gtsam.types import FrameStatus, MapUpdate
 
 STAGES = ("waiting", "mapping", "publishing", "total")
-_LATEST = 1000
-"""Sweeps of which the latencies are kept."""
-_REASONS = 30
-"""Different reasons that are counted one by one: they may quote numbers of the message."""
-_LETTERS = 300
-"""Letters of a reason that are kept."""
+_LATEST = 1000  # sweeps of which the latencies are kept
+_REASONS = 30  # that are counted one by one: they may quote numbers of the message
+_LETTERS = 300  # of a reason that are kept
 OTHER_REASONS = "other reasons"
 
 
@@ -43,8 +40,7 @@ class LiveReport:
         a time that has been mapped
     without_imu : sweeps mapped although their IMU samples had not all come
     statuses : sweeps mapped, by status
-    waiting : sweeps in the queue now
-    deepest : most sweeps that were in the queue
+    waiting, deepest : sweeps in the queue now, and at most
     latency : of the last 1000 sweeps, by stage: ``waiting`` from its reception to the start,
         ``mapping``, ``publishing``, and ``total``. Empty before the first one.
     """
@@ -63,12 +59,8 @@ class LiveReport:
     def __str__(self) -> str:
         """One line for a log."""
         parts = [f"{sum(self.statuses.values())} sweeps mapped ({_listed(self.statuses)})"]
-        for what, counts in (
-            ("dropped", self.dropped),
-            ("late", self.late),
-            ("unmatched", self.unmatched),
-            ("not used", self.faults),
-        ):
+        counted = {"dropped": self.dropped, "late": self.late, "unmatched": self.unmatched}
+        for what, counts in (counted | {"not used": self.faults}).items():
             if sum(counts.values()):
                 parts.append(f"{what}: {_listed(counts)}")
         if self.without_imu:

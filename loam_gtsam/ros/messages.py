@@ -36,12 +36,10 @@ TYPES = {
 _PATH_STEP = 10
 """Poses by which the path grows at least before it is written again; later a tenth of its length,
 so that all path messages together are eleven times the last one, not its square."""
-_NS = 10**9
 _LAST_SECOND = 2**31
 """ROS 2 counts seconds in an int32; ROS 1, in a uint32, reaches twice as far."""
 _FIELDS = ("x", "y", "z", "intensity")
-_FLOAT32 = 7
-"""sensor_msgs/PointField"""
+_FLOAT32 = 7  # of sensor_msgs/PointField
 _UNKNOWN = np.zeros(36)
 _UNKNOWN[0] = -1.0
 _UNKNOWN.flags.writeable = False
@@ -84,10 +82,6 @@ class FrameMessages:
     ----------
     config : names of the frames, and which clouds to make
     ros1 : serialise for ROS 1 bags instead of ROS 2
-
-    Attributes
-    ----------
-    store : the types, as rosbags has them
     """
 
     def __init__(self, config: BagConfig, *, ros1: bool = False) -> None:
@@ -96,7 +90,7 @@ class FrameMessages:
                 "bag.map_frame, bag.lidar_frame: expected two different names, got "
                 f"{config.map_frame!r} and {config.lidar_frame!r}"
             )
-        # All of these types are the same from Humble to today.
+        # The types, as rosbags has them; all of these are the same from Humble to today.
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         if ros1:  # not part of that store
             definition = "geometry_msgs/TransformStamped[] transforms\n"
@@ -140,7 +134,6 @@ class FrameMessages:
             yield PATH, self._path()
 
     def _odometry(self, update: MapUpdate) -> bytes:
-        """The pose, and the twist in the lidar's own axes."""
         pose, (turn, velocity) = update.map_T_lidar, np.split(update.twist, 2)
         linear, angular = self._xyz("Vector3", velocity), self._xyz("Vector3", turn)
         twist = self._geometry("Twist", linear=linear, angular=angular)
@@ -154,7 +147,6 @@ class FrameMessages:
         )
 
     def _transform(self, update: MapUpdate) -> bytes:
-        """The one transform from the lidar's frame to the map's."""
         position = self._xyz("Vector3", update.map_T_lidar.translation())
         turn = self._quaternion(update.map_T_lidar)
         stamped = self._geometry(
@@ -166,7 +158,6 @@ class FrameMessages:
         return self._serialised(TF, transforms=[stamped])
 
     def _path(self) -> bytes:
-        """All poses, one at least; the stamp of the path is that of its last pose."""
         poses = [
             self._geometry("PoseStamped", header=self._header(stamp), pose=self._pose(pose))
             for stamp, pose in self._poses
@@ -174,7 +165,6 @@ class FrameMessages:
         return self._serialised(PATH, header=poses[-1].header, poses=poses)
 
     def _cloud(self, stamp: int, points_map: Points) -> bytes:
-        """float32 fields x, y, z, intensity."""
         check_array(points_map, "points_map", ("N", len(_FIELDS)))
         rows = np.ascontiguousarray(points_map, dtype="<f4")
         step = rows.itemsize * len(_FIELDS)
@@ -204,7 +194,7 @@ class FrameMessages:
         return bytes(serialise(self._make(name, **values), name))
 
     def _header(self, stamp: int) -> Any:
-        seconds, rest = divmod(int(stamp), _NS)
+        seconds, rest = divmod(int(stamp), 10**9)
         if not 0 <= seconds < _LAST_SECOND:
             raise OutputError(
                 f"stamp {stamp} ns: a ROS message takes 0 to {_LAST_SECOND} s; run without a bag, "
@@ -213,8 +203,8 @@ class FrameMessages:
         time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         # ROS 1 publishers count in seq; in a bag nothing depends on it.
         counter = {"seq": 0} if self._ros1 else {}
-        frame = self._config.map_frame
-        return self._make("std_msgs/msg/Header", **counter, stamp=time, frame_id=frame)
+        values = {"stamp": time, "frame_id": self._config.map_frame}
+        return self._make("std_msgs/msg/Header", **counter, **values)
 
     def _pose(self, pose: gtsam.Pose3) -> Any:
         position, turn = self._xyz("Point", pose.translation()), self._quaternion(pose)

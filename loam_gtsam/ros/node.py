@@ -1,7 +1,7 @@
 """The ROS 2 node: ``python -m loam_gtsam.ros --ros-args -p cloud_topic:=/points``.
 
-Messages cross the border to ROS as bytes and are read by rosbags, as those of a bag are. So the
-node needs no message package to decode, and what is mapped live and from a bag is the same.
+Messages cross the border to ROS as bytes and are read by rosbags, as those of a bag are: the node
+needs no message package to decode, and what is mapped live and from a bag is the same.
 """
 
 from __future__ import annotations
@@ -44,12 +44,10 @@ PARAMETERS: dict[str, Any] = {
 }
 """Parameters of the node with their defaults; an empty text is none. See docs/live.md."""
 
+_CLOUD_OPTIONS = ("time_field", "time_unit", "stamp_is")
 _CLOUD_TYPE, _IMU_TYPE = TYPES[REGISTERED], "sensor_msgs/msg/Imu"
-_IMU_DEPTH = 1000
-"""IMU messages that ROS keeps while Python is busy."""
-_DEPTH = 10
-"""Published messages of a topic that ROS keeps for a slow subscriber."""
-
+_IMU_DEPTH = 1000  # IMU messages that ROS keeps while Python is busy
+_DEPTH = 10  # published messages of a topic that ROS keeps for a slow subscriber
 _log = logging.getLogger(__name__)
 
 
@@ -62,17 +60,10 @@ class LiveNode:
     ----------
     node : an ``rclpy.node.Node``; the constructor declares its parameters, subscribes, advertises
     on_error : called when an error ends the thread that maps
-
-    Attributes
-    ----------
-    live : maps the sweeps
     """
 
     def __init__(self, node: Any, on_error: Callable[[], object] = lambda: None) -> None:
-        values = {
-            name: node.declare_parameter(name, default).value
-            for name, default in PARAMETERS.items()
-        }
+        values = {key: node.declare_parameter(key, v).value for key, v in PARAMETERS.items()}
         config = config_of(values)
         self._messages = FrameMessages(config.bag)
         self._read = self._messages.store.deserialize_cdr
@@ -84,11 +75,7 @@ class LiveNode:
             imu=bool(values["imu_topic"]),
             features=self._features,
             axes=values["axes"],
-            clouds=CloudStream(
-                time_field=values["time_field"] or None,
-                time_unit=values["time_unit"] or None,
-                stamp_is=values["stamp_is"] or None,
-            ),
+            clouds=CloudStream(**{key: values[key] or None for key in _CLOUD_OPTIONS}),
             observe=self._observe,
         )
         self._output = make_folder(values["output"]) if values["output"] else None
@@ -133,10 +120,8 @@ class LiveNode:
             kinds[imu] = _IMU_TYPE
         for topic, kind in kinds.items():
             # Best effort, for it takes from reliable publishers too.
-            qos = QoSProfile(
-                depth=_IMU_DEPTH if kind == _IMU_TYPE else queue,
-                reliability=ReliabilityPolicy.BEST_EFFORT,
-            )
+            depth = _IMU_DEPTH if kind == _IMU_TYPE else queue
+            qos = QoSProfile(depth=depth, reliability=ReliabilityPolicy.BEST_EFFORT)
             receive = partial(self._receive, topic, kind)
             node.create_subscription(_message_class(kind), topic, receive, qos, raw=True)
 
@@ -214,6 +199,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _message_class(kind: str) -> Any:
-    """``sensor_msgs/msg/Imu`` as a class."""
     package, _, name = kind.partition("/msg/")
     return getattr(import_module(f"{package}.msg"), name)

@@ -11,15 +11,11 @@ from loam_gtsam.types import BoolArray, FloatArray
 from loam_gtsam.view.frame_view import LARGE_RESIDUAL, RESIDUAL_COLOURS, FrameView, MapView
 from loam_gtsam.view.plots import INK, PATH, empty_figure, save_figure
 
-_REACH = (6.0, 50.0)
-"""Metres around the sensor that are drawn, at least and at most."""
-_SHARE = 0.88
-"""Share of the sweep that is drawn, where that is between these limits."""
-_ASIDE_DEG, _ABOVE_DEG = 28.0, 33.0
-"""Direction of the view: aside of the sensor's back, and above the ground."""
+_REACH = (6.0, 50.0)  # metres around the sensor that are drawn, at least and at most
+_SHARE = 0.88  # of the sweep that is drawn, where that is between these limits
+_ASIDE_DEG, _ABOVE_DEG = 28.0, 33.0  # of the view: beside the sensor's back, above the ground
 _MAP, _SWEEP = "#b9c3cc", "#6b7a88"
-_ENLARGED = 10.0
-"""Factor by which residuals and the ellipse of the covariance are enlarged."""
+_ENLARGED = 10.0  # factor for residuals and the ellipse of the covariance
 _SIGMAS = 3.0
 
 
@@ -86,7 +82,6 @@ class _Camera:
         self._axes = np.stack([right, up])
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """(N, 2) metres to the right of the sensor and upwards."""
         across: FloatArray = (points - self._centre) @ self._axes.T
         return across
 
@@ -101,14 +96,11 @@ class _Camera:
         return outline
 
     def is_near(self, points: FloatArray) -> BoolArray:
-        """Which of (N, 3) points are to be drawn."""
         return self._distances(points) < self.reach
 
     def near(self, points: FloatArray) -> FloatArray:
-        """Those of (N, 3) points."""
         return points[self.is_near(points)]
 
     def _distances(self, points: FloatArray) -> FloatArray:
-        """(N,) metres, seen from above."""
         distances: FloatArray = np.linalg.norm((points - self._centre)[:, :2], axis=1)
         return distances

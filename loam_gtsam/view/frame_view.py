@@ -24,7 +24,6 @@ class FrameView:
     Attributes
     ----------
     number : of the frame, from 0
-    update : result of the mapper
     map_T_lidar : (4, 4) pose of the frame
     position_covariance : (3, 3) m^2 of the position, along the axes of the map; NaN where the
         frame was not solved

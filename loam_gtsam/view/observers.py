@@ -60,8 +60,6 @@ def record(recording: Recording) -> Observer:
 def watch(*watchers: FrameWatcher) -> Observer:
     """The ``observe`` of :func:`loam_gtsam.pipeline.run` that shows every frame.
 
-    The run is the same with it: bit by bit, but for the time it takes.
-
     Examples
     --------
     >>> with RerunViewer("run.rrd") as viewer:  # doctest: +SKIP
@@ -223,7 +221,6 @@ def surrounding_cloud(update: MapUpdate, mapper: Mapper) -> FloatArray:
 def _deskewed(
     scan: Scan, organised: OrganisedSweep, update: MapUpdate, mapper: Mapper
 ) -> FloatArray:
-    """(N, 3) points of a sweep in the map frame, moved as the mapper moves features."""
     since_scan = (update.stamp - scan.stamp) * 1e-9
     first, last = organised.span
     points = Features(
@@ -246,7 +243,6 @@ def _deskewed(
 
 
 def _correction(pipeline: Pipeline) -> FloatArray:
-    """(4, 4) ``map_T_odom``; without loops the two frames are one."""
     if pipeline.loops is None:
         return np.eye(4)
     correction: FloatArray = pipeline.loops.map_T_odom.matrix()

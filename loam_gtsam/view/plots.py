@@ -1,7 +1,6 @@
 """Pictures of a run as PNG files. Needs the ``plot`` extra; nothing is shown on a screen.
 
-Every function writes the file ``path`` and raises :class:`loam_gtsam.types.OutputError` if
-matplotlib is missing or the file cannot be written.
+Every function raises OutputError if matplotlib is missing or the file cannot be written.
 """
 
 from __future__ import annotations
@@ -24,17 +23,13 @@ INK, FAINT, PATH, TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
 _STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d",
                   "#54a24b", "#bab0ac", "#ff9da6")  # fmt: skip
 _RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8", "#7a5230")
-"""Of the solvers of a comparison, in the order they were named."""
 _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 """Pale ground, dark walls: what stands out of the ground stands out of the page."""
-_MAX_BYTES = 300_000
-"""Larger pictures are reduced to ``_PALETTE`` colours: they are for READMEs and reports."""
+_MAX_BYTES = 300_000  # larger pictures get fewer colours: they are for READMEs and reports
 _PALETTE = 255
-_MAP_CELLS = 700
-"""Cells along the longer side of the top view; a picture has about as many pixels."""
-_MIN_CELL = 0.1
-"""Metres. The map is voxel-filtered: smaller cells would be mostly empty."""
+_MAP_CELLS = 700  # along the longer side of the top view; a picture has about as many pixels
+_MIN_CELL = 0.1  # metres; the map is voxel-filtered: smaller cells would be mostly empty
 
 
 def available() -> bool:
@@ -80,10 +75,7 @@ def plot_map(
 ) -> None:
     """Draw the map from above, coloured by height, with the path.
 
-    Parameters
-    ----------
-    edges, planes : (E, 3) and (P, 3) metres, map frame
-    trajectory : drawn on top, or None
+    ``edges`` and ``planes`` are (E, 3) and (P, 3) metres, map frame.
     """
     figure = empty_figure(9.0, 7.0)
     axes = figure.subplots()
@@ -102,13 +94,7 @@ def plot_map(
 
 
 def plot_errors(path: str | Path, stamps: IntArray, errors: FloatArray) -> None:
-    """Draw how far the positions are off the truth, over time.
-
-    Parameters
-    ----------
-    stamps : (N,) nanoseconds
-    errors : (N,) metres, see :class:`loam_gtsam.studies.evaluation.AbsoluteError`
-    """
+    """Draw how far positions are off the truth, (N,) metres, over stamps, (N,) nanoseconds."""
     figure = empty_figure(9.0, 3.2)
     axes = figure.subplots()
     seconds = (stamps - stamps[0]) * 1e-9 if len(stamps) else stamps
@@ -154,10 +140,8 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     if names:
         milliseconds = 1e3 * np.nan_to_num(seconds)
         colours = list(islice(cycle(_STAGE_COLOURS), len(names)))
-        labels = [
-            f"{name}  {median:.1f} ms"
-            for name, median in zip(names, np.median(milliseconds, axis=0), strict=True)
-        ]
+        medians = zip(names, np.median(milliseconds, axis=0), strict=True)
+        labels = [f"{name}  {median:.1f} ms" for name, median in medians]
         axes.stackplot(np.arange(len(updates)), milliseconds.T, labels=labels, colors=colours, lw=0)
         # A rare slow frame (start-up, a busy machine) would flatten everything else.
         axes.set_ylim(0.0, 1.3 * float(np.percentile(milliseconds.sum(axis=1), 98)) + 1e-9)
@@ -174,13 +158,7 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
 def plot_trajectories(
     path: str | Path, trajectories: Mapping[str, Trajectory], truth: Trajectory | None = None
 ) -> None:
-    """Draw several paths from above, and their heights.
-
-    Parameters
-    ----------
-    trajectories : by name, all in one frame (align them first)
-    truth : reference poses in the same frame, or None
-    """
+    """Draw several paths, all in one frame (align them first), from above, and their heights."""
     lines = [] if truth is None else [("truth", truth, TRUTH, 4.0)]
     named = zip(trajectories.items(), cycle(_RUN_COLOURS), strict=False)
     lines += [(name, trajectory, colour, 1.3) for (name, trajectory), colour in named]
@@ -224,12 +202,7 @@ def plot_curves(
 
 
 def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> None:
-    """Draw the time a frame takes as one bar per solver, split into stages.
-
-    Parameters
-    ----------
-    stages : solver -> stage -> milliseconds
-    """
+    """Draw the time of a frame as one bar per solver; solver -> stage -> milliseconds."""
     figure = empty_figure(9.0, 1.4 + 0.5 * len(stages))
     axes = figure.subplots()
     names = list(dict.fromkeys(stage for row in stages.values() for stage in row))
@@ -247,7 +220,6 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
 def _trajectory_figure(
     height: float, lines: Sequence[tuple[str, Trajectory, str, float]]
 ) -> tuple[Any, Any]:
-    """Names, trajectories, colours and widths from above and by height; the upper axes too."""
     figure = empty_figure(9.0, height)
     top, side = figure.subplots(2, 1, height_ratios=(4, 1))
     for name, trajectory, colour, width in lines:
@@ -262,7 +234,6 @@ def _trajectory_figure(
 
 
 def _draw_path(axes: Any, xyz: FloatArray) -> None:
-    """A path on a map, from its start on."""
     axes.plot(xyz[:, 0], xyz[:, 1], color="white", lw=3.0)
     axes.plot(xyz[:, 0], xyz[:, 1], color=PATH, lw=1.6)
     axes.plot(xyz[:1, 0], xyz[:1, 1], "o", color=PATH, mec="white", ms=7)
@@ -314,9 +285,8 @@ def save_figure(figure: Any, path: str | Path) -> None:
     """Common style, then the PNG."""
     for axes in figure.axes:
         axes.tick_params(colors=INK, length=0, labelsize=9)
-        axes.xaxis.label.set_color(INK)
-        axes.yaxis.label.set_color(INK)
-        axes.title.set_color(INK)
+        for text in (axes.xaxis.label, axes.yaxis.label, axes.title):
+            text.set_color(INK)
         for spine in axes.spines.values():
             spine.set_color(FAINT)
         if axes.get_label() != "<colorbar>":
@@ -331,7 +301,6 @@ def save_figure(figure: Any, path: str | Path) -> None:
 
 
 def _with_palette(png: io.BytesIO) -> io.BytesIO:
-    """The same picture in few colours, a third of the size or less."""
     from PIL import Image  # comes with matplotlib
 
     smaller = io.BytesIO()

@@ -22,15 +22,13 @@ from loam_gtsam.view.frame_view import FrameView, MapView, residual_colours
 from loam_gtsam.view.rrd_file import RrdFile
 
 _NAME = "loam_gtsam"
-_MEMORY = "2GB"
-"""What the viewer may take; it then forgets the oldest frames."""
+_MEMORY = "2GB"  # what the viewer may take; it then forgets the oldest frames
 _FLUSH_SECONDS = 10.0
 _SIGMAS = 3.0
 _SWEEP, _MAP_EDGE, _MAP_PLANE = (220, 226, 232), (150, 160, 172), (96, 106, 118)
 _EDGE, _PLANE, _PATH = (228, 87, 46), (63, 143, 166), (228, 87, 46)
 _LOOP_ON, _LOOP_OFF, _ELLIPSOID = (46, 158, 107), (194, 34, 47), (238, 202, 59)
-_MOST_PATH = 2_000
-"""Points of the trajectory that are drawn at most."""
+_MOST_PATH = 2_000  # points of the trajectory that are drawn at most
 _FINE = (FrameStatus.OK, FrameStatus.FIRST)
 
 
@@ -51,10 +49,6 @@ class RerunViewer(ClosingWriter):
     most_sweep, most_map : points of a sweep, and of the map around it, that are drawn at most; of
         more, so many evenly spread ones
 
-    Attributes
-    ----------
-    path : as given
-    frames : shown so far
     """
 
     def __init__(
@@ -70,7 +64,7 @@ class RerunViewer(ClosingWriter):
     ) -> None:
         self._rr = _rerun()
         self.path = None if path is None else Path(path)
-        self.frames = 0
+        self.frames = 0  # shown so far
         self._every, self._exaggerate = max(every, 1), exaggerate
         self._most_sweep, self._most_map = most_sweep, most_map
         self._around: Callable[[], MapView] | None = None
@@ -127,7 +121,6 @@ class RerunViewer(ClosingWriter):
             self.path.unlink(missing_ok=True)
 
     def _draw_frame(self, frame: FrameView) -> None:
-        """Pose, covariance, sweep, features and matches."""
         rr, pose = self._rr, frame.map_T_lidar
         self._log("map/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         self._log("map/covariance", self._ellipsoid(pose[:3, 3], frame.position_covariance))
@@ -141,13 +134,12 @@ class RerunViewer(ClosingWriter):
         self._draw("map/matches/residuals", rr.LineStrips3D, lines, colours, 1.0)
 
     def _draw_map(self) -> None:
-        """The last view of the map, if it has not been drawn."""
         if self._around is None:
             return
         rr, view, self._around = self._rr, self._around(), None
         total = max(len(view.edges) + len(view.planes), 1)
-        surroundings = ("edges", view.edges, _MAP_EDGE), ("planes", view.planes, _MAP_PLANE)
-        for name, points, colour in surroundings:
+        parts = {"edges": (view.edges, _MAP_EDGE), "planes": (view.planes, _MAP_PLANE)}
+        for name, (points, colour) in parts.items():
             some = _thinned(points, self._most_map * len(points) // total)
             self._draw(f"map/surroundings/{name}", rr.Points3D, some, colour, 0.5)
         self._draw("map/trajectory", rr.LineStrips3D, [_thinned(view.path, _MOST_PATH)], _PATH, 2.0)
@@ -156,7 +148,6 @@ class RerunViewer(ClosingWriter):
         self._draw("map/loops/switched_off", rr.LineStrips3D, unused, _LOOP_OFF, 1.5)
 
     def _plot(self, frame: FrameView) -> None:
-        """Numbers over time, and what went wrong in words."""
         rr, update = self._rr, frame.update
         numbers = {
             "matches/edges": update.n_edge_matches,
@@ -170,8 +161,8 @@ class RerunViewer(ClosingWriter):
             self._log(f"frame/{name}", rr.Scalars(float(value)))
         if update.message:
             level = "INFO" if update.status in _FINE else "WARN"
-            text = rr.TextLog(f"{update.status}: {update.message}", level=level)
-            self._log("frame/messages", text)
+            text = f"{update.status}: {update.message}"
+            self._log("frame/messages", rr.TextLog(text, level=level))
 
     def _ellipsoid(self, centre: FloatArray, covariance: FloatArray) -> Any:
         """Of 3 sigma, enlarged; nothing where the covariance is not known."""
@@ -195,7 +186,6 @@ class RerunViewer(ClosingWriter):
             stream.log(entity, what, static=static)
 
     def _shown(self) -> Any:
-        """A stream into a window."""
         # The program beside this Python, whose folder need not be on the path.
         here = shutil.which("rerun", path=str(Path(sys.executable).parent))
         stream = self._rr.RecordingStream(_NAME)
@@ -240,7 +230,6 @@ def _check_screen() -> None:
 
 
 def _blueprint() -> Any:
-    """The layout in which the viewer opens."""
     from rerun import blueprint as bp
 
     titles = {

@@ -83,9 +83,6 @@ def files_in(folder: Path | str) -> set[str]:
     return {path.name for path in Path(folder).iterdir()}
 
 
-# -- what a good run gives ---------------------------------------------------------------------
-
-
 def test_demo_writes_everything_and_says_how_accurate_it_is():
     text = said("demo", "--scene", "room", "--frames", FRAMES, "--profile")
     folder = Path("loam_gtsam_output/room_vlp16")
@@ -132,8 +129,7 @@ def test_an_earlier_run_is_kept_unless_overwrite_is_given(opens, scans):
     Path("out/trajectory.png").write_text("of the earlier run")
     opens(scans[:3])
     mapped("--overwrite")
-    assert len(read_tum("out/trajectory.tum")) == 3
-    assert len(read_tum("out-2/trajectory.tum")) == 2
+    assert (len(read_tum("out/trajectory.tum")), len(read_tum("out-2/trajectory.tum"))) == (3, 2)
     assert files_in("out") == {*RUN_FILES, "notes.md"}
     assert not Path("out-4").exists()
 
@@ -146,9 +142,6 @@ def test_text_of_the_data_is_never_taken_for_markup_and_quiet_prints_nothing(ope
     text = said("inspect", "x")
     assert "x [y] z" in text
     assert "a [red]small[/red] problem" in text
-
-
-# -- what is odd, and what is wrong ------------------------------------------------------------
 
 
 def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
@@ -253,9 +246,6 @@ def test_wrong_options_say_what_was_expected(arguments, code, message):
     assert message in said("run", "sim:room", "--quiet", "--no-plot", *arguments, code=code)
 
 
-# -- the other commands ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     ("items", "code", "words"),
     [
@@ -291,8 +281,6 @@ def test_version_names_what_matters_in_a_bug_report():
     lines = loam("--version").output.splitlines()
     assert [line.split()[0] for line in lines] == ["loam_gtsam", "gtsam", "numpy", "python"]
 
-
-# -- stopping ----------------------------------------------------------------------------------
 
 _ENDLESS = """
 import itertools, signal, sys, time
@@ -377,9 +365,6 @@ def test_a_signal_is_noted_unless_it_is_ignored_and_handlers_are_put_back(ignore
         signal.signal(signal.SIGINT, before)
 
 
-# -- IMU and loops -----------------------------------------------------------------------------
-
-
 def test_run_says_what_was_made_of_the_imu():
     text = said("run", "sim:room", "--frames", 3, "--no-plot")
     for part in (
@@ -440,9 +425,6 @@ def test_run_closes_loops_and_writes_the_graph():
     said("optimize", folder / "pose_graph.g2o")
 
 
-# -- resume ------------------------------------------------------------------------------------
-
-
 def test_resume_starts_goes_on_and_says_when_all_is_done(opens, scans):
     opens([*scans[:2], DatasetError("the disk was pulled out")])
     mapped("--resume", code=1)
@@ -484,9 +466,6 @@ def test_a_run_that_cannot_start_says_so_at_once_and_leaves_no_folder(opens):
     Path("out").mkdir()
     mapped("--bag", "there.bag", code=1)
     assert Path("out").is_dir()
-
-
-# -- help --------------------------------------------------------------------------------------
 
 
 _HELP = """

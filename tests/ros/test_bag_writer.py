@@ -91,9 +91,6 @@ def cloud_rows(message: Any) -> np.ndarray:
     )
 
 
-# -- what is in it ---------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_every_message_reads_back(tmp_path: Path, name: str) -> None:
     frames = 12
@@ -200,13 +197,9 @@ def test_all_paths_together_grow_as_the_run_does(tmp_path: Path) -> None:
         for number in range(frames):
             bag.write(make_update(number))
     lengths = [len(path.poses) for _, path in read(tmp_path / "run.bag")[PATH]]
-    assert lengths[0] == 10
-    assert lengths[-1] == frames
+    assert (lengths[0], lengths[-1]) == (10, frames)
     assert np.all(np.diff(lengths[:-1]) >= np.maximum(10, np.array(lengths[:-2]) // 10))
     assert sum(lengths) <= 12 * frames
-
-
-# -- covariance ------------------------------------------------------------------------------------
 
 
 def test_covariance_is_that_of_positions_and_turns_about_the_axes_of_the_map() -> None:
@@ -235,9 +228,6 @@ def test_an_unknown_covariance_is_minus_one(tmp_path: Path, status: FrameStatus)
     unknown, known = (message for _, message in read(tmp_path / "run.mcap")[ODOMETRY])
     assert unknown.pose.covariance.tolist() == [-1.0] + [0.0] * 35
     assert known.pose.covariance[0] > 0.0
-
-
-# -- whatever ends the run -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -304,9 +294,6 @@ def test_a_full_disk_is_a_clear_error(
         bag.close() if fails == "close" else bag.write(make_update(1))
 
 
-# -- names -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", NAMES)
 def test_an_earlier_bag_is_replaced_only_if_asked_and_when_complete(
     tmp_path: Path, name: str
@@ -366,9 +353,6 @@ def test_frames_need_two_names(tmp_path: Path, map_frame: str, lidar_frame: str)
         BagWriter(tmp_path / "run.bag", config)
 
 
-# -- what a message can say ------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(
     ("stamp", "fits"), [(-1, False), (0, True), (2**31 * 10**9 - 1, True), (2**31 * 10**9, False)]
@@ -397,9 +381,6 @@ def test_a_cloud_has_four_columns_and_may_be_empty_or_have_holes(tmp_path: Path)
     empty, broken = (message for _, message in found[REGISTERED])
     assert (empty.width, len(empty.data), empty.is_dense) == (0, 0, True)
     assert (broken.width, broken.is_dense) == (40, False)
-
-
-# -- ROS's own tool --------------------------------------------------------------------------------
 
 
 def test_the_first_record_is_as_long_as_rosbag_takes_it_to_be(tmp_path: Path) -> None:

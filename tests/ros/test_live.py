@@ -121,9 +121,6 @@ def shaken_up(messages: list[Message]) -> list[Message]:
     return moved
 
 
-# --- the same as from a bag -----------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "interleaved",
     [
@@ -221,9 +218,6 @@ def test_messages_of_rclpy_are_read_as_those_of_rosbags(bag: Path, offline: RunR
             content = replace(message.content, data=array("B", message.content.data.tobytes()))
             messages[number] = replace(message, content=content)
     assert_the_same(*lived(messages), offline)
-
-
-# --- with every part of a run, and begun anew -----------------------------------------------
 
 
 class OneLoop:
@@ -358,9 +352,6 @@ def test_a_run_of_twice_as_many_sweeps_keeps_no_more() -> None:
     assert sizes[1] < 1.01 * sizes[0]
 
 
-# --- waiting for the IMU --------------------------------------------------------------------
-
-
 def test_a_sweep_waits_for_its_samples_and_no_longer(bag: Path) -> None:
     messages = messages_of(bag)
     sweeps = [m for m in messages if m.topic == POINTS]
@@ -426,9 +417,6 @@ def test_one_sample_from_the_future_opens_no_gate(bag: Path) -> None:
     for message in (wild, samples[0]):
         hand_over(live, message)
     assert live.step() is None
-
-
-# --- queues ---------------------------------------------------------------------------------
 
 
 def thin(number: int) -> Any:
@@ -509,9 +497,6 @@ def test_samples_that_find_no_room_are_counted(bag: Path) -> None:
     for message in samples:
         hand_over(live, message)
     assert live.report().dropped == {"imu": len(samples) - 30}
-
-
-# --- faulty, late and odd messages ----------------------------------------------------------
 
 
 def without(name: str) -> Any:
@@ -628,9 +613,6 @@ def test_reasons_stay_few_however_many_there_are() -> None:
     assert [len(reason) for reason in log.faults] == [300]
 
 
-# --- LOAM's topics --------------------------------------------------------------------------
-
-
 def replayed_topics(
     recording: Any, topics: tuple[str, ...] = (*REQUIRED, CLOUD), **options: Any
 ) -> tuple[LiveMapper, list[LiveResult]]:
@@ -695,9 +677,6 @@ def test_axes_that_cannot_be_told_yet_are_told_by_a_later_sweep() -> None:
     assert "cannot tell the axes" in next(iter(live.report().faults))
     live, results = replayed_topics(recording, topics, axes="lidar")
     assert results[0].update.status is not FrameStatus.UNUSABLE_SCAN
-
-
-# --- wrong use ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

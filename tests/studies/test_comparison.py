@@ -123,8 +123,7 @@ def test_presets_and_configuration_files_are_solvers(dataset, tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("map:\n  edge_voxel: 0.3\n")
     mine = find_contender(str(file))
-    assert mine.name == "mine"
-    assert mine.config.map.edge_voxel == 0.3
+    assert (mine.name, mine.config.map.edge_voxel) == ("mine", 0.3)
 
 
 def test_solvers_must_be_known_and_have_different_names(dataset):
@@ -186,8 +185,7 @@ def test_relative_errors_of_all_are_over_the_same_lengths():
     truth = winding(20)
     part = Trajectory(truth.stamps[:15], truth.map_T_lidar[:15])
     long, short = solver_run("long", truth), solver_run("short", part)
-    assert score(long, truth).lengths[0] == 1.0
-    assert score(short, truth).lengths[0] == 0.5
+    assert (score(long, truth).lengths[0], score(short, truth).lengths[0]) == (1.0, 0.5)
     both = score_all(Comparison("x", (long, short), truth))
     assert both[0].lengths == both[1].lengths == score(short, truth).lengths
     assert both[0].rpe_percent == pytest.approx(0.0, abs=1e-9)
@@ -225,9 +223,6 @@ def test_no_sweep_is_read_beyond_max_frames(name, sweeps, fake):
     result = compare_solvers(data, [find_contender(name)], max_frames=2)
     assert result.error is None
     assert result.frames == 2
-
-
-# -- with other features -----------------------------------------------------------------------
 
 
 class Recorder:

@@ -31,9 +31,6 @@ def changed(trajectory, poses):
     return Trajectory(trajectory.stamps, poses)
 
 
-# -- alignment -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_align_recovers_a_rigid_transform(seed):
     rng = np.random.default_rng(seed)
@@ -78,9 +75,6 @@ def test_align_rotations_recovers_a_turn_and_averages():
     np.testing.assert_allclose(align_rotations(some[:2], offsets @ some[:2]), np.eye(3), atol=1e-12)
 
 
-# -- interpolation ---------------------------------------------------------------------------------
-
-
 def test_interpolation_of_constant_velocity_and_rotation_is_exact():
     rate, velocity = np.array([0.3, -0.2, 0.5]), np.array([10.0, -2.0, 0.5])
     stamps = 1_700_000_000_000_000_000 + np.array([0, 1, 3, 4]) * 100_000_000
@@ -122,9 +116,6 @@ def test_a_reference_that_cannot_be_interpolated_is_refused(stamps, message):
         interpolate(bad, np.array([1]))
     with pytest.raises(InputError, match=f"absolute_error: expected {message}"):
         absolute_error(winding(), bad)
-
-
-# -- absolute error --------------------------------------------------------------------------------
 
 
 def test_a_rigid_change_is_no_error_unless_unaligned():
@@ -212,9 +203,6 @@ def test_absolute_errors_are_those_of_evo():
     # Fitted to the orientations themselves, these are at least as near as evo leaves them.
     assert error.rotation_rmse_deg <= evo_rmse(angle, True)
     assert error.rotation_rmse_deg == pytest.approx(evo_rmse(angle, True), rel=0.1)
-
-
-# -- relative error --------------------------------------------------------------------------------
 
 
 def test_relative_error_of_known_drifts():

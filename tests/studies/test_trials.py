@@ -52,8 +52,7 @@ def test_a_row_has_the_numbers_of_the_run():
     truth, found = world.truth, result.trajectory
     absolute, relative = absolute_error(found, truth), relative_error(found, truth)
     assert row["error"] is row["problem"] is row["peer"] is None
-    assert row["ate_m"] == absolute.rmse
-    assert row["rotation_deg"] == absolute.rotation_rmse_deg
+    assert (row["ate_m"], row["rotation_deg"]) == (absolute.rmse, absolute.rotation_rmse_deg)
     assert row["rpe_percent"] == relative.translation_percent
     assert row["rpe_shortest_m"] == relative.lengths[0]
     apart = pose_differences(found, truth)[1][-1]

@@ -203,8 +203,6 @@ def test_residuals_go_from_blue_to_red_and_large_ones_are_alike():
     assert residual_colours(np.zeros(0)).shape == (0, 3)
 
 
-# -- the clouds of a bag --------------------------------------------------------------------------
-
 STAMP = 1_700_000_000_000_000_000
 PLACE = gtsam.Pose3.Expmap(np.array([0.2, -0.1, 1.5, 3.0, 4.0, -1.0]))
 
@@ -313,9 +311,6 @@ def test_the_whole_of_a_run_is_recorded(tmp_path: Path) -> None:
 def topics(path: Path) -> dict[str, int]:
     with AnyReader([path]) as reader:
         return {topic: info.msgcount for topic, info in reader.topics.items()}
-
-
-# -- from the command line -------------------------------------------------------------------------
 
 
 @pytest.fixture(autouse=True)

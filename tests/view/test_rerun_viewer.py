@@ -70,9 +70,6 @@ def test_a_full_disk_is_an_error_and_does_not_block(tmp_path):
         file.finish()
 
 
-# -- with Rerun --------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def chunks():
     """Read a recording: its rows by entity, its chunks, and how many blueprints it has."""
@@ -115,8 +112,7 @@ def test_a_run_is_recorded_frame_by_frame(tmp_path, chunks):
     some = ("trajectory", "surroundings/edges", "surroundings/planes", "loops/used")
     # Frames 0 and 4, and the end.
     assert [rows[f"/map/{name}"] for name in some] == [3] * len(some)
-    assert rows["/frame/matches/planes"] == 6
-    assert rows["/frame/messages"] == 1
+    assert (rows["/frame/matches/planes"], rows["/frame/messages"]) == (6, 1)
     assert blueprints == 1
     matches = column(found, "/map/matches/points", "Points3D:positions")
     expected = [u.n_edge_matches + u.n_plane_matches for u in outcome.updates]

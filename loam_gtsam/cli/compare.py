@@ -25,10 +25,8 @@ def execute(options: CompareOptions) -> int:
     An error that ends the comparison early is raised after the results up to there were written.
     """
     names = options.solvers or [name for name in solver_names() if name not in PEERS]
-    contenders = [
-        Contender(entry.name, entry.config and options.changed(entry.config))
-        for entry in map(find_contender, names)
-    ]
+    found = map(find_contender, names)
+    contenders = [Contender(c.name, c.config and options.changed(c.config)) for c in found]
     dataset = options.dataset()
     name, plot = dataset.name, console.draws_pictures(options.plot)
     wanted = options.output or Path("loam_gtsam_output") / f"{console.file_name(name)}_compare"

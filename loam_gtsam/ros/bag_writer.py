@@ -111,9 +111,8 @@ class BagWriter(ClosingWriter):
         with self._failing():
             for topic, message in messages:
                 if topic not in self._connections:
-                    self._connections[topic] = self._writer.add_connection(
-                        topic, TYPES[topic], typestore=self._frames.store
-                    )
+                    add, store = self._writer.add_connection, self._frames.store
+                    self._connections[topic] = add(topic, TYPES[topic], typestore=store)
                 self._writer.write(self._connections[topic], stamp, message)
 
     def _make_room(self, overwrite: bool) -> None:
@@ -148,13 +147,12 @@ class BagWriter(ClosingWriter):
         return writer
 
     def _give_name(self) -> None:
-        source = self._active
+        source = self._active if self._kind == ".bag" else self._active / self.path.stem
         if self._kind == ".bag":
-            _pad_header(self._active)
+            _pad_header(source)
         elif self._kind == ".mcap":
-            source = self._active / self.path.stem / self.path.name
+            source /= self.path.name
         else:
-            source = self._active / self.path.stem
             _remove(self.path)
         os.replace(source, self.path)
 

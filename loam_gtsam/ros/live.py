@@ -65,8 +65,7 @@ class LiveMapper:
     Parameters
     ----------
     config : section ``live`` says how long the queues are
-    imu : whether IMU samples will come
-    features : topics of LOAM's front end that will come, in place of clouds
+    imu, features : whether IMU samples, which topics of LOAM's front end (not clouds) will come
     axes : of those topics, see :class:`loam_gtsam.datasets.bags.loam_topics.LoamTopicsDataset`
     clouds : decodes the clouds; None takes a new one without options
     observe : called after each sweep, e.g. to publish it; its time counts as publishing

@@ -55,14 +55,9 @@ def ros_covariance(covariance: FloatArray, map_T_lidar: gtsam.Pose3) -> FloatArr
     R w about the fixed axes of the map, to first order: ``Exp`` of a rotation on the right is that
     of R w on the left. So with ``B = [[0, R], [R, 0]]`` the covariance is ``B C B^T``.
 
-    Parameters
-    ----------
-    covariance : (6, 6), rotation first, body frame, as ``MapUpdate.covariance``
-
-    Returns
-    -------
-    (36,) row by row: x, y, z (m), rotation about the map's X, Y, Z (rad). If it is not finite, it
-    is unknown: -1, and zeros (as ``sensor_msgs/Imu`` has it; Odometry has no convention).
+    ``covariance`` is (6, 6), rotation first, body frame, as ``MapUpdate.covariance``. Returns (36,)
+    row by row: x, y, z (m), rotation about the map's X, Y, Z (rad). If it is not finite, it is
+    unknown: -1, and zeros (as ``sensor_msgs/Imu`` has it; Odometry has no convention).
     """
     if not np.isfinite(covariance).all():
         return _UNKNOWN
@@ -75,13 +70,9 @@ def ros_covariance(covariance: FloatArray, map_T_lidar: gtsam.Pose3) -> FloatArr
 class FrameMessages:
     """Serialised messages of one frame after the other.
 
-    The poses of all frames are kept, for the path: 14 MB in an hour at 10 Hz. Raises ConfigError if
-    the names of the frames are empty or equal.
-
-    Parameters
-    ----------
-    config : names of the frames, and which clouds to make
-    ros1 : serialise for ROS 1 bags instead of ROS 2
+    The poses of all frames are kept, for the path: 14 MB in an hour at 10 Hz. ``ros1`` serialises
+    for ROS 1 bags instead of ROS 2. Raises ConfigError if the names of the frames are empty or
+    equal.
     """
 
     def __init__(self, config: BagConfig, *, ros1: bool = False) -> None:

@@ -56,10 +56,8 @@ class LiveNode:
 
     Raises LoamError if a parameter is wrong, or the output folder cannot be made.
 
-    Parameters
-    ----------
-    node : an ``rclpy.node.Node``; the constructor declares its parameters, subscribes, advertises
-    on_error : called when an error ends the thread that maps
+    The constructor declares the parameters of ``node``, an ``rclpy.node.Node``, subscribes and
+    advertises; ``on_error`` is called when an error ends the thread that maps.
     """
 
     def __init__(self, node: Any, on_error: Callable[[], object] = lambda: None) -> None:

@@ -41,10 +41,8 @@ class Comparison:
 
     Attributes
     ----------
-    runs : one per contender, in their order
     notes : sentences that a reader of the numbers must know
-    interrupted : whether the user stopped the comparison before the data set ended
-    error : what ended the comparison early, or None
+    interrupted, error : whether the user, or which error, ended the comparison early
     shared_guess : whether all solvers of this package had the guesses of the first of them
     """
 
@@ -73,8 +71,6 @@ class Scores:
 
     Attributes
     ----------
-    ate_m, ate_max_m, rotation_deg : :class:`~loam_gtsam.studies.evaluation.AbsoluteError`
-    rpe_percent, rpe_deg_per_m : :class:`~loam_gtsam.studies.evaluation.RelativeError`
     path_m : length of the reference trajectory that was compared
     iterations, solver_iterations : associations and solver steps, mean of the solved frames
     matches : number of matches of the last association, median of the solved frames
@@ -118,8 +114,7 @@ def compare_solvers(
     ----------
     contenders : the first one is the reference where there is no truth
     max_frames : stop after so many sweeps; no further sweep is read
-    shared_guess : whether all solvers of this package start from the guesses of the first of them
-        (:class:`~loam_gtsam.studies.contenders.SharedGuess`)
+    shared_guess : see :class:`~loam_gtsam.studies.contenders.SharedGuess`
     on_frame : called with the number of each sweep and the first contender's result; a
         KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far, as
         it has after an error later than the first sweep
@@ -263,13 +258,7 @@ def score(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameDifferences:
-    """Distance of one solver's poses from those of the first-named one.
-
-    Attributes
-    ----------
-    frames : (N,) numbers of the frames that both solvers have a pose for
-    metres, degrees : (N,) see :func:`~loam_gtsam.studies.evaluation.pose_differences`
-    """
+    """Distance (N,) of one solver's poses from those of the first-named one, in common frames."""
 
     frames: IntArray
     metres: FloatArray

@@ -244,12 +244,10 @@ def _settings(run: SolverRun) -> str:
         where = "see docs/compare.md for its de-skew and the moment of its poses"
         return f"{run.version}; its own defaults; {where}"
     default = config_to_dict(Config())
-    changed = [
-        f"{section}.{key} = {value}"
-        for section, values in config_to_dict(run.config).items()
-        for key, value in values.items()
-        if value != default[section][key]
-    ]
+    changed = []
+    for section, values in config_to_dict(run.config).items():
+        own = (key for key in values if values[key] != default[section][key])
+        changed += [f"{section}.{key} = {values[key]}" for key in own]
     return f"{run.version}; differs from the default in: {', '.join(changed) or 'nothing'}"
 
 

@@ -35,13 +35,9 @@ _PRESET_OF = {"gtsam": "default"}  # solver names that are not the name of their
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """One solver that a comparison is to run.
+    """One solver that a comparison is to run; ``config`` is None for a peer.
 
-    Attributes
-    ----------
-    name : of the preset (``gtsam`` is the default one), or of a peer
-    config : of a solver of this package; None for a peer
-    solver : a user's own solver in place of the one that ``config`` names
+    ``solver`` is a user's own solver in place of the one that ``config`` names.
     """
 
     name: str
@@ -108,12 +104,9 @@ class SolverRun:
     @property
     def used(self) -> tuple[int, ...]:
         """Numbers of the frames with a pose; of this package's solvers also predicted poses."""
-        return tuple(
-            number
-            for number, update in enumerate(self.updates)
-            if update.status is FrameStatus.OK
-            or (self.config is not None and update.status.has_pose)
-        )
+        statuses = enumerate(update.status for update in self.updates)
+        ours = self.config is not None
+        return tuple(n for n, s in statuses if s is FrameStatus.OK or (ours and s.has_pose))
 
     @property
     def trajectory(self) -> Trajectory:

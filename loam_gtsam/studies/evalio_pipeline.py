@@ -79,10 +79,7 @@ class LoamGtsam(EvalioPipeline):
 
     @staticmethod
     def default_params() -> dict[str, bool | int | float | str]:
-        """Every scalar of the configuration as ``section.name``, and ``preset``.
-
-        A parameter that differs from these defaults is set on top of the preset.
-        """
+        """Scalars of the configuration, ``section.name``, to be set on top of ``preset``."""
         params: dict[str, bool | int | float | str] = {_PRESET: "default"}
         for section, values in config_to_dict(Config()).items():
             for key, value in values.items():

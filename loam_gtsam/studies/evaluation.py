@@ -16,9 +16,8 @@ from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
 _NO_SPREAD = 1e-9
 """Ratio of the second to the first singular value below which positions lie on a line (the ratio
 of the spreads is its root: 3 cm across a line of a kilometre)."""
-_LENGTHS = 8
+_LENGTHS = 8  # path lengths of the relative error, as in KITTI; multiples of one of these metres:
 _LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
-"""Number of path lengths of the relative error (KITTI's 8), and what they are multiples of."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,14 +107,13 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
 def absolute_error(
     estimate: Trajectory, reference: Trajectory, *, aligned: bool = True
 ) -> AbsoluteError:
-    """Absolute error (ATE) of the poses whose stamps lie inside the reference.
+    """Absolute error (ATE) of the poses inside the reference, interpolated at their stamps.
 
     Raises InputError if fewer than three poses overlap in time, or the reference's stamps do not
     increase.
 
     Parameters
     ----------
-    reference : is interpolated at the stamps of the estimate
     aligned : fit positions by a rigid transform (SE(3), :func:`align_positions`) and orientations
         by a rotation (:func:`align_rotations`) first; else the poses are compared as they are
     """
@@ -168,7 +166,7 @@ def path_lengths(path: float) -> FloatArray:
 def relative_error(
     estimate: Trajectory, reference: Trajectory, lengths: FloatArray | None = None
 ) -> RelativeError:
-    """Relative error (RPE) of the poses whose stamps lie inside the reference.
+    """Relative error (RPE) of the poses inside the reference, interpolated at their stamps.
 
     For each length d and each start i, the end j is the first pose more than d along the reference
     after i. With the relative motions Q of the reference and P of the estimate, ``E = Q^-1 P``
@@ -179,7 +177,6 @@ def relative_error(
 
     Parameters
     ----------
-    reference : is interpolated at the stamps of the estimate
     lengths : (L,) metres along the reference; :func:`path_lengths` of its path if None
     """
     _, poses, truth = _common("relative_error", estimate, reference)
@@ -216,12 +213,8 @@ def pose_differences(
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Distances between two trajectories, pose by pose, both seen from their first common moment.
 
-    Raises InputError if fewer than three poses overlap in time, or the reference's stamps do not
-    increase.
-
-    Returns
-    -------
-    stamps, metres, degrees : (N,) each, of the poses inside the reference's time span
+    Gives stamps, metres and degrees, (N,) each, of the poses inside the reference's time span.
+    Raises InputError as :func:`absolute_error` does.
     """
     stamps, poses, others = _common("pose_differences", estimate, reference)
     here, there = inverse_pose(poses[:1]) @ poses, inverse_pose(others[:1]) @ others

@@ -46,7 +46,6 @@ class Peer(ABC):
     ----------
     name, package, module : name on the command line, for pip and for ``import``
     alone : whether instances in one process share state, so that only one may run at a time
-    updates : one per registered sweep; stamp, pose, status and time have a meaning
     """
 
     name: str
@@ -60,12 +59,8 @@ class Peer(ABC):
     def register(self, stamp: int, sweep: TimedPoints) -> MapUpdate:
         """Register a sweep and measure the time of the registration itself.
 
-        Raises InputError if the peer cannot take this sweep.
-
-        Parameters
-        ----------
-        stamp : nanoseconds from which the times of the points count; that of the result is the
-            moment that the pose belongs to
+        The times of the points count from ``stamp``, nanoseconds; the stamp of the result is the
+        moment that the pose belongs to. Raises InputError if the peer cannot take this sweep.
         """
         started = time.perf_counter()
         pose, moment = self._register(stamp, sweep)

@@ -71,10 +71,8 @@ def table_html(table: TextTable) -> str:
     head = "".join(f"<th>{escape(cell)}</th>" for cell in table.header)
     lines = []
     for number, row in enumerate(table.rows):
-        cells = (
-            f"<td{_BEST if (number, column) in table.best else ''}>{escape(cell)}</td>"
-            for column, cell in enumerate(row)
-        )
+        styles = (_BEST if (number, column) in table.best else "" for column in range(len(row)))
+        cells = (f"<td{s}>{escape(cell)}</td>" for s, cell in zip(styles, row, strict=True))
         lines.append(f"<tr>{''.join(cells)}</tr>")
     return (
         f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'

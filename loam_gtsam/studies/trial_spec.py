@@ -23,13 +23,9 @@ _CONFIG = ("solver", "set")
 
 @dataclass(frozen=True, slots=True)
 class Spec:
-    """The specification of a parameter study.
+    """A parameter study: name and content of its file, trials, and the columns to show.
 
-    Attributes
-    ----------
-    name, text : of the file: its name without the ending, and its content
-    trials : sequences x configurations x seeds, in this order
-    metrics : columns of the table that are shown at the end
+    The trials are sequences x configurations x seeds, in this order.
     """
 
     name: str
@@ -80,14 +76,10 @@ def load_spec(path: str | Path) -> Spec:
     entries = _mapping(name, data, _SPEC)
     folder = path.parent
     frames = _count(f"{name}: frames", entries.get("frames"))
-    sequences = {
-        key: _sequence(f"{name}: sequences.{key}", value, folder, frames)
-        for key, value in _named(name, "sequences", entries)
-    }
-    configs = {
-        key: _config(f"{name}: configs.{key}", value, folder)
-        for key, value in _named(name, "configs", entries)
-    }
+    named = _named(name, "sequences", entries)
+    sequences = {k: _sequence(f"{name}: sequences.{k}", v, folder, frames) for k, v in named}
+    named = _named(name, "configs", entries)
+    configs = {key: _config(f"{name}: configs.{key}", value, folder) for key, value in named}
     seeds = _seeds(f"{name}: seeds", entries.get("seeds"), sequences)
     trials = tuple(
         Trial(

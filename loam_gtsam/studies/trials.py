@@ -34,16 +34,13 @@ from loam_gtsam.types import FrameStatus, LoamError, OutputError, Trajectory
 
 Row = dict[str, Any]
 """The values of a trial by the name of their column, see :data:`COLUMNS`; None if not known."""
-
 VERSIONS = ("loam_gtsam", "gtsam", "numpy")
 """Packages whose version decides the numbers of the solvers of this package."""
-
 METRICS = (
     "ate_m", "ate_max_m", "rotation_deg", "rpe_percent", "rpe_deg_per_m", "drift_percent",
     "iterations", "solver_iterations", "matches", "ms_median", "ms_95",
 )  # fmt: skip
 """Columns to compare solvers by; see ``docs/compare.md`` and ``docs/parameter_studies.md``."""
-
 COLUMNS: dict[str, type] = {
     **dict.fromkeys(("trial", "sequence", "config"), str),
     "seed": int,
@@ -61,10 +58,8 @@ COLUMNS: dict[str, type] = {
     "host": str,
 }
 """Name and type of the columns of the table, in their order."""
-
 NOT_REPEATABLE = ("ms_median", "ms_95", "wall_s", "host")
 """Columns that differ when the same trial runs again; all other columns are the same."""
-
 TABLE_FILE = "results.parquet"
 TRIALS_FOLDER = "trials"
 
@@ -75,9 +70,8 @@ class Trial:
 
     Attributes
     ----------
-    sequence, config_name : names in the specification
     path, options : of the data set, see :func:`loam_gtsam.datasets.open_dataset`
-    frames : number of sweeps after which the trial stops; None takes all sweeps
+    frames : at most so many sweeps; None takes all
     seed : of a built-in world; None for recorded data
     config : of the run; a peer uses the section ``sensor`` only
     peer : name of a peer; None for a solver of this package
@@ -182,10 +176,8 @@ def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
         _, metres, _ = pose_differences(finished.trajectory, truth)
         row["drift_percent"] = 100.0 * float(metres[-1]) / scores.path_m
     # NaN would not equal itself when two tables are compared.
-    return {
-        key: None if isinstance(value, float) and not math.isfinite(value) else value
-        for key, value in row.items()
-    }
+    unknown = [k for k, v in row.items() if isinstance(v, float) and not math.isfinite(v)]
+    return row | dict.fromkeys(unknown)
 
 
 def _unusable(name: str, finished: SolverRun) -> str | None:
@@ -205,9 +197,6 @@ def _hash(value: Mapping[str, Any]) -> str:
     """A hash that is equal on every machine; a value that JSON does not know counts as text."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), default=str)
     return hashlib.sha256(text.encode("utf-8")).hexdigest()[:16]
-
-
-# -- files -----------------------------------------------------------------------------------------
 
 
 class TrialStore:

@@ -122,18 +122,10 @@ def frame_view(number: int, sweep: Sweep, update: MapUpdate, pipeline: Pipeline)
         points, feet = transform(map_T_odom, points), transform(map_T_odom, feet)
     # The perturbation of a pose is in the axes of the lidar.
     rotation = map_T_lidar[:3, :3]
-    return FrameView(
-        number=number,
-        update=update,
-        map_T_lidar=map_T_lidar,
-        position_covariance=rotation @ update.covariance[3:, 3:] @ rotation.T,
-        sweep=_NONE if cloud is None else transform(map_T_odom, cloud[:, :3]),
-        edges=edges,
-        planes=planes,
-        points=points,
-        feet=feet,
-        residuals=residuals,
-    )
+    covariance = rotation @ update.covariance[3:, 3:] @ rotation.T
+    swept = _NONE if cloud is None else transform(map_T_odom, cloud[:, :3])
+    matches = points, feet, residuals
+    return FrameView(number, update, map_T_lidar, covariance, swept, edges, planes, *matches)
 
 
 def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) -> MapView:
@@ -155,12 +147,10 @@ def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) 
 
 
 def matched_points(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Matched features, the nearest points of their matches, and the residuals.
+    """Matched features, the nearest points of their matches, and the residuals; edges first.
 
-    Returns
-    -------
-    (M, 3) and (M, 3) metres in the frame of the mapper, and (M,) distances over their standard
-    deviations; edges first. Empty if the sweep was not solved.
+    They are (M, 3) and (M, 3) metres in the frame of the mapper, and (M,) distances over their
+    standard deviations. Empty if the sweep was not solved.
     """
     if seen.matches is None:
         return _NONE, _NONE, np.zeros(0)
@@ -180,12 +170,8 @@ def matched_points(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray
 def registered_cloud(sweep: Sweep, update: MapUpdate, mapper: Mapper) -> FloatArray | None:
     """All usable points of a sweep, de-skewed with its final motion, in the map frame.
 
-    The sensor and the de-skew are read as the mapper does, which made ``update`` of the sweep.
-
-    Returns
-    -------
-    (N, 4) metres, and LOAM's intensity: the ring plus the seconds since the sweep began. None if
-    there are no points. Those of another front end have intensity 0.
+    They are (N, 4) metres, and LOAM's intensity: the ring plus the seconds since the sweep began;
+    0 for those of another front end. None if there are no points.
     """
     if isinstance(sweep, FeatureSweep):
         if sweep.cloud is None:
@@ -204,11 +190,9 @@ def registered_cloud(sweep: Sweep, update: MapUpdate, mapper: Mapper) -> FloatAr
 
 
 def surrounding_cloud(update: MapUpdate, mapper: Mapper) -> FloatArray:
-    """Map points of the cubes around the sensor, those that the next sweep is matched with.
+    """Map points around the sensor, those that the next sweep is matched with.
 
-    Returns
-    -------
-    (N, 4) metres, map frame, and the intensity: 0 of edge, 1 of plane points
+    They are (N, 4) metres, map frame, and the intensity: 0 of edge, 1 of plane points.
     """
     pose = update.map_T_lidar.matrix()
     parts = []

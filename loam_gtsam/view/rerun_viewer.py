@@ -102,10 +102,7 @@ class RerunViewer(ClosingWriter):
         self.frames += 1
 
     def close(self) -> None:
-        """Show the map as it is in the end, and close the file. Calling it again does nothing.
-
-        OutputError is raised if the file could not be written.
-        """
+        """Show the map as it is in the end, and close the file; OutputError if that fails."""
         if not self._streams:
             return
         self._draw_map()
@@ -220,7 +217,7 @@ def _rerun() -> Any:
 
 
 def _check_screen() -> None:
-    """Rerun would say so only after a while, and the run go on unseen."""
+    # Rerun would say so only after a while, and the run go on unseen.
     screens = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
     if sys.platform == "linux" and not any(os.environ.get(name) for name in screens):
         raise OutputError(

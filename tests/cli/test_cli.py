@@ -310,13 +310,9 @@ main()
 def start_endless_run(pause: float, workers: int = 0) -> subprocess.Popen[str]:
     """A run that goes on for ever; returns when it reads its fourth sweep, ``pause`` s long."""
     command = ["run", "x", "--output", "out", "--no-plot", "--workers", str(workers), str(pause)]
-    process = subprocess.Popen(
-        [sys.executable, "-c", _ENDLESS, *command],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=os.environ | {"COLUMNS": "300"},
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    start = [sys.executable, "-c", _ENDLESS, *command]
+    process = subprocess.Popen(start, env=os.environ | {"COLUMNS": "300"}, **pipes)
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     return process

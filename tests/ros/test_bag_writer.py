@@ -6,6 +6,7 @@ import shutil
 import sqlite3
 import struct
 import subprocess
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,9 +45,8 @@ def make_cloud(number: int, count: int = 40) -> np.ndarray:
 def write(path: Path, frames: int, config: BagConfig | None = None, **options: Any) -> Path:
     with BagWriter(path, config, **options) as bag:
         for number in range(frames):
-            bag.write(
-                make_update(number), make_cloud(number), lambda: make_cloud(bag.frames + 1000)
-            )
+            around = partial(make_cloud, 1000 + number)
+            bag.write(make_update(number), make_cloud(number), around)
     return path
 
 
@@ -83,12 +83,8 @@ def cloud_rows(message: Any) -> np.ndarray:
     assert not message.is_bigendian
     data = bytes(message.data)
     assert len(data) == message.row_step
-    return np.array(
-        [
-            [struct.unpack_from("<f", data, row * message.point_step + at)[0] for at in offsets]
-            for row in range(message.width)
-        ]
-    )
+    starts = [row * message.point_step for row in range(message.width)]
+    return np.array([[struct.unpack_from("<f", data, s + at)[0] for at in offsets] for s in starts])
 
 
 @pytest.mark.parametrize("name", NAMES)

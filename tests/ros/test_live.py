@@ -243,6 +243,7 @@ def near_the_start(_: Any) -> list[gtsam.NonlinearFactor]:
     return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)]
 
 
+AT_THE_END = DeskewConfig(rotation="orientation", reference="end")
 PARTS: dict[str, tuple[Config, Any]] = {
     "loops": (
         Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9)),
@@ -253,10 +254,7 @@ PARTS: dict[str, tuple[Config, Any]] = {
         dict,
     ),
     "de-skew by orientation": (
-        Config(
-            deskew=DeskewConfig(rotation="orientation", reference="end"),
-            imu=ImuConfig(average_seconds=0.0),
-        ),
+        Config(deskew=AT_THE_END, imu=ImuConfig(average_seconds=0.0)),
         dict,
     ),
     "longer averages": (Config(imu=ImuConfig(average_seconds=0.2, still_seconds=0.3)), dict),
@@ -293,8 +291,7 @@ def test_with_every_part_a_live_run_is_that_of_the_bag_and_again_after_a_reset(
     live.reset()
     assert_the_same(live, replay(live, clock, messages_of(short_bag)), expected)
     report = live.report()
-    assert report.statuses["first"] == 2
-    assert sum(report.statuses.values()) == 2 * 9
+    assert (report.statuses["first"], sum(report.statuses.values())) == (2, 2 * 9)
     assert report.late == {"imu": 0}
     assert report.without_imu == 0
 
@@ -507,6 +504,10 @@ def stamped(seconds: float) -> Any:
     return lambda m: with_seconds(m, seconds)
 
 
+def accelerated(x: float) -> Any:
+    return lambda m: replace(m, linear_acceleration=replace(m.linear_acceleration, x=x))
+
+
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
@@ -584,10 +585,7 @@ def test_sweeps_out_of_order_are_counted_and_skipped(bag: Path) -> None:
         (lambda m: replace(m, orientation_covariance=[]), "expected an Imu message"),
         (stamped(math.nan), "NaN"),
         (stamped(-1), "expected 0 to 2"),
-        (
-            lambda m: replace(m, linear_acceleration=replace(m.linear_acceleration, x=math.inf)),
-            "NaN or infinity",
-        ),
+        (accelerated(math.inf), "NaN or infinity"),
     ],
 )
 def test_faulty_samples_are_counted_and_left_out(bag: Path, spoil: Any, reason: str) -> None:
@@ -657,11 +655,9 @@ def test_faulty_features_are_counted_and_the_run_goes_on() -> None:
     live, results = replayed_topics(recording)
     assert len(results) == 3
     assert results[1].update.status is FrameStatus.UNUSABLE_SCAN
-    reasons = list(live.report().faults)
-    assert [("header.stamp" in r, "no field x" in r) for r in reasons] == [
-        (True, False),
-        (False, True),
-    ]
+    without_stamp, without_field = live.report().faults
+    assert "header.stamp" in without_stamp
+    assert "no field x" in without_field
 
 
 def test_axes_that_cannot_be_told_yet_are_told_by_a_later_sweep() -> None:
@@ -670,10 +666,8 @@ def test_axes_that_cannot_be_told_yet_are_told_by_a_later_sweep() -> None:
     empty = next(n for n, entry in enumerate(recording) if entry[0] == REQUIRED[1])
     recording[empty] = (*recording[empty][:2], cloud(ROS1, START, np.zeros((0, 3))))
     live, results = replayed_topics(recording, topics)
-    assert [result.update.status for result in results][:2] == [
-        FrameStatus.UNUSABLE_SCAN,
-        FrameStatus.FIRST,
-    ]
+    statuses = [result.update.status for result in results]
+    assert statuses[:2] == [FrameStatus.UNUSABLE_SCAN, FrameStatus.FIRST]
     assert "cannot tell the axes" in next(iter(live.report().faults))
     live, results = replayed_topics(recording, topics, axes="lidar")
     assert results[0].update.status is not FrameStatus.UNUSABLE_SCAN
@@ -706,10 +700,11 @@ def test_the_report_is_a_copy_and_a_line() -> None:
         live.add_cloud(thin(number))
     while live.step() is not None:
         pass
-    assert before.received == {}
-    assert before.latency == {}
-    text = str(live.report())
-    assert "1 sweeps mapped (unusable_scan 1)" in text
-    assert "dropped: sweep 2" in text
-    assert "0 waiting (most: 1)" in text
-    assert "; total " in text
+    assert before.received == before.latency == {}
+    said = (
+        "1 sweeps mapped (unusable_scan 1)",
+        "dropped: sweep 2",
+        "0 waiting (most: 1)",
+        "; total ",
+    )
+    assert [part for part in said if part not in str(live.report())] == []

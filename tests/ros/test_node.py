@@ -109,21 +109,15 @@ def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         pass
 
     made = module("rclpy", ended=ExternalShutdownException())
+    reliability = SimpleNamespace(BEST_EFFORT="best effort")
     modules = [
         made,
         module("rclpy.executors", ExternalShutdownException=ExternalShutdownException),
-        module(
-            "rclpy.qos",
-            QoSProfile=SimpleNamespace,
-            ReliabilityPolicy=SimpleNamespace(BEST_EFFORT="best effort"),
-        ),
+        module("rclpy.qos", QoSProfile=SimpleNamespace, ReliabilityPolicy=reliability),
     ]
-    for package, *names in (
-        ("sensor_msgs", "PointCloud2", "Imu"),
-        ("nav_msgs", "Odometry", "Path"),
-        ("tf2_msgs", "TFMessage"),
-    ):
-        content = {name: type(name, (), {}) for name in names}
+    kinds = {"sensor_msgs": "PointCloud2 Imu", "nav_msgs": "Odometry Path", "tf2_msgs": "TFMessage"}
+    for package, names in kinds.items():
+        content = {name: type(name, (), {}) for name in names.split()}
         modules += [module(package), module(f"{package}.msg", **content)]
     for fake in modules:
         monkeypatch.setitem(sys.modules, fake.__name__, fake)

@@ -100,9 +100,8 @@ def test_what_decides_the_features_is_that_of_the_first(dataset):
     other = config_from_dict(
         {"features": {"sectors": 4}, "deskew": {"reference": "end", "refine": False}}
     )
-    result = compare_solvers(
-        dataset, [Contender("a", Config()), Contender("b", other)], max_frames=2
-    )
+    pair = [Contender("a", Config()), Contender("b", other)]
+    result = compare_solvers(dataset, pair, max_frames=2)
     used = result.runs[1].config
     assert used.features == Config().features
     assert used.deskew == other.deskew.changed(reference="start")

@@ -44,8 +44,7 @@ def set_up(**params: object) -> LoamGtsam:
 
 def estimates(pipeline: LoamGtsam, data: object = ROOM) -> Trajectory:
     """As evalio runs it: the last sweep ends the run, whatever comes after."""
-    poses = ty.Trajectory()
-    sweeps = 0
+    poses, sweeps = ty.Trajectory(), 0
     for measurement in data:  # type: ignore[attr-defined]
         if isinstance(measurement, ty.ImuMeasurement):
             pipeline.add_imu(measurement)
@@ -65,14 +64,9 @@ def test_evalio_s_command_line_runs_it_and_its_poses_are_those_of_the_imu(tmp_pa
     command = [sys.executable, "-c", "from evalio.cli import app; app()"]
     options = ["run", "-p", "loam_gtsam", "-d", "simulated_room/shaken", "-o", str(tmp_path)]
     modules = {"EVALIO_CUSTOM": "loam_gtsam.studies.evalio_pipeline,support.evalio_room"}
-    done = subprocess.run(
-        command + options,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(paths)} | modules,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        cwd=tmp_path,
-    )
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(paths)} | modules
+    how = {"capture_output": True, "text": True, "timeout": 300, "cwd": tmp_path}
+    done = subprocess.run(command + options, env=env, **how)
     assert done.returncode == 0, done.stderr
     poses = ty.Trajectory.from_file(tmp_path / "simulated_room" / "shaken" / "loam_gtsam.csv")
     assert isinstance(poses, ty.Trajectory), done.stdout + done.stderr

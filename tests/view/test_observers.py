@@ -109,10 +109,9 @@ def test_the_matches_are_those_that_the_pose_was_solved_with(watched):
     for frame, update in zip(kept.frames, outcome.updates, strict=True):
         matches = update.n_edge_matches + update.n_plane_matches
         assert len(frame.points) == len(frame.feet) == len(frame.residuals) == matches
-        assert (len(frame.edges), len(frame.planes)) == (
-            (update.n_edges, update.n_planes) if update.status is not FrameStatus.UNUSABLE_SCAN
-            else (0, 0)
-        )  # fmt: skip
+        used = update.status is not FrameStatus.UNUSABLE_SCAN
+        counts = (update.n_edges, update.n_planes) if used else (0, 0)
+        assert (len(frame.edges), len(frame.planes)) == counts
         assert np.isfinite(frame.position_covariance).all() is np.bool_(update.status.solved)
     shown = [len(frame.points) > 100 for frame in kept.frames]
     assert shown == [False, True, True, False, True, True]
@@ -147,9 +146,8 @@ def test_covariances_of_positions_are_along_the_axes_of_the_map(watched):
     moved = update.map_T_lidar.retract(np.concatenate([np.zeros(3), step]))
     in_map = moved.translation() - update.map_T_lidar.translation()
     inverse = np.linalg.inv(update.covariance[3:, 3:])
-    np.testing.assert_allclose(
-        in_map @ np.linalg.inv(frame.position_covariance) @ in_map, step @ inverse @ step
-    )
+    found = in_map @ np.linalg.inv(frame.position_covariance) @ in_map
+    np.testing.assert_allclose(found, step @ inverse @ step)
 
 
 def test_the_map_and_the_way_are_those_of_the_run(watched):
@@ -275,11 +273,8 @@ def test_clouds_of_other_front_ends_and_sweeps_without_any() -> None:
     cloud = registered_cloud(with_cloud, result(0.0), Mapper())
     expected = np.array([PLACE.transformFrom(point) for point in points])
     np.testing.assert_allclose(cloud, np.column_stack([expected, np.zeros(30)]), atol=1e-5)
-    for sweep in (
-        FeatureSweep(features, gtsam.Pose3()),
-        BadSweep(STAMP, "broken"),
-        Scan(np.zeros((3, 3)), STAMP),
-    ):
+    bare = FeatureSweep(features, gtsam.Pose3())
+    for sweep in (bare, BadSweep(STAMP, "broken"), Scan(np.zeros((3, 3)), STAMP)):
         assert registered_cloud(sweep, result(0.0), Mapper()) is None
 
 

@@ -173,17 +173,16 @@ def _summary(results: ScoredComparison) -> dict[str, Any]:
     solvers = []
     for run, scores in results.rows:
         difference = results.differences.get(run.name)
-        solvers.append(
-            {
-                "name": run.name,
-                "version": run.version,
-                "config": run.config and config_to_dict(run.config),
-                "scores": asdict(scores),
-                "stages_ms": _stages(run),
-                "difference_m": difference and _median_95_max(difference.metres),
-                "difference_deg": difference and _median_95_max(difference.degrees),
-            }
-        )
+        solver = {
+            "name": run.name,
+            "version": run.version,
+            "config": run.config and config_to_dict(run.config),
+            "scores": asdict(scores),
+            "stages_ms": _stages(run),
+            "difference_m": difference and _median_95_max(difference.metres),
+            "difference_deg": difference and _median_95_max(difference.degrees),
+        }
+        solvers.append(solver)
     comparison = results.comparison
     return {
         "dataset": comparison.name,

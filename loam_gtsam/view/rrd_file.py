@@ -3,9 +3,12 @@
 In rerun-sdk 0.41.0 the thread of the file sink ends at the first write that fails. If a flush is
 waiting just then, the flush times out, and ``disconnect`` and the end of the process never return.
 To see it: limit the file size (``RLIMIT_FSIZE``, SIGXFSZ ignored) to 1 MB, log 30 clouds of 5,000
-points into ``RecordingStream.save``, ``flush(timeout_sec=5)``, ``disconnect()``. With a later
-rerun-sdk, try that again: if ``disconnect`` returns, this file is no longer needed. Behind a pipe
-the sink never fails, and what goes wrong with the file is an error like any other.
+points into ``RecordingStream.save``, ``flush(timeout_sec=5)``, ``disconnect()``. There was no
+report of it at github.com/rerun-io/rerun in November 2026; the timeout of a flush came with its
+pull request 11008. When ``viewer`` in pyproject.toml allows a later rerun-sdk, try that again: if
+``disconnect`` returns, this file is no longer needed.
+
+Behind a pipe the sink never fails, and what goes wrong with the file is an error like any other.
 """
 
 from __future__ import annotations
@@ -17,13 +20,17 @@ from pathlib import Path
 from loam_gtsam.types import OutputError
 
 _CHUNK = 1 << 20
-_PATIENCE = 60.0  # seconds to wait for the last bytes
+_PATIENCE = 60.0
+"""Seconds to wait for the last bytes."""
 
 
 class RrdFile:
     """Copies what is written to the path :attr:`sink` into a file, in a thread.
 
-    Raises OutputError if the name does not end in ``.rrd``, the file exists or cannot be written.
+    Raises
+    ------
+    OutputError
+        If the name does not end in ``.rrd``, the file exists or cannot be written.
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:

@@ -6,8 +6,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Writer1
-from support import bags
+from rosrosbag1 import Writer as Writer1
+from support.bags import (
+    KINDS,
+    LATENCY,
+    ROS1,
+    START,
+    Recording,
+    cloud,
+    imu,
+    store_of,
+    sweep_points,
+    sweeps,
+    write_bag,
+)
 
 from loam_gtsam.datasets import BagDataset, Dataset, open_dataset
 from loam_gtsam.datasets.bags.bag import POINT_CLOUD
@@ -15,30 +27,29 @@ from loam_gtsam.datasets.bags.bag_reader import choose_topic
 from loam_gtsam.types import BadSweep, DatasetError, Scan
 
 
-@pytest.mark.parametrize("kind", bags.KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_bag_round_trip(tmp_path: Path, kind: str) -> None:
-    store = bags.store_of(kind)
-    recording = bags.sweeps(kind)
+    store = store_of(kind)
+    recording = sweeps(kind)
     recording += [
-        ("/imu", bags.START + i * 5_000_000, bags.imu(store, bags.START + i * 5_000_000))
-        for i in range(9)
+        ("/imu", START + i * 5_000_000, imu(store, START + i * 5_000_000)) for i in range(9)
     ]
     recording.sort(key=lambda entry: entry[1])
-    dataset = open_dataset(bags.write_bag(tmp_path / "run", kind, recording))
+    dataset = open_dataset(write_bag(tmp_path / "run", kind, recording))
     assert isinstance(dataset, BagDataset)
     assert isinstance(dataset, Dataset)
     assert len(dataset) == 4
     scans = list(dataset)
     for index, scan in enumerate(scans):
-        assert scan.stamp == bags.START + index * 100_000_000  # the header's, not the receive time
-        np.testing.assert_array_equal(scan.points, bags.sweep_points(index))
+        assert scan.stamp == START + index * 100_000_000  # the header's, not the receive time
+        np.testing.assert_array_equal(scan.points, sweep_points(index))
         np.testing.assert_allclose(scan.times, np.linspace(0, 0.1, 300), atol=1e-8)
         np.testing.assert_array_equal(scan.rings, np.arange(300) % 16)
     for scan, again in zip(scans, dataset, strict=True):
         np.testing.assert_array_equal(scan.points, again.points)
     samples = dataset.imu
     assert samples.orientation is not None
-    np.testing.assert_array_equal(samples.stamps, bags.START + np.arange(9) * 5_000_000)
+    np.testing.assert_array_equal(samples.stamps, START + np.arange(9) * 5_000_000)
     np.testing.assert_allclose(samples.gyro[0], [0.1, 0.2, 0.3])
     info = dataset.info()
     assert info.facts["rate"] == "10.00 Hz"
@@ -50,7 +61,7 @@ def test_bag_round_trip(tmp_path: Path, kind: str) -> None:
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
 def test_single_ros2_file(tmp_path: Path, kind: str) -> None:
-    folder = bags.write_bag(tmp_path / "run", kind, bags.sweeps(kind))
+    folder = write_bag(tmp_path / "run", kind, sweeps(kind))
     file = next(folder.glob("*.db3" if kind == "sqlite3" else "*.mcap"))
     alone = file.rename(tmp_path / file.name)
     scans = list(open_dataset(alone))
@@ -58,9 +69,9 @@ def test_single_ros2_file(tmp_path: Path, kind: str) -> None:
 
 
 def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
-    recording = [*bags.sweeps("ros1", 2, "/a"), *bags.sweeps("ros1", 3, "/b")]
-    recording.append(("/imu", bags.START, bags.imu(bags.ROS1, bags.START)))
-    path = bags.write_bag(tmp_path / "run", "ros1", recording)
+    recording = [*sweeps("ros1", 2, "/a"), *sweeps("ros1", 3, "/b")]
+    recording.append(("/imu", START, imu(ROS1, START)))
+    path = write_bag(tmp_path / "run", "ros1", recording)
     dataset = BagDataset(path)
     assert dataset.topic == "/b"
     assert len(dataset) == 3
@@ -80,73 +91,52 @@ def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("recording", "problem"),
     [
-        (
-            [
-                *bags.sweeps("ros1"),
-                ("/imu", bags.START, bags.imu(bags.ROS1, bags.START, unknown=True)),
-            ],
-            "no orientation",
-        ),
-        (
-            [("/p", bags.START, bags.cloud(bags.ROS1, bags.START, bags.sweep_points(0)))],
-            "no per-point time",
-        ),
-        (bags.sweeps("ros1", 3, "/velodyne_cloud_registered"), "do not map them again"),
+        ([*sweeps("ros1"), ("/imu", START, imu(ROS1, START, unknown=True))], "no orientation"),
+        ([("/p", START, cloud(ROS1, START, sweep_points(0)))], "no per-point time"),
+        (sweeps("ros1", 3, "/velodyne_cloud_registered"), "do not map them again"),
     ],
 )
-def test_what_a_bag_lacks_is_said(tmp_path: Path, recording: bags.Recording, problem: str) -> None:
-    dataset = BagDataset(bags.write_bag(tmp_path / "run", "ros1", recording))
+def test_what_a_bag_lacks_is_said(tmp_path: Path, recording: Recording, problem: str) -> None:
+    dataset = BagDataset(write_bag(tmp_path / "run", "ros1", recording))
     assert dataset.imu is None or dataset.imu.orientation is None
     assert any(problem in text for text in dataset.info().problems)
     assert problem != "no per-point time" or [scan.times for scan in dataset] == [None]
 
 
 def test_clouds_in_the_map_are_no_sweeps_while_there_are_others(tmp_path: Path) -> None:
-    mapped = bags.sweeps("ros1", 3, "/velodyne_cloud_registered")
-    both = bags.write_bag(
-        tmp_path / "both", "ros1", [*mapped, *bags.sweeps("ros1", 2, "/velodyne_points")]
-    )
+    mapped = sweeps("ros1", 3, "/velodyne_cloud_registered")
+    both = write_bag(tmp_path / "both", "ros1", [*mapped, *sweeps("ros1", 2, "/velodyne_points")])
     assert BagDataset(both).topic == "/velodyne_points"
 
 
 def test_bag_whose_times_fit_nothing(tmp_path: Path) -> None:
-    recording = [
-        (
-            "/p",
-            bags.START,
-            bags.cloud(bags.ROS1, bags.START, bags.sweep_points(0), time=np.zeros(300)),
-        )
-    ]
-    path = bags.write_bag(tmp_path / "run", "ros1", recording)
+    recording = [("/p", START, cloud(ROS1, START, sweep_points(0), time=np.zeros(300)))]
+    path = write_bag(tmp_path / "run", "ros1", recording)
     with pytest.raises(DatasetError, match=r"run.bag, topic /p: .*fit no unit"):
         open_dataset(path)
     assert len(list(open_dataset(path, time_field="none"))) == 1
 
 
-@pytest.mark.parametrize("kind", bags.KINDS)
+@pytest.mark.parametrize("kind", KINDS)
 def test_undecodable_messages_are_bad_sweeps(tmp_path: Path, kind: str) -> None:
-    recording = bags.sweeps(kind, 5)
-    store = bags.store_of(kind)
-    stamp = bags.START + 200_000_000
-    without_x = bags.cloud(store, stamp, bags.sweep_points(2))
+    recording = sweeps(kind, 5)
+    store = store_of(kind)
+    stamp = START + 200_000_000
+    without_x = cloud(store, stamp, sweep_points(2))
     without_x.fields = without_x.fields[1:]
-    recording[2] = ("/points", stamp + bags.LATENCY, without_x)
-    recording[3] = (
-        "/points",
-        bags.START + 300_000_000 + bags.LATENCY,
-        b"\x00\x01\x00\x00garbage" * 3,
-    )
-    dataset = open_dataset(bags.write_bag(tmp_path / "run", kind, recording))
+    recording[2] = ("/points", stamp + LATENCY, without_x)
+    recording[3] = ("/points", START + 300_000_000 + LATENCY, b"\x00\x01\x00\x00garbage" * 3)
+    dataset = open_dataset(write_bag(tmp_path / "run", kind, recording))
     got = list(dataset)
     assert [type(sweep) for sweep in got] == [Scan, Scan, BadSweep, BadSweep, Scan]
     assert "no field x" in got[2].message
     assert "/points" in got[3].message
     # receive times are led back to the clock of the stamps
-    assert [sweep.stamp for sweep in got[2:4]] == [stamp, bags.START + 300_000_000]
+    assert [sweep.stamp for sweep in got[2:4]] == [stamp, START + 300_000_000]
 
 
 def test_truncated_bags_cannot_be_opened(tmp_path: Path) -> None:
-    path = bags.write_bag(tmp_path / "run", "ros1", bags.sweeps("ros1"))
+    path = write_bag(tmp_path / "run", "ros1", sweeps("ros1"))
     data = path.read_bytes()
     for size in (0, 5, 100, len(data) // 2, len(data) - 30):
         path.write_bytes(data[:size])
@@ -160,9 +150,9 @@ def test_damage_inside_keeps_what_came_before(tmp_path: Path) -> None:
     writer.set_compression(Writer1.CompressionFormat.BZ2)
     writer.chunk_threshold = 1  # a chunk per message
     with writer:
-        connection = writer.add_connection("/p", "sensor_msgs/msg/PointCloud2", typestore=bags.ROS1)
-        for _, received, message in bags.sweeps("ros1", 6):
-            raw = bags.ROS1.serialize_ros1(message, message.__msgtype__)
+        connection = writer.add_connection("/p", "sensor_msgs/msg/PointCloud2", typestore=ROS1)
+        for _, received, message in sweeps("ros1", 6):
+            raw = ROS1.serialize_ros1(message, message.__msgtype__)
             writer.write(connection, received, raw)
     data = bytearray(path.read_bytes())
     starts = [i for i in range(len(data)) if data[i : i + 4] == b"BZh9"]
@@ -173,14 +163,14 @@ def test_damage_inside_keeps_what_came_before(tmp_path: Path) -> None:
     got = list(dataset)
     assert [type(sweep) for sweep in got] == [Scan] * 4 + [BadSweep]
     assert "the rest is lost" in got[4].message
-    assert got[4].stamp == bags.START + 400_000_000  # when the next sweep was due
+    assert got[4].stamp == START + 400_000_000  # when the next sweep was due
     list(dataset)
     assert sum("the rest is lost" in text for text in dataset.info().problems) == 1
 
 
 def test_a_bag_of_packets_says_what_they_need(tmp_path: Path) -> None:
-    recording = [("/imu", bags.START, bags.imu(bags.ROS1, bags.START))]
-    path = bags.write_bag(tmp_path / "run", "ros1", recording)
+    recording = [("/imu", START, imu(ROS1, START))]
+    path = write_bag(tmp_path / "run", "ros1", recording)
     with pytest.raises(
         DatasetError, match=r"no topic of type .*PointCloud2; the bag has: /imu.*Imu, 1\)$"
     ):

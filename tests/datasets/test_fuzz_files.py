@@ -21,7 +21,6 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2
-from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.types import BadSweep, FeatureSweep, LoamError, Scan
@@ -163,25 +162,6 @@ def test_a_damaged_folder_of_sweeps_is_read_or_refused(data: st.DataObject) -> N
             (place / name).parent.mkdir(exist_ok=True)
             (place / name).write_bytes(content)
         read_all(place)
-
-
-@pytest.mark.parametrize("word", TOKENS)
-@pytest.mark.parametrize("name", ["times.txt", "gt.tum", "imu.csv"])
-def test_no_word_in_a_table_ends_a_run_with_a_traceback(name: str, word: str) -> None:
-    with folder() as place:
-        (place / "velodyne").mkdir()
-        for number in range(2):
-            np.full((40, 4), 2.0, "<f4").tofile(place / "velodyne" / f"{number}.bin")
-        lines = TEXTS[name].splitlines()
-        cells = lines[-1].replace(",", " ").split()
-        for column in (0, len(cells) - 1):
-            changed = [word if i == column else cell for i, cell in enumerate(cells)]
-            lines[-1] = ("," if "," in TEXTS[name] else " ").join(changed)
-            (place / name).write_text("\n".join(lines), encoding="utf-8")
-            read_all(place)
-            if name == "gt.tum":
-                with suppress(LoamError):
-                    read_tum(place / name)
 
 
 GRAPH = (

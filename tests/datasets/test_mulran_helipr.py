@@ -20,9 +20,8 @@ STAMPS = write.stamps()
 
 BASE_T_LIDAR = np.eye(4)
 """MulRan's calib_base2ouster.txt: 1.7042 -0.021 1.8047 0.0001 0.0003 179.6654."""
-BASE_T_LIDAR[:3, :3] = Rotation.from_euler(
-    "xyz", np.radians([0.0001, 0.0003, 179.6654])
-).as_matrix()
+BASE_R_LIDAR = Rotation.from_euler("xyz", np.radians([0.0001, 0.0003, 179.6654]))
+BASE_T_LIDAR[:3, :3] = BASE_R_LIDAR.as_matrix()
 BASE_T_LIDAR[:3, 3] = (1.7042, -0.021, 1.8047)
 
 
@@ -73,8 +72,7 @@ def test_times_and_beams_of_mulran_follow_from_the_order_of_the_points(tmp_path:
         order = np.lexsort((63 - row[seen], scan.times[seen]))
         np.testing.assert_array_equal(scan.points[seen][order], expected.points)
         np.testing.assert_allclose(scan.times[seen][order], expected.times - shift, atol=1e-9)
-        said = [text for text in dataset.info().problems if "which moment" in text]
-        assert not said
+        assert "which moment" not in " ".join(dataset.info().problems)
     assert "which moment" in " ".join(open_dataset(root).info().problems)
 
 
@@ -109,10 +107,8 @@ def test_poses_of_mulran_may_be_unsorted_but_not_distorted(tmp_path: Path) -> No
     problems = " ".join(dataset.info().problems)
     assert "global_pose.csv: poses out of order, sorted" in problems
     assert "global_pose.csv: 1 poses with a repeated stamp left out" in problems
-    file.write_text(
-        "\n".join([lines[0], ",".join([lines[1].split(",")[0], "2.0", *lines[1].split(",")[2:]])])
-        + "\n"
-    )
+    stamp, _, *rest = lines[1].split(",")
+    file.write_text("\n".join([lines[0], ",".join([stamp, "2.0", *rest])]) + "\n")
     with pytest.raises(DatasetError, match=r"global_pose.csv: row 2 does not hold a rotation"):
         _ = open_dataset(root).truth
     file.write_text(lines[0] + "\n1,2,3\n")
@@ -144,9 +140,7 @@ def test_the_gyro_is_where_the_orientation_says(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lidar", ["Ouster", "Velodyne"])
-def test_a_helipr_sequence_is_recognised_with_times_rings_and_truth(
-    tmp_path: Path, lidar: str
-) -> None:
+def test_a_helipr_sequence_has_times_rings_and_truth(tmp_path: Path, lidar: str) -> None:
     dataset = open_dataset(write.write_helipr(tmp_path, lidar))
     assert isinstance(dataset, HeLiPRDataset)
     sensor = "os1-128" if lidar == "Ouster" else "vlp16"
@@ -185,7 +179,5 @@ def test_helipr_says_what_is_broken(tmp_path: Path) -> None:
     assert "is not a multiple of 26 (x, y, z, intensity, t, reflectivity" in sweeps[1].message
     for file in files:
         file.write_bytes(b"123")
-    with pytest.raises(
-        DatasetError, match=r"Ouster: no usable sweep among the first 10; .*3 bytes"
-    ):
+    with pytest.raises(DatasetError, match=r"no usable sweep among the first 10; .*3 bytes"):
         open_dataset(root).info()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rosrosbag1 import Writer as Writer1
+from rosbags.rosbag1 import Writer as Writer1
 from support.bags import (
     KINDS,
     LATENCY,

@@ -41,9 +41,8 @@ class Motion:
 
     def __init__(self, scene: Scene, speed: float) -> None:
         self._scene, self._speed = scene, speed
-        points = scene.waypoints
-        if scene.closed:
-            points = np.vstack([points, points[:1]])
+        way = scene.waypoints
+        points = np.vstack([way, way[:1]]) if scene.closed else way
         bounds = "periodic" if scene.closed else "natural"
         chord = distances_along(points)
         rough = CubicSpline(chord, points, bc_type=bounds)

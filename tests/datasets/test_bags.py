@@ -24,7 +24,7 @@ from support.bags import (
 from loam_gtsam.datasets import BagDataset, Dataset, open_dataset
 from loam_gtsam.datasets.bags.bag import POINT_CLOUD
 from loam_gtsam.datasets.bags.bag_reader import choose_topic
-from loam_gtsam.types import BadSweep, DatasetError, Scan
+from loam_gtsam.types import BadSweep, DatasetError, LoamError, Scan
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -181,3 +181,20 @@ def test_a_bag_of_packets_says_what_they_need(tmp_path: Path) -> None:
     topics = {"/packets": ("velodyne_msgs/msg/VelodyneScan", 3)}
     with pytest.raises(DatasetError, match="raw packets become PointCloud2 with the driver"):
         choose_topic(path, topics, POINT_CLOUD, None, [])
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_truncated_ros2_never_escapes_loam_error(tmp_path: Path, kind: str) -> None:
+    folder = write_bag(tmp_path / "run", kind, sweeps(kind, 20))
+    file = next(folder.glob("*.db3" if kind == "sqlite3" else "*.mcap"))
+    data = file.read_bytes()
+    refused = 0
+    for size in (0, 10, len(data) // 3, len(data) - 100):
+        file.write_bytes(data[:size])
+        try:
+            got = list(open_dataset(folder))
+        except LoamError:
+            refused += 1
+        else:
+            assert isinstance(got[-1], BadSweep)
+    assert refused >= 2

@@ -31,9 +31,7 @@ class MapPair:
 
     def __init__(self, config: MapConfig) -> None:
         self.config = config
-        self.edges = CubeMap(config, config.edge_voxel)
-        self.planes = CubeMap(config, config.plane_voxel)
-        self._thinned: tuple[CubeMap, CubeMap] | None = None
+        self.clear()
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {"_thinned": None}
@@ -42,7 +40,7 @@ class MapPair:
         """Forget all points."""
         self.edges = CubeMap(self.config, self.config.edge_voxel)
         self.planes = CubeMap(self.config, self.config.plane_voxel)
-        self._thinned = None
+        self._thinned: tuple[CubeMap, CubeMap] | None = None
 
     def recenter(self, map_T_lidar: gtsam.Pose3) -> None:
         """Let the windows follow.
@@ -52,6 +50,7 @@ class MapPair:
         InputError
             If the pose is not finite, or beyond the voxel grid.
         """
+        self._thinned = None  # of other cubes, after a sweep that was not inserted
         for cubes in (self.edges, self.planes):
             cubes.recenter(map_T_lidar.translation())
 

@@ -132,3 +132,15 @@ def test_with_too_few_matches_the_search_is_wide_and_equals_brute_force():
     np.testing.assert_array_equal(found.planes.indices, expected.indices)
     np.testing.assert_allclose(found.planes.normals, expected.normals, atol=1e-9)
     np.testing.assert_allclose(found.planes.distances, expected.distances, atol=1e-9)
+
+
+def test_the_thinned_map_follows_the_window_without_an_insertion():
+    """After a lost sweep nothing is inserted, but the window moves on."""
+    maps = MapPair(Config().map)
+    points = np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3))
+    maps.planes.insert(points)
+    here = maps.thinned(4.0)[1]
+    assert here.count() > 0
+    assert maps.thinned(4.0)[1] is here
+    maps.recenter(gtsam.Pose3(gtsam.Rot3(), np.array([5000.0, 0.0, 0.0])))
+    assert maps.thinned(4.0)[1].count() == 0

@@ -161,7 +161,7 @@ def _open_world(text: str, options: dict[str, Any]) -> Dataset:
     from loam_gtsam.datasets.sim.world import SimulatedWorld
 
     settings = {key: _number_or_text(value) for key, value in pairs} | options
-    numbers = set(inspect.signature(SimulatedWorld).parameters) - {"sensor"}
+    numbers = set(inspect.signature(SimulatedWorld).parameters) - {"sensor", "start", "imu"}
     for key, value in settings.items():
         if key in numbers and isinstance(value, str):
             raise DatasetError(f"{text}: {key}: expected a number, got {value!r}")

@@ -6,11 +6,12 @@ few solids near the sensor, never over rays: each is tested against the columns 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from loam_gtsam.datasets.sim.ways import Mover
 from loam_gtsam.types import BoolArray, FloatArray
 
 _EPSILON = 1e-12
@@ -76,6 +77,7 @@ class Solids:
     foliage : (N,) which ellipsoids are tree crowns, into which a beam penetrates a little
     tubes : (N, 5) endless, level and seen from inside: x y z of a point on the axis, yaw of the
         axis (rad), radius. The sensor must stay in them.
+    movers : cylinders and boxes that are somewhere else at every time
     ground : height field; the sensor must stay above it
     """
 
@@ -85,10 +87,15 @@ class Solids:
     foliage: BoolArray = field(default_factory=lambda: np.zeros(0, np.bool_))
     ground: Ground = field(default_factory=Ground)
     tubes: FloatArray = field(default_factory=lambda: np.zeros((0, 5)))
+    movers: tuple[Mover, ...] = ()
 
 
 def cast_rays(
-    solids: Solids, origins: FloatArray, directions: FloatArray, max_range: float
+    solids: Solids,
+    origins: FloatArray,
+    directions: FloatArray,
+    max_range: float,
+    times: FloatArray,
 ) -> tuple[FloatArray, BoolArray]:
     """Distance (C, B) along each ray to the first surface or inf, and (C, B) whether it is foliage.
 
@@ -99,32 +106,24 @@ def cast_rays(
     directions : (3, C, B) unit vectors in the world frame, well away from the vertical. Azimuth
         must run monotonically over the columns, about once round.
     max_range : metres
+    times : (C,) seconds at which the columns fire, for what moves
     """
     ranges = np.full(directions.shape[1:], max_range)
     view = _View.of(origins, directions, max_range)
     dx, dy, dz = directions
     horizontal = dx * dx + dy * dy
     for i, part in view.facing_boxes(solids.boxes):
-        cx, cy, cz, hx, hy, hz, yaw = solids.boxes[i]
-        cosine, sine = np.cos(yaw), np.sin(yaw)
-        x, y, z = (origins[part] - (cx, cy, cz)).T[:, :, None]
-        rays_x, rays_y = dx[part], dy[part]
-        along = cosine * rays_x + (sine * rays_y + _EPSILON)
-        across = cosine * rays_y - (sine * rays_x + _EPSILON)
-        near, far = _slab(cosine * x + sine * y, along, hx)
-        for other in (_slab(cosine * y - sine * x, across, hy), _slab(z, dz[part] + _EPSILON, hz)):
-            np.maximum(near, other[0], out=near)
-            np.minimum(far, other[1], out=far)
-        near[(near > far) | (near <= 0.0)] = np.inf
+        centre, half, yaw = solids.boxes[i, :3], solids.boxes[i, 3:6], solids.boxes[i, 6]
+        near = _box_entry(origins[part] - centre, directions[:, part], half, yaw)
         np.minimum(ranges[part], near, out=ranges[part])
     for i, part in view.facing_discs(solids.cylinders[:, :2], solids.cylinders[:, 2]):
         cx, cy, radius, low, high = solids.cylinders[i]
-        x, y, z = (origins[part] - (cx, cy, 0.0)).T[:, :, None]
-        c = x * x + y * y - radius * radius
-        near = _entry(horizontal[part], x * dx[part] + y * dy[part], c)
-        height = z + near * dz[part]
-        near[(height < low) | (height > high)] = np.inf
+        offsets, rays = origins[part] - (cx, cy, 0.0), directions[:, part]
+        near = _cylinder_entry(offsets, rays, horizontal[part], radius, (low, high))
         np.minimum(ranges[part], near, out=ranges[part])
+    if solids.movers:
+        moving = _cast_movers(solids.movers, view, origins, directions, times)
+        np.minimum(ranges, moving, out=ranges)
     soft = np.zeros(ranges.shape, np.bool_)
     widest = solids.ellipsoids[:, 3:5].max(axis=1, initial=0.0)
     for i, part in view.facing_discs(solids.ellipsoids[:, :2], widest):
@@ -150,6 +149,71 @@ def cast_rays(
     np.minimum(ranges, ground, out=ranges)
     ranges[ranges >= max_range] = np.inf
     return ranges, soft
+
+
+def _cast_movers(
+    movers: Sequence[Mover],
+    view: _View,
+    origins: FloatArray,
+    directions: FloatArray,
+    times: FloatArray,
+) -> FloatArray:
+    """Distances (C, B) to what moves or inf, each column with everything where it is by then."""
+    ranges = np.full(directions.shape[1:], np.inf)
+    middle = times[len(times) // 2 : len(times) // 2 + 1]
+    centres = np.concatenate([mover.places(middle)[0] for mover in movers])
+    apart = float(np.abs(times - middle).max())
+    reaches = np.array([mover.reach + mover.speed * apart for mover in movers])
+    for i, part in view.facing_discs(centres, reaches):
+        mover, rays = movers[i], directions[:, part]
+        places, yaw = mover.places(times[part])
+        offsets = origins[part].copy()
+        offsets[:, :2] -= places
+        if len(mover.footprint) == 1:
+            horizontal = rays[0] * rays[0] + rays[1] * rays[1]
+            heights = mover.low, mover.high
+            near = _cylinder_entry(offsets, rays, horizontal, mover.footprint[0], heights)
+        else:
+            offsets[:, 2] -= 0.5 * (mover.low + mover.high)
+            half = np.array([*mover.footprint, 0.5 * (mover.high - mover.low)])
+            near = _box_entry(offsets, rays, half, yaw[:, None])
+        np.minimum(ranges[part], near, out=ranges[part])
+    return ranges
+
+
+def _box_entry(
+    offsets: FloatArray, rays: FloatArray, half: FloatArray, yaw: float | FloatArray
+) -> FloatArray:
+    """Distances (P, B) to a box or inf, from (P, 3) sensor positions relative to its centre."""
+    cosine, sine = np.cos(yaw), np.sin(yaw)
+    x, y, z = offsets.T[:, :, None]
+    along = cosine * rays[0] + (sine * rays[1] + _EPSILON)
+    across = cosine * rays[1] - (sine * rays[0] + _EPSILON)
+    near, far = _slab(cosine * x + sine * y, along, half[0])
+    for other in (
+        _slab(cosine * y - sine * x, across, half[1]),
+        _slab(z, rays[2] + _EPSILON, half[2]),
+    ):
+        np.maximum(near, other[0], out=near)
+        np.minimum(far, other[1], out=far)
+    near[(near > far) | (near <= 0.0)] = np.inf
+    return near
+
+
+def _cylinder_entry(
+    offsets: FloatArray,
+    rays: FloatArray,
+    horizontal: FloatArray,
+    radius: float,
+    heights: tuple[float, float],
+) -> FloatArray:
+    """Distances (P, B) to a mantle or inf, from (P, 3) sensor positions relative to its axis."""
+    x, y, z = offsets.T[:, :, None]
+    c = x * x + y * y - radius * radius
+    near = _entry(horizontal, x * rays[0] + y * rays[1], c)
+    height = z + near * rays[2]
+    near[(height < heights[0]) | (height > heights[1])] = np.inf
+    return near
 
 
 def _slab(offset: FloatArray, direction: FloatArray, half: float) -> tuple[FloatArray, FloatArray]:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from loam_gtsam.datasets.sim import streets
+from loam_gtsam.datasets.sim import indoors, outdoors, streets
 from loam_gtsam.datasets.sim.raycast import Solids
 from loam_gtsam.types import FloatArray
 
@@ -197,6 +197,12 @@ BUILDERS: dict[str, Callable[[int], streets.Scene]] = {
     "tunnel": build_tunnel,
     "sparse_terrain": build_sparse_terrain,
     "avenue": streets.build_avenue,
+    "park": outdoors.build_park,
+    "forest": outdoors.build_forest,
+    "rooms": indoors.build_rooms,
+    "tunnel_pilasters": indoors.build_tunnel_pilasters,
+    "square": outdoors.build_square,
+    "bridge": outdoors.build_bridge,
 }
 
 

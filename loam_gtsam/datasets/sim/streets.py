@@ -10,6 +10,7 @@ from scipy.ndimage import gaussian_filter1d
 from scipy.spatial import cKDTree
 
 from loam_gtsam.datasets.sim.raycast import Ground, Solids
+from loam_gtsam.datasets.sim.ways import distances_along, points_along
 from loam_gtsam.geometry import as_array
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 
@@ -43,12 +44,14 @@ class Scene:
     ----------
     name : shown in descriptions
     solids : what the beams hit
-    waypoints : (W, 2) x y on the smooth path of the sensor
+    waypoints : (W, 2) x y on the smooth path of the sensor; or (W, 3) x y z of the sensor itself,
+        which then does not follow the ground: on stairs, on a bridge
     closed : whether the path returns to its first way point, to be driven round and round
     speed : m/s on a straight
-    height : of the sensor above the ground
+    height : of the sensor above the ground, where the way points have no z
     sway : amplitudes of heave (m), roll, pitch and yaw (rad)
     frames : sweeps by default; None is once round, or to the end
+    bends : metres between the knots of the path, short where bends are narrow
     """
 
     name: str
@@ -59,6 +62,7 @@ class Scene:
     height: float = 1.8
     sway: tuple[float, float, float, float] = CAR
     frames: int | None = None
+    bends: float = 2.0
 
 
 class Kerb:
@@ -342,18 +346,6 @@ def rolling_ground(
     phase = rng.uniform(0.0, 2.0 * np.pi, len(amplitudes))
     u, v = number * np.cos(direction), number * np.sin(direction)
     return Ground(np.column_stack([amplitudes, u, v, phase]))
-
-
-def distances_along(way: FloatArray) -> FloatArray:
-    """(N,) metres from the first of (N, 2) points to each, along straight lines between them."""
-    steps = np.linalg.norm(np.diff(way, axis=0), axis=1)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def points_along(way: FloatArray, metres: FloatArray) -> FloatArray:
-    """(M, 2) points so far along a way of (N, 2) points, of which no two in a row are the same."""
-    distances = distances_along(way)
-    return np.stack([np.interp(metres, distances, way[:, k]) for k in (0, 1)], axis=1)
 
 
 def _rounded_rectangle(half_x: float, half_y: float, radius: float, wander: float) -> FloatArray:

@@ -44,6 +44,7 @@ SENSORS: dict[str, tuple[FloatArray, int]] = {
     "os1-128": (np.linspace(-22.5, 22.5, 128), 1024),
 }
 """Elevations in degrees from the lowest beam up, and columns per sweep at 10 Hz (data sheets)."""
+STARTS = "rest", "moving"
 
 _EPOCH = 1_700_000_000_000_000_000
 """Nanoseconds of the first sweep: as large as real stamps are, which floats cannot hold."""
@@ -58,8 +59,8 @@ class SimulatedWorld:
     """A data set made on the fly, the same for the same arguments on every run.
 
     The sensor spins clockwise from straight behind; all beams of a column fire together, and
-    points come in firing order. It starts at rest and gathers speed within three seconds. The
-    IMU sits at the lidar's origin with the lidar's axes.
+    points come in firing order. It gathers speed within three seconds. The IMU has the lidar's
+    axes; where it sits is in ``sensor``.
 
     Parameters
     ----------
@@ -76,6 +77,7 @@ class SimulatedWorld:
     speed : m/s on a straight; None is the scene's own
     columns : firings per sweep; None is the sensor's own
     max_range : metres
+    start : ``rest``, or ``moving``: the same way, its first sweep taken at full speed
     imu_noise : orientation, rad per axis
     gyro_noise, gyro_bias : rad/s per axis, white and constant
     acceleration_noise, acceleration_bias : m/s^2 per axis, white and constant
@@ -111,6 +113,7 @@ class SimulatedWorld:
         speed: float | None = None,
         columns: int | None = None,
         max_range: float = 100.0,
+        start: str = "rest",
         imu_noise: float = 0.003,
         gyro_noise: float = 0.003,
         gyro_bias: tuple[float, float, float] = (0.002, -0.001, 0.0015),
@@ -121,6 +124,8 @@ class SimulatedWorld:
             raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
         if sensor not in SENSORS:
             raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
+        if start not in STARTS:
+            raise ConfigError(f"start: expected one of {', '.join(STARTS)}; got {start!r}")
         for label, whole, least in (
             ("seed", seed, 0),
             ("frames", frames, 1),
@@ -146,7 +151,7 @@ class SimulatedWorld:
         self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
         self._imu_noise, self._gyro = imu_noise, (gyro_noise, gyro_bias)
         self._acceleration = acceleration_noise, acceleration_bias
-        self._motion = Motion(self.scene, speed)
+        self._motion = Motion(self.scene, speed, start == "moving")
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"
         self.sensor: Mapping[str, Any] = _SPIN | {"model": sensor, "period": 1.0 / rate}
@@ -169,10 +174,11 @@ class SimulatedWorld:
         if not 0 <= i < self._frames:
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
         stamp = self._stamp(i)
-        world_T_lidar = self._motion.world_T_lidar((stamp - _EPOCH) * 1e-9 + self._times)
+        times = (stamp - _EPOCH) * 1e-9 + self._times
+        world_T_lidar = self._motion.world_T_lidar(times)
         directions = np.einsum("cij,jcb->icb", world_T_lidar[:, :3, :3], self._beams)
         origins = world_T_lidar[:, :3, 3]
-        ranges, soft = cast_rays(self.scene.solids, origins, directions, self._max_range)
+        ranges, soft = cast_rays(self.scene.solids, origins, directions, self._max_range, times)
         rng = np.random.default_rng([self._seed, i])
         lost = rng.random(ranges.shape) < self._dropout
         ranges += self._range_noise * rng.standard_normal(ranges.shape)

@@ -68,13 +68,34 @@ class Localizability:
         chosen: FloatArray = self.directions[self.aligned < least]
         return chosen
 
-    def projector(self, least: float) -> FloatArray | None:
-        """(6, 6) projector onto the weak directions along the others, None if there are none."""
+    def open(self, least: float) -> Directions | None:
+        """The weak directions, along the others; None if there are none."""
         mask = self.aligned < least
         if not mask.any():
             return None
-        columns = self.directions.T
-        projector: FloatArray = columns @ (mask[:, None] * np.linalg.inv(columns))
+        return Directions(self.directions[mask], np.linalg.inv(self.directions.T)[mask])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Directions:
+    """Some motions, and how each motion is made up of these and of others.
+
+    Attributes
+    ----------
+    vectors : (W, 6) rows, tangent vectors as in :class:`Localizability`
+    shares : (W, 6) rows whose products with a tangent vector are its coefficients
+    """
+
+    vectors: FloatArray
+    shares: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.vectors)
+
+    @property
+    def projector(self) -> FloatArray:
+        """(6, 6) projector onto these directions along the others."""
+        projector: FloatArray = self.vectors.T @ self.shares
         return projector
 
 
@@ -115,8 +136,8 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
 
 def unseen_by_planes(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, seen: Localizability, least: float
-) -> Localizability | None:
-    """How well the planes alone fix the pose, if some motions are to be left to the lines.
+) -> Directions | None:
+    """The motions that planes alone do not fix, if these are to be left to the lines.
 
     On rough ground the few lines of poles show how far the pose is off. The thousand planes of the
     ground do not show it: by noise they hold the pose where it was, and they outweigh the poles.
@@ -128,12 +149,46 @@ def unseen_by_planes(
         return None
     no_lines = subset(matches.edges, np.zeros(len(matches.edges), np.bool_))
     planes = localizability(replace(matches, edges=no_lines), map_T_lidar)
-    directions = planes.weak(least)
-    if not len(directions):
+    unseen = planes.open(least)
+    if unseen is None:
         return None
-    by_lines = line_sight(matches.edges, map_T_lidar, directions).sum(axis=0)
+    by_lines = line_sight(matches.edges, map_T_lidar, unseen.vectors).sum(axis=0)
     held = seen.aligned[0] < least or by_lines.min() >= _HELD * least
-    return planes if held else None
+    return unseen if held else None
+
+
+def left_open(
+    matches: ScanMatches, map_T_lidar: gtsam.Pose3, unseen: Directions, least: float
+) -> Directions | None:
+    """Those motions, out of some that planes do not fix, that lines do not fix either.
+
+    Lines come and go between one association and the next. So this is to be asked for the matches
+    of every association: a direction that is left to lines must have some.
+
+    ``unseen`` is of :func:`unseen_by_planes`, ``least`` as in :meth:`Localizability.weak`.
+    """
+    among = _mixed(matches.edges, map_T_lidar, unseen)
+    by_lines = line_sight(matches.edges, map_T_lidar, among.vectors).sum(axis=0)
+    p = matches.planes
+    normals = p.normals @ map_T_lidar.rotation().matrix()
+    tilts = np.zeros(len(p)) if p.tilts is None else p.tilts
+    by_planes = _sight(p.points, normals, tilts, among.vectors).sum(axis=0)
+    left = (by_lines < _HELD * least) | (by_lines + by_planes < least)
+    return Directions(among.vectors[left], among.shares[left]) if left.any() else None
+
+
+def _mixed(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, unseen: Directions) -> Directions:
+    """The same motions as others that span the same space, of which lines see each as it is."""
+    points, normals, tilts = _planes_through(edges)
+    normals = normals @ map_T_lidar.rotation().matrix()
+    keep = np.repeat(np.ones(len(edges), np.bool_) if edges.distinct is None else edges.distinct, 2)
+    points, normals, tilts = points[keep], normals[keep], tilts[keep]
+    across = np.hstack([cross(points.T, normals.T).T, normals]) @ unseen.vectors.T
+    noise = unseen.vectors @ _displacements(points, tilts**2) @ unseen.vectors.T
+    columns = _eigenvectors(across.T @ across, noise + np.eye(len(unseen)))
+    columns = columns / np.linalg.norm(columns, axis=0)
+    vectors: FloatArray = columns.T @ unseen.vectors
+    return Directions(vectors, np.linalg.inv(columns) @ unseen.shares)
 
 
 def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatArray) -> FloatArray:

@@ -306,14 +306,14 @@ def scan_error(
 
     total = solution.information if with_priors else information
     priors = user = _positive(total - information)
-    try:
-        bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
-    except np.linalg.LinAlgError:
+    if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
+    bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
     if solution.weak is not None:
         # Along weak directions the prior is the expected motion, which starts at the last pose.
-        renewed = renewed + solution.weak.T @ priors @ solution.weak
-        keep = np.eye(6) - solution.weak
+        weak = solution.weak.projector
+        renewed = renewed + weak.T @ priors @ weak
+        keep = np.eye(6) - weak
         user = keep.T @ user @ keep
     covariance, renewed = (symmetric(bread @ part @ bread) for part in (meat + priors, renewed))
     return ScanError(covariance, renewed, bread @ user, variance, effective)

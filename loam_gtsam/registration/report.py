@@ -93,9 +93,9 @@ def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
 
 def weak_directions_in_words(solution: Solution) -> str:
     """The degenerate directions of a solution in words: metres and rad in lidar axes."""
-    assert solution.localizability is not None
+    assert solution.weak is not None
     names = []
-    for direction in solution.localizability.directions[: solution.n_weak]:
+    for direction in solution.weak.vectors:
         unit = direction / direction[np.abs(direction).argmax()]  # the sign is arbitrary
         parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
         names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))

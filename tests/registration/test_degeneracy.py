@@ -11,9 +11,10 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config
-from loam_gtsam.registration.degeneracy import localizability, unseen_by_planes
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, MotionPrior
+from loam_gtsam.registration.degeneracy import left_open, localizability, unseen_by_planes
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, subset
+from loam_gtsam.registration.report import status_of
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, Matcher, MotionPrior
 from loam_gtsam.types import FrameStatus
 
 LEAST = SolverConfig().min_aligned
@@ -81,7 +82,7 @@ def found(planes, edges=NO_EDGES):
 def test_a_room_has_no_weak_direction():
     seen = found(surfaces(*whole_room(), noise=0.05))
     assert len(seen.weak(LEAST)) == 0
-    assert seen.projector(LEAST) is None
+    assert seen.open(LEAST) is None
     assert np.all(np.diff(seen.aligned) >= 0)
 
 
@@ -157,6 +158,46 @@ def test_poles_say_where_they_see_and_planes_do_not(policy, distinct, off):
     error = np.linalg.norm(POSE.localCoordinates(solution.map_T_lidar)[3:5])
     assert error == pytest.approx(off, rel=0.3, abs=0.02)
     assert (solution.n_weak > 0) == (not distinct)
+
+
+class Vanishing(Matcher):
+    """Poles on open ground, of which only so many are found again after the first association."""
+
+    def __init__(self, left):
+        self.matches = ground_and_poles()
+        keep = np.arange(len(self.matches.edges)) < left
+        self.fewer = replace(self.matches, edges=subset(self.matches.edges, keep))
+
+    def __call__(self, _):
+        return self.matches
+
+    def again(self, _, __):
+        return self.fewer
+
+
+@pytest.mark.parametrize(("left", "weak"), [(60, 0), (10, 1), (0, 3)])
+def test_no_direction_is_left_to_lines_that_vanish(left, weak):
+    """Planes are left out of x, y and yaw for 60 lines; then 10 of one pole remain, then none."""
+    prior = MotionPrior(GUESS, 25.0 * np.eye(6))
+    solver = GtsamSolver(SolverConfig(step_sigmas=0.0))
+    solution = solver.solve(Vanishing(left), GUESS, (), prior)
+    assert solution.iterations > 1
+    assert solution.n_weak == weak
+    assert (status_of(solution, "")[0] is FrameStatus.DEGENERATE) == (weak > 0)
+    covariance = np.linalg.inv(solution.information)
+    assert np.linalg.eigvalsh(covariance).max() < 1.0  # of the expected motion: 0.2 m, 0.2 rad
+    assert np.linalg.norm(POSE.localCoordinates(solution.map_T_lidar)) < 1.0
+
+
+def test_what_lines_leave_open_is_a_turn_about_the_one_pole():
+    matches = ScanMatches(lines(np.tile([4.0, 3, 0], (20, 1))), surfaces(*ground()))
+    unseen = localizability(replace(matches, edges=NO_EDGES), POSE).open(LEAST)
+    left = left_open(matches, POSE, unseen, LEAST)
+    assert (len(unseen), len(left)) == (3, 1)
+    turn = left.vectors[0] / left.vectors[0, 2]
+    np.testing.assert_allclose(turn[[3, 4]], [3.0, -4.0], atol=0.1)  # (4, 3) does not move
+    np.testing.assert_allclose(left.projector @ left.vectors[0], left.vectors[0], atol=1e-9)
+    np.testing.assert_allclose(left.projector @ left.projector, left.projector, atol=1e-9)
 
 
 def test_planes_are_believed_where_lines_see_too_little():

@@ -8,6 +8,7 @@ import pytest
 
 from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.geometry import voxel_keys
+from loam_gtsam.registration.degeneracy import Directions
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.pose_errors import SeenGround, scan_error
 from loam_gtsam.registration.solvers import Solution, match_rows
@@ -30,14 +31,14 @@ def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
                           np.arange(count))  # fmt: skip
     matches = ScanMatches(NO_EDGES, planes)
     residuals, jacobian = match_rows(matches).residuals(pose)
-    keep = np.eye(6) if weak is None else np.eye(6) - weak
+    keep = np.eye(6) if weak is None else np.eye(6) - weak.projector
     information = keep.T @ jacobian.T @ jacobian @ keep
     if prior is not None:
         information = information + prior
     step = -np.linalg.solve(information, keep.T @ jacobian.T @ residuals)
     return Solution(
         pose.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information, weak=weak,
-        unseen=weak, beacons=np.zeros(count, np.bool_),
+        unseen=None if weak is None else weak.projector, beacons=np.zeros(count, np.bool_),
     ), step  # fmt: skip
 
 
@@ -147,8 +148,8 @@ def test_along_a_weak_direction_there_is_the_expected_motion_only():
     rng = np.random.default_rng(0)
     points, normals, _ = surroundings(rng, axes=2)  # nothing across x of the map
     along = np.concatenate([np.zeros(3), POSE.rotation().matrix().T @ [1.0, 0.0, 0.0]])
-    weak = np.outer(along, along)
-    prior = 400.0 * weak  # 0.05 m
+    weak = Directions(along[None], along[None])
+    prior = 400.0 * weak.projector  # 0.05 m
     found = error_of(solved(points, normals, rng.normal(0, 0.02, 1500), prior=prior, weak=weak)[0])
     assert along @ found.covariance @ along == pytest.approx(0.05**2, rel=1e-6)
     assert along @ found.renewed @ along == pytest.approx(0.05**2, rel=1e-6)
@@ -173,12 +174,15 @@ def test_along_unseen_directions_only_the_beacons_count():
     assert 10 < after / before < 200  # 500 walls against 10
 
 
-def test_singular_information_gives_no_covariance():
+@pytest.mark.parametrize(("left", "known"), [(0.0, False), (1e-11, False), (1e-2, True)])
+def test_singular_information_gives_no_covariance(left, known):
+    """What rounding leaves along a direction, beside 1e9 along the others, is no information."""
     rng = np.random.default_rng(0)
     points, normals, _ = surroundings(rng, axes=1)
     matches = solved(points, normals, np.zeros(1500), prior=np.eye(6))[0].matches
-    nothing = Solution(POSE, True, True, matches, 1, 1, 0.0, 0.0, np.zeros((6, 6)))
-    assert scan_error(nothing, np.inf, SeenGround(0.8), CONFIG) is None
+    information = np.diag([left, *[1e9] * 5])
+    solution = Solution(POSE, True, True, matches, 1, 1, 0.0, 0.0, information)
+    assert (scan_error(solution, np.inf, SeenGround(0.8), CONFIG) is not None) == known
 
 
 def test_only_new_ground_is_renewed():

@@ -11,7 +11,7 @@ import numpy as np
 
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows
-from loam_gtsam.registration.degeneracy import Localizability
+from loam_gtsam.registration.degeneracy import Directions, Localizability
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.types import BoolArray, FloatArray
 
@@ -60,7 +60,7 @@ class Solution:
         last matches
     information : (6, 6) of matches and priors at the pose, tangent order of the package
     localizability : how well the first matches fix each motion; None if not computed
-    weak : (6, 6) projector onto the degenerate directions; None if there are none
+    weak : the directions that the last matches left open, degenerate ones; None if there are none
     unseen : (6, 6) projector onto the directions that the planes do not fix, along which only
         ``beacons`` and the expected motion count; None if there are none
     beacons : (R,) mask of the rows that count along ``unseen``
@@ -77,7 +77,7 @@ class Solution:
     error_after: float
     information: FloatArray
     localizability: Localizability | None = None
-    weak: FloatArray | None = None
+    weak: Directions | None = None
     unseen: FloatArray | None = None
     beacons: BoolArray | None = None
     rows: MatchRows | None = None
@@ -92,15 +92,15 @@ class Solution:
 
     @property
     def n_weak(self) -> int:
-        """Number of degenerate directions; they are the first of ``localizability.directions``."""
-        return 0 if self.weak is None else round(float(np.trace(self.weak)))
+        """Number of degenerate directions."""
+        return 0 if self.weak is None else len(self.weak)
 
     @property
     def scan_information(self) -> FloatArray:
         """(6, 6) ``information`` without the degenerate directions."""
         if self.weak is None:
             return self.information
-        keep = np.eye(6) - self.weak
+        keep = np.eye(6) - self.weak.projector
         kept: FloatArray = keep.T @ self.information @ keep
         return kept
 

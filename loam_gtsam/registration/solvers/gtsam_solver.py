@@ -18,7 +18,9 @@ from loam_gtsam.factors import (
     scan_match_factor,
 )
 from loam_gtsam.registration.degeneracy import (
+    Directions,
     Localizability,
+    left_open,
     line_sight,
     localizability,
     unseen_by_planes,
@@ -91,16 +93,18 @@ class GtsamSolver:
         values.insert(POSE_KEY, pose)
         graph = gtsam.NonlinearFactorGraph()
         rows = match_rows(matches, config.kernel_width, config.kernel)
-        unseen = sight.weak
+        weak, unseen = sight.weak, sight.weak
         beacons = np.zeros(len(rows.points), np.bool_)
-        if sight.planes is not None:
-            unseen = sight.planes.projector(config.min_aligned)
-            seen = line_sight(matches.edges, pose, sight.planes.weak(config.min_aligned))
+        if sight.unseen is not None:
+            unseen = sight.unseen
+            weak = left_open(matches, pose, unseen, config.min_aligned)
+            seen = line_sight(matches.edges, pose, unseen.vectors)
             beacons[: 2 * len(seen)] = np.repeat(seen.any(axis=1), 2)
-        for factor in _scan_factors(rows, values, unseen, beacons):
+        without = None if unseen is None else unseen.projector
+        for factor in _scan_factors(rows, values, without, beacons):
             graph.add(factor)
-        if sight.weak is not None and expected is not None:
-            graph.add(expected.factor(sight.weak))
+        if weak is not None and expected is not None:
+            graph.add(expected.factor(weak.projector))
         for factor in priors:
             graph.add(factor)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
@@ -109,27 +113,27 @@ class GtsamSolver:
         after, steps = optimizer.error(), optimizer.iterations()
         information = graph.linearize(optimizer.values()).hessian()[0]
         small = within_tolerance(pose.localCoordinates(moved), information, config)
-        sights = sight.scan, sight.weak, unseen, beacons, rows
+        sights = sight.scan, weak, without, beacons, rows
         return Solution(moved, True, small, matches, 1, steps, before, after, information, *sights)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Sight:
-    """Localizability by the first matches of a frame: all of them, and the planes alone."""
+    """What the first matches of a frame see: all of them, and the planes alone."""
 
     scan: Localizability | None = None
-    weak: FloatArray | None = None  # projector onto the degenerate directions
-    planes: Localizability | None = None  # None where planes fix all that the scan fixes
+    weak: Directions | None = None  # the degenerate directions
+    unseen: Directions | None = None  # left to lines; None where planes fix all that is fixed
 
 
 def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> _Sight:
     scan = localizability(matches, pose)
-    weak = planes = None
+    weak = unseen = None
     if config.degeneracy != "off":
-        weak = scan.projector(config.min_aligned)
+        weak = scan.open(config.min_aligned)
     if config.degeneracy == "prior":
-        planes = unseen_by_planes(matches, pose, scan, config.min_aligned)
-    return _Sight(scan, weak, planes)
+        unseen = unseen_by_planes(matches, pose, scan, config.min_aligned)
+    return _Sight(scan, weak, unseen)
 
 
 def _scan_factors(

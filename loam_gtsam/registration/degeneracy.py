@@ -73,7 +73,8 @@ class Localizability:
         mask = self.aligned < least
         if not mask.any():
             return None
-        return Directions(self.directions[mask], np.linalg.inv(self.directions.T)[mask])
+        shares: FloatArray = np.linalg.inv(self.directions.T).astype(np.float64, copy=False)
+        return Directions(self.directions[mask], shares[mask])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.sim.inertial import IMUS, Axes, ImuErrors
 from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import BUILDERS
@@ -78,7 +78,10 @@ class SimulatedWorld:
     columns : firings per sweep; None is the sensor's own
     max_range : metres
     start : ``rest``, or ``moving``: the same way, its first sweep taken at full speed
-    imu_noise : orientation, rad per axis
+    imu : ``white``, at the lidar's origin with white noise and constant biases; or ``mems``, beside
+        it, with an attitude wrong by 0.4 degrees per axis that changes over half a minute, and
+        biases of 0.3 deg/s and 0.05 m/s^2
+    imu_noise : orientation, white, rad per axis; this and the next are the IMU's own if None
     gyro_noise, gyro_bias : rad/s per axis, white and constant
     acceleration_noise, acceleration_bias : m/s^2 per axis, white and constant
 
@@ -114,18 +117,18 @@ class SimulatedWorld:
         columns: int | None = None,
         max_range: float = 100.0,
         start: str = "rest",
-        imu_noise: float = 0.003,
-        gyro_noise: float = 0.003,
-        gyro_bias: tuple[float, float, float] = (0.002, -0.001, 0.0015),
-        acceleration_noise: float = 0.03,
-        acceleration_bias: tuple[float, float, float] = (0.03, -0.02, 0.04),
+        imu: str = "white",
+        imu_noise: float | None = None,
+        gyro_noise: float | None = None,
+        gyro_bias: Axes | None = None,
+        acceleration_noise: float | None = None,
+        acceleration_bias: Axes | None = None,
     ) -> None:
-        if isinstance(scene, str) and scene not in BUILDERS:
-            raise ConfigError(f"scene: expected one of {', '.join(SCENES)}; got {scene!r}")
-        if sensor not in SENSORS:
-            raise ConfigError(f"sensor: expected one of {', '.join(SENSORS)}; got {sensor!r}")
-        if start not in STARTS:
-            raise ConfigError(f"start: expected one of {', '.join(STARTS)}; got {start!r}")
+        if isinstance(scene, str):
+            _one_of("scene", scene, SCENES)
+        _one_of("sensor", sensor, SENSORS)
+        _one_of("start", start, STARTS)
+        _one_of("imu", imu, IMUS)
         for label, whole, least in (
             ("seed", seed, 0),
             ("frames", frames, 1),
@@ -137,24 +140,26 @@ class SimulatedWorld:
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
-        _at_least("range_noise", range_noise, 0.0)
-        _at_least("foliage_noise", foliage_noise, 0.0)
-        _at_least("imu_noise", imu_noise, 0.0)
-        _at_least("gyro_noise", gyro_noise, 0.0)
-        _at_least("acceleration_noise", acceleration_noise, 0.0)
-        _at_least("rate", rate, 0.1)
-        _at_least("speed", speed, 0.01)
-        _at_least("max_range", max_range, _MIN_RANGE)
+        noises = {"gyro_noise": gyro_noise, "acceleration_noise": acceleration_noise}
+        _at_least(0.0, range_noise=range_noise, foliage_noise=foliage_noise)
+        _at_least(0.0, imu_noise=imu_noise, **noises)
+        _at_least(0.1, rate=rate)
+        _at_least(0.01, speed=speed)
+        _at_least(_MIN_RANGE, max_range=max_range)
         if not 0.0 <= dropout < 1.0:
             raise ConfigError(f"dropout: expected a share in [0, 1), got {dropout!r}")
         self._seed, self._rate, self._max_range = seed, float(rate), float(max_range)
         self._range_noise, self._dropout, self._foliage = range_noise, dropout, foliage_noise
-        self._imu_noise, self._gyro = imu_noise, (gyro_noise, gyro_bias)
-        self._acceleration = acceleration_noise, acceleration_bias
+        self._imu_kind = imu
+        biases = {"gyro_bias": gyro_bias, "acceleration_bias": acceleration_bias}
+        own = {"attitude_noise": imu_noise} | noises | biases
+        self._imu_errors = ImuErrors.of(imu, seed, own)
         self._motion = Motion(self.scene, speed, start == "moving")
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"
         self.sensor: Mapping[str, Any] = _SPIN | {"model": sensor, "period": 1.0 / rate}
+        if any(self._imu_errors.lever):
+            self.sensor = self.sensor | {"imu.lidar_t_imu": self._imu_errors.lever}
         turns = np.arange(self._columns) / self._columns
         self._times = turns / rate
         self._beams = _beam_directions(turns, elevations)
@@ -222,21 +227,12 @@ class SimulatedWorld:
         """200 Hz, from 0.2 s before the first sweep to 0.2 s after the last."""
         last = self._stamp(self._frames) + _IMU_MARGIN
         stamps = np.arange(_EPOCH - _IMU_MARGIN, last + 1, _IMU_PERIOD, dtype=np.int64)
-        poses, gyro, acceleration = self._motion.inertial(_seconds(stamps))
-        # One number more than a sweep's seed, so that no sweep shares this stream.
-        rng = np.random.default_rng([self._seed, 0, 200])
-        shape = gyro.shape
-        wrong = Rotation.from_rotvec(self._imu_noise * rng.standard_normal(shape))
-        orientation = (Rotation.from_matrix(poses[:, :3, :3]) * wrong).as_quat()
-        measured = [
-            exact + bias + noise * rng.standard_normal(shape)
-            for exact, (noise, bias) in ((gyro, self._gyro), (acceleration, self._acceleration))
-        ]
-        return ImuSamples(stamps, orientation, *measured)
+        return self._imu_errors.samples(self._motion, stamps, _seconds(stamps), self._seed)
 
     def info(self) -> DatasetInfo:
         """Scene, sensor, frames and length of the way; reads nothing."""
         beams, columns = self._beams.shape[2], self._columns
+        within = math.hypot(self._imu_errors.attitude_noise, self._imu_errors.attitude_drift)
         facts = {
             "scene": self.scene.name,
             "sensor": f"{self.sensor['model']}: {beams} beams x {columns} columns, clockwise",
@@ -244,7 +240,7 @@ class SimulatedWorld:
             "path": f"{self.truth.path_length:.1f} m, {'closed' if self.scene.closed else 'open'}",
             "noise": f"{self._range_noise:g} m, {100.0 * self._dropout:g} % lost",
             "times": "per point, seconds from the start of the sweep",
-            "imu": f"200 Hz, orientation within {self._imu_noise:g} rad",
+            "imu": f"200 Hz, {self._imu_kind}, orientation within {within:.3g} rad",
             "truth": "exact, at the start of each sweep",
             "seed": str(self._seed),
         }
@@ -277,12 +273,18 @@ def _seconds(stamps: IntArray) -> FloatArray:
     return (stamps - _EPOCH).astype(np.float64) * 1e-9
 
 
+def _one_of(name: str, value: str, names: Collection[str]) -> None:
+    if value not in names:
+        raise ConfigError(f"{name}: expected one of {', '.join(names)}; got {value!r}")
+
+
 def _whole_at_least(name: str, value: int, least: int) -> None:
     if not isinstance(value, (int, np.integer)):
         raise ConfigError(f"{name}: expected a whole number, got {value!r}")
-    _at_least(name, value, least)
+    _at_least(least, **{name: value})
 
 
-def _at_least(name: str, value: float, least: float) -> None:
-    if not (math.isfinite(value) and value >= least):
-        raise ConfigError(f"{name}: expected at least {least:g}, got {value!r}")
+def _at_least(least: float, **values: float | None) -> None:
+    for name, value in values.items():
+        if value is not None and not (math.isfinite(value) and value >= least):
+            raise ConfigError(f"{name}: expected at least {least:g}, got {value!r}")

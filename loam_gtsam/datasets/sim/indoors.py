@@ -99,6 +99,96 @@ def build_tunnel_pilasters(seed: int) -> streets.Scene:
     )
 
 
+def build_garage(seed: int) -> streets.Scene:
+    """A storey of a parking garage: low ceiling with beams, columns on a grid, parked cars."""
+    rng = np.random.default_rng([seed, 0, 16])
+    half_x, half_y, ceiling = 30.0, 17.0, 2.6
+    boxes: streets.Rows = [
+        streets.box(-half_x - 1.0, half_x + 1.0, -half_y - 1.0, half_y + 1.0, ceiling, 4.0),
+        streets.box(-half_x - 1.0, -half_x, -half_y, half_y, -1.0, 4.0),
+        streets.box(half_x, half_x + 1.0, -half_y, half_y, -1.0, 4.0),
+        streets.box(-half_x - 1.0, half_x + 1.0, -half_y - 1.0, -half_y, -1.0, 4.0),
+        streets.box(-half_x - 1.0, half_x + 1.0, half_y, half_y + 1.0, -1.0, 4.0),
+    ]
+    cylinders = []
+    grid = np.arange(-24.0, 25.0, 8.0)
+    boxes += [streets.box(x - 0.2, x + 0.2, -half_y, half_y, 2.25, ceiling) for x in grid]
+    for x in grid:
+        for y in (-11.5, -5.0, 5.0, 11.5):
+            if abs(y) > 6.0 or rng.random() < 0.5:
+                cylinders.append([x, y, 0.3, 0.0, ceiling])
+            else:
+                boxes.append(streets.box(x - 0.25, x + 0.25, y - 0.25, y + 0.25, 0.0, ceiling))
+    boxes.append(streets.box(-2.5, 2.5, -1.5, 1.5, 0.0, ceiling))  # the lift
+    # Rows of bays: along both walls, and back to back between the two aisles.
+    for row, ahead in ((-14.4, 1.0), (-2.7, -1.0), (2.7, 1.0), (14.4, -1.0)):
+        for x in np.arange(-21.2, 21.5, 2.65) + 0.1:
+            beside = np.abs(grid - x).min() < 1.3 and abs(row) < 6.0
+            if rng.random() < 0.6 and not beside and (abs(x) > 4.5 or abs(row) > 6.0):
+                boxes += _parked(rng, x, row, ahead)
+    corners = np.array([[0, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * (26.5, 9.0)
+    return streets.Scene(
+        name="garage",
+        solids=Solids(boxes=np.array(boxes), cylinders=np.array(cylinders)),
+        waypoints=rounded(corners, 3.0, 2.0, closed=True),
+        closed=True,
+        speed=4.0,
+        height=1.6,
+        frames=300,
+    )
+
+
+def build_stairwell(seed: int) -> streets.Scene:
+    """A shaft with eight flights of stairs and a landing after each, walked up."""
+    rng = np.random.default_rng([seed, 0, 17])
+    flight, end, wide = 0.5 * _STEPS * _RUN, 2.9, 1.5
+    climb, top = _STEPS * _RISE, (_FLIGHTS + 2) * _STEPS * _RISE
+    boxes: streets.Rows = [
+        streets.box(-end - 1.0, end + 1.0, wide, wide + 1.0, -1.0, top),
+        streets.box(-end - 1.0, end + 1.0, -wide - 1.0, -wide, -1.0, top),
+        streets.box(end, end + 1.0, -wide, wide, -1.0, top),
+        streets.box(-end - 1.0, -end, -wide, wide, -1.0, top),
+        streets.box(-end, end, -wide, wide, top - 1.0, top),
+    ]
+    cylinders = [[float(rng.uniform(-2.7, -2.3)), 1.35, 0.07, 0.0, top]]  # a pipe
+    corners: list[list[float]] = []  # of the sensor's way
+    for number in range(_FLIGHTS + 1):
+        foot, eye = number * climb, number * climb + 1.4
+        ahead = -1.0 if number % 2 else 1.0  # this flight leads to +x or -x
+        side = -ahead
+        # The landing behind the foot of this flight, with a door or a radiator on its wall.
+        boxes.append(streets.box(-ahead * flight, -ahead * end, -wide, wide, foot - 0.25, foot))
+        y, half, high = rng.uniform(-0.8, 0.8), rng.uniform(0.3, 0.5), rng.choice([0.7, 2.05])
+        out = rng.uniform(0.05, 0.15)
+        wall = -ahead * (end - out), -ahead * end
+        boxes.append(streets.box(*wall, y - half, y + half, foot, foot + high))
+        angle = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 9) if number else np.zeros(0)
+        for turn in angle:  # round from the flight before
+            x = -ahead * (flight + 0.15 + 0.75 * np.cos(turn))
+            corners.append([x, side * 0.75 * np.sin(turn), eye])
+        if number == 0:
+            corners.append([-flight - 0.8, -0.75, eye])
+        if number == _FLIGHTS:
+            continue
+        corners += [
+            [-ahead * flight, side * 0.75, eye],
+            [ahead * flight, side * 0.75, eye + climb],
+        ]
+        for step in range(_STEPS):
+            x, z = ahead * (step * _RUN - flight), foot + (step + 1) * _RISE
+            inner, outer = side * 0.1, side * wide
+            boxes.append(streets.box(x, x + ahead * _RUN, inner, outer, z - 2.0 * _RISE, z))
+    return streets.Scene(
+        name="stairwell",
+        solids=Solids(boxes=np.array(boxes), cylinders=np.array(cylinders)),
+        waypoints=rounded(np.array(corners), 0.25, 0.3, closed=False),
+        speed=0.9,
+        sway=_WALKING,
+        frames=300,
+        bends=0.3,
+    )
+
+
 def _wall_along_x(
     y: float, thick: float, begin: float, end: float, doors: FloatArray
 ) -> streets.Rows:
@@ -134,3 +224,13 @@ def _furniture(
         corner = right - 0.5, side * (far - 0.45)
         rows.append([*corner, 0.45, 0.25, 0.25, 0.45, rng.uniform(0.0, np.pi)])  # a chair
     return rows
+
+
+def _parked(rng: np.random.Generator, x: float, y: float, ahead: float) -> streets.Rows:
+    """A car in its bay, nose to +y or -y: body and cabin."""
+    y += float(rng.uniform(-0.2, 0.2))
+    half, top = rng.uniform(0.82, 0.92), rng.uniform(1.4, 1.75)
+    body = [x, y, 0.55, half, rng.uniform(1.95, 2.25), 0.33, 0.0]
+    cabin = [x, y - 0.25 * ahead, 0.5 * (top + 0.88), half - 0.12, 1.2, 0.5 * (top - 0.88), 0.0]
+    turn = float(rng.normal(0.0, 0.03))
+    return [[*body[:6], turn], [*cabin[:6], turn]]

@@ -201,6 +201,8 @@ BUILDERS: dict[str, Callable[[int], streets.Scene]] = {
     "forest": outdoors.build_forest,
     "rooms": indoors.build_rooms,
     "tunnel_pilasters": indoors.build_tunnel_pilasters,
+    "garage": indoors.build_garage,
+    "stairwell": indoors.build_stairwell,
     "square": outdoors.build_square,
     "bridge": outdoors.build_bridge,
 }

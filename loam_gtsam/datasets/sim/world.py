@@ -129,13 +129,9 @@ class SimulatedWorld:
         _one_of("sensor", sensor, SENSORS)
         _one_of("start", start, STARTS)
         _one_of("imu", imu, IMUS)
-        for label, whole, least in (
-            ("seed", seed, 0),
-            ("frames", frames, 1),
-            ("columns", columns, 8),
-        ):
-            if whole is not None:
-                _whole_at_least(label, whole, least)
+        _whole_at_least(0, seed=seed)
+        _whole_at_least(1, frames=frames)
+        _whole_at_least(8, columns=columns)
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         elevations, default_columns = SENSORS[sensor]
         self._columns = default_columns if columns is None else columns
@@ -278,10 +274,11 @@ def _one_of(name: str, value: str, names: Collection[str]) -> None:
         raise ConfigError(f"{name}: expected one of {', '.join(names)}; got {value!r}")
 
 
-def _whole_at_least(name: str, value: int, least: int) -> None:
-    if not isinstance(value, (int, np.integer)):
-        raise ConfigError(f"{name}: expected a whole number, got {value!r}")
-    _at_least(least, **{name: value})
+def _whole_at_least(least: int, **values: int | None) -> None:
+    for name, value in values.items():
+        if value is not None and not isinstance(value, (int, np.integer)):
+            raise ConfigError(f"{name}: expected a whole number, got {value!r}")
+    _at_least(least, **values)
 
 
 def _at_least(least: float, **values: float | None) -> None:

@@ -66,9 +66,11 @@ def test_the_start_is_chosen_by_name():
         open_dataset("sim:room?frames=many")
 
 
-@pytest.mark.parametrize(
-    "scene", ["park", "forest", "rooms", "tunnel_pilasters", "square", "bridge"]
-)
+PLACES = ("park", "forest", "square", "bridge")
+PLACES += ("rooms", "tunnel_pilasters", "garage", "stairwell")
+
+
+@pytest.mark.parametrize("scene", PLACES)
 def test_places_are_random_by_seed_and_by_nothing_else(scene):
     first, again, other = (
         SimulatedWorld(scene, columns=120, sensor=sensor, seed=seed)
@@ -144,3 +146,31 @@ def test_rounded_corners_are_cut_as_much_as_they_say():
     rate = np.diff(turn) / np.linalg.norm(step[1:], axis=1)
     assert 1.0 / rate.max() == pytest.approx(0.9, abs=0.03)
     assert np.allclose(points_along(corners, np.array([25.0])), [[20.0, 5.0]])
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_stairs_are_walked_at_the_height_of_a_head(seed):
+    world = SimulatedWorld("stairwell", seed=seed)
+    way = (world.world_T_start @ world.truth.map_T_lidar)[:, :3, 3]
+    boxes = world.scene.solids.boxes
+    above = []
+    for x, y, z in way[::5]:
+        under = np.abs(boxes[:, :2] - (x, y)) < boxes[:, 3:5]
+        tops = (boxes[:, 2] + boxes[:, 5])[under.all(axis=1)]
+        above.append(z - max(tops[tops < z], default=0.0))
+    assert min(above) > 1.1
+    assert max(above) < 1.65
+    assert way[-1, 2] - way[0, 2] > 6.0  # more than one floor and a half
+    climbing = np.diff(way[:, 2]) / np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).clip(1e-3)
+    assert np.percentile(climbing, 90) == pytest.approx(0.17 / 0.28, rel=0.3)
+
+
+def test_the_rooms_are_145_metres_round_and_both_faces_of_a_wall_are_seen():
+    for seed in (0, 3):
+        world = SimulatedWorld("rooms", seed=seed, frames=1400, columns=90)
+        way = world.truth.map_T_lidar[:, :3, 3]
+        home = 1000 + np.linalg.norm(way[1000:], axis=1).argmin()
+        metres = np.linalg.norm(np.diff(way[:home], axis=0), axis=1).sum()
+        assert metres == pytest.approx(145.0, abs=8.0)
+        walls = world.scene.solids.boxes[:, 3:5].min(axis=1) * 2.0
+        assert np.sum((walls >= 0.1) & (walls <= 0.2)) > 40

@@ -37,15 +37,12 @@ def build_rooms(seed: int) -> streets.Scene:
     end, depth, half = float(edges[-1]), 4.8, 1.2
     rows: streets.Rows = [
         streets.box(-1.0, end + 1.0, -9.0, 9.0, _CEILING, 4.0),
-        streets.box(-1.0, 0.0, -9.0, 9.0, -1.0, 4.0),
-        streets.box(end, end + 1.0, -9.0, 9.0, -1.0, 4.0),
+        *_walls((0.0, end), (-half - thick[0] - depth, half + thick[0] + depth), 4.0),
     ]
     middles = 0.5 * (edges[1:] + edges[:-1]) + rng.uniform(-0.5, 0.5, _ROOMS)
     corners: list[tuple[float, float]] = []
     for side in (-1.0, 1.0):
         near, far = half + thick[0], half + thick[0] + depth
-        back = sorted((side * far, side * (far + 1.0)))
-        rows.append(streets.box(-1.0, end + 1.0, back[0], back[1], -1.0, 4.0))
         rows += _wall_along_x(side * (half + 0.5 * thick[0]), thick[0], 0.0, end, middles)
         inner = side * (near + rng.uniform(1.8, 2.6, _ROOMS))  # doors from room to room
         for number, x in enumerate(edges[1:-1]):
@@ -105,10 +102,7 @@ def build_garage(seed: int) -> streets.Scene:
     half_x, half_y, ceiling = 30.0, 17.0, 2.6
     boxes: streets.Rows = [
         streets.box(-half_x - 1.0, half_x + 1.0, -half_y - 1.0, half_y + 1.0, ceiling, 4.0),
-        streets.box(-half_x - 1.0, -half_x, -half_y, half_y, -1.0, 4.0),
-        streets.box(half_x, half_x + 1.0, -half_y, half_y, -1.0, 4.0),
-        streets.box(-half_x - 1.0, half_x + 1.0, -half_y - 1.0, -half_y, -1.0, 4.0),
-        streets.box(-half_x - 1.0, half_x + 1.0, half_y, half_y + 1.0, -1.0, 4.0),
+        *_walls((-half_x, half_x), (-half_y, half_y), 4.0),
     ]
     cylinders = []
     grid = np.arange(-24.0, 25.0, 8.0)
@@ -144,10 +138,7 @@ def build_stairwell(seed: int) -> streets.Scene:
     flight, end, wide = 0.5 * _STEPS * _RUN, 2.9, 1.5
     climb, top = _STEPS * _RISE, (_FLIGHTS + 2) * _STEPS * _RISE
     boxes: streets.Rows = [
-        streets.box(-end - 1.0, end + 1.0, wide, wide + 1.0, -1.0, top),
-        streets.box(-end - 1.0, end + 1.0, -wide - 1.0, -wide, -1.0, top),
-        streets.box(end, end + 1.0, -wide, wide, -1.0, top),
-        streets.box(-end - 1.0, -end, -wide, wide, -1.0, top),
+        *_walls((-end, end), (-wide, wide), top),
         streets.box(-end, end, -wide, wide, top - 1.0, top),
     ]
     cylinders = [[float(rng.uniform(-2.7, -2.3)), 1.35, 0.07, 0.0, top]]  # a pipe
@@ -187,6 +178,16 @@ def build_stairwell(seed: int) -> streets.Scene:
         frames=300,
         bends=0.3,
     )
+
+
+def _walls(x: tuple[float, float], y: tuple[float, float], top: float) -> streets.Rows:
+    """Four of them, 1 m thick, round a rectangle between these."""
+    return [
+        streets.box(x[0] - 1.0, x[0], y[0] - 1.0, y[1] + 1.0, -1.0, top),
+        streets.box(x[1], x[1] + 1.0, y[0] - 1.0, y[1] + 1.0, -1.0, top),
+        streets.box(x[0], x[1], y[0] - 1.0, y[0], -1.0, top),
+        streets.box(x[0], x[1], y[1], y[1] + 1.0, -1.0, top),
+    ]
 
 
 def _wall_along_x(

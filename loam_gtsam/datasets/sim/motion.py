@@ -69,7 +69,7 @@ class Motion:
         ends = "periodic" if scene.closed else None
         self._path = make_interp_spline(knots, samples, k=5, bc_type=ends)
         self._heading = self._path.derivative()
-        times = np.arange(0.0, 2.0 * self._end / speed + _START_UP, 0.01)
+        times = np.arange(0.0, 2.0 * self._end / speed + _START_UP + self._lead, 0.01)
         # An open path is left before its very end, so that an IMU can look a little further.
         begin = float(self._travelled(np.array([self._lead]))[0])
         goal = begin + self._end if scene.closed else self._end - _RUN_OUT * speed

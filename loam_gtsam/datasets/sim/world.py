@@ -67,14 +67,14 @@ class SimulatedWorld:
     scene : one of :data:`SCENES`, or a :class:`Scene` of your own
     sensor : one of :data:`SENSORS`
     frames : sweeps; None is the scene's own number: once round and two seconds more for
-        ``street_loop``, to the end for the corridors and the slopes. Closed paths (room, shaken,
-        street_loop, trees) are driven round and round, open ones have an end.
+        ``street_loop``, to the end for the corridors and the slopes. Closed paths are driven
+        round and round, open ones have an end.
     seed : of the place and of all noise
     range_noise : standard deviation along the beam, metres
     dropout : share of returns that are lost
     foliage_noise : mean depth by which a beam enters a tree crown (exponential), metres
     rate : sweeps per second
-    speed : m/s on a straight; None is the scene's own
+    speed : m/s on a straight, less in bends; None is the scene's own
     columns : firings per sweep; None is the sensor's own
     max_range : metres
     start : ``rest``, or ``moving``: the same way, its first sweep taken at full speed

@@ -174,3 +174,14 @@ def test_the_rooms_are_145_metres_round_and_both_faces_of_a_wall_are_seen():
         assert metres == pytest.approx(145.0, abs=8.0)
         walls = world.scene.solids.boxes[:, 3:5].min(axis=1) * 2.0
         assert np.sum((walls >= 0.1) & (walls <= 0.2)) > 40
+
+
+@pytest.mark.parametrize("speed", [5.0, 20.0, 40.0])
+@pytest.mark.parametrize("scene", ["street_loop", "avenue", "single_pole"])
+def test_a_start_can_be_as_fast_as_asked(scene, speed):
+    world = SimulatedWorld(scene, speed=speed, start="moving", frames=10, columns=60)
+    steps = np.diff(world.truth.map_T_lidar[:, :3, 3], axis=0)
+    first = np.linalg.norm(steps[0]) * 10.0
+    # Bends slow it down: the pole's way is one of 6 m radius.
+    most = np.sqrt(2.5 * 6.0) * 1.6 if scene == "single_pole" else 1.15 * speed
+    assert min(0.5 * speed, 3.0) < first < most

@@ -155,8 +155,7 @@ class Mapper:
         """
         clock = Clock()
         self.registered = None
-        refused = self._check(features)
-        if refused is not None:
+        if (refused := self._check(features)) is not None:
             return refused
         if self.last is None and self.imu is not None:
             guess = self.imu.first_pose(features.stamp, guess)
@@ -187,6 +186,8 @@ class Mapper:
                 update = self._with_pose(frame, outcome, clock)
             else:
                 update = self._without_pose(frame, solution, outcome)
+        if not update.status.solved:
+            self._errors.skipped(sweep)
         self.last = replace(update, timings=clock.seconds)
         return self.last
 
@@ -208,8 +209,7 @@ class Mapper:
 
     def _check(self, features: Features) -> MapUpdate | None:
         """The update of a sweep that cannot be used; None if it can."""
-        refused = self._refused(features.stamp)
-        if refused is not None:
+        if (refused := self._refused(features.stamp)) is not None:
             return refused
         problem = problem_of(features)
         return None if problem is None else self._unused(features.stamp, *problem)

@@ -331,6 +331,10 @@ class Uncertainty:
         along the axes of the map, about its origin. It never shrinks.
     residual_variance : of the whitened residuals; 1 if their standard deviations are right
     effective_matches : independent rows that would know as much as the correlated ones do
+    blind : (6, 6) further drift, along directions that no scan saw, by an error of the velocity
+        that persists: ``blind @ u`` with u of unit covariance
+    forgotten : (6,) what was passed on of each u from frame to frame since the start, as the
+        negative logarithm of the correlation
     """
 
     own: FloatArray
@@ -339,6 +343,8 @@ class Uncertainty:
     drift: FloatArray
     residual_variance: float
     effective_matches: float
+    blind: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    forgotten: FloatArray = field(default_factory=lambda: np.zeros(6))
 
 
 class Timings(Mapping[str, float]):

@@ -282,6 +282,10 @@ class SolverConfig(Section):
     """Along degenerate directions, constant velocity is believed to within this acceleration."""
     turn_sigma: float = parameter(2.0, unit="rad/s^2", low=1e-6)
     """Along degenerate directions, a constant turn rate is believed to within this acceleration."""
+    start_speed: float = parameter(10.0, unit="m/s", low=1e-6)
+    """Along degenerate directions, the speed at the start of a run is zero to within this."""
+    start_turn: float = parameter(0.5, unit="rad/s", low=1e-6)
+    """Along degenerate directions, the turn rate at the start of a run is zero to within this."""
     degeneracy_threshold: float = parameter(100.0, source="LOAM", low=0.0)
     """The method loam projects the step out of eigenvectors of A^T A that have eigenvalues below
     this (mixed rad and m); 0 turns the projection off."""

@@ -107,7 +107,7 @@ def align(
         solution.solved,
         solution.converged,
         len(solution.matches) / len(points),
-        None if solution.weak is None else solution.weak.projector,
+        solution.weak,
         solution.matches,
     )
 

@@ -37,6 +37,7 @@ class Localizability:
     displacement : (6, 6) quadratic form: the mean squared displacement of the matched points by a
         motion, m^2
     by_planes : (6,) the part of ``aligned`` that comes from planes
+    tilt : standard deviation of the matches' normals, rad (root mean square)
     """
 
     directions: FloatArray
@@ -44,6 +45,7 @@ class Localizability:
     information: FloatArray
     displacement: FloatArray
     by_planes: FloatArray
+    tilt: float
 
     def seen_from(self, a_T_b: gtsam.Pose3) -> Localizability:
         """The localizability about frame ``a``, of that about frame ``b``, fixed to each other."""
@@ -67,6 +69,26 @@ class Localizability:
         """(W, 6) the directions with fewer aligned matches than ``least``."""
         chosen: FloatArray = self.directions[self.aligned < least]
         return chosen
+
+    def wander(self, moved: FloatArray) -> FloatArray:
+        """(6, 6) covariance of what a motion along a weak direction does along the others.
+
+        The noise of the normals turns a weak direction v towards another one, w, by c, of variance
+        ``tilt^2 / aligned`` of w (first-order perturbation of eigenvectors). Of pure translations,
+        it can only do so towards other translations. ``moved`` is the (6, 6) covariance of the
+        motion.
+        """
+        spread = (self.directions.T / np.maximum(self.aligned, 1.0)) @ self.directions
+        turned = float(np.trace(self.displacement[:3, :3] @ moved[:3, :3]))
+        shifted = np.zeros((6, 6))
+        shifted[3:, 3:] = np.trace(moved[3:, 3:]) * np.linalg.inv(np.linalg.inv(spread)[3:, 3:])
+        wander: FloatArray = self.tilt**2 * (turned * spread + shifted)
+        return wander
+
+    def projector(self, least: float) -> FloatArray | None:
+        """(6, 6) projector onto the weak directions along the others, None if there are none."""
+        found = self.open(least)
+        return None if found is None else found.projector
 
     def open(self, least: float) -> Directions | None:
         """The weak directions, along the others; None if there are none."""
@@ -110,15 +132,7 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
 
     ``map_T_lidar`` is the pose at which the matches were made.
     """
-    e, p = matches.edges, matches.planes
-    if e.distinct is not None:
-        e = subset(e, e.distinct)
-    points, normals, tilts = _planes_through(e)
-    points, normals = np.concatenate([points, p.points]), np.concatenate([normals, p.normals])
-    normals = normals @ map_T_lidar.rotation().matrix()
-    tilts = np.concatenate([tilts, np.zeros(len(p)) if p.tilts is None else p.tilts])
-    weights = np.concatenate([np.repeat(e.weights / e.sigmas, 2), p.weights / p.sigmas])
-
+    points, normals, tilts, weights = _as_planes(matches, map_T_lidar)
     rows = np.hstack([cross(points.T, normals.T).T, normals])
     information = rows.T @ (rows * (weights**2)[:, None])
     noise = _displacements(points, (weights * tilts) ** 2)
@@ -129,10 +143,58 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     directions = columns.T / np.maximum(scale, floor)[:, None]
 
     sight = _sight(points, normals, tilts, directions)
-    aligned, by_planes = sight.sum(axis=0), sight[len(sight) - len(p) :].sum(axis=0)
+    first = len(sight) - len(matches.planes)
+    aligned, by_planes = sight.sum(axis=0), sight[first:].sum(axis=0)
     order = np.argsort(aligned, kind="stable")
     along = np.einsum("ki,ij,kj->k", directions, information, directions)
-    return Localizability(directions[order], aligned[order], along[order], unit, by_planes[order])
+    tilt = float(np.sqrt(np.mean(tilts**2))) if len(tilts) else 0.0
+    shown = directions[order], aligned[order], along[order]
+    return Localizability(*shown, unit, by_planes[order], tilt)
+
+
+def with_translations(
+    seen: Localizability, matches: ScanMatches, map_T_lidar: gtsam.Pose3, least: float
+) -> Localizability:
+    """The localizability with pure translations among the weak directions, where there are any.
+
+    By noise, an eigenvector is a translation with a little of a rotation that the scan sees well.
+    Over a long blind way that little turns the pose. So a translation that is as weak on its own
+    takes the place of the eigenvector; ``least`` as in :meth:`Localizability.weak`.
+    """
+    count = int(np.count_nonzero(seen.aligned < least))
+    if not count:
+        return seen
+    points, normals, tilts, weights = _as_planes(matches, map_T_lidar)
+    across = normals * weights[:, None]
+    pure = np.zeros((3, 6))
+    pure[:, 3:] = np.linalg.eigh(across.T @ across)[1].T
+    pure = pure[_sight(points, normals, tilts, pure).sum(axis=0) < least][:count]
+    # The rest of the weak space, at right angles as to the displacement of the points.
+    form = seen.displacement
+    rest = seen.directions[:count]
+    rest = rest - (rest @ form @ pure.T) @ pure
+    root = np.linalg.cholesky(form + 1e-12 * np.trace(form) * np.eye(6))
+    rest = np.linalg.svd(rest @ root)[2][: count - len(pure)] @ np.linalg.inv(root)
+    weak = np.concatenate([pure, rest])
+    sight = _sight(points, normals, tilts, weak)
+    rows = np.hstack([cross(points.T, normals.T).T, normals]) * weights[:, None]
+    parts = (
+        (weak, seen.directions),
+        (sight.sum(axis=0), seen.aligned),
+        (((rows @ weak.T) ** 2).sum(axis=0), seen.information),
+        (sight[len(sight) - len(matches.planes) :].sum(axis=0), seen.by_planes),
+    )
+    directions, aligned, information, by_planes = (
+        np.concatenate([new, old[count:]]) for new, old in parts
+    )
+    order = np.argsort(aligned, kind="stable")
+    return replace(
+        seen,
+        directions=directions[order],
+        aligned=aligned[order],
+        information=information[order],
+        by_planes=by_planes[order],
+    )
 
 
 def unseen_by_planes(
@@ -149,8 +211,9 @@ def unseen_by_planes(
     if seen.by_planes.min() >= least:
         return None
     no_lines = subset(matches.edges, np.zeros(len(matches.edges), np.bool_))
-    planes = localizability(replace(matches, edges=no_lines), map_T_lidar)
-    unseen = planes.open(least)
+    alone = replace(matches, edges=no_lines)
+    planes = localizability(alone, map_T_lidar)
+    unseen = with_translations(planes, alone, map_T_lidar, least).open(least)
     if unseen is None:
         return None
     by_lines = line_sight(matches.edges, map_T_lidar, unseen.vectors).sum(axis=0)
@@ -200,6 +263,20 @@ def line_sight(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, directions: FloatAr
     if edges.distinct is not None:
         sight[~edges.distinct] = 0.0
     return sight
+
+
+def _as_planes(
+    matches: ScanMatches, map_T_lidar: gtsam.Pose3
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Points, normals, tilts, weights of distinct lines' rows and of planes; axes of the lidar."""
+    e, p = matches.edges, matches.planes
+    if e.distinct is not None:
+        e = subset(e, e.distinct)
+    points, normals, tilts = _planes_through(e)
+    points, normals = np.concatenate([points, p.points]), np.concatenate([normals, p.normals])
+    tilts = np.concatenate([tilts, np.zeros(len(p)) if p.tilts is None else p.tilts])
+    weights = np.concatenate([np.repeat(e.weights / e.sigmas, 2), p.weights / p.sigmas])
+    return points, normals @ map_T_lidar.rotation().matrix(), tilts, weights
 
 
 def _planes_through(lines: EdgeMatches) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ import numpy as np
 from loam_gtsam.config import Config, CovarianceConfig
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import symmetric, transform, voxel_keys
-from loam_gtsam.registration.solvers import Solution, match_rows
+from loam_gtsam.registration.solvers import MotionError, Solution, match_rows
 from loam_gtsam.types import (
     BoolArray,
     FloatArray,
@@ -31,6 +31,7 @@ _PRIOR_CELLS = 6.0
 cells the scores alone do not span the six directions."""
 _LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
+_LEAST_KEPT = 1e-4  # below that correlation all is forgotten
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
@@ -64,7 +65,9 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     to_later = later.map_T_lidar.between(earlier.map_T_lidar).AdjointMap()
     from_map = later.map_T_lidar.inverse().AdjointMap()
     covariance = second.own + to_later @ first.own @ to_later.T
-    covariance += from_map @ (second.drift - first.drift) @ from_map.T
+    # The error of the velocity was the same in both, but for what was forgotten in between.
+    blind = second.blind - first.blind * np.exp(first.forgotten - second.forgotten)
+    covariance += from_map @ (second.drift - first.drift + blind @ blind.T) @ from_map.T
     if second.follows == earlier.stamp:
         common = second.shared @ to_later.T
         covariance -= common + common.T
@@ -99,7 +102,8 @@ class PoseErrors:
         self._gyro_noise = config.imu.gyro_noise
         self._seen = SeenGround(self.config.ground_cell)
         self._motion = _Acceleration(self.config.window)
-        self._drift = np.zeros((6, 6))
+        self._expected = MotionError(config.solver)
+        self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
         self._last: _Middle | None = None
 
     def calibrated(self, update: MapUpdate, sweep: MovingSweep, solution: Solution) -> MapUpdate:
@@ -120,7 +124,18 @@ class PoseErrors:
         to_map = middle.AdjointMap()
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self.config.drift if first else self.config.drift
-        self._drift = self._drift + to_map @ (factor * scan.renewed) @ to_map.T
+        step = self._expected.observe(sweep.stamp, scan.expected, scan.raw, turned=_turned(sweep))
+        blind = self._blind + to_map @ step.by_velocity
+        self._blind, faded = blind @ step.kept.T, np.eye(6) - step.kept.T @ step.kept
+        self._forgotten = self._forgotten - np.log(np.clip(np.diag(step.kept), _LEAST_KEPT, 1.0))
+        by_chance = factor * scan.renewed + step.by_chance
+        if solution.weak is not None and solution.localizability is not None:
+            moved = step.by_velocity @ step.by_velocity.T + step.by_chance
+            rows = len(solution.matches) / max(scan.effective_matches, 1.0)
+            by_chance = by_chance + rows * solution.localizability.wander(moved)
+        self._drift = self._drift + symmetric(
+            to_map @ by_chance @ to_map.T + blind @ _positive(faded) @ blind.T
+        )
         own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
         from_map = update.map_T_lidar.inverse().AdjointMap()
         by_scan = to_reference @ (np.eye(6) - scan.user) @ np.linalg.inv(to_reference)
@@ -130,16 +145,24 @@ class PoseErrors:
             shared=shared,
             follows=None if self._last is None else self._last.reference_stamp,
             drift=self._drift,
+            blind=self._blind,
+            forgotten=self._forgotten,
             residual_variance=scan.residual_variance,
             effective_matches=scan.effective_matches,
         )
         self._last = now
-        covariance = symmetric(own + drifted @ self._drift @ drifted.T)
+        total = self._drift + self._blind @ self._blind.T
+        covariance = symmetric(own + drifted @ total @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""
         self._last = None
+        self._expected.cut()
+
+    def skipped(self, sweep: MovingSweep) -> None:
+        """Account for a sweep whose pose is the expected one."""
+        self._expected.coast(sweep.stamp, turned=_turned(sweep))
 
     def _own(
         self, reference_stamp: int, sweep: MovingSweep, middle: gtsam.Pose3,
@@ -153,7 +176,7 @@ class PoseErrors:
             last = None
         seconds = np.inf if last is None else (sweep.stamp - last.stamp) * 1e-9
         share = np.full(6, sweep.middle / seconds)
-        turned = sweep.motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
+        turned = _turned(sweep)
         if turned:  # the rotation within the sweep is measured
             share[:3] = 0.0
         kept = 1.0 - share
@@ -177,6 +200,11 @@ class PoseErrors:
         own = to_reference @ (own + np.diag(missed)) @ to_reference.T
         now = _Middle(sweep.stamp, middle, covariance, kept, to_reference, reference_stamp)
         return symmetric(own), shared, now
+
+
+def _turned(sweep: MovingSweep) -> bool:
+    """Whether an IMU knows the rotation of a sweep."""
+    return sweep.motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
 
 
 class _Acceleration:
@@ -218,15 +246,18 @@ class ScanError:
     Attributes
     ----------
     covariance : (6, 6) of the pose if the map were exact
-    renewed : (6, 6) part of ``covariance`` that stems from ground matched for the first time, and
-        from weak directions, along which only the expected motion ties the pose to the map
+    renewed : (6, 6) part of ``covariance`` that stems from ground matched for the first time
     user : (6, 6) share of the pose that factors beside the scan decide
+    expected : (6, 6) share of the pose that the expected motion decides
+    raw : (6, 6) raw covariance of what scan and other factors decide
     residual_variance, effective_matches : see :class:`loam_gtsam.types.Uncertainty`
     """
 
     covariance: FloatArray
     renewed: FloatArray
     user: FloatArray
+    expected: FloatArray
+    raw: FloatArray
     residual_variance: float
     effective_matches: float
 
@@ -284,10 +315,11 @@ def scan_error(
     pose = solution.map_T_lidar
     rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
     residuals, jacobian = rows.residuals(pose)
+    keep = np.eye(6) if solution.weak is None else np.eye(6) - solution.weak
     if solution.unseen is not None:
         assert solution.beacons is not None
         without = jacobian @ (np.eye(6) - solution.unseen)
-        jacobian = np.where(solution.beacons[:, None], jacobian, without)
+        jacobian = np.where(solution.beacons[:, None], jacobian @ keep, without)
     points = transform(pose.matrix(), rows.points)
     scores = jacobian * residuals[:, None]
     by_ground, new = seen.cells(points)
@@ -305,18 +337,19 @@ def scan_error(
     effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
 
     total = solution.information if with_priors else information
-    priors = user = _positive(total - information)
+    priors = _positive(total - information)
+    expected = solution.expected
+    if expected is None:  # of a solver that does not say: all priors along weak directions
+        weak = np.eye(6) - keep
+        expected = weak.T @ priors @ weak
     if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
     bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
-    if solution.weak is not None:
-        # Along weak directions the prior is the expected motion, which starts at the last pose.
-        weak = solution.weak.projector
-        renewed = renewed + weak.T @ priors @ weak
-        keep = np.eye(6) - weak
-        user = keep.T @ user @ keep
-    covariance, renewed = (symmetric(bread @ part @ bread) for part in (meat + priors, renewed))
-    return ScanError(covariance, renewed, bread @ user, variance, effective)
+    user = keep.T @ priors @ keep
+    parts = meat + priors, renewed, total - expected
+    covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
+    shares = bread @ user, bread @ expected
+    return ScanError(covariance, renewed, *shares, raw, variance, effective)
 
 
 def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:

@@ -94,9 +94,15 @@ def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
 def weak_directions_in_words(solution: Solution) -> str:
     """The degenerate directions of a solution in words: metres and rad in lidar axes."""
     assert solution.weak is not None
+    spanned = np.linalg.svd(solution.weak)[0][:, : solution.n_weak].T
+    for row in range(len(spanned)):  # each is to have an axis that the others have not
+        spanned[row:] = spanned[row:][np.argsort(-np.abs(spanned[row:]).max(axis=1), kind="stable")]
+        axis = int(np.abs(spanned[row]).argmax())
+        unit = spanned[row] / spanned[row, axis]
+        spanned = spanned - np.outer(spanned[:, axis], unit)
+        spanned[row] = unit
     names = []
-    for direction in solution.weak.vectors:
-        unit = direction / direction[np.abs(direction).argmax()]  # the sign is arbitrary
+    for unit in spanned:
         parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
         names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
     return " or ".join(names)

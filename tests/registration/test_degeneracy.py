@@ -82,7 +82,7 @@ def found(planes, edges=NO_EDGES):
 def test_a_room_has_no_weak_direction():
     seen = found(surfaces(*whole_room(), noise=0.05))
     assert len(seen.weak(LEAST)) == 0
-    assert seen.open(LEAST) is None
+    assert seen.projector(LEAST) is None
     assert np.all(np.diff(seen.aligned) >= 0)
 
 

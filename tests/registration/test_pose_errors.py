@@ -18,6 +18,7 @@ from loam_gtsam.registration.solvers import POSE_KEY, Solution
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 
 FRAME = 100_000_000
+NONE = np.zeros((3, 6, 6))
 
 
 def some_covariance(rng, scale=1e-4):
@@ -254,7 +255,7 @@ def calibrated(errors, number):
 def test_ground_that_replaces_none_counts_half(monkeypatch):
     def error(solution, width, seen, config, **_):
         seen.cells(np.zeros((1, 3)))
-        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), np.zeros((6, 6)), 1.0, 10.0)
+        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, 1.0, 10.0)
 
     monkeypatch.setattr(covariance_module, "scan_error", error)
     errors = PoseErrors(Config())
@@ -264,7 +265,7 @@ def test_ground_that_replaces_none_counts_half(monkeypatch):
 
 
 def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatch):
-    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), np.zeros((6, 6)), 1.0, 10.0)
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, 1.0, 10.0)
     answers = iter([good, good, None, good])
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: next(answers))
     errors = PoseErrors(Config())

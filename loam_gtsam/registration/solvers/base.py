@@ -11,7 +11,7 @@ import numpy as np
 
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows
-from loam_gtsam.registration.degeneracy import Directions, Localizability
+from loam_gtsam.registration.degeneracy import Localizability
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.types import BoolArray, FloatArray
 
@@ -60,11 +60,13 @@ class Solution:
         last matches
     information : (6, 6) of matches and priors at the pose, tangent order of the package
     localizability : how well the first matches fix each motion; None if not computed
-    weak : the directions that the last matches left open, degenerate ones; None if there are none
+    weak : (6, 6) projector onto the directions that the last matches left open, the degenerate
+        ones; None if there are none
     unseen : (6, 6) projector onto the directions that the planes do not fix, along which only
         ``beacons`` and the expected motion count; None if there are none
-    beacons : (R,) mask of the rows that count along ``unseen``
+    beacons : (R,) mask of the rows that count along ``unseen``, though not along ``weak``
     rows : the matches with the weights of the last association; None if the solver has no rows
+    expected : (6, 6) part of ``information`` that the expected motion added; None if none
     """
 
     map_T_lidar: gtsam.Pose3
@@ -77,10 +79,11 @@ class Solution:
     error_after: float
     information: FloatArray
     localizability: Localizability | None = None
-    weak: Directions | None = None
+    weak: FloatArray | None = None
     unseen: FloatArray | None = None
     beacons: BoolArray | None = None
     rows: MatchRows | None = None
+    expected: FloatArray | None = None
 
     @classmethod
     def unsolved(
@@ -93,14 +96,14 @@ class Solution:
     @property
     def n_weak(self) -> int:
         """Number of degenerate directions."""
-        return 0 if self.weak is None else len(self.weak)
+        return 0 if self.weak is None else round(float(np.trace(self.weak)))
 
     @property
     def scan_information(self) -> FloatArray:
         """(6, 6) ``information`` without the degenerate directions."""
         if self.weak is None:
             return self.information
-        keep = np.eye(6) - self.weak.projector
+        keep = np.eye(6) - self.weak
         kept: FloatArray = keep.T @ self.information @ keep
         return kept
 
@@ -115,14 +118,16 @@ class MotionPrior:
     map_T_lidar: gtsam.Pose3
     information: FloatArray
 
+    def along(self, directions: FloatArray) -> MotionPrior:
+        """The expected pose along directions alone, given by their (6, 6) projector."""
+        return replace(self, information=directions.T @ self.information @ directions)
+
     def factor(self, directions: FloatArray | None = None) -> gtsam.NonlinearFactor:
         """The expected pose as a factor on :data:`POSE_KEY`.
 
         ``directions`` is a (6, 6) projector onto those in which the factor acts; all if None.
         """
-        information = self.information
-        if directions is not None:
-            information = directions.T @ information @ directions
+        information = self.information if directions is None else self.along(directions).information
         expected = gtsam.Values()
         expected.insert(POSE_KEY, self.map_T_lidar)
         hessian = gtsam.HessianFactor(POSE_KEY, information, np.zeros(6), 0.0)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -24,6 +24,7 @@ from loam_gtsam.registration.degeneracy import (
     line_sight,
     localizability,
     unseen_by_planes,
+    with_translations,
 )
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers.base import POSE_KEY, Associate, MotionPrior, Solution, rematch
@@ -100,11 +101,15 @@ class GtsamSolver:
             weak = left_open(matches, pose, unseen, config.min_aligned)
             seen = line_sight(matches.edges, pose, unseen.vectors)
             beacons[: 2 * len(seen)] = np.repeat(seen.any(axis=1), 2)
-        without = None if unseen is None else unseen.projector
-        for factor in _scan_factors(rows, values, without, beacons):
-            graph.add(factor)
-        if weak is not None and expected is not None:
-            graph.add(expected.factor(weak.projector))
+        blind, without = (None if part is None else part.projector for part in (weak, unseen))
+        for mask, left_out in ((beacons, blind), (~beacons, without)):
+            if mask.any():
+                graph.add(_scan_factor(rows, values, mask, left_out))
+        added = None
+        if blind is not None and expected is not None:
+            along = expected.along(blind)
+            graph.add(along.factor())
+            added = along.information
         for factor in priors:
             graph.add(factor)
         optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
@@ -113,7 +118,7 @@ class GtsamSolver:
         after, steps = optimizer.error(), optimizer.iterations()
         information = graph.linearize(optimizer.values()).hessian()[0]
         small = within_tolerance(pose.localCoordinates(moved), information, config)
-        sights = sight.scan, weak, without, beacons, rows
+        sights = sight.scan, blind, without, beacons, rows, added
         return Solution(moved, True, small, matches, 1, steps, before, after, information, *sights)
 
 
@@ -127,7 +132,7 @@ class _Sight:
 
 
 def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> _Sight:
-    scan = localizability(matches, pose)
+    scan = with_translations(localizability(matches, pose), matches, pose, config.min_aligned)
     weak = unseen = None
     if config.degeneracy != "off":
         weak = scan.open(config.min_aligned)
@@ -136,27 +141,17 @@ def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> 
     return _Sight(scan, weak, unseen)
 
 
-def _scan_factors(
-    rows: MatchRows, values: gtsam.Values, unseen: FloatArray | None, beacons: BoolArray
-) -> Iterator[gtsam.NonlinearFactor]:
-    """The factors of a scan; along unseen directions only the beacons count."""
-    if unseen is None:
-        yield scan_match_factor(POSE_KEY, rows)
-        return
-    if beacons.any():
-        yield scan_match_factor(POSE_KEY, rows.where(beacons))
-    if not beacons.all():
-        yield _without(scan_match_factor(POSE_KEY, rows.where(~beacons)), values, unseen)
-
-
-def _without(
-    scan: gtsam.NonlinearFactor, values: gtsam.Values, weak: FloatArray
+def _scan_factor(
+    rows: MatchRows, values: gtsam.Values, mask: BoolArray, blind: FloatArray | None
 ) -> gtsam.NonlinearFactor:
-    """The factor of a scan, linearised, without its information on weak directions."""
+    """The factor of some rows of a scan, linearised without its information on some directions."""
+    scan = scan_match_factor(POSE_KEY, rows if mask.all() else rows.where(mask))
+    if blind is None:
+        return scan
     linear = scan.linearize(values)
     information, column = linear.information(), linear.augmentedInformation()[:, -1]
     right, squared = column[:-1], float(column[-1])
-    keep = np.eye(6) - weak
+    keep = np.eye(6) - blind
     hessian = gtsam.HessianFactor(POSE_KEY, keep.T @ information @ keep, keep.T @ right, squared)
     return gtsam.LinearContainerFactor(hessian, values)
 

@@ -42,7 +42,7 @@ class SweepFault(StrEnum):
     """The beams cannot be told apart."""
     NO_FEATURES = "no_features"
     DUPLICATE_STAMP = "duplicate_stamp"
-    """The stamp is that of the sweep before (:mod:`loam_gtsam.registration.stamp_check`)."""
+    """The stamp is that of the sweep before (:mod:`loam_gtsam.frontend.stamp_check`)."""
     LATE = "late"
     """A later sweep was used already."""
     STAMP_BACK = "stamp_back"

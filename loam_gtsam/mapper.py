@@ -14,6 +14,7 @@ import gtsam
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
+from loam_gtsam.frontend.stamp_check import StampCheck
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker
@@ -26,13 +27,15 @@ from loam_gtsam.registration.relocalization import (
     Found,
     Lost,
     doubtful,
-    rebuild_start,
+    found_at,
     search,
+    second_opinion,
+    unplaced,
 )
 from loam_gtsam.registration.report import Clock, make_update, problem_of, status_of
 from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors, PoseContext, own_factors
-from loam_gtsam.registration.stamp_check import StampCheck
+from loam_gtsam.registration.start import Start
 from loam_gtsam.types import (
     ConfigError,
     Features,
@@ -112,7 +115,7 @@ class Mapper:
         self.monitor = FitMonitor(self.config.relocalization)
         self._errors = PoseErrors(self.config)
         self._stamps = StampCheck()
-        self._first: Prediction | None = None
+        self._start: Start | None = None
         self._moment: Moment | None = None
         self.maps = MapPair(self.config.map)
 
@@ -153,7 +156,7 @@ class Mapper:
         MapUpdate
             Never raises for what a sweep contains: see its ``status``.
         """
-        clock = Clock()
+        clock, given = Clock(), guess is not None
         self.registered = None
         if (refused := self._check(features)) is not None:
             return refused
@@ -170,22 +173,20 @@ class Mapper:
         clock.lap("prepare")
         placed = predicted.posed, predicted.map_T_lidar
         if self.last is None:
-            self._first = predicted if self.config.deskew.refine else None
+            self._start = Start(predicted, self.keyframe) if self.config.deskew.refine else None
             update = self._insert(*placed, FrameStatus.FIRST, "the map starts here", clock)
         elif sparse := not self.monitor.lost and self.maps.too_sparse(predicted, self.config):
-            self._first = None
+            self._start = None
             update = self._insert(*placed, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
             frame = self._frame(predicted, priors, clock)
-            solution = frame.solve(self.solver)
+            frame, outcome = self._placed(frame, features, given)
             clock.lap("solve")
-            outcome: Found | Lost = Found(solution, frame.twist_to(solution.map_T_lidar))
-            if doubtful(frame, solution, self.monitor, self.last.twist):
-                outcome = search(frame, solution, self.monitor, self.solver)
             if isinstance(outcome, Found) and outcome.solution.solved:
                 update = self._with_pose(frame, outcome, clock)
             else:
-                update = self._without_pose(frame, solution, outcome)
+                self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
+                update = unplaced(frame, outcome, self.monitor)
         if not update.status.solved:
             self._errors.skipped(sweep)
         self.last = replace(update, timings=clock.seconds)
@@ -230,9 +231,8 @@ class Mapper:
 
     def _unused(self, stamp: int, message: str, fault: SweepFault | None) -> MapUpdate:
         """The update of a sweep that says nothing: the pose is predicted."""
-        guess, unusable = ConstantVelocity(self.imu).at(stamp, self.last), FrameStatus.UNUSABLE_SCAN
-        pose, twist = guess.map_T_lidar, guess.twist
-        update = MapUpdate(stamp, pose, unusable, message, twist=twist, fault=fault)
+        guess, bad = ConstantVelocity(self.imu).at(stamp, self.last), FrameStatus.UNUSABLE_SCAN
+        update = MapUpdate(stamp, guess.map_T_lidar, bad, message, twist=guess.twist, fault=fault)
         if self.last is not None:
             self.last = update
         return update
@@ -247,18 +247,40 @@ class Mapper:
         if self.extra_factors is not None and self._moment is not None:
             context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
             factors += own_factors(self.extra_factors, context)
-        # The first sweep's motion is that of the second: both are de-skewed anew together.
-        refine = self.config.deskew.refine and self._first is None
+        refine = self.config.deskew.refine
         matcher = FrameMatcher.of(
             predicted.posed, self.maps, self.config, self._moment, clock, refine=refine
         )
         return Frame(matcher, predicted, factors)
 
+    def _placed(self, frame: Frame, features: Features, given: bool) -> tuple[Frame, Found | Lost]:
+        """Find the sweep: from the expected pose, without the IMU, or by a search."""
+        assert self.last is not None
+        found, twist, stamp = (
+            found_at(frame, frame.solve(self.solver)),
+            self.last.twist,
+            frame.sweep.stamp,
+        )
+        if self._start is not None and not given:
+            found = self._start.first_motion(frame, found, self.solver)
+        doubt = doubtful(frame, found.solution, self.monitor, twist)
+        if self.imu is not None and (
+            doubt or self.imu.contradicted(self._moment, found.solution, stamp)
+        ):
+            sweep, before = MovingSweep(features, self.config), (self.last, self._moment, None)
+            alone = predict(sweep, *before, self.config.solver)
+            frame, found = second_opinion(frame, found, alone, self.solver)
+            if frame.predicted is alone:
+                self.imu.reject()
+                doubt = doubtful(frame, found.solution, self.monitor, twist)
+        solution, monitor = found.solution, self.monitor
+        return frame, search(frame, solution, monitor, self.solver) if doubt else found
+
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
-        if self._first is not None:
-            first, self._first = self._first, None
-            frame, found = rebuild_start(first, frame, found, self.solver)
+        if self._start is not None:
+            frame, found = self._start.add(frame, found, self.keyframe, self.solver)
+            self._start = None if self._start.complete else self._start
         solution = found.solution
         if not solution.matches.wide:
             fit = Fit.of(solution.matches, frame.matcher.offered)
@@ -273,25 +295,6 @@ class Mapper:
         update = self._errors.calibrated(update, frame.sweep, solution)
         clock.lap("covariance")
         return update
-
-    def _without_pose(self, frame: Frame, solution: Solution, outcome: Found | Lost) -> MapUpdate:
-        """The update of a sweep that is lost, or that matches too little: the map is unchanged."""
-        self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
-        least = self.config.solver.min_matches
-        if isinstance(outcome, Lost):
-            self.monitor.lost += 1
-            status, message = FrameStatus.LOST, outcome.message
-            guess, tried = frame.predicted.map_T_middle, solution.iterations
-            solution = Solution.unsolved(guess, solution.matches, tried, 0)
-        else:
-            # Once may be chance; a sweep that has plenty to match is searched for the next time.
-            self.monitor.lost += frame.matcher.offered >= 2 * least
-            solution = outcome.solution
-            status = FrameStatus.FEW_MATCHES
-            message = f"{len(solution.matches)} matches; {least} are needed"
-        return make_update(
-            frame.predicted.posed, frame.predicted.map_T_lidar, status, message, solution
-        )
 
     def _insert(
         self,

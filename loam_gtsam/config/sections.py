@@ -86,8 +86,9 @@ class DeskewConfig(Section):
     enabled: bool = parameter(True)
     """Sweeps are de-skewed with the predicted motion, and again with the solution."""
     refine: bool = parameter(True, source="LOAM de-skews once")
-    """Sweeps are de-skewed again with the solution, and the first two are registered anew when
-    their motion is known; false de-skews once, with the prediction."""
+    """Sweeps are de-skewed again with the solution, the motion between the first two is searched
+    for, and the first eight are registered together; false de-skews once, with the prediction, and
+    takes the platform for at rest at the start."""
     rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
     """The rotation within a sweep comes from the gyro of an IMU where that covers the sweep, else
     from a constant velocity (auto), or from the attitude of the IMU (orientation)."""

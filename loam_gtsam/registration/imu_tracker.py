@@ -39,6 +39,9 @@ against one map last over frames (built-in scenes: mean squared errors of 1 to 4
 information's over 10 to 50 frames)."""
 
 
+_SURE = 4.2  # sigmas of one attitude: three of the difference of two
+
+
 class ImuTracker:
     """The IMU's part in mapping, and what it has learnt from the frames so far.
 
@@ -114,8 +117,13 @@ class ImuTracker:
             return ()
         return (self._gravity(measured),)
 
-    def add_tilt(self, stamp: int, solution: Solution) -> tuple[Solution, TiltPrior]:
-        """Add the IMU's roll and pitch to the solution of a moment, in the modes with a factor."""
+    def add_tilt(
+        self, stamp: int, solution: Solution, last: Moment | None = None
+    ) -> tuple[Solution, TiltPrior]:
+        """Add the IMU's roll and pitch to the solution of a moment, in the modes with a factor.
+
+        ``last`` is the moment before; an attitude that turned unlike the scans since is dropped.
+        """
         config = self.config
         if config.prior in ("off", "blend"):
             return solution, TiltPrior.NONE
@@ -124,6 +132,8 @@ class ImuTracker:
             return solution, TiltPrior.DROPPED
         if config.prior == "sigma":
             return solution, TiltPrior.GRAVITY  # it was in the solve
+        if not self._attitude_turned(last, stamp, solution.map_T_lidar):
+            return solution, TiltPrior.DROPPED
         pose, information = solution.map_T_lidar, solution.information
         level_R_lidar = self.level.level_R_map.compose(pose.rotation())
         if too_steep(level_R_lidar, measured) or self._tilt_is_unknown(solution, level_R_lidar):
@@ -147,23 +157,48 @@ class ImuTracker:
             return blended, TiltPrior.GRAVITY
         return blend(map_T_lidar, measured, weight, level.level_R_map), TiltPrior.BLEND
 
+    def contradicted(self, last: Moment | None, solution: Solution, stamp: int) -> bool:
+        """Whether the gyro, while trusted, turned otherwise than a solved sweep says.
+
+        ``last`` and ``stamp`` are of the middles of the last sweep and of this one.
+        """
+        if last is None or not last.solved or not solution.solved or self.trusted_gyro is None:
+            return False
+        turned = self.buffer.rotation_between(last.stamp, stamp)
+        if turned is None:
+            return False
+        scan = last.map_T_lidar.rotation().between(solution.map_T_lidar.rotation())
+        return _disagree(scan, turned, *_DISAGREEMENT)
+
     def compare_gyro(self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3]) -> None:
         """Learn the gyro's bias from two solved sweeps; distrust a gyro that contradicts them."""
         turned = self.buffer.rotation_between(last[0], now[0])
         if turned is None or now[0] <= last[0]:  # sweeps of unlike length
             return
         scan = last[1].rotation().between(now[1].rotation())
-        missing = gtsam.Rot3.Logmap(scan.between(turned))
         by_scan, by_gyro = gtsam.Rot3.Logmap(scan), gtsam.Rot3.Logmap(turned)
         self._turns = np.vstack([self._turns, np.hstack([by_scan, by_gyro])])[-_PAIRS:]
-        limit, share = _DISAGREEMENT
-        allowed = limit + share * float(np.linalg.norm(by_scan))
-        if np.linalg.norm(missing) > allowed:
+        if _disagree(scan, turned, *_DISAGREEMENT):
             self._disagreements = min(self._disagreements + 1, 2 * _DISTRUST)
             return
         self._disagreements = max(self._disagreements - 1, 0)
-        rate = missing / ((now[0] - last[0]) * 1e-9)
+        rate = gtsam.Rot3.Logmap(scan.between(turned)) / ((now[0] - last[0]) * 1e-9)
         self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
+
+    def reject(self) -> None:
+        """Take the last prediction back: a sweep fitted better without the IMU."""
+        self._predicted = None
+
+    def _attitude_turned(self, last: Moment | None, stamp: int, map_T_lidar: gtsam.Pose3) -> bool:
+        """Whether the IMU's attitude turned as the scans did since ``last``, as far as is known."""
+        if last is None or not last.solved:
+            return True
+        before, now = self.buffer.orientation(last.stamp), self.buffer.orientation(stamp)
+        if before is None or now is None:
+            return True
+        scan = last.map_T_lidar.rotation().between(map_T_lidar.rotation())
+        noise = _SURE * float(np.radians(self.config.sigma_deg))
+        return not _disagree(scan, before.between(now), noise, _DISAGREEMENT[1])
 
     def add_scan(
         self, posed: PosedSweep, last: Moment | None, solution: Solution
@@ -179,7 +214,7 @@ class ImuTracker:
             now = stamp, solution.map_T_lidar
             self.compare_gyro(last[:2], now)
             self.observe(last[:2], now, solution.scan_information)
-        solution, tilt = self.add_tilt(stamp, solution)
+        solution, tilt = self.add_tilt(stamp, solution, last)
         pose = solution.map_T_lidar.compose(posed.middle_T_reference)
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
@@ -246,3 +281,9 @@ class ImuTracker:
         """Whether the scan knows some direction of the tilt less well than the IMU."""
         knows = tilt_information(solution.scan_information, level_R_lidar)
         return bool(np.linalg.eigvalsh(knows)[0] < np.radians(self.config.sigma_deg) ** -2)
+
+
+def _disagree(scan: gtsam.Rot3, turned: gtsam.Rot3, angle: float, share: float) -> bool:
+    """Whether two rotations differ by more than an angle, rad, and a share of the first."""
+    missing = np.linalg.norm(gtsam.Rot3.Logmap(scan.between(turned)))
+    return bool(missing > angle + share * np.linalg.norm(gtsam.Rot3.Logmap(scan)))

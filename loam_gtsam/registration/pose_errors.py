@@ -6,7 +6,7 @@ together count as one, and two errors are added: docs/maths/covariance.md.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -32,6 +32,7 @@ cells the scores alone do not span the six directions."""
 _LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
+_KNOWN = 3  # accelerations from which their mean is believed
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
@@ -101,9 +102,12 @@ class PoseErrors:
         self._with_priors = graph
         self._gyro_noise = config.imu.gyro_noise
         self._seen = SeenGround(self.config.ground_cell)
-        self._motion = _Acceleration(self.config.window)
+        expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
+        self._motion = _Acceleration(self.config.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionError(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+        self._first: MovingSweep | None = None
+        self._origin = _Origin()
         self._last: _Middle | None = None
 
     def calibrated(self, update: MapUpdate, sweep: MovingSweep, solution: Solution) -> MapUpdate:
@@ -137,6 +141,8 @@ class PoseErrors:
             to_map @ by_chance @ to_map.T + blind @ _positive(faded) @ blind.T
         )
         own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
+        if first and self._first is not None:
+            self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         from_map = update.map_T_lidar.inverse().AdjointMap()
         by_scan = to_reference @ (np.eye(6) - scan.user) @ np.linalg.inv(to_reference)
         drifted = by_scan @ from_map
@@ -152,6 +158,7 @@ class PoseErrors:
         )
         self._last = now
         total = self._drift + self._blind @ self._blind.T
+        total = total + self._origin.error(self._motion.variances)
         covariance = symmetric(own + drifted @ total @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
@@ -161,7 +168,9 @@ class PoseErrors:
         self._expected.cut()
 
     def skipped(self, sweep: MovingSweep) -> None:
-        """Account for a sweep whose pose is the expected one."""
+        """Account for a sweep whose pose is the expected one; the very first begins the map."""
+        if self._first is None and self._seen.is_empty:
+            self._first = sweep
         self._expected.coast(sweep.stamp, turned=_turned(sweep))
 
     def _own(
@@ -207,12 +216,50 @@ def _turned(sweep: MovingSweep) -> bool:
     return sweep.motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
 
 
-class _Acceleration:
-    """Mean square of the body acceleration, from the poses at the middles of three sweeps."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Origin:
+    """The error of the first pose, which is where the map is: all later poses have it in common.
 
-    def __init__(self, window: int) -> None:
+    The pose at the reference time of the first sweep is held; the points of that sweep are where
+    they are by the motion from its middle, which is that to the middle of the second sweep.
+    """
+
+    to_map: FloatArray = field(default_factory=lambda: np.eye(6))
+    velocity: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
+    bend: FloatArray = field(default_factory=lambda: np.zeros(6))  # s^2, by axis
+
+    @classmethod
+    def of(
+        cls, first: MovingSweep, second: MovingSweep, to_map: FloatArray, covariance: FloatArray
+    ) -> _Origin:
+        """``covariance`` (6, 6) is that of the second sweep, ``to_map`` its adjoint to the map."""
+        seconds = (second.stamp - first.stamp) * 1e-9
+        if seconds <= 0.0:  # sweeps of different length
+            return cls()
+        share = np.full(6, first.middle / seconds)
+        # From the middle between both sweeps back to the reference time.
+        bend = np.full(6, 0.5 * abs(first.middle) * (seconds + first.middle))
+        if _turned(first):
+            share[:3] = bend[:3] = 0.0
+        return cls(to_map, share[:, None] * covariance * share, bend)
+
+    def error(self, accelerations: FloatArray) -> FloatArray:
+        """(6, 6) in the map, from the (6,) mean squared accelerations."""
+        own = self.velocity + np.diag(self.bend**2 * accelerations)
+        in_map: FloatArray = self.to_map @ own @ self.to_map.T
+        return in_map
+
+
+class _Acceleration:
+    """Mean square of the body acceleration, from the poses at the middles of three sweeps.
+
+    ``expected`` (6,), (rad/s^2)^2 and (m/s^2)^2, stands for it until three are known.
+    """
+
+    def __init__(self, window: int, expected: FloatArray) -> None:
         self._window = window
         self._count = 0
+        self._expected = expected
         self._mean = np.zeros(6)
         self._last: tuple[int, FloatArray] | None = None
 
@@ -220,7 +267,7 @@ class _Acceleration:
     def variances(self) -> FloatArray:
         """(6,) (rad/s^2)^2 and (m/s^2)^2."""
         variances: FloatArray = np.maximum(self._mean, 0.0)
-        return variances
+        return variances if self._count >= _KNOWN else np.maximum(variances, self._expected)
 
     def add(
         self, last: _Middle, stamp: int, map_T_lidar: gtsam.Pose3, covariance: FloatArray

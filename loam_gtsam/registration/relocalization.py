@@ -16,12 +16,12 @@ from scipy.ndimage import maximum_filter
 
 from loam_gtsam.config import RelocalizationConfig
 from loam_gtsam.registration.association import spread_rows
-from loam_gtsam.registration.frame_matcher import Frame
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.odometry import Moment, Prediction, advance
-from loam_gtsam.registration.report import distance_in_words
+from loam_gtsam.registration.odometry import Prediction, advance
+from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate
 
 _AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
 _CELL = 0.5  # metres: half the reach of a match, which is then the neighbouring cell
@@ -30,9 +30,8 @@ _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than 
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
-_START_ROUNDS = 2  # times the first two sweeps are registered anew, to learn their motion
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
-_CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
+CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
 _APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 
 
@@ -137,11 +136,17 @@ class Found:
     message: str = ""  # sentence for the user if the search moved the sweep
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class Lost:
     """The outcome of a search that found nothing, with a sentence for the user."""
 
+    solution: Solution  # of no pose, with the matches at the expected one
     message: str
+
+
+def found_at(frame: Frame, solution: Solution) -> Found:
+    """The sweep at a solved pose, with the motion that leads there."""
+    return Found(solution, frame.twist_to(solution.map_T_lidar))
 
 
 def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
@@ -163,29 +168,25 @@ def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: 
     return not solution.matches.wide and monitor.misfit(fit)
 
 
-def rebuild_start(
-    first: Prediction, frame: Frame, found: Found, solver: ScanSolver
+def second_opinion(
+    frame: Frame, found: Found, alone: Prediction, solver: ScanSolver
 ) -> tuple[Frame, Found]:
-    """Rebuild the map of the first sweep with the motion that is known from the second sweep.
+    """The sweep as predicted and de-skewed without the IMU, if it clearly fits the map better so.
 
-    Otherwise the map of a run that starts in motion would always hold a distorted first sweep.
-    ``frame`` and ``found`` are the second sweep and its solve; returned as in the rebuilt map.
+    ``alone`` is that prediction; ``frame`` and ``found`` are returned if it does not.
     """
-    pose, maps = first.map_T_lidar, frame.matcher.maps
-    for _ in range(_START_ROUNDS):
-        posed = first.posed.sweep.at(found.twist)
-        middle = posed.map_T_middle(pose)
-        maps.clear()
-        maps.recenter(pose)
-        maps.insert(posed, middle, 0)
-        last = Moment(posed.sweep.stamp, middle, True)
-        frame = replace(frame, matcher=replace(frame.matcher.moving_at(found.twist), last=last))
-        start = found.solution.map_T_lidar
-        again = solver.solve(frame.matcher, start, frame.priors, frame.predicted.motion)
-        if not again.solved:
-            break
-        found = replace(found, solution=again, twist=frame.twist_to(again.map_T_lidar))
-    return frame, found
+    m = frame.matcher
+    matcher = FrameMatcher.of(alone.posed, m.maps, m.config, m.last, m.clock, refine=m.refine)
+    other = replace(frame, matcher=matcher, predicted=alone)
+    solution = other.solve(solver)
+    if not solution.solved:
+        return frame, found
+    fit, before = (
+        Fit.of(solution.matches, matcher.offered),
+        Fit.of(found.solution.matches, m.offered),
+    )
+    better = not found.solution.solved or fit.total > CLEARLY * before.total
+    return (other, found_at(other, solution)) if better else (frame, found)
 
 
 def search(
@@ -197,17 +198,17 @@ def search(
     within the sweeps. Three velocities are tried: the predicted one, rest, and the predicted one in
     axes that were turned on the vehicle.
     """
-    matcher, guess = frame.matcher, frame.matcher.posed.twist
+    matcher, steady = frame.matcher, frame.matcher.posed.twist
     usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
     lost = monitor.lost > 0 or monitor.misfit(before)
     start: gtsam.Pose3 | None = solution.map_T_lidar
     moving = frame.twist_to(solution.map_T_lidar)
-    twists = [guess, np.zeros(6) if lost else moving]
+    twists = [steady, np.zeros(6) if lost else moving]
     if lost:
         start = _place(frame, solution, monitor, solver)
         if start is not None:
             twists.append(
-                _turned(guess, start.rotation().between(frame.predicted.map_T_middle.rotation()))
+                _turned(steady, start.rotation().between(frame.predicted.map_T_middle.rotation()))
             )
     best: tuple[Fit, Solution, FloatArray] | None = None
     for twist in twists:
@@ -218,7 +219,7 @@ def search(
         fit = Fit.of(found.matches, matcher.offered)
         if not (found.solved and monitor.fits_again(fit)):
             continue
-        if best is None or fit.total > _CLEARLY * best[0].total:
+        if best is None or fit.total > CLEARLY * best[0].total:
             best = fit, found, twist
     matcher.clock.lap("relocalize")
     if best is not None and best[2] is not moving:
@@ -227,10 +228,28 @@ def search(
         return Found(best[1], best[2], f"relocalised{after}, {moved}" if lost else moved)
     if not lost:
         return Found(solution, moving)
+    guess = frame.predicted.map_T_middle
+    nowhere = Solution.unsolved(guess, solution.matches, solution.iterations, 0)
     return Lost(
+        nowhere,
         f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
-        f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps"
+        f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps",
     )
+
+
+def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpdate:
+    """The update of a sweep that is lost, or that matches too little; the monitor counts it."""
+    least, solution = frame.matcher.config.solver.min_matches, outcome.solution
+    if isinstance(outcome, Lost):
+        monitor.lost += 1
+        status, message = FrameStatus.LOST, outcome.message
+    else:
+        # Once may be chance; a sweep that has plenty to match is searched for the next time.
+        monitor.lost += frame.matcher.offered >= 2 * least
+        status = FrameStatus.FEW_MATCHES
+        message = f"{len(solution.matches)} matches; {least} are needed"
+    predicted = frame.predicted
+    return make_update(predicted.posed, predicted.map_T_lidar, status, message, solution)
 
 
 def _place(
@@ -275,6 +294,7 @@ def likely_poses(
     around: Sequence[gtsam.Pose3],
     radius: float,
     count: int,
+    most_turn: float = np.pi,
 ) -> list[gtsam.Pose3]:
     """Poses from which a sweep may have been taken, the likeliest first.
 
@@ -288,8 +308,9 @@ def likely_poses(
     points, map_points : (N, 3), a few hundred of the sweep in the lidar frame, and (M, 3), metres
     around, radius : centres of the search, ``map_T_lidar``, and metres around each
     count : largest number of poses, which are more than 1.5 m or 12 degrees apart
+    most_turn : largest rotation against the centre about the vertical axis, rad
     """
-    tried = [_scores(points, map_points, pose, radius) for pose in around]
+    tried = [_scores(points, map_points, pose, radius, most_turn) for pose in around]
     scores, moves = (np.concatenate(parts) for parts in zip(*tried, strict=True))
     owner = np.repeat(np.arange(len(tried)), [len(scored) for scored, _ in tried])
     best: list[gtsam.Pose3] = []
@@ -307,7 +328,11 @@ def likely_poses(
 
 
 def _scores(
-    points: FloatArray, map_points: FloatArray, map_T_lidar: gtsam.Pose3, radius: float
+    points: FloatArray,
+    map_points: FloatArray,
+    map_T_lidar: gtsam.Pose3,
+    radius: float,
+    most_turn: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Scores (T,) of trial poses, and their offsets (T, 3): x and y in metres, yaw in rad."""
     steps = int(radius / (_SPACING * _CELL))
@@ -328,7 +353,8 @@ def _scores(
     ahead, aside = ahead[close], aside[close]
     shifts = _SPACING * (ahead * shape[1] + aside) * shape[2]
     metres = _SPACING * _CELL * np.column_stack([ahead, aside])
-    turns = np.arange(0.0, 2.0 * np.pi - 0.5 * _TURN, _TURN)
+    most = int(np.ceil(min(most_turn, np.pi) / _TURN))
+    turns = _TURN * np.arange(-most, most + (most_turn < np.pi))
     scores = np.empty((len(turns), len(shifts)))
     for row, turn in zip(scores, turns.tolist(), strict=True):
         turned = level @ gtsam.Rot3.Yaw(turn).matrix().T

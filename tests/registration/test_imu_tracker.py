@@ -15,6 +15,7 @@ from loam_gtsam.imu.level import Level
 from loam_gtsam.imu_prior import roll_pitch, roll_pitch_jacobian, tilt_information
 from loam_gtsam.io.state import freeze
 from loam_gtsam.registration.imu_tracker import ImuTracker
+from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import ImuSamples, TiltPrior
 
@@ -30,6 +31,11 @@ def tracker_for(measured, level_R_map=None, **config):
     tracker = new_tracker(samples, **config)
     tracker.level = Level(level_R_map or FLAT, 0.0, 0.0, 1, "still")
     return tracker
+
+
+def along(axis):
+    """The projector onto an axis of the tangent, as a solver tells that it is weak."""
+    return np.diag(np.eye(6)[axis])
 
 
 def new_tracker(samples, **config):
@@ -109,9 +115,9 @@ def test_what_only_the_expected_motion_says_about_the_tilt_does_not_count():
     solution = with_information(gtsam.Pose3(), 1e6 * np.eye(6))
     tracker = tracker_for(rot3(0.1, 0, 0))
     assert tracker.add_tilt(NOW, solution)[1] is TiltPrior.EQUIVALENT
-    blind = dataclasses.replace(solution, weak=np.diag([1.0, 0, 0, 0, 0, 0]))
+    blind = dataclasses.replace(solution, weak=along(0))
     assert tracker.add_tilt(NOW, blind)[1] is TiltPrior.GRAVITY
-    forward = dataclasses.replace(solution, weak=np.diag([0, 0, 0, 1.0, 0, 0]))
+    forward = dataclasses.replace(solution, weak=along(3))
     assert tracker.add_tilt(NOW, forward)[1] is TiltPrior.EQUIVALENT
 
 
@@ -486,3 +492,26 @@ def test_samples_fed_live_and_forgotten_lead_to_the_same(preintegration, monkeyp
             said.append([predicted and predicted.covariance, tracker.buffer.gyro_bias, blended])
         np.testing.assert_equal(*said)
     assert len(live.buffer) < 0.6 * len(samples.stamps) < len(at_once.buffer)
+
+
+@pytest.mark.parametrize(("degrees", "contradicted"), [(0.2, False), (2.0, True)])
+def test_a_gyro_that_turns_unlike_the_scans_is_contradicted(degrees, contradicted):
+    tracker = new_tracker(turning(rot3(0.0, 0.0, 0.3)))  # which does not turn
+    turned = gtsam.Pose3(gtsam.Rot3.Yaw(np.radians(degrees)), np.zeros(3))
+    solution = with_information(turned, np.eye(6))
+    last = Moment(NOW - FRAME, gtsam.Pose3(), True)
+    assert tracker.contradicted(last, solution, NOW) is contradicted
+    assert not tracker.contradicted(last._replace(solved=False), solution, NOW)
+    assert not tracker.contradicted(None, solution, NOW)
+
+
+@pytest.mark.parametrize(
+    ("degrees", "tilt"), [(1.0, TiltPrior.EQUIVALENT), (9.0, TiltPrior.DROPPED)]
+)
+def test_an_attitude_that_turns_unlike_the_scans_is_dropped(degrees, tilt):
+    tracker = tracker_for(rot3(0.0, 0.0, 0.0))  # which stays as it is
+    turned = gtsam.Pose3(gtsam.Rot3.Roll(np.radians(degrees)), np.zeros(3))
+    solution = with_information(turned, 1e6 * np.eye(6))
+    last = Moment(NOW - FRAME, gtsam.Pose3(), True)
+    assert tracker.add_tilt(NOW, solution, last)[1] is tilt
+    assert tracker.add_tilt(NOW, solution)[1] is TiltPrior.EQUIVALENT

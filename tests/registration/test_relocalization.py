@@ -8,6 +8,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -37,7 +38,7 @@ from loam_gtsam.registration.relocalization import (
 )
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
-from loam_gtsam.types import FrameStatus
+from loam_gtsam.types import FrameStatus, ImuSamples
 
 AT = 22
 """The sweep before which the lidar is put somewhere else."""
@@ -359,3 +360,33 @@ def test_few_matches_twice_in_a_row_start_a_search(calm):
     assert "relocalised after 1 lost sweeps" in found.message
     away = found.map_T_lidar.translation() - calm.truth.map_T_lidar[21, :3, 3]
     assert np.linalg.norm(away) < 0.1
+
+
+# -- an IMU that breaks ----------------------------------------------------------------------------
+
+
+def broken(samples, kind):
+    """The samples of an IMU of which something is wrong, from the middle of the run or always."""
+    late = samples.stamps > np.median(samples.stamps)
+    gyro, force = samples.gyro.copy(), samples.acceleration.copy()
+    orientation = samples.orientation
+    if kind == "gyro":
+        gyro[late] += [0.0, 0.0, 3.0]
+    elif kind == "accelerometer":
+        force[late] += [160.0, 0.0, 0.0]
+    elif kind == "attitude":
+        orientation = Rotation.random(len(orientation), rng=1).as_quat()
+    return ImuSamples(samples.stamps, orientation, gyro, force)
+
+
+@pytest.mark.parametrize("preintegration", [False, True])
+@pytest.mark.parametrize("kind", ["nothing", "gyro", "accelerometer", "attitude"])
+def test_an_imu_that_breaks_is_left_out(kind, preintegration):
+    world = SimulatedWorld("street_loop", frames=30, columns=600, start="moving")
+    sweeps = ArrayDataset(list(world), imu=broken(world.imu, kind), sensor=world.sensor)
+    result = run(sweeps, Config().changed({"imu.preintegration": preintegration}))
+    assert all(update.status.solved for update in result.updates[1:])
+    truth = world.truth.map_T_lidar
+    for update, pose in zip(result.updates, truth, strict=True):
+        moved = result.updates[0].map_T_lidar.between(update.map_T_lidar)
+        assert moved.range(gtsam.Pose3(pose)) < 0.3

@@ -14,8 +14,8 @@ from support.list_dataset import ListDataset
 from loam_gtsam import Checkpoint, Features, FeatureSweep, Mapper, MapUpdate
 from loam_gtsam.cli.report import summary
 from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.frontend.stamp_check import IN_A_ROW, StampCheck
 from loam_gtsam.pipeline import Pipeline, run
-from loam_gtsam.registration.stamp_check import IN_A_ROW, StampCheck
 from loam_gtsam.types import BadSweep, FrameStatus, Scan, SweepFault
 
 TENTH = 10**8

@@ -1,0 +1,225 @@
+"""The start of a run: the first sweeps are registered together, before the map is relied on.
+
+A map of one sweep is thin, and distorted by a motion that nobody knows yet. An error made in it
+would stay for good. Therefore the first motion is searched for, and the first eight sweeps are
+registered again and again, each with the map of all the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.geometry import transform
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
+from loam_gtsam.registration.odometry import Moment, Prediction
+from loam_gtsam.registration.relocalization import (
+    CLEARLY,
+    Fit,
+    Found,
+    likely_poses,
+    sample_features,
+)
+from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
+from loam_gtsam.types import FloatArray
+
+_TOGETHER = (2, 3, 5, 8)
+"""Numbers of sweeps at which all are registered anew: each time half as many more or so."""
+_ROUNDS = 2  # times that each of them is then registered with the map of the others
+_PLACES = 6  # motions between the first two sweeps that are tried beside the expected one
+_FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
+_FARTHEST = 30.0  # metres: largest distance between the first two sweeps
+_TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical axis
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlySweep:
+    """One of the first sweeps of a run, where it is in the map.
+
+    Attributes
+    ----------
+    posed : the sweep, de-skewed
+    map_T_middle : pose at the middle of the sweep
+    held : whether further factors decided on the pose, which is then left as it is
+    leeway : (6, 6) information of the expected motion, for directions that the scan does not fix
+    keyframe : number of the keyframe to which the points belong
+    """
+
+    posed: PosedSweep
+    map_T_middle: gtsam.Pose3
+    held: bool
+    leeway: FloatArray
+    keyframe: int
+
+    @property
+    def moment(self) -> Moment:
+        """The middle of the sweep."""
+        return Moment(self.posed.sweep.stamp, self.map_T_middle, True)
+
+
+class _Tried(NamedTuple):
+    """A first motion that was tried."""
+
+    total: float  # share of the features that agree
+    sweeps: list[EarlySweep]
+    solution: Solution
+
+
+class Start:
+    """The first sweeps of a run; the pose of the very first at its reference time never changes."""
+
+    def __init__(self, first: Prediction, keyframe: int) -> None:
+        self._map_T_first = first.map_T_lidar
+        middle, leeway = first.map_T_middle, first.motion.information
+        self._sweeps = [EarlySweep(first.posed, middle, True, leeway, keyframe)]
+
+    @property
+    def complete(self) -> bool:
+        """Whether all sweeps of the start are there."""
+        return len(self._sweeps) >= _TOGETHER[-1]
+
+    def first_motion(self, frame: Frame, expected: Found, solver: ScanSolver) -> Found:
+        """Search for the motion between the first two sweeps; returns ``expected`` for later ones.
+
+        The places where the second sweep may have been taken are tried, each with both sweeps
+        de-skewed for the motion that leads there. Another place than the expected one is chosen if
+        more features agree there, and if the scan tells the two places apart.
+        """
+        if len(self._sweeps) > 1:
+            return expected
+        first, middle = self._sweeps[0], frame.predicted.map_T_middle
+        seconds = first.moment.seconds_to(frame.sweep.stamp)
+        places = likely_poses(
+            sample_features(*frame.matcher.posed.points),
+            np.concatenate(_in_map(first)),
+            [middle],
+            min(_FASTEST * seconds, _FARTHEST),
+            _PLACES,
+            most_turn=_TURNING * seconds,
+        )
+        best = self._tried(frame, expected.solution.map_T_lidar, solver)
+        for place in places:
+            tried = self._tried(frame, place, solver)
+            if tried.total > CLEARLY * best.total and _told_apart(tried, best):
+                best = tried
+        self._sweeps = best.sweeps[:1]
+        return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
+
+    def add(
+        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
+    ) -> tuple[Frame, Found]:
+        """Add a solved sweep; after some, all are registered anew and the map is made of them.
+
+        Returns the sweep and its solve in the new map, which does not hold this sweep yet.
+        """
+        new = EarlySweep(
+            frame.sweep.at(found.twist),
+            found.solution.map_T_lidar,
+            bool(frame.priors),
+            frame.predicted.motion.information,
+            keyframe,
+        )
+        sweeps = [*self._sweeps, new]
+        if len(sweeps) not in _TOGETHER:
+            self._sweeps = sweeps
+            return frame, found
+        for _ in range(_ROUNDS):
+            sweeps = self._with_motion(sweeps)
+            for number, sweep in enumerate(sweeps):
+                if sweep.held and sweep.posed.sweep is not frame.sweep:
+                    continue
+                solution = self._solved(frame, sweeps, number, solver)
+                if solution.solved:
+                    sweeps[number] = replace(sweeps[number], map_T_middle=solution.map_T_lidar)
+        sweeps = self._with_motion(sweeps)
+        solution = self._solved(frame, sweeps, len(sweeps) - 1, solver)
+        if not solution.solved:
+            self._fill(frame, self._sweeps)
+            return frame, found
+        last, posed = sweeps[-2].moment, sweeps[-1].posed
+        sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
+        self._sweeps = sweeps
+        frame = replace(frame, matcher=replace(frame.matcher, posed=posed, last=last))
+        twist = frame.twist_to(solution.map_T_lidar)
+        return frame, replace(found, solution=solution, twist=twist)
+
+    def _with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
+        """The sweeps, de-skewed for the motion between their poses."""
+        moved = list(sweeps)
+        for number in range(1, len(moved)):
+            last, now = moved[number - 1].moment, moved[number]
+            sweep = now.posed.sweep
+            if sweep.stamp > last.stamp:  # not for sweeps of unlike length
+                twist = sweep.twist_since(last[:2], now.map_T_middle)
+                moved[number] = replace(now, posed=sweep.at(twist))
+        posed = moved[0].posed.sweep.at(moved[1].posed.twist)
+        middle = posed.map_T_middle(self._map_T_first)
+        moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
+        return moved
+
+    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> _Tried:
+        """The first two sweeps, the second near a pose, and how well they fit each other."""
+        first, leeway = self._sweeps[0], frame.predicted.motion.information
+        moved = first.map_T_middle.between(map_T_middle)
+        second = EarlySweep(frame.matcher.posed, map_T_middle, False, leeway, 0)
+        first, second = self._with_motion([first, second])
+        sweeps = [first, replace(second, map_T_middle=first.map_T_middle.compose(moved))]
+        solution = self._solved(frame, sweeps, 1, solver, quickly=True)
+        sweeps = self._with_motion([first, replace(second, map_T_middle=solution.map_T_lidar)])
+        solution = self._solved(frame, sweeps, 1, solver)
+        sweeps[1] = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
+        total = Fit.of(solution.matches, frame.matcher.offered).total if solution.solved else 0.0
+        return _Tried(total, sweeps, solution)
+
+    def _solved(
+        self,
+        frame: Frame,
+        sweeps: Sequence[EarlySweep],
+        number: int,
+        solver: ScanSolver,
+        *,
+        quickly: bool = False,
+    ) -> Solution:
+        """One of the sweeps, registered with a map of all the others."""
+        one = sweeps[number]
+        self._fill(frame, [*sweeps[:number], *sweeps[number + 1 :]])
+        old = frame.matcher
+        matcher = FrameMatcher.of(
+            one.posed, old.maps, old.config, old.last, old.clock, refine=False
+        )
+        if quickly:
+            matcher = matcher.with_few_matches()
+        expected = MotionPrior(one.map_T_middle, one.leeway)
+        priors = frame.priors if one.posed.sweep is frame.sweep else ()
+        return solver.solve(matcher, one.map_T_middle, priors, expected)
+
+    def _fill(self, frame: Frame, sweeps: Sequence[EarlySweep]) -> None:
+        """Make the map of these sweeps."""
+        maps = frame.matcher.maps
+        maps.clear()
+        maps.recenter(self._map_T_first)
+        for sweep in sweeps:
+            maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
+
+
+def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
+    pose = sweep.map_T_middle.matrix()
+    edges, planes = sweep.posed.points
+    return transform(pose, edges), transform(pose, planes)
+
+
+def _told_apart(tried: _Tried, best: _Tried) -> bool:
+    """Whether most of the way from one place to the other is along directions that a scan fixes."""
+    weak = tried.solution.weak
+    if weak is None:
+        return True
+    way = tried.solution.map_T_lidar.localCoordinates(best.solution.map_T_lidar)
+    form = tried.solution.localizability
+    assert form is not None
+    seen = way - weak @ way
+    return bool(seen @ form.displacement @ seen > 0.5 * way @ form.displacement @ way)

@@ -1,0 +1,105 @@
+"""The first sweeps of a run: their motion is searched for, and they are registered together."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam import Mapper
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.registration import start
+from loam_gtsam.types import FrameStatus
+
+CONFIG = Config().changed("imu.enabled=false")
+
+
+def features_of(scene, frames, **options):
+    world = SimulatedWorld(scene, frames=frames, columns=600, **options)
+    return world, [extract_features(scan, CONFIG) for scan in world]
+
+
+def errors(world, updates):
+    """Metres from the truth, of every pose."""
+    truth = [gtsam.Pose3(pose) for pose in world.truth.map_T_lidar]
+    return np.array([u.map_T_lidar.range(t) for u, t in zip(updates, truth, strict=False)])
+
+
+@pytest.mark.parametrize("speed", [5.0, 20.0, 36.0])
+def test_a_run_may_start_at_any_speed(speed):
+    world, features = features_of("avenue", 12, speed=speed, start="moving")
+    mapper = Mapper(CONFIG)
+    updates = [mapper.register(one) for one in features]
+    assert all(update.status.solved for update in updates[1:])
+    assert errors(world, updates).max() < 0.2
+    moved = np.linalg.norm(updates[1].twist[3:])
+    assert moved == pytest.approx(np.linalg.norm(world.truth.map_T_lidar[1][:3, 3]) / 0.1, rel=0.05)
+
+
+def test_sweeps_may_be_missing_between_the_first_two():
+    world, features = features_of("avenue", 30, speed=10.0, start="moving")
+    mapper = Mapper(CONFIG)
+    updates = [mapper.register(one) for one in features[::5]]
+    truth = world.truth.map_T_lidar[::5]
+    far = [u.map_T_lidar.range(gtsam.Pose3(t)) for u, t in zip(updates, truth, strict=True)]
+    assert max(far) < 0.3
+
+
+@pytest.mark.parametrize("scene", ["room", "corridor_bare", "open_field"])
+def test_a_platform_at_rest_stays_where_it_is(scene):
+    # Nothing tells the places along a bare corridor or on a field apart: none is better than rest.
+    world, features = features_of(scene, 3)
+    mapper = Mapper(CONFIG)
+    updates = [mapper.register(one) for one in features]
+    assert errors(world, updates).max() < 0.1
+
+
+def test_only_a_motion_that_nobody_knows_is_searched_for(monkeypatch):
+    asked = []
+    monkeypatch.setattr(start, "likely_poses", lambda *_, **__: asked.append(1) or [])
+    _, features = features_of("avenue", 4, speed=20.0, start="moving")
+    for guess, searches in ((gtsam.Pose3(), 0), (None, 1)):
+        mapper = Mapper(CONFIG)
+        mapper.register(features[0])
+        mapper.register(features[1], guess)
+        mapper.register(features[2])
+        assert len(asked) == searches
+
+
+def test_without_refinement_a_fast_start_is_not_searched_for():
+    _, features = features_of("avenue", 2, speed=20.0, start="moving")
+    mapper = Mapper(CONFIG.changed("deskew.refine=false"))
+    mapper.register(features[0])
+    assert np.linalg.norm(mapper.register(features[1]).twist[3:]) < 10.0
+
+
+def test_the_map_is_made_anew_of_the_first_sweeps_and_then_left_alone():
+    _, features = features_of("room", 11)
+    mapper = Mapper(CONFIG)
+    changed = []
+    for one in features:
+        before = mapper.maps.planes
+        mapper.register(one)
+        changed.append(mapper.maps.planes is not before)
+    assert [number + 1 for number, anew in enumerate(changed) if anew] == [2, 3, 5, 8]
+
+
+def test_the_first_pose_stays_and_the_start_becomes_better():
+    world, features = features_of("park", 9)
+    mapper = Mapper(CONFIG)
+    updates = [mapper.register(one) for one in features]
+    assert updates[0].status is FrameStatus.FIRST
+    assert updates[0].map_T_lidar.equals(gtsam.Pose3(), 0.0)
+    assert errors(world, updates)[-1] < 0.06
+
+
+def test_after_a_reset_the_next_sweep_is_a_start_again():
+    world, features = features_of("avenue", 4, speed=20.0, start="moving")
+    mapper = Mapper(CONFIG)
+    once = [mapper.register(one).map_T_lidar.matrix() for one in features]
+    mapper.reset()
+    again = [mapper.register(one).map_T_lidar.matrix() for one in features]
+    assert np.array_equal(once, again)
+    assert np.linalg.norm(once[-1][:3, 3]) > 0.9 * world.truth.path_length

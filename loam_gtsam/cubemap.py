@@ -20,12 +20,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.geometry import as_array, as_points, transform
+from loam_gtsam.geometry import as_array, as_points
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 from loam_gtsam.voxels.archive import Archive
-from loam_gtsam.voxels.cubes import NO_POINTS, Cube, Owners, SortedPoints
+from loam_gtsam.voxels.cubes import (
+    NO_POINTS,
+    Cube,
+    CubePoints,
+    SortedPoints,
+    joined,
+    mark_second,
+)
 from loam_gtsam.voxels.grid import CubeIndex, Grid, Window, cubes_in_view
-from loam_gtsam.voxels.trees import TreeCache
+from loam_gtsam.voxels.tags import Faces, look, tags_of
+from loam_gtsam.voxels.trees import Neighbours, TreeCache
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +165,13 @@ class CubeMap:
             return cubes
         return cubes_in_view(cubes, pose, self._grid.cube_size)
 
-    def insert(self, points_map: NDArray[np.floating]) -> None:
-        """Add points; each voxel keeps one.
+    def insert(
+        self,
+        points_map: NDArray[np.floating],
+        seen_from: NDArray[np.floating] | None = None,
+        faces: Faces | None = None,
+    ) -> None:
+        """Add points; each voxel keeps one, and one more of a surface that faces the other way.
 
         With the policy ``centroid`` a voxel holds the mean of the point it had and the new ones,
         the old one counting once: what LOAM's voxel filter does to a cube after each sweep. With
@@ -169,6 +182,9 @@ class CubeMap:
         Parameters
         ----------
         points_map : (N, 3) metres, map frame
+        seen_from : (3,) or (N, 3) positions of the lidar, metres, map frame; None if not known. The
+            policy ``centroid`` has no use for them: a mean may be of several surfaces.
+        faces : those points that may be second in voxels whose first points are on another side
 
         Raises
         ------
@@ -176,7 +192,12 @@ class CubeMap:
             If the array is not (N, 3) floats, all finite; the map is then unchanged.
         """
         points = as_points(points_map, "points_map")
-        self._put(points, np.full(len(points), self.owner, np.int32))
+        tags = tags_of(len(points), self.owner)
+        if seen_from is not None and self._config.insertion == "settled":
+            look(tags, points, seen_from)
+            if faces is not None:
+                mark_second(CubePoints(points, tags), faces, self._cubes, self._grid)
+        self._put(CubePoints(points, tags))
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points of the window and of the archive, after a loop closure; return how many.
@@ -191,14 +212,11 @@ class CubeMap:
         owners = np.array(sorted(moves), np.int32)
         taken = [cube.take_out(owners) for cube in self._cubes.values()]
         taken += self._archive.take_out(owners)
+        content = joined(taken)
         self._trees = TreeCache()
-        count = 0
         for owner in owners.tolist():
-            parts = [part.points[part.owners == owner] for part in taken]
-            points = transform(moves[owner], np.concatenate([NO_POINTS, *parts]))
-            self._put(points, np.full(len(points), owner, np.int32), archive=True)
-            count += len(points)
-        return count
+            self._put(content.of(owner).moved(moves[owner]), archive=True)
+        return len(content.points)
 
     def moved_points(self, moves: Mapping[int, FloatArray]) -> FloatArray:
         """Points of the whole map as they would be after :meth:`move`; the map does not change."""
@@ -206,21 +224,21 @@ class CubeMap:
         copy.move(moves)
         return copy.points(archived=True)
 
-    def _put(self, points: FloatArray, owners: Owners, *, archive: bool = False) -> None:
+    def _put(self, content: CubePoints, *, archive: bool = False) -> None:
         """Insert points; with ``archive`` those outside the window go into the archive."""
         # By component: numpy is several times slower along an axis of three.
-        axes = np.ascontiguousarray(points.T)
+        axes = np.ascontiguousarray(content.points.T)
         cells = self._grid.cells(axes)
         within = self._grid.reaches(axes)
         inside = within & self._window.holds(cells)
         if not inside.all():
             away = within & ~inside if archive else np.zeros_like(inside)
-            self._archive.settle(points[away], owners[away])
+            self._archive.settle(content.chosen(away))
             self._outside += int(np.count_nonzero(~(inside | away)))
-            points, owners, cells = points[inside], owners[inside], cells[:, inside]
-        if len(points) == 0:
+            content, cells = content.chosen(inside), cells[:, inside]
+        if len(content.points) == 0:
             return
-        new = SortedPoints.of(points, owners, cells, self._grid)
+        new = SortedPoints.of(content, cells, self._grid)
         cubes = [self._cubes.setdefault(index, Cube()) for index in new.cubes]
         if self._config.insertion == "settled":
             parts = zip(new.cubes, cubes, new.firsts(), strict=True)
@@ -232,7 +250,7 @@ class CubeMap:
 
     def nearest(
         self, queries: NDArray[np.floating], k: int, max_distance: float, cubes: Iterable[CubeIndex]
-    ) -> tuple[FloatArray, FloatArray]:
+    ) -> Neighbours:
         """The k nearest points of the given cubes to each query, exactly, also across borders.
 
         Parameters
@@ -241,11 +259,6 @@ class CubeMap:
         k : neighbours a query
         max_distance : metres; only points nearer than this count. May be infinite.
         cubes : as from :meth:`neighbourhood`; cubes that hold no points are allowed
-
-        Returns
-        -------
-        points : (M, k, 3) metres, map frame, nearest first; NaN where there is no neighbour
-        squared_distances : (M, k) square metres, ascending; infinite where there is none
 
         Raises
         ------
@@ -263,7 +276,7 @@ class CubeMap:
             raise InputError(f"max_distance: expected metres above 0, got {max_distance}")
         held = {index for index in cubes if index in self._cubes}
         if not held or len(queries) == 0:
-            return np.full((len(queries), k, 3), np.nan), np.full((len(queries), k), np.inf)
+            return Neighbours.none(len(queries), k)
         return self._trees.over(held, self._cubes).nearest(queries, k, max_distance)
 
     def points(

@@ -309,9 +309,9 @@ class Mapper:
         """Add the sweep to the map; its update."""
         clock.lap("solve")
         middle = posed.map_T_middle(map_T_lidar)
-        self.maps.insert(posed, middle, self.keyframe)
-        self._moment = Moment(posed.sweep.stamp, middle, status is not FrameStatus.SPARSE_MAP)
         matches = None if solution is None else solution.matches
+        self.maps.insert(posed, middle, self.keyframe, matches)
+        self._moment = Moment(posed.sweep.stamp, middle, status is not FrameStatus.SPARSE_MAP)
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")
         return make_update(posed, map_T_lidar, status, message, solution, tilt)

@@ -22,7 +22,7 @@ def test_border_query_finds_the_eight_cubes_that_meet() -> None:
     cube_map.insert(corner + 0.3 * signs)
     cubes = cube_map.neighbourhood(np.eye(4))
     assert len(cubes) == 8
-    points, squared = cube_map.nearest(corner[None], 9, 1.0, cubes)
+    points, squared, _ = cube_map.nearest(corner[None], 9, 1.0, cubes)
     np.testing.assert_allclose(squared[0, :8], 3 * 0.3**2)
     assert np.isinf(squared[0, 8])
     assert np.isnan(points[0, 8]).all()
@@ -38,10 +38,10 @@ def test_border_query_finds_the_eight_cubes_that_meet() -> None:
 def test_distances_are_squared_metres_and_the_limit_is_exclusive() -> None:
     cube_map = CubeMap(ALL_AROUND, 0.4)
     cube_map.insert(np.array([[3.0, 0.0, 0.0], [0.0, 2.0, 0.0]]))
-    points, squared = cube_map.nearest(np.zeros((1, 3)), 3, 3.0, [(0, 0, 0)])
+    points, squared, _ = cube_map.nearest(np.zeros((1, 3)), 3, 3.0, [(0, 0, 0)])
     np.testing.assert_array_equal(squared, [[4.0, np.inf, np.inf]])
     np.testing.assert_array_equal(points[0, 0], [0.0, 2.0, 0.0])
-    _, squared = cube_map.nearest(np.zeros((1, 3)), 3, 3.001, [(0, 0, 0), (0, 0, 0)])
+    _, squared, _ = cube_map.nearest(np.zeros((1, 3)), 3, 3.001, [(0, 0, 0), (0, 0, 0)])
     np.testing.assert_array_equal(squared, [[4.0, 9.0, np.inf]])
 
 
@@ -51,11 +51,11 @@ def test_empty_map_and_empty_arrays() -> None:
     assert cube_map.stats.cubes == cube_map.count() == 0
     assert cube_map.points().shape == (0, 3)
     assert cube_map.neighbourhood(np.eye(4)) == ()
-    points, squared = cube_map.nearest(np.zeros((2, 3)), 5, 1.0, [(0, 0, 0)])
+    points, squared, _ = cube_map.nearest(np.zeros((2, 3)), 5, 1.0, [(0, 0, 0)])
     np.testing.assert_array_equal(points, np.full((2, 5, 3), np.nan))
     assert np.isinf(squared).all()
     cube_map.insert(np.zeros((1, 3)))
-    points, squared = cube_map.nearest(np.empty((0, 3)), 5, 1.0, [(0, 0, 0)])
+    points, squared, _ = cube_map.nearest(np.empty((0, 3)), 5, 1.0, [(0, 0, 0)])
     assert (points.shape, squared.shape) == ((0, 5, 3), (0, 5))
 
 

@@ -162,7 +162,7 @@ def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
             border = np.round((queries[:3] - 0.5 * CUBE) / CUBE) * CUBE + 0.5 * CUBE
             queries[:3] = np.where(rng.random((3, 3)) < 0.5, border, queries[:3])
             k, limit = int(rng.integers(1, 7)), float(rng.choice([0.5, 2.0, np.inf]))
-            found, squared = cubes.nearest(queries, k, limit, around)
+            found, squared, _ = cubes.nearest(queries, k, limit, around)
             near = reference.points(list(around))
             np.testing.assert_allclose(squared, k_nearest(near, queries, k, limit), rtol=1e-9,
                                        atol=1e-12)  # fmt: skip

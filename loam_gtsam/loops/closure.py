@@ -239,8 +239,9 @@ class ScanLoopCloser:
         here = history.pose(candidate)
         poses = [here.between(history.pose(other.index)).matrix() for other in chosen]
         for cubes, kind in zip(maps, ("edges", "planes"), strict=True):
-            parts = (getattr(other, kind) for other in chosen)
-            cubes.insert(np.concatenate(list(map(transform, poses, parts))))
+            parts = list(map(transform, poses, (getattr(other, kind) for other in chosen)))
+            origins = [np.tile(p[:3, 3], (len(q), 1)) for p, q in zip(poses, parts, strict=True)]
+            cubes.insert(np.concatenate(parts), np.concatenate(origins))
         return maps
 
     def _judged(self, fit: Fit) -> Rejection | None:

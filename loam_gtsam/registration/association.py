@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -15,12 +16,18 @@ from loam_gtsam.registration.matches import (
     EdgeMatches,
     PlaneMatches,
     ScanMatches,
-    joined_edges,
+    joined,
     subset,
 )
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
+from loam_gtsam.voxels.tags import Faces, sines
+from loam_gtsam.voxels.trees import Neighbours
 
 _TINY = 1e-9
+_MORE = 2
+"""Times as many neighbours are searched for where those of one side are wanted: a wall has two."""
+_SURE = 2.0
+"""Standard deviations beyond which a difference is none of noise (95 %)."""
 
 
 def associate(
@@ -79,14 +86,13 @@ def match_features(
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
     pose = map_T_lidar.matrix()
-    edges_map, planes_map = transform(pose, edges), transform(pose, planes)
+    edges_map = transform(pose, edges)
     k, limit = config.neighbours, config.max_distance if reach is None else reach
     distinct = rows.distinct
     around = edge_map.neighbourhood(pose)
     near_edges = edge_map.nearest(edges_map, k, limit, around)
-    near_planes = plane_map.nearest(planes_map, k, limit, plane_map.neighbourhood(pose))
-    lines = match_lines(edges, edges_map, *near_edges, pose, config, limit)
-    surfaces = match_planes(planes, planes_map, *near_planes, pose, config, limit)
+    lines = match_lines(edges, edges_map, *near_edges[:2], pose, config, limit)
+    surfaces, faces = match_surfaces(planes, pose, plane_map, config, limit)
     if distinct is not None:
         alone = distinct.copy()
         alone[lines.indices] = False
@@ -95,13 +101,82 @@ def match_features(
             # A pole that few beams met has no five points within max_distance.
             far = config.wide_search * limit
             near_edges = edge_map.nearest(edges_map[left], k, far, around)
-            more = match_lines(edges[left], edges_map[left], *near_edges, pose, config, far)
-            lines = joined_edges(lines, replace(more, indices=left[more.indices]))
+            more = match_lines(edges[left], edges_map[left], *near_edges[:2], pose, config, far)
+            lines = joined(lines, replace(more, indices=left[more.indices]))
         lines = replace(lines, distinct=distinct[lines.indices])
     return ScanMatches(
         replace(lines, indices=rows.edges[lines.indices]),
         replace(surfaces, indices=rows.planes[surfaces.indices]),
+        faces=faces._replace(rows=rows.planes[faces.rows]),
     )
+
+
+def match_surfaces(
+    points: FloatArray,
+    map_T_lidar: FloatArray,
+    plane_map: CubeMap,
+    config: MatchingConfig,
+    reach: float,
+) -> tuple[PlaneMatches, Faces]:
+    """Match plane features with surfaces that show towards the lidar.
+
+    Neighbours on two sides of a thin wall make one plane between the two. Where their views say so,
+    the plane is fitted to those of this side alone, and there is no match if these are too few.
+    Parameters are those of :func:`match_planes`.
+
+    Returns
+    -------
+    matches, faces : of the features, and those of them that have neighbours on another side
+    """
+    points_map, around = transform(map_T_lidar, points), plane_map.neighbourhood(map_T_lidar)
+    k = config.neighbours
+    near = plane_map.nearest(points_map, k, reach, around)
+    rows = np.flatnonzero(near.squared[:, -1] < reach**2)
+    fits = _fit(near.points.take(rows, axis=0), config)
+    sight = map_T_lidar[:3, 3:] - points_map.take(rows, axis=0).T
+    side = _dot(fits.normals, sight) / np.maximum(_norm(sight), _TINY)
+    # A view tells the side if its angle to the plane is beyond the error of the normal.
+    spread = np.maximum(fits.eigenvalues[1], _TINY)
+    least = _SURE * config.point_sigma / np.sqrt(k * spread)
+    facing = fits.normals * (np.sign(side) * (np.abs(side) > least))
+    hidden = (sines(near.views.take(rows, axis=0), facing) < -least).any(axis=0)
+    doubtful = np.flatnonzero(hidden & fits.planar)
+    faces = Faces(rows[doubtful], facing.T[doubtful], least[doubtful])
+    if len(doubtful):
+        first, far = near.of(faces.rows), points_map.take(faces.rows, axis=0)
+        more = plane_map.nearest(far, _MORE * k, reach, around)
+        again, known = _on_this_side(first, more, faces, config)
+        fits.planar[doubtful[~known]] = False
+        better = again.planar
+        for column, new in zip(fits, again, strict=True):
+            column[..., doubtful[better]] = new[..., better]
+    return _matched_planes(points, points_map, rows, fits, map_T_lidar, config), faces
+
+
+def _on_this_side(
+    first: Neighbours, more: Neighbours, faces: Faces, config: MatchingConfig
+) -> tuple[_Fits, BoolArray]:
+    """Planes through the neighbours of this side, and where (M,) there are enough of these.
+
+    Such a plane is planar only if it explains the others among the ``first`` neighbours: they lie
+    behind it, and were seen from behind.
+
+    Parameters
+    ----------
+    first, more : k neighbours of M features, and more than k
+    faces : of the planes through the first neighbours
+    """
+    facing, least = faces.normals.T, faces.least
+    hidden = (sines(more.views, facing) < -least).T | np.isinf(more.squared)
+    order = hidden.argsort(axis=1, kind="stable")[:, : config.neighbours]
+    known = np.count_nonzero(~hidden, axis=1) >= config.neighbours
+    order[~known] = 0  # no plane, but finite
+    fits = _fit(np.take_along_axis(more.points, order[:, :, None], axis=1), config)
+    normals = fits.normals * np.sign(_dot(fits.normals, facing))
+    depth = _dot(first.points.T - fits.centres[:, None], normals[:, None])
+    behind = (depth < -_SURE * config.point_sigma) & (sines(first.views, normals) < -least)
+    explained = behind | (sines(first.views, facing) >= -least)
+    return fits._replace(planar=fits.planar & known & explained.all(axis=0)), known
 
 
 def _fixed_by(planes: PlaneMatches) -> float:
@@ -157,7 +232,8 @@ def rematched(
     weights = _plane_weights(distances, _norm(reach.T), config)
     keep = weights > config.min_weight
     planes = replace(p, distances=distances, weights=weights)
-    return ScanMatches(edges, planes if keep.all() else subset(planes, keep))
+    planes = planes if keep.all() else subset(planes, keep)
+    return ScanMatches(edges, planes, faces=matches.faces)
 
 
 def _line_weights(distances: FloatArray, config: MatchingConfig) -> FloatArray:
@@ -236,34 +312,72 @@ def match_planes(
     LIO-SAM). ``plane_fit: unit_offset`` and ``weight_range: map`` give the published forms.
     """
     reach = config.max_distance if reach is None else reach
-    near = np.flatnonzero(squared_distances[:, -1] < reach**2)
+    rows = np.flatnonzero(squared_distances[:, -1] < reach**2)
+    fits = _fit(neighbours.take(rows, axis=0), config)
+    return _matched_planes(points, points_map, rows, fits, map_T_lidar, config)
+
+
+class _Fits(NamedTuple):
+    """Planes through M groups of neighbours."""
+
+    centres: FloatArray  # (3, M)
+    normals: FloatArray  # (3, M)
+    offsets: FloatArray  # (M,)
+    wide: FloatArray  # (3, M) unit directions of the widest extent
+    eigenvalues: FloatArray  # (3, M) variances across the plane and along its extents, ascending
+    planar: BoolArray  # (M,) whether the neighbours lie in the plane and span it
+
+
+def _fit(neighbours: FloatArray, config: MatchingConfig) -> _Fits:
+    """Planes through groups (M, k, 3)."""
     # Memory order is axis by axis, as in all of the following arrays.
-    axes = np.ascontiguousarray(neighbours.take(near, axis=0).transpose(2, 1, 0))
-    here = np.ascontiguousarray(points_map.take(near, axis=0).T)
+    axes = np.ascontiguousarray(neighbours.transpose(2, 1, 0))
     group = axes.transpose(2, 1, 0)
     centres, normals, wide, eigenvalues = fit_planes(group)
     offsets = -_dot(normals, centres)
     if config.plane_fit == "unit_offset":
         normals, offsets = _unit_offset_planes(group)
     across = _dot(axes, normals[:, None, :]) + offsets
-    is_plane = np.abs(across).max(axis=0) <= config.plane_tolerance
-    is_plane &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
-    away = here - centres
+    planar = np.abs(across).max(axis=0) <= config.plane_tolerance
+    planar &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
+    return _Fits(centres, normals, offsets, wide, eigenvalues, planar)
+
+
+def _matched_planes(
+    points: FloatArray,
+    points_map: FloatArray,
+    rows: IntArray,
+    fits: _Fits,
+    map_T_lidar: FloatArray,
+    config: MatchingConfig,
+) -> PlaneMatches:
+    """The matches of some rows of the points with the planes fitted to their neighbours."""
+    normals, offsets, eigenvalues = fits.normals, fits.offsets, fits.eigenvalues
+    here = np.ascontiguousarray(points_map.take(rows, axis=0).T)
+    away = here - fits.centres
     distances = _dot(here, normals) + offsets
     rays = here - map_T_lidar[:3, 3:]
     ranges = _norm(rays)
-    is_plane &= np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
+    seen = np.abs(_dot(normals, rays)) >= config.min_incidence_sine * ranges
     far = _norm(here) if config.weight_range == "map" else ranges
     weights = _plane_weights(distances, far, config)
-    keep = is_plane & (weights > config.min_weight)
-    along = _dot(away, wide)
+    keep = fits.planar & seen & (weights > config.min_weight)
+    along = _dot(away, fits.wide)
     aside = np.maximum(_dot(away, away) - along**2 - distances**2, 0.0)
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
     fit = eigenvalues[0], eigenvalues[1], leverage
-    sigmas, tilts = _deviations(*fit, 3, neighbours.shape[1], config)
-    columns = (part[keep] for part in (offsets, distances, sigmas, weights, near, tilts))
-    return PlaneMatches(points[near[keep]], normals.T[keep], *columns)
+    sigmas, tilts = _deviations(*fit, 3, config.neighbours, config)
+    return PlaneMatches(
+        points[rows[keep]],
+        normals.T[keep],
+        offsets[keep],
+        distances[keep],
+        sigmas[keep],
+        weights[keep],
+        rows[keep],
+        tilts[keep],
+    )
 
 
 def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -54,11 +54,19 @@ class MapPair:
         for cubes in (self.edges, self.planes):
             cubes.recenter(map_T_lidar.translation())
 
-    def insert(self, posed: PosedSweep, map_T_middle: gtsam.Pose3, keyframe: int) -> None:
-        """Add a sweep whose points belong to a keyframe."""
-        for cubes, points in zip((self.edges, self.planes), posed.points, strict=True):
-            cubes.owner = keyframe
-            cubes.insert(transform(map_T_middle.matrix(), points))
+    def insert(
+        self,
+        posed: PosedSweep,
+        map_T_middle: gtsam.Pose3,
+        keyframe: int,
+        matches: ScanMatches | None = None,
+    ) -> None:
+        """Add a sweep, by its last matches if there are any; its points belong to a keyframe."""
+        self.edges.owner = self.planes.owner = keyframe
+        edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
+        self.edges.insert(edges)  # which has no side: a corner shows from both
+        faces = None if matches is None else matches.faces
+        self.planes.insert(planes, map_T_middle.translation(), faces)
         self._thinned = None
 
     def too_sparse(self, predicted: Prediction, config: Config) -> str:

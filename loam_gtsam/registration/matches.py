@@ -10,6 +10,7 @@ import numpy as np
 
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
+from loam_gtsam.voxels.tags import Faces
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,11 +72,15 @@ class PlaneMatches:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanMatches:
-    """All matches of one sweep at one pose, and the neighbour search, if any, that found them."""
+    """All matches of one sweep at one pose, and the neighbour search, if any, that found them.
+
+    ``faces`` are the planes of the sweep by which the map has points of another side.
+    """
 
     edges: EdgeMatches
     planes: PlaneMatches
     search: Search | None = None
+    faces: Faces | None = None
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
@@ -118,11 +123,11 @@ def subset(matches: _Matches, keep: BoolArray) -> _Matches:
     return replace(matches, **kept)
 
 
-def joined_edges(first: EdgeMatches, second: EdgeMatches) -> EdgeMatches:
+def joined(first: _Matches, second: _Matches) -> _Matches:
     """All matches of both, in the order of the features, without ``distinct``."""
     columns: dict[str, Any] = {}
     order = np.argsort(np.concatenate([first.indices, second.indices]), kind="stable")
     for item in fields(first):
         parts = getattr(first, item.name), getattr(second, item.name)
         columns[item.name] = None if parts[0] is None else np.concatenate(parts)[order]
-    return EdgeMatches(**columns)
+    return replace(first, **columns)

@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
-from loam_gtsam.types import ConfigError, FloatArray
-from loam_gtsam.voxels.cubes import Cube, CubePoints, Owners, SortedPoints
+from loam_gtsam.types import ConfigError
+from loam_gtsam.voxels.cubes import Cube, CubePoints, SortedPoints
 from loam_gtsam.voxels.grid import CubeIndex, Grid
+from loam_gtsam.voxels.tags import Owners
 
 _log = logging.getLogger(__name__)
+_COLUMNS = 5  # of a file: a point and its tags
 
 
 class Archive:
@@ -99,13 +101,13 @@ class Archive:
         try:
             # Mapped, so that a damaged header cannot claim more memory than the file has bytes.
             rows = np.load(self._path(index), mmap_mode="r", allow_pickle=False)
-            expected = (self._disk[index], 4)
+            expected = (self._disk[index], _COLUMNS)
             if rows.shape != expected or rows.dtype != np.float64:
                 raise ValueError(f"expected {expected} float64, got {rows.shape} {rows.dtype}")
         except (OSError, ValueError) as error:
             self._drop(self._disk.pop(index), f"cannot read {self._path(index)}: {error}")
             return None
-        return CubePoints(np.array(rows[:, :3], order="C"), rows[:, 3].astype(np.int32))
+        return CubePoints(np.array(rows[:, :3], order="C"), rows[:, 3:].astype(np.int32))
 
     def contents(self) -> Iterator[tuple[CubeIndex, CubePoints]]:
         """The readable cubes and their points, in the order of :meth:`indices`."""
@@ -130,17 +132,17 @@ class Archive:
         """Remove the points of some owners from the archived cubes, and return them."""
         taken = []
         for index, content in self.contents():
-            if np.isin(content.owners, owners).any():
+            if np.isin(content.tags[:, 0], owners).any():
                 cube = self.take(index) or Cube()
                 taken.append(cube.take_out(owners))
                 self.store(index, cube.content)
         return taken
 
-    def settle(self, points: FloatArray, owners: Owners) -> None:
-        """Add points (N, 3) within the grid's limit to archived cubes where voxels are free."""
-        if len(points) == 0:
+    def settle(self, content: CubePoints) -> None:
+        """Add points within the grid's limit to archived cubes where voxels are free."""
+        if len(content.points) == 0:
             return
-        new = SortedPoints.of(points, owners, self._grid.cells(points.T), self._grid)
+        new = SortedPoints.of(content, self._grid.cells(content.points.T), self._grid)
         for index, part in zip(new.cubes, new.firsts(), strict=True):
             cube = self.take(index) or Cube()
             cube.settle(part)

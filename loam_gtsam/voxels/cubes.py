@@ -1,47 +1,73 @@
-"""One cube of a map: its points, at most one a voxel, and the owner of each point."""
+"""One cube of a map: its points, the owner of each, and from where it was seen.
+
+A voxel holds one point; where a thin wall passes through it, a second one, of the other face.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from loam_gtsam.geometry import find_in_sorted, run_starts, voxel_keys
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.geometry import find_in_sorted, run_starts, transform, voxel_keys
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
 from loam_gtsam.voxels.key_table import Columns, KeyTable
-
-Owners = NDArray[np.int32]
-"""Numbers that points carry: points of one number can be moved together."""
+from loam_gtsam.voxels.tags import Faces, Owners, Tags, second, sines, tags_of, turn, views
 
 NO_POINTS: FloatArray = np.empty((0, 3))
 _NO_KEYS: IntArray = np.empty(0, np.int64)
-_NO_OWNERS: Owners = np.empty(0, np.int32)
+_NO_TAGS = tags_of(0, 0)
+_SECOND = np.int64(-(1 << 63))
+"""The sign bit: it is set in the keys of points that are second in their voxels."""
 
 
 class CubePoints(NamedTuple):
-    """Points of a cube, (N, 3) metres, and the owners of the points, (N,)."""
+    """Points of cubes, (N, 3) metres, and their tags, (N, 2)."""
 
     points: FloatArray
-    owners: Owners
+    tags: Tags
 
     @property
     def nbytes(self) -> int:
         """Bytes."""
-        return self.points.nbytes + self.owners.nbytes
+        return self.points.nbytes + self.tags.nbytes
+
+    def chosen(self, which: BoolArray | IntArray) -> CubePoints:
+        """The points for which a mask is true, or those of some rows."""
+        return CubePoints(self.points[which], self.tags[which])
+
+    def of(self, owner: int) -> CubePoints:
+        """The points of one owner."""
+        return self.chosen(self.tags[:, 0] == owner)
+
+    def moved(self, move: FloatArray) -> CubePoints:
+        """The points after a rigid transform (4, 4)."""
+        tags = self.tags.copy()
+        turn(tags, move[:3, :3])
+        return CubePoints(transform(move, self.points), tags)
+
+    def keys(self, grid: Grid) -> IntArray:
+        """(N,) under which cubes hold the points."""
+        keys = voxel_keys(self.points, grid.voxel_size)
+        keys[second(self.tags)] |= _SECOND
+        return keys
 
 
-VoxelPoints = tuple[IntArray, FloatArray, Owners]
-"""Ascending keys (V,) of voxels, a point (V, 3) of each, and the owners (V,) of the points."""
+class VoxelPoints(NamedTuple):
+    """Ascending keys (V,) of voxels, a point (V, 3) of each, and the tags (V, 2) of the points."""
+
+    keys: IntArray
+    points: FloatArray
+    tags: Tags
 
 
 class VoxelSums(NamedTuple):
     """Sums (V, 3), bounds (V, 3) and counts (V,) of the points of voxels, by ascending key (V,)."""
 
     keys: IntArray
-    owners: Owners
+    tags: Tags
     sums: FloatArray
     lows: FloatArray
     highs: FloatArray
@@ -49,43 +75,51 @@ class VoxelSums(NamedTuple):
 
 
 class Cube(KeyTable):
-    """Points of a cube in the order of their voxels, at most one a voxel."""
+    """Points of a cube in the order of their keys: one of each voxel, or a first and a second."""
 
     __slots__ = ()
 
     def __init__(
-        self, keys: IntArray = _NO_KEYS, points: FloatArray = NO_POINTS, owners: Owners = _NO_OWNERS
+        self, keys: IntArray = _NO_KEYS, points: FloatArray = NO_POINTS, tags: Tags = _NO_TAGS
     ) -> None:
-        super().__init__(keys, points, owners)
+        super().__init__(keys, points, tags)
 
     @classmethod
     def of(cls, content: CubePoints, grid: Grid) -> Cube:
-        """A cube that holds these points, of which no two are in one voxel."""
-        keys = voxel_keys(content.points, grid.voxel_size)
+        """A cube that holds these points, of which no two are both first or second in a voxel."""
+        keys = content.keys(grid)
         order = np.argsort(keys, kind="stable")
-        return cls(keys[order], content.points[order], content.owners[order])
+        return cls(keys[order], *content.chosen(order))
 
     @property
     def points(self) -> FloatArray:
-        """(N, 3) metres, in the order of their voxels."""
+        """(N, 3) metres, in the order of their keys."""
         points: FloatArray = self.columns[1]
         return points
 
     @property
     def content(self) -> CubePoints:
-        """All that is kept of the cube in an archive."""
+        """All that is kept of the cube in an archive, and in trees."""
         return CubePoints(*self.columns[1:])
 
-    def settle(self, new: VoxelPoints) -> FloatArray:
-        """Add the points whose voxels are free, and return them."""
-        return new[1].take(self.add(*new), axis=0)
+    def tags_at(self, keys: IntArray) -> Tags:
+        """Tags (V, 2) of the points that are first in voxels; those of unknown view if none is."""
+        at, present = find_in_sorted(self.columns[0], keys)
+        found = tags_of(len(keys), 0)
+        found[present] = self.columns[2][at[present]]
+        return found
+
+    def settle(self, new: VoxelPoints) -> CubePoints:
+        """Add the points whose places in their voxels are free, and return them."""
+        added = self.add(*new)
+        return CubePoints(new.points.take(added, axis=0), new.tags.take(added, axis=0))
 
     def average(self, new: VoxelSums) -> None:
         """Put into each voxel the mean of its point, if it has one, and the new ones.
 
         A voxel that has a point keeps the owner of that point. The arrays of ``new`` are changed.
         """
-        keys, held, _ = self.columns
+        keys, held = self.columns[:2]
         at, taken = find_in_sorted(keys, new.keys)
         old = held[at[taken]]
         new.sums[taken] += old
@@ -96,17 +130,38 @@ class Cube(KeyTable):
         means = np.clip(new.sums / new.counts[:, None], new.lows, new.highs)
         held[at[taken]] = means[taken]
         free = np.flatnonzero(~taken)
-        self.append(*(column.take(free, axis=0) for column in (new.keys, means, new.owners)))
+        self.append(*(column.take(free, axis=0) for column in (new.keys, means, new.tags)))
         self.merge()  # the next call changes points in place
 
     def take_out(self, owners: Owners) -> CubePoints:
         """Remove the points of some owners, and return them."""
-        columns = self.columns
-        out = np.isin(columns[2], owners)
-        if not out.any():
-            return CubePoints(NO_POINTS, _NO_OWNERS)
-        self._put(*(column[~out] for column in columns))
-        return CubePoints(columns[1][out], columns[2][out])
+        columns, content = self.columns, self.content
+        out = np.isin(content.tags[:, 0], owners)
+        if out.any():
+            self._put(*(column[~out] for column in columns))
+        return content.chosen(out)
+
+
+def joined(parts: Sequence[CubePoints]) -> CubePoints:
+    """The points of all parts."""
+    return CubePoints(*map(np.concatenate, zip(Cube().content, *parts, strict=True)))
+
+
+def mark_second(
+    content: CubePoints, faces: Faces, cubes: Mapping[CubeIndex, Cube], grid: Grid
+) -> None:
+    """Mark points as second if the first ones of their voxels are on the other side of a face."""
+    near = grid.reaches(content.points[faces.rows].T)
+    rows, normals, least = faces.rows[near], faces.normals[near], faces.least[near]
+    points = content.points[rows]
+    cells, keys = grid.cells(points), voxel_keys(points, grid.voxel_size)
+    held = tags_of(len(rows), 0)
+    for cell in set(map(tuple, cells.tolist())):
+        cube = cubes.get(cube_index(np.array(cell)))
+        if cube is not None:
+            inside = (cells == cell).all(axis=1)
+            held[inside] = cube.tags_at(keys[inside])
+    views(content.tags)[rows, 3] = sines(views(held), normals.T) < -least
 
 
 class SortedPoints(NamedTuple):
@@ -115,21 +170,21 @@ class SortedPoints(NamedTuple):
     Attributes
     ----------
     points : (N, 3) metres
-    keys, owners : (V,) key of each voxel, and owner of its first point
+    keys, tags : (V,) key of each voxel, and (V, 2) the tags of its first point
     starts : (V,) the point with which each voxel begins
     cubes, parts : the C cubes, and the voxels of each
     """
 
     points: FloatArray
     keys: IntArray
-    owners: Owners
+    tags: Tags
     starts: IntArray
     cubes: list[CubeIndex]
     parts: list[slice]
 
     @classmethod
-    def of(cls, points: FloatArray, owners: Owners, cells: FloatArray, grid: Grid) -> SortedPoints:
-        """Sort points, (N, 3) with N > 0; those of one voxel stay in the order given.
+    def of(cls, content: CubePoints, cells: FloatArray, grid: Grid) -> SortedPoints:
+        """Sort points, of any cubes and at least one; those of one voxel stay in the order given.
 
         ``cells`` (3, N) are the indices of the cubes of the points.
         """
@@ -137,7 +192,7 @@ class SortedPoints(NamedTuple):
         steps = (cells - low).astype(np.int64)
         box = tuple((steps.max(axis=1) + 1).tolist())
         numbers = np.ravel_multi_index(tuple(steps), box)
-        keys = voxel_keys(points, grid.voxel_size)
+        keys = content.keys(grid)
         order = np.lexsort((keys, numbers))  # stable
         keys, numbers = keys[order], numbers[order]
         starts = run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))
@@ -145,9 +200,9 @@ class SortedPoints(NamedTuple):
         heads = run_starts(numbers[1:] != numbers[:-1])
         ends = zip(heads.tolist(), np.append(heads[1:], len(numbers)).tolist(), strict=True)
         return cls(
-            points.take(order, axis=0),  # several times faster than an index on rows
+            content.points.take(order, axis=0),  # several times faster than an index on rows
             keys[starts],
-            owners[order[starts]],
+            content.tags.take(order[starts], axis=0),
             starts,
             [cube_index(cell) for cell in (np.unravel_index(numbers[heads], box) + low).T],
             [slice(*part) for part in ends],
@@ -156,12 +211,13 @@ class SortedPoints(NamedTuple):
     def firsts(self) -> Iterator[VoxelPoints]:
         """The first point of each voxel, cube by cube."""
         firsts = self.points.take(self.starts, axis=0)
-        return ((self.keys[part], firsts[part], self.owners[part]) for part in self.parts)
+        for part in self.parts:
+            yield VoxelPoints(self.keys[part], firsts[part], self.tags[part])
 
     def sums(self) -> Iterator[VoxelSums]:
         """Sums over the points of each voxel, cube by cube."""
         hows = np.add, np.minimum, np.maximum
         sums = (how.reduceat(self.points, self.starts, axis=0) for how in hows)
         counts = np.diff(np.append(self.starts, len(self.points))).astype(np.float64)
-        columns: Columns = self.keys, self.owners, *sums, counts
+        columns: Columns = self.keys, self.tags, *sums, counts
         return (VoxelSums(*(column[part] for column in columns)) for part in self.parts)

@@ -167,8 +167,8 @@ def test_an_archived_cube_that_claims_more_than_its_file_holds_is_dropped(tmp_pa
     cubes.recenter(np.array([40.0, 0.0, 0.0]))
     (file,) = tmp_path.rglob("*.npy")
     content = file.read_bytes()
-    for shape in (b"(2147483648, 4), }", b"(99999999999999, 4), }"):
-        claim = content.replace(b"(1, 4), }", shape)
+    for shape in (b"(2147483648, 5), }", b"(99999999999999, 5), }"):
+        claim = content.replace(b"(1, 5), }", shape)
         file.write_bytes(claim[: len(content) - len(shape) + 9] + claim[-40:])
     assert most_memory(lambda: cubes.recenter(np.zeros(3))) < 10_000_000
     assert cubes.stats.dropped_cubes == 1

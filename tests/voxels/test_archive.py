@@ -67,8 +67,8 @@ def test_two_maps_share_an_archive_folder(tmp_path: Path) -> None:
 
 
 def test_budget_drops_the_oldest_counts_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    """Each stop leaves one cube of 7 points, 168 bytes; two of them fit into 400 bytes."""
-    cube_map = CubeMap(SMALL.changed(archive_megabytes=400e-6), 0.5)
+    """Each stop leaves one cube of 7 points, 224 bytes; two of them fit into 500 bytes."""
+    cube_map = CubeMap(SMALL.changed(archive_megabytes=500e-6), 0.5)
     heap = np.arange(-1.5, 1.6, 0.5)[:, None] * np.ones(3)
     with caplog.at_level(logging.WARNING, logger="loam_gtsam.cubemap"):
         for stop in range(5):
@@ -89,7 +89,7 @@ def test_budget_drops_the_oldest_counts_and_says_so(caplog: pytest.LogCaptureFix
 
 def test_restoring_goes_before_dropping() -> None:
     """A cube that comes back is not pushed out by one that leaves in the same step."""
-    cube_map = CubeMap(SMALL.changed(archive_megabytes=30e-6), 0.5)
+    cube_map = CubeMap(SMALL.changed(archive_megabytes=40e-6), 0.5)
     cube_map.insert(np.zeros((1, 3)))
     cube_map.recenter(np.array([100.0, 0.0, 0.0]))
     cube_map.insert(np.array([[100.0, 0.0, 0.0]]))

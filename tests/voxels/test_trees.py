@@ -9,8 +9,9 @@ from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import FloatArray
-from loam_gtsam.voxels.cubes import Cube, SortedPoints
+from loam_gtsam.voxels.cubes import Cube, CubePoints, SortedPoints
 from loam_gtsam.voxels.grid import Grid
+from loam_gtsam.voxels.tags import tags_of
 from loam_gtsam.voxels.trees import CubeTrees, TreeCache
 
 GRID = Grid(4.0, 0.01)
@@ -29,6 +30,10 @@ def brute_force(
     return np.where(np.isinf(squared)[:, :, None], np.nan, points[order]), squared
 
 
+def tagged(points: FloatArray) -> CubePoints:
+    return CubePoints(points, tags_of(len(points), 0))
+
+
 class Cubes(dict):
     """Cubes and the trees over them, as a map keeps them."""
 
@@ -37,7 +42,7 @@ class Cubes(dict):
         self.trees = TreeCache()
 
     def insert(self, points: FloatArray) -> None:
-        new = SortedPoints.of(points, np.zeros(len(points), np.int32), GRID.cells(points.T), GRID)
+        new = SortedPoints.of(tagged(points), GRID.cells(points.T), GRID)
         parts = zip(new.cubes, new.firsts(), strict=True)
         self.trees.add({index: self.setdefault(index, Cube()).settle(p) for index, p in parts})
 
@@ -123,7 +128,7 @@ def test_restored_trees_are_due_when_those_before_would_have_been() -> None:
     np.testing.assert_array_equal(one[0], other[0])
     np.testing.assert_array_equal(one[1], other[1])
     assert not trees.is_stale
-    more = {MIDDLE: rng.uniform(-2.0, 2.0, (51, 3))}
+    more = {MIDDLE: tagged(rng.uniform(-2.0, 2.0, (51, 3)))}
     for either in (trees, again):
         either.add(more)
         assert either.is_stale

@@ -20,6 +20,7 @@ _CLEAR = 3.0  # sigmas of a normal by which a displacement must leave its surfac
 _MOVED = 0.1
 """Share of the root mean square displacement by which a point must move to count in full: points on
 a pole move by millimetres in a turn about the pole, and say nothing about this turn."""
+_RANK = 1e-6  # singular value over the largest one, below which there is no direction
 _HELD = 0.5  # share of ``min_aligned`` that lines alone must reach before planes are left out
 
 
@@ -70,6 +71,27 @@ class Localizability:
         chosen: FloatArray = self.directions[self.aligned < least]
         return chosen
 
+    def without_noise(self, blind: FloatArray, shared: float) -> FloatArray:
+        """(6, 6) what a projector onto blind directions would be without noise of the normals.
+
+        By noise, an eigenvector is a translation with a little of a rotation that the scan sees
+        well. Over a long blind way that little would turn the pose. A direction whose rotation is
+        within three standard deviations of its noise (:meth:`wander`) is taken for a translation.
+
+        ``shared`` is the number of matches over that of independent ones.
+        """
+        form, turns = self.displacement, self.displacement[:3, :3]
+        spanned, sizes, _ = np.linalg.svd(blind)
+        basis = spanned[:, sizes > _RANK * sizes[0]]
+        basis = basis @ np.linalg.inv(np.linalg.cholesky(basis.T @ form @ basis)).T
+        basis = basis @ np.linalg.eigh(basis[:3].T @ turns @ basis[:3])[1]
+        share = np.einsum("ik,ij,jk->k", basis[:3], turns, basis[:3])
+        pure = basis.copy()
+        limit = _CLEAR**2 * shared * np.trace(turns @ self._turned_by_noise()[:3, :3])
+        pure[:3, share < limit] = 0.0
+        cleaned: FloatArray = pure @ basis.T @ form @ blind
+        return cleaned
+
     def wander(self, moved: FloatArray) -> FloatArray:
         """(6, 6) covariance of what a motion along a weak direction does along the others.
 
@@ -78,21 +100,26 @@ class Localizability:
         it can only do so towards other translations. ``moved`` is the (6, 6) covariance of the
         motion.
         """
-        spread = (self.directions.T / np.maximum(self.aligned, 1.0)) @ self.directions
+        spread = self._turned_by_noise()
         turned = float(np.trace(self.displacement[:3, :3] @ moved[:3, :3]))
         shifted = np.zeros((6, 6))
         shifted[3:, 3:] = np.trace(moved[3:, 3:]) * np.linalg.inv(np.linalg.inv(spread)[3:, 3:])
-        wander: FloatArray = self.tilt**2 * (turned * spread + shifted)
+        wander: FloatArray = turned * spread + shifted
         return wander
+
+    def _turned_by_noise(self) -> FloatArray:
+        counts = np.maximum(self.aligned, 1.0) / max(self.tilt, _RANK) ** 2
+        spread: FloatArray = (self.directions.T / counts) @ self.directions
+        return spread
 
     def projector(self, least: float) -> FloatArray | None:
         """(6, 6) projector onto the weak directions along the others, None if there are none."""
-        found = self.open(least)
+        found = self.between(-1.0, least)
         return None if found is None else found.projector
 
-    def open(self, least: float) -> Directions | None:
-        """The weak directions, along the others; None if there are none."""
-        mask = self.aligned < least
+    def between(self, least: float, most: float) -> Directions | None:
+        """Directions with at least ``least`` and fewer than ``most`` aligned matches, if any."""
+        mask = (self.aligned >= least) & (self.aligned < most)
         if not mask.any():
             return None
         shares: FloatArray = np.linalg.inv(self.directions.T).astype(np.float64, copy=False)
@@ -152,51 +179,6 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     return Localizability(*shown, unit, by_planes[order], tilt)
 
 
-def with_translations(
-    seen: Localizability, matches: ScanMatches, map_T_lidar: gtsam.Pose3, least: float
-) -> Localizability:
-    """The localizability with pure translations among the weak directions, where there are any.
-
-    By noise, an eigenvector is a translation with a little of a rotation that the scan sees well.
-    Over a long blind way that little turns the pose. So a translation that is as weak on its own
-    takes the place of the eigenvector; ``least`` as in :meth:`Localizability.weak`.
-    """
-    count = int(np.count_nonzero(seen.aligned < least))
-    if not count:
-        return seen
-    points, normals, tilts, weights = _as_planes(matches, map_T_lidar)
-    across = normals * weights[:, None]
-    pure = np.zeros((3, 6))
-    pure[:, 3:] = np.linalg.eigh(across.T @ across)[1].T
-    pure = pure[_sight(points, normals, tilts, pure).sum(axis=0) < least][:count]
-    # The rest of the weak space, at right angles as to the displacement of the points.
-    form = seen.displacement
-    rest = seen.directions[:count]
-    rest = rest - (rest @ form @ pure.T) @ pure
-    root = np.linalg.cholesky(form + 1e-12 * np.trace(form) * np.eye(6))
-    rest = np.linalg.svd(rest @ root)[2][: count - len(pure)] @ np.linalg.inv(root)
-    weak = np.concatenate([pure, rest])
-    sight = _sight(points, normals, tilts, weak)
-    rows = np.hstack([cross(points.T, normals.T).T, normals]) * weights[:, None]
-    parts = (
-        (weak, seen.directions),
-        (sight.sum(axis=0), seen.aligned),
-        (((rows @ weak.T) ** 2).sum(axis=0), seen.information),
-        (sight[len(sight) - len(matches.planes) :].sum(axis=0), seen.by_planes),
-    )
-    directions, aligned, information, by_planes = (
-        np.concatenate([new, old[count:]]) for new, old in parts
-    )
-    order = np.argsort(aligned, kind="stable")
-    return replace(
-        seen,
-        directions=directions[order],
-        aligned=aligned[order],
-        information=information[order],
-        by_planes=by_planes[order],
-    )
-
-
 def unseen_by_planes(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, seen: Localizability, least: float
 ) -> Directions | None:
@@ -211,20 +193,19 @@ def unseen_by_planes(
     if seen.by_planes.min() >= least:
         return None
     no_lines = subset(matches.edges, np.zeros(len(matches.edges), np.bool_))
-    alone = replace(matches, edges=no_lines)
-    planes = localizability(alone, map_T_lidar)
-    unseen = with_translations(planes, alone, map_T_lidar, least).open(least)
+    planes = localizability(replace(matches, edges=no_lines), map_T_lidar)
+    unseen = planes.between(-1.0, least)
     if unseen is None:
         return None
-    by_lines = line_sight(matches.edges, map_T_lidar, unseen.vectors).sum(axis=0)
-    held = seen.aligned[0] < least or by_lines.min() >= _HELD * least
+    lines = line_sight(matches.edges, map_T_lidar, unseen.vectors).sum(axis=0)
+    held = seen.aligned[0] < least or lines.min() >= _HELD * least
     return unseen if held else None
 
 
-def left_open(
+def by_lines(
     matches: ScanMatches, map_T_lidar: gtsam.Pose3, unseen: Directions, least: float
-) -> Directions | None:
-    """Those motions, out of some that planes do not fix, that lines do not fix either.
+) -> tuple[Directions | None, Directions | None]:
+    """Motions that planes do not fix: those that lines do not fix either, and those that they fix.
 
     Lines come and go between one association and the next. So this is to be asked for the matches
     of every association: a direction that is left to lines must have some.
@@ -232,13 +213,17 @@ def left_open(
     ``unseen`` is of :func:`unseen_by_planes`, ``least`` as in :meth:`Localizability.weak`.
     """
     among = _mixed(matches.edges, map_T_lidar, unseen)
-    by_lines = line_sight(matches.edges, map_T_lidar, among.vectors).sum(axis=0)
+    lines = line_sight(matches.edges, map_T_lidar, among.vectors).sum(axis=0)
     p = matches.planes
     normals = p.normals @ map_T_lidar.rotation().matrix()
     tilts = np.zeros(len(p)) if p.tilts is None else p.tilts
-    by_planes = _sight(p.points, normals, tilts, among.vectors).sum(axis=0)
-    left = (by_lines < _HELD * least) | (by_lines + by_planes < least)
-    return Directions(among.vectors[left], among.shares[left]) if left.any() else None
+    planes = _sight(p.points, normals, tilts, among.vectors).sum(axis=0)
+    left = (lines < _HELD * least) | (lines + planes < least)
+    parts = [
+        Directions(among.vectors[mask], among.shares[mask]) if mask.any() else None
+        for mask in (left, ~left)
+    ]
+    return parts[0], parts[1]
 
 
 def _mixed(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, unseen: Directions) -> Directions:

@@ -128,18 +128,7 @@ class PoseErrors:
         to_map = middle.AdjointMap()
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self.config.drift if first else self.config.drift
-        step = self._expected.observe(sweep.stamp, scan.expected, scan.raw, turned=_turned(sweep))
-        blind = self._blind + to_map @ step.by_velocity
-        self._blind, faded = blind @ step.kept.T, np.eye(6) - step.kept.T @ step.kept
-        self._forgotten = self._forgotten - np.log(np.clip(np.diag(step.kept), _LEAST_KEPT, 1.0))
-        by_chance = factor * scan.renewed + step.by_chance
-        if solution.weak is not None and solution.localizability is not None:
-            moved = step.by_velocity @ step.by_velocity.T + step.by_chance
-            rows = len(solution.matches) / max(scan.effective_matches, 1.0)
-            by_chance = by_chance + rows * solution.localizability.wander(moved)
-        self._drift = self._drift + symmetric(
-            to_map @ by_chance @ to_map.T + blind @ _positive(faded) @ blind.T
-        )
+        self._add_drift(sweep, solution, scan, factor * scan.renewed)
         own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
@@ -166,6 +155,29 @@ class PoseErrors:
         """Start anew in time: the next frame is on another clock than the frames before."""
         self._last = None
         self._expected.cut()
+
+    def _add_drift(
+        self, sweep: MovingSweep, solution: Solution, scan: ScanError, renewed: FloatArray
+    ) -> None:
+        """What new ground adds to the map's error, and the expected motion where it is alone."""
+        to_map, share, seen = solution.map_T_lidar.AdjointMap(), scan.expected, None
+        if solution.weak is not None and share.any():
+            seen = solution.localizability
+        if seen is not None:
+            rows = len(solution.matches) / max(scan.effective_matches, 1.0)
+            share = seen.without_noise(share, rows)
+        step = self._expected.observe(sweep.stamp, share, scan.raw, turned=_turned(sweep))
+        by_chance = renewed + step.by_chance
+        if seen is not None:
+            moved = step.by_velocity @ step.by_velocity.T + step.by_chance
+            by_chance = by_chance + rows * seen.wander(moved)
+        blind = self._blind + to_map @ step.by_velocity
+        faded = _positive(np.eye(6) - step.kept.T @ step.kept)
+        self._drift = self._drift + symmetric(
+            to_map @ by_chance @ to_map.T + blind @ faded @ blind.T
+        )
+        self._blind = blind @ step.kept.T
+        self._forgotten = self._forgotten - np.log(np.clip(np.diag(step.kept), _LEAST_KEPT, 1.0))
 
     def skipped(self, sweep: MovingSweep) -> None:
         """Account for a sweep whose pose is the expected one; the very first begins the map."""

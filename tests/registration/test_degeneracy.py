@@ -1,6 +1,6 @@
 """Which directions a scan fixes: closed-form scenes, false information, and what takes over."""
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import gtsam
 import numpy as np
@@ -11,7 +11,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config
-from loam_gtsam.registration.degeneracy import left_open, localizability, unseen_by_planes
+from loam_gtsam.registration.degeneracy import by_lines, localizability, unseen_by_planes
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, subset
 from loam_gtsam.registration.report import status_of
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, Matcher, MotionPrior
@@ -191,13 +191,54 @@ def test_no_direction_is_left_to_lines_that_vanish(left, weak):
 
 def test_what_lines_leave_open_is_a_turn_about_the_one_pole():
     matches = ScanMatches(lines(np.tile([4.0, 3, 0], (20, 1))), surfaces(*ground()))
-    unseen = localizability(replace(matches, edges=NO_EDGES), POSE).open(LEAST)
-    left = left_open(matches, POSE, unseen, LEAST)
+    unseen = localizability(replace(matches, edges=NO_EDGES), POSE).between(-1.0, LEAST)
+    left = by_lines(matches, POSE, unseen, LEAST)[0]
     assert (len(unseen), len(left)) == (3, 1)
     turn = left.vectors[0] / left.vectors[0, 2]
     np.testing.assert_allclose(turn[[3, 4]], [3.0, -4.0], atol=0.1)  # (4, 3) does not move
     np.testing.assert_allclose(left.projector @ left.vectors[0], left.vectors[0], atol=1e-9)
     np.testing.assert_allclose(left.projector @ left.projector, left.projector, atol=1e-9)
+
+
+def corridor_with_end(count, follows):
+    """A corridor with so many points on an end wall; one that ``follows`` is wherever one is."""
+    points, normals = room()
+    end = np.column_stack(
+        [np.full(count, 20.0), *np.random.default_rng(3).uniform(-2, 2, (2, count))]
+    )
+    walls, wall = (
+        surfaces(points, normals, noise=0.02),
+        surfaces(end, np.tile(np.eye(3)[0], (count, 1))),
+    )
+
+    def associate(pose):
+        here = pose.matrix()[:3, :3] @ end.T + pose.translation()[:, None]
+        offsets = -np.einsum("ij,ij->i", wall.normals, here.T) if follows else wall.offsets
+        parts = replace(walls, distances=walls.distances), replace(wall, offsets=offsets)
+        both = {
+            item.name: np.concatenate([getattr(part, item.name) for part in parts])
+            for item in fields(PlaneMatches)
+        }
+        return ScanMatches(NO_EDGES, PlaneMatches(**both))
+
+    return associate
+
+
+@pytest.mark.parametrize(
+    ("count", "follows", "weak"), [(14, False, 0), (14, True, 1), (3, False, 1), (60, False, 0)]
+)
+def test_few_matches_are_believed_if_they_bring_a_displaced_pose_back(count, follows, weak):
+    """Accidental planes of noise move with the pose; an end wall stays where it is."""
+    associate = corridor_with_end(count, follows)
+    assert (localizability(associate(POSE), POSE).aligned[0] < LEAST) == (count < LEAST)
+    solution = GtsamSolver(SolverConfig()).solve(
+        associate, GUESS, (), MotionPrior(GUESS, 1e4 * np.eye(6))
+    )
+    assert solution.n_weak == weak
+    error = POSE.localCoordinates(solution.map_T_lidar)
+    expected = POSE.localCoordinates(GUESS)[3] if weak else 0.0
+    assert error[3] == pytest.approx(expected, abs=0.05)
+    assert np.abs(np.delete(error, 3)).max() < 0.02
 
 
 def test_planes_are_believed_where_lines_see_too_little():
@@ -403,3 +444,22 @@ def test_no_false_alarm(scene):
     assert {update.status for update in updates[1:]} == {FrameStatus.OK}
     assert min(update.localizability[0] for update in updates[1:]) > LEAST
     assert min(update.axis_localizability.min() for update in updates[1:]) > LEAST
+
+
+@pytest.mark.parametrize(("mixed", "pure"), [(0.001, True), (0.2, False)])
+def test_a_translation_is_freed_of_the_rotation_that_noise_adds(mixed, pure):
+    """Along a corridor; a motion with a turn that the walls would show is left as it is."""
+    seen = found(surfaces(*room(), noise=0.02))
+    along = np.array([0.0, 0.0, mixed, 1.0, 0.0, 0.0])
+    blind = np.outer(along, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0])
+    cleaned = seen.without_noise(blind, 1.0)
+    expected = blind * [[0], [0], [0], [1], [1], [1]] if pure else blind
+    np.testing.assert_allclose(cleaned, expected, atol=1e-4)
+
+
+def test_a_blind_way_turns_towards_translations_by_the_noise_of_the_normals():
+    seen = found(surfaces(*room(), tilt=0.05, noise=0.02))
+    wander = seen.wander(np.diag([0.0, 0.0, 0.0, 4.0, 0.0, 0.0]))
+    np.testing.assert_array_equal(wander[:3], 0.0)
+    across = 2.0 * 0.05 / np.sqrt(400)  # 2 m along, 400 normals across y or z
+    np.testing.assert_allclose(np.sqrt(np.diag(wander)[4:]), across, rtol=0.3)

@@ -20,14 +20,20 @@ from loam_gtsam.factors import (
 from loam_gtsam.registration.degeneracy import (
     Directions,
     Localizability,
-    left_open,
+    by_lines,
     line_sight,
     localizability,
     unseen_by_planes,
-    with_translations,
 )
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.solvers.base import POSE_KEY, Associate, MotionPrior, Solution, rematch
+from loam_gtsam.registration.solvers.base import (
+    POSE_KEY,
+    Associate,
+    Matcher,
+    MotionPrior,
+    Solution,
+    rematch,
+)
 from loam_gtsam.types import BoolArray, FloatArray
 
 _REDESCENDING = 2.816
@@ -42,6 +48,11 @@ _FUSE.setlambdaInitial(1e-12)  # a single pose near its optimum: plain Gauss-New
 _FUSE.setRelativeErrorTol(1e-14)
 _FUSE.setAbsoluteErrorTol(0.0)
 
+_FEW = 3.0  # times ``min_aligned`` below which a direction is tried before it is believed
+_PUSH = 0.2  # metres (root mean square of the points) by which the pose is displaced for that
+_COMES_BACK = 0.25
+"""Least share of the displacement that one more association must undo. It is the share of true
+information: below, that of noise is three times as much."""
 _CERTAIN = 1e10  # information that outweighs every other factor: 0.01 mrad and 0.01 mm
 
 
@@ -78,7 +89,36 @@ class GtsamSolver:
                 sight = _Sight() if motion is None else _sight_of(matches, pose, self.config)
             return self._optimise(matches, pose, sight, expected, priors)
 
+        found = rematch(associate, guess, self.config, optimise)
+        if sight is None or not found.solved or self.config.degeneracy == "off":
+            return found
+        doubted = sight.doubted(found, self.config.min_aligned)
+        if doubted is None:
+            return found
+        lost = self._returns(associate, found, doubted, sight, expected) < _COMES_BACK
+        if not lost.any():
+            return found
+        sight = sight.without(lost, self.config.min_aligned)
         return rematch(associate, guess, self.config, optimise)
+
+    def _returns(
+        self,
+        associate: Associate,
+        found: Solution,
+        doubted: Directions,
+        sight: _Sight,
+        expected: MotionPrior | None,
+    ) -> FloatArray:
+        """(W,) share of a displacement along each direction that one more association undoes."""
+        away = found.map_T_lidar.retract(_PUSH * doubted.vectors.sum(axis=0))
+        if isinstance(associate, Matcher):
+            associate = associate.deskewed(found.map_T_lidar)
+        matches = associate(away)
+        if len(matches) < self.config.min_matches:
+            return np.zeros(len(doubted))
+        back = self._optimise(matches, away, sight, expected, ()).map_T_lidar
+        returned: FloatArray = doubted.shares @ away.localCoordinates(back) / -_PUSH
+        return returned
 
     def _optimise(
         self,
@@ -98,7 +138,7 @@ class GtsamSolver:
         beacons = np.zeros(len(rows.points), np.bool_)
         if sight.unseen is not None:
             unseen = sight.unseen
-            weak = left_open(matches, pose, unseen, config.min_aligned)
+            weak = by_lines(matches, pose, unseen, config.min_aligned)[0]
             seen = line_sight(matches.edges, pose, unseen.vectors)
             beacons[: 2 * len(seen)] = np.repeat(seen.any(axis=1), 2)
         blind, without = (None if part is None else part.projector for part in (weak, unseen))
@@ -130,12 +170,31 @@ class _Sight:
     weak: Directions | None = None  # the degenerate directions
     unseen: Directions | None = None  # left to lines; None where planes fix all that is fixed
 
+    def doubted(self, found: Solution, least: float) -> Directions | None:
+        """The directions that few matches fix, without the weak ones; None if there are none."""
+        if self.scan is None:
+            return None
+        if self.unseen is None:
+            return self.scan.between(least, _FEW * least)
+        return by_lines(found.matches, found.map_T_lidar, self.unseen, least)[1]
+
+    def without(self, lost: BoolArray, least: float) -> _Sight:
+        """Such that the lost ones of the doubted directions are weak."""
+        if self.unseen is not None:
+            return replace(self, weak=self.unseen, unseen=None)
+        assert self.scan is not None
+        few = np.flatnonzero((self.scan.aligned >= least) & (self.scan.aligned < _FEW * least))
+        aligned = self.scan.aligned.copy()
+        aligned[few[lost]] = 0.0
+        scan = replace(self.scan, aligned=aligned)
+        return replace(self, scan=scan, weak=scan.between(-1.0, least))
+
 
 def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> _Sight:
-    scan = with_translations(localizability(matches, pose), matches, pose, config.min_aligned)
+    scan = localizability(matches, pose)
     weak = unseen = None
     if config.degeneracy != "off":
-        weak = scan.open(config.min_aligned)
+        weak = scan.between(-1.0, config.min_aligned)
     if config.degeneracy == "prior":
         unseen = unseen_by_planes(matches, pose, scan, config.min_aligned)
     return _Sight(scan, weak, unseen)

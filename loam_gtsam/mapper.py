@@ -282,9 +282,8 @@ class Mapper:
             frame, found = self._start.add(frame, found, self.keyframe, self.solver)
             self._start = None if self._start.complete else self._start
         solution = found.solution
-        if not solution.matches.wide:
-            fit = Fit.of(solution.matches, frame.matcher.offered)
-            self.monitor.accept(fit, solution.map_T_lidar)
+        fit = Fit.of(solution.matches, frame.matcher.offered)
+        self.monitor.accept(fit, solution.map_T_lidar)
         posed, tilt = frame.sweep.at(found.twist), TiltPrior.NONE
         if self.imu is None:
             pose = solution.map_T_lidar.compose(posed.middle_T_reference)

@@ -199,9 +199,9 @@ class MatchingConfig(Section):
     max_distance: float = parameter(1.0, unit="m", source="LOAM", low=0.0)
     """A feature is matched only if its nearest map points are all within this distance."""
     wide_search: float = parameter(4.0, source="LOAM has no such search", low=1.0)
-    """With fewer matches than solver.min_matches, the search is repeated with max_distance and the
-    voxels of the map enlarged by this factor. This helps at the start on open ground, where the
-    rings of one sweep are too far apart; 1 turns the search off."""
+    """While the map is thin, and fewer than half of the plane features have planes near by, the
+    others are matched with planes within this times max_distance, among voxels enlarged by this
+    factor: at the start the rings of a sweep are too far apart. 1 turns the search off."""
     wide_below: float = parameter(8.0, low=0.0)
     """Lines are searched for within wide_search times max_distance, too, if fewer planes than this
     fix a translation, counted as if they lay across it."""

@@ -16,14 +16,18 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.registration.association import (
     chosen_rows,
     match_features,
+    match_surfaces,
     rematched,
     trial_matching,
 )
-from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search
+from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, joined
 from loam_gtsam.registration.odometry import Moment, Prediction, twist_to
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
 from loam_gtsam.types import FloatArray
+
+_FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
+_THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: some twenty sweeps
 
 
 class MapPair:
@@ -40,7 +44,7 @@ class MapPair:
         """Forget all points."""
         self.edges = CubeMap(self.config, self.config.edge_voxel)
         self.planes = CubeMap(self.config, self.config.plane_voxel)
-        self._thinned: tuple[CubeMap, CubeMap] | None = None
+        self._thinned: CubeMap | None = None
 
     def recenter(self, map_T_lidar: gtsam.Pose3) -> None:
         """Let the windows follow.
@@ -100,10 +104,10 @@ class MapPair:
         self._thinned = None
         return self.edges.move(moves) + self.planes.move(moves)
 
-    def thinned(self, factor: float) -> tuple[CubeMap, CubeMap]:
-        """Both with voxels larger by a factor, the same at every call; made once a sweep."""
+    def thinned(self, factor: float) -> CubeMap:
+        """The planes with voxels larger by a factor, the same at every call; made once a sweep."""
         if self._thinned is None:
-            self._thinned = self.edges.thinned(factor), self.planes.thinned(factor)
+            self._thinned = self.planes.thinned(factor)
         return self._thinned
 
 
@@ -113,7 +117,7 @@ class FrameMatcher(Matcher):
 
     posed: PosedSweep
     maps: MapPair  # which must not change while the matcher is in use
-    config: Config  # of which ``solver.min_matches`` is used
+    config: Config
     matching: MatchingConfig
     rows: ChosenRows
     last: Moment | None  # middle of the last sweep, from which ``deskewed`` takes the motion
@@ -194,14 +198,24 @@ class FrameMatcher(Matcher):
         features = *self.posed.rows(self.rows.edges, self.rows.planes), map_T_lidar
         maps, config = (self.maps.edges, self.maps.planes), self.matching
         matches = match_features(*features, *maps, config, self.rows)
-        wide = len(matches) < self.config.solver.min_matches and config.wide_search > 1.0
-        if wide:
-            # One sweep alone on open ground: five neighbours lie on one ring. Seen more coarsely,
-            # there are others among them.
-            reach = config.wide_search * config.max_distance
-            maps = self.maps.thinned(config.wide_search)
-            matches = match_features(*features, *maps, config, self.rows, reach)
-        return replace(matches, search=Search(map_T_lidar, self.posed, matches, wide))
+        few = len(matches.planes) < _FEW * len(self.rows.planes)
+        if few and config.wide_search > 1.0 and maps[1].count() < _THIN:
+            matches = self._with_wide_planes(matches, map_T_lidar)
+        return replace(matches, search=Search(map_T_lidar, self.posed, matches))
+
+    def _with_wide_planes(self, matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> ScanMatches:
+        """The matches, and wider planes for the plane features that have none near by.
+
+        In a map of a few sweeps the five points nearest to a point of the ground lie on one ring,
+        and make no plane. Seen more coarsely, there are others among them.
+        """
+        config, coarse = self.matching, self.maps.thinned(self.matching.wide_search)
+        left = np.setdiff1d(self.rows.planes, matches.planes.indices, assume_unique=True)
+        _, points = self.posed.rows(self.rows.edges[:0], left)
+        reach = config.wide_search * config.max_distance
+        wide, _ = match_surfaces(points, map_T_lidar.matrix(), coarse, config, reach)
+        wide = replace(wide, indices=left[wide.indices])
+        return replace(matches, planes=joined(matches.planes, wide))
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:

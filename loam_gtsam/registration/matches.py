@@ -85,11 +85,6 @@ class ScanMatches:
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
 
-    @property
-    def wide(self) -> bool:
-        """Whether the matches come from a wide search; see :class:`Search`."""
-        return self.search is not None and self.search.wide
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:
@@ -98,7 +93,6 @@ class Search:
     map_T_lidar: gtsam.Pose3
     posed: PosedSweep  # whose points were searched for
     found: ScanMatches
-    wide: bool  # whether, after too few matches, the map was thinned and the reach enlarged
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -124,10 +118,11 @@ def subset(matches: _Matches, keep: BoolArray) -> _Matches:
 
 
 def joined(first: _Matches, second: _Matches) -> _Matches:
-    """All matches of both, in the order of the features, without ``distinct``."""
+    """All matches of both, in the order of the features; a column that one lacks is left out."""
     columns: dict[str, Any] = {}
     order = np.argsort(np.concatenate([first.indices, second.indices]), kind="stable")
     for item in fields(first):
         parts = getattr(first, item.name), getattr(second, item.name)
-        columns[item.name] = None if parts[0] is None else np.concatenate(parts)[order]
+        missing = parts[0] is None or parts[1] is None
+        columns[item.name] = None if missing else np.concatenate(parts)[order]
     return replace(first, **columns)

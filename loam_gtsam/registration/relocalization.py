@@ -163,9 +163,7 @@ def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: 
     expected = advance(moment.map_T_lidar, last_twist, seconds)
     if monitor.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
         return True
-    # The fit of a wide search cannot be compared with the usual fit.
-    fit = Fit.of(solution.matches, frame.matcher.offered)
-    return not solution.matches.wide and monitor.misfit(fit)
+    return monitor.misfit(Fit.of(solution.matches, frame.matcher.offered))
 
 
 def second_opinion(

@@ -12,6 +12,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
+from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.association import match_planes
 from loam_gtsam.registration.frame_matcher import FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment
@@ -102,7 +103,7 @@ def test_deskewing_anew_makes_another_matcher(parts, matcher):
     assert plain.deskewed(HERE) is plain
 
 
-def test_with_too_few_matches_the_search_is_wide_and_equals_brute_force():
+def test_with_few_planes_the_search_is_wide_and_equals_brute_force():
     """Map points 1.5 m apart have no five neighbours within 1 m."""
     rng = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(*[np.arange(-15.0, 15.0, 1.5)] * 2), axis=-1).reshape(-1, 2)
@@ -116,12 +117,11 @@ def test_with_too_few_matches_the_search_is_wide_and_equals_brute_force():
     maps = MapPair(CONFIG.map)
     maps.insert(first.at(np.zeros(6)), gtsam.Pose3(), 0)
     found = matcher_of(second, Moment(0, gtsam.Pose3(), True), maps)(HERE)
-    assert found.wide
     assert len(found) > 30
 
     config = CONFIG.matching
     reach = config.wide_search * config.max_distance
-    known = maps.thinned(config.wide_search)[1].points()
+    known = maps.thinned(config.wide_search).points()
     points = second.at(TWIST).points[1]
     there = transform(HERE.matrix(), points)
     distances = cdist(there, known)
@@ -139,8 +139,21 @@ def test_the_thinned_map_follows_the_window_without_an_insertion():
     maps = MapPair(Config().map)
     points = np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3))
     maps.planes.insert(points)
-    here = maps.thinned(4.0)[1]
+    here = maps.thinned(4.0)
     assert here.count() > 0
-    assert maps.thinned(4.0)[1] is here
+    assert maps.thinned(4.0) is here
     maps.recenter(gtsam.Pose3(gtsam.Rot3(), np.array([5000.0, 0.0, 0.0])))
-    assert maps.thinned(4.0)[1].count() == 0
+    assert maps.thinned(4.0).count() == 0
+
+
+def test_in_a_map_that_has_enough_planes_none_is_searched_for_widely(matcher, monkeypatch):
+    """The room is small: its planes are dense from the first sweep on."""
+    found = matcher(HERE)
+    assert len(found.planes) > 0.5 * len(matcher.rows.planes)
+    monkeypatch.setattr(frame_matcher, "_FEW", 1.0)
+    wider = matcher(HERE)
+    assert len(wider.planes) > len(found.planes)
+    near = np.isin(wider.planes.indices, found.planes.indices)
+    np.testing.assert_array_equal(wider.planes.normals[near], found.planes.normals)
+    monkeypatch.setattr(frame_matcher, "_THIN", 10)
+    assert same(matcher(HERE), found)

@@ -147,6 +147,17 @@ def joined(parts: Sequence[CubePoints]) -> CubePoints:
     return CubePoints(*map(np.concatenate, zip(Cube().content, *parts, strict=True)))
 
 
+def _order(keys: IntArray, numbers: IntArray) -> IntArray:
+    """Rows (N,) by number, then by key, then as given; in half of ``np.lexsort``'s time."""
+    order = keys.argsort()  # numpy's fastest, but equal keys come in any order
+    runs = np.cumsum(np.diff(keys[order]) != 0)
+    order[1:] += len(keys) * runs
+    order.sort()
+    order %= len(keys)
+    small = numbers[order].astype(np.min_scalar_type(int(numbers.max())))
+    return order[small.argsort(kind="stable")]  # by radix for two bytes
+
+
 def mark_second(
     content: CubePoints, faces: Faces, cubes: Mapping[CubeIndex, Cube], grid: Grid
 ) -> None:
@@ -193,7 +204,7 @@ class SortedPoints(NamedTuple):
         box = tuple((steps.max(axis=1) + 1).tolist())
         numbers = np.ravel_multi_index(tuple(steps), box)
         keys = content.keys(grid)
-        order = np.lexsort((keys, numbers))  # stable
+        order = _order(keys, numbers)
         keys, numbers = keys[order], numbers[order]
         starts = run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))
         numbers = numbers[starts]

@@ -129,8 +129,8 @@ class MapConfig(Section):
     plane_voxel: float = parameter(0.4, unit="m", source="LOAM", low=0.01)
     """The plane map keeps one point per voxel of this size."""
     insertion: Literal["settled", "centroid"] = parameter("settled")
-    """New points enter a cube in this way: settled keeps the first point of a voxel; centroid
-    filters the cube again with its new points, as LOAM does."""
+    """New points enter a cube in this way: settled keeps the first point of a voxel, and one of
+    each face of a thin wall; centroid filters the cube again with its new points, as LOAM does."""
     archive_megabytes: float = parameter(512.0, unit="MB", low=0.0)
     """Cubes that left the window take at most this much memory. Beyond it, the oldest go to
     archive_dir, or are dropped and counted if archive_dir is not set."""

@@ -194,7 +194,8 @@ def test_a_restored_map_goes_on_with_the_archive_it_had(
     for stop in range(4):
         going.recenter(np.array([20.0 * stop, 0.0, 0.0]))
         going.owner = stop
-        going.insert(rng.normal((20.0 * stop, 0.0, 0.0), 3.0, (100, 3)))
+        seen_from = np.array([20.0 * stop, 0.0, 9.0])
+        going.insert(rng.normal((20.0 * stop, 0.0, 0.0), 3.0, (100, 3)), seen_from)
     thaw(freeze({"map": going}, {"config": config}), {"map": resumed}, {"config": config})
     assert resumed.stats == going.stats
     moved = {1: moved_by(7.0), 3: moved_by(-30.0)}
@@ -206,3 +207,7 @@ def test_a_restored_map_goes_on_with_the_archive_it_had(
     assert resumed.stats == going.stats
     assert going.stats.restored > 0
     np.testing.assert_array_equal(resumed.points(archived=True), going.points(archived=True))
+    cubes = going.neighbourhood(np.eye(4))
+    found, again = (cube_map.nearest(extra, 5, 2.0, cubes).views for cube_map in (going, resumed))
+    np.testing.assert_array_equal(again, found)
+    assert found.any() == (insertion == "settled")

@@ -104,9 +104,8 @@ class Cube(KeyTable):
 
     def tags_at(self, keys: IntArray) -> Tags:
         """Tags (V, 2) of the points that are first in voxels; those of unknown view if none is."""
-        at, present = find_in_sorted(self.columns[0], keys)
         found = tags_of(len(keys), 0)
-        found[present] = self.columns[2][at[present]]
+        self.look_up(keys, 2, found)
         return found
 
     def settle(self, new: VoxelPoints) -> CubePoints:

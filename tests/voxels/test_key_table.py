@@ -14,6 +14,9 @@ def test_a_table_is_a_dictionary_in_the_order_of_its_keys() -> None:
         rows, owners = rng.normal(size=(len(keys), 2)), np.full(len(keys), step, np.int32)
         held = [key in expected for key in keys.tolist()]
         assert table.holds(keys).tolist() == held
+        owned = np.full(len(keys), -1)
+        table.look_up(keys, 2, owned)
+        assert owned.tolist() == [expected.get(key, (-1,))[-1] for key in keys.tolist()]
         added = table.add(keys, rows, owners)
         assert added.tolist() == np.flatnonzero(~np.array(held, np.bool_)).tolist()
         expected |= {int(keys[i]): (*rows[i], step) for i in added}

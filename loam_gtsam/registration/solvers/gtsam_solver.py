@@ -98,8 +98,7 @@ class GtsamSolver:
         lost = self._returns(associate, found, doubted, sight, expected) < _COMES_BACK
         if not lost.any():
             return found
-        sight = sight.without(lost, self.config.min_aligned)
-        return rematch(associate, guess, self.config, optimise)
+        return sight.without(lost, self.config.min_aligned).told_of(found, expected)
 
     def _returns(
         self,
@@ -188,6 +187,19 @@ class _Sight:
         aligned[few[lost]] = 0.0
         scan = replace(self.scan, aligned=aligned)
         return replace(self, scan=scan, weak=scan.between(-1.0, least))
+
+    def told_of(self, found: Solution, expected: MotionPrior | None) -> Solution:
+        """The solution with its pose, and the information of these weak directions."""
+        if self.weak is None or expected is None:
+            return found
+        weak = self.weak.projector
+        keep, added = np.eye(6) - weak, expected.along(weak).information
+        information = keep.T @ found.information @ keep + added
+        beacons = None if found.beacons is None else np.zeros_like(found.beacons)
+        return replace(
+            found, localizability=self.scan, weak=weak, unseen=weak, beacons=beacons,
+            information=information, expected=added,
+        )  # fmt: skip
 
 
 def _sight_of(matches: ScanMatches, pose: gtsam.Pose3, config: SolverConfig) -> _Sight:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -21,6 +22,7 @@ from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buf
 from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Sweep, SweepError
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
+_BLIND = (FrameStatus.LOST, FrameStatus.FEW_MATCHES, FrameStatus.DEGENERATE)
 _MESSAGES, _TRIED_SWEEPS = 3, 5
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
@@ -52,7 +54,22 @@ def summary(
         rows |= _imu_facts(result.imu)
         notes += _imu_problems(result.imu)
     notes += _odd_frames(result.updates)
-    return Group(_table(name, rows), *(Text(f"  {note}", style="yellow") for note in notes))
+    texts = [Text(f"  {note}", style="yellow") for note in notes]
+    if warning := _warning(result.updates):
+        texts.append(Text(f"  {warning}", style="bold red"))
+    return Group(_table(name, rows), *texts)
+
+
+def _warning(updates: Sequence[MapUpdate]) -> str:
+    """One line about the poses that no scan has fixed, "" if there are none."""
+    blind = [number for number, update in enumerate(updates) if update.status in _BLIND]
+    if not blind:
+        return ""
+    counts = _counts(Counter(updates[number].status for number in blind))
+    return (
+        f"{len(blind)} of {len(updates)} poses are not fixed by their scans ({counts}), first that "
+        f"of frame {blind[0]}: see their covariances"
+    )
 
 
 def _dropped(result: RunResult) -> str:

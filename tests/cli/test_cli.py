@@ -154,6 +154,12 @@ def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
         assert data["messages"][-1] == "damaged 6"
 
 
+def test_poses_that_no_scan_fixes_are_told_in_one_line():
+    assert "not fixed" not in said("run", "sim:room?frames=3&columns=300", "--output", "room")
+    text = said("run", "sim:open_field?frames=4&columns=300", "--output", "field")
+    assert "3 of 4 poses are not fixed by their scans (3 degenerate), first that of frame 1" in text
+
+
 @pytest.mark.parametrize(
     ("items", "message", "written"),
     [

@@ -97,7 +97,7 @@ PRESETS: dict[str, Config] = {
     # Zhang and Singh, LOAM (RSS 2014), constants of the published laserMapping.
     "loam": Config().changed(
         _CLASSICAL,
-        {"solver": {"method": "loam", "min_map_planes": 101}},
+        {"solver": {"method": "loam", "iterations": 10, "min_map_planes": 101}},
         {"imu": {"prior": "blend", "weight": 0.002, "average_seconds": 0.0}},
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings. It has no minimum of

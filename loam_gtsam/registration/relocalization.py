@@ -193,8 +193,8 @@ def search(
     """Search for the pose of a sweep whose solution is doubtful.
 
     The motion of a lidar that was carried away between two sweeps says nothing about the motion
-    within the sweeps. These velocities are tried: the predicted one, rest, the predicted one in axes
-    that were turned on the vehicle, and that of a drive from the last pose to the one found.
+    within the sweeps. These velocities are tried: the predicted one, rest, the predicted one in
+    axes that were turned on the vehicle, and that of a drive from the last pose to the one found.
     """
     matcher, steady = frame.matcher, frame.matcher.posed.twist
     usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)

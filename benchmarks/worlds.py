@@ -30,10 +30,12 @@ from loam_gtsam.datasets.base import ChangedDataset, DatasetInfo
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.studies.evaluation import absolute_error, interpolate
-from loam_gtsam.types import FloatArray, FrameStatus, LoamError, Trajectory
+from loam_gtsam.types import FloatArray, FrameStatus, LoamError, MapUpdate, Trajectory
 
 WINDOWS = (1, 10, 50)
 """Frames over which the error of a motion is held against its covariance."""
+START = 0
+"""The window that stands for the pose since the start of the map."""
 FREEDOM = 6
 FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), FREEDOM))
 """Squared Mahalanobis distance of a pose that is as unlikely as five standard deviations."""
@@ -242,26 +244,12 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
     seconds = [sum(t for name, t in update.timings.items() if name != "read") for update in updates]
     nees: dict[str, FloatArray] = {}
     broken = 0
-    for window in WINDOWS:
-        pairs = [
-            (a, b, true[k].between(true[k + window]))
-            for k, (a, b) in enumerate(zip(updates, updates[window:], strict=False))
-            if a.uncertainty is not None and b.uncertainty is not None
-        ]
-        found = [
-            _squared(
-                a.map_T_lidar.between(b.map_T_lidar).localCoordinates(motion),
-                relative_covariance(a, b),
-            )
-            for a, b, motion in pairs
-        ]
-        nees[str(window)] = np.array([value for value in found if value is not None])
+    for window in (*WINDOWS, START):
+        found = list(squared_errors(updates, true, window).values())
+        nees[name_of(window)] = np.array([value for value in found if value is not None])
         broken += found.count(None)
-    solved = [k for k, update in enumerate(updates) if update.uncertainty is not None]
-    since = [_squared(errors[k], updates[k].covariance) for k in solved]
-    broken += since.count(None)
-    nees["start"] = np.array([value for value in since if value is not None])
-    far = [k for k, value in zip(solved, since, strict=True) if value is None or value > FIVE_SIGMA]
+    since = squared_errors(updates, true, START)
+    far = [k for k, value in since.items() if value is None or value > FIVE_SIGMA]
     good = sum(updates[k].status is FrameStatus.OK for k in far)
     return replace(
         row,
@@ -277,6 +265,31 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
         statuses=dict(Counter(str(update.status) for update in updates)),
         ms=1e3 * float(np.median(seconds)),
     )
+
+
+def squared_errors(
+    updates: Sequence[MapUpdate], true: Sequence[gtsam.Pose3], window: int
+) -> dict[int, float | None]:
+    """By number of the later frame: squared Mahalanobis distance of each motion over a window.
+
+    For the window :data:`START`, of each pose against the first one, which is where the map is and
+    has no error. Only solved frames count; None stands for what is no covariance.
+    """
+    found = {}
+    for k in range(window or 1, len(updates)):
+        start = k - window if window else 0
+        earlier, later = updates[start], updates[k]
+        if later.uncertainty is None or (window and earlier.uncertainty is None):
+            continue
+        covariance = relative_covariance(earlier, later) if window else later.covariance
+        moved = earlier.map_T_lidar.between(later.map_T_lidar)
+        found[k] = _squared(moved.localCoordinates(true[start].between(true[k])), covariance)
+    return found
+
+
+def name_of(window: int) -> str:
+    """Of a window in tables."""
+    return str(window) if window else "start"
 
 
 def _squared(error: FloatArray, covariance: FloatArray) -> float | None:
@@ -336,7 +349,7 @@ class Line:
             f"{1e3 * max(row.ate for row in rows):.0f}",
             f"{max(row.start_deg for row in rows):.2f}",
             f"{1e3 * max(row.start_m for row in rows):.0f}",
-            *(_marked(self.nees(window)) for window in (*map(str, WINDOWS), "start")),
+            *(_marked(self.nees(name_of(window))) for window in (*WINDOWS, START)),
             *(str(sum(column)) for column in zip(*((row.beyond, row.beyond_degenerate, row.broken)
                                                    for row in rows), strict=True)),
             f"{fine}/{total}" + "".join(f", {text}" for text in others),

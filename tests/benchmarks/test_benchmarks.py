@@ -16,7 +16,6 @@ import pytest
 from benchmarks import __main__ as tool
 from benchmarks import (
     cases,
-    consistency,
     growth,
     kills,
     loops,
@@ -29,6 +28,7 @@ from benchmarks import (
     soak_faults,
     study,
     study_figures,
+    worlds,
 )
 from benchmarks.cases import Case, CaseResult, PeerResult, judge
 from benchmarks.growth_report import GrowthResult
@@ -61,7 +61,7 @@ class InProcess:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    for module in (growth, robustness, soak, consistency, scenes, study, loops):
+    for module in (growth, robustness, soak, worlds, scenes, study, loops):
         if hasattr(module, "ProcessPoolExecutor"):
             monkeypatch.setattr(module, "ProcessPoolExecutor", InProcess)
     return monkeypatch
@@ -91,13 +91,16 @@ def test_cases_are_measured_beside_their_targets(tmp_path: Path, here: pytest.Mo
     assert "tottime" in tool.profile("room", tmp_path)[1]
 
 
-def test_covariances_are_measured_the_same_by_any_number_of_workers(tmp_path: Path) -> None:
-    one, two = (consistency.measure(consistency.QUICK, workers) for workers in (1, 2))
-    assert one == two
-    assert [row.window for row in one] == ["1", "5", "start", "1"]
-    paths = consistency.write(one, tmp_path)
-    assert [path.name for path in paths] == ["nees.csv", "nees.md", "nees.png"]
-    assert all(0.0 < float(row["mean"]) < 50.0 for row in table(paths[0]))
+def test_worlds_are_judged_the_same_by_any_number_of_workers(tmp_path: Path) -> None:
+    for workers in ("1", "2"):
+        options = ["--quick", "--seeds", "2", "--modes", "lidar", "--workers", workers]
+        against = ["--against", str(tmp_path / "1" / "worlds.json")] if workers == "2" else []
+        assert worlds.main([*options, *against, "--output", str(tmp_path / workers)]) == 0
+    one, two = (worlds.read(tmp_path / workers / "worlds.json") for workers in ("1", "2"))
+    assert [replace(row, ms=0.0) for row in one] == [replace(row, ms=0.0) for row in two]
+    assert [row.seed for row in one] == [0, 1]
+    assert all(0.0 < row.ate < 0.05 and row.broken == row.beyond == 0 for row in one)
+    assert "geometric mean 1.000, worst 1.00" in (tmp_path / "2" / "worlds.md").read_text("utf-8")
 
 
 def test_long_drives_leave_cubes_behind_and_keep_them(
@@ -261,14 +264,18 @@ def random_walk(rng: np.random.Generator, frames: int) -> tuple[list[MapUpdate],
 
 @pytest.mark.parametrize("window", [1, 10, 50])
 def test_right_covariances_have_a_nees_of_one(window: int) -> None:
-    rng, room = np.random.default_rng(2), consistency.Study("room", 1)
-    parts = [consistency.samples(room, window, *random_walk(rng, 400)) for _ in range(10)]
-    row = consistency.summarise(parts)
-    assert 0.85 < row.mean < 1.15
-    assert 0.92 < row.coverage < 0.975
-    assert row.within
-    assert not replace(row, mean=2.01).within
-    assert not replace(row, coverage=0.84).within
+    rng = np.random.default_rng(2)
+    runs = [worlds.squared_errors(*random_walk(rng, 400), window) for _ in range(10)]
+    values = np.array([value for run in runs for value in run.values()])
+    assert len(values) == 10 * (400 - window)
+    assert 0.85 < values.mean() / worlds.FREEDOM < 1.15
+    assert np.count_nonzero(values > worlds.FIVE_SIGMA) == 0
+
+
+def test_what_is_no_covariance_is_counted() -> None:
+    updates, true = random_walk(np.random.default_rng(0), 3)
+    updates[2] = replace(updates[2], covariance=np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1.0]))
+    assert list(worlds.squared_errors(updates, true, worlds.START).values())[1] is None
 
 
 def test_growth_is_the_last_tenth_over_the_second_on_a_machine_of_any_pace() -> None:

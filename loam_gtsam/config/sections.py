@@ -212,7 +212,9 @@ class MatchingConfig(Section):
     )
     """Planes are fitted in this way: about the centroid, or by A n = -1 (unit_offset), which cannot
     represent a plane through the map origin."""
-    plane_tolerance: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
+    plane_tolerance: float = parameter(
+        0.09, unit="m", source="three point_sigma; LOAM uses 0.2", low=0.0
+    )
     """A plane is accepted only if none of its map points is farther from it than this."""
     plane_ratio: float = parameter(0.2, low=0.0, high=1.0)
     """A plane needs its second eigenvalue above this times the largest one: points along one ring
@@ -257,7 +259,7 @@ class SolverConfig(Section):
     translation_tolerance: float = parameter(0.0005, unit="m", source="LOAM", low=0.0)
     """The solve stops when an association moves the pose by less than this and turns it by less
     than rotation_tolerance_deg."""
-    kernel: Literal["huber", "geman_mcclure"] = parameter("huber")
+    kernel: Literal["huber", "geman_mcclure"] = parameter("geman_mcclure")
     """The method gtsam has this robust kernel on the matches; geman_mcclure all but ignores matches
     that are far off, for traffic and crowds."""
     kernel_width: float = parameter(1.345, source="95 % efficiency on normal noise", low=0.1)

@@ -81,6 +81,7 @@ _CLASSICAL = {
         "wide_search": 1.0,
         "line_ratio": 3.0,
         "plane_fit": "unit_offset",
+        "plane_tolerance": 0.2,
         "plane_ratio": 0.0,
         "max_ring_cosine": 1.0,
         "min_incidence_sine": 0.0,

@@ -156,7 +156,7 @@ class Mapper:
         MapUpdate
             Never raises for what a sweep contains: see its ``status``.
         """
-        clock, given = Clock(), guess is not None
+        clock = Clock()
         self.registered = None
         if (refused := self._check(features)) is not None:
             return refused
@@ -180,7 +180,7 @@ class Mapper:
             update = self._insert(*placed, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
             frame = self._frame(predicted, priors, clock)
-            frame, outcome = self._placed(frame, features, given)
+            frame, outcome = self._placed(frame, features)
             clock.lap("solve")
             if isinstance(outcome, Found) and outcome.solution.solved:
                 update = self._with_pose(frame, outcome, clock)
@@ -253,7 +253,7 @@ class Mapper:
         )
         return Frame(matcher, predicted, factors)
 
-    def _placed(self, frame: Frame, features: Features, given: bool) -> tuple[Frame, Found | Lost]:
+    def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""
         assert self.last is not None
         found, twist, stamp = (
@@ -261,7 +261,7 @@ class Mapper:
             self.last.twist,
             frame.sweep.stamp,
         )
-        if self._start is not None and not given:
+        if self._start is not None:
             found = self._start.first_motion(frame, found, self.solver)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
         if self.imu is not None and (

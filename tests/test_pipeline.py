@@ -466,15 +466,11 @@ def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
         run(data_of(shaken, sweeps[:1]), config, extra_factors=lambda _: [tight(np.zeros(3))])
 
 
-@pytest.mark.parametrize(("seed", "range_noise", "tracked"), [(1, 0.02, True), (1, 0.0, False),
-                                                              (2, 0.02, True)])  # fmt: skip
-def test_foliage_does_not_hold_the_pose(seed, range_noise, tracked):
-    """Without the test for smooth rings the woods keep the attitude of the first sweeps."""
+@pytest.mark.parametrize("seed", [1, 2])
+def test_foliage_does_not_hold_the_pose(seed):
     world = SimulatedWorld("trees", frames=35, columns=600, seed=seed)
     # Without poles: the trunks alone would do.
-    config = Config().changed(
-        {"features.range_noise": range_noise, "features.post_depth": 0.0, "imu.enabled": False}
-    )
+    config = Config().changed({"features.post_depth": 0.0, "imu.enabled": False})
     positions = run(world, config).trajectory.map_T_lidar[:, :3, 3]
     error = np.linalg.norm(positions - world.truth.map_T_lidar[:, :3, 3], axis=1).max()
-    assert error < 0.12 if tracked else error > 0.5
+    assert error < 0.12

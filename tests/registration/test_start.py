@@ -56,17 +56,24 @@ def test_a_platform_at_rest_stays_where_it_is(scene):
     assert errors(world, updates).max() < 0.1
 
 
-def test_only_a_motion_that_nobody_knows_is_searched_for(monkeypatch):
+def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
     asked = []
     monkeypatch.setattr(start, "likely_poses", lambda *_, **__: asked.append(1) or [])
     _, features = features_of("avenue", 4, speed=20.0, start="moving")
-    once = CONFIG.changed("deskew.refine=false")
-    for config, guess, searches in ((CONFIG, gtsam.Pose3(), 0), (once, None, 0), (CONFIG, None, 1)):
+    for config, searches in ((CONFIG.changed("deskew.refine=false"), 0), (CONFIG, 1)):
         mapper = Mapper(config)
-        mapper.register(features[0])
-        mapper.register(features[1], guess)
-        mapper.register(features[2])
+        for one in features:
+            mapper.register(one)
         assert len(asked) == searches
+
+
+def test_a_good_guess_of_a_user_stays_and_a_bad_one_does_not():
+    world, features = features_of("avenue", 2, speed=36.0, start="moving")
+    truth = gtsam.Pose3(world.truth.map_T_lidar[1])
+    for guess in (truth, gtsam.Pose3(gtsam.Rot3(), np.array([-3.0, 0.0, 0.0]))):
+        mapper = Mapper(CONFIG)
+        mapper.register(features[0])
+        assert mapper.register(features[1], guess).map_T_lidar.range(truth) < 0.1
 
 
 def test_the_map_is_made_anew_of_the_first_sweeps_and_then_left_alone():

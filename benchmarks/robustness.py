@@ -70,12 +70,12 @@ class Place:
 
 
 MOVING = "30 % on moving objects"
-REDESCENDING = f"{MOVING}, kernel geman_mcclure"
+HUBER = f"{MOVING}, kernel huber"
 """The same sweeps; ours only."""
 COMMON = (
     NONE,
     MOVING,
-    REDESCENDING,
+    HUBER,
     "20 % outliers",
     "a quarter of the azimuth lost",
     "one sweep missing",
@@ -100,7 +100,7 @@ PLACES = (
         disturbances=(*COMMON, *(name for name in MOVES if "10 m" not in name)),
     ),
     Place(TOWN, frames=None, disturbances=(*COMMON, *AHEAD)),
-    Place("trees", lane=1.5, disturbances=(NONE, MOVING, REDESCENDING)),
+    Place("trees", lane=1.5, disturbances=(NONE, MOVING, HUBER)),
 )
 QUICK = (
     Place(
@@ -185,7 +185,7 @@ def disturbed(place: Place, name: str, data: Path) -> Case:
         return Case(Disturbed(calm, [MissingSweeps(thirds)]), thirds)
     if name == "five sweeps missing":
         return Case(Disturbed(calm, [MissingSweeps(thirds, 5)]), thirds)
-    if name in (MOVING, REDESCENDING):
+    if name in (MOVING, HUBER):
         passing = MovingObjects(lane=place.lane).covering(0.3, sweeps[half])
         return Case(Disturbed(calm, [passing]))
     changes = {
@@ -248,12 +248,12 @@ def measure(task: tuple[Place, str], data: Path) -> list[Measured]:
     truth = case.dataset.truth
     assert truth is not None
     config = effective_config(Config(), case.dataset)
-    if name == REDESCENDING:
-        config = config.changed("solver.kernel=geman_mcclure")
+    if name == HUBER:
+        config = config.changed("solver.kernel=huber")
     result = run(case.dataset, config)
     statuses = ", ".join(f"{count} {status}" for status, count in _others(result.status_counts))
     found = {OURS: result.trajectory}
-    if load("kiss_icp") is not None and name != REDESCENDING:
+    if load("kiss_icp") is not None and name != HUBER:
         kiss = KissIcp()
         for sweep in case.dataset:
             assert isinstance(sweep, Scan)

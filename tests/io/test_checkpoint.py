@@ -77,7 +77,7 @@ def held_near_the_start(context):
 LOOPS = Config().changed("loops.enabled=true", "loops.min_way=6", "pose_graph.keyframe_distance=1")
 BOTH = LOOPS.changed("imu.preintegration=true")
 IMU = Config().changed("imu.preintegration=true", "imu.lag=5")
-DENSE = Config().changed("pose_graph.keyframe_distance=0.5")
+DENSE = Config().changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
 CASES = {
     "plain": ("street_loop?frames=8", Config(), [1, 2, 5]),
     "imu in the graph": ("corridor?frames=16", IMU, [3, 11]),

@@ -19,7 +19,7 @@ from loam_gtsam.registration.association import (
 )
 from loam_gtsam.registration.matches import ScanMatches
 
-CONFIG = MatchingConfig()
+CONFIG = MatchingConfig(plane_tolerance=0.2)  # groups may be rough
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
 X, Y, Z = np.eye(3)
 SQUARE = np.array([[1.0, 1], [1, -1], [-1, -1], [-1, 1], [0, 0]])

@@ -236,5 +236,5 @@ def test_a_drive_through_the_mirror_is_the_mirrored_drive() -> None:
     through = [replace(scan, points=scan.points @ MIRROR.astype(np.float32)) for scan in sweeps()]
     for here, there in zip(poses(list(sweeps())), poses(through), strict=True):
         step = mirror(here).localCoordinates(there)
-        assert np.degrees(np.linalg.norm(step[:3])) < 0.03
-        assert np.linalg.norm(step[3:]) < 2e-3
+        assert np.degrees(np.linalg.norm(step[:3])) < 0.1
+        assert np.linalg.norm(step[3:]) < 5e-3

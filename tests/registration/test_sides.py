@@ -17,7 +17,7 @@ from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray
 from loam_gtsam.voxels.tags import Faces, second
 
-CONFIG = MatchingConfig()
+CONFIG = MatchingConfig(plane_tolerance=0.2)  # planes may lie between two faces
 MAP = MapConfig(field_of_view=False)
 FRONT, BACK = np.array([0.0, -2.0, 0.0]), np.array([0.0, 2.2, 0.0])  # positions of the lidar
 THICKNESS = 0.2

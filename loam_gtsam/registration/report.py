@@ -87,7 +87,7 @@ def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
     if solution.weak is not None:
         status = FrameStatus.DEGENERATE
         weak = weak_directions_in_words(solution)
-        problem = f"the scan does not tell {weak}; the expected motion was kept"
+        problem = f"the scan does not tell {weak}; no better known than the expected motion"
     return status, "; ".join(filter(None, (message, problem)))
 
 

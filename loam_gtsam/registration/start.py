@@ -108,6 +108,7 @@ class Start:
             if tried.total > CLEARLY * best.total and _told_apart(tried, best):
                 best = tried
         self._sweeps = best.sweeps[:1]
+        self._fill(frame, self._sweeps)
         return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
 
     def add(

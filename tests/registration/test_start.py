@@ -11,6 +11,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration import start
+from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.types import FrameStatus
 
 CONFIG = Config().changed("imu.enabled=false")
@@ -65,6 +66,24 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
         for one in features:
             mapper.register(one)
         assert len(asked) == searches
+
+
+def test_the_search_leaves_the_map_of_the_motion_that_it_chose(monkeypatch):
+    """Every place that is tried makes the map anew; what follows must not match the last one."""
+    shares = []
+
+    def add(self, frame, found, *_):
+        again = frame.matcher.moving_at(found.twist)(found.solution.map_T_lidar)
+        shares.append([Fit.of(m, 1000).total for m in (found.solution.matches, again)])
+        return frame, found
+
+    monkeypatch.setattr(start.Start, "add", add)
+    _, features = features_of("avenue", 2, speed=36.0, start="moving")
+    mapper = Mapper(CONFIG)
+    for one in features:
+        mapper.register(one)
+    ((chosen, again),) = shares
+    assert again > 0.9 * chosen > 0.0
 
 
 def test_a_good_guess_of_a_user_stays_and_a_bad_one_does_not():

@@ -32,6 +32,9 @@ _TOGETHER = (2, 3, 5, 8)
 """Numbers of sweeps at which all are registered anew: each time half as many more or so."""
 _ROUNDS = 2  # times that each of them is then registered with the map of the others
 _PLACES = 6  # motions between the first two sweeps that are tried beside the expected one
+_AGAINST = 3.0
+"""Number of features that agree which one outweighs that contradicts: noise makes 3 of 1000 do so.
+Between the rings of the first sweep more of the ground finds planes than on them, at any place."""
 _FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
 _FARTHEST = 30.0  # metres: largest distance between the first two sweeps
 _TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical axis
@@ -65,7 +68,7 @@ class EarlySweep:
 class _Tried(NamedTuple):
     """A first motion that was tried."""
 
-    total: float  # share of the features that agree
+    total: float  # share of the features that agree, less that of those that contradict
     sweeps: list[EarlySweep]
     solution: Solution
 
@@ -174,8 +177,9 @@ class Start:
         sweeps = self._with_motion([first, replace(second, map_T_middle=solution.map_T_lidar)])
         solution = self._solved(frame, sweeps, 1, solver)
         sweeps[1] = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
-        total = Fit.of(solution.matches, frame.matcher.offered).total if solution.solved else 0.0
-        return _Tried(total, sweeps, solution)
+        fit = Fit.of(solution.matches, frame.matcher.offered)
+        total = fit.total - _AGAINST * (fit.share - fit.total) if solution.solved else 0.0
+        return _Tried(max(total, 0.0), sweeps, solution)
 
     def _solved(
         self,

@@ -90,16 +90,23 @@ def drift(estimate: FloatArray, truth: FloatArray) -> float:
     return float(np.abs(height - wanted).max())
 
 
-def tilt(estimate: FloatArray, truth: FloatArray) -> float:
-    """Root mean square of the angle between the up axes, seen from the lidar, degrees.
+def tilts(estimate: FloatArray, truth: FloatArray) -> FloatArray:
+    """(N,) angles between the up axes, seen from the lidar: roll and pitch together, rad.
 
     Parameters
     ----------
     estimate, truth : (N, 4, 4) in frames with z up
     """
     up, wanted = estimate[:, 2, :3], truth[:, 2, :3]
-    angles = np.arctan2(np.linalg.norm(np.cross(up, wanted), axis=1), (up * wanted).sum(axis=1))
-    return float(np.degrees(np.sqrt(np.mean(angles**2))))
+    angles: FloatArray = np.arctan2(
+        np.linalg.norm(np.cross(up, wanted), axis=1), (up * wanted).sum(axis=1)
+    )
+    return angles
+
+
+def tilt(estimate: FloatArray, truth: FloatArray) -> float:
+    """Root mean square of :func:`tilts`, degrees."""
+    return float(np.degrees(np.sqrt(np.mean(tilts(estimate, truth) ** 2))))
 
 
 def along(estimate: FloatArray, truth: FloatArray) -> float:

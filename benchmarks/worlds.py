@@ -24,6 +24,7 @@ from scipy.stats import chi2, norm
 
 from benchmarks.cases import ROOT, data_folder
 from benchmarks.process import processor_clock
+from benchmarks.scene_tables import tilts
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import Dataset, SimulatedWorld, Sweep, open_dataset
 from loam_gtsam.datasets.base import ChangedDataset, DatasetInfo
@@ -69,8 +70,7 @@ class World:
         if self.recorded:
             dataset = open_dataset(data_folder() / self.scene)
         else:
-            kind = {"imu": imu} if imu not in (None, "white") else {}
-            dataset = SimulatedWorld(self.scene, seed=seed, **self.options, **kind)
+            dataset = SimulatedWorld(self.scene, seed=seed, imu=imu or "white", **self.options)
         return dataset if self.every == 1 and not self.first else EveryNth(dataset, self)
 
 
@@ -241,21 +241,21 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
     moved = [updates[0].map_T_lidar.between(update.map_T_lidar) for update in updates]
     exact = [true[0].between(pose) for pose in true]
     errors = np.array([a.localCoordinates(b) for a, b in zip(moved, exact, strict=True)])
+    starts = (np.array([pose.matrix() for pose in poses[:_START]]) for poses in (moved, exact))
     seconds = [sum(t for name, t in update.timings.items() if name != "read") for update in updates]
     nees: dict[str, FloatArray] = {}
     broken = 0
-    for window in (*WINDOWS, START):
-        found = list(squared_errors(updates, true, window).values())
-        nees[name_of(window)] = np.array([value for value in found if value is not None])
-        broken += found.count(None)
-    since = squared_errors(updates, true, START)
-    far = [k for k, value in since.items() if value is None or value > FIVE_SIGMA]
+    for window in (*WINDOWS, START):  # that since the start is the last, and judged once more
+        found = squared_errors(updates, true, window)
+        nees[name_of(window)] = np.array([value for value in found.values() if value is not None])
+        broken += list(found.values()).count(None)
+    far = [k for k, value in found.items() if value is None or value > FIVE_SIGMA]
     good = sum(updates[k].status is FrameStatus.OK for k in far)
     return replace(
         row,
         path=Trajectory(truth.stamps, truth.map_T_lidar).path_length,
         ate=absolute_error(result.trajectory, truth).rmse,
-        start_deg=max(_tilt_deg(a, b) for a, b in zip(moved[:_START], exact, strict=False)),
+        start_deg=float(np.degrees(tilts(*starts).max())),
         start_m=float(np.linalg.norm(errors[:_START, 3:], axis=1).max()),
         nees={k: float(v.mean()) / FREEDOM if len(v) >= _FEW else np.nan for k, v in nees.items()},
         samples={k: len(v) for k, v in nees.items()},
@@ -300,12 +300,6 @@ def _squared(error: FloatArray, covariance: FloatArray) -> float | None:
         return None
     whitened = np.linalg.solve(root, error)
     return float(whitened @ whitened)
-
-
-def _tilt_deg(moved: gtsam.Pose3, exact: gtsam.Pose3) -> float:
-    """Angle between the two up axes: roll and pitch together, degrees."""
-    up, true = moved.rotation().matrix()[2], exact.rotation().matrix()[2]
-    return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(up, true)), up @ true)))
 
 
 # -- tables ----------------------------------------------------------------------------------------

@@ -10,6 +10,7 @@ import numpy as np
 
 from loam_gtsam.datasets.sim import indoors, outdoors, streets
 from loam_gtsam.datasets.sim.raycast import Solids
+from loam_gtsam.datasets.sim.ways import distance_to_way
 from loam_gtsam.types import FloatArray
 
 _CORRIDOR = 320.0  # metres
@@ -62,8 +63,7 @@ def build_trees(seed: int) -> streets.Scene:
     fine = np.concatenate([path + f * (np.roll(path, -1, axis=0) - path) for f in (0.0, 0.5)])
 
     def clear(candidates: FloatArray, margin: float) -> FloatArray:
-        gaps = np.linalg.norm(candidates[:, None, :] - fine[None], axis=2).min(axis=1)
-        return np.asarray(candidates[gaps > margin])
+        return np.asarray(candidates[distance_to_way(fine, candidates) > margin])
 
     trunks = clear(rng.uniform(-110.0, 110.0, (700, 2)), 4.0)
     thick = rng.uniform(0.08, 0.32, len(trunks))

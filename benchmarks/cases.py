@@ -98,7 +98,7 @@ CASES: tuple[Case, ...] = (
     Case(
         "kitti_2011_09_26_0002",
         "kitti_2011_09_26_0002",
-        kiss=(KissVariant("KISS-ICP", elevation_deg=0.205), NO_DESKEW),
+        kiss=(KissVariant(), NO_DESKEW),
         ate_limit=0.06,
         ms_limit=200.0,
         ratio_limit=1.0,

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import importlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from loam_gtsam.datasets.kitti.folder import raise_elevation
-from loam_gtsam.studies import peers
 from loam_gtsam.studies.contenders import timed_points as timed_points
-from loam_gtsam.studies.peers import TimedPoints
-from loam_gtsam.types import FloatArray, MapUpdate
+from loam_gtsam.studies.peers import TimedPoints as TimedPoints
+from loam_gtsam.studies.peers import icp
+from loam_gtsam.types import FloatArray
 
 
 def load(module: str) -> Any | None:
@@ -31,28 +30,18 @@ class KissVariant:
     ----------
     label : column of the report
     deskew : use its own de-skew
-    elevation_deg : raise every ray, as its loader of KITTI's raw data does (0.205 degrees)
     """
 
     label: str = "KISS-ICP"
     deskew: bool = True
-    elevation_deg: float = 0.0
 
 
-class KissIcp(peers.KissIcp):
+class KissIcp(icp.KissIcp):
     """KISS-ICP, given the sweeps as a variant says."""
 
     def __init__(self, variant: KissVariant = KissVariant()) -> None:
-        self.variant, self.deskew = variant, variant.deskew
-        super().__init__()
-
-    def register(self, stamp: int, sweep: TimedPoints) -> MapUpdate:
-        """See :meth:`loam_gtsam.studies.peers.Peer.register`."""
-        if self.variant.elevation_deg:
-            angle = float(np.radians(self.variant.elevation_deg))
-            points = raise_elevation(sweep.points, angle).astype(np.float64)
-            sweep = replace(sweep, points=points)
-        return super().register(stamp, sweep)
+        self.variant = variant
+        super().__init__({"deskew": variant.deskew})
 
     @property
     def seconds(self) -> list[float]:

@@ -199,7 +199,7 @@ class Runs:
             own = self._prepared[key] = []
             for sweep in dataset:
                 started = time.process_time()
-                extraction = extract_for_all(sweep, config)
+                extraction = extract_for_all(sweep, config, {}) if isinstance(sweep, Scan) else None
                 own.append((extraction, time.process_time() - started))
         return self._prepared[key]
 

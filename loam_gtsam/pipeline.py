@@ -7,17 +7,17 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
-from typing import Any, TypeVar
+from typing import Any, TypedDict, TypeVar, Unpack
 
 import gtsam
 
 from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead
+from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.level import Level
 from loam_gtsam.imu.quality import ImuReport
-from loam_gtsam.io.checkpoint import Checkpoint
+from loam_gtsam.io.checkpoint import Checkpoint, Progress
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import Mapper
@@ -27,7 +27,6 @@ from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
 from loam_gtsam.types import (
     BadSweep,
-    DatasetError,
     Features,
     FeatureSweep,
     FloatArray,
@@ -126,17 +125,36 @@ _REFUSED = (FrameStatus.BAD_STAMP, FrameStatus.UNUSABLE_SCAN)
 """Statuses of sweeps from which no later sweep is predicted."""
 
 
+class Parts(TypedDict, total=False):
+    """Parts of a user's own; one that is left out or None is the package's own.
+
+    Attributes
+    ----------
+    solver : finds the pose of a sweep, see
+        :class:`~loam_gtsam.registration.solvers.base.ScanSolver`
+    features : makes the features of a sweep in place of
+        :func:`~loam_gtsam.frontend.features.extract_features`; raises SweepError for a sweep
+        without any
+    odometry : predicts each sweep, see :class:`~loam_gtsam.registration.odometry.Odometry`
+    extra_factors : factors of every sweep, see :class:`~loam_gtsam.PoseContext`
+    loop_closer : finds loops, see :class:`~loam_gtsam.loops.closure.LoopCloser`; the package's own
+        looks for them only with ``loops.enabled``
+    """
+
+    solver: ScanSolver | None
+    features: FrontEnd | None
+    odometry: Odometry | None
+    extra_factors: ExtraFactors | None
+    loop_closer: LoopCloser | None
+
+
 class Pipeline:
     """Feature extraction, odometry guess and mapping, one sweep at a time.
 
     Parameters
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
-    solver : see :class:`~loam_gtsam.Mapper`; None takes the configured one
-    odometry : predicts each sweep, see :class:`~loam_gtsam.registration.odometry.Odometry`; None
-        takes the configured one
-    extra_factors : a user's own factors, see :class:`~loam_gtsam.PoseContext`
-    loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
+    parts : solver, front end and others of a user's own, see :class:`Parts`
 
     Attributes
     ----------
@@ -150,20 +168,21 @@ class Pipeline:
         config: Config | None = None,
         *,
         imu: ImuBuffer | None = None,
-        solver: ScanSolver | None = None,
-        odometry: Odometry | None = None,
-        extra_factors: ExtraFactors | None = None,
-        loop_closer: LoopCloser | None = None,
+        **parts: Unpack[Parts],
     ) -> None:
         self.config = config or Config()
-        self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=extra_factors)
+        solver, factors = parts.get("solver"), parts.get("extra_factors")
+        self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
-        self.odometry = odometry or make_odometry(self.config.odometry, self.mapper.imu)
+        own = parts.get("odometry")
+        self.odometry = own or make_odometry(self.config.odometry, self.mapper.imu)
+        self._features = parts.get("features")
         self._last_odom: gtsam.Pose3 | None = None
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.loops: LoopMapping | None = None
-        if self.config.loops.enabled or loop_closer is not None:
-            self.loops = LoopMapping(self.mapper, self.config, loop_closer)
+        closer = parts.get("loop_closer")
+        if self.config.loops.enabled or closer is not None:
+            self.loops = LoopMapping(self.mapper, self.config, closer)
 
     def reset(self) -> None:
         """Forget map, motion, IMU and loops: the next sweep is the first of a new run."""
@@ -192,7 +211,7 @@ class Pipeline:
                 "makes one of an array"
             )
         if extraction is None:
-            extraction = extract(sweep, self.config)
+            extraction = extract(sweep, self.config, self._features)
         features, last = extraction.features, self.mapper.last
         if features is None:
             stamp = sweep.stamp + self._to_reference
@@ -241,6 +260,8 @@ class Pipeline:
         if self.odometry is not None:
             roots["odometry"] = self.odometry
         shared = {"solver": mapper.solver, **_sections("config", self.config)}
+        if self._features is not None:
+            shared["features"] = self._features
         if mapper.extra_factors is not None:
             shared["extra_factors"] = mapper.extra_factors
         if mapper.imu is not None:
@@ -329,11 +350,10 @@ def run(
     max_frames: int | None = None,
     on_frame: OnFrame | None = None,
     keep_partial: bool = False,
-    extra_factors: ExtraFactors | None = None,
-    loop_closer: LoopCloser | None = None,
     observe: Observer | None = None,
     workers: int = 0,
     checkpoint: Checkpoint | None = None,
+    **parts: Unpack[Parts],
 ) -> RunResult:
     """Map a data set.
 
@@ -344,15 +364,15 @@ def run(
     on_frame : e.g. to show progress
     keep_partial : if an error ends the run after some sweeps, return what was computed until
         then, with ``error`` set, instead of raising
-    extra_factors : a user's own factors, see :class:`loam_gtsam.mapper.PoseContext`
-    loop_closer : finds loops; None takes the package's own, if ``loops.enabled``
     observe : e.g. :func:`loam_gtsam.view.observers.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
         needs the usual ``if __name__ == "__main__":``.
     checkpoint : keeps the state of the run, and may begin with that of one that was stopped;
-        ``on_frame`` and ``observe`` are then called for the frames that follow. With factors or a
-        loop closer of your own, give the same ones again.
+        ``on_frame`` and ``observe`` are then called for the frames that follow. With parts of your
+        own, give the same ones again.
+    parts : solver, front end and others of your own, see :class:`Parts`; a front end of your own
+        is called in this process
 
     Returns
     -------
@@ -375,8 +395,11 @@ def run(
         )
     config = effective_config(config or Config(), dataset)
     imu = imu_buffer(dataset, config)
-    pipeline = Pipeline(config, imu=imu, extra_factors=extra_factors, loop_closer=loop_closer)
-    progress = _Progress(pipeline, dataset, checkpoint)
+    pipeline = Pipeline(config, imu=imu, **parts)
+    if parts.get("features") is not None:
+        workers = 0
+    about = {"data set": dataset.name, "configuration": dump_config(config)}
+    progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
     interrupted = False
     error: Exception | None = None
@@ -401,52 +424,6 @@ def run(
         error = caught
         progress.save()
     return pipeline.result(updates, interrupted=interrupted, error=error)
-
-
-class _Progress:
-    """The frames of a run so far, and its checkpoints."""
-
-    def __init__(self, pipeline: Pipeline, dataset: Dataset, checkpoint: Checkpoint | None) -> None:
-        self._pipeline, self._checkpoint = pipeline, checkpoint
-        self.whole = True  # not in the middle of a frame
-        self.stamps: list[int] = []
-        self.updates: list[MapUpdate] = []
-        if checkpoint is not None:
-            about = {"data set": dataset.name, "configuration": dump_config(pipeline.config)}
-            self.stamps, self.updates = checkpoint.begin(about, *pipeline.state())
-
-    def rest(self, sweeps: Iterator[tuple[Sweep, float]]) -> Iterator[tuple[Sweep, float]]:
-        """The sweeps after those that are done."""
-        for number, done in enumerate(self.stamps):
-            sweep = next(sweeps, None)
-            stamp = None if sweep is None else _stamp(sweep[0])
-            if stamp != done:
-                raise DatasetError(
-                    f"sweep {number}: expected the stamp {done} ns of the run to go on with, got "
-                    f"{'no more sweeps' if stamp is None else stamp}; resume with the same data "
-                    "and options, or start again"
-                )
-        return sweeps
-
-    def add(self, sweep: Sweep, update: MapUpdate) -> None:
-        """A frame is done."""
-        self.stamps.append(_stamp(sweep))
-        self.updates.append(update)
-        self.whole = True
-
-    def save_if_due(self) -> None:
-        """Write a checkpoint, if it is time."""
-        if self._checkpoint is not None and self._checkpoint.due:
-            self.save()
-
-    def save(self) -> None:
-        """Write a checkpoint, unless a frame was cut off in the middle."""
-        if self._checkpoint is not None and self.whole:
-            self._checkpoint.save(self.stamps, self.updates, *self._pipeline.state())
-
-
-def _stamp(sweep: Sweep) -> int:
-    return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
 
 
 def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import re
 import signal
 import sys
 import tempfile
@@ -28,11 +27,6 @@ from loam_gtsam.types import DatasetError, MapUpdate, OutputError
 from loam_gtsam.view import plots
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-def file_name(name: str) -> str:
-    """A name of a data set as that of a file or folder."""
-    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "run"
 
 
 @contextmanager

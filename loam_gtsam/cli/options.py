@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
@@ -13,6 +13,8 @@ import typer
 if TYPE_CHECKING:  # the help of a command needs neither GTSAM nor SciPy
     from loam_gtsam.config import Config
     from loam_gtsam.datasets.base import Dataset
+    from loam_gtsam.pipeline import Parts
+    from loam_gtsam.studies.contenders import Contender
 
 _TYPER = "typer"
 
@@ -174,8 +176,43 @@ class DemoOptions(OutputOptions):
         return RunOptions(path=f"sim:{self.scene}", profile=self.profile, **shared)
 
 
+_FACTORY = "PACKAGE.MODULE:FACTORY"
+
+
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(OutputOptions, InspectOptions):
+class PartOptions(InspectOptions):
+    """Parts of a user's own; each is made by a function of one argument, the configuration."""
+
+    solver: str | None = option(
+        "gtsam, loam or aloam (solver.method), or a solver of your own.", metavar=f"NAME|{_FACTORY}"
+    )
+    features: str | None = option("A front end of your own.", metavar=_FACTORY)
+    odometry: str | None = option("A prediction of your own.", metavar=_FACTORY)
+    extra_factors: str | None = option("Factors of your own on every sweep.", metavar=_FACTORY)
+    loop_closer: str | None = option("A loop closer of your own.", metavar=_FACTORY)
+
+    def settings(self) -> Config:
+        """With ``--solver``, if it names one of the package."""
+        from loam_gtsam.studies.contenders import with_solver
+        from loam_gtsam.studies.factories import is_factory
+
+        config = super().settings()
+        if self.solver is None or is_factory(self.solver):
+            return config
+        return with_solver(config, self.solver)
+
+    def parts(self, config: Config) -> Parts:
+        """Those that were asked for."""
+        from loam_gtsam.studies.factories import PARTS, is_factory, make_parts
+
+        names = {name: getattr(self, name) for name in PARTS}
+        if self.solver is not None and not is_factory(self.solver):
+            del names["solver"]
+        return make_parts(names, config)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(OutputOptions, PartOptions):
     """Options of ``run``."""
 
     profile: bool = flag("Show the time per stage.", "--profile")
@@ -237,15 +274,68 @@ class CompareOptions(OutputOptions, SourceOptions):
 
     frames: int | None = option("Stop after so many sweeps.", min=1)
     solvers: list[str] | None = option(
-        "gtsam, another preset (loam, aloam), a configuration file (.yaml), or a peer (kiss-icp, "
-        "small-gicp, genz-icp; see docs/compare.md); may be given repeatedly. Without truth the "
-        "first one is the reference [default: gtsam and all presets].",
+        "gtsam, loam, aloam, or a solver of your own: only the solver differs; may be given "
+        "repeatedly, as all of these [default, if nothing is chosen: gtsam, loam and aloam].",
         "--solver",
+        metavar="NAME|PACKAGE.MODULE:FACTORY",
+    )
+    front_ends: list[str] | None = option(
+        "A front end of your own: only the features differ.",
+        "--features",
+        metavar="PACKAGE.MODULE:FACTORY",
+    )
+    presets: list[str] | None = option(
+        "default, loam or aloam: the whole system differs.", "--preset", metavar="NAME"
+    )
+    configs: list[Path] | None = option(
+        "A configuration file (.yaml): the whole system differs.", "--config", metavar="FILE"
+    )
+    peers: list[str] | None = option(
+        "Another system: kiss-icp, genz-icp, small-gicp, and with an IMU rko-lio, genz-lio; with "
+        "settings as in 'kiss-icp?deskew=false&voxel=scene' (docs/compare.md).",
+        "--peer",
         metavar="NAME",
+    )
+    base: str = option(
+        "Preset or configuration file (.yaml) into which --solver and --features are put.",
+        default="default",
+        metavar="NAME|FILE",
     )
     shared_guess: bool = flag(
         "All solvers of this package start from the guesses of the first of them.", "--shared-guess"
     )
+    same_matches: bool = flag(
+        "Ask every solver for the pose of each sweep with the same map and guess, so that the "
+        "solve alone differs: cost, differences, convergence from disturbed guesses, time.",
+        "--same-matches",
+    )
+    driver: str | None = option(
+        "With --same-matches: the solver whose poses make the map, or truth [default: the first].",
+        metavar="NAME",
+    )
+
+    def contenders(self) -> list[Contender]:
+        """Those of all groups; the solvers of the package if none is chosen."""
+        from loam_gtsam.config import load_config, preset
+        from loam_gtsam.studies.contenders import METHODS, Group, make_contender
+
+        is_file = Path(self.base).suffix in (".yaml", ".yml")
+        base = self.changed(load_config(self.base) if is_file else preset(self.base, "--base: "))
+        chosen = {
+            Group.SOLVER: self.solvers,
+            Group.FEATURES: self.front_ends,
+            Group.PRESET: self.presets,
+            Group.CONFIG: self.configs,
+            Group.PEER: self.peers,
+        }
+        if not any(chosen.values()):
+            chosen[Group.SOLVER] = [*METHODS]
+        found = [
+            make_contender(group, str(name), base)
+            for group, names in chosen.items()
+            for name in names or []
+        ]
+        return [replace(c, config=c.config and self.changed(c.config)) for c in found]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -17,6 +17,7 @@ from loam_gtsam.cli.report import profile_table, summary
 from loam_gtsam.cli.results import RUN_OUTPUTS, Results, is_complete
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.io.atomic import file_name
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.pipeline import Observer, Pipeline, run
 from loam_gtsam.types import DatasetError, MapUpdate, Sweep
@@ -35,7 +36,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
     if options.loops:
         config = config.changed("loops.enabled=true")
     plot = console.draws_pictures(options.plot)
-    wanted = options.output or Path("loam_gtsam_output") / console.file_name(dataset.name)
+    wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)
     last = LastFrame()
     known, overwrite = (*RUN_OUTPUTS, CHECKPOINT), options.overwrite or options.resume
@@ -61,6 +62,7 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
                     observe=observe,
                     workers=worker_count(options.workers, total),
                     checkpoint=checkpoint,
+                    **options.parts(config),
                 )
             seconds = time.perf_counter() - started
             if not result.updates:

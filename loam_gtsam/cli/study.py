@@ -15,7 +15,7 @@ from rich.text import Text
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import StudyOptions
-from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.io.atomic import file_name, make_folder
 from loam_gtsam.studies import trial_runner as runner
 from loam_gtsam.studies import trials
 from loam_gtsam.studies.trial_spec import Spec, load_spec
@@ -29,7 +29,7 @@ def execute(options: StudyOptions) -> int:
         raise typer.BadParameter("give --workers or --scheduler, not both")
     trials.import_pyarrow()
     spec = load_spec(options.spec)
-    folder = options.output or Path("loam_gtsam_output") / f"{console.file_name(spec.name)}_study"
+    folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_study"
     make_folder(folder / trials.TRIALS_FOLDER)
     store = trials.TrialStore(folder)
     missing = []

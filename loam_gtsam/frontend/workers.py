@@ -7,7 +7,7 @@ import logging
 import signal
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import cycle
@@ -31,6 +31,9 @@ _PATIENCE = 5.0
 
 _log = logging.getLogger(__name__)
 
+FrontEnd = Callable[[Scan], Features]
+"""Makes the features of a sweep; raises SweepError for a sweep without any."""
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Extraction:
@@ -42,8 +45,10 @@ class Extraction:
     fault: SweepFault | None = None
 
 
-def extract(scan: Scan, config: Config) -> Extraction:
+def extract(scan: Scan, config: Config, front_end: FrontEnd | None = None) -> Extraction:
     """Extract the features of a sweep in this process; no content of a sweep raises an error.
+
+    ``front_end`` takes the place of :func:`~loam_gtsam.frontend.features.extract_features`.
 
     With ``odometry.method: constant_velocity`` the features are thinned to the voxels of the map,
     as the mapper would do it, so that less is handed over. ``scan_to_scan`` needs all of them.
@@ -51,7 +56,7 @@ def extract(scan: Scan, config: Config) -> Extraction:
     started = time.perf_counter()
     features, problem, fault = None, "", None
     try:
-        features = extract_features(scan, config)
+        features = extract_features(scan, config) if front_end is None else front_end(scan)
         if config.odometry.method == "constant_velocity":
             features = thinned(features, config.map)
     except SweepError as error:

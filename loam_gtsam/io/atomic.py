@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import tempfile
 from abc import ABC, abstractmethod
@@ -17,6 +18,11 @@ import numpy as np
 from loam_gtsam.types import OutputError
 
 _STAGED = ".loam_gtsam_new"  # folder of new files among the old ones, until all are written
+
+
+def file_name(name: str) -> str:
+    """Any name as that of a file or folder."""
+    return re.sub(r"[^\w.-]+", "_", name).strip("._") or "run"
 
 
 def _refused(problem: str, error: OSError) -> OutputError:

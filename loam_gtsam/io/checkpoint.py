@@ -11,7 +11,7 @@ import logging
 import re
 import time
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from loam_gtsam.io.atomic import atomic_file, make_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.types import MapUpdate, OutputError
+from loam_gtsam.types import DatasetError, FeatureSweep, MapUpdate, OutputError, Sweep
 
 _HEADER = "header"
 _FILE = re.compile(r"(frames_\d+_\d+|state_\d+)\.npz")
@@ -179,6 +179,63 @@ class Checkpoint:
                     f"{_shorten(about.get(name))}, now it is {_shorten(now)}; resume with the "
                     "same, or start again"
                 )
+
+
+class Progress:
+    """The frames of a run so far, and its checkpoints.
+
+    Parameters
+    ----------
+    checkpoint : None keeps nothing
+    about : see :meth:`Checkpoint.begin`
+    state : gives roots and shared objects, see :func:`loam_gtsam.io.state.freeze`
+    """
+
+    def __init__(
+        self,
+        checkpoint: Checkpoint | None,
+        about: Mapping[str, str],
+        state: Callable[[], tuple[Mapping[str, Any], Mapping[str, Any]]],
+    ) -> None:
+        self._checkpoint, self._state = checkpoint, state
+        self.whole = True  # not in the middle of a frame
+        self.stamps: list[int] = []
+        self.updates: list[MapUpdate] = []
+        if checkpoint is not None:
+            self.stamps, self.updates = checkpoint.begin(about, *state())
+
+    def rest(self, sweeps: Iterator[tuple[Sweep, float]]) -> Iterator[tuple[Sweep, float]]:
+        """The sweeps after those that are done."""
+        for number, done in enumerate(self.stamps):
+            sweep = next(sweeps, None)
+            stamp = None if sweep is None else _stamp(sweep[0])
+            if stamp != done:
+                raise DatasetError(
+                    f"sweep {number}: expected the stamp {done} ns of the run to go on with, got "
+                    f"{'no more sweeps' if stamp is None else stamp}; resume with the same data "
+                    "and options, or start again"
+                )
+        return sweeps
+
+    def add(self, sweep: Sweep, update: MapUpdate) -> None:
+        """A frame is done."""
+        self.stamps.append(_stamp(sweep))
+        self.updates.append(update)
+        self.whole = True
+
+    def save_if_due(self) -> None:
+        """Write a checkpoint, if it is time."""
+        if self._checkpoint is not None and self._checkpoint.due:
+            self.save()
+
+    def save(self) -> None:
+        """Write a checkpoint, unless a frame was cut off in the middle."""
+        if self._checkpoint is not None and self.whole:
+            self._checkpoint.save(self.stamps, self.updates, *self._state())
+
+
+def _stamp(sweep: Sweep) -> int:
+    return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
 
 
 def _is_ours(path: Path) -> bool:

@@ -1,38 +1,43 @@
-"""The comparison of several solvers on the same sweeps, and its numbers.
+"""The comparison of several contenders on the same sweeps, and its numbers.
 
 All contenders register a sweep before the next sweep is read: the conditions of the machine are the
-same for all. Pipelines share the features of a sweep; peers get the points these were taken from.
+same for all. Pipelines that want the same features share them; peers get the points these were
+taken from.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
 from itertools import islice
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.pipeline import OnFrame, Pipeline, effective_config, imu_buffer
+from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies import evaluation
 from loam_gtsam.studies.contenders import (
     Contender,
     PeerRunner,
     PipelineRunner,
+    SharedFeatures,
     SharedGuess,
     SolverRun,
-    extract_for_all,
 )
-from loam_gtsam.studies.peers import PEERS, make_peer
-from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray, Trajectory
-
-_SHARED = ("sensor", "features")
-"""Sections of the configuration that all solvers of this package take from the first of them, with
-``deskew.enabled`` and ``deskew.reference``: they decide the features and the moment of a pose."""
+from loam_gtsam.types import (
+    DatasetError,
+    FloatArray,
+    FrameStatus,
+    InputError,
+    IntArray,
+    Trajectory,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +46,7 @@ class Comparison:
 
     Attributes
     ----------
+    runs : group by group, the first one first
     notes : sentences that a reader of the numbers must know
     interrupted, error : whether the user, or which error, ended the comparison early
     shared_guess : whether all solvers of this package had the guesses of the first of them
@@ -72,27 +78,40 @@ class Scores:
     Attributes
     ----------
     path_m : length of the reference trajectory that was compared
+    start_m : RMS distance of the positions if the first common poses are made equal: no fit
+    statuses, faults : number of frames by status, and of unused sweeps by their fault
+    solved : share of the frames after the first whose pose was solved; of a peer, that have a pose
+    beyond : frames ``ok`` whose pose is off by more than five told standard deviations; NaN
+        without truth or without covariances
+    nees, nees_step : mean squared error over covariance, in degrees of freedom, of the poses since
+        the start and of the motions from frame to frame: 1 if the covariances are right
     iterations, solver_iterations : associations and solver steps, mean of the solved frames
     matches : number of matches of the last association, median of the solved frames
     ms_median, ms_95 : milliseconds per frame without reading, the first frame left out
-    map_points, solved : points of the whole map, frames whose pose was solved
+    map_points : points of the whole map
     lengths : metres, the path lengths of the relative error
     problem : why an error is missing
     """
 
     ate_m: float = np.nan
     ate_max_m: float = np.nan
+    start_m: float = np.nan
     rotation_deg: float = np.nan
     rpe_percent: float = np.nan
     rpe_deg_per_m: float = np.nan
     path_m: float = np.nan
+    statuses: Mapping[str, int] = field(default_factory=dict)
+    faults: Mapping[str, int] = field(default_factory=dict)
+    solved: float = np.nan
+    beyond: float = np.nan
+    nees: float = np.nan
+    nees_step: float = np.nan
     iterations: float = np.nan
     solver_iterations: float = np.nan
     matches: float = np.nan
     ms_median: float = np.nan
     ms_95: float = np.nan
     map_points: int = 0
-    solved: int = 0
     lengths: tuple[float, ...] = ()
     problem: str = ""
 
@@ -105,10 +124,10 @@ def compare_solvers(
     shared_guess: bool = False,
     on_frame: OnFrame | None = None,
 ) -> Comparison:
-    """Run several solvers on one data set.
+    """Run several contenders on one data set.
 
-    Raises InputError if there is no contender, two have the same name, or two peers cannot run side
-    by side; PeerError if a peer is not installed; DatasetError if the data set cannot be read.
+    Raises InputError if there is no contender or two have the same name; PeerError if a peer is not
+    installed; DatasetError if the data set cannot be read.
 
     Parameters
     ----------
@@ -120,28 +139,32 @@ def compare_solvers(
         it has after an error later than the first sweep
     """
     _check_names(contenders)
-    runners, first, notes = _make_runners(contenders, dataset, shared_guess)
+    # Group by group, as the report shows them; the order within a group is the caller's.
+    groups = list(dict.fromkeys(entry.group for entry in contenders))
+    contenders = sorted(contenders, key=lambda entry: groups.index(entry.group))
     ended: BaseException | None = None
     done = 0
-    try:
-        for sweep in islice(dataset, max_frames):
-            extraction = None if first is None else extract_for_all(sweep, first)
-            for runner in runners:
-                runner.register(sweep, extraction)
-            done += 1
-            if on_frame is not None:
-                on_frame(done - 1, runners[0].updates[-1])
-    except (KeyboardInterrupt, Exception) as caught:
-        if not done:
-            raise
-        ended = caught
+    with ExitStack() as stack:
+        runners, notes = _make_runners(contenders, dataset, shared_guess, stack)
+        try:
+            for sweep in islice(dataset, max_frames):
+                for runner in runners:
+                    runner.register(sweep)
+                done += 1
+                if on_frame is not None:
+                    on_frame(done - 1, runners[0].updates[-1])
+        except (KeyboardInterrupt, Exception) as caught:
+            if not done:
+                raise
+            ended = caught
+        runs = tuple(runner.result(done) for runner in runners)
     if not done:
         raise DatasetError(
             f"{dataset.name}: no sweeps in it; see what is understood with: loam-gtsam inspect"
         )
     return Comparison(
         name=dataset.name,
-        runs=tuple(runner.result(done) for runner in runners),
+        runs=runs,
         truth=dataset.truth,
         notes=tuple(notes),
         interrupted=isinstance(ended, KeyboardInterrupt),
@@ -154,48 +177,44 @@ def _check_names(contenders: Sequence[Contender]) -> None:
     names = [entry.name for entry in contenders]
     if not names or len(set(names)) < len(names):
         raise InputError(
-            f"compare: expected solvers of different names, got {', '.join(names) or 'none'}"
-        )
-    packages = [PEERS[name].package for name in names if name in PEERS and PEERS[name].alone]
-    if len(set(packages)) < len(packages):
-        raise InputError(
-            f"compare: instances of {packages[0]} in one process disturb each other; compare its "
-            "variants in two comparisons"
+            f"compare: expected contenders of different names, got {', '.join(names) or 'none'}"
         )
 
 
 def _make_runners(
-    contenders: Sequence[Contender], dataset: Dataset, shared_guess: bool
-) -> tuple[list[PipelineRunner | PeerRunner], Config | None, list[str]]:
+    contenders: Sequence[Contender], dataset: Dataset, shared_guess: bool, stack: ExitStack
+) -> tuple[list[PipelineRunner | PeerRunner], list[str]]:
     configs = [entry.config and effective_config(entry.config, dataset) for entry in contenders]
-    found = ((entry.name, c) for entry, c in zip(contenders, configs, strict=True) if c is not None)
-    name, first = next(found, ("", None))
+    first = next((config for config in configs if config is not None), None)
     common = first or effective_config(Config(), dataset)
     runners: list[PipelineRunner | PeerRunner] = []
     notes: list[str] = []
-    guess: SharedGuess | None = None
+    features, guess = SharedFeatures(), None
     for entry, config in zip(contenders, configs, strict=True):
         if config is None:
-            runners.append(PeerRunner(make_peer(entry.name), common))
-            continue
-        shared: dict[str, Any] = {section: getattr(common, section) for section in _SHARED}
-        # How often and from what rotation a sweep is de-skewed again is part of the method.
-        own = config.deskew
-        shared["deskew"] = common.deskew.changed(refine=own.refine, rotation=own.rotation)
-        notes += (
-            f"{entry.name}: section {section} is that of {name}, so that all get the same features "
-            "at the same moments"
-            for section, value in shared.items()
-            if getattr(config, section) != value
-        )
-        config = config.changed(**shared)
-        imu = imu_buffer(dataset, config)
-        pipeline = Pipeline(config, imu=imu, solver=entry.solver, odometry=guess)
-        if shared_guess and guess is None:
-            steady = ConstantVelocity(pipeline.mapper.imu)
-            pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)
-        runners.append(PipelineRunner(entry.name, pipeline))
-    return runners, first, notes
+            runners.append(PeerRunner.of(entry.peer, dataset, common))
+        else:
+            if config.sensor != common.sensor:
+                notes.append(
+                    f"{entry.name}: section sensor is that of the first, so that all get the same "
+                    "points"
+                )
+                config = config.changed(sensor=common.sensor)
+            imu = imu_buffer(dataset, config)
+            if imu is not None and config.imu.prior != common.imu.prior:
+                notes.append(
+                    f"{entry.name}: the tilt of the IMU comes in by imu.prior {config.imu.prior}, "
+                    f"in the first by {common.imu.prior}"
+                )
+            # A guess that is shared takes the place of the contender's own odometry.
+            parts = cast(Parts, dict(entry.parts) | ({} if guess is None else {"odometry": guess}))
+            pipeline = Pipeline(config, imu=imu, **parts)
+            if shared_guess and guess is None:
+                steady = ConstantVelocity(pipeline.mapper.imu)
+                pipeline.odometry = guess = SharedGuess(pipeline.odometry or steady)
+            runners.append(PipelineRunner(entry, pipeline, features))
+        stack.callback(runners[-1].close)
+    return runners, notes
 
 
 def score_all(comparison: Comparison) -> tuple[Scores, ...]:
@@ -204,29 +223,66 @@ def score_all(comparison: Comparison) -> tuple[Scores, ...]:
     Without truth the first run is the reference and has no errors itself.
     """
     references = [comparison.reference] * len(comparison.runs)
+    exact = comparison.truth is not None
     pairs = list(zip(comparison.runs, [comparison.truth, *references[1:]], strict=True))
-    scores = tuple(score(run, reference) for run, reference in pairs)
+    scores = tuple(score(run, reference, exact=exact) for run, reference in pairs)
     found = {entry.lengths for entry in scores if entry.lengths}
     if len(found) < 2:
         return scores
     # Some runs have poses over a part of the path only: the lengths must fit the shortest part.
-    return tuple(score(run, reference, min(found)) for run, reference in pairs)
+    return tuple(score(run, reference, min(found), exact=exact) for run, reference in pairs)
 
 
 def score(
-    run: SolverRun, reference: Trajectory | None, lengths: Sequence[float] | None = None
+    run: SolverRun,
+    reference: Trajectory | None,
+    lengths: Sequence[float] | None = None,
+    *,
+    exact: bool = True,
 ) -> Scores:
     """The scores of one run, without errors if there is no reference.
 
-    ``lengths`` are those of the relative error, in metres; those that fit the path if None.
+    Parameters
+    ----------
+    lengths : of the relative error, in metres; those that fit the path if None
+    exact : whether the reference is the truth, so that covariances can be held against it
     """
-    solved = [update for update in run.updates if update.status.solved]
-    values: dict[str, Any] = {"map_points": run.map_points, "solved": len(solved)}
+    values = _cost(run) | _frames(run)
+    problems = [run.problem] if run.problem else []
+    relative = partial(_relative, lengths=lengths)
+    parts: list[Callable[[SolverRun, Trajectory], dict[str, Any]]] = [_absolute, relative]
+    if exact and run.config is not None and not run.loops:
+        parts.append(_consistency)
+    for part in parts:
+        if reference is None:
+            break
+        try:
+            values |= part(run, reference)
+        except InputError as problem:  # no overlap in time, positions alone, or too short a path
+            problems.append(str(problem))
+    return Scores(**values, problem="; ".join(dict.fromkeys(problems)))
+
+
+def _frames(run: SolverRun) -> dict[str, Any]:
+    good = [update.status.solved or run.config is None for update in run.updates]
+    has = [update.status is FrameStatus.OK for update in run.updates]
+    share = has if run.config is None else good[1:]
+    return {
+        "statuses": dict(Counter(str(update.status) for update in run.updates)),
+        "faults": dict(Counter(str(u.fault) for u in run.updates if u.fault is not None)),
+        "solved": float(np.mean(share)) if share else np.nan,
+        "map_points": run.map_points,
+    }
+
+
+def _cost(run: SolverRun) -> dict[str, Any]:
+    values: dict[str, Any] = {}
     seconds = [sum(update.timings.values()) for update in run.updates if update.timings]
     # The first frame loads code and has no map to match: its time is not that of a usual frame.
     if len(seconds) > 1:
         median, high = np.percentile(1e3 * np.array(seconds[1:]), (50.0, 95.0))
         values |= {"ms_median": float(median), "ms_95": float(high)}
+    solved = [update for update in run.updates if update.status.solved]
     if run.config is not None and solved:
         matches = [update.n_edge_matches + update.n_plane_matches for update in solved]
         values |= {
@@ -234,26 +290,40 @@ def score(
             "solver_iterations": float(np.mean([update.solver_iterations for update in solved])),
             "matches": float(np.median(matches)),
         }
-    problems = [run.problem] if run.problem else []
-    try:
-        if reference is not None:
-            absolute = evaluation.absolute_error(run.trajectory, reference)
-            values |= {
-                "ate_m": absolute.rmse,
-                "ate_max_m": absolute.maximum,
-                "rotation_deg": absolute.rotation_rmse_deg,
-                "path_m": evaluation.interpolate(reference, absolute.stamps).path_length,
-            }
-            given = None if lengths is None else np.array(lengths, np.float64)
-            relative = evaluation.relative_error(run.trajectory, reference, given)
-            values |= {
-                "rpe_percent": relative.translation_percent,
-                "rpe_deg_per_m": relative.rotation_deg_per_m,
-                "lengths": tuple(relative.lengths.tolist()),
-            }
-    except InputError as problem:  # no overlap in time, or too short a path
-        problems.append(str(problem))
-    return Scores(**values, problem="; ".join(problems))
+    return values
+
+
+def _absolute(run: SolverRun, reference: Trajectory) -> dict[str, Any]:
+    trajectory = run.trajectory
+    absolute = evaluation.absolute_error(trajectory, reference)
+    values: dict[str, Any] = {
+        "ate_m": absolute.rmse,
+        "ate_max_m": absolute.maximum,
+        "rotation_deg": absolute.rotation_rmse_deg,
+        "path_m": evaluation.interpolate(reference, absolute.stamps).path_length,
+    }
+    with suppress(InputError):  # positions alone, which the relative error says
+        values["start_m"] = evaluation.absolute_error(trajectory, reference, aligned="start").rmse
+    return values
+
+
+def _relative(
+    run: SolverRun, reference: Trajectory, lengths: Sequence[float] | None
+) -> dict[str, Any]:
+    given = None if lengths is None else np.array(lengths, np.float64)
+    relative = evaluation.relative_error(run.trajectory, reference, given)
+    return {
+        "rpe_percent": relative.translation_percent,
+        "rpe_deg_per_m": relative.rotation_deg_per_m,
+        "lengths": tuple(relative.lengths.tolist()),
+    }
+
+
+def _consistency(run: SolverRun, truth: Trajectory) -> dict[str, Any]:
+    since_start = evaluation.nees(run.updates, truth)
+    ok = [n for n in since_start.beyond if run.updates[n].status is FrameStatus.OK]
+    step = evaluation.nees(run.updates, truth, window=1)
+    return {"nees": since_start.mean, "nees_step": step.mean, "beyond": float(len(ok))}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, config_to_dict
-from loam_gtsam.io.atomic import write_json, write_text
+from loam_gtsam.io.atomic import file_name, write_json, write_text
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.studies import evaluation
@@ -31,6 +31,8 @@ from loam_gtsam.types import FloatArray, InputError, Trajectory
 from loam_gtsam.view import plots
 
 TRUTH_FILE = "truth.tum"
+TRAJECTORIES = "trajectory_", "truth_matched_"
+"""How the names of the trajectories begin; the name of the contender follows."""
 TABLE_FILES = ("comparison.csv", "comparison.json", "frames.csv")
 PICTURES = {
     "trajectories.png": "Trajectories",
@@ -52,16 +54,32 @@ class Column:
     lower_wins: bool = False
 
 
-COLUMNS = (
+ACCURACY = (
     Column("ate_m", "ATE [m]", "root mean square distance between the positions of the solver "
             "and the reference at the same moments, after the rigid motion (SE(3), no scale) that "
             "brings them nearest", 4, True),
     Column("ate_max_m", "max [m]", "largest of those distances", 3, True),
+    Column("start_m", "not fitted [m]", "root mean square distance if only the first common poses "
+            "are made equal: a fit hides a run that went the wrong way, this does not", 3, True),
     Column("rotation_deg", "rot. [deg]", "root mean square angle between the orientations, after "
             "the rotation that fits them best", 3, True),
     Column("rpe_percent", "RPE [%]", "error of the relative motion over each path length, in per "
             "cent of it; mean over all starts and lengths", 3, True),
     Column("rpe_deg_per_m", "RPE [deg/m]", "the same for the rotation", 4, True),
+)  # fmt: skip
+FRAMES = (
+    Column("solved", "solved", "share of the frames after the first whose pose a scan gave; of a "
+            "peer, share with a pose", 3),
+    Column("beyond", "> 5 sigma", "frames ok whose pose since the start is off by more than five "
+            "told standard deviations: wrong, and said to be right", 0),
+    Column("nees", "NEES/6", "mean squared error over covariance, in degrees of freedom, of the "
+            "poses since the start; 1 if the covariances are right, above if they are too small",
+            2),
+    Column("nees_step", "NEES/6, step", "the same of the motions from frame to frame", 2),
+    Column("statuses", "frames", "number of frames by status", 0),
+    Column("faults", "unused", "number of sweeps that could not be used, by cause", 0),
+)  # fmt: skip
+COST = (
     Column("iterations", "assoc.", "associations a frame, mean of the solved frames", 1),
     Column("solver_iterations", "iter.", "solver steps a frame, over all associations, mean", 1),
     Column("matches", "matches", "edge and plane matches of the last association, median", 0),
@@ -71,8 +89,9 @@ COLUMNS = (
     Column("map_points", "map", "points of the whole map; of a peer, points or voxels it "
             "still keeps", 0),
 )  # fmt: skip
-ACCURACY_COLUMNS = 5
-"""Number of the first columns that hold errors; the other columns hold the cost."""
+TABLES = {"Accuracy": ACCURACY, "Frames": FRAMES, "Cost": COST}
+"""The tables of scores; one table of all columns would not fit a page."""
+COLUMNS = (*ACCURACY, *FRAMES, *COST)
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,17 +133,29 @@ class ScoredComparison:
         return [about, guesses, *self.comparison.notes, *problems]
 
 
-def score_table(results: ScoredComparison, columns: Sequence[Column] = COLUMNS) -> TextTable:
-    """Some columns of the scores as a table, a dash where there is no number."""
-    rows = [[run.name] for run in results.comparison.runs]
+def score_table(results: ScoredComparison, columns: Sequence[Column]) -> TextTable:
+    """Some columns of the scores as a table by groups, a dash where there is no number."""
+    runs = results.comparison.runs
+    rows = [[run.name, *(_cell(scores, c) for c in columns)] for run, scores in results.rows]
     best = set()
     for index, column in enumerate(columns, 1):
+        if not column.lower_wins:
+            continue
         values = np.array([getattr(scores, column.key) for scores in results.scores], np.float64)
-        for row, value in zip(rows, values.tolist(), strict=True):
-            row.append(f"{value:.{column.digits}f}" if value == value else "-")
-        if column.lower_wins and np.isfinite(values).sum() > 1:
+        if np.isfinite(values).sum() > 1:
             best.add((int(np.nanargmin(values)), index))
-    return TextTable(["solver", *(column.title for column in columns)], rows, frozenset(best))
+    groups = {run.group: number for number, run in reversed(list(enumerate(runs)))}
+    first = sorted((number, group) for group, number in groups.items())
+    sections = {number: f"{group}: {group.held_equal}" for number, group in first}
+    header = ["", *(column.title for column in columns)]
+    return TextTable(header, rows, frozenset(best), sections)
+
+
+def _cell(scores: Scores, column: Column) -> str:
+    value = getattr(scores, column.key)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{count} {name}" for name, count in value.items()) or "-"
+    return f"{value:.{column.digits}f}" if value == value else "-"
 
 
 def difference_table(results: ScoredComparison) -> TextTable:
@@ -146,12 +177,21 @@ def _median_95_max(values: FloatArray) -> tuple[float, float, float]:
 def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> list[str]:
     """Write all files; returns their names."""
     comparison = results.comparison
-    keys = [*(column.key for column in COLUMNS), "path_m", "solved", "problem"]
-    rows = ([run.name, run.version, *(getattr(s, key) for key in keys)] for run, s in results.rows)
-    _write_csv(folder / "comparison.csv", ["solver", "version", *keys], rows)
+    keys = [*(column.key for column in COLUMNS), "path_m", "problem"]
+    rows = (
+        [run.name, str(run.group), run.version, *(getattr(s, key) for key in keys)]
+        for run, s in results.rows
+    )
+    _write_csv(folder / "comparison.csv", ["solver", "group", "version", *keys], rows)
     write_json(folder / "comparison.json", _summary(results))
     _write_csv(folder / "frames.csv", _FRAME_COLUMNS, _frame_rows(results))
-    trajectories = {f"trajectory_{run.name}.tum": run.trajectory for run in comparison.runs}
+    trajectories = {}
+    for run in comparison.runs:
+        name, found = file_name(run.name), run.trajectory
+        trajectories[f"trajectory_{name}.tum"] = found
+        if comparison.truth is not None:
+            matched = evaluation.matched_truth(found, comparison.truth)
+            trajectories[f"truth_matched_{name}.tum"] = matched
     if comparison.truth is not None:
         trajectories[TRUTH_FILE] = comparison.truth
     for name, trajectory in trajectories.items():
@@ -159,7 +199,7 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
     drawn = _draw(results, folder) if plot else []
     pictures = {PICTURES[name]: folder / name for name in drawn}
     sections = {
-        "Scores": table_html(score_table(results)),
+        **{name: table_html(score_table(results, part)) for name, part in TABLES.items()},
         **{caption: picture_html(caption, file) for caption, file in pictures.items()},
         "Definitions": list_html({column.title: column.meaning for column in COLUMNS}),
         "What was run": list_html({run.name: _settings(run) for run in comparison.runs}),
@@ -175,6 +215,8 @@ def _summary(results: ScoredComparison) -> dict[str, Any]:
         difference = results.differences.get(run.name)
         solver = {
             "name": run.name,
+            "group": str(run.group),
+            "held_equal": run.group.held_equal,
             "version": run.version,
             "config": run.config and config_to_dict(run.config),
             "scores": asdict(scores),
@@ -220,6 +262,8 @@ def _frame_rows(results: ScoredComparison) -> Iterable[list[Any]]:
 
 def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
     def field(value: Any) -> Any:  # a number that is not known is an empty field
+        if isinstance(value, Mapping):
+            return " ".join(f"{name}={count}" for name, count in value.items())
         if not isinstance(value, float):
             return value
         return f"{value:.9g}" if math.isfinite(value) else ""

@@ -1,21 +1,26 @@
-"""The contenders of a comparison, pipelines of this package and other systems, on equal sweeps."""
+"""The contenders of a comparison, in groups that say what is held equal among them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from pathlib import Path
+from typing import Any, get_args
 
 import gtsam
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from loam_gtsam.config import PRESETS, Config, load_config
+from loam_gtsam.config import Config, SolverConfig, load_config, preset
+from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.frontend.workers import Extraction, extract
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.pipeline import Pipeline, RunResult
+from loam_gtsam.pipeline import Parts, Pipeline, RunResult
 from loam_gtsam.registration.odometry import Guess, Odometry
-from loam_gtsam.registration.solvers import ScanSolver
-from loam_gtsam.studies.peers import PEERS, Peer, TimedPoints
+from loam_gtsam.studies.factories import is_factory, make_parts
+from loam_gtsam.studies.peers import Inertial, Peer, TimedPoints, make_peer
 from loam_gtsam.types import (
     BadSweep,
     ConfigError,
@@ -30,43 +35,98 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
-_PRESET_OF = {"gtsam": "default"}  # solver names that are not the name of their preset
+METHODS: tuple[str, ...] = get_args(SolverConfig.model_fields["method"].annotation)
+"""Solvers of this package by the name of their ``solver.method``."""
+
+
+class Group(StrEnum):
+    """What sets the contenders of a group apart, and so what they have in common."""
+
+    SOLVER = "solver"
+    FEATURES = "front end"
+    PRESET = "preset"
+    CONFIG = "configuration"
+    PEER = "peer"
+
+    @property
+    def held_equal(self) -> str:
+        """A sentence on what the contenders of this group share."""
+        return _HELD_EQUAL[self]
+
+
+_HELD_EQUAL = {
+    Group.SOLVER: "Only the solver differs: features, map, search, gates of the matches, limits "
+    "and the rule to predict are the same.",
+    Group.FEATURES: "Only the features differ: map, gates, solver and the rule to predict are the "
+    "same.",
+    Group.PRESET: "The whole system differs: features, de-skew, map, gates, limits and solver are "
+    "those of the preset.",
+    Group.CONFIG: "The whole system differs, as the configuration files say.",
+    Group.PEER: "Other systems on the points and times of the same sweeps, with their own de-skew, "
+    "features, map and settings.",
+}
 
 
 @dataclass(frozen=True, slots=True)
 class Contender:
-    """One solver that a comparison is to run; ``config`` is None for a peer.
+    """What a comparison is to run.
 
-    ``solver`` is a user's own solver in place of the one that ``config`` names.
+    Attributes
+    ----------
+    name : of its row and its files; no two may be equal
+    config : of a run of this package; None for a peer
+    group : with which others it is to be compared
+    parts : of a user's own, see :class:`loam_gtsam.pipeline.Parts`; each contender needs its own
+    peer : see :func:`loam_gtsam.studies.peers.make_peer`; empty for runs of this package
     """
 
     name: str
     config: Config | None = None
-    solver: ScanSolver | None = None
+    group: Group = Group.CONFIG
+    parts: Parts = field(default_factory=lambda: Parts())
+    peer: str = ""
 
 
-def solver_names() -> tuple[str, ...]:
-    """All names that :func:`find_contender` knows, those of this package first."""
-    named = {preset: name for name, preset in _PRESET_OF.items()}
-    return (*(named.get(preset, preset) for preset in PRESETS), *PEERS)
+def with_solver(base: Config, method: str) -> Config:
+    """``base`` with another ``solver.method`` and nothing else.
 
-
-def find_contender(name: str) -> Contender:
-    """The contender called ``name``; a name that ends in .yaml or .yml is a configuration file.
-
-    Raises ConfigError if no solver has this name, or the configuration file does not fit.
+    One thing must follow: the IMU's tilt is a factor only where there is a graph. The classical
+    solvers get the blend, which does the same to the pose (``docs/maths/imu_prior.md``).
     """
-    if name in PEERS:
-        return Contender(name)
-    if Path(name).suffix in (".yaml", ".yml"):
-        return Contender(Path(name).stem, load_config(name))
-    preset = _PRESET_OF.get(name, name)
-    if preset not in PRESETS:
+    changes: dict[str, Any] = {"solver.method": method}
+    if method != "gtsam" and base.imu.prior in ("equivalent", "sigma"):
+        changes["imu.prior"] = "blend"
+    return base.changed(changes)
+
+
+def make_contender(group: Group, name: str, base: Config) -> Contender:
+    """The contender called ``name`` in a group.
+
+    Parameters
+    ----------
+    group, name : ``SOLVER``: gtsam, loam, aloam, or ``package.module:factory``; ``FEATURES``:
+        ``package.module:factory``; ``PRESET``: its name; ``CONFIG``: a file; ``PEER``: its name,
+        with settings
+    base : into which solvers and front ends are put
+
+    Raises ConfigError if there is none of that name.
+    """
+    if group is Group.PEER:
+        return Contender(name, None, group, peer=name)
+    if group is Group.CONFIG:
+        return Contender(Path(name).stem, load_config(name), group)
+    if group is Group.PRESET:
+        return Contender(f"preset {name}", preset(name), group)
+    if group is Group.FEATURES or is_factory(name):
+        part = "features" if group is Group.FEATURES else "solver"
+        return Contender(name.rpartition(":")[2], base, group, make_parts({part: name}, base))
+    if name not in METHODS:
         raise ConfigError(
-            f"unknown solver {name!r}; expected one of {', '.join(solver_names())}, or a "
-            "configuration file (.yaml)"
+            f"unknown solver {name!r}; expected {', '.join(METHODS)}, or PACKAGE.MODULE:FACTORY. "
+            "Presets, configuration files and peers have options of their own: --preset, --config, "
+            "--peer"
         )
-    return Contender(name, PRESETS[preset])
+    return Contender(name, with_solver(base, name), group)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +140,7 @@ class SolverRun:
     updates : one per sweep, corrected by loop closures if there are any
     map_points : points of the whole map; of a peer the points or voxels that it still keeps
     problem : what ended the contender early, else ""
+    loops : whether loop closures moved the poses, to which their covariances then do not belong
     """
 
     name: str
@@ -88,9 +149,11 @@ class SolverRun:
     updates: tuple[MapUpdate, ...]
     map_points: int
     problem: str = ""
+    group: Group = Group.CONFIG
+    loops: bool = False
 
     @classmethod
-    def of_result(cls, name: str, result: RunResult) -> SolverRun:
+    def of_result(cls, name: str, result: RunResult, group: Group = Group.CONFIG) -> SolverRun:
         """The run of a pipeline of this package."""
         updates = list(result.updates)
         if result.loops is not None:
@@ -98,8 +161,8 @@ class SolverRun:
             for number, pose in zip(placed, result.trajectory.map_T_lidar, strict=True):
                 updates[number] = replace(updates[number], map_T_lidar=gtsam.Pose3(pose))
         points = len(result.edge_points) + len(result.plane_points)
-        version = f"loam_gtsam {installed_version()}"
-        return cls(name, version, result.config, tuple(updates), points)
+        version, loops = f"loam_gtsam {installed_version()}", result.loops is not None
+        return cls(name, version, result.config, tuple(updates), points, "", group, loops)
 
     @property
     def used(self) -> tuple[int, ...]:
@@ -115,12 +178,34 @@ class SolverRun:
         return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
 
-def extract_for_all(sweep: Sweep, config: Config) -> Extraction | None:
-    """The features of a sweep for several pipelines; None if the sweep has no points."""
-    if not isinstance(sweep, Scan):
-        return None
+class SharedFeatures:
+    """The features of the last sweep, extracted once for all that want the same."""
+
+    def __init__(self) -> None:
+        self._sweep: Sweep | None = None
+        self._found: list[tuple[Any, Extraction]] = []
+
+    def of(self, sweep: Sweep, config: Config, parts: Parts) -> Extraction | None:
+        """The features of a sweep for one contender; None if the sweep has no points."""
+        if not isinstance(sweep, Scan):
+            return None
+        if sweep is not self._sweep:
+            self._sweep, self._found = sweep, []
+        front_end, deskew = parts.get("features"), config.deskew
+        key = config.sensor, config.features, deskew.enabled, deskew.reference, front_end
+        for known, extraction in self._found:
+            if known == key:
+                return extraction
+        extraction = extract_for_all(sweep, config, parts)
+        self._found.append((key, extraction))
+        return extraction
+
+
+def extract_for_all(sweep: Scan, config: Config, parts: Parts) -> Extraction:
+    """The features of a sweep for several pipelines, which may have maps of different voxels."""
     # No feature is left out: each pipeline thins the features to the voxels of its own map.
-    return extract(sweep, config.changed({"odometry.method": "scan_to_scan"}))
+    whole = config.changed({"odometry.method": "scan_to_scan"})
+    return extract(sweep, whole, parts.get("features"))
 
 
 def timed_points(scan: Scan, config: Config) -> TimedPoints:
@@ -171,17 +256,23 @@ class PipelineRunner:
     Pipeline and IMU buffer are for this contender alone: the buffer learns the gyro's bias.
     """
 
-    def __init__(self, name: str, pipeline: Pipeline) -> None:
-        self.name, self.pipeline = name, pipeline
+    def __init__(self, contender: Contender, pipeline: Pipeline, features: SharedFeatures) -> None:
+        self.contender, self.pipeline, self._features = contender, pipeline, features
         self.updates: list[MapUpdate] = []
 
-    def register(self, sweep: Sweep, extraction: Extraction | None = None) -> None:
-        """Register a sweep, with features that were extracted before if there are any."""
+    def register(self, sweep: Sweep) -> None:
+        """Register a sweep, with features that another one extracted before if there are any."""
+        extraction = self._features.of(sweep, self.pipeline.config, self.contender.parts)
         self.updates.append(self.pipeline.process(sweep, extraction))
 
     def result(self, frames: int) -> SolverRun:
         """The run over the first ``frames`` sweeps."""
-        return SolverRun.of_result(self.name, self.pipeline.result(self.updates[:frames]))
+        whole = self.pipeline.result(self.updates[:frames])
+        return SolverRun.of_result(self.contender.name, whole, self.contender.group)
+
+    def close(self) -> None:
+        """Nothing is held."""
+        return
 
 
 class PeerRunner:
@@ -190,13 +281,18 @@ class PeerRunner:
     ``config`` decides which points of a sweep are used, and their times.
     """
 
-    def __init__(self, peer: Peer, config: Config) -> None:
-        self.peer, self.config = peer, config
+    def __init__(self, name: str, peer: Peer, config: Config) -> None:
+        self.name, self.peer, self.config = name, peer, config
         self.updates: list[MapUpdate] = []
         self.problem = ""  # what ended the peer early
         self._last_stamp: int | None = None
 
-    def register(self, sweep: Sweep, extraction: Extraction | None = None) -> None:
+    @classmethod
+    def of(cls, text: str, dataset: Dataset, config: Config) -> PeerRunner:
+        """The peer called ``text``, for a data set and its effective configuration."""
+        return cls(text, make_peer(text, inertial_of(dataset, config)), config)
+
+    def register(self, sweep: Sweep) -> None:
         """Register a sweep; InputError if it has features instead of points."""
         if isinstance(sweep, FeatureSweep):
             raise InputError("peers need the points of raw sweeps; this data set has features only")
@@ -226,4 +322,18 @@ class PeerRunner:
         """The run over the first ``frames`` sweeps."""
         peer, updates = self.peer, tuple(self.updates[:frames])
         version = f"{peer.package} {installed_version(peer.package)}"
-        return SolverRun(peer.name, version, None, updates, peer.map_points, self.problem)
+        points, problem = peer.map_points, self.problem
+        return SolverRun(self.name, version, None, updates, points, problem, Group.PEER)
+
+    def close(self) -> None:
+        """End the peer's process, if it has one."""
+        self.peer.close()
+
+
+def inertial_of(dataset: Dataset, config: Config) -> Inertial | None:
+    """The IMU of a data set for peers, by its extrinsics; None if there is none."""
+    samples = dataset.imu if config.imu.enabled else None
+    if samples is None:
+        return None
+    rotation = Rotation.from_euler("xyz", config.imu.lidar_R_imu_deg, degrees=True)
+    return Inertial(samples, rigid_transform(rotation, config.imu.lidar_t_imu))

@@ -1,23 +1,33 @@
-"""Trajectory errors, absolute and relative.
+"""Trajectory errors, absolute and relative, and whether covariances are as large as the errors.
 
-Positions are compared as evo compares them; orientations see :class:`AbsoluteError`.
+Positions are compared as evo compares them; orientations see :class:`AbsoluteError`. A reference of
+positions alone (GPS) has NaN as its orientations; what needs them is then NaN or refused.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
+import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
+from scipy.stats import chi2, norm
 
 from loam_gtsam.geometry import inverse_pose, transform
-from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
+from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory
 
 _NO_SPREAD = 1e-9
 """Ratio of the second to the first singular value below which positions lie on a line (the ratio
 of the spreads is its root: 3 cm across a line of a kilometre)."""
 _LENGTHS = 8  # path lengths of the relative error, as in KITTI; multiples of one of these metres:
 _LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+FREEDOM = 6
+"""Degrees of freedom of a pose."""
+FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), FREEDOM))
+"""Squared Mahalanobis distance of a pose that is as unlikely as five standard deviations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,15 +107,34 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
         )
     times, queries = ((some - trajectory.stamps[0]) * 1e-9 for some in (trajectory.stamps, stamps))
     poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    rotations = Rotation.from_matrix(trajectory.map_T_lidar[:, :3, :3])
-    poses[:, :3, :3] = Slerp(times, rotations)(queries).as_matrix()
+    rotations = trajectory.map_T_lidar[:, :3, :3]
+    if np.isfinite(rotations).all():
+        turned = Slerp(times, Rotation.from_matrix(rotations))(queries)
+        poses[:, :3, :3] = turned.as_matrix()
+    else:  # positions alone
+        poses[:, :3, :3] = np.nan
     for axis in range(3):
         poses[:, axis, 3] = np.interp(queries, times, trajectory.map_T_lidar[:, axis, 3])
     return Trajectory(np.asarray(stamps, np.int64), poses)
 
 
+def matched_truth(trajectory: Trajectory, reference: Trajectory) -> Trajectory:
+    """The reference at the stamps of a trajectory, for tools that pair equal stamps (evo).
+
+    Poses outside the time span of the reference have none. Raises InputError if the stamps of the
+    reference do not increase.
+    """
+    _check_stamps("matched_truth", reference)
+    stamps = trajectory.stamps
+    inside = (stamps >= reference.stamps[0]) & (stamps <= reference.stamps[-1])
+    return interpolate(reference, stamps[inside])
+
+
 def absolute_error(
-    estimate: Trajectory, reference: Trajectory, *, aligned: bool = True
+    estimate: Trajectory,
+    reference: Trajectory,
+    *,
+    aligned: bool | Literal["start"] = True,
 ) -> AbsoluteError:
     """Absolute error (ATE) of the poses inside the reference, interpolated at their stamps.
 
@@ -115,12 +144,18 @@ def absolute_error(
     Parameters
     ----------
     aligned : fit positions by a rigid transform (SE(3), :func:`align_positions`) and orientations
-        by a rotation (:func:`align_rotations`) first; else the poses are compared as they are
+        by a rotation (:func:`align_rotations`) first. ``"start"``: move the estimate so that its
+        first common pose is that of the reference, which hides no drift. False: compare the poses
+        as they are.
     """
     stamps, poses, truth = _common("absolute_error", estimate, reference)
+    if aligned == "start":
+        _need_orientation("absolute_error", truth)
+        poses = truth[0] @ inverse_pose(poses[:1]) @ poses
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
-    if aligned:
+    if aligned is True and np.isfinite(truth).all():
         rotations = align_rotations(rotations, truth[:, :3, :3]) @ rotations
+    if aligned is True:
         positions = transform(align_positions(positions, truth[:, :3, 3]), positions)
     errors = np.linalg.norm(positions - truth[:, :3, 3], axis=1)
     angles = _angles_deg(np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations)
@@ -180,6 +215,7 @@ def relative_error(
     lengths : (L,) metres along the reference; :func:`path_lengths` of its path if None
     """
     _, poses, truth = _common("relative_error", estimate, reference)
+    _need_orientation("relative_error", truth)
     travelled = distance_travelled(truth[:, :3, 3])
     path = float(travelled[-1])
     lengths = path_lengths(path) if lengths is None else np.asarray(lengths, np.float64)
@@ -208,6 +244,86 @@ def relative_error(
     )
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Nees:
+    """Normalised estimation error squared: errors of poses held against their covariances.
+
+    Attributes
+    ----------
+    mean : mean of ``squared`` over the six degrees of freedom: 1 if the covariances are right,
+        larger if they are too small; NaN without samples
+    frames : (N,) numbers of the frames, solved ones with a covariance, and reference poses at both
+        ends of the window
+    squared : (N,) squared Mahalanobis distances of the errors; infinite where the covariance is
+        not positive definite
+    """
+
+    mean: float
+    frames: IntArray
+    squared: FloatArray
+
+    @property
+    def beyond(self) -> IntArray:
+        """(M,) numbers of the frames that are off by more than five told standard deviations."""
+        return self.frames[self.squared > FIVE_SIGMA]
+
+
+def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0) -> Nees:
+    """Errors of poses, or of motions over a window, held against the covariances that were told.
+
+    See Bar-Shalom, Li and Kirubarajan, Estimation with Applications to Tracking and Navigation,
+    2001, section 5.4.
+
+    Parameters
+    ----------
+    updates : of a run, in order; without corrections of loop closures, which have no covariance
+        here
+    reference : interpolated at the stamps of the updates
+    window : motions over so many frames, with :func:`~loam_gtsam.relative_covariance`; 0 for poses
+        since the first frame inside the reference, with ``MapUpdate.covariance``
+
+    Raises
+    ------
+    InputError
+        If no update lies inside the reference, its stamps do not increase, or it has positions
+        alone.
+    """
+    _check_stamps("nees", reference)
+    first, last = reference.stamps[0], reference.stamps[-1]
+    inside = [n for n, u in enumerate(updates) if u.status.has_pose and first <= u.stamp <= last]
+    if not inside:
+        raise InputError(f"nees: expected poses inside {first} to {last} ns, got none")
+    chosen = [updates[n] for n in inside]
+    truth = interpolate(reference, np.array([update.stamp for update in chosen], np.int64))
+    _need_orientation("nees", truth.map_T_lidar)
+    true = [gtsam.Pose3(pose) for pose in truth.map_T_lidar]
+    frames, squared = [], []
+    for k in range(window or 1, len(chosen)):
+        start = k - window if window else 0
+        before, now = chosen[start], chosen[k]
+        if now.uncertainty is None or (window and before.uncertainty is None):
+            continue
+        covariance = relative_covariance(before, now) if window else now.covariance
+        moved = before.map_T_lidar.between(now.map_T_lidar)
+        error = moved.localCoordinates(true[start].between(true[k]))
+        frames.append(inside[k])
+        squared.append(_mahalanobis(error, covariance))
+    found = np.array(squared, np.float64)
+    finite = found[np.isfinite(found)]
+    mean = float(finite.mean()) / FREEDOM if len(finite) else np.nan
+    return Nees(mean, np.array(frames, np.int64), found)
+
+
+def _mahalanobis(error: FloatArray, covariance: FloatArray) -> float:
+    """Squared; infinite if the covariance is none."""
+    try:
+        root = np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:
+        return np.inf
+    whitened = np.linalg.solve(root, error)
+    return float(whitened @ whitened)
+
+
 def pose_differences(
     estimate: Trajectory, reference: Trajectory
 ) -> tuple[IntArray, FloatArray, FloatArray]:
@@ -217,6 +333,7 @@ def pose_differences(
     Raises InputError as :func:`absolute_error` does.
     """
     stamps, poses, others = _common("pose_differences", estimate, reference)
+    _need_orientation("pose_differences", others)
     here, there = inverse_pose(poses[:1]) @ poses, inverse_pose(others[:1]) @ others
     metres = np.linalg.norm(here[:, :3, 3] - there[:, :3, 3], axis=1)
     rotation = np.swapaxes(there[:, :3, :3], 1, 2) @ here[:, :3, :3]
@@ -246,10 +363,18 @@ def _common(
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:
-    if not len(rotations):
-        return np.zeros(0)
+    if not len(rotations) or not np.isfinite(rotations).all():
+        return np.full(len(rotations), np.nan)
     angles: FloatArray = np.degrees(Rotation.from_matrix(rotations).magnitude())
     return angles
+
+
+def _need_orientation(caller: str, truth: FloatArray) -> None:
+    if not np.isfinite(truth).all():
+        raise InputError(
+            f"{caller}: expected reference poses with orientation, got positions alone; only the "
+            "absolute error of positions can be taken"
+        )
 
 
 def _check_stamps(caller: str, trajectory: Trajectory) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
 from string import Template
@@ -19,14 +19,15 @@ _PAGE = Template("""<!DOCTYPE html>
 <title>$title</title>
 <style>
 body { font: 15px/1.5 system-ui, sans-serif; color: #22303c; background: #fff;
-       max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
+       max-width: 76rem; margin: 2rem auto; padding: 0 1rem; }
 h1 { font-size: 1.5rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
-.scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #d7dde2;
          white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
 td.best { font-weight: 700; }
+td.text { text-align: left; white-space: normal; }
+tr.group td { text-align: left; white-space: normal; color: #5c6b77; padding-top: 1rem; }
 dt { font-weight: 600; } dd { margin: 0 0 .5rem 0; }
 img { max-width: 100%; height: auto; }
 .note { color: #5c6b77; }
@@ -39,7 +40,8 @@ $body
 </body>
 </html>
 """)
-_BEST = ' class="best"'
+_BEST, _TEXT = ' class="best"', ' class="text"'
+_LONG = 16  # letters of a cell that may be broken
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,11 +49,13 @@ class TextTable:
     """A table of texts, for the terminal and for the report.
 
     ``best`` are (row, column) of the cells to point out; column 0 is the name of the row.
+    ``sections`` are lines of text above some rows, by the number of the row.
     """
 
     header: Sequence[str]
     rows: Sequence[Sequence[str]]
     best: frozenset[tuple[int, int]] = frozenset()
+    sections: Mapping[int, str] = field(default_factory=dict)
 
 
 def page(title: str, intro: Sequence[str], sections: Mapping[str, str]) -> str:
@@ -67,17 +71,19 @@ def page(title: str, intro: Sequence[str], sections: Mapping[str, str]) -> str:
 
 
 def table_html(table: TextTable) -> str:
-    """A table, its best cells in bold type."""
+    """A table, its best cells in bold type; long texts may go over several lines."""
     head = "".join(f"<th>{escape(cell)}</th>" for cell in table.header)
     lines = []
     for number, row in enumerate(table.rows):
-        styles = (_BEST if (number, column) in table.best else "" for column in range(len(row)))
+        if number in table.sections:
+            text = escape(table.sections[number])
+            span = len(table.header)
+            lines.append(f'<tr class="group"><td colspan="{span}">{text}</td></tr>')
+        best = (_BEST if (number, column) in table.best else "" for column in range(len(row)))
+        styles = [_TEXT if len(cell) > _LONG else s for s, cell in zip(best, row, strict=True)]
         cells = (f"<td{s}>{escape(cell)}</td>" for s, cell in zip(styles, row, strict=True))
         lines.append(f"<tr>{''.join(cells)}</tr>")
-    return (
-        f'<div class="scroll"><table><thead><tr>{head}</tr></thead>\n'
-        f"<tbody>{''.join(lines)}</tbody></table></div>"
-    )
+    return f"<table><thead><tr>{head}</tr></thead>\n<tbody>{''.join(lines)}</tbody></table>"
 
 
 def picture_html(caption: str, file: Path) -> str:

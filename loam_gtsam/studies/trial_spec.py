@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qsl
 
 from ruamel.yaml import YAML
 
-from loam_gtsam.config import Config
-from loam_gtsam.studies.contenders import Contender, find_contender
+from loam_gtsam.config import Config, load_config, preset
+from loam_gtsam.studies.contenders import METHODS, with_solver
+from loam_gtsam.studies.factories import PARTS, is_factory
+from loam_gtsam.studies.peers import PEERS
 from loam_gtsam.studies.trials import METRICS, Trial
 from loam_gtsam.types import ConfigError
 
 _SPEC = ("sequences", "configs", "seeds", "frames", "metrics")
 _SEQUENCE = ("path", "options", "frames", "set")
-_CONFIG = ("solver", "set")
+_CONFIG = ("base", "peer", "set", *PARTS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,6 +34,15 @@ class Spec:
     text: str
     trials: tuple[Trial, ...]
     metrics: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class _System:
+    """What runs: a configuration and parts of a user's own by name, or a peer."""
+
+    config: Config
+    parts: Mapping[str, str] = field(default_factory=dict)
+    peer: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +100,9 @@ def load_spec(path: str | Path) -> Spec:
             options=sequence.options,
             frames=sequence.frames,
             seed=seed,
-            config=_changed(entry.config or Config(), f"{sequence.where}.set", sequence.changes),
-            peer=entry.name if entry.config is None else None,
+            config=_changed(entry.config, f"{sequence.where}.set", sequence.changes),
+            peer=entry.peer,
+            parts=entry.parts,
         )
         for label, sequence in sequences.items()
         for config_name, entry in configs.items()
@@ -113,23 +125,41 @@ def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequ
     return _Sequence(path, options, frames, _mapping(f"{where}.set", entries.get("set", {})), where)
 
 
-def _config(where: str, value: Any, folder: Path) -> Contender:
-    entries = {"solver": value} if isinstance(value, str) else _mapping(where, value, _CONFIG)
-    solver = entries.get("solver", "gtsam")
-    if not isinstance(solver, str):
-        raise ConfigError(f"{where}.solver: expected a name or a .yaml file, got {solver!r}")
-    if Path(solver).suffix in (".yaml", ".yml"):
-        solver = str(folder / Path(solver).expanduser())
-    try:
-        entry = find_contender(solver)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from error
+def _config(where: str, value: Any, folder: Path) -> _System:
+    entries = {_kind(value): value} if isinstance(value, str) else _mapping(where, value, _CONFIG)
+    for key in (*PARTS, "base", "peer"):
+        if not isinstance(entries.get(key, ""), str):
+            raise ConfigError(f"{where}.{key}: expected a name, got {entries[key]!r}")
     changes = _mapping(f"{where}.set", entries.get("set", {}))
-    if entry.config is None:
-        if changes:
-            raise ConfigError(f"{where}.set: {solver} is a peer and runs with its own defaults")
-        return entry
-    return Contender(entry.name, _changed(entry.config, f"{where}.set", changes))
+    if peer := entries.get("peer"):
+        if len(entries) > 1:
+            raise ConfigError(f"{where}: {peer} is a peer, beside which nothing can be set")
+        if peer.partition("?")[0] not in PEERS:
+            known = ", ".join(PEERS)
+            raise ConfigError(f"{where}.peer: unknown peer {peer!r} (known: {known})")
+        return _System(Config(), peer=peer)
+    base = entries.get("base", "default")
+    if Path(base).suffix in (".yaml", ".yml"):
+        config = load_config(folder / Path(base).expanduser())
+    else:
+        config = preset(base, f"{where}.base: ")
+    parts = {key: entries[key] for key in PARTS if key in entries}
+    solver = parts.get("solver", "")
+    if solver and not is_factory(solver):
+        if solver not in METHODS:
+            raise ConfigError(
+                f"{where}.solver: unknown solver {solver!r}; expected {', '.join(METHODS)}, or "
+                "PACKAGE.MODULE:FACTORY; a preset or a configuration file (.yaml) is a 'base'"
+            )
+        config = with_solver(config, parts.pop("solver"))
+    return _System(_changed(config, f"{where}.set", changes), parts)
+
+
+def _kind(name: str) -> str:
+    """What a name alone stands for: a configuration file, a peer, or else a solver."""
+    if Path(name).suffix in (".yaml", ".yml"):
+        return "base"
+    return "peer" if name.partition("?")[0] in PEERS else "solver"
 
 
 def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:

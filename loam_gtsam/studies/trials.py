@@ -14,7 +14,8 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from contextlib import closing
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -29,7 +30,7 @@ from loam_gtsam.pipeline import OnFrame, effective_config, run
 from loam_gtsam.studies.comparison import score
 from loam_gtsam.studies.contenders import PeerRunner, SolverRun
 from loam_gtsam.studies.evaluation import pose_differences
-from loam_gtsam.studies.peers import make_peer
+from loam_gtsam.studies.factories import make_parts
 from loam_gtsam.types import FrameStatus, LoamError, OutputError, Trajectory
 
 Row = dict[str, Any]
@@ -37,14 +38,15 @@ Row = dict[str, Any]
 VERSIONS = ("loam_gtsam", "gtsam", "numpy")
 """Packages whose version decides the numbers of the solvers of this package."""
 METRICS = (
-    "ate_m", "ate_max_m", "rotation_deg", "rpe_percent", "rpe_deg_per_m", "drift_percent",
+    "ate_m", "ate_max_m", "start_m", "rotation_deg", "rpe_percent", "rpe_deg_per_m",
+    "drift_percent", "solved", "beyond", "nees", "nees_step",
     "iterations", "solver_iterations", "matches", "ms_median", "ms_95",
 )  # fmt: skip
 """Columns to compare solvers by; see ``docs/compare.md`` and ``docs/parameter_studies.md``."""
 COLUMNS: dict[str, type] = {
     **dict.fromkeys(("trial", "sequence", "config"), str),
     "seed": int,
-    **dict.fromkeys(("path", "options", "config_hash", "peer", "peer_version"), str),
+    **dict.fromkeys(("path", "options", "config_hash", "parts", "peer", "peer_version"), str),
     **{f"{name}_version": str for name in VERSIONS},
     "frames": int,
     **{f"frames_{status}": int for status in FrameStatus},
@@ -74,7 +76,8 @@ class Trial:
     frames : at most so many sweeps; None takes all
     seed : of a built-in world; None for recorded data
     config : of the run; a peer uses the section ``sensor`` only
-    peer : name of a peer; None for a solver of this package
+    peer : name of a peer, with settings; None for a run of this package
+    parts : of a user's own by name, see :func:`loam_gtsam.studies.factories.make_parts`
     """
 
     sequence: str
@@ -85,11 +88,13 @@ class Trial:
     seed: int | None
     config: Config
     peer: str | None = None
+    parts: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def config_hash(self) -> str:
-        """Hash of every value of the configuration, and of the name of the peer."""
-        return _hash({"peer": self.peer, "config": config_to_dict(self.config)})
+        """Hash of every value of the configuration, and of the names of peer and parts."""
+        named = {"peer": self.peer, **self.parts}
+        return _hash(named | {"config": config_to_dict(self.config)})
 
     @property
     def id(self) -> str:
@@ -140,6 +145,7 @@ def empty_row(trial: Trial) -> Row:
         "path": trial.path,
         "options": json.dumps(dict(trial.options), sort_keys=True, default=str),
         "config_hash": trial.config_hash,
+        "parts": json.dumps(dict(trial.parts), sort_keys=True) if trial.parts else None,
         "peer": trial.peer,
     }
     return dict.fromkeys(COLUMNS) | dict(versions()) | known
@@ -147,16 +153,19 @@ def empty_row(trial: Trial) -> Row:
 
 def _run_solver(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
     if trial.peer is None:
-        result = run(dataset, trial.config, max_frames=trial.frames, on_frame=on_frame)
+        parts = make_parts(trial.parts, trial.config)
+        frames = trial.frames
+        result = run(dataset, trial.config, max_frames=frames, on_frame=on_frame, **parts)
         if result.interrupted:
             raise KeyboardInterrupt
         return SolverRun.of_result(trial.config_name, result)
-    runner = PeerRunner(make_peer(trial.peer), effective_config(trial.config, dataset))
-    for number, sweep in enumerate(islice(dataset, trial.frames)):
-        runner.register(sweep)
-        if on_frame is not None:
-            on_frame(number, runner.updates[-1])
-    return runner.result(len(runner.updates))
+    runner = PeerRunner.of(trial.peer, dataset, effective_config(trial.config, dataset))
+    with closing(runner):
+        for number, sweep in enumerate(islice(dataset, trial.frames)):
+            runner.register(sweep)
+            if on_frame is not None:
+                on_frame(number, runner.updates[-1])
+        return runner.result(len(runner.updates))
 
 
 def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:

@@ -28,6 +28,7 @@ _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 """Pale ground, dark walls: what stands out of the ground stands out of the page."""
 _MAX_BYTES = 300_000  # larger pictures get fewer colours: they are for READMEs and reports
 _PALETTE = 255
+_LEGEND_COLUMNS = 4
 _MAP_CELLS = 700  # along the longer side of the top view; a picture has about as many pixels
 _MIN_CELL = 0.1  # metres; the map is voxel-filtered: smaller cells would be mostly empty
 
@@ -163,7 +164,7 @@ def plot_trajectories(
     named = zip(trajectories.items(), cycle(_RUN_COLOURS), strict=False)
     lines += [(name, trajectory, colour, 1.3) for (name, trajectory), colour in named]
     figure, top = _trajectory_figure(7.5, lines)
-    top.legend(frameon=False)
+    _legend_above(figure, *top.get_legend_handles_labels())
     save_figure(figure, path)
 
 
@@ -195,8 +196,7 @@ def plot_curves(
         else:
             axes.set_ylim(bottom=0.0)
         axes.set_ylabel(ylabel)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(frameon=False)
+    _legend_above(figure, *rows[0].get_legend_handles_labels())
     rows[-1].set_xlabel(xlabel)
     save_figure(figure, path)
 
@@ -231,6 +231,13 @@ def _trajectory_figure(
     top.set(xlabel="x [m]", ylabel="y [m]")
     side.set(xlabel="distance travelled [m]", ylabel="z [m]")
     return figure, top
+
+
+def _legend_above(figure: Any, handles: Sequence[Any], labels: Sequence[str]) -> None:
+    """A legend over the panels, off the curves."""
+    if handles:
+        columns = min(len(labels), _LEGEND_COLUMNS)
+        figure.legend(handles, labels, loc="outside upper center", ncols=columns, frameon=False)
 
 
 def _draw_path(axes: Any, xyz: FloatArray) -> None:

@@ -39,11 +39,13 @@ def rows(path):
 
 
 def test_command_writes_tables_pictures_and_report(command, fake, world):
-    result = command("--solver", "gtsam", "--solver", "fake", "--output", "out", "--set",
+    result = command("--solver", "gtsam", "--peer", "fake", "--output", "out", "--set",
                      "solver.iterations=3")  # fmt: skip
     assert result.exit_code == 0, result.output
     names = {path.name for path in Path("out").iterdir()}
-    trajectories = {"trajectory_gtsam.tum", "trajectory_fake.tum", "truth.tum"}
+    poses = {f"{kind}_{name}.tum" for kind in ("trajectory", "truth_matched")
+             for name in ("gtsam", "fake")}  # fmt: skip
+    trajectories = poses | {"truth.tum"}
     assert names == {*TABLE_FILES, REPORT_FILE} | trajectories | set(PICTURES if PLOTS else ())
     table = rows("out/comparison.csv")
     assert [row["solver"] for row in table] == ["gtsam", "fake"]
@@ -65,20 +67,22 @@ def test_command_writes_tables_pictures_and_report(command, fake, world):
 
 
 def test_report_is_one_file_with_everything_escaped(command, fake):
-    assert command("--solver", "gtsam", "--solver", "fake", "--output", "out").exit_code == 0
+    assert command("--solver", "gtsam", "--peer", "fake", "--output", "out").exit_code == 0
     page = Path("out/report.html").read_text()
     assert "a &lt;b&gt;list&lt;/b&gt; [red]" in page
     assert "<b>list" not in page
     assert 'src="http' not in page
     assert "href" not in page
     assert page.count("data:image/png;base64,") == (4 if PLOTS else 0)
-    assert len(re.findall("<tr>", page)) == 3
+    assert len(re.findall("<tr>", page)) == 3 * 3  # three tables of two contenders
+    assert len(re.findall('<tr class="group">', page)) == 3 * 2
+    assert "Only the solver differs" in page
     assert 'class="best"' in page
 
 
 def test_without_truth_the_first_solver_is_the_reference(command, dataset, fake):
     dataset.truth = None
-    result = command("--solver", "gtsam", "--solver", "fake", "--no-plot", "--output", "out")
+    result = command("--solver", "gtsam", "--peer", "fake", "--no-plot", "--output", "out")
     assert result.exit_code == 0, result.output
     assert "errors against gtsam" in result.output
     ours, theirs = rows("out/comparison.csv")
@@ -120,7 +124,7 @@ def test_ctrl_c_ends_it_between_two_sweeps(command, dataset, fake, monkeypatch):
     # A test run in the background inherits an ignored SIGINT, which the command respects.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        result = command("--solver", "fake", "--solver", "gtsam", "--no-plot", "--output", "out")
+        result = command("--peer", "fake", "--solver", "gtsam", "--no-plot", "--output", "out")
     finally:
         signal.signal(signal.SIGINT, before)
     assert result.exit_code == 130, result.output

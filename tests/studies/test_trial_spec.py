@@ -29,7 +29,7 @@ def test_trials_are_sequences_times_configs_times_seeds_in_this_order(tmp_path):
               room: sim:room
               drive: {path: data/drive, frames: null, options: {topic: /points}}
             configs:
-              mine: {solver: mine.yaml, set: {map.window: [11, 11, 5]}}
+              mine: {base: mine.yaml, set: {map.window: [11, 11, 5]}}
               kiss: kiss-icp
             seeds: [3, 1]
             frames: 9
@@ -60,12 +60,29 @@ def test_trials_are_sequences_times_configs_times_seeds_in_this_order(tmp_path):
 def test_what_a_sequence_sets_holds_for_every_solver_on_it(tmp_path):
     text = """
     sequences: {a: {path: x, set: {sensor.model: vlp16}}, b: y}
-    configs: {aloam: aloam, kiss: kiss-icp}
+    configs: {aloam: {base: aloam}, kiss: kiss-icp}
     """
     trials = load_spec(write_spec(tmp_path, text)).trials
     default = Config().sensor.model
     assert [t.config.sensor.model for t in trials] == ["vlp16", "vlp16", default, default]
     assert trials[0].config.solver == preset("aloam").solver
+
+
+def test_a_solver_is_swapped_into_its_base_and_nothing_else_changes(tmp_path):
+    text = """
+    sequences: {a: x}
+    configs:
+      default: gtsam
+      loam: loam
+      swapped: {base: loam, solver: gtsam}
+      own: {solver: 'my.module:make', features: 'my.module:front_end'}
+    """
+    default, loam, swapped, own = load_spec(write_spec(tmp_path, text)).trials
+    assert default.config == own.config == Config()
+    assert loam.config == Config().changed({"solver.method": "loam", "imu.prior": "blend"})
+    assert swapped.config == preset("loam").changed({"solver.method": "gtsam"})
+    assert own.parts == {"solver": "my.module:make", "features": "my.module:front_end"}
+    assert len({trial.config_hash for trial in (default, loam, swapped, own)}) == 4
 
 
 def test_without_seeds_a_world_has_its_own(tmp_path):
@@ -86,13 +103,15 @@ GTSAM = "configs: {c: gtsam}\n"
         (ROOM, "configs: expected at least one"),
         (GTSAM, "sequences: expected at least one"),
         (ROOM + GTSAM + "sede: [1]", "unknown key 'sede' (known: sequences, configs"),
-        (ROOM + "configs: {c: gtsm}", "configs.c: unknown solver 'gtsm'"),
+        (ROOM + "configs: {c: gtsm}", "configs.c.solver: unknown solver 'gtsm'"),
+        (ROOM + "configs: {c: {peer: kis-icp}}", "configs.c.peer: unknown peer 'kis-icp'"),
+        (ROOM + "configs: {c: {base: lom}}", "configs.c.base: unknown preset 'lom'"),
         (ROOM + "configs: {c: absent.yaml}", "absent.yaml: cannot read"),
         (ROOM + "configs: {c: {preset: loam}}", "configs.c: unknown key 'preset'"),
         (ROOM + "configs: {c: {set: {solver.iteratons: 3}}}", "did you mean 'iterations'"),
         (ROOM + "configs: {c: {set: {solver: 3}}}", "configs.c.set: expected SECTION.KEY"),
         (ROOM + "configs: {c: {set: 3}}", "configs.c.set: expected a mapping"),
-        (ROOM + "configs: {c: {solver: kiss-icp, set: {solver.iterations: 3}}}", "is a peer"),
+        (ROOM + "configs: {c: {peer: kiss-icp, set: {solver.iterations: 3}}}", "is a peer"),
         (ROOM + "configs: {c: {solver: 3}}", "configs.c.solver: expected a name"),
         (ROOM + "configs: {1: gtsam}", "expected names as keys, got 1"),
         (GTSAM + "sequences: {a: {frames: 3}}", "sequences.a: expected a path"),

@@ -38,10 +38,11 @@ def test_the_id_depends_on_what_decides_the_result_and_on_no_name():
         {"seed": 0},
         {"config": preset("loam")},
         {"peer": "kiss-icp"},
+        {"parts": {"solver": "a:b"}},
     )
     others = [trial_of(**change) for change in changes]
     assert len({t.id for t in [trial, *others]}) == len(changes) + 1
-    assert len({t.config_hash for t in [trial, *others]}) == 3
+    assert len({t.config_hash for t in [trial, *others]}) == 4
 
 
 def test_a_row_has_the_numbers_of_the_run():

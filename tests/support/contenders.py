@@ -28,6 +28,10 @@ class FakePeer(Peer):
     name, package, module = "fake", "fake", "fake"
     fails_at: int | None = None
 
+    @classmethod
+    def load(cls, name=""):
+        return None
+
     @property
     def map_points(self):
         return 7

@@ -46,7 +46,7 @@ def test_rounding_does_not_stretch_a_logarithmic_axis(tmp_path, monkeypatch):
     visualization.plot_curves("x.png", {"y": {"first": nothing, "b": curve}}, "x", log=True)
     (axes,) = figures[0].axes
     assert axes.get_ylim()[0] > 0.01
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["b"]
+    assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["b"]
 
 
 def test_trajectory_with_and_without_truth(tmp_path):

@@ -1,0 +1,81 @@
+"""Solvers on the same matches, frame by frame."""
+
+from __future__ import annotations
+
+import csv
+
+import numpy as np
+import pytest
+from support.contenders import Sweeps
+
+from loam_gtsam.config import Config
+from loam_gtsam.pipeline import run
+from loam_gtsam.studies.contenders import METHODS, Contender, Group, make_contender
+from loam_gtsam.studies.same_matches import (
+    TRUTH,
+    compare_on_same_matches,
+    table_of,
+    write_same_matches,
+)
+from loam_gtsam.types import FrameStatus, InputError
+
+
+def solvers(*names):
+    return [make_contender(Group.SOLVER, name, Config()) for name in names]
+
+
+def test_the_driver_s_run_is_the_one_it_would_have_alone(dataset):
+    updates = []
+    result = compare_on_same_matches(
+        dataset,
+        solvers("aloam", "gtsam"),
+        driver="gtsam",
+        disturbances=(),
+        on_frame=lambda number, update: updates.append(update),
+    )
+    alone = run(dataset, Config())
+    for ours, theirs in zip(updates, alone.updates, strict=True):
+        np.testing.assert_array_equal(ours.map_T_lidar.matrix(), theirs.map_T_lidar.matrix())
+    assert list(result.frames) == [n for n, u in enumerate(updates) if u.status is FrameStatus.OK]
+    assert {len(solves) for solves in result.solves.values()} == {len(result.frames)}
+
+
+def test_a_solver_beside_itself_differs_in_nothing(dataset):
+    twins = [*solvers("gtsam"), Contender("twin", Config(), Group.SOLVER)]
+    result = compare_on_same_matches(dataset, twins, disturbances=((0.01, 0.1),))
+    for solve in result.solves["twin"]:
+        assert (solve.metres, solve.degrees, solve.cost) == pytest.approx(
+            (0.0, 0.0, 1.0), abs=1e-12
+        )
+        assert solve.returned == (True,)
+        assert solve.solve_ms > 0.0
+        assert solve.match_ms > 0.0
+
+
+def test_the_truth_can_make_the_map_and_is_what_errors_are_taken_from(dataset, tmp_path):
+    result = compare_on_same_matches(dataset, solvers(*METHODS), driver=TRUTH)
+    for name, solves in result.solves.items():
+        errors = [solve.error_m for solve in solves if np.isfinite(solve.error_m)]
+        assert errors, name
+        assert np.median(errors) < 0.05, name
+    table = table_of(result)
+    assert [row[0] for row in table.rows] == list(METHODS)
+    assert {len(row) for row in table.rows} == {len(table.header)}
+    assert write_same_matches(result, tmp_path) == ["same_matches.csv", "report.html"]
+    with open(tmp_path / "same_matches.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(METHODS) * len(result.frames)
+    assert "the map is made by truth" in (tmp_path / "report.html").read_text()
+
+
+def test_what_cannot_be_asked_is_refused(dataset, sweeps):
+    for contenders, driver in (
+        ([], ""),
+        ([make_contender(Group.PEER, "kiss-icp", Config())], ""),
+        (solvers("gtsam", "gtsam"), ""),
+        (solvers("gtsam"), "loam"),
+    ):
+        with pytest.raises(InputError, match="same matches: expected solvers"):
+            compare_on_same_matches(dataset, contenders, driver=driver)
+    with pytest.raises(InputError, match="no truth to place the sweeps by"):
+        compare_on_same_matches(Sweeps(sweeps), solvers("gtsam"), driver=TRUTH)

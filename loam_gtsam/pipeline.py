@@ -415,6 +415,8 @@ def run(
             if on_frame is not None:
                 on_frame(len(updates) - 1, update)
             progress.save_if_due()
+        if max_frames is not None and len(updates) == max_frames:
+            progress.save()  # a longer run can go on from here
     except KeyboardInterrupt:
         interrupted = True
         progress.save()

@@ -99,6 +99,25 @@ class SourceOptions(Options):
         "--option",
         metavar="KEY=VALUE",
     )
+    start: int = option("Number of the first sweep that is used.", default=0, min=0)
+    every: int = option("Use only every so many sweeps.", default=1, min=1)
+    begin: float | None = option(
+        "Use sweeps from so many seconds after the first.", min=0.0, metavar="SECONDS"
+    )
+    end: float | None = option(
+        "Use sweeps until so many seconds after the first.", min=0.0, metavar="SECONDS"
+    )
+    truth: Path | None = option(
+        "Reference poses: TUM, EuRoC (csv), KITTI, positions, or a bag (docs/inputs.md).",
+        metavar="FILE",
+    )
+    truth_topic: str | None = option(
+        "Topic of the reference poses in a bag (PoseStamped, Odometry, NavSatFix, ...)."
+    )
+    truth_extrinsic: str | None = option(
+        "Pose of the lidar in the frame of the reference poses: x y z, or x y z qx qy qz qw.",
+        metavar="NUMBERS",
+    )
     sensor: str | None = option(
         "Sensor model (sensor.model): vlp16, hdl32, hdl64, os1-16, os1-32, os1-64 or os1-128."
     )
@@ -109,9 +128,20 @@ class SourceOptions(Options):
     def dataset(self) -> Dataset:
         """Open the data set."""
         from loam_gtsam.datasets import open_dataset
+        from loam_gtsam.datasets.base import PartOf, WithTruth
+        from loam_gtsam.datasets.truth import extrinsic
 
         options = dict(_key_value("--option", entry) for entry in self.loader_options or [])
-        return open_dataset(self.path, topic=self.topic, imu_topic=self.imu_topic, **options)
+        dataset = open_dataset(self.path, topic=self.topic, imu_topic=self.imu_topic, **options)
+        if self.truth is not None:
+            given = self.truth_extrinsic
+            at = None if given is None else extrinsic(given)
+            dataset = WithTruth.of(dataset, self.truth, topic=self.truth_topic, body_T_lidar=at)
+        elif self.truth_topic is not None or self.truth_extrinsic is not None:
+            raise typer.BadParameter("--truth-topic and --truth-extrinsic belong to --truth FILE")
+        if (self.start, self.every, self.begin, self.end) == (0, 1, None, None):
+            return dataset
+        return PartOf(dataset, self.start, self.every, self.begin, self.end)
 
     def changed(self, config: Config) -> Config:
         """``config`` with ``--sensor``, then with every ``--set`` at once."""
@@ -239,7 +269,7 @@ class RunOptions(OutputOptions, PartOptions):
     )
     resume: bool = flag(
         "Go on from the last checkpoint in the output folder, if a run of the same data and "
-        "configuration was stopped or killed; the result is the same.",
+        "configuration was stopped or killed, or ended by --frames; the result is the same.",
         "--resume",
     )
     checkpoint: float = option(

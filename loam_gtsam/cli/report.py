@@ -82,7 +82,12 @@ def _accuracy(accuracy: Mapping[str, Any]) -> str:
         return str(accuracy.get("problem", ""))
     error, length = accuracy["ate_rmse_m"], accuracy["compared_length_m"]
     share = f" ({100.0 * error / length:.3f} % of the path)" if length >= _MIN_PATH else ""
-    return f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
+    text = f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
+    if "not_fitted_rmse_m" in accuracy:
+        text += f"; {accuracy['not_fitted_rmse_m']:.3f} m if not fitted"
+    if accuracy.get("ok_beyond_five_sigma"):
+        text += f"; {accuracy['ok_beyond_five_sigma']} frames ok are off by more than 5 told sigma"
+    return text
 
 
 def _loops(counts: dict[str, int]) -> str:

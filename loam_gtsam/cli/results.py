@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
@@ -15,15 +18,15 @@ from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.pipeline import RunResult, effective_config
 from loam_gtsam.studies import evaluation
-from loam_gtsam.types import LoamError, OutputError, Trajectory
+from loam_gtsam.types import FrameStatus, InputError, LoamError, OutputError, Trajectory
 from loam_gtsam.view import frame_plot, plots
 from loam_gtsam.view.observers import LastFrame
 
 PLOT_FILES = ("trajectory.png", "map.png", "frame.png", "timings.png")
 ERROR_PLOT = "errors.png"
-TRUTH_FILE = "truth.tum"
+TRUTH_FILE, MATCHED_FILE = "truth.tum", "truth_matched.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
-RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE)
+RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE, MATCHED_FILE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,15 +37,19 @@ class Results:
     info: DatasetInfo
     truth: Trajectory | None
     last: LastFrame | None  # for the pictures; None draws none
+    whole: bool = True  # the data set ended, and not the number of frames that was asked for
     accuracy: Mapping[str, Any] = field(default_factory=dict)  # or ``problem``; empty without truth
     error: evaluation.AbsoluteError | None = None
     map_truth: Trajectory | None = None  # in the map frame; None if it cannot be compared
 
     @staticmethod
-    def of(run: RunResult, dataset: Dataset, last: LastFrame | None) -> Results:
+    def of(
+        run: RunResult, dataset: Dataset, last: LastFrame | None, *, whole: bool = True
+    ) -> Results:
         """Compare a run with the truth of its data set, if there is any."""
         trajectory, truth = run.trajectory, dataset.truth
-        results = Results(run=run, info=_input_info(dataset), truth=truth, last=last)
+        info = _input_info(dataset)
+        results = Results(run=run, info=info, truth=truth, last=last, whole=whole)
         if truth is None:
             return results
         try:
@@ -52,25 +59,33 @@ class Results:
         there = evaluation.interpolate(truth, error.stamps)
         inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
         here = trajectory.map_T_lidar[inside]
-        turn = evaluation.align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
+        turn = None
+        if np.isfinite(there.map_T_lidar).all():
+            turn = evaluation.align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
         map_T_truth = evaluation.align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
         accuracy = {
             "ate_rmse_m": error.rmse,
             "ate_max_m": error.maximum,
             "compared_poses": len(error.stamps),
             "compared_length_m": there.path_length,
+            **_without_fit(run, truth),
         }
         moved = Trajectory(there.stamps, map_T_truth @ there.map_T_lidar)
         return replace(results, accuracy=accuracy, error=error, map_truth=moved)
 
     def write(self, folder: Path) -> list[str]:
         """Write all files into a folder; returns their names."""
-        extra = {"accuracy": self.accuracy or None, "input": asdict(self.info)}
+        extra = {"whole": self.whole, "accuracy": self.accuracy or None}
+        extra["input"] = asdict(self.info)
         files = list(RUN_FILES)
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
         if self.truth is not None:
             write_tum(folder / TRUTH_FILE, self.truth)
             files.append(TRUTH_FILE)
+            if self.error is not None:
+                matched = evaluation.matched_truth(self.run.trajectory, self.truth)
+                write_tum(folder / MATCHED_FILE, matched)
+                files.append(MATCHED_FILE)
         if self.run.loops is not None:
             write_tum(folder / LOOP_FILES[0], self.run.odometry, comments={"frame": "odom"})
             write_graph(folder / LOOP_FILES[1], self.run.loops.graph.saved())
@@ -91,8 +106,24 @@ class Results:
         return [name for name in (*PLOT_FILES, ERROR_PLOT) if (folder / name).exists()]
 
 
+def _without_fit(run: RunResult, truth: Trajectory) -> dict[str, float]:
+    """The error that no fit hides, and the covariances against the errors."""
+    found: dict[str, float] = {}
+    with suppress(InputError):  # positions alone
+        start = evaluation.absolute_error(run.trajectory, truth, aligned="start")
+        found["not_fitted_rmse_m"] = start.rmse
+        if run.loops is None:
+            nees = evaluation.nees(run.updates, truth)
+            ok = [n for n in nees.beyond if run.updates[n].status is FrameStatus.OK]
+            found |= {"nees": nees.mean, "ok_beyond_five_sigma": len(ok)}
+    return found
+
+
 def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> bool:
-    """Whether a folder holds the complete results of the run; an OutputError if of another."""
+    """Whether a folder holds the complete results of the run; an OutputError if of another.
+
+    Results that end earlier because fewer frames were asked for are not complete.
+    """
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         written = (folder / "config.yaml").read_text(encoding="utf-8")
@@ -100,8 +131,11 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
         return False
     if summary.get("interrupted") or summary.get("error"):
         return False
-    now = total, _described(_input_info(dataset)), dump_config(effective_config(config, dataset))
-    if (summary.get("frames"), summary.get("dataset"), written) != now:
+    now = _described(_input_info(dataset)), dump_config(effective_config(config, dataset))
+    frames, same = summary.get("frames"), (summary.get("dataset"), written) == now
+    if same and frames < total and not summary.get("whole", True):
+        return False
+    if not same or not (frames == total or (summary.get("whole") and frames < total)):
         raise OutputError(
             f"{folder}: holds the results of another run (data, configuration or number of "
             "sweeps); choose another folder, or --overwrite without --resume"

@@ -67,9 +67,12 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
             seconds = time.perf_counter() - started
             if not result.updates:
                 raise DatasetError(f"{dataset.name}: no sweeps in it; see loam-gtsam inspect")
-            results = Results.of(result, dataset, last if plot else None)
+            done = len(result.updates)
+            whole = options.frames is None or not done == options.frames < len(dataset)
+            results = Results.of(result, dataset, last if plot else None, whole=whole)
             files = console.write_results(folder, RUN_OUTPUTS, "summary.json", results.write)
-            if checkpoint is not None and not result.interrupted and result.error is None:
+            ended = not result.interrupted and result.error is None
+            if checkpoint is not None and ended and (whole or not options.resume):
                 checkpoint.remove()
     if not options.quiet:
         if options.profile:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
@@ -17,7 +17,7 @@ _SHORTEST = 1_000_000
 """Nanoseconds between sweeps; no spinning lidar turns a thousand times a second."""
 
 
-class ArrayDataset:
+class ArrayDataset(Loader):
     """Sweeps from numpy arrays, or ready :class:`Scan` objects.
 
     Parameters

@@ -3,13 +3,26 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
+
+import numpy as np
 
 from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
-from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, IntArray, Scan, Sweep, Trajectory
+from loam_gtsam.types import (
+    BadSweep,
+    DatasetError,
+    FeatureSweep,
+    FloatArray,
+    ImuSamples,
+    InputError,
+    IntArray,
+    Scan,
+    Sweep,
+    Trajectory,
+)
 
 
 @dataclass(slots=True)
@@ -73,12 +86,44 @@ class Dataset(Protocol):
         ...
 
 
-class ChangedDataset:
+class Loader:
+    """What every loader can do besides: be cut, and be given reference poses."""
+
+    def part(
+        self,
+        start: int = 0,
+        every: int = 1,
+        *,
+        begin_s: float | None = None,
+        end_s: float | None = None,
+    ) -> PartOf:
+        """Some of the sweeps of this data set; IMU and reference poses stay whole.
+
+        Parameters
+        ----------
+        start, every : number of the first sweep that is used, and the step to the next
+        begin_s, end_s : seconds after the first sweep of the data set between which sweeps are
+            used
+        """
+        return PartOf(cast(Dataset, self), start, every, begin_s, end_s)
+
+    def with_truth(
+        self,
+        truth: Trajectory | str | Path,
+        *,
+        topic: str | None = None,
+        body_T_lidar: FloatArray | None = None,
+    ) -> WithTruth:
+        """The same data set with other reference poses, see :meth:`WithTruth.of`."""
+        return WithTruth.of(cast(Dataset, self), truth, topic=topic, body_T_lidar=body_T_lidar)
+
+
+class ChangedDataset(Loader):
     """A data set made of another one by a ``change``, which is added to its name."""
 
     def __init__(self, dataset: Dataset, change: str) -> None:
         self._dataset = dataset
-        self.name = f"{dataset.name} {change}"
+        self.name = f"{dataset.name} {change}".rstrip()
         self.sensor: Mapping[str, Any] = dataset.sensor
 
     @property
@@ -97,7 +142,129 @@ class ChangedDataset:
         return replace(info, facts=info.facts | more)
 
 
-class SweepFiles(ABC):
+class PartOf(ChangedDataset):
+    """Some of the sweeps of a data set, see :meth:`Loader.part`; InputError if there are none."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        start: int,
+        every: int,
+        begin_s: float | None = None,
+        end_s: float | None = None,
+    ) -> None:
+        low = 0.0 if begin_s is None else begin_s
+        high = np.inf if end_s is None else end_s
+        if start < 0 or every < 1 or not 0.0 <= low < high:
+            raise InputError(
+                "part: expected start of 0 or more, every of 1 or more, and 0 <= begin < end; got "
+                f"start {start}, every {every}, begin {begin_s} s, end {end_s} s"
+            )
+        said = [f"from sweep {start}"] if start else []
+        said += [f"every {every}"] if every > 1 else []
+        said += [f"{low:g} to {high:g} s"] if low or np.isfinite(high) else []
+        super().__init__(dataset, " ".join(said))
+        self._said, self._slice, self._window = (
+            ", ".join(said),
+            slice(start, None, every),
+            (low, high),
+        )
+
+    def __len__(self) -> int:
+        """Number of sweeps; the most there can be if only reading them tells their stamps."""
+        stamps = getattr(self._dataset, "stamps", None)
+        if stamps is None or not len(stamps):
+            return len(range(len(self._dataset))[self._slice])
+        seconds = (stamps[self._slice] - stamps[0]) * 1e-9
+        return int(((seconds >= self._window[0]) & (seconds <= self._window[1])).sum())
+
+    def __iter__(self) -> Iterator[Sweep]:
+        first: int | None = None
+        for number, sweep in enumerate(self._dataset):
+            stamp = sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
+            first = stamp if first is None else first
+            seconds = (stamp - first) * 1e-9
+            if seconds > self._window[1]:
+                return
+            beyond = number - self._slice.start
+            if beyond >= 0 and beyond % self._slice.step == 0 and seconds >= self._window[0]:
+                yield sweep
+
+    def info(self) -> DatasetInfo:
+        """Of the whole data set, and which part of it is used."""
+        return self._info(used=f"{self._said}: {len(self)} sweeps")
+
+
+class WithTruth(ChangedDataset):
+    """A data set with other reference poses, see :meth:`Loader.with_truth`."""
+
+    def __init__(
+        self, dataset: Dataset, truth: Trajectory, source: str, problems: Sequence[str] = ()
+    ) -> None:
+        super().__init__(dataset, "")
+        self._truth, self._source, self._problems = truth, source, list(problems)
+
+    @classmethod
+    def of(
+        cls,
+        dataset: Dataset,
+        truth: Trajectory | str | Path,
+        *,
+        topic: str | None = None,
+        body_T_lidar: FloatArray | None = None,
+    ) -> WithTruth:
+        """A data set with the reference poses of a file.
+
+        Parameters
+        ----------
+        truth : poses, or a file of them, see :func:`loam_gtsam.datasets.truth.read_truth`
+        topic : of a bag
+        body_T_lidar : (4, 4) pose of the lidar in the frame whose poses are given
+        """
+        if isinstance(truth, Trajectory):
+            if body_T_lidar is not None:
+                truth = Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
+            return cls(dataset, truth, "given")
+        from loam_gtsam.datasets.truth import read_truth
+
+        problems: list[str] = []
+        stamps = getattr(dataset, "stamps", None)
+        poses = read_truth(
+            truth, topic=topic, body_T_lidar=body_T_lidar, stamps=stamps, problems=problems
+        )
+        return cls(dataset, poses, str(truth), problems)
+
+    def __len__(self) -> int:
+        return len(self._dataset)
+
+    def __iter__(self) -> Iterator[Sweep]:
+        return iter(self._dataset)
+
+    @property
+    def truth(self) -> Trajectory | None:
+        """The poses that were given."""
+        return self._truth
+
+    @property
+    def stamps(self) -> IntArray | None:
+        """Of the sweeps, if the data set knows them without reading."""
+        return getattr(self._dataset, "stamps", None)
+
+    def info(self) -> DatasetInfo:
+        """Of the data set, and where the poses come from."""
+        info = self._info(reference_poses=f"{len(self._truth)} ({self._source})")
+        span = self.stamps
+        if span is not None and len(span):
+            inside = (span >= self._truth.stamps[0]) & (span <= self._truth.stamps[-1])
+            if not inside.any():
+                self._problems.append(
+                    f"{self._source}: its stamps, {self._truth.stamps[0] * 1e-9:.3f} to "
+                    f"{self._truth.stamps[-1] * 1e-9:.3f} s, are none of the sweeps'"
+                )
+        return replace(info, problems=[*info.problems, *self._problems])
+
+
+class SweepFiles(Loader, ABC):
     """The sweeps of a data set with one file each; one that cannot be read is a bad sweep."""
 
     stamps: IntArray

@@ -87,7 +87,7 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
     text = said("demo", "--scene", "room", "--frames", FRAMES, "--profile")
     folder = Path("loam_gtsam_output/room_vlp16")
     plots = {*PLOT_FILES, ERROR_PLOT} if visualization.available() else set()
-    assert files_in(folder) == {*RUN_FILES, "truth.tum"} | plots
+    assert files_in(folder) == {*RUN_FILES, "truth.tum", "truth_matched.tum"} | plots
     accuracy = summary_in(folder)["accuracy"]
     assert accuracy["compared_poses"] == FRAMES
     assert accuracy["ate_rmse_m"] < 0.05
@@ -103,7 +103,7 @@ def test_run_opens_built_in_worlds_and_uses_every_option():
         "--config", "mine.yaml", "--sensor", "vlp16", "--set", "solver.iterations=7",
         "--set", "map.window=[11, 11, 5]", "--set", "deskew.enabled=false", "--option", "seed=3",
     )  # fmt: skip
-    assert files_in("out") == {*RUN_FILES, "truth.tum"}
+    assert files_in("out") == {*RUN_FILES, "truth.tum", "truth_matched.tum"}
     config = load_config("out/config.yaml")
     assert config.sensor.model == "vlp16"
     assert (config.solver.iterations, config.solver.min_matches) == (7, 20)

@@ -13,7 +13,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from loam_gtsam.datasets.bags import bag_reader
-from loam_gtsam.datasets.base import BagOptions, DatasetInfo
+from loam_gtsam.datasets.base import BagOptions, DatasetInfo, Loader
 from loam_gtsam.datasets.decode import extrinsics, pointcloud2, tables
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
@@ -23,7 +23,7 @@ IMU = "sensor_msgs/msg/Imu"
 _PEEK = 10  # sweeps looked at before the run, to decide on times and to describe the bag
 
 
-class BagDataset:
+class BagDataset(Loader):
     """Sweeps and IMU of a bag, read message by message.
 
     Parameters

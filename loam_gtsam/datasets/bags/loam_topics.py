@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.datasets.bags import bag_reader
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.decode import loam_messages
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.datasets.decode.tables import describe_stamps
@@ -21,7 +21,7 @@ MAPPED = "/aft_mapped_to_init"
 _Asked = Literal["auto", "lidar", "loam"]
 
 
-class LoamTopicsDataset:
+class LoamTopicsDataset(Loader):
     """De-skewed features and odometry poses of LOAM or A-LOAM, recorded in a bag.
 
     Parameters

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.sim.inertial import IMUS, Axes, ImuErrors
 from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
@@ -55,7 +55,7 @@ _IMU_PERIOD = 5_000_000  # nanoseconds: 200 Hz
 _IMU_MARGIN = 200_000_000  # nanoseconds of IMU data before the first and after the last sweep
 
 
-class SimulatedWorld:
+class SimulatedWorld(Loader):
     """A data set made on the fly, the same for the same arguments on every run.
 
     The sensor spins clockwise from straight behind; all beams of a column fire together, and

@@ -1,0 +1,181 @@
+"""Reference poses of any data set, and parts of a data set."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from support import bags
+from support.trajectories import winding
+
+from loam_gtsam.datasets import SimulatedWorld, open_dataset
+from loam_gtsam.datasets.base import PartOf
+from loam_gtsam.datasets.truth import extrinsic, read_truth
+from loam_gtsam.io.trajectories import write_tum
+from loam_gtsam.pipeline import run
+from loam_gtsam.studies.evaluation import absolute_error, nees, relative_error
+from loam_gtsam.types import DatasetError, InputError, Trajectory
+
+TRUTH = winding(12)
+
+
+@pytest.fixture(scope="module")
+def world():
+    return SimulatedWorld("room", frames=8, columns=300)
+
+
+def same(found: Trajectory, wanted: Trajectory = TRUTH) -> None:
+    np.testing.assert_array_equal(found.stamps, wanted.stamps)
+    np.testing.assert_allclose(found.map_T_lidar, wanted.map_T_lidar, atol=1e-6)
+
+
+def rows(path):
+    """Stamp in ns, x y z, qx qy qz qw as texts."""
+    write_tum(path / "x.tum", TRUTH)
+    lines = [line.split() for line in (path / "x.tum").read_text().splitlines()]
+    numbers = [line for line in lines if not line[0].startswith("#")]
+    return [[str(s), *line[1:]] for s, line in zip(TRUTH.stamps, numbers, strict=True)]
+
+
+def test_tum_euroc_and_kitti_give_the_same_poses(tmp_path):
+    table = rows(tmp_path)
+    same(read_truth(tmp_path / "x.tum"))
+    euroc = tmp_path / "data.csv"
+    lines = [",".join([*row[:4], row[7], *row[4:7], "0", "0"]) for row in table]
+    euroc.write_text("\n".join(["#timestamp, p_RS_R_x [m], ...", *lines]))
+    same(read_truth(euroc))
+    kitti = tmp_path / "00.txt"
+    np.savetxt(kitti, TRUTH.map_T_lidar[:, :3].reshape(-1, 12))
+    first = np.linalg.inv(TRUTH.map_T_lidar[0])
+    same(
+        read_truth(kitti, stamps=TRUTH.stamps), Trajectory(TRUTH.stamps, first @ TRUTH.map_T_lidar)
+    )
+
+
+def test_the_extrinsic_moves_the_poses_to_the_lidar(tmp_path):
+    rows(tmp_path)
+    lever = extrinsic("0.1, 0.2 -0.3  0 0 0.7071068 0.7071068")
+    found = read_truth(tmp_path / "x.tum", body_T_lidar=lever)
+    same(found, Trajectory(TRUTH.stamps, TRUTH.map_T_lidar @ lever))
+    np.testing.assert_allclose(lever[:3, 3], [0.1, 0.2, -0.3])
+    np.testing.assert_allclose(lever[:3, 0], [0.0, 1.0, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(extrinsic("1 2 3")[:3, 3], [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(extrinsic(" ".join(map(str, lever[:3].ravel()))), lever)
+    for text in ("1 2", "a b c", "2 0 0 0 0 1 0 0 0 0 1 0", "0 0 0 0 0 0 0"):
+        with pytest.raises(DatasetError, match="extrinsic: expected x y z"):
+            extrinsic(text)
+
+
+def positions(tmp_path):
+    file = tmp_path / "gps.txt"
+    lines = [f"{s * 1e-9:.9f} {p[0]:.9f} {p[1]:.9f} {p[2]:.9f}" for s, p in
+             zip(TRUTH.stamps, TRUTH.map_T_lidar[:, :3, 3], strict=True)]  # fmt: skip
+    file.write_text("\n".join(lines))
+    return file
+
+
+def test_positions_alone_give_the_error_of_positions_and_nothing_else(tmp_path):
+    truth = read_truth(positions(tmp_path))
+    assert np.isnan(truth.map_T_lidar[:, :3, :3]).all()
+    turned = Trajectory(TRUTH.stamps, extrinsic("5 6 7 0 0 1 0") @ TRUTH.map_T_lidar)
+    error = absolute_error(turned, truth)
+    assert error.rmse < 1e-3
+    assert np.isnan(error.rotation_rmse_deg)
+    for refused in (
+        lambda: relative_error(turned, truth),
+        lambda: absolute_error(turned, truth, aligned="start"),
+        lambda: read_truth(tmp_path / "gps.txt", body_T_lidar=extrinsic("1 0 0")),
+    ):
+        with pytest.raises((InputError, DatasetError), match="positions alone"):
+            refused()
+
+
+@pytest.mark.parametrize("kind", ["PoseStamped", "Odometry"])
+@pytest.mark.parametrize("bag", ["ros1", "mcap"])
+def test_topics_of_poses(tmp_path, kind, bag):
+    store = bags.store_of(bag)
+    table = [[float(x) for x in row[1:]] for row in rows(tmp_path)]
+    recording = []
+    for stamp, row in zip(TRUTH.stamps.tolist(), table, strict=True):
+        message = bags.odometry(store, stamp, row[:3], row[3:])
+        if kind == "PoseStamped":
+            make = store.types["geometry_msgs/msg/PoseStamped"]
+            message = make(header=message.header, pose=message.pose.pose)
+        recording.append(("/pose", stamp, message))
+    path = bags.write_bag(tmp_path / "poses", bag, recording)
+    same(read_truth(path))
+    same(read_truth(path, topic="/pose"))
+    with pytest.raises(DatasetError, match="topic '/other' is none of"):
+        read_truth(path, topic="/other")
+
+
+def test_gps_fixes_become_metres_east_north_and_up(monkeypatch):
+    from loam_gtsam.datasets import truth as module
+
+    metres = module._east_north_up(np.array([
+        [48.0, 11.0, 500.0], [48.001, 11.0, 500.0], [48.0, 11.001, 510.0],
+    ]))  # fmt: skip
+    # A thousandth of a degree: of latitude 111.2 m there, of longitude 74.6 m (WGS 84).
+    np.testing.assert_allclose(metres[0], 0.0)
+    np.testing.assert_allclose(metres[1], [0.0, 111.2, 0.0], atol=0.03)
+    np.testing.assert_allclose(metres[2], [74.63, 0.0, 10.0], atol=0.03)
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "no numbers"),
+        ("1 2 3\n", "lines of 3 columns"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0\n", "expected lines like the first one"),
+        ("1 0 0 0 0 0 0 0\n", "quaternion of length 0"),
+        ("1 0 0 0 0 1 0 0 0 0 1 0\n", "1 poses without stamps"),
+    ],
+)
+def test_what_is_no_truth_is_told(tmp_path, text, told):
+    file = tmp_path / "truth.txt"
+    file.write_text(text)
+    with pytest.raises(DatasetError, match=told):
+        read_truth(file)
+
+
+def test_a_data_set_with_truth_is_judged_by_it(world, tmp_path):
+    truth = world.truth
+    write_tum(tmp_path / "mine.tum", truth)
+    given = world.with_truth(tmp_path / "mine.tum", body_T_lidar=extrinsic("0 0 1"))
+    assert len(given) == len(world)
+    assert given.name == world.name
+    raised = (truth.map_T_lidar @ [0.0, 0.0, 1.0, 1.0])[:, :3]
+    np.testing.assert_allclose(given.truth.map_T_lidar[:, :3, 3], raised, atol=1e-8)
+    assert "mine.tum" in given.info().facts["reference poses"]
+    direct = world.with_truth(truth)
+    np.testing.assert_array_equal(direct.truth.map_T_lidar, truth.map_T_lidar)
+    result = run(direct)
+    assert nees(result.updates, direct.truth).mean < 5.0
+
+
+def test_parts_of_a_data_set(world):
+    stamps = [scan.stamp for scan in world]
+    for part, wanted in (
+        (world.part(2), stamps[2:]),
+        (world.part(1, 3), stamps[1::3]),
+        (world.part(begin_s=0.2, end_s=0.5), stamps[2:6]),
+        (world.part(1, 2).part(1), stamps[3::2]),
+        (world.with_truth(TRUTH).part(every=4), stamps[::4]),
+    ):
+        assert [scan.stamp for scan in part] == wanted
+        assert len(part) == len(wanted) or part._window != (0.0, np.inf)
+        assert part.truth is not None
+        assert part.name != world.name
+        assert "sweeps" in part.info().facts["used"]
+    for wrong in ({"start": -1}, {"every": 0}, {"begin_s": 3.0, "end_s": 2.0}):
+        with pytest.raises(InputError, match="part: expected start of 0 or more"):
+            world.part(**wrong)
+
+
+def test_the_length_of_a_time_window_is_exact_where_stamps_are_known(world):
+    known = SimpleNamespace(
+        name="x", sensor={}, stamps=np.arange(10) * 100_000_000, imu=None, truth=None
+    )
+    assert len(PartOf(known, 0, 2, 0.2, 0.7)) == 3
+    assert len(open_dataset("sim:room?frames=8").part(1, 2)) == 4

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -225,11 +226,11 @@ class WithTruth(ChangedDataset):
             if body_T_lidar is not None:
                 truth = Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
             return cls(dataset, truth, "given")
-        from loam_gtsam.datasets.truth import read_truth
-
+        # By name, as the loaders: what reads bags is itself made of what is here.
+        reader = importlib.import_module("loam_gtsam.datasets.truth")
         problems: list[str] = []
         stamps = getattr(dataset, "stamps", None)
-        poses = read_truth(
+        poses = reader.read_truth(
             truth, topic=topic, body_T_lidar=body_T_lidar, stamps=stamps, problems=problems
         )
         return cls(dataset, poses, str(truth), problems)

@@ -54,10 +54,10 @@ __all__ = ["Dataset", "DatasetInfo", "Sweep", "open_dataset", *_LAZY]
 
 _BAG_FILES = (".bag", ".mcap", ".db3")
 _ACCEPTED = (
-    "a folder with .bin sweeps (also in velodyne/, scans/ or velodyne_points/data/), a ROS 1 .bag, "
-    "a ROS 2 bag folder (with metadata.yaml), an .mcap or .db3 file, a sequence of Newer College, "
-    "MulRan, HeLiPR or Oxford Spires, or a built-in world such as sim:street_loop or "
-    "'sim:room?frames=50&seed=3'"
+    "a folder with .bin, .pcd, .ply or .npy sweeps (also in velodyne/, scans/ or "
+    "velodyne_points/data/), a ROS 1 .bag, a ROS 2 bag folder (with metadata.yaml), an .mcap or "
+    ".db3 file, a sequence of Newer College, MulRan, HeLiPR or Oxford Spires, or a built-in world "
+    "such as sim:street_loop or 'sim:room?frames=50&seed=3'"
 )
 _OTHERS = "sweeps of any other format: docs/own_sensor.md"
 _LOOKED_AT = 500  # folders searched for a better path to suggest

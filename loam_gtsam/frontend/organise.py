@@ -16,6 +16,7 @@ from loam_gtsam.frontend.rings import (
     MAX_RINGS,
     RingAssignment,
     azimuth_steps,
+    beams_of,
     rings_from_elevation,
     rings_from_file_order,
     rings_from_labels,
@@ -221,6 +222,13 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
             "source",
             SweepFault.BAD_RINGS,
         )
+    beams = beams_of(sensor.model)
+    if beams is not None and found.count > beams:
+        raise SweepError(
+            f"sensor.model {sensor.model} has {beams} beams, and the points have {found.count} "
+            f"rings ({found.method}): set sensor.model to the sensor of the data, or to auto",
+            SweepFault.BAD_RINGS,
+        )
     return found
 
 
@@ -255,8 +263,36 @@ def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -
             f"{_MAX_SPAN:g} s, within {_MAX_OFFSET:g} s: times count from the stamp, in seconds",
             SweepFault.BAD_TIMES,
         )
+    _check_sensor(columns, rings, sensor, span)
     note = f"per-point times from {span[0]:.4f} to {span[1]:.4f} s after the stamp"
     return TimeAssignment(columns.times, span, "field", note)
+
+
+def _check_sensor(
+    columns: SweepColumns,
+    rings: RingAssignment,
+    sensor: SensorConfig,
+    span: tuple[float, float],
+) -> None:
+    """SweepError if the times of the points contradict what was set of the sensor's rotation."""
+    problem = ""
+    seconds, default = span[1] - span[0], type(sensor)()
+    if sensor.period != default.period and not 0.5 < seconds / sensor.period < 2.0:
+        problem = f"sensor.period is {sensor.period:g} s, and the points span {seconds:.3g} s"
+    if sensor.spin != "auto" and columns.times is not None:
+        order = np.lexsort((columns.times, rings.rings))
+        number = rings.rings[order]
+        step = azimuth_steps(columns.azimuth[order])[number[1:] == number[:-1]]
+        share = float(np.mean(step < 0.0)) if len(step) else 0.5
+        turned = "clockwise" if share > _ONE_WAY else "counterclockwise"
+        if max(share, 1.0 - share) > _ONE_WAY and turned != sensor.spin:
+            problem = f"sensor.spin is {sensor.spin}, and by their times the points turn {turned}"
+    if problem:
+        raise SweepError(
+            f"{problem}: it is for times from azimuths, and contradicts the times of the points; "
+            "leave it out, or set sensor.times to azimuth",
+            SweepFault.BAD_TIMES,
+        )
 
 
 def _times_from_azimuth(

@@ -39,6 +39,13 @@ _STRAY = 0.1
 typical peak (the one the median point belongs to); lower ones are stray returns."""
 
 
+def beams_of(model: str) -> int | None:
+    """Number of beams of a model of a lidar; None if it is not known."""
+    if model in ELEVATIONS:
+        return len(ELEVATIONS[model])
+    return _OUSTER_BEAMS.get(model)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class RingAssignment:
     """The beam of each point.

@@ -119,7 +119,7 @@ def _sequence(where: str, value: Any, folder: Path, frames: int | None) -> _Sequ
     if not path.startswith("sim:"):
         # Absolute: the same relative path under another folder is other data. Symbolic links stay:
         # on another machine they may lead to another place.
-        path = os.path.abspath(folder / Path(path).expanduser())
+        path = os.path.abspath(folder / Path(os.path.expandvars(path)).expanduser())
     options = _mapping(f"{where}.options", entries.get("options", {}))
     frames = _count(f"{where}.frames", entries.get("frames", frames))
     return _Sequence(path, options, frames, _mapping(f"{where}.set", entries.get("set", {})), where)

@@ -16,6 +16,8 @@ from loam_gtsam.types import DatasetError
 
 XYZI = np.dtype([(name, "<f4") for name in ("x", "y", "z", "intensity")])
 """Record of a point in the files of KITTI and MulRan."""
+XYZI_RING = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "intensity", "ring"))])
+"""Record of a point in the files of nuScenes: the fifth column is the beam."""
 _CODES = {code: number for number, code in DATATYPES.items()}
 _PCD_KEYS = ("FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "POINTS", "DATA")
 
@@ -85,6 +87,53 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
             f"got {len(body)}; the file is cut off"
         )
     return _packed(stamp, record, height, width, body[:needed])
+
+
+def read_ply(path: Path, stamp: int) -> PackedCloud:
+    """The vertices of a PLY file; ``stamp`` in nanoseconds.
+
+    DatasetError if it is not understood, cut off, or plyfile is not installed.
+    """
+    try:
+        from plyfile import PlyData
+    except ImportError as error:
+        raise DatasetError(
+            f'{path}: PLY needs plyfile: pip install "loam_gtsam[ply]" ({error})'
+        ) from error
+    try:
+        vertices = np.asarray(PlyData.read(str(path), mmap=False)["vertex"].data)
+    except Exception as error:  # of plyfile, or of whatever a damaged file makes it stumble over
+        raise DatasetError(f"{path}: the PLY file cannot be read: {error}") from error
+    return _of_structure(path, stamp, vertices)
+
+
+def read_npy(path: Path, stamp: int) -> PackedCloud:
+    """An array: (N, 3) or (N, 4), x y z intensity, or (N,) with named fields; ``stamp`` in ns."""
+    try:
+        array = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError) as error:
+        raise DatasetError(f"{path}: the array cannot be read: {error}") from error
+    if array.dtype.names:
+        return _of_structure(path, stamp, array.reshape(-1))
+    if array.ndim != 2 or array.shape[1] not in (3, 4) or array.dtype.kind not in "fiu":
+        raise DatasetError(
+            f"{path}: expected an array of shape (N, 3) or (N, 4), or with named fields x, y, z; "
+            f"got {array.dtype} of shape {array.shape}"
+        )
+    columns = {name: array[:, n] for n, name in enumerate(XYZI.names or ()) if n < array.shape[1]}
+    records = np.zeros(len(array), XYZI)
+    for name, column in columns.items():
+        records[name] = column
+    return _of_structure(path, stamp, records)
+
+
+def _of_structure(path: Path, stamp: int, points: NDArray[Any]) -> PackedCloud:
+    little = points.astype(points.dtype.newbyteorder("<"), copy=False)
+    names = little.dtype.names or ()
+    if not {"x", "y", "z"} <= set(names):
+        raise DatasetError(f"{path}: expected fields x, y, z; got {', '.join(names)}")
+    data = np.ascontiguousarray(little).view(np.uint8).reshape(-1)
+    return _packed(stamp, little.dtype, 1, len(little), data)
 
 
 def firing_by_firing(cloud: PackedCloud, beams: int, columns: int, source: str) -> PackedCloud:

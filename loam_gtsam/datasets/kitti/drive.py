@@ -6,6 +6,7 @@ the ``readme.txt`` and ``dataformat.txt`` of the development kits.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,10 +32,13 @@ _BRIDGED_NS = 100_000_000  # default of ``imu.max_gap``
 
 
 def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntArray:
-    """Nanoseconds of each sweep, by ``times.txt`` or ``velodyne_points/timestamps.txt``."""
+    """Nanoseconds of each sweep, by ``times.txt``, their names or KITTI's ``timestamps.txt``."""
+    names = [re.search(r"__(\d{16})(\.|$)", file.stem) for file in files]
     path, raw = root / "times.txt", root / _RAW / "timestamps.txt"
     if path.is_file():
         stamps = tables.read_stamps(path)
+    elif all(names):  # nuScenes: microseconds
+        stamps = np.array([int(name[1]) for name in names if name], np.int64) * 1000
     elif raw.is_file():
         path, listed = raw, read_dates(raw)
         stamps = _of_files(listed, files)
@@ -45,7 +49,7 @@ def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntA
         return np.arange(len(files), dtype=np.int64) * tables.DEFAULT_PERIOD_NS
     if len(stamps) != len(files):
         counts = f"{len(stamps)} stamps for {len(files)} sweeps"
-        raise DatasetError(f"{path}: {counts}; expected one line for each .bin file")
+        raise DatasetError(f"{path}: {counts}; expected one line for each file")
     return stamps
 
 

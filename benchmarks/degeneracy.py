@@ -21,7 +21,7 @@ import gtsam
 import numpy as np
 
 from benchmarks.tables import write_csv
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.features import extract_features
@@ -165,7 +165,7 @@ def by_aligned(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> FloatArray | N
 def by_eigenvalue(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> FloatArray | None:
     """LOAM's: eigenvalues of the normal matrix below 100."""
     jacobian = loam_rows(matches, map_T_lidar).residuals(map_T_lidar)[1]
-    kept = degeneracy_projector(jacobian.T @ jacobian, Config().solver.degeneracy_threshold)
+    kept = degeneracy_projector(jacobian.T @ jacobian, preset("loam").solver.degeneracy_threshold)
     weak: FloatArray = np.eye(6) - kept
     return weak if np.trace(weak) > 0.5 else None
 
@@ -211,7 +211,7 @@ class Place:
         self.world = SimulatedWorld(name, seed=seed, frames=frames, columns=columns)
         self.config = effective_config(Config(), self.world)
         self.unseen = np.array(UNSEEN[name], np.float64).reshape(-1, 6)
-        self.maps = MapPair(self.config.map)
+        self.maps = MapPair(self.config)
         for number in range(self.first, self.first + MAPPED):
             posed, middle = self.sweep(number)
             self.maps.recenter(middle)

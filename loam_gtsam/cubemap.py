@@ -13,7 +13,6 @@ touches a dozen, most of them with a handful of points. See :mod:`loam_gtsam.vox
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 
 import numpy as np
@@ -199,6 +198,12 @@ class CubeMap:
                 mark_second(CubePoints(points, tags), faces, self._cubes, self._grid)
         self._put(CubePoints(points, tags))
 
+    def fill(self, other: CubeMap, *, archived: bool = False) -> None:
+        """Add the points of another map, archived ones if asked, to free voxels: none is moved."""
+        parts = [other._cubes[index].content for index in sorted(other._cubes)]
+        parts += [content for _, content in other._archive.contents()] if archived else []
+        self._put(joined(parts), archive=archived, settle=True)
+
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points of the window and of the archive, after a loop closure; return how many.
 
@@ -218,14 +223,8 @@ class CubeMap:
             self._put(content.of(owner).moved(moves[owner]), archive=True)
         return len(content.points)
 
-    def moved_points(self, moves: Mapping[int, FloatArray]) -> FloatArray:
-        """Points of the whole map as they would be after :meth:`move`; the map does not change."""
-        copy = deepcopy(self)
-        copy.move(moves)
-        return copy.points(archived=True)
-
-    def _put(self, content: CubePoints, *, archive: bool = False) -> None:
-        """Insert points; with ``archive`` those outside the window go into the archive."""
+    def _put(self, content: CubePoints, *, archive: bool = False, settle: bool = False) -> None:
+        """Insert points, by the policy or to ``settle``; with ``archive`` also those outside."""
         # By component: numpy is several times slower along an axis of three.
         axes = np.ascontiguousarray(content.points.T)
         cells = self._grid.cells(axes)
@@ -240,7 +239,7 @@ class CubeMap:
             return
         new = SortedPoints.of(content, cells, self._grid)
         cubes = [self._cubes.setdefault(index, Cube()) for index in new.cubes]
-        if self._config.insertion == "settled":
+        if settle or self._config.insertion == "settled":
             parts = zip(new.cubes, cubes, new.firsts(), strict=True)
             self._trees.add({index: cube.settle(part) for index, cube, part in parts})
         else:

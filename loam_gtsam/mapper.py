@@ -117,7 +117,7 @@ class Mapper:
         self._stamps = StampCheck()
         self._start: Start | None = None
         self._moment: Moment | None = None
-        self.maps = MapPair(self.config.map)
+        self.maps = MapPair(self.config)
 
     def __getstate__(self) -> dict[str, Any]:
         # For checkpoints: no frame depends on what is only there to be looked at.
@@ -167,7 +167,7 @@ class Mapper:
         before = self.last, self._moment, self.imu
         predicted = predict(sweep, *before, self.config.solver, guess, twist)
         try:
-            self.maps.recenter(predicted.map_T_middle)
+            self.maps.recenter(predicted.map_T_middle, features.reach)
         except InputError as error:
             return self._unused(features.stamp, str(error), None)
         clock.lap("prepare")
@@ -249,7 +249,7 @@ class Mapper:
             factors += own_factors(self.extra_factors, context)
         refine = self.config.deskew.refine
         matcher = FrameMatcher.of(
-            predicted.posed, self.maps, self.config, self._moment, clock, refine=refine
+            predicted.posed, self.maps, self.maps.config, self._moment, clock, refine=refine
         )
         return Frame(matcher, predicted, factors)
 
@@ -291,7 +291,7 @@ class Mapper:
             solution, pose, tilt = self.imu.add_scan(posed, frame.matcher.last, solution)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
-        update = self._errors.calibrated(update, frame.sweep, solution)
+        update = self._errors.calibrated(update, frame.sweep, solution, small=self.maps.small)
         clock.lap("covariance")
         return update
 

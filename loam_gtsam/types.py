@@ -121,6 +121,8 @@ class Features:
     voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
         point each (:func:`loam_gtsam.frontend.features.thinned`). None if they hold all points, or
         points that were moved since.
+    reach : metres; three quarters of the points of the sweep are nearer, which tells whether the
+        place is small (``map.small_below``). Infinite if unknown: the place then counts as open.
     """
 
     stamp: int
@@ -136,6 +138,7 @@ class Features:
     edge_prominence: FloatArray | None = None
     not_finite: int = 0
     voxel_sizes: tuple[float, float] | None = None
+    reach: float = np.inf
 
     @classmethod
     def from_points(

@@ -128,6 +128,10 @@ class MapConfig(Section):
     """The edge map keeps one point per voxel of this size."""
     plane_voxel: float = parameter(0.4, unit="m", source="LOAM", low=0.01)
     """The plane map keeps one point per voxel of this size."""
+    small_below: float = parameter(7.0, unit="m", source="LOAM has one size of voxels", low=0.0)
+    """A place is small where three quarters of a sweep's points are nearer than this. There the
+    voxels of map and features and covariance.ground_cell have half their size, lines and planes are
+    fitted to twice as many neighbours, and max_planes is halved; 0 keeps all values everywhere."""
     insertion: Literal["settled", "centroid"] = parameter("settled")
     """New points enter a cube in this way: settled keeps the first point of a voxel, and one of
     each face of a thin wall; centroid filters the cube again with its new points, as LOAM does."""
@@ -275,9 +279,9 @@ class SolverConfig(Section):
     min_map_planes: int = parameter(50, source="A-LOAM uses 51, LOAM uses 101", low=0)
     """A sweep is solved only if the local map has at least this many plane points."""
     degeneracy: Literal["prior", "project", "off"] = parameter("prior", source="LOAM projects")
-    """Degenerate directions, which a scan does not fix, are treated like this by the method gtsam:
-    prior adds the predicted motion with its own covariance; project keeps that motion exactly;
-    off believes the scan."""
+    """Degenerate directions, which a scan does not fix, are treated like this: prior adds the
+    predicted motion with its own covariance; project keeps that motion exactly, which the methods
+    loam and aloam do for prior, too; off believes the scan."""
     min_aligned: float = parameter(8.0, low=0.0)
     """A direction is degenerate if fewer matches than this fix it, counted as if their normals
     pointed that way."""
@@ -289,9 +293,10 @@ class SolverConfig(Section):
     """Along degenerate directions, the speed at the start of a run is zero to within this."""
     start_turn: float = parameter(0.5, unit="rad/s", low=1e-6)
     """Along degenerate directions, the turn rate at the start of a run is zero to within this."""
-    degeneracy_threshold: float = parameter(100.0, source="LOAM", low=0.0)
+    degeneracy_threshold: float = parameter(0.0, source="LOAM uses 100", low=0.0)
     """The method loam projects the step out of eigenvectors of A^T A that have eigenvalues below
-    this (mixed rad and m); 0 turns the projection off."""
+    this (mixed rad and m, so that it depends on the number of matches); with 0 it is min_aligned
+    that tells which directions are degenerate."""
     degeneracy_projector: Literal["correct", "published"] = parameter("correct")
     """The method loam projects by V^-1 V2 with eigenvectors as rows (correct), or as columns like
     the published Eigen port, which is no projection onto the good directions; only to study it."""

@@ -68,13 +68,43 @@ class Config(Section):
         where = f"{source}: " if source else ""
         return override(self.model_copy(update=sections), nested(changes, where), lambda _: where)
 
+    def of_small_places(self) -> Self:
+        """The configuration where a place is small, see ``map.small_below``.
 
+        Steps, door frames and furniture are smaller than the voxels of a street. With half of
+        the spacing, twice as many neighbours fix a normal as well as before; half as many planes
+        are matched, so that the search takes no longer.
+        """
+        found = self.matching
+        matching = found.model_copy(
+            update={
+                "neighbours": round(found.neighbours / SMALL),
+                "max_planes": round(found.max_planes * SMALL),
+            }
+        )
+        return self.model_copy(
+            update={
+                "features": _scaled(self.features, "plane_voxel"),
+                "map": _scaled(self.map, "edge_voxel", "plane_voxel"),
+                "matching": matching,
+                "covariance": _scaled(self.covariance, "ground_cell"),
+            }
+        )
+
+
+def _scaled(section: Section, *names: str) -> Section:
+    """The section with these lengths as they are in small places."""
+    return section.model_copy(update={name: SMALL * getattr(section, name) for name in names})
+
+
+SMALL = 0.5
+"""Size of voxels and cells in small places over that in the open."""
 _WIDTH = 100
 _CLASSICAL = {
     "features": {"range_noise": 0.0, "post_depth": 0.0},
     "deskew": {"refine": False, "rotation": "constant_velocity"},
     "odometry.method": "scan_to_scan",
-    "map.insertion": "centroid",
+    "map": {"insertion": "centroid", "small_below": 0.0},
     "matching": {
         "max_edges": 0,
         "max_planes": 0,
@@ -99,6 +129,7 @@ PRESETS: dict[str, Config] = {
     "loam": Config().changed(
         _CLASSICAL,
         {"solver": {"method": "loam", "iterations": 10, "min_map_planes": 101}},
+        {"solver.degeneracy_threshold": 100.0},
         {"imu": {"prior": "blend", "weight": 0.002, "average_seconds": 0.0}},
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings. It has no minimum of
@@ -107,7 +138,7 @@ PRESETS: dict[str, Config] = {
         _CLASSICAL,
         {"map": {"neighbourhood": [5, 5, 3], "field_of_view": False}, "imu.enabled": False},
         {"solver": {"method": "aloam", "iterations": 2, "inner_iterations": 4, "min_matches": 6}},
-        {"solver.min_map_planes": 51, "matching.weight_slope": 0.0},
+        {"solver.min_map_planes": 51, "matching.weight_slope": 0.0, "solver.degeneracy": "off"},
     ),
 }
 

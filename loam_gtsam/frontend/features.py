@@ -23,7 +23,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, MapConfig
+from loam_gtsam.config import SMALL, Config, MapConfig
 from loam_gtsam.frontend.curvature import (
     curvature,
     prominence,
@@ -41,6 +41,11 @@ _ROUGH = 4.0
 """Standard deviations of range noise: no smooth surface scatters by that much."""
 _KEY_BITS = 18
 """Bits per axis of a voxel key, which leaves 9 for the ring: +-131,072 voxels."""
+_REACH = 0.75
+"""Share of a sweep's points that are nearer than its reach. Half of them are near the lidar in the
+open, too, where it is mounted low."""
+_ENOUGH = 8192
+"""Points from which the reach is found: more make no difference."""
 
 
 def extract_features(scan: Scan, config: Config) -> Features:
@@ -103,16 +108,18 @@ def extract_features(scan: Scan, config: Config) -> Features:
 def thinned(features: Features, config: MapConfig) -> Features:
     """The centroids of the features in each voxel, at their mean times: what the mapper matches.
 
-    Features that were thinned to these voxels before are returned as they are. Otherwise the result
+    Voxels are smaller for a sweep of a small place, by its reach. Features that were thinned to
+    these voxels before are returned as they are. Otherwise the result
     knows neither beams (``edge_rings`` and ``plane_rings`` are 0) nor which features are the most
     pronounced (``sharp`` and ``flat`` are empty).
 
     Parameters
     ----------
     features : of one sweep
-    config : ``edge_voxel`` and ``plane_voxel`` are used
+    config : ``edge_voxel``, ``plane_voxel`` and ``small_below`` are used
     """
-    sizes = config.edge_voxel, config.plane_voxel
+    scale = scale_of(features.reach, config)
+    sizes = scale * config.edge_voxel, scale * config.plane_voxel
     if features.voxel_sizes == sizes:
         return features
     stands_out = features.edge_prominence
@@ -234,7 +241,8 @@ def _assemble(
     def positions(chosen: IntArray) -> FloatArray:
         return scan.points[sweep.index[chosen]].astype(np.float64)
 
-    size = config.features.plane_voxel
+    reach = _reach(sweep.xyz)
+    size = scale_of(reach, config.map) * config.features.plane_voxel
     if size > 0.0 and len(rest):
         rest_of = voxel_filter_by_ring(sweep.xyz.take(rest, axis=1), times[rest], ring[rest], size)
     else:
@@ -255,7 +263,21 @@ def _assemble(
         span=(span[0] - reference, span[1] - reference),
         edge_prominence=np.concatenate((stands_out, poles.depths)),
         not_finite=sweep.not_finite,
+        reach=reach,
     )
+
+
+def scale_of(reach: float, config: MapConfig) -> float:
+    """Size of voxels for a sweep of this reach, metres, over that in the open."""
+    return SMALL if reach < config.small_below else 1.0
+
+
+def _reach(xyz: NDArray[np.float32]) -> float:
+    """Metres from the lidar within which three quarters of the points (3, N) lie."""
+    x, y, z = xyz[:, :: max(1, xyz.shape[1] // _ENOUGH)]
+    squared = x * x + y * y + z * z
+    rank = int(_REACH * len(squared))
+    return float(np.sqrt(np.partition(squared, rank)[rank]))
 
 
 def voxel_filter_by_ring(

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, MapConfig, MatchingConfig
+from loam_gtsam.config import Config, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
@@ -28,13 +29,25 @@ from loam_gtsam.types import FloatArray
 
 _FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
 _THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: some twenty sweeps
+_OPEN = 1.5
+"""A place is small until the reach of a sweep is this much above the limit: not each door that
+opens changes the maps in use."""
 
 
 class MapPair:
-    """The map of edges and the map of planes."""
+    """The map of edges and the map of planes, and both once more with the voxels of small places.
 
-    def __init__(self, config: MapConfig) -> None:
-        self.config = config
+    All sweeps go into the maps of the open, those from small places into the small maps as well.
+    When a place becomes small, the small maps take over what was mapped of it from the open.
+
+    Attributes
+    ----------
+    small : whether the place is small, so that the maps with small voxels are in use
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._configs = config, config.of_small_places()
+        self.small = False
         self.clear()
 
     def __getstate__(self) -> dict[str, Any]:
@@ -42,12 +55,29 @@ class MapPair:
 
     def clear(self) -> None:
         """Forget all points."""
-        self.edges = CubeMap(self.config, self.config.edge_voxel)
-        self.planes = CubeMap(self.config, self.config.plane_voxel)
+        grids = [config.map for config in self._configs]
+        self._open, self._small = (
+            (CubeMap(grid, grid.edge_voxel), CubeMap(grid, grid.plane_voxel)) for grid in grids
+        )
         self._thinned: CubeMap | None = None
 
-    def recenter(self, map_T_lidar: gtsam.Pose3) -> None:
-        """Let the windows follow.
+    @property
+    def config(self) -> Config:
+        """The configuration of the place."""
+        return self._configs[self.small]
+
+    @property
+    def edges(self) -> CubeMap:
+        """The map of edges in use."""
+        return (self._small if self.small else self._open)[0]
+
+    @property
+    def planes(self) -> CubeMap:
+        """The map of planes in use."""
+        return (self._small if self.small else self._open)[1]
+
+    def recenter(self, map_T_lidar: gtsam.Pose3, reach: float | None = None) -> None:
+        """Let the windows follow, and choose the maps by the reach of a sweep, metres.
 
         Raises
         ------
@@ -55,8 +85,15 @@ class MapPair:
             If the pose is not finite, or beyond the voxel grid.
         """
         self._thinned = None  # of other cubes, after a sweep that was not inserted
-        for cubes in (self.edges, self.planes):
+        for cubes in (*self._open, *self._small):
             cubes.recenter(map_T_lidar.translation())
+        if reach is None:
+            return
+        was_small, limit = self.small, self.config.map.small_below
+        self.small = reach < (_OPEN * limit if was_small else limit)
+        if self.small and not was_small:
+            for small, cubes in zip(self._small, self._open, strict=True):
+                small.fill(cubes)
 
     def insert(
         self,
@@ -66,11 +103,12 @@ class MapPair:
         matches: ScanMatches | None = None,
     ) -> None:
         """Add a sweep, by its last matches if there are any; its points belong to a keyframe."""
-        self.edges.owner = self.planes.owner = keyframe
         edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
-        self.edges.insert(edges)  # which has no side: a corner shows from both
         faces = None if matches is None else matches.faces
-        self.planes.insert(planes, map_T_middle.translation(), faces)
+        for edge_map, plane_map in (self._open, self._small)[: 1 + self.small]:
+            edge_map.owner = plane_map.owner = keyframe
+            edge_map.insert(edges)  # which has no side: a corner shows from both
+            plane_map.insert(planes, map_T_middle.translation(), faces)
         self._thinned = None
 
     def too_sparse(self, predicted: Prediction, config: Config) -> str:
@@ -92,9 +130,9 @@ class MapPair:
 
         They are where :meth:`move` would bring them with ``moves``; the map does not change.
         """
-        if moves:
-            return self.edges.moved_points(moves), self.planes.moved_points(moves)
-        return self.edges.points(archived=True), self.planes.points(archived=True)
+        kinds = zip(self._open, self._small, strict=True)
+        edges, planes = (_points(*maps, moves or {}) for maps in kinds)
+        return edges, planes
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points with the keyframes they belong to; returns the number of points moved.
@@ -102,13 +140,26 @@ class MapPair:
         ``moves`` holds (4, 4) rigid transforms in the frame of the map, by number of the keyframe.
         """
         self._thinned = None
-        return self.edges.move(moves) + self.planes.move(moves)
+        for cubes in self._small:
+            cubes.move(moves)
+        return sum(cubes.move(moves) for cubes in self._open)
 
     def thinned(self, factor: float) -> CubeMap:
         """The planes with voxels larger by a factor, the same at every call; made once a sweep."""
         if self._thinned is None:
             self._thinned = self.planes.thinned(factor)
         return self._thinned
+
+
+def _points(cubes: CubeMap, small: CubeMap, moves: Mapping[int, FloatArray]) -> FloatArray:
+    """(N, 3) all points of small places, and those that only the map of the open holds, moved."""
+    has_small = small.count() or small.stats.archived
+    if moves or has_small:
+        whole = deepcopy(small if has_small else cubes)
+        whole.fill(cubes, archived=True)
+        whole.move(moves)
+        cubes = whole
+    return cubes.points(archived=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -94,30 +94,45 @@ class PoseErrors:
     """
 
     def __init__(self, config: Config) -> None:
-        self.config = config.covariance
+        self._places = [
+            (place.covariance, SeenGround(place.covariance.ground_cell))
+            for place in (config, config.of_small_places())
+        ]
+        self._drift_factor = config.covariance.drift
+        self._small = False
+        self._is_empty = True
         graph = config.solver.method == "gtsam"
         self._kernel = config.solver.kernel
         self._kernel_width = config.solver.kernel_width if graph else np.inf
         # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
         self._with_priors = graph
         self._gyro_noise = config.imu.gyro_noise
-        self._seen = SeenGround(self.config.ground_cell)
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
-        self._motion = _Acceleration(self.config.window, np.repeat(expected, 3) ** 2)
+        self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionError(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
 
-    def calibrated(self, update: MapUpdate, sweep: MovingSweep, solution: Solution) -> MapUpdate:
+    def calibrated(
+        self, update: MapUpdate, sweep: MovingSweep, solution: Solution, *, small: bool = False
+    ) -> MapUpdate:
         """The update of a solved frame with its covariance; to be called once for each, in order.
 
-        The sweep has the motion of the solution, which is at its middle.
+        The sweep has the motion of the solution, which is at its middle. ``small`` tells whether
+        the place is small.
         """
-        first = self._seen.is_empty
+        first, self._is_empty = self._is_empty, False
+        config, seen = self._places[small]
+        if small != self._small and not first:
+            # The ground is the same, only in other cells.
+            found = solution.matches
+            points = np.concatenate([found.edges.points, found.planes.points])
+            seen.cells(transform(solution.map_T_lidar.matrix(), points))
+        self._small = small
         scan = scan_error(
-            solution, self._kernel_width, self._seen, self.config,
+            solution, self._kernel_width, seen, config,
             kernel=self._kernel, with_priors=self._with_priors,
         )  # fmt: skip
         if scan is None:
@@ -127,7 +142,7 @@ class PoseErrors:
         to_reference = update.map_T_lidar.between(middle).AdjointMap()
         to_map = middle.AdjointMap()
         # At the first solve all ground is new but replaces none, which makes half the drift.
-        factor = 0.5 * self.config.drift if first else self.config.drift
+        factor = 0.5 * self._drift_factor if first else self._drift_factor
         self._add_drift(sweep, solution, scan, factor * scan.renewed)
         own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
         if first and self._first is not None:
@@ -181,7 +196,7 @@ class PoseErrors:
 
     def skipped(self, sweep: MovingSweep) -> None:
         """Account for a sweep whose pose is the expected one; the very first begins the map."""
-        if self._first is None and self._seen.is_empty:
+        if self._first is None and self._is_empty:
             self._first = sweep
         self._expected.coast(sweep.stamp, turned=_turned(sweep))
 
@@ -395,9 +410,11 @@ def scan_error(
     inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
     effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
 
-    total = solution.information if with_priors else information
-    priors = _positive(total - information)
     expected = solution.expected
+    total = solution.information if with_priors else information
+    if expected is not None and not with_priors:
+        total = total + expected
+    priors = _positive(total - information)
     if expected is None:  # of a solver that does not say: all priors along weak directions
         weak = np.eye(6) - keep
         expected = weak.T @ priors @ weak

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from loam_gtsam.config import Config, DeskewConfig, FeatureConfig, SensorConfig
+from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.curvature import curvature, squared_gaps, unreliable_points, window_fits
 from loam_gtsam.frontend.features import (
     extract_features,
@@ -383,3 +384,27 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
     assert len(thin.plane_rings) == len(thin.planes)
     assert thinned(thin, config) is thin
     assert len(thinned(thin, config.changed(plane_voxel=2.0)).planes) < len(thin.planes)
+
+
+def shrunk(scan, factor):
+    return replace(scan, points=(factor * scan.points).astype(np.float32))
+
+
+def test_in_a_small_place_features_are_twice_as_dense():
+    """Three quarters of the points of this room are nearer than 7 m; four times as large, none."""
+    scan = SimulatedWorld("room", frames=1, columns=450)[0]
+    ranges = np.linalg.norm(scan.points, axis=1)
+    small = extract_features(scan, Config())
+    assert small.reach == pytest.approx(np.quantile(ranges, 0.75), rel=0.01)
+    fixed = Config().changed("map.small_below=0")
+    same = extract_features(scan, fixed)
+    assert len(small.planes) > 1.2 * len(same.planes)
+    assert thinned(small, Config().map).voxel_sizes == (0.1, 0.2)
+    assert thinned(small, fixed.map).voxel_sizes == (0.2, 0.4)
+    halved = fixed.changed("features.plane_voxel=0.1")
+    np.testing.assert_array_equal(extract_features(scan, halved).planes, small.planes)
+    hall = shrunk(scan, 4.0)
+    large, given = (extract_features(hall, config) for config in (Config(), fixed))
+    assert large.reach == pytest.approx(4.0 * small.reach, rel=1e-6)
+    np.testing.assert_array_equal(large.planes, given.planes)
+    assert thinned(large, Config().map).voxel_sizes == (0.2, 0.4)

@@ -66,6 +66,7 @@ MODES = {
     "own closer": (CLOSE, {"loop_closer": ScanLoopCloser}),
     "own solver": ((), {"solver": Curious}),
     "own odometry, pre-integration": (("imu.preintegration=true",), {"odometry": Steady}),
+    "a place that becomes small": (("map.small_below=5.24",), {}),
     "classical": (("solver.method=loam", "imu.prior=off"), {}),
 }
 

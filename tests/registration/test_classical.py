@@ -18,7 +18,9 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import Mapper, make_solver
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, match_rows
+from loam_gtsam.registration.pose_errors import SeenGround, scan_error
+from loam_gtsam.registration.report import status_of
+from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, MotionPrior, match_rows
 from loam_gtsam.registration.solvers.classical import (
     ALoamSolver,
     ClassicalSolver,
@@ -27,7 +29,7 @@ from loam_gtsam.registration.solvers.classical import (
     euler_jacobian,
     loam_rows,
 )
-from loam_gtsam.types import InputError
+from loam_gtsam.types import FrameStatus, InputError
 
 OFFSET = np.array([0.02, -0.01, 0.02, 0.07, 0.13, -0.13])
 SIX = np.eye(6)
@@ -251,6 +253,51 @@ def test_weak_directions_below_the_threshold_stay_and_others_move():
     np.testing.assert_allclose(held.translation(), [0.3, 0.0, 0.0], atol=0.02)
     np.testing.assert_allclose(held.translation()[1:], 0.0, atol=0.01)
     assert held.x() > 0.28
+
+
+@pytest.mark.parametrize("kind", [ClassicalSolver, ALoamSolver])
+@pytest.mark.parametrize("n_wall", [4, 40])
+def test_what_is_not_solved_is_said_and_known_no_better_than_the_expected_motion(kind, n_wall):
+    """Four rows across x are fewer than ``min_aligned``, 8; forty are enough."""
+    guess = gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.1]))
+    motion = MotionPrior(guess, np.diag([1e4, 1e4, 1e4, 25.0, 25.0, 25.0]))
+
+    def solve(**changes):
+        classical = solver(kind, iterations=20, **changes)
+        return classical.solve(lambda pose: floor_and_wall(n_wall), guess, motion=motion)
+
+    found, believed = solve(), solve(degeneracy="off")
+    assert believed.weak is None
+    assert abs(believed.map_T_lidar.x()) < 1e-4
+    assert found.localizability is not None
+    if n_wall == 40:
+        assert found.weak is None
+        assert difference(found.map_T_lidar, believed.map_T_lidar) < 1e-9
+        assert status_of(found, "")[0] is FrameStatus.OK
+        return
+    np.testing.assert_allclose(found.map_T_lidar.translation(), [0.3, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(found.weak @ found.weak, found.weak, atol=1e-9)
+    assert found.n_weak == 1
+    assert abs(found.weak[3, 3]) > 0.99
+    assert status_of(found, "")[0] is FrameStatus.DEGENERATE
+    config = Config().covariance
+    error = scan_error(found, np.inf, SeenGround(config.ground_cell), config, with_priors=False)
+    told = np.sqrt(np.diag(error.covariance))
+    assert 0.15 < told[3] < 0.25  # 1 / sqrt(25)
+    assert max(told[4:]) < 0.1
+    np.testing.assert_allclose(error.expected[3, 3], 1.0, atol=0.05)
+
+
+def test_what_loams_threshold_projects_out_is_said_too():
+    guess = gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.2, 0.1]))
+    motion = MotionPrior(guess, 25.0 * SIX)
+    for n_wall, said in ((40, True), (200, False)):
+        loam = solver(ClassicalSolver, degeneracy_threshold=100.0)
+        found = loam.solve(lambda pose, n=n_wall: floor_and_wall(n), guess, motion=motion)
+        assert (found.weak is not None) == said
+        silent = loam.solve(lambda pose, n=n_wall: floor_and_wall(n), guess)
+        assert silent.weak is None
+        assert found.map_T_lidar.equals(silent.map_T_lidar, 1e-15)
 
 
 def test_the_projector_is_that_of_the_first_association():

@@ -1,6 +1,6 @@
 """The matcher of one frame: pure, keeps matches near by, searches widely where there is little."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import gtsam
 import numpy as np
@@ -33,7 +33,7 @@ def parts():
     """The second sweep of the room, the middle of the first one, and the map of the first one."""
     world = SimulatedWorld("room", frames=2, columns=450)
     first, second = (MovingSweep(extract_features(scan, CONFIG), CONFIG) for scan in world)
-    maps = MapPair(CONFIG.map)
+    maps = MapPair(CONFIG)
     maps.insert(first.at(TWIST), gtsam.Pose3(), 0)
     return second, Moment(first.stamp, gtsam.Pose3(), True), maps
 
@@ -114,7 +114,7 @@ def test_with_few_planes_the_search_is_wide_and_equals_brute_force():
         MovingSweep(Features.from_points(stamp, none, points), CONFIG)
         for stamp, points in ((0, ground), (10**8, some))
     )
-    maps = MapPair(CONFIG.map)
+    maps = MapPair(CONFIG)
     maps.insert(first.at(np.zeros(6)), gtsam.Pose3(), 0)
     found = matcher_of(second, Moment(0, gtsam.Pose3(), True), maps)(HERE)
     assert len(found) > 30
@@ -136,7 +136,7 @@ def test_with_few_planes_the_search_is_wide_and_equals_brute_force():
 
 def test_the_thinned_map_follows_the_window_without_an_insertion():
     """After a lost sweep nothing is inserted, but the window moves on."""
-    maps = MapPair(Config().map)
+    maps = MapPair(Config())
     points = np.random.default_rng(0).uniform(-5.0, 5.0, (500, 3))
     maps.planes.insert(points)
     here = maps.thinned(4.0)
@@ -157,3 +157,86 @@ def test_in_a_map_that_has_enough_planes_none_is_searched_for_widely(matcher, mo
     np.testing.assert_array_equal(wider.planes.normals[near], found.planes.normals)
     monkeypatch.setattr(frame_matcher, "_THIN", 10)
     assert same(matcher(HERE), found)
+
+
+LIMIT = CONFIG.map.small_below
+
+
+def sweep_of(points, reach=np.inf):
+    features = replace(Features.from_points(0, points[::7], points), reach=reach)
+    return MovingSweep(features, CONFIG).at(np.zeros(6))
+
+
+def wall(seed, x):
+    """4,000 points of a wall of 10 m x 5 m."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([np.full(4000, x), rng.uniform([-5.0, 0.0], [5.0, 5.0], (4000, 2))])
+
+
+def test_the_maps_of_small_places_are_in_use_until_the_reach_is_clearly_larger():
+    maps, here = MapPair(CONFIG), gtsam.Pose3()
+    used = []
+    for reach in (np.inf, LIMIT, 0.99 * LIMIT, 1.49 * LIMIT, 1.51 * LIMIT, LIMIT, 0.99 * LIMIT):
+        maps.recenter(here, reach)
+        used.append(maps.small)
+    assert used == [False, False, True, True, False, False, True]
+    maps.recenter(here)
+    maps.clear()
+    assert maps.small
+    matching = maps.config.matching
+    assert matching.neighbours == 2 * CONFIG.matching.neighbours
+    assert 2 * matching.max_planes == CONFIG.matching.max_planes
+    always = MapPair(CONFIG.changed("map.small_below=0"))
+    always.recenter(here, 0.1)
+    assert not always.small
+    assert always.config.matching == CONFIG.matching
+
+
+@pytest.mark.parametrize("insertion", ["settled", "centroid"])
+def test_out_of_the_street_into_a_small_place_and_back(insertion):
+    """The small map takes over what was there; the map of the open stays as coarse as ever."""
+    maps, here = MapPair(CONFIG.changed({"map.insertion": insertion})), gtsam.Pose3()
+    street, later = sweep_of(wall(0, 3.0)), sweep_of(wall(2, 8.0))
+    stairs = sweep_of(wall(1, 3.0), reach=1.0)
+    maps.recenter(here)
+    maps.insert(street, here, 1)
+    before = maps.planes.points()
+    maps.recenter(here, 1.0)
+    np.testing.assert_array_equal(in_order(maps.planes.points()), in_order(before))
+    maps.insert(stairs, here, 2)
+    fine = maps.planes.points()
+    assert len(fine) > 2.5 * len(before)  # of four voxels of 0.2 m in one of 0.4 m
+    assert set(map(tuple, before)) <= set(map(tuple, fine)) or insertion == "centroid"
+    maps.recenter(here, 100.0)
+    assert len(maps.planes.points()) < 1.3 * len(before)
+    maps.insert(later, here, 3)
+    edges, planes = maps.points()
+    assert set(map(tuple, fine)) <= set(map(tuple, planes))
+    assert np.count_nonzero(planes[:, 0] > 7.0) == np.count_nonzero(maps.planes.points()[:, 0] > 7)
+    maps.recenter(here, 1.0)
+    np.testing.assert_array_equal(in_order(maps.planes.points()), in_order(planes))
+    assert len(edges) >= len(maps.edges.points())
+
+
+def in_order(points):
+    return points[np.lexsort(points.T)]
+
+
+def test_points_of_both_resolutions_follow_their_keyframe_and_come_back_from_the_archive():
+    maps, here = MapPair(CONFIG), gtsam.Pose3()
+    maps.recenter(here)
+    maps.insert(sweep_of(wall(0, 3.0)), here, 1)
+    maps.recenter(here, 1.0)
+    maps.insert(sweep_of(wall(1, 3.0), 1.0), here, 2)
+    _, whole = maps.points()
+    maps.recenter(gtsam.Pose3(gtsam.Rot3(), np.array([5000.0, 0.0, 0.0])), 100.0)
+    assert maps.planes.count() == 0
+    np.testing.assert_array_equal(in_order(maps.points()[1]), in_order(whole))
+    up = np.eye(4)
+    up[2, 3] = 10.0
+    moved = maps.points({1: up, 2: up})[1]
+    maps.move({1: up, 2: up})
+    np.testing.assert_array_equal(in_order(maps.points()[1]), in_order(moved))
+    np.testing.assert_allclose(moved[:, 2].mean(), whole[:, 2].mean() + 10.0, atol=0.1)
+    maps.recenter(here, 1.0)
+    assert len(maps.planes.points()) == len(moved)

@@ -1,6 +1,8 @@
 """Covariances of a run: parts, drift, the motion between two frames, and what must not change."""
 
+from dataclasses import replace
 from itertools import pairwise
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -262,6 +264,28 @@ def test_ground_that_replaces_none_counts_half(monkeypatch):
     drifts = [calibrated(errors, k).uncertainty.drift[0, 0] for k in range(3)]
     once = Config().covariance.drift * 1e-8
     np.testing.assert_allclose(drifts, [0.5 * once, 1.5 * once, 2.5 * once])
+
+
+def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
+    """Its cells are others, but what was matched in the frame of the change was mapped before."""
+    fresh = []
+
+    def error(solution, width, seen, config, **_):
+        fresh.append(int(seen.cells(solution.matches.planes.points)[1].sum()))
+        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, 1.0, 10.0)
+
+    monkeypatch.setattr(covariance_module, "scan_error", error)
+    errors, ground = PoseErrors(Config()), np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 0.5]])
+    none = SimpleNamespace(points=ground[:0])
+    steps = ((0.0, False), (0.0, True), (0.0, True), (5.0, True), (0.0, False), (5.0, False))
+    for number, (height, small) in enumerate(steps):
+        planes = SimpleNamespace(points=ground + height)
+        matches = SimpleNamespace(edges=none, planes=planes)
+        solution = replace(Solution.unsolved(gtsam.Pose3(), None, 1, 1), matches=matches)
+        update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
+        sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
+        errors.calibrated(update, sweep, solution, small=small)
+    assert fresh == [1, 0, 0, 2, 0, 1]  # cells of 0.8 m, and of 0.4 m in small places
 
 
 def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatch):

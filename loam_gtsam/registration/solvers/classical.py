@@ -1,13 +1,15 @@
 """The classical solvers: LOAM's hand solve and A-LOAM's robust least squares, in numpy.
 
 Rows have a standard deviation of 1 m, as in the originals: divide ``Solution.information`` by the
-variance of a residual, m^2, to compare it with that of ``GtsamSolver``. The motion prior is unused.
+variance of a residual, m^2, to compare it with that of ``GtsamSolver``. Along degenerate directions
+no step is made: the pose stays at the guess, and the expected motion tells how well that is known.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -16,6 +18,7 @@ from scipy.linalg import qr, solve_triangular
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows, concatenate_rows, line_rows, plane_rows
 from loam_gtsam.geometry import transform
+from loam_gtsam.registration.degeneracy import Localizability, localizability
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers.base import Associate, MotionPrior, Solution, rematch
 from loam_gtsam.types import FloatArray, InputError
@@ -53,10 +56,42 @@ class _SolverWithoutPriors(ABC):
                 f"priors: the {self.config.method} solver has no place for them, got "
                 f"{len(priors)}; use solver.method: gtsam"
             )
-        return rematch(associate, guess, self.config, self._optimiser(), stop=self._stop)
+        seen = weak = kept = None
+
+        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Solution:
+            nonlocal seen, weak, kept
+            if kept is None:  # the first matches decide which directions are degenerate
+                seen = None if motion is None else localizability(matches, pose)
+                kept, weak = self._kept(matches, pose, self._weak(seen))
+            return self._optimise(matches, pose, kept)
+
+        found = rematch(associate, guess, self.config, optimise, stop=self._stop)
+        if not found.solved or motion is None or weak is None:
+            return replace(found, localizability=seen)
+        rows = np.zeros(2 * len(found.matches.edges) + len(found.matches.planes), np.bool_)
+        added = motion.along(weak).information
+        return replace(
+            found, localizability=seen, weak=weak, unseen=weak, beacons=rows, expected=added
+        )
+
+    def _weak(self, seen: Localizability | None) -> FloatArray | None:
+        """(6, 6) projector onto the degenerate directions; None if there are none."""
+        if seen is None or self.config.degeneracy == "off":
+            return None
+        return seen.projector(self.config.min_aligned)
 
     @abstractmethod
-    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]: ...
+    def _kept(
+        self, matches: ScanMatches, pose: gtsam.Pose3, weak: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """(6, 6) projector of steps, in the solver's unknowns, and onto what it takes away.
+
+        ``weak`` and the second one are in the package's tangent, None for no direction.
+        """
+
+    @abstractmethod
+    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3, kept: FloatArray) -> Solution:
+        """The next pose, from fixed matches."""
 
 
 class ClassicalSolver(_SolverWithoutPriors):
@@ -67,7 +102,8 @@ class ClassicalSolver(_SolverWithoutPriors):
     row, multiplied by its weight s; ``A^T A x = A^T b`` is solved by QR. Directions with an
     eigenvalue of ``A^T A`` below ``config.degeneracy_threshold`` at the first association are
     projected out of every step (Zhang, Kaess and Singh, On Degeneracy of Optimization-based State
-    Estimation Problems, ICRA 2016).
+    Estimation Problems, ICRA 2016). With a threshold of 0, those that ``GtsamSolver`` finds
+    degenerate are.
 
     Notes
     -----
@@ -76,26 +112,30 @@ class ClassicalSolver(_SolverWithoutPriors):
     exactly on its line the published code divides by zero; here such a match adds nothing.
     """
 
-    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
-        projector: FloatArray | None = None
-        threshold = self.config.degeneracy_threshold
-        published = self.config.degeneracy_projector == "published"
-
-        def optimise(matches: ScanMatches, pose: gtsam.Pose3) -> Solution:
-            nonlocal projector
-            residual, jacobian = loam_rows(matches, pose).residuals(pose)
-            a = jacobian @ euler_jacobian(pose)
+    def _kept(
+        self, matches: ScanMatches, pose: gtsam.Pose3, weak: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        turn, threshold = euler_jacobian(pose), self.config.degeneracy_threshold
+        back = np.linalg.inv(turn)
+        if threshold > 0.0:
+            a = loam_rows(matches, pose).residuals(pose)[1] @ turn
             normal = a.T @ a
-            if projector is None:
-                projector = degeneracy_projector(normal, threshold, published=published)
-            step = projector @ _solve_by_qr(normal, -a.T @ residual)
-            moved = _add_euler(pose, step)
-            after, jacobian = loam_rows(matches, moved).residuals(moved)
-            costs = 0.5 * float(residual @ residual), 0.5 * float(after @ after)
-            small = _is_small(step, self.config)
-            return Solution(moved, True, small, matches, 1, 1, *costs, jacobian.T @ jacobian)
+            published = self.config.degeneracy_projector == "published"
+            kept = degeneracy_projector(normal, threshold, published=published)
+            if np.linalg.eigvalsh(normal)[0] >= threshold:
+                return kept, None
+            return kept, np.eye(6) - turn @ degeneracy_projector(normal, threshold) @ back
+        return (np.eye(6) if weak is None else back @ (np.eye(6) - weak) @ turn), weak
 
-        return optimise
+    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3, kept: FloatArray) -> Solution:
+        residual, jacobian = loam_rows(matches, pose).residuals(pose)
+        a = jacobian @ euler_jacobian(pose)
+        step = kept @ _solve_by_qr(a.T @ a, -a.T @ residual)
+        moved = _add_euler(pose, step)
+        after, jacobian = loam_rows(matches, moved).residuals(moved)
+        costs = 0.5 * float(residual @ residual), 0.5 * float(after @ after)
+        small = _is_small(step, self.config)
+        return Solution(moved, True, small, matches, 1, 1, *costs, jacobian.T @ jacobian)
 
 
 class ALoamSolver(_SolverWithoutPriors):
@@ -104,7 +144,7 @@ class ALoamSolver(_SolverWithoutPriors):
     Levenberg-Marquardt with Ceres' damping, at most ``config.inner_iterations`` steps, on the
     distance vectors of edges and the distances of planes with a Huber loss. All
     ``config.iterations`` associations are made; the stop rule only decides what is reported as
-    converged.
+    converged. A-LOAM takes no direction for degenerate; ``config.degeneracy: off`` does so.
 
     Notes
     -----
@@ -115,10 +155,13 @@ class ALoamSolver(_SolverWithoutPriors):
 
     _stop = False
 
-    def _optimiser(self) -> Callable[[ScanMatches, gtsam.Pose3], Solution]:
-        return self._optimise
+    def _kept(
+        self, matches: ScanMatches, pose: gtsam.Pose3, weak: FloatArray | None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        turn = _turn(pose)
+        return (np.eye(6) if weak is None else turn @ (np.eye(6) - weak) @ turn.T), weak
 
-    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3) -> Solution:
+    def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3, kept: FloatArray) -> Solution:
         rows, pairs, delta = aloam_rows(matches), len(matches.edges), self.config.huber_delta
         first, steps = pose, 0
         radius, shrink = _START_RADIUS, 2.0
@@ -128,7 +171,7 @@ class ALoamSolver(_SolverWithoutPriors):
             steps += 1
             damping = np.clip(normal.diagonal(), *_DIAGONAL) / radius
             damped = np.linalg.solve(normal + np.diag(damping), gradient)
-            step: FloatArray = np.negative(damped, dtype=np.float64)
+            step: FloatArray = kept @ np.negative(damped, dtype=np.float64)
             expected = -float(step @ (gradient + 0.5 * normal @ step))
             moved = _add_global(pose, step)
             new_cost, new_normal, new_gradient = _robust(rows, pairs, delta, moved)

@@ -130,8 +130,8 @@ class MapConfig(Section):
     """The plane map keeps one point per voxel of this size."""
     small_below: float = parameter(7.0, unit="m", source="LOAM has one size of voxels", low=0.0)
     """A place is small where three quarters of a sweep's points are nearer than this. There the
-    voxels of map and features and covariance.ground_cell have half their size, lines and planes are
-    fitted to twice as many neighbours, and max_planes is halved; 0 keeps all values everywhere."""
+    voxels of map and features and covariance.ground_cell have half their size, and lines and planes
+    are fitted to twice as many neighbours; 0 keeps these values everywhere."""
     insertion: Literal["settled", "centroid"] = parameter("settled")
     """New points enter a cube in this way: settled keeps the first point of a voxel, and one of
     each face of a thin wall; centroid filters the cube again with its new points, as LOAM does."""

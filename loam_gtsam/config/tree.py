@@ -72,15 +72,10 @@ class Config(Section):
         """The configuration where a place is small, see ``map.small_below``.
 
         Steps, door frames and furniture are smaller than the voxels of a street. With half of
-        the spacing, twice as many neighbours fix a normal as well as before; half as many planes
-        are matched, so that the search takes no longer.
+        the spacing, twice as many neighbours fix a normal as well as before.
         """
-        found = self.matching
-        matching = found.model_copy(
-            update={
-                "neighbours": round(found.neighbours / SMALL),
-                "max_planes": round(found.max_planes * SMALL),
-            }
+        matching = self.matching.model_copy(
+            update={"neighbours": round(self.matching.neighbours / SMALL)}
         )
         return self.model_copy(
             update={

@@ -185,7 +185,6 @@ def test_the_maps_of_small_places_are_in_use_until_the_reach_is_clearly_larger()
     assert maps.small
     matching = maps.config.matching
     assert matching.neighbours == 2 * CONFIG.matching.neighbours
-    assert 2 * matching.max_planes == CONFIG.matching.max_planes
     always = MapPair(CONFIG.changed("map.small_below=0"))
     always.recenter(here, 0.1)
     assert not always.small

@@ -259,7 +259,7 @@ def test_a_search_of_too_small_a_radius_says_that_the_sweep_is_lost(before, kidn
     monitor.config = monitor.config.changed(radius=1.0, max_radius=1.0)
     monitor.lost = 2
     before = copy(before)  # a solver that does not get far by itself
-    before.solver = GtsamSolver(before.config.solver.changed(iterations=8))
+    before.solver = GtsamSolver(before.config.solver.changed(iterations=4))
     _, outcome, _ = search_in(before, list(kidnapped)[AT], monitor)
     assert isinstance(outcome, Lost)
     assert "nothing fits within 1 m; lost for 3 sweeps" in outcome.message

@@ -146,7 +146,7 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
 
     with closing(open_bag(path)) as reader:
         loam = reader.topics.keys() >= set(REQUIRED)
-    plain = BagOptions.__annotations__.keys() & options.keys()
+    plain = (BagOptions.__annotations__.keys() - {"imu_topic"}) & options.keys()
     own = "axes" in options or (loam and not plain)
     return _construct(LoamTopicsDataset if own else BagDataset, path, options)
 

@@ -26,7 +26,7 @@ from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
 from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checked_stamp
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
-from loam_gtsam.types import ConfigError, DatasetError, InputError, MapUpdate, Sweep
+from loam_gtsam.types import DatasetError, InputError, MapUpdate, Sweep
 
 _POLL = 0.02  # seconds after which a worker looks whether a sweep has waited for long enough
 
@@ -59,8 +59,7 @@ class LiveMapper:
     :func:`loam_gtsam.pipeline.run` on a bag of the same messages, to the last bit.
 
     Memory grows with the map and the keyframes of the loops only, not with the time of the run.
-    Raises ConfigError if features come without one of LOAM's three topics, or with an IMU, or
-    ``axes`` is unknown.
+    Raises ConfigError if features come without one of LOAM's three topics, or ``axes`` is unknown.
 
     Parameters
     ----------
@@ -94,8 +93,6 @@ class LiveMapper:
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._config = config = config or Config()
-        if features and imu:
-            raise ConfigError("features, imu: LOAM's front end has used the IMU already")
         self._decoder = SweepDecoder(config, features, axes, clouds or CloudStream())
         bounded = config.live.when_full != "never"
         self._imu: LiveImu | None = None

@@ -79,7 +79,11 @@ class SweepDecoder:
         is_group = isinstance(content, dict)
         try:
             if is_group:
-                return ReadySweep(self._feature_sweep(content), received, None)
+                sweep = self._feature_sweep(content)
+                # Its points are de-skewed: only the tilt of that moment is asked for.
+                after = 0.5 * self._config.imu.average_seconds
+                needs = sweep.features.stamp + int(np.ceil(after * 1e9)) + 1
+                return ReadySweep(sweep, received, needs)
             checked_stamp(content)
             scan = self._clouds.decode(content)
         # Whatever a faulty message makes a decoder stumble over: the next one may be good.

@@ -168,7 +168,7 @@ def test_recorded_poses_of_loam_are_optional_and_broken_ones_are_left_out(tmp_pa
     np.testing.assert_array_equal(dataset.recorded.stamps - START, [100_000_000, 300_000_000])
     info = dataset.info()
     assert info.facts["recorded result"] == f"{mapped}, 2 poses"
-    assert info.facts["not used"] == "/imu"
+    assert info.facts["IMU topic"] == "/imu"
     assert sum("left out: " in text for text in info.problems) == 1
     # A bag without them, in which one kind of feature is missing once.
     recording = [entry for entry in recording if entry[0] != mapped]

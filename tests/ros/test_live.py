@@ -677,7 +677,6 @@ def test_axes_that_cannot_be_told_yet_are_told_by_a_later_sweep() -> None:
     ("options", "match"),
     [
         ({"features": REQUIRED[:2]}, "expected /laser_odom_to_init among them"),
-        ({"features": REQUIRED, "imu": True}, "has used the IMU already"),
         ({"axes": "camera"}, "one of auto, lidar, loam"),
     ],
 )

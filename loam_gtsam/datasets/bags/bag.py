@@ -85,17 +85,7 @@ class BagDataset(Loader):
         """All samples of the IMU topic, or None; reads them at the first access."""
         if self.imu_topic is None:
             return None
-        rows, lost = [], 0
-        for message in self._messages(self.imu_topic, self._problems):
-            if isinstance(message, BadSweep):
-                lost += 1
-            else:
-                rows.append(pointcloud2.decode_imu(message.content))
-        if lost:
-            self._problems.append(f"IMU: {lost} messages cannot be read")
-        stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
-        values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 10)
-        return tables.clean_imu(stamps, values, self._problems)
+        return bag_reader.read_imu(self._path, self.imu_topic, self._problems, self._parts)
 
     @property
     def truth(self) -> Trajectory | None:

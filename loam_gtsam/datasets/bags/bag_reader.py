@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS
-from loam_gtsam.types import BadSweep, DatasetError
+from loam_gtsam.datasets.decode.pointcloud2 import decode_imu
+from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS, clean_imu
+from loam_gtsam.types import BadSweep, DatasetError, ImuSamples
 
 MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_registered")
 """Topics on which LOAM and A-LOAM publish clouds in the map."""
@@ -139,6 +141,23 @@ def read_messages(
                 yield BadSweep(received, text)
                 continue
             yield Message(connection.topic, received, content)
+
+
+def read_imu(
+    path: Path, topic: str, problems: list[str], parts: Sequence[Path] = ()
+) -> ImuSamples | None:
+    """All samples of an IMU topic, put in order; what had to be put right goes to ``problems``."""
+    rows, lost = [], 0
+    for message in read_messages(path, [topic], problems, parts):
+        if isinstance(message, BadSweep):
+            lost += 1
+        else:
+            rows.append(decode_imu(message.content))
+    if lost:
+        problems.append(f"IMU: {lost} messages cannot be read")
+    stamps = np.array([stamp for stamp, _ in rows], dtype=np.int64)
+    values = np.array([row for _, row in rows], dtype=np.float64).reshape(-1, 10)
+    return clean_imu(stamps, values, problems)
 
 
 def bag_kind(path: Path) -> str:

@@ -14,10 +14,11 @@ from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.decode import loam_messages
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
-from loam_gtsam.datasets.decode.tables import describe_stamps
+from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.types import BadSweep, DatasetError, FeatureSweep, ImuSamples, LoamError, Trajectory
 
 MAPPED = "/aft_mapped_to_init"
+_IMU = "sensor_msgs/msg/Imu"
 _Asked = Literal["auto", "lidar", "loam"]
 
 
@@ -30,6 +31,9 @@ class LoamTopicsDataset(Loader):
         ``/laser_odom_to_init`` and, optionally, ``/velodyne_cloud_3`` and ``/aft_mapped_to_init``
     axes : ``lidar`` (A-LOAM), ``loam`` (the original's camera-like axes), or ``auto``: the
         directions of a spinning lidar's points spread least along its vertical axis
+
+    imu_topic : whose roll and pitch the mapping uses, as laserMapping does; the one with the most
+        messages if None, if there is any
 
     Attributes
     ----------
@@ -46,12 +50,12 @@ class LoamTopicsDataset(Loader):
         If the bag cannot be opened, a topic is missing or the axes cannot be told.
     """
 
-    imu: ImuSamples | None = None
-    """The front end of LOAM has used it already."""
     truth: Trajectory | None = None
     """The result of LOAM itself is ``recorded``."""
 
-    def __init__(self, path: str | Path, *, axes: _Asked = "auto") -> None:
+    def __init__(
+        self, path: str | Path, *, axes: _Asked = "auto", imu_topic: str | None = None
+    ) -> None:
         if axes not in ("auto", "lidar", "loam"):
             raise DatasetError(f"axes: expected one of auto, lidar, loam; got {axes!r}")
         self._path = Path(path)
@@ -65,6 +69,10 @@ class LoamTopicsDataset(Loader):
             listing = ", ".join(f"{name} ({kind})" for name, (kind, _) in self._types.items())
             text = f"no topic {', '.join(missing)}; the bag has: {listing or 'none'}"
             raise DatasetError(f"{self._path}: {text}")
+        self.imu_topic: str | None = None
+        if imu_topic is not None or any(kind == _IMU for kind, _ in self._types.values()):
+            choice = self._path, self._types, _IMU, imu_topic, self._problems
+            self.imu_topic = bag_reader.choose_topic(*choice)
         self._topics = list(loam_messages.REQUIRED)
         self._topics += [loam_messages.CLOUD] if loam_messages.CLOUD in self._types else []
         self.axes: Literal["lidar", "loam"] = axes if axes != "auto" else self._decide_axes()
@@ -88,6 +96,13 @@ class LoamTopicsDataset(Loader):
             if group is not None:
                 yield self._sweep(group)
         self.unmatched = matcher.finish()
+
+    @cached_property
+    def imu(self) -> ImuSamples | None:
+        """All samples of the IMU topic, in the axes of the IMU, not in LOAM's; None without it."""
+        if self.imu_topic is None:
+            return None
+        return bag_reader.read_imu(self._path, self.imu_topic, self._problems)
 
     @cached_property
     def recorded(self) -> Trajectory | None:
@@ -114,7 +129,12 @@ class LoamTopicsDataset(Loader):
         if self.recorded is not None:
             facts["recorded result"] = f"{MAPPED}, {len(self.recorded)} poses"
             describe_stamps(self.recorded.stamps, facts, problems)
-        if others := [name for name in self._types if name not in (*self._topics, MAPPED)]:
+        imu = self.imu  # first: it may find problems
+        facts["IMU"] = describe_imu(imu)
+        if self.imu_topic is not None:
+            facts["IMU topic"] = self.imu_topic
+        known = *self._topics, MAPPED, self.imu_topic
+        if others := [name for name in self._types if name not in known]:
             facts["not used"] = ", ".join(others)
         if len({self._types[topic][1] for topic in self._topics}) > 1:
             problems.append(

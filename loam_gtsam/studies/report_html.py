@@ -25,6 +25,7 @@ table { border-collapse: collapse; font-variant-numeric: tabular-nums; }
 th, td { padding: .3rem .7rem; text-align: right; border-bottom: 1px solid #d7dde2;
          white-space: nowrap; }
 th:first-child, td:first-child { text-align: left; }
+th { white-space: normal; vertical-align: bottom; }
 td.best { font-weight: 700; }
 td.text { text-align: left; white-space: normal; }
 tr.group td { text-align: left; white-space: normal; color: #5c6b77; padding-top: 1rem; }

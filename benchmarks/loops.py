@@ -269,7 +269,7 @@ def _until(world: SimulatedWorld, metres: float) -> Iterator[Scan]:
 
 def _without_imu() -> Config:
     config = Config()
-    return config.changed("imu.enabled=false")
+    return config.changed("imu.coupling=off")
 
 
 def _is_wrong(loop: LoopClosure, poses: Sequence[gtsam.Pose3]) -> bool:

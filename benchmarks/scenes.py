@@ -42,12 +42,12 @@ def _with_imu(**changes: Any) -> Config:
 
 
 AIDS: Mapping[str, Config] = {
-    NONE: _with_imu(enabled=False),
+    NONE: _with_imu(coupling="off"),
     "gyro only": _with_imu(prior="off"),
     "blend": _with_imu(prior="blend"),
     "equivalent": _with_imu(prior="equivalent"),
     "sigma": _with_imu(prior="sigma"),
-    "pre-integration": _with_imu(prior="equivalent", preintegration=True),
+    "tight": _with_imu(coupling="tight"),
 }
 """Uses of an IMU by the default; ``gyro only`` levels the map and de-skews."""
 
@@ -150,7 +150,7 @@ class Runs:
     def run(self, table: str, variant: str, config: Config, noise: float = np.nan) -> Row:
         """One run, with the IMU of that noise if the configuration uses one."""
         recording = self.recording
-        imu = recording.imus[noise] if config.imu.enabled else None
+        imu = recording.imus[noise] if config.imu.coupling != "off" else None
         dataset = ArrayDataset(
             recording.sweeps, imu=imu, truth=recording.truth, sensor=recording.sensor
         )
@@ -210,7 +210,7 @@ def measure(place: Place, data: Path) -> list[Row]:
     rows = []
     for name in place.solvers:
         config = preset(name)
-        config = config.changed("imu.enabled=false")
+        config = config.changed("imu.coupling=off")
         rows.append(runs.run("solvers", name, config))
     if NONE in place.aids:
         same = [row for row in rows if row.variant == "default"]

@@ -102,16 +102,21 @@ class Mode:
     more: tuple[str, ...] = ()
 
     @property
+    def coupling(self) -> str:
+        """Of the IMU: tight, unless the changes say otherwise."""
+        return "off" if self.imu is None else "tight"
+
+    @property
     def config(self) -> Config:
         """The default with the changes, and more of them as ``KEY=VALUE``."""
-        return Config().changed({"imu.enabled": self.imu is not None}, self.changes, *self.more)
+        return Config().changed({"imu.coupling": self.coupling}, self.changes, *self.more)
 
 
 MODES = (
     Mode("lidar"),
     Mode("imu", "white"),
     Mode("mems", "mems"),
-    Mode("inertial", "mems", {"imu.preintegration": True}),
+    Mode("loose", "mems", {"imu.coupling": "loose"}),
     Mode("project", None, {"solver.degeneracy": "project"}),
 )
 

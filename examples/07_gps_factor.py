@@ -23,7 +23,7 @@ rng = np.random.default_rng(0)
 stamps = world.truth.stamps[[*range(0, 28, 3), *range(33, 60, 3)]]
 positions = world.truth_at(stamps).map_T_lidar[:, :3, 3]
 positions = positions + rng.normal(0.0, SIGMA, positions.shape)
-config = Config().changed("imu.level=false")
+config = Config().changed("imu.coupling=loose", "imu.level=false")  # no accelerometer
 had_one: list[int] = []
 
 

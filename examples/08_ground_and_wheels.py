@@ -18,7 +18,7 @@ WHEELS = (10.0, 10.0, 0.01, 0.003, 0.003, 10.0)
 # A short-sighted lidar between bare walls: no sweep says how far one went.
 world = SimulatedWorld("corridor_bare", frames=60, columns=900, max_range=6.0)
 floor_up = world.world_T_start[2, :3]  # z of the world in the map, which is the first pose's frame
-off = Config().changed("imu.enabled=false")  # the factors have to do it
+off = Config().changed("imu.coupling=off")  # the factors have to do it
 
 
 def floor(context: PoseContext) -> gtsam.NonlinearFactor:

@@ -154,6 +154,21 @@ def symmetric_eigenvalues(matrices: FloatArray) -> FloatArray:
     return np.stack([smallest, 3.0 * mean - largest - smallest, largest])
 
 
+def nearest_positive(matrix: FloatArray) -> FloatArray:
+    """The nearest positive semi-definite matrix; what is left of rounding becomes zero."""
+    root = positive_root(matrix)
+    return root @ root
+
+
+def positive_root(matrix: FloatArray) -> FloatArray:
+    """The symmetric root of the nearest positive semi-definite matrix."""
+    eigenvalues, vectors = np.linalg.eigh(symmetric(matrix))
+    root: FloatArray = ((vectors * np.sqrt(np.maximum(eigenvalues, 0.0))) @ vectors.T).astype(
+        np.float64
+    )
+    return root
+
+
 def symmetric_eigenvector(matrices: FloatArray, eigenvalues: FloatArray) -> FloatArray:
     """Unit eigenvectors (3, N) of symmetric matrices (6, N) for simple eigenvalues (N,).
 

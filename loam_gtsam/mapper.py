@@ -17,7 +17,7 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
-from loam_gtsam.registration.imu_tracker import ImuTracker
+from loam_gtsam.registration.imu_tracker import ImuTracker, with_imu
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
 from loam_gtsam.registration.pose_errors import PoseErrors
@@ -248,9 +248,8 @@ class Mapper:
             context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
             factors += own_factors(self.extra_factors, context)
         refine = self.config.deskew.refine
-        matcher = FrameMatcher.of(
-            predicted.posed, self.maps, self.maps.config, self._moment, clock, refine=refine
-        )
+        args = predicted.posed, self.maps, self.maps.config, self._moment, clock
+        matcher = FrameMatcher.of(*args, refine=refine, inertial=predicted.inertial)
         return Frame(matcher, predicted, factors)
 
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
@@ -284,14 +283,15 @@ class Mapper:
         solution = found.solution
         fit = Fit.of(solution.matches, frame.matcher.offered)
         self.monitor.accept(fit, solution.map_T_lidar)
-        posed, tilt = frame.sweep.at(found.twist), TiltPrior.NONE
-        if self.imu is None:
-            pose = solution.map_T_lidar.compose(posed.middle_T_reference)
-        else:
-            solution, pose, tilt = self.imu.add_scan(posed, frame.matcher.last, solution)
+        posed = frame.sweep.at(found.twist)
+        scan = self._errors.of_scan(solution, small=self.maps.small)
+        alone = None if scan is None else scan.with_factors(solution.map_T_lidar, frame.priors)
+        posed, solution, pose, tilt, fused = with_imu(
+            self.imu, posed, frame.matcher.last, solution, alone
+        )
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
-        update = self._errors.calibrated(update, frame.sweep, solution, small=self.maps.small)
+        update = self._errors.calibrated(update, frame.sweep, solution, scan, fused)
         clock.lap("covariance")
         return update
 

@@ -339,7 +339,7 @@ def _filled(section: _Section, implied: Mapping[str, Any]) -> _Section:
 
 def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
     """The data set's IMU, None if there is none or it is not to be used."""
-    samples = dataset.imu if config.imu.enabled else None
+    samples = dataset.imu if config.imu.coupling != "off" else None
     return None if samples is None else ImuBuffer(config.imu, samples)
 
 

@@ -174,8 +174,8 @@ def test_aliases_that_multiply_do_not_make_an_endless_message(place):
 
 
 def test_anchors_and_other_looks_of_a_value_do_not_matter():
-    plain = parse_config("imu: {enabled: true, lag: 16, gravity: 10.0}\nbag: {map_frame: map}")
-    text = "imu: {enabled: &a true, lag: &b 0x10, gravity: &c 1.0e+1}\nbag: {map_frame: &d 'map'}"
+    plain = parse_config("imu: {level: true, lag: 16, gravity: 10.0}\nbag: {map_frame: map}")
+    text = "imu: {level: &a true, lag: &b 0x10, gravity: &c 1.0e+1}\nbag: {map_frame: &d 'map'}"
     dressed = parse_config(text)
     assert dressed == plain
     types = [[type(value) for value in vars(config.imu).values()] for config in (dressed, plain)]
@@ -238,11 +238,11 @@ def test_values_change_by_text_mapping_or_section_all_at_once():
     config = Config().changed(
         "sensor.min_range=200",
         {"sensor.max_range": 300.0, "solver.iterations": 5, "map": {"window": [9, 9, 5]}},
-        imu=ImuConfig(enabled=False),
+        imu=ImuConfig(coupling="off"),
     )
     assert (config.sensor.min_range, config.sensor.max_range) == (200.0, 300.0)
     assert (config.solver.iterations, config.map.window) == (5, (9, 9, 5))
-    assert config.imu == ImuConfig().changed(enabled=False)
+    assert config.imu == ImuConfig().changed(coupling="off")
     assert Config().changed() == Config()
     most = Config().changed("solver.min_matches=2600", matching=MatchingConfig(max_planes=2100))
     assert most.solver.min_matches == 500 + most.matching.max_planes

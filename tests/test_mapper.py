@@ -416,9 +416,9 @@ def test_a_user_may_hand_priors_and_own_factors_together(mapped, rng):
 # -- values and states -----------------------------------------------------------------------------
 
 
-def with_preintegration(world, count):
-    """A mapper with pre-integration after some sweeps, and the features of the next one."""
-    config = Config().changed("imu.preintegration=true")
+def with_coupling(world, count):
+    """A tightly coupled mapper after some sweeps, and the features of the next one."""
+    config = Config()
     mapper = Mapper(config, imu=imu_buffer(world, config))
     for number in range(count):
         mapper.register(extract_features(world[number], config))
@@ -437,7 +437,7 @@ def test_a_guess_is_used_under_pre_integration():
             return super().solve(associate, guess, priors, motion)
 
     for away in (0.0, 5.0):
-        mapper, features = with_preintegration(world, 10)
+        mapper, features = with_coupling(world, 10)
         expected = mapper.last.map_T_lidar
         mapper.solver = Spy(mapper.config.solver)
         guess = expected.compose(gtsam.Pose3(gtsam.Rot3(), np.array([away, 0.0, 0.0])))
@@ -449,7 +449,7 @@ def test_a_guess_is_used_under_pre_integration():
 def test_a_predicted_pose_teaches_nothing_about_the_gyro():
     """After a sweep with too few matches, the next solved one leaves the bias alone."""
     world = SimulatedWorld("room", frames=12, columns=450)
-    mapper, features = with_preintegration(world, 10)
+    mapper, features = with_coupling(world, 10)
     few = replace(
         features,
         edges=features.edges[:5],

@@ -274,7 +274,7 @@ def test_an_imu_levels_the_map_deskews_and_holds_the_tilt(shaken, sweeps):
     assert result.imu.problem == ""
     np.testing.assert_allclose(result.imu.gyro_bias, (0.002, -0.001, 0.0015), atol=0.002)
     assert up_error(result, shaken) < 0.5
-    without = run(data_of(shaken, sweeps), with_imu(enabled=False))
+    without = run(data_of(shaken, sweeps), with_imu(coupling="off"))
     assert without.imu is None
     assert {(u.sweep_motion, u.tilt_prior) for u in without.updates} == {
         ("constant_velocity", "none")
@@ -461,7 +461,7 @@ def test_a_faulty_own_factor_is_an_error_and_no_crash(shaken, sweeps, residual, 
 
 @pytest.mark.parametrize("name", ["loam", "aloam"])
 def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
-    config = preset(name).changed(imu=ImuConfig(enabled=False))
+    config = preset(name).changed(imu=ImuConfig(coupling="off"))
     with pytest.raises(ConfigError, match=r"extra_factors: .* use solver\.method gtsam"):
         run(data_of(shaken, sweeps[:1]), config, extra_factors=lambda _: [tight(np.zeros(3))])
 
@@ -470,7 +470,7 @@ def test_a_classical_solver_has_no_place_for_own_factors(shaken, sweeps, name):
 def test_foliage_does_not_hold_the_pose(seed):
     world = SimulatedWorld("trees", frames=35, columns=600, seed=seed)
     # Without poles: the trunks alone would do.
-    config = Config().changed({"features.post_depth": 0.0, "imu.enabled": False})
+    config = Config().changed({"features.post_depth": 0.0, "imu.coupling": "off"})
     positions = run(world, config).trajectory.map_T_lidar[:, :3, 3]
     error = np.linalg.norm(positions - world.truth.map_T_lidar[:, :3, 3], axis=1).max()
     assert error < 0.12

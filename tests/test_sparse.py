@@ -11,7 +11,7 @@ from loam_gtsam.types import FrameStatus
 
 
 def alone(**changes):
-    return Config(imu=ImuConfig(enabled=False), matching=MatchingConfig(**changes))
+    return Config(imu=ImuConfig(coupling="off"), matching=MatchingConfig(**changes))
 
 
 @pytest.mark.parametrize(("wide", "degenerate"), [(1.0, 0), (4.0, 11)])

@@ -65,7 +65,7 @@ def one_frame(path: Path, frames: int) -> None:
 def town_loops(path: Path, frames: int) -> None:
     """A town before and after its loops are closed, with an odometry that drifts."""
     config = Config()
-    config = config.changed({"imu.enabled": False, "pose_graph.turn_walk_deg": TURN_WALK_DEG})
+    config = config.changed({"imu.coupling": "off", "pose_graph.turn_walk_deg": TURN_WALK_DEG})
     world = SimulatedWorld(build_city(streets()), columns=600, speed=20.0, frames=frames)
     pipeline, graph, closer = Pipeline(config), PoseGraph(config), ScanLoopCloser(config)
     last = odometry = gtsam.Pose3()

@@ -191,7 +191,7 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
 
 def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:
     """A problem if the IMU has no samples at a sweep, as on another clock."""
-    imu = dataset.imu if config.imu.enabled else None
+    imu = dataset.imu if config.imu.coupling != "off" else None
     if imu is None or len(imu.stamps) == 0:
         return []
     stamp = sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp

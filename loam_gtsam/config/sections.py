@@ -325,17 +325,18 @@ class CovarianceConfig(Section):
 class ImuConfig(Section):
     """The use of an inertial measurement unit (IMU); without one, nothing here matters."""
 
-    enabled: bool = parameter(True)
-    """The measurements of the IMU are used; false maps as if there were no IMU."""
+    coupling: Literal["tight", "loose", "off"] = parameter("tight")
+    """The measurements of the IMU act in this way: tight, gyro and accelerometer predict every pose
+    and are estimated together with the scans (pose, velocity, biases, gravity); loose, the gyro
+    turns the prediction and the sweep; off, not at all. Roll and pitch act by the prior, except if
+    off."""
     prior: Literal["off", "blend", "equivalent", "sigma"] = parameter(
         "equivalent", source="LOAM blends"
     )
     """Roll and pitch of the IMU act on the pose in this way: off, not at all; blend, mixed in after
     the solve; equivalent, by a factor that has the weight's share of what the scan knows, which
     gives the same mean; sigma, by a gravity direction of the given standard deviation."""
-    weight: float = parameter(
-        0.01, source="LOAM uses 0.002; on slopes that is too little to be seen", low=0.0, high=0.999
-    )
+    weight: float = parameter(0.002, source="LOAM", low=0.0, high=0.999)
     """Roll and pitch of the IMU have this share in the result of blend and equivalent."""
     sigma_deg: float = parameter(0.5, unit="degrees", low=1e-4)
     """The gravity direction of the IMU has this standard deviation, its slow errors included. It is
@@ -355,14 +356,11 @@ class ImuConfig(Section):
     """These are roll, pitch and yaw of the rotation Rz Ry Rx that takes vectors from the frame of
     the IMU into the frame of the lidar."""
     lidar_t_imu: tuple[Finite, Finite, Finite] = parameter((0.0, 0.0, 0.0), unit="m")
-    """The IMU has this position in the frame of the lidar; pre-integration uses it."""
+    """The IMU has this position in the frame of the lidar; the tight coupling uses it."""
     filter_seconds: float = parameter(60.0, unit="s", low=0.1)
     """The attitude filter, which replaces a missing orientation, has this time constant."""
-    preintegration: bool = parameter(False)
-    """Every pose is predicted from gyro and accelerometer, with velocity and biases estimated over
-    the last frames, and the prediction decides directions that the scan does not fix."""
     lag: int = parameter(20, low=2)
-    """The graph of the pre-integration keeps this many frames."""
+    """The graph of the tight coupling keeps this many frames."""
     gravity: float = parameter(9.81, unit="m/s^2", low=0.0)
     """The gravitational acceleration has this magnitude at the place of the recording."""
     gyro_noise: float = parameter(2e-4, unit="rad/s/sqrt(Hz)", low=1e-9)

@@ -53,7 +53,7 @@ class Config(Section):
         changes : texts as ``"solver.iterations=5"``, with a value as YAML writes it, or mappings
             of such keys to values, as ``{"solver.iterations": 5}``
         source : where the changes come from, for error messages
-        sections : whole sections, as ``imu=ImuConfig(enabled=False)``
+        sections : whole sections, as ``imu=ImuConfig(coupling="off")``
 
         Raises
         ------
@@ -62,7 +62,7 @@ class Config(Section):
 
         Examples
         --------
-        >>> Config().changed("solver.iterations=5", "imu.enabled=false").solver.iterations
+        >>> Config().changed("solver.iterations=5", "imu.coupling=off").solver.iterations
         5
         """
         where = f"{source}: " if source else ""
@@ -125,13 +125,13 @@ PRESETS: dict[str, Config] = {
         _CLASSICAL,
         {"solver": {"method": "loam", "iterations": 10, "min_map_planes": 101}},
         {"solver.degeneracy_threshold": 100.0},
-        {"imu": {"prior": "blend", "weight": 0.002, "average_seconds": 0.0}},
+        {"imu": {"coupling": "loose", "prior": "blend", "weight": 0.002, "average_seconds": 0.0}},
     ),
     # A-LOAM's laserMapping with the voxel sizes of its VLP-16 settings. It has no minimum of
     # matches; fewer than 6 cannot fix a pose.
     "aloam": Config().changed(
         _CLASSICAL,
-        {"map": {"neighbourhood": [5, 5, 3], "field_of_view": False}, "imu.enabled": False},
+        {"map": {"neighbourhood": [5, 5, 3], "field_of_view": False}, "imu.coupling": "off"},
         {"solver": {"method": "aloam", "iterations": 2, "inner_iterations": 4, "min_matches": 6}},
         {"solver.min_map_planes": 51, "matching.weight_slope": 0.0, "solver.degeneracy": "off"},
     ),

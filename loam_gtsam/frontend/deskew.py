@@ -4,6 +4,7 @@ to first order; at the start or the end the same error would shift the whole swe
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -70,6 +71,7 @@ class MovingSweep:
         self.n_edges, self.n_planes = map(len, self._points)
         self.motion = SweepMotion.CONSTANT_VELOCITY if moving else SweepMotion.NONE
         self._turned: tuple[FloatArray, FloatArray] | None = None
+        self._bend: tuple[FloatArray, FloatArray] | None = None
         span = np.array([first, 0.0, end]) - self.middle
         if moving and imu is not None and config.deskew.rotation != "constant_velocity":
             moments = np.concatenate([span, *self._seconds])
@@ -88,6 +90,31 @@ class MovingSweep:
                 edges, planes = self._points
                 self._turned = _rotated(edges, turns[3:split]), _rotated(planes, turns[split:])
 
+    def bent(self, seconds: FloatArray, path: FloatArray) -> MovingSweep:
+        """The sweep of a lidar whose path bends.
+
+        ``path`` (K, 3) is the way from the straight line through the middle of the sweep, metres in
+        the axes of the lidar there, at ``seconds`` (K,) from the middle, ascending. Nothing changes
+        if no gyro knows the rotation.
+        """
+        if self._turned is None:
+            return self
+        sweep = copy(self)
+        sweep._bend = seconds, path
+        turned = (
+            points + sweep._bent(seconds)
+            for points, seconds in zip(self._turned, self._seconds, strict=True)
+        )
+        sweep._turned = next(turned), next(turned)
+        return sweep
+
+    def _bent(self, seconds: FloatArray | float) -> FloatArray:
+        """(..., 3) the way from the straight line."""
+        if self._bend is None:
+            return np.zeros(3)
+        times, path = self._bend
+        return np.stack([np.interp(seconds, times, column) for column in path.T], axis=-1)
+
     def at(self, twist: FloatArray) -> PosedSweep:
         """The sweep de-skewed for a (6,) body velocity at the reference time, rad/s and m/s."""
         return PosedSweep(self, twist)
@@ -97,7 +124,8 @@ class MovingSweep:
         if self._turned is None:
             return gtsam.Pose3.Expmap(-twist * self.middle)
         rotation = self._middle_R_reference
-        return gtsam.Pose3(gtsam.Rot3(rotation), rotation @ twist[3:] * -self.middle)
+        moved = rotation @ twist[3:] * -self.middle + self._bent(-self.middle)
+        return gtsam.Pose3(gtsam.Rot3(rotation), moved)
 
     def twist_since(self, last: tuple[int, gtsam.Pose3], map_T_middle: gtsam.Pose3) -> FloatArray:
         """(6,) body velocity at the reference time, from the poses of the middles of two sweeps.
@@ -109,7 +137,10 @@ class MovingSweep:
             twist: FloatArray = gtsam.Pose3.Logmap(last[1].between(map_T_middle)) / seconds
             return twist
         away = np.asarray(map_T_middle.translation()) - last[1].translation()
-        map_R_reference = map_T_middle.rotation().matrix() @ self._middle_R_reference
+        # The velocity of the middle, not the mean since then.
+        map_R_middle = map_T_middle.rotation().matrix()
+        away = away + map_R_middle @ self._bent(-seconds)
+        map_R_reference = map_R_middle @ self._middle_R_reference
         return np.concatenate([self._rate, map_R_reference.T @ away / seconds])
 
     def twist_at_reference(self, rate: FloatArray, velocity: FloatArray) -> FloatArray:

@@ -63,12 +63,40 @@ class StartSigmas:
 class Prediction:
     """Pose of the next frame by the IMU, and (3,) m/s of the lidar, map frame.
 
-    The (6, 6) covariance of the pose, ``[rotation, translation]``, right perturbation, is regular.
+    The (6, 6) covariance of the pose, ``[rotation, translation]``, right perturbation, is regular;
+    ``across`` (3, 6) is that of the velocity with the pose.
     """
 
     map_T_lidar: gtsam.Pose3
     velocity: FloatArray
     covariance: FloatArray
+    across: FloatArray
+
+    def velocity_at(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
+        """(3,) m/s of the lidar, map frame: what is expected if this is the pose."""
+        away = self.map_T_lidar.localCoordinates(map_T_lidar)
+        expected: FloatArray = self.velocity + self.across @ np.linalg.solve(self.covariance, away)
+        return expected
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Fused:
+    """A frame by its scan and the IMU together.
+
+    Attributes
+    ----------
+    map_T_lidar : the pose
+    velocity : (3,) m/s of the lidar, map frame
+    covariance : (9, 9) of pose and velocity, in the map as it is around the lidar
+    across : (9, 9) of these errors with those of the frame before
+    gyro_bias : (3,) rad/s
+    """
+
+    map_T_lidar: gtsam.Pose3
+    velocity: FloatArray
+    covariance: FloatArray
+    across: FloatArray
+    gyro_bias: FloatArray
 
 
 class InertialOdometry:
@@ -91,6 +119,7 @@ class InertialOdometry:
     Attributes
     ----------
     state : the newest frame
+    surprise : squared Mahalanobis distance between the last scan and its prediction; chi-squared
     restarts : how often the window was begun anew by itself: at the scan's pose, because the scan
         contradicts the prediction (more than 30 standard deviations); or at the predicted pose,
         because the graph could not be solved. Biases and gravity are kept.
@@ -117,7 +146,7 @@ class InertialOdometry:
             raise InputError(f"map_gravity: expected about 9.81 m/s^2, got {size:.3g}")
         self._lidar_T_imu = gtsam.Pose3(gtsam.Rot3(), np.asarray(config.lidar_t_imu, np.float64))
         self._to_lidar: FloatArray = self._lidar_T_imu.AdjointMap()
-        self.restarts = 0
+        self.restarts, self.surprise = 0, 0.0
         covariance = np.zeros((STATE, STATE))
         biases = np.repeat(np.square([sigmas.acceleration_bias, sigmas.gyro_bias]), 3)
         covariance[BIASES, BIASES] = np.diag(biases)
@@ -136,21 +165,26 @@ class InertialOdometry:
         covariance. Nothing has changed then; :meth:`restart` at a pose known otherwise.
         """
         frame = WindowFrame(self.config, self._window.newest + 1, self.state, stamp, samples)
-        # The IMU goes round the lidar as the platform turns.
-        lever = cross(frame.rate - self.state.gyro_bias, self._lidar_T_imu.translation())
-        map_T_imu = frame.predicted.map_T_imu
+        covariance = frame.predicted.covariance
         prediction = Prediction(
-            map_T_imu.compose(self._lidar_T_imu.inverse()),
-            frame.predicted.velocity - map_T_imu.rotation().matrix() @ lever,
-            self._to_lidar @ frame.predicted.covariance[POSE, POSE] @ self._to_lidar.T,
+            *self._of_lidar(frame.predicted, frame.rate),
+            self._to_lidar @ covariance[POSE, POSE] @ self._to_lidar.T,
+            covariance[VELOCITY, POSE] @ self._to_lidar.T,
         )
         if not _has_inverse(prediction.covariance):
             raise SweepError("IMU samples: the covariance of the motion they make has no inverse")
         self._pending = frame
         return prediction
 
-    def update(self, measured: gtsam.Pose3, information: FloatArray) -> None:
-        """Take in what the scan said about the predicted frame.
+    def _of_lidar(self, state: InertialState, rate: FloatArray) -> tuple[gtsam.Pose3, FloatArray]:
+        """Pose and velocity of the lidar, round which the IMU goes as the platform turns."""
+        lever = cross(rate - state.gyro_bias, self._lidar_T_imu.translation())
+        map_T_imu = state.map_T_imu
+        velocity: FloatArray = state.velocity - map_T_imu.rotation().matrix() @ lever
+        return map_T_imu.compose(self._lidar_T_imu.inverse()), velocity
+
+    def update(self, measured: gtsam.Pose3, information: FloatArray) -> Fused | None:
+        """Take in what the scan said about the predicted frame; None if a new window began.
 
         InputError if a value is wrong, or nothing has been predicted. SweepError if no window can
         begin here; make a new object then.
@@ -166,16 +200,20 @@ class InertialOdometry:
         if self._pending is None:
             raise InputError("nothing has been predicted: call predict() once for every frame")
         frame, self._pending = self._pending, None
+        before, predicted = self.state.covariance, frame.predicted
+        left = np.eye(STATE)  # share of the predicted state's error that the scan leaves
         if len(root):
-            predicted = frame.predicted
             error, derivative = scan_residual(predicted.map_T_imu, self._lidar_T_imu, measured)
             surprise, rows = root @ error, root @ derivative
-            covariance = predicted.covariance[POSE, POSE]
+            spread = predicted.covariance[:, POSE]
+            covariance = spread[POSE]
             with np.errstate(over="ignore", invalid="ignore"):
                 expected = rows @ covariance @ rows.T + np.eye(len(rows))
             if not _has_inverse(expected):
-                return self._start(predicted, 1)
-            if surprise @ np.linalg.solve(expected, surprise) > _JUMP**2:
+                self._start(predicted, 1)
+                return None
+            self.surprise = float(surprise @ np.linalg.solve(expected, surprise))
+            if self.surprise > _JUMP**2:
                 known = _updated(covariance, rows, expected)
                 # A velocity that was wrong looks like this too: it is free along the jump, and
                 # kept across it, where the scan may be blind.
@@ -183,12 +221,23 @@ class InertialOdometry:
                 jump = measured.rotation().matrix() @ error[3:] / seconds
                 free = predicted.covariance[VELOCITY, VELOCITY] + np.outer(jump, jump)
                 moved = replace(predicted, map_T_imu=measured.compose(self._lidar_T_imu))
-                return self._start(_uncorrelated(moved, known, free), 1)
+                self._start(_uncorrelated(moved, known, free), 1)
+                return None
             frame.add_scan(self._lidar_T_imu, measured, root)
+            left[:, POSE] -= spread @ rows.T @ np.linalg.solve(expected, rows)
         try:
             self.state = self._window.append(frame)
         except _UNSOLVABLE:
             self._start(frame.predicted, 1)
+            return None
+        to_lidar = np.eye(VELOCITY.stop)
+        to_lidar[POSE, POSE] = self._to_lidar
+        own, across = (
+            to_lidar @ whole[: VELOCITY.stop, : VELOCITY.stop] @ to_lidar.T
+            for whole in (self.state.covariance, left @ frame.transition @ before)
+        )
+        pose, velocity = self._of_lidar(self.state, frame.rate)
+        return Fused(pose, velocity, own, across, self.state.gyro_bias)
 
     def restart(self, stamp: int, map_T_lidar: gtsam.Pose3, velocity: FloatArray) -> None:
         """Begin a new window at a known pose, e.g. after a gap in the IMU data.

@@ -81,6 +81,7 @@ class WindowFrame:
     ----------
     number, graph : of the frame, and its factors
     predicted : state by the samples, with its covariance
+    transition : (18, 18) derivative of that state by the one before
     rate : (3,) rad/s of the gyro at the end
     scan : arguments of :func:`scan_factor` behind the key; empty if the scan says nothing
     """
@@ -96,7 +97,7 @@ class WindowFrame:
         config, self.number, before, stamp, samples = state[0]
         samples = _covering(samples, before.stamp, stamp, config.max_gap)
         self._made_of = config, self.number, before, stamp, samples
-        self.predicted, factor, self.rate = _predict(*self._made_of)
+        self.predicted, self.transition, factor, self.rate = _predict(*self._made_of)
         self.graph = gtsam.NonlinearFactorGraph()
         self.graph.add(factor)
         self.scan: tuple[Any, ...] = ()
@@ -129,8 +130,8 @@ def _covering(samples: ImuSamples, start: int, stop: int, max_gap: float) -> Imu
 
 def _predict(
     config: ImuConfig, n: int, last: InertialState, stamp: int, samples: ImuSamples
-) -> tuple[InertialState, gtsam.NonlinearFactor, FloatArray]:
-    """State of frame ``n`` from the one before, the factor between the two, and the last rate."""
+) -> tuple[InertialState, FloatArray, gtsam.NonlinearFactor, FloatArray]:
+    """State of frame ``n`` from the one before, transition, factor between the two, last rate."""
     # Offsets in integers first: floats do not hold nanoseconds since 1970.
     times = (samples.stamps - last.stamp) * 1e-9
     knots = np.concatenate([[0.0], times[1:-1], [(stamp - last.stamp) * 1e-9]])
@@ -160,12 +161,16 @@ def _predict(
     values = last.values(n - 1)
     values.insert(G(0), last.map_gravity)
     values.insert(predicted.values(n))
-    covariance = _propagated_covariance(factor.linearize(values), last.covariance)
-    return replace(predicted, covariance=covariance), factor, joined[-1, :3]
+    moved, transition = _propagated(factor.linearize(values), last.covariance)
+    return replace(predicted, covariance=moved), transition, factor, joined[-1, :3]
 
 
-def _propagated_covariance(factor: gtsam.GaussianFactor, covariance: FloatArray) -> FloatArray:
-    """Covariance (18, 18) of the next state from that of the last one, equation (2)."""
+def _propagated(
+    factor: gtsam.GaussianFactor, covariance: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Covariance (18, 18) of the next state from that of the last one, equation (2), and the
+    derivative of the next state by the last one.
+    """
     jacobian = factor.jacobian()[0]
     # Columns as the factor has its keys: X, V, next X, next V, B, next B, G.
     x, v, next_x, next_v, b, next_b, g = np.split(jacobian, [6, 9, 15, 18, 24, 30], axis=1)
@@ -181,7 +186,7 @@ def _propagated_covariance(factor: gtsam.GaussianFactor, covariance: FloatArray)
         moved[:15, :15] += root @ root.T
     if not np.isfinite(moved).all():
         raise SweepError("IMU samples: the motion they make has no finite covariance")
-    return moved
+    return moved, transition
 
 
 def scan_residual(

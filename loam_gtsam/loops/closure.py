@@ -24,9 +24,9 @@ from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key,
 from loam_gtsam.registration.association import associate, trial_matching
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ScanMatches, subset
-from loam_gtsam.registration.pose_errors import SeenGround, scan_error
 from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
 from loam_gtsam.registration.solvers import GtsamSolver, Solution
+from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import FloatArray, IntArray
 
 _ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full

@@ -14,8 +14,8 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import as_points, voxel_filter
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.pose_errors import SeenGround, scan_error
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
+from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import FloatArray, InputError
 
 _NONE = np.empty((0, 3))

@@ -14,6 +14,7 @@ from loam_gtsam.config import Config, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
+from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.association import (
     chosen_rows,
     match_features,
@@ -172,6 +173,7 @@ class FrameMatcher(Matcher):
     matching: MatchingConfig
     rows: ChosenRows
     last: Moment | None  # middle of the last sweep, from which ``deskewed`` takes the motion
+    inertial: InertialPrediction | None  # from which it takes the velocity instead
     refine: bool  # whether ``deskewed`` changes anything
     clock: Clock  # books the time of every call on the stage ``match``
 
@@ -185,10 +187,11 @@ class FrameMatcher(Matcher):
         clock: Clock,
         *,
         refine: bool,
+        inertial: InertialPrediction | None = None,
     ) -> FrameMatcher:
         """The matcher with the configured matching."""
         rows = _rows_to_match(posed.sweep, config.matching)
-        return cls(posed, maps, config, config.matching, rows, last, refine, clock)
+        return cls(posed, maps, config, config.matching, rows, last, inertial, refine, clock)
 
     @property
     def offered(self) -> int:
@@ -224,7 +227,7 @@ class FrameMatcher(Matcher):
         if not self.refine:
             return self
         sweep = self.posed.sweep
-        twist = twist_to(sweep, self.last, map_T_lidar, self.posed.twist)
+        twist = twist_to(sweep, self.last, self.inertial, map_T_lidar, self.posed.twist)
         return replace(self, posed=sweep.at(twist))
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:
@@ -293,5 +296,5 @@ class Frame:
 
     def twist_to(self, map_T_middle: gtsam.Pose3) -> FloatArray:
         """(6,) body velocity that leads from the last sweep to a pose of this one."""
-        matcher = self.matcher
-        return twist_to(self.sweep, matcher.last, map_T_middle, matcher.posed.twist)
+        m = self.matcher
+        return twist_to(self.sweep, m.last, m.inertial, map_T_middle, m.posed.twist)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -12,8 +12,9 @@ import numpy as np
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.coupling import TightCoupling
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
-from loam_gtsam.imu.preintegration import InertialOdometry, Prediction
+from loam_gtsam.imu.preintegration import Fused, Prediction
 from loam_gtsam.imu.quality import extrinsic_problem
 from loam_gtsam.imu_prior import (
     blend,
@@ -26,20 +27,37 @@ from loam_gtsam.imu_prior import (
 )
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
-from loam_gtsam.types import FloatArray, SweepError, TiltPrior
+from loam_gtsam.types import FloatArray, TiltPrior
 
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
 """Angle and share of the turn by which gyro and scan must differ to disagree: above all noise."""
 _DISTRUST = 5  # frames of disagreement less those of agreement from which the gyro is not used
 _PAIRS = 2000  # number of pairs of frames, the newest, behind the check of the mounting
-_SCAN_VARIANCE = 4.0
-"""By which the scan's information is divided before pre-integration believes it: errors of scans
-against one map last over frames (built-in scenes: mean squared errors of 1 to 4 times the
-information's over 10 to 50 frames)."""
-
-
 _SURE = 4.2  # sigmas of one attitude: three of the difference of two
+
+
+class Registration(NamedTuple):
+    """A solved sweep after the IMU had its say."""
+
+    posed: PosedSweep  # with the final motion
+    solution: Solution  # at the middle of the sweep
+    map_T_lidar: gtsam.Pose3  # at the reference time
+    tilt: TiltPrior = TiltPrior.NONE  # how roll and pitch acted
+    fused: Fused | None = None  # scan, gyro and accelerometer together; None if not
+
+
+def with_imu(
+    imu: ImuTracker | None,
+    posed: PosedSweep,
+    last: Moment | None,
+    solution: Solution,
+    alone: tuple[gtsam.Pose3, FloatArray] | None,
+) -> Registration:
+    """What :meth:`ImuTracker.add_scan` makes of a solved sweep; the sweep as solved without one."""
+    if imu is None:
+        return Registration(posed, solution, solution.map_T_lidar.compose(posed.middle_T_reference))
+    return imu.add_scan(posed, last, solution, alone)
 
 
 class ImuTracker:
@@ -63,8 +81,7 @@ class ImuTracker:
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
         self._disagreements, self._turns = 0, np.zeros((0, 6))
-        self._inertial: InertialOdometry | None = None
-        self._predicted: int | None = None
+        self._coupling = TightCoupling(self.config)
 
     def __getstate__(self) -> dict[str, Any]:
         learnt = {"gyro_bias": self.buffer.gyro_bias}
@@ -187,7 +204,7 @@ class ImuTracker:
 
     def reject(self) -> None:
         """Take the last prediction back: a sweep fitted better without the IMU."""
-        self._predicted = None
+        self._coupling.reject()
 
     def _attitude_turned(self, last: Moment | None, stamp: int, map_T_lidar: gtsam.Pose3) -> bool:
         """Whether the IMU's attitude turned as the scans did since ``last``, as far as is known."""
@@ -201,67 +218,71 @@ class ImuTracker:
         return not _disagree(scan, before.between(now), noise, _DISAGREEMENT[1])
 
     def add_scan(
-        self, posed: PosedSweep, last: Moment | None, solution: Solution
-    ) -> tuple[Solution, gtsam.Pose3, TiltPrior]:
-        """Learn from a solved sweep, and bring roll and pitch into its pose.
+        self,
+        posed: PosedSweep,
+        last: Moment | None,
+        solution: Solution,
+        alone: tuple[gtsam.Pose3, FloatArray] | None = None,
+    ) -> Registration:
+        """Learn from a solved sweep, and bring the IMU into its pose.
 
         ``posed`` has the final motion; ``solution`` and ``last`` are of the middles of this and the
-        last sweep, of which a predicted pose says nothing about the IMU. Returns the solution, the
-        pose ``map_T_lidar`` at the reference time, and how roll and pitch acted.
+        last sweep, of which a predicted pose says nothing about the IMU. ``alone`` is the pose
+        without the IMU and its (6, 6) information; None if nothing is known of it.
         """
         stamp, reference_stamp = posed.sweep.stamp, posed.sweep.reference_stamp
+        fused: Fused | None = None
         if last is not None and last.solved:
-            now = stamp, solution.map_T_lidar
-            self.compare_gyro(last[:2], now)
-            self.observe(last[:2], now, solution.scan_information)
+            self.compare_gyro(last[:2], (stamp, solution.map_T_lidar))
+            if alone is not None:
+                fused = self.observe(last[:2], (stamp, alone[0]), alone[1])
+        if fused is not None:
+            self.buffer.gyro_bias = fused.gyro_bias
+            solution = replace(solution, map_T_lidar=fused.map_T_lidar)
+            velocity = fused.map_T_lidar.rotation().matrix().T @ fused.velocity
+            posed = posed.sweep.at(posed.sweep.twist_at_reference(posed.twist[:3], velocity))
         solution, tilt = self.add_tilt(stamp, solution, last)
         pose = solution.map_T_lidar.compose(posed.middle_T_reference)
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        return solution, pose, tilt
+        return Registration(posed, solution, pose, tilt, fused)
 
     def predict(self, stamp: int) -> Prediction | None:
-        """Pose, velocity and covariance of a moment by pre-integration; None without prediction.
+        """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.
 
-        There is none before the first :meth:`observe`, and none if the samples have a gap or are
-        absurd. To be called once a frame, before :meth:`observe` of the same stamp.
+        To be called once a frame, before :meth:`observe` of the same stamp.
         """
-        self._predicted = None
-        if self._inertial is None:
+        if self.config.coupling != "tight" or self.trusted_gyro is None:
+            self._coupling.reject()
             return None
-        margin = round(self.config.max_gap * 1e9)
-        samples = self.buffer.samples_between(self._inertial.state.stamp - margin, stamp + margin)
-        try:
-            prediction = self._inertial.predict(stamp, samples)
-        except SweepError:
+        return self._coupling.predict(stamp, self.buffer)
+
+    def bend(self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray) -> FloatArray | None:
+        """(K, 3) metres: the lidar's way from a straight line, by :func:`loam_gtsam.imu.bend.bend`.
+
+        ``map_R_lidar`` (3, 3) is the rotation at ``stamp``, near enough to know what is down. None
+        if the IMU does not tell.
+        """
+        if self.config.coupling != "tight" or self.level is None or self.trusted_gyro is None:
             return None
-        self._predicted = stamp
-        return prediction
+        return self._coupling.bend(stamp, seconds, map_R_lidar, self._down(), self.buffer)
 
     def observe(
         self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3], information: FloatArray
-    ) -> None:
-        """Take in what the scan alone said about a moment, for the predictions to come.
+    ) -> Fused | None:
+        """Take in what the scan alone said about a moment; the pose by both, None if by none.
 
         ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed.
         """
-        stamp, pose = now
-        if not self.config.preintegration or self.level is None or stamp <= last[0]:
-            return
-        try:
-            if self._inertial is not None and self._predicted == stamp:
-                self._inertial.update(pose, information / _SCAN_VARIANCE)
-                return
-            velocity = (pose.translation() - last[1].translation()) / ((stamp - last[0]) * 1e-9)
-            if self._inertial is not None:
-                self._inertial.restart(stamp, pose, velocity)
-                return
-            gravity = -self.config.gravity * self.level.map_up
-            bias = self.buffer.gyro_bias
-            self._inertial = InertialOdometry(self.config, gravity, stamp, pose, velocity, bias)
-        except SweepError:  # no window can begin here: with the next frame, then
-            self._inertial = None
+        if self.config.coupling != "tight" or self.level is None:
+            return None
+        bias = self.buffer.gyro_bias
+        return self._coupling.observe(last, now, information, self._down(), bias)
+
+    def _down(self) -> FloatArray:
+        assert self.level is not None
+        return -self.config.gravity * self.level.map_up
 
     def _attitude(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar``; None if unknown, or up is unknown in the map."""

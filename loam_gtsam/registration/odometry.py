@@ -16,6 +16,8 @@ from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
+_NODES = 41  # of the path between the middle of the last sweep and the end of this one
+_BENT = 1.0  # longest time over which accelerations are integrated for that, seconds
 _LONGEST = 10.0  # seconds of extrapolation: after more the pose would be anywhere
 _SHORTEST = 1e-3  # least seconds between the middles of two sweeps
 _REASSOCIATE_EVERY = 5  # gauss-Newton iterations per association of scan to scan (LOAM)
@@ -111,19 +113,25 @@ class Prediction:
     posed : the sweep, de-skewed with the predicted motion
     map_T_lidar, map_T_middle : pose at the reference time and at the middle of the sweep
     motion : the expected pose at the middle, for directions that the scan does not fix
+    inertial : what gyro and accelerometer predict; None without
     """
 
     posed: PosedSweep
     map_T_lidar: gtsam.Pose3
     map_T_middle: gtsam.Pose3
     motion: MotionPrior
+    inertial: InertialPrediction | None = None
 
 
 class InertialPredictor(Turns, Protocol):
     """The part of the mapper's IMU that predictions need."""
 
     def predict(self, stamp: int) -> InertialPrediction | None:
-        """The pose, velocity and covariance by pre-integration; None if not available."""
+        """The pose, velocity and covariance by gyro and accelerometer; None if not available."""
+        ...
+
+    def bend(self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray) -> FloatArray | None:
+        """(K, 3) metres: the lidar's way from a straight line; None if unknown."""
         ...
 
 
@@ -136,18 +144,21 @@ def predict(
     guess: gtsam.Pose3 | None = None,
     twist: FloatArray | None = None,
 ) -> Prediction:
-    """Predict the pose of a sweep: by pre-integration if available, else by constant velocity.
+    """Predict the pose of a sweep: by gyro and accelerometer if known, else by constant velocity.
 
     Parameters
     ----------
     last, moment : update and middle of the last sweep; None for the first sweep
-    imu : source of the rotation, or of the motion by pre-integration
+    imu : source of the rotation, or of all of the motion
     config : ``turn_sigma`` and ``acceleration_sigma`` are the uncertainty of a constant velocity
     guess : ``map_T_lidar`` at the reference time, which replaces the predicted pose
     twist : (6,) body velocity at the reference time, which replaces the predicted velocity
     """
     steady = ConstantVelocity(imu).at(sweep.reference_stamp, last)
     inertial = None if last is None or imu is None else imu.predict(sweep.stamp)
+    if imu is not None:
+        around = (steady.map_T_lidar if guess is None else guess).rotation()
+        sweep = _bent(sweep, moment, imu, around)
     if twist is None and inertial is not None:
         velocity = inertial.map_T_lidar.rotation().matrix().T @ inertial.velocity
         twist = sweep.twist_at_reference(steady.twist[:3], velocity)
@@ -164,16 +175,41 @@ def predict(
         seconds = moment.seconds_to(sweep.stamp)
         sigmas = np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
         motion = MotionPrior(middle, np.diag((0.5 * seconds**2 * sigmas) ** -2.0))
-    return Prediction(posed, guess, middle, motion)
+    return Prediction(posed, guess, middle, motion, inertial)
+
+
+def _bent(
+    sweep: MovingSweep, last: Moment | None, imu: InertialPredictor, map_R_lidar: gtsam.Rot3
+) -> MovingSweep:
+    """The sweep on the bent path that the accelerometer felt, if it felt one."""
+    since = 0.0 if last is None else last.seconds_to(sweep.stamp)
+    end = 0.5 * sweep.duration
+    if not 0.0 < max(since, end) < _BENT:
+        return sweep
+    seconds = np.linspace(-max(since, end), end, _NODES)
+    middle_R_reference = sweep.middle_T_reference(np.zeros(6)).rotation()
+    map_R_middle = map_R_lidar.compose(middle_R_reference.inverse()).matrix()
+    path = imu.bend(sweep.stamp, seconds, map_R_middle)
+    return sweep if path is None else sweep.bent(seconds, path)
 
 
 def twist_to(
-    sweep: MovingSweep, last: Moment | None, map_T_middle: gtsam.Pose3, otherwise: FloatArray
+    sweep: MovingSweep,
+    last: Moment | None,
+    inertial: InertialPrediction | None,
+    map_T_middle: gtsam.Pose3,
+    otherwise: FloatArray,
 ) -> FloatArray:
-    """(6,) body velocity between the middles of the last sweep and of this sweep.
+    """(6,) body velocity that belongs to a pose at the middle of a sweep.
 
-    ``otherwise`` without a last sweep, or if its middle is not earlier (sweeps of unlike length).
+    With the IMU's prediction it is that which is expected if this is the pose; else that between
+    the middles of the last sweep and of this sweep; ``otherwise`` without a last sweep, or if its
+    middle is not earlier (sweeps of unlike length).
     """
+    if inertial is not None:
+        velocity = inertial.velocity_at(map_T_middle)
+        velocity = map_T_middle.rotation().matrix().T @ velocity
+        return sweep.twist_at_reference(otherwise[:3], velocity)
     if last is None or sweep.stamp <= last.stamp:
         return otherwise
     return sweep.twist_since(last[:2], map_T_middle)

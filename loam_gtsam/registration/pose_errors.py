@@ -11,29 +11,25 @@ from dataclasses import dataclass, field, replace
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, CovarianceConfig
+from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.geometry import symmetric, transform, voxel_keys
-from loam_gtsam.registration.solvers import MotionError, Solution, match_rows
+from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
+from loam_gtsam.imu.preintegration import Fused
+from loam_gtsam.registration.solvers import MotionError, Solution
+from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 from loam_gtsam.types import (
-    BoolArray,
     FloatArray,
     InputError,
-    IntArray,
     MapUpdate,
     SweepMotion,
     Uncertainty,
 )
-from loam_gtsam.voxels.key_table import KeyTable
 
-_PRIOR_CELLS = 6.0
-"""Weight, in cells, of the scatter of all residuals beside that of the cells: with fewer than six
-cells the scores alone do not span the six directions."""
-_LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
-_REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
+_LASTING = 0.3
+"""Share of a scan's covariance that stays for some frames and that no filter averages: consecutive
+innovations correlate by 0 to 0.5, by axis and place (street, park, room, garage, trees)."""
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
 _KNOWN = 3  # accelerations from which their mean is believed
-_NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
@@ -85,6 +81,8 @@ class _Middle:
     kept: FloatArray  # (6,) share of the scan's own error in the pose at the reference time
     to_reference: FloatArray  # (6, 6) adjoint from the middle to the reference time
     reference_stamp: int
+    of_state: FloatArray | None = None  # (6, 9) by which errors of pose and velocity get there
+    lasting: FloatArray | None = None  # (6, 6) root of what its scan shares with the next one's
 
 
 class PoseErrors:
@@ -114,27 +112,40 @@ class PoseErrors:
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
+        self._is_first = True
 
-    def calibrated(
-        self, update: MapUpdate, sweep: MovingSweep, solution: Solution, *, small: bool = False
-    ) -> MapUpdate:
-        """The update of a solved frame with its covariance; to be called once for each, in order.
+    def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
+        """The error of a solved scan; to be called once for each, in order.
 
-        The sweep has the motion of the solution, which is at its middle. ``small`` tells whether
-        the place is small.
+        ``small`` tells whether the place is small.
         """
-        first, self._is_empty = self._is_empty, False
+        self._is_first, self._is_empty = self._is_empty, False
         config, seen = self._places[small]
-        if small != self._small and not first:
+        if small != self._small and not self._is_first:
             # The ground is the same, only in other cells.
             found = solution.matches
             points = np.concatenate([found.edges.points, found.planes.points])
             seen.cells(transform(solution.map_T_lidar.matrix(), points))
         self._small = small
-        scan = scan_error(
+        return scan_error(
             solution, self._kernel_width, seen, config,
             kernel=self._kernel, with_priors=self._with_priors,
         )  # fmt: skip
+
+    def calibrated(
+        self,
+        update: MapUpdate,
+        sweep: MovingSweep,
+        solution: Solution,
+        scan: ScanError | None,
+        fused: Fused | None = None,
+    ) -> MapUpdate:
+        """The update of a solved frame with its covariance; to be called after :meth:`of_scan`.
+
+        The sweep has the motion of the solution, which is at its middle; ``fused`` is that pose by
+        scan and IMU together.
+        """
+        first = self._is_first
         if scan is None:
             self._last = None
             return update
@@ -144,7 +155,12 @@ class PoseErrors:
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
         self._add_drift(sweep, solution, scan, factor * scan.renewed)
-        own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
+        if fused is None or solution.weak is not None:
+            own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
+        else:
+            lasting = symmetric(to_reference @ scan.covariance @ to_reference.T)
+            root = np.sqrt(_LASTING) * positive_root(lasting)
+            own, shared, now = self._own_of(update, sweep, middle, fused, to_reference, root)
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         from_map = update.map_T_lidar.inverse().AdjointMap()
@@ -187,7 +203,7 @@ class PoseErrors:
             moved = step.by_velocity @ step.by_velocity.T + step.by_chance
             by_chance = by_chance + rows * seen.wander(moved)
         blind = self._blind + to_map @ step.by_velocity
-        faded = _positive(np.eye(6) - step.kept.T @ step.kept)
+        faded = nearest_positive(np.eye(6) - step.kept.T @ step.kept)
         self._drift = self._drift + symmetric(
             to_map @ by_chance @ to_map.T + blind @ faded @ blind.T
         )
@@ -199,6 +215,30 @@ class PoseErrors:
         if self._first is None and self._is_empty:
             self._first = sweep
         self._expected.coast(sweep.stamp, turned=_turned(sweep))
+
+    def _own_of(
+        self, update: MapUpdate, sweep: MovingSweep, middle: gtsam.Pose3,
+        fused: Fused, to_reference: FloatArray, lasting: FloatArray,
+    ) -> tuple[FloatArray, FloatArray, _Middle]:  # fmt: skip
+        """As :meth:`_own`, of a frame whose velocity is known too.
+
+        ``lasting`` (6, 6) is the root of the covariance of what consecutive scans have in common.
+        """
+        last = self._last
+        back = -sweep.middle * update.map_T_lidar.rotation().matrix().T
+        of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
+        turned = np.repeat([self._gyro_noise**2 * abs(sweep.middle), 0.0], 3)
+        own = of_state @ fused.covariance @ of_state.T + np.diag(turned) + lasting @ lasting.T
+        shared = np.zeros((6, 6))
+        if last is not None and last.of_state is not None and last.lasting is not None:
+            shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
+        pose = fused.covariance[:6, :6]
+        if last is not None and sweep.stamp > last.stamp:
+            self._motion.add(last, sweep.stamp, middle, pose)
+        now = _Middle(
+            sweep.stamp, middle, pose, np.ones(6), to_reference, update.stamp, of_state, lasting
+        )
+        return symmetric(own), shared, now
 
     def _own(
         self, reference_stamp: int, sweep: MovingSweep, middle: gtsam.Pose3,
@@ -311,131 +351,3 @@ class _Acceleration:
         gain = max(1.0 / self._count, 1.0 / self._window)
         squared = ((velocity - before[1]) / seconds) ** 2
         self._mean = self._mean + gain * (squared - noise - self._mean)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ScanError:
-    """The error of one solved frame, from its matches; all about the middle of the sweep.
-
-    Attributes
-    ----------
-    covariance : (6, 6) of the pose if the map were exact
-    renewed : (6, 6) part of ``covariance`` that stems from ground matched for the first time
-    user : (6, 6) share of the pose that factors beside the scan decide
-    expected : (6, 6) share of the pose that the expected motion decides
-    raw : (6, 6) raw covariance of what scan and other factors decide
-    residual_variance, effective_matches : see :class:`loam_gtsam.types.Uncertainty`
-    """
-
-    covariance: FloatArray
-    renewed: FloatArray
-    user: FloatArray
-    expected: FloatArray
-    raw: FloatArray
-    residual_variance: float
-    effective_matches: float
-
-
-class SeenGround:
-    """Cells of the map that have been matched; cells not matched for long are forgotten.
-
-    Parameters
-    ----------
-    size : edge length of a cell, metres
-    remembered : cells of a generation. When the younger generation is full, it becomes the older
-        one, and the older one is forgotten.
-    """
-
-    def __init__(self, size: float, remembered: int = _REMEMBERED) -> None:
-        self._size = size
-        self._remembered = remembered
-        self._younger, self._older = KeyTable(_NO_KEYS), KeyTable(_NO_KEYS)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing has been matched yet."""
-        return len(self._younger) + len(self._older) == 0
-
-    def cells(self, points_map: FloatArray) -> tuple[IntArray, BoolArray]:
-        """Cell numbers (N,) of points (N, 3), metres, and which of C cells are new; adds them."""
-        keys, numbers = np.unique(voxel_keys(points_map, self._size), return_inverse=True)
-        added = self._younger.add(keys)
-        new = np.zeros(len(keys), np.bool_)
-        new[added] = ~self._older.holds(keys[added])
-        if len(self._younger) > self._remembered:
-            self._younger, self._older = KeyTable(_NO_KEYS), self._younger
-        return numbers, new
-
-
-def scan_error(
-    solution: Solution, kernel_width: float, seen: SeenGround, config: CovarianceConfig,
-    *, kernel: str = "huber", with_priors: bool = True,
-) -> ScanError | None:  # fmt: skip
-    """The error of one solved frame from its residuals; None if its information is singular.
-
-    The sandwich ``B S B`` of robust statistics, with B the inverse information and S the scatter of
-    the scores ``J^T r``, summed over cells of the map before they are squared: matches in one cell
-    share map points, and their errors (Liang and Zeger, Biometrika 73, 1986; White, Econometrica
-    48, 1980).
-
-    Parameters
-    ----------
-    solution : of the solver
-    kernel_width, kernel : of the solver, for the weights of the matches if the solution has no rows
-    seen : ground matched so far; the cells of this frame are added
-    config : ``match_cell`` is used
-    with_priors : whether ``solution.information`` counts priors beside the matches
-    """
-    pose = solution.map_T_lidar
-    rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
-    residuals, jacobian = rows.residuals(pose)
-    keep = np.eye(6) if solution.weak is None else np.eye(6) - solution.weak
-    if solution.unseen is not None:
-        assert solution.beacons is not None
-        without = jacobian @ (np.eye(6) - solution.unseen)
-        jacobian = np.where(solution.beacons[:, None], jacobian @ keep, without)
-    points = transform(pose.matrix(), rows.points)
-    scores = jacobian * residuals[:, None]
-    by_ground, new = seen.cells(points)
-    fresh = _sums(scores, by_ground, len(new))[new]
-    _, by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)
-    cells = by_cell.max(initial=-1) + 1
-    scatter = _sums(scores, by_cell, cells)
-    information: FloatArray = jacobian.T @ jacobian
-    variance = max(float(residuals @ residuals) / max(len(residuals) - 6, 1), _LEAST_VARIANCE)
-    meat: FloatArray = cells * scatter.T @ scatter + _PRIOR_CELLS * variance * information
-    meat = meat / (cells + _PRIOR_CELLS)
-    renewed: FloatArray = fresh.T @ fresh
-    # Least squares, because the matches alone may leave a direction free.
-    inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
-    effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
-
-    expected = solution.expected
-    total = solution.information if with_priors else information
-    if expected is not None and not with_priors:
-        total = total + expected
-    priors = _positive(total - information)
-    if expected is None:  # of a solver that does not say: all priors along weak directions
-        weak = np.eye(6) - keep
-        expected = weak.T @ priors @ weak
-    if np.linalg.matrix_rank(total, hermitian=True) < len(total):
-        return None
-    bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
-    user = keep.T @ priors @ keep
-    parts = meat + priors, renewed, total - expected
-    covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
-    shares = bread @ user, bread @ expected
-    return ScanError(covariance, renewed, *shares, raw, variance, effective)
-
-
-def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:
-    """(count, C) sums of the rows (N, C) that have the same number."""
-    columns = [np.bincount(numbers, column, minlength=count) for column in rows.T]
-    return np.stack(columns, axis=1)
-
-
-def _positive(matrix: FloatArray) -> FloatArray:
-    """The nearest positive semi-definite matrix; what is left of rounding becomes zero."""
-    eigenvalues, vectors = np.linalg.eigh(symmetric(matrix))
-    nearest: FloatArray = ((vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T).astype(np.float64)
-    return nearest

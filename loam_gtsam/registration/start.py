@@ -148,7 +148,9 @@ class Start:
         last, posed = sweeps[-2].moment, sweeps[-1].posed
         sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
         self._sweeps = sweeps
-        frame = replace(frame, matcher=replace(frame.matcher, posed=posed, last=last))
+        frame = replace(
+            frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
+        )
         twist = frame.twist_to(solution.map_T_lidar)
         return frame, replace(found, solution=solution, twist=twist)
 

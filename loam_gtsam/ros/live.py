@@ -96,7 +96,7 @@ class LiveMapper:
         self._decoder = SweepDecoder(config, features, axes, clouds or CloudStream())
         bounded = config.live.when_full != "never"
         self._imu: LiveImu | None = None
-        if imu and config.imu.enabled:
+        if imu and config.imu.coupling != "off":
             self._imu = LiveImu(config.imu, config.live.imu_queue if bounded else None)
         self._parts: dict[str, Any] = {"solver": solver, "odometry": odometry}
         self._parts |= {"extra_factors": extra_factors, "loop_closer": loop_closer}

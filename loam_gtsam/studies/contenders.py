@@ -332,7 +332,7 @@ class PeerRunner:
 
 def inertial_of(dataset: Dataset, config: Config) -> Inertial | None:
     """The IMU of a data set for peers, by its extrinsics; None if there is none."""
-    samples = dataset.imu if config.imu.enabled else None
+    samples = dataset.imu if config.imu.coupling != "off" else None
     if samples is None:
         return None
     rotation = Rotation.from_euler("xyz", config.imu.lidar_R_imu_deg, degrees=True)

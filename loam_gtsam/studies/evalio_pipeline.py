@@ -130,7 +130,7 @@ class LoamGtsam(EvalioPipeline):
             if name and value != default[key]:
                 sections.setdefault(section, {})[name] = value
         config = with_implied(config_from_dict(sections, "evalio parameters"), self._implied)
-        self._buffer = ImuBuffer(config.imu) if config.imu.enabled else None
+        self._buffer = ImuBuffer(config.imu) if config.imu.coupling != "off" else None
         self._pipeline = Pipeline(config, imu=self._buffer)
 
     def add_imu(self, mm: ImuMeasurement) -> None:

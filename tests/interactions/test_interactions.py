@@ -57,16 +57,16 @@ class Steady:
 
 MODES = {
     "plain": ((), {}),
-    "pre-integration": (("imu.preintegration=true",), {}),
+    "loose": (("imu.coupling=loose",), {}),
     "scan to scan": (("odometry.method=scan_to_scan",), {}),
     "loops": (CLOSE, {}),
-    "loops, pre-integration": ((*CLOSE, "imu.preintegration=true"), {}),
+    "loops, loose": ((*CLOSE, "imu.coupling=loose"), {}),
     "own factors": ((), {"extra_factors": gps}),
     "own factors between sweeps": ((), {"extra_factors": wheels}),
     "own closer": (CLOSE, {"loop_closer": ScanLoopCloser}),
     "own solver": ((), {"solver": Curious}),
-    "own odometry, pre-integration": (("imu.preintegration=true",), {"odometry": Steady}),
     "a place that becomes small": (("map.small_below=5.24",), {}),
+    "own odometry": ((), {"odometry": Steady}),
     "classical": (("solver.method=loam", "imu.prior=off"), {}),
 }
 
@@ -140,7 +140,7 @@ def state_of(pipeline):
     return {name: array.tobytes() for name, array in freeze(*pipeline.state()).items()}
 
 
-@pytest.mark.parametrize("mode", ["plain", "loops, pre-integration", "scan to scan"])
+@pytest.mark.parametrize("mode", ["plain", "loops, loose", "scan to scan"])
 def test_workers_change_nothing(mode, world):
     config = Config().changed(*MODES[mode][0])
     here, there = (run(world, config, max_frames=8, workers=count) for count in (0, 1))
@@ -158,7 +158,7 @@ def test_asking_for_matches_again_changes_nothing(world, sweeps):
 
 def test_a_refused_sweep_is_not_remembered(world, sweeps):
     """Of a sweep whose stamp is an hour ahead, the next guess knows nothing."""
-    config = Config().changed("odometry.method=scan_to_scan", "imu.enabled=false")
+    config = Config().changed("odometry.method=scan_to_scan", "imu.coupling=off")
     expected = outcome(Pipeline(config), sweeps[:8])
     pipeline, statuses = Pipeline(config), []
     updates = []

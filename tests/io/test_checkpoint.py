@@ -75,8 +75,7 @@ def held_near_the_start(context):
 
 
 LOOPS = Config().changed("loops.enabled=true", "loops.min_way=6", "pose_graph.keyframe_distance=1")
-BOTH = LOOPS.changed("imu.preintegration=true")
-IMU = Config().changed("imu.preintegration=true", "imu.lag=5")
+IMU = Config().changed("imu.lag=5")
 DENSE = Config().changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
 CASES = {
     "plain": ("street_loop?frames=8", Config(), [1, 2, 5]),
@@ -84,7 +83,6 @@ CASES = {
     "scan to scan": ("trees?frames=6", Config().changed("odometry.method=scan_to_scan"), [4]),
     "classical": ("room?frames=8", preset("aloam"), [4]),
     "loops": ("room?frames=60&columns=400&speed=3", LOOPS, [20, 52]),
-    "loops and imu in the graph": ("room?frames=12&columns=400&speed=3", BOTH, [7]),
     "own closer": ("room?frames=40&columns=400&speed=4", DENSE, [12, 33]),
     "own factors": ("room?frames=6&columns=400", Config(), [3]),
     "workers": ("room?frames=8&columns=400", Config(), [4]),

@@ -152,13 +152,13 @@ class Remembering:
         self.seen = []
 
 
-@pytest.mark.parametrize("preintegration", [False, True])
+@pytest.mark.parametrize("coupling", ["loose", "tight"])
 @pytest.mark.parametrize("begin", ["resumed", "reset"])
-def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, preintegration):
+def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, coupling):
     """With a loop closer of one's own, and looked at after every frame."""
     dataset = open_dataset("sim:corridor?frames=16&columns=300&speed=8")
     limits = {"keyframe_distance": 0.1, "follow_distance": 1e-4, "follow_angle_deg": 1e-4}
-    config = settings(**limits).changed({"imu.preintegration": preintegration})
+    config = settings(**limits).changed({"imu.coupling": coupling})
     sweeps = list(dataset)
 
     def pipeline():

@@ -383,13 +383,13 @@ def observed(tracker, frames, acceleration, information):
         tracker.observe(at(last, acceleration), at(now, acceleration), information)
 
 
-@pytest.mark.parametrize("on", [True, False])
-def test_pre_integration_predicts_what_constant_velocity_cannot(on):
-    tracker = tracker_for(accelerating(2.0), preintegration=on)
+@pytest.mark.parametrize("coupling", ["tight", "loose"])
+def test_tight_coupling_predicts_what_constant_velocity_cannot(coupling):
+    tracker = tracker_for(accelerating(2.0), coupling=coupling)
     observed(tracker, range(8), 2.0, 1e6 * np.eye(6))
     stamp, truth = at(8, 2.0)
     predicted = tracker.predict(stamp)
-    if not on:
+    if coupling == "loose":
         assert predicted is None
         return
     error = truth.localCoordinates(predicted.map_T_lidar)
@@ -400,7 +400,7 @@ def test_pre_integration_predicts_what_constant_velocity_cannot(on):
 def test_a_gap_in_the_imu_leaves_the_prediction_out_and_it_begins_anew():
     samples = accelerating(2.0)
     since = (samples.stamps - NOW) * 1e-9
-    tracker = tracker_for(part(samples, (since < 0.82) | (since > 1.15)), preintegration=True)
+    tracker = tracker_for(part(samples, (since < 0.82) | (since > 1.15)))
     observed(tracker, range(8), 2.0, 1e6 * np.eye(6))
     assert tracker.predict(at(10, 2.0)[0]) is None
     observed(tracker, range(11, 15), 2.0, 1e6 * np.eye(6))
@@ -409,7 +409,7 @@ def test_a_gap_in_the_imu_leaves_the_prediction_out_and_it_begins_anew():
 
 def test_sweeps_whose_middles_are_not_in_order_are_not_observed():
     """A short sweep that begins late in a long one has its middle before that of the long one."""
-    tracker = tracker_for(accelerating(2.0), preintegration=True)
+    tracker = tracker_for(accelerating(2.0))
     observed(tracker, range(4), 2.0, 1e6 * np.eye(6))
     stamp, pose = at(3, 2.0)
     for earlier in (stamp, stamp - 1):
@@ -425,7 +425,7 @@ def test_an_imu_that_measures_nonsense_makes_no_prediction_and_ends_no_run(absur
     samples, rng = accelerating(0.0), np.random.default_rng(0)
     values = getattr(samples, absurd) + size * rng.normal(size=(len(samples.stamps), 3)).clip(-1, 1)
     bad = dataclasses.replace(samples, **{absurd: values})
-    tracker = tracker_for(bad, preintegration=True, gyro_noise=1e3, acceleration_noise=1e3, lag=2)
+    tracker = tracker_for(bad, gyro_noise=1e3, acceleration_noise=1e3, lag=2)
     for last, now in pairwise(range(14)):
         predicted = tracker.predict(at(now, 0.0)[0])
         assert predicted is None or np.isfinite(np.linalg.inv(predicted.covariance)).all()
@@ -433,10 +433,10 @@ def test_an_imu_that_measures_nonsense_makes_no_prediction_and_ends_no_run(absur
 
 
 def test_after_a_reset_the_tracker_is_a_new_one_to_the_last_bit():
-    """Level, bias, distrust and pre-integration are forgotten."""
+    """Level, bias, distrust and coupling are forgotten."""
     rate = (0.0, 0.0, 0.8)
     samples = turning(rot3(3, -2, 0), rate, seconds=3.0, bias=(0.02, -0.01, 0.015))
-    fresh, used = (new_tracker(samples, preintegration=True) for _ in range(2))
+    fresh, used = (new_tracker(samples) for _ in range(2))
 
     def run(tracker):
         tracker.first_pose(NOW)
@@ -459,8 +459,8 @@ def test_after_a_reset_the_tracker_is_a_new_one_to_the_last_bit():
         np.testing.assert_array_equal(one, two)
 
 
-def test_the_state_of_a_run_with_pre_integration_does_not_grow():
-    tracker = tracker_for(accelerating(0.1, seconds=8.0), preintegration=True, lag=5)
+def test_the_state_of_a_tight_coupling_does_not_grow():
+    tracker = tracker_for(accelerating(0.1, seconds=8.0), lag=5)
     sizes = []
     for last, now in pairwise(range(60)):
         observed(tracker, (last, now), 0.1, 1e6 * np.eye(6))
@@ -470,10 +470,10 @@ def test_the_state_of_a_run_with_pre_integration_does_not_grow():
     assert max(sizes[10:]) < 1.03 * min(sizes[10:])
 
 
-@pytest.mark.parametrize("preintegration", [False, True])
-def test_samples_fed_live_and_forgotten_lead_to_the_same(preintegration, monkeypatch):
+@pytest.mark.parametrize("coupling", ["loose", "tight"])
+def test_samples_fed_live_and_forgotten_lead_to_the_same(coupling, monkeypatch):
     monkeypatch.setattr("loam_gtsam.imu.buffer.MEMORY", 1.0)
-    rate, config = (0.0, 0.1, 0.5), {"preintegration": preintegration, "prior": "blend"}
+    rate, config = (0.0, 0.1, 0.5), {"coupling": coupling, "prior": "blend"}
     samples = turning(rot3(3, -2, 0), seconds=12.0, rate=rate, bias=(0.02, -0.01, 0.015))
     at_once, live = new_tracker(samples, **config), new_tracker(None, **config)
     for last, now in pairwise(frames(rate, 100)):

@@ -98,7 +98,7 @@ def blind_field():
     world = SimulatedWorld("open_field", frames=25, columns=450)
     dataset = ListDataset([world[i] for i in range(25)])
     dataset.sensor = world.sensor
-    updates = run(dataset, Config().changed("imu.enabled=false")).updates
+    updates = run(dataset, Config().changed("imu.coupling=off")).updates
     return updates, [gtsam.Pose3(pose) for pose in world.truth.map_T_lidar]
 
 

@@ -118,12 +118,17 @@ OTHER = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 3.0]))
 
 
 class Inertial(Gyro):
-    """A gyro with a pre-integration that knows one pose."""
+    """A gyro with an accelerometer that knows one pose."""
 
-    known = Predicted(OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)))
+    known = Predicted(
+        OTHER, np.array([1.0, 0.0, 0.5]), np.diag(np.arange(1.0, 7.0)), np.zeros((3, 6))
+    )
 
     def predict(self, stamp):
         return self.known if stamp <= self.until else None
+
+    def bend(self, stamp, seconds, map_R_lidar):
+        return None
 
 
 def predicted(imu=None, guess=None, twist=None, last=MIDDLE):
@@ -158,13 +163,13 @@ def test_a_given_guess_and_twist_take_the_place_of_the_predicted_ones(imu):
     assert difference(found.motion.map_T_lidar, expected) < 1e-12
 
 
-def test_by_pre_integration_the_pose_of_the_middle_is_the_predicted_one():
+def test_with_an_accelerometer_the_pose_of_the_middle_is_the_predicted_one():
     found = predicted(Inertial([0.0, 0.0, 2.0]))
     assert difference(found.map_T_middle, OTHER) < 1e-12
     np.testing.assert_allclose(found.motion.information, np.diag(1.0 / np.arange(1.0, 7.0)))
     velocity = OTHER.rotation().matrix() @ found.posed.twist[3:]
     np.testing.assert_allclose(velocity, [1.0, 0.0, 0.5], atol=1e-12)
-    # Where pre-integration fails, the gyro alone predicts.
+    # Where the accelerometer fails, the gyro alone predicts.
     failed = predicted(Inertial([0.0, 0.0, 2.0], until=STAMP))
     assert difference(failed.map_T_lidar, advance(START, TWIST, 0.1)) < 1e-12
 

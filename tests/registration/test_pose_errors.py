@@ -20,7 +20,7 @@ from loam_gtsam.registration.solvers import POSE_KEY, Solution
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 
 FRAME = 100_000_000
-NONE = np.zeros((3, 6, 6))
+NONE = np.zeros((4, 6, 6))
 
 
 def some_covariance(rng, scale=1e-4):
@@ -57,7 +57,7 @@ def part(world, first, last):
 
 def no_imu(**covariance):
     config = Config()
-    return config.changed("imu.enabled=false", covariance=config.covariance.changed(**covariance))
+    return config.changed("imu.coupling=off", covariance=config.covariance.changed(**covariance))
 
 
 def made_up(stamp, pose, own, drift, shared=None, follows=None):
@@ -190,7 +190,7 @@ def test_a_prior_of_ones_own_holds_the_pose_in_spite_of_drift():
 def test_classical_solvers_have_covariances_of_the_same_size(name):
     world = SimulatedWorld("room", frames=8, columns=900)
     ours = run(world, no_imu()).updates[-1]
-    theirs = run(world, preset(name).changed("imu.enabled=false")).updates[-1]
+    theirs = run(world, preset(name).changed("imu.coupling=off")).updates[-1]
     ratio = np.sqrt(np.diag(theirs.uncertainty.own) / np.diag(ours.uncertainty.own))
     assert ratio.min() > 0.2
     assert ratio.max() < 5.0
@@ -251,13 +251,13 @@ def calibrated(errors, number):
     update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
     solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
-    return errors.calibrated(update, sweep, solution)
+    return errors.calibrated(update, sweep, solution, errors.of_scan(solution))
 
 
 def test_ground_that_replaces_none_counts_half(monkeypatch):
     def error(solution, width, seen, config, **_):
         seen.cells(np.zeros((1, 3)))
-        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, 1.0, 10.0)
+        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, np.zeros(6), 1.0, 10.0)
 
     monkeypatch.setattr(covariance_module, "scan_error", error)
     errors = PoseErrors(Config())
@@ -289,7 +289,7 @@ def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
 
 
 def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatch):
-    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, 1.0, 10.0)
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
     answers = iter([good, good, None, good])
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: next(answers))
     errors = PoseErrors(Config())

@@ -382,12 +382,12 @@ def broken(samples, kind):
     return ImuSamples(samples.stamps, orientation, gyro, force)
 
 
-@pytest.mark.parametrize("preintegration", [False, True])
+@pytest.mark.parametrize("coupling", ["loose", "tight"])
 @pytest.mark.parametrize("kind", ["nothing", "gyro", "accelerometer", "attitude"])
-def test_an_imu_that_breaks_is_left_out(kind, preintegration):
+def test_an_imu_that_breaks_is_left_out(kind, coupling):
     world = SimulatedWorld("street_loop", frames=30, columns=600, start="moving")
     sweeps = ArrayDataset(list(world), imu=broken(world.imu, kind), sensor=world.sensor)
-    result = run(sweeps, Config().changed({"imu.preintegration": preintegration}))
+    result = run(sweeps, Config().changed({"imu.coupling": coupling}))
     assert all(update.status.solved for update in result.updates[1:])
     truth = world.truth.map_T_lidar
     for update, pose in zip(result.updates, truth, strict=True):

@@ -9,8 +9,8 @@ import pytest
 from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.pose_errors import SeenGround, scan_error
 from loam_gtsam.registration.solvers import Solution, match_rows
+from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 
 CONFIG = CovarianceConfig()
 SIGMA = 0.05

@@ -228,5 +228,5 @@ def test_second_points_have_a_place_of_their_own() -> None:
 def test_a_walk_through_rooms_keeps_its_way() -> None:
     """Past two doors: 31 mm off without sides, 14 mm with."""
     world = SimulatedWorld("rooms", frames=120, columns=450)
-    result = run(world, Config().changed("imu.enabled=false"))
+    result = run(world, Config().changed("imu.coupling=off"))
     assert absolute_error(result.trajectory, world.truth).rmse < 0.022

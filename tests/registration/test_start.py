@@ -14,7 +14,7 @@ from loam_gtsam.registration import start
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.types import FrameStatus
 
-CONFIG = Config().changed("imu.enabled=false")
+CONFIG = Config().changed("imu.coupling=off")
 
 
 def features_of(scene, frames, **options):

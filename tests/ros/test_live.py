@@ -249,8 +249,8 @@ PARTS: dict[str, tuple[Config, Any]] = {
         Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9)),
         lambda: {"loop_closer": OneLoop()},
     ),
-    "pre-integration": (
-        Config(imu=ImuConfig(preintegration=True, lidar_R_imu_deg=(1.0, -2.0, 3.0))),
+    "tight": (
+        Config(imu=ImuConfig(lidar_R_imu_deg=(1.0, -2.0, 3.0))),
         dict,
     ),
     "de-skew by orientation": (
@@ -396,7 +396,7 @@ def test_impatience_is_counted_and_changes_the_result(bag: Path, offline: RunRes
 
 def test_without_an_imu_nothing_waits(bag: Path) -> None:
     first = next(m for m in messages_of(bag) if m.topic == POINTS)
-    for live in (LiveMapper(), LiveMapper(Config(imu=ImuConfig(enabled=False)), imu=True)):
+    for live in (LiveMapper(), LiveMapper(Config(imu=ImuConfig(coupling="off")), imu=True)):
         for message in messages_of(bag)[:20]:
             if message.topic == IMU:
                 hand_over(live, message)

@@ -106,7 +106,7 @@ def test_an_imu_that_stops_holds_no_sweep_for_long() -> None:
 
 
 def test_without_imu_no_sweep_waits() -> None:
-    for params, data in (({}, evalio_room.lidar()), ({"imu.enabled": False}, ROOM)):
+    for params, data in (({}, evalio_room.lidar()), ({"imu.coupling": "off"}, ROOM)):
         trajectory = estimates(set_up(**params), data)
         assert len(trajectory) == write.COUNT
         assert absolute_error(trajectory, imu_truth()).rmse < 0.05

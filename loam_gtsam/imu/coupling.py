@@ -1,0 +1,125 @@
+"""Gyro, accelerometer and scans in one estimate, see docs/maths/inertial.md."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from scipy.stats import chi2, norm
+
+from loam_gtsam.config import ImuConfig
+from loam_gtsam.imu.bend import bend
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.preintegration import Fused, InertialOdometry, Prediction
+from loam_gtsam.types import FloatArray, ImuSamples, SweepError
+
+_FORCE = 0.2, 3.0
+"""Least and largest mean specific force over a sweep, in multiples of gravity. Less is free fall,
+an accelerometer without gravity or in other units; more is beyond any vehicle, or a fault."""
+_UNLIKELY = float(chi2.isf(2.0 * norm.sf(5.0), 6))
+"""Squared Mahalanobis distance from which a pose contradicts its prediction: as unlikely as five
+standard deviations."""
+_OUTWEIGHS = 5  # frames that agree and one that contradicts: the one after it knows no velocity
+_DISTRUST = 3 * _OUTWEIGHS  # from which, less agreements, the accelerometer is not used
+
+
+class TightCoupling:
+    """What scans and IMU together know of pose, velocity, biases and gravity.
+
+    For every frame :meth:`predict`, then :meth:`observe`. While scans contradict the predictions
+    for some frames in a row, there are none.
+    """
+
+    def __init__(self, config: ImuConfig) -> None:
+        self.config = config
+        self._odometry: InertialOdometry | None = None
+        self._predicted: int | None = None
+        self._contradictions = 0
+
+    @property
+    def trusted(self) -> bool:
+        """Whether the scans agree with gyro and accelerometer."""
+        return self._contradictions < _DISTRUST
+
+    def predict(self, stamp: int, buffer: ImuBuffer) -> Prediction | None:
+        """Pose, velocity and covariance of a moment; None if not known.
+
+        It is not before the first :meth:`observe`, nor if the samples have a gap or are absurd.
+        """
+        self._predicted = None
+        if self._odometry is None:
+            return None
+        margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
+        if not self._believable(buffer.samples_between(since, stamp)):
+            return None
+        samples = buffer.samples_between(since - margin, stamp + margin)
+        try:
+            prediction = self._odometry.predict(stamp, samples)
+        except SweepError:
+            return None
+        self._predicted = stamp
+        return prediction if self.trusted else None
+
+    def reject(self) -> None:
+        """Take the last prediction back: a sweep fitted better without the IMU."""
+        self._predicted = None
+
+    def bend(
+        self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray,
+        gravity: FloatArray, buffer: ImuBuffer,
+    ) -> FloatArray | None:  # fmt: skip
+        """See :func:`loam_gtsam.imu.bend.bend`; None if the samples do not tell.
+
+        ``map_R_lidar`` (3, 3) is the rotation at ``stamp``; ``gravity`` (3,) m/s^2, map frame,
+        stands for it until it is estimated.
+        """
+        bias = np.zeros(3)
+        if self._odometry is not None:
+            gravity, bias = self._odometry.state.map_gravity, self._odometry.state.acceleration_bias
+        first, last = (stamp + round(float(end) * 1e9) for end in (seconds[0], seconds[-1]))
+        samples = buffer.samples_between(first, last)
+        if not self.trusted or not self._believable(samples):
+            return None
+        lever = np.asarray(self.config.lidar_t_imu, np.float64)
+        return bend(buffer, stamp, seconds, gravity @ map_R_lidar, bias, lever)
+
+    def observe(
+        self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3],
+        information: FloatArray, gravity: FloatArray, gyro_bias: FloatArray,
+    ) -> Fused | None:  # fmt: skip
+        """Take in what the scan alone said about a moment; the pose by both.
+
+        None if there is no prediction, or if the two contradict each other.
+
+        Parameters
+        ----------
+        last, now : stamp, nanoseconds, and ``map_T_lidar`` of the frame before and of this one
+        information : (6, 6) of the second pose, zero where the scan is not believed
+        gravity, gyro_bias : (3,) m/s^2 in the map frame and rad/s, with which the estimate begins
+        """
+        stamp, pose = now
+        if stamp <= last[0]:  # sweeps of unlike length
+            return None
+        try:
+            if self._odometry is not None and self._predicted == stamp:
+                fused = self._odometry.update(pose, information)
+                agree = fused is not None and self._odometry.surprise < _UNLIKELY
+                count = self._contradictions + (-1 if agree else _OUTWEIGHS)
+                self._contradictions = min(max(count, 0), 2 * _DISTRUST)
+                return fused if agree and self.trusted else None
+            velocity = (pose.translation() - last[1].translation()) / ((stamp - last[0]) * 1e-9)
+            if self._odometry is not None:
+                self._odometry.restart(stamp, pose, velocity)
+            else:
+                self._odometry = InertialOdometry(
+                    self.config, gravity, stamp, pose, velocity, gyro_bias
+                )
+        except SweepError:  # no window can begin here: with the next frame, then
+            self._odometry = None
+        return None
+
+    def _believable(self, samples: ImuSamples) -> bool:
+        """Whether a lidar that is carried about may feel such accelerations."""
+        if not len(samples.stamps):
+            return False
+        force = np.linalg.norm(samples.acceleration, axis=1).mean() / max(self.config.gravity, 1.0)
+        return bool(_FORCE[0] < force < _FORCE[1])

@@ -1,0 +1,222 @@
+"""The bend of a path, and gyro, accelerometer and scans in one estimate."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from support.imu import START, ns
+
+from loam_gtsam.config import Config, ImuConfig
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.imu.bend import bend
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.imu.coupling import TightCoupling
+from loam_gtsam.imu.preintegration import InertialOdometry
+from loam_gtsam.registration.solvers import POSE_KEY
+from loam_gtsam.registration.solvers.scan_error import ScanError
+from loam_gtsam.types import Features, ImuSamples
+
+DOWN = np.array([0.0, 0.0, -9.81])
+FRAME = 100_000_000
+NOW = START + 500_000_000
+SECONDS = np.linspace(-0.15, 0.06, 41)
+RATE, TURN = np.array([0.3, -0.2, 0.9]), np.array([0.5, 1.0, -0.8])
+
+
+def buffer(config=None, acceleration=(1.5, -0.5, 0.2), arm=(0.0, 0.0, 0.0), scale=1.0):
+    """Of a lidar that turns evenly about RATE, and gathers speed in a map that is level at NOW."""
+    times = np.arange(-100, 400) / 200.0
+    rotations = Rotation.from_rotvec(np.outer(times, RATE))
+    arm = np.asarray(arm)
+    felt = rotations.inv().apply(np.asarray(acceleration) - DOWN)
+    felt += np.cross(RATE, np.cross(RATE, arm))
+    gyro = np.tile(RATE, (len(times), 1))
+    samples = ImuSamples(NOW + np.round(times * 1e9).astype(np.int64), None, gyro, scale * felt)
+    return ImuBuffer(config or ImuConfig(), samples)
+
+
+@pytest.mark.parametrize("arm", [(0.0, 0.0, 0.0), (0.5, -0.2, 0.3)])
+def test_a_path_bends_as_the_lidar_accelerates_wherever_the_imu_sits(arm):
+    acceleration, bias = np.array([1.5, -0.5, 0.2]), np.array([0.1, 0.2, -0.1])
+    data = buffer(arm=arm)
+    path = bend(data, NOW, SECONDS, DOWN, np.zeros(3), np.asarray(arm))
+    np.testing.assert_allclose(path, 0.5 * np.outer(SECONDS**2, acceleration), atol=2e-5)
+    # A bias turns with the lidar, which at NOW has the axes of the map.
+    wrong = bend(data, NOW, SECONDS, DOWN, bias, np.asarray(arm)) - path
+    np.testing.assert_allclose(wrong[-1], -0.5 * SECONDS[-1] ** 2 * bias, atol=2e-5)
+
+
+def test_a_gap_in_the_samples_leaves_the_bend_unknown():
+    data = buffer()
+    assert bend(data, NOW + 5_000_000_000, SECONDS, DOWN, np.zeros(3), np.zeros(3)) is None
+    assert bend(data, NOW - 450_000_000, SECONDS, DOWN, np.zeros(3), np.zeros(3)) is None
+
+
+def test_a_sweep_on_a_bent_path_is_undone_and_its_velocity_is_that_of_the_middle():
+    acceleration, velocity = np.array([1.5, -0.5, 0.2]), np.array([8.0, 1.0, -0.5])
+    rng = np.random.default_rng(0)
+    points, times = rng.uniform(-9.0, 9.0, (300, 3)), rng.uniform(0.0, 0.1, 300)
+    middle = NOW + FRAME // 2
+
+    def pose(seconds):
+        """At seconds from the middle of the sweep."""
+        way = np.outer(seconds, velocity) + 0.5 * np.outer(seconds**2, acceleration)
+        return Rotation.from_rotvec(np.outer(seconds, RATE)), way
+
+    turned, way = pose(times - 0.05)
+    measured = turned.inv().apply(points - way)
+    features = replace(
+        Features.from_points(NOW, measured, measured),
+        edge_times=times, plane_times=times, span=(0.0, 0.1),
+    )  # fmt: skip
+    level = ImuSamples(*_level_at(middle, acceleration))
+    sweep = MovingSweep(features, Config(), ImuBuffer(ImuConfig(), level), thin=False)
+    path = bend(ImuBuffer(ImuConfig(), level), middle, SECONDS, DOWN, np.zeros(3), np.zeros(3))
+    bent = sweep.bent(SECONDS, path)
+    before, way = pose(np.array([-0.1]))
+    last = middle - FRAME, gtsam.Pose3(gtsam.Rot3(before[0].as_matrix()), way[0])
+    twist = bent.twist_since(last, gtsam.Pose3())
+    reference, there = pose(np.array([-0.05]))
+    np.testing.assert_allclose(reference[0].apply(twist[3:]), velocity, atol=1e-3)
+    np.testing.assert_allclose(bent.at(twist).points[1], points, atol=1e-4)
+    at = bent.middle_T_reference(twist)
+    np.testing.assert_allclose(at.translation(), there[0], atol=1e-4)
+    # The mean velocity since the last middle, on a straight path: 2 mm off at the ends.
+    straight = sweep.at(sweep.twist_since(last, gtsam.Pose3()))
+    assert np.abs(straight.points[1] - points).max() > 2e-3
+
+
+def _level_at(stamp, acceleration):
+    times = np.arange(-100, 100) / 200.0
+    felt = Rotation.from_rotvec(np.outer(times, RATE)).inv().apply(acceleration - DOWN)
+    stamps = stamp + np.round(times * 1e9).astype(np.int64)
+    return stamps, None, np.tile(RATE, (len(times), 1)), felt
+
+
+# -- the estimate ----------------------------------------------------------------------------------
+
+
+def drive(coupling, data, frames, errors=None, information=None):
+    """Observe frames of a lidar at rest; what comes of each."""
+    information = np.diag([1e6] * 3 + [1e4] * 3) if information is None else information
+    found = []
+    for number in frames:
+        last, now = ((NOW + k * FRAME, gtsam.Pose3()) for k in (number - 1, number))
+        if errors is not None:
+            now = now[0], gtsam.Pose3().retract(errors[number])
+        predicted = coupling.predict(now[0], data)
+        found.append((predicted, coupling.observe(last, now, information, DOWN, np.zeros(3))))
+    return found
+
+
+def resting(acceleration=(0.0, 0.0, 9.81), rng=None, seconds=12.0):
+    stamps = ns(np.arange(round(200 * seconds)) / 200.0)
+    felt = np.tile(np.asarray(acceleration, float), (len(stamps), 1))
+    gyro = np.zeros_like(felt)
+    if rng is not None:
+        config = ImuConfig()
+        felt += config.acceleration_noise * np.sqrt(200.0) * rng.standard_normal(felt.shape)
+        gyro += config.gyro_noise * np.sqrt(200.0) * rng.standard_normal(felt.shape)
+    return ImuBuffer(ImuConfig(), ImuSamples(stamps, None, gyro, felt))
+
+
+def test_errors_of_poses_of_velocities_and_between_frames_are_as_told():
+    """NEES of 40 runs of 25 frames: of the last state, and of the motion between two frames."""
+    rng = np.random.default_rng(0)
+    sigmas = np.repeat([1e-3, 5e-3], 3)
+    state, motion = [], []
+    for _ in range(40):
+        data, errors = resting(rng=rng, seconds=4.0), sigmas * rng.standard_normal((30, 6))
+        errors[0] = 0.0
+        found = [fused for _, fused in drive(TightCoupling(ImuConfig()), data, range(1, 26), errors,
+                                             np.diag(sigmas**-2))]  # fmt: skip
+        last, now = (gtsam.Pose3.Logmap(fused.map_T_lidar) for fused in found[-2:])
+        off = np.append(now, found[-1].velocity)
+        state.append(off @ np.linalg.solve(found[-1].covariance, off))
+        across = found[-1].across[:6, :6]
+        between = found[-1].covariance[:6, :6] + found[-2].covariance[:6, :6] - across - across.T
+        motion.append((now - last) @ np.linalg.solve(between, now - last))
+    assert 0.7 < np.mean(state) / 9 < 1.4
+    assert 0.7 < np.mean(motion) / 6 < 1.4
+
+
+def test_a_pose_by_both_is_better_than_by_either():
+    rng = np.random.default_rng(1)
+    errors = np.repeat([1e-3, 5e-3], 3) * rng.standard_normal((60, 6))
+    information = np.diag(np.repeat([1e-3, 5e-3], 3) ** -2.0)
+    data = resting(rng=rng, seconds=8.0)
+    found = drive(TightCoupling(ImuConfig()), data, range(1, 60), errors, information)
+    fused = [gtsam.Pose3.Logmap(both.map_T_lidar) for _, both in found[10:]]
+    assert np.std(fused, axis=0).max() < 0.6 * 5e-3
+    assert np.std(fused, axis=0)[:3].max() < 0.5e-3
+
+
+@pytest.mark.parametrize(
+    "felt", [(0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0, 981.0), (160.0, 0.0, 9.81)]
+)
+def test_no_gravity_other_units_and_nonsense_are_not_used(felt):
+    coupling, data = TightCoupling(ImuConfig()), resting(felt)
+    assert all(predicted is None for predicted, _ in drive(coupling, data, range(1, 8)))
+    assert coupling.bend(NOW, SECONDS, np.eye(3), DOWN, data) is None
+    good = resting()
+    assert coupling.bend(NOW, SECONDS, np.eye(3), DOWN, good) is not None
+
+
+def test_an_accelerometer_that_contradicts_the_scans_is_left_out_until_it_agrees_again():
+    coupling, good, bad = TightCoupling(ImuConfig()), resting(), resting((12.0, 0.0, 9.81))
+    sharp = 1e6 * np.eye(6)
+    assert drive(coupling, good, range(1, 6), information=sharp)[-1][1] is not None
+    assert coupling.trusted
+    said = drive(coupling, bad, range(6, 30), information=sharp)
+    assert said[0][1] is None
+    assert not coupling.trusted
+    assert all(predicted is None and fused is None for predicted, fused in said[12:])
+    assert drive(coupling, good, range(30, 80), information=sharp)[-1][1] is not None
+    assert coupling.trusted
+
+
+def test_a_rejected_prediction_is_not_fused():
+    coupling, data = TightCoupling(ImuConfig()), resting()
+    drive(coupling, data, range(1, 6))
+    assert coupling.predict(NOW + 6 * FRAME, data) is not None
+    coupling.reject()
+    last, now = ((NOW + k * FRAME, gtsam.Pose3()) for k in (5, 6))
+    assert coupling.observe(last, now, np.eye(6), DOWN, np.zeros(3)) is None
+
+
+def test_the_velocity_of_a_pose_follows_from_how_far_it_is_from_the_expected_one():
+    """Right after the start the velocity is hardly known; later a pose changes it little."""
+    odometry = InertialOdometry(ImuConfig(), DOWN, NOW, gtsam.Pose3(), np.zeros(3), np.zeros(3))
+    data = resting().samples_between(START, START + 10**10)
+    away = gtsam.Pose3(gtsam.Rot3(), np.array([0.05, 0.0, 0.0]))
+    first = odometry.predict(NOW + FRAME, data)
+    assert first.velocity_at(away)[0] == pytest.approx(0.05 / 0.1, rel=0.1)
+    for number in range(1, 20):
+        odometry.predict(NOW + number * FRAME, data)
+        odometry.update(gtsam.Pose3(), np.diag([1e6] * 3 + [1e5] * 3))
+    later = odometry.predict(NOW + 20 * FRAME, data)
+    assert abs(later.velocity_at(away)[0]) < 0.2
+
+
+# -- the scan beside further factors ---------------------------------------------------------------
+
+
+def test_a_scan_and_a_factor_have_their_true_shares():
+    pose = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 3.0]))
+    zero, alone = np.zeros((6, 6)), np.diag([1e6] * 3 + [1e4] * 3)
+    scan = ScanError(zero, zero, zero, zero, zero, alone, np.full(6, 1e-3), 1.0, 1.0)
+    kept, information = scan.with_factors(pose, [])
+    assert kept is pose
+    assert information is alone
+    # 1 cm by the scan, 2 cm by the prior: a fifth of the way from the scan's optimum.
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.02)
+    prior = gtsam.GPSFactor(POSE_KEY, pose.translation() + np.array([0.0, 0.0, 0.05]), noise)
+    moved, information = scan.with_factors(pose, [prior])
+    np.testing.assert_allclose(moved.translation()[2] - 3.0, 1e-3 + 0.2 * 0.049, atol=1e-5)
+    np.testing.assert_allclose(np.diag(information)[3:], 1e4 + 2500.0)
+    # Where nothing tells, the pose stays.
+    blind = ScanError(zero, zero, zero, zero, zero, zero, np.zeros(6), 1.0, 1.0)
+    moved, _ = blind.with_factors(pose, [prior])
+    np.testing.assert_allclose(pose.localCoordinates(moved)[:3], 0.0, atol=1e-12)

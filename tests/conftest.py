@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 from pathlib import Path
 
@@ -17,6 +18,14 @@ settings.register_profile(
     "thorough", max_examples=2000, deadline=None, suppress_health_check=_slow, print_blob=True
 )
 settings.load_profile("default")
+
+
+@pytest.fixture(autouse=True)
+def speaking_loggers() -> None:
+    """A tool that some test calls disables the loggers that exist, which other tests listen to."""
+    for name, logger in logging.Logger.manager.loggerDict.items():
+        if name.startswith("loam_gtsam") and isinstance(logger, logging.Logger):
+            logger.disabled = False
 
 
 @pytest.fixture(scope="session")

@@ -272,7 +272,7 @@ def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
 
     def error(solution, width, seen, config, **_):
         fresh.append(int(seen.cells(solution.matches.planes.points)[1].sum()))
-        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, 1.0, 10.0)
+        return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, np.zeros(6), 1.0, 10.0)
 
     monkeypatch.setattr(covariance_module, "scan_error", error)
     errors, ground = PoseErrors(Config()), np.array([[0.1, 0.1, 0.1], [0.1, 0.1, 0.5]])
@@ -284,7 +284,7 @@ def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
         solution = replace(Solution.unsolved(gtsam.Pose3(), None, 1, 1), matches=matches)
         update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
         sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
-        errors.calibrated(update, sweep, solution, small=small)
+        errors.calibrated(update, sweep, solution, errors.of_scan(solution, small=small))
     assert fresh == [1, 0, 0, 2, 0, 1]  # cells of 0.8 m, and of 0.4 m in small places
 
 

@@ -1,5 +1,6 @@
 """Configuration: YAML there and back, and every way in which a file can be wrong."""
 
+import math
 import re
 import typing
 
@@ -39,7 +40,7 @@ def bounds(field):
         metadata = typing.get_args(field.annotation)[0].__metadata__
     low = next((item.ge for item in metadata if hasattr(item, "ge")), None)
     high = next((item.le for item in metadata if hasattr(item, "le")), None)
-    return low, None if high == 2**63 - 1 else high
+    return low, high
 
 
 def name_of(value):
@@ -132,7 +133,7 @@ def test_the_tree_is_frozen():
         ("solver: {iterations: &a true}", ("expected int", "True")),
         ("map: {field_of_view: 1}", ("expected bool", "1")),
         ("map: {archive_dir: 3}", ("map.archive_dir", "expected str", "3")),
-        ("map: {cube_size: .nan}", ("map.cube_size", "at least 1.0", "nan")),
+        ("map: {cube_size: .nan}", ("map.cube_size", "at most 1000000.0", "nan")),
         ("map: {window: [9, 9]}", ("map.window", "expected 3 values")),
         ("map: {window: [9, 9, 0]}", ("map.window", "at least 1", "0")),
         ("sensor: {model: vlp17}", ("sensor.model", "expected one of", "did you mean 'vlp16'")),
@@ -145,7 +146,7 @@ def test_the_tree_is_frozen():
         ("a: \0", ("here.yaml", "not valid YAML")),
         ("imu: {gravity: 2001-12-00}", ("here.yaml", "not valid YAML", "day is out of range")),
         (f"imu: {{lag: {'9' * 9000}}}", ("here.yaml", "not valid YAML")),
-        (f"imu: {{lag: 0x{'f' * 9000}}}", ("here.yaml:1", "imu.lag", "too large")),
+        (f"imu: {{lag: 0x{'f' * 9000}}}", ("here.yaml:1", "imu.lag", "at most 1000", "too long")),
         ("imu: " + "[" * 3000, ("here.yaml", "not valid YAML")),
         ("imu: &a [*a]", ("here.yaml:1: imu: expected a mapping",)),
         ("? [a, b]\n: 3", ("here.yaml:1", "unknown key")),
@@ -186,14 +187,59 @@ def test_anchors_and_other_looks_of_a_value_do_not_matter():
 @pytest.mark.parametrize(("owner", "name", "limit", "sign"), BOUNDS, ids=name_of)
 def test_every_bound_accepts_itself_and_refuses_what_lies_beyond(owner, name, limit, sign):
     default = owner.model_fields[name].default
-    at, step = (float(limit), 1e-9) if type(default) is float else (int(limit), 1)
-    beyond = at + sign * step
+    whole = type(default[0] if isinstance(default, tuple) else default) is int
+    at = int(limit) if whole else float(limit)
+    beyond = at + sign if whole else math.nextafter(at, sign * math.inf)
     if isinstance(default, tuple):
         at, beyond = (at,) * 3, (at, at, beyond)
     others = {key: at for pair in owner.in_order if pair[sign < 0] == name for key in pair}
     assert getattr(owner(**{**others, name: at}), name) == at
     with pytest.raises(ConfigError, match=rf"{owner.__name__}\.{name}: expected at"):
         owner(**{name: beyond})
+
+
+EXTREMES = (
+    *(
+        sign * value
+        for value in (0, 1, 10**9, 10**19, 10**400, 0.5, 5e-324, 1e300)
+        for sign in (1, -1)
+    ),
+    *(math.inf, -math.inf, math.nan, True, None, "9" * 5000, [], [1, 2, 3], [0.1] * 10**5, {}, 1j),
+)
+
+
+@pytest.mark.parametrize(("owner", "name", "field"), FIELDS, ids=name_of)
+def test_an_extreme_value_is_refused_with_what_was_expected_or_within_bounds(owner, name, field):
+    low, high = bounds(field)
+    numeric = isinstance(field.default, (int, float, tuple)) and type(field.default) is not bool
+    assert not numeric or (low is not None and high is not None) or name == "kernel_width"
+    partners = {key: field.default for pair in owner.in_order if name in pair for key in pair}
+    for value in (*EXTREMES, *([entry] * 3 for entry in EXTREMES)):
+        text = ""
+        try:
+            taken = getattr(owner(**{**partners, name: value}), name)
+        except ConfigError as error:
+            taken, text = None, str(error)
+        if taken is None:
+            assert (value is None and not text) or re.match(
+                rf"{owner.__name__}\.\w+: expected \S", text
+            )
+            assert len(text) < 500
+        elif numeric:
+            entries = taken if isinstance(taken, tuple) else (taken,)
+            assert all(low <= entry <= (high or math.inf) for entry in entries)
+        else:
+            assert taken is value
+
+
+def test_in_small_places_values_are_scaled_only_as_far_as_their_bounds():
+    least = {"map": {"edge_voxel": 0.01, "plane_voxel": 0.015}, "matching.neighbours": 99}
+    small = Config().changed(least, "features.plane_voxel=0.0").of_small_places()
+    assert small.map.edge_voxel == small.map.plane_voxel == 0.01
+    assert small.matching.neighbours == 100
+    assert config_from_dict(config_to_dict(small)) == small
+    usual = Config().of_small_places()
+    assert (usual.map.edge_voxel, usual.matching.neighbours) == (0.1, 10)
 
 
 @pytest.mark.parametrize(

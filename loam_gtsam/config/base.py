@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
 
@@ -16,23 +17,28 @@ from ruamel.yaml.scalarbool import ScalarBoolean
 from loam_gtsam.types import ConfigError
 
 _LONGEST = 200  # characters of a value in an error message
-_LARGEST = (1 << 63) - 1
 _PAIR = "pair"
+_HIGHEST = {"m": 1e6, "degrees": 360.0}
+"""Upper bounds by unit: 1000 km, where single precision still resolves 6 cm, and one turn."""
+_NO_LIMIT = 1_000_000_000
+"""Upper bound of all else, which stands for "no limit": it fits into 32 bits as a count, into 63
+as nanoseconds of so many seconds, and its powers are far from infinity."""
 _EXPECTED = {
     "bool_type": "bool",
     "int_type": "int",
     "float_type": "float",
     "string_type": "str",
-    "finite_number": "a finite number",
     "greater_than_equal": "at least {ge}",
     "less_than_equal": "at most {le}",
     "model_type": "a mapping, for it is a section",
 }
 
-Count = Annotated[int, Ge(1), Le(_LARGEST)]
-"""An entry of a tuple: a whole number of at least 1."""
-Finite = Annotated[float, Field(allow_inf_nan=False)]
-"""An entry of a tuple: a finite number."""
+Count = Annotated[int, Ge(1), Le(10_000)]
+"""An entry of a tuple: a number of cubes, few enough that indices of cubes stay exact."""
+Angle = Annotated[float, Ge(-360.0), Le(360.0)]
+"""An entry of a tuple: degrees."""
+Offset = Annotated[float, Ge(-1000.0), Le(1000.0)]
+"""An entry of a tuple: metres on one vehicle."""
 
 
 def parameter(
@@ -43,11 +49,17 @@ def parameter(
     low: float | None = None,
     high: float | None = None,
 ) -> Any:
-    """A field of a section, which the string below it describes; its bounds are inclusive."""
+    """A field of a section, which the string below it describes; its bounds are inclusive.
+
+    A number without an upper bound of its own has that of its unit. Its own one is the size up to
+    which time and memory were measured to stay within reason.
+    """
+    if high is None and low is not None:
+        high = _HIGHEST.get(unit, _NO_LIMIT)
     return Field(
         default,
         ge=low,
-        le=_LARGEST if type(default) is int and high is None else high,
+        le=None if high == math.inf else high,
         strict=False if isinstance(default, tuple) else None,  # which takes lists, too
         json_schema_extra={"unit": unit, "source": source},
     )
@@ -110,8 +122,6 @@ class Section(BaseModel):
             return (key,), f"expected one of {', '.join(choices)}; got {given}{near}"
         if isinstance(field.default, tuple) and (len(error["loc"]) == 1 or kind == "missing"):
             return (key,), f"expected {len(choices)} values, got {given}"
-        if error.get("ctx", {}).get("le") == _LARGEST:
-            return (key,), "the number is too large"
         expected = _EXPECTED.get(kind, "a valid value").format(**error.get("ctx", {}))
         return (key,), f"expected {expected}, got {given}"
 
@@ -126,6 +136,15 @@ class Section(BaseModel):
     def changed(self, /, **values: Any) -> Self:
         """A copy with other values, as ``config.solver.changed(iterations=5)``."""
         return type(self)(**{**vars(self), **values})
+
+
+def clipped(section: Section, name: str, value: float) -> float:
+    """The value if it is within the bounds of that parameter, else the nearer bound."""
+    bounds: Any
+    for bounds in type(section).model_fields[name].metadata:
+        value = max(value, getattr(bounds, "ge", value))
+        value = min(value, getattr(bounds, "le", value))
+    return value
 
 
 def out_of_order(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
-from loam_gtsam.config.base import Count, Finite, Section, parameter
+from loam_gtsam.config.base import Angle, Count, Offset, Section, parameter
 
 
 class SensorConfig(Section):
@@ -27,7 +28,7 @@ class SensorConfig(Section):
     """The lidar rotates in this sense, seen from above; it is used for times from azimuths."""
     start_azimuth_deg: float = parameter(180.0, unit="degrees", low=-360.0, high=360.0)
     """A sweep starts at this azimuth, counted from x towards y."""
-    period: float = parameter(0.1, unit="s", low=1e-4)
+    period: float = parameter(0.1, unit="s", low=1e-4, high=1e3)
     """A sweep lasts this long; the duration is used for times from azimuths."""
     stamp: Literal["auto", "start", "middle", "end"] = parameter("auto")
     """The stamp of a sweep is this moment of it, for times from azimuths; auto takes what the
@@ -43,9 +44,9 @@ class FeatureConfig(Section):
 
     in_order = (("sharp_per_sector", "edges_per_sector"),)
 
-    sectors: int = parameter(6, source="LOAM", low=1)
+    sectors: int = parameter(6, source="LOAM", low=1, high=1000)
     """Every ring is divided into this many sectors, which each give their own features."""
-    half_window: int = parameter(5, source="LOAM", low=1)
+    half_window: int = parameter(5, source="LOAM", low=1, high=100)
     """The curvature at a point takes this many neighbours on either side of it in its ring."""
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
@@ -101,11 +102,11 @@ class OdometryConfig(Section):
 
     method: Literal["constant_velocity", "scan_to_scan"] = parameter("constant_velocity")
     """The predicted motion repeats the last one, or comes from scan-to-scan registration."""
-    iterations: int = parameter(25, source="LOAM", low=1)
+    iterations: int = parameter(25, source="LOAM", low=1, high=1000)
     """Scan-to-scan registration takes at most this many iterations."""
     max_distance: float = parameter(5.0, unit="m", source="LOAM", low=0)
     """Scan-to-scan registration matches no points farther apart than this."""
-    ring_gap: int = parameter(2, source="LOAM", low=1)
+    ring_gap: int = parameter(2, source="LOAM", low=1, high=1000)
     """Scan-to-scan registration searches this many rings above and below the ring of a match."""
 
 
@@ -154,7 +155,7 @@ class RelocalizationConfig(Section):
     enabled: bool = parameter(True, source="LOAM believes every solve")
     """Every sweep is tested, and is lost if it fits the map less well than the sweeps before it;
     false believes every solve."""
-    memory: int = parameter(10, low=1)
+    memory: int = parameter(10, low=1, high=10_000)
     """The usual shares are medians over this many earlier sweeps; no sweep is lost before them."""
     min_agreement: float = parameter(
         0.8, source="0.88 or more is usual, at most 0.75 when kidnapped", low=0.0, high=1.0
@@ -176,7 +177,7 @@ class RelocalizationConfig(Section):
     max_turn_acceleration: float = parameter(60.0, unit="rad/s^2", low=0.0)
     """A pose is a jump as well if its rotation differs from the predicted one by more than this
     angular acceleration explains."""
-    radius: float = parameter(10.0, unit="m", low=0.0)
+    radius: float = parameter(10.0, unit="m", low=0.0, high=100.0)
     """The search begins within this radius about the predicted pose."""
     radius_growth: float = parameter(1.0, unit="m", low=0.0)
     """The radius of the search grows by this with every lost sweep."""
@@ -198,11 +199,11 @@ class MatchingConfig(Section):
     lost sweep and for a loop closure."""
     trial_planes: int = parameter(500, low=1)
     """At most this many plane features are matched where many poses are tried."""
-    neighbours: int = parameter(5, source="LOAM", low=3)
+    neighbours: int = parameter(5, source="LOAM", low=3, high=100)
     """A line or plane is fitted to this many map points nearest to a feature."""
-    max_distance: float = parameter(1.0, unit="m", source="LOAM", low=0.0)
+    max_distance: float = parameter(1.0, unit="m", source="LOAM", low=0.01)
     """A feature is matched only if its nearest map points are all within this distance."""
-    wide_search: float = parameter(4.0, source="LOAM has no such search", low=1.0)
+    wide_search: float = parameter(4.0, source="LOAM has no such search", low=1.0, high=100.0)
     """While the map is thin, and fewer than half of the plane features have planes near by, the
     others are matched with planes within this times max_distance, among voxels enlarged by this
     factor: at the start the rings of a sweep are too far apart. 1 turns the search off."""
@@ -253,9 +254,9 @@ class SolverConfig(Section):
     method: Literal["gtsam", "loam", "aloam"] = parameter("gtsam")
     """The pose is solved by a factor graph (gtsam), by LOAM's Gauss-Newton on Euler angles (loam),
     or by A-LOAM's robust Levenberg-Marquardt (aloam)."""
-    iterations: int = parameter(20, source="LOAM uses 10", low=1)
+    iterations: int = parameter(20, source="LOAM uses 10", low=1, high=1000)
     """A solve associates the features with the map at most this many times."""
-    inner_iterations: int = parameter(2, source="A-LOAM uses 4", low=1)
+    inner_iterations: int = parameter(2, source="A-LOAM uses 4", low=1, high=1000)
     """After each association, Levenberg-Marquardt takes at most this many iterations."""
     rotation_tolerance_deg: float = parameter(0.05, unit="degrees", source="LOAM", low=0.0)
     """The solve stops when an association turns the pose by less than this and moves it by less
@@ -266,7 +267,9 @@ class SolverConfig(Section):
     kernel: Literal["huber", "geman_mcclure"] = parameter("geman_mcclure")
     """The method gtsam has this robust kernel on the matches; geman_mcclure all but ignores matches
     that are far off, for traffic and crowds."""
-    kernel_width: float = parameter(1.345, source="95 % efficiency on normal noise", low=0.1)
+    kernel_width: float = parameter(
+        1.345, source="95 % efficiency on normal noise", low=0.1, high=math.inf
+    )
     """The Huber kernel on the matches has this width, in units of their scatter; .inf turns it off.
     The Geman-McClure kernel is 2.816 times as wide, which makes the two alike on normal noise."""
     step_sigmas: float = parameter(0.5, low=0.0)
@@ -318,7 +321,7 @@ class CovarianceConfig(Section):
     """A cell of this size is new ground when it is matched for the first time."""
     drift: float = parameter(6.0, source="fitted, see docs/consistency.md", low=0.0)
     """The error of the map grows by this times the share of new ground in a frame's covariance."""
-    window: int = parameter(10, low=1)
+    window: int = parameter(10, low=1, high=10_000)
     """The acceleration that constant velocity misses is averaged over this many frames."""
 
 
@@ -343,23 +346,23 @@ class ImuConfig(Section):
     used by sigma, and by equivalent where the scan or the angles allow no equivalent factor."""
     level: bool = parameter(True)
     """The z axis of the map points up from the start; false takes the frame of the first pose."""
-    still_seconds: float = parameter(0.5, unit="s", low=0.0)
+    still_seconds: float = parameter(0.5, unit="s", low=0.0, high=60.0)
     """The platform may be at rest for this long before the first sweep; that window is examined."""
     average_seconds: float = parameter(
-        0.1, unit="s", source="the period of a sweep; LOAM uses 0", low=0.0
+        0.1, unit="s", source="the period of a sweep; LOAM uses 0", low=0.0, high=60.0
     )
     """Roll and pitch of a frame are the mean over this duration, brought to the moment of the frame
     by the gyro; 0 takes those of the moment itself."""
-    max_gap: float = parameter(0.1, unit="s", low=1e-3)
+    max_gap: float = parameter(0.1, unit="s", low=1e-3, high=60.0)
     """A gap between samples that is longer than this is not bridged."""
-    lidar_R_imu_deg: tuple[Finite, Finite, Finite] = parameter((0.0, 0.0, 0.0), unit="degrees")
+    lidar_R_imu_deg: tuple[Angle, Angle, Angle] = parameter((0.0, 0.0, 0.0), unit="degrees")
     """These are roll, pitch and yaw of the rotation Rz Ry Rx that takes vectors from the frame of
     the IMU into the frame of the lidar."""
-    lidar_t_imu: tuple[Finite, Finite, Finite] = parameter((0.0, 0.0, 0.0), unit="m")
+    lidar_t_imu: tuple[Offset, Offset, Offset] = parameter((0.0, 0.0, 0.0), unit="m")
     """The IMU has this position in the frame of the lidar; the tight coupling uses it."""
     filter_seconds: float = parameter(60.0, unit="s", low=0.1)
     """The attitude filter, which replaces a missing orientation, has this time constant."""
-    lag: int = parameter(20, low=2)
+    lag: int = parameter(20, low=2, high=1000)
     """The graph of the tight coupling keeps this many frames."""
     gravity: float = parameter(9.81, unit="m/s^2", low=0.0)
     """The gravitational acceleration has this magnitude at the place of the recording."""
@@ -389,9 +392,11 @@ class PoseGraphConfig(Section):
     max_chi2: float = parameter(40.0, source="one of 10,000 right loops exceeds 28", low=0.0)
     """A loop closure is used if its squared Mahalanobis distance (6 degrees of freedom) from what
     all the others say is not above this."""
-    kernel_width: float = parameter(5.0, source="right loops have a norm of sqrt(6)", low=0.1)
+    kernel_width: float = parameter(
+        5.0, source="right loops have a norm of sqrt(6)", low=0.1, high=math.inf
+    )
     """In iSAM2 a loop closure has a Huber kernel, this wide after whitening; .inf turns it off."""
-    believed_loops: int = parameter(6, low=2)
+    believed_loops: int = parameter(6, low=2, high=1000)
     """At least this many loop closures that agree pairwise are used even against the odometry."""
     follow_distance: float = parameter(0.05, unit="m", low=0.0)
     """Map points follow their keyframe once a loop closure has moved it by more than this as seen
@@ -415,19 +420,19 @@ class LoopConfig(Section):
     gate_drift: float = parameter(0.02, low=0.0)
     """The third part of the gate is this share of the distance travelled between the two keyframes,
     for drift that the covariances do not know."""
-    rings: int = parameter(20, source="Scan Context", low=1)
+    rings: int = parameter(20, source="Scan Context", low=1, high=200)
     """The place descriptor has this many rings."""
-    sectors: int = parameter(60, source="Scan Context", low=4)
+    sectors: int = parameter(60, source="Scan Context", low=4, high=360)
     """The place descriptor has this many sectors."""
     reach: float = parameter(60.0, unit="m", source="Scan Context uses 80", low=1.0)
     """The place descriptor covers points up to this range."""
     max_unlike: float = parameter(0.6, source="Scan Context uses 0.2 to 0.6", low=0.0)
     """A candidate is tried if the distance of the two place descriptors is not above this."""
-    tries: int = parameter(2, low=1)
+    tries: int = parameter(2, low=1, high=100)
     """At most this many candidates are verified for a keyframe."""
-    neighbours: int = parameter(6, low=0)
+    neighbours: int = parameter(6, low=0, high=1000)
     """The submap of a candidate has its features and those of so many keyframes on either side."""
-    search: float = parameter(8.0, unit="m", low=1.0)
+    search: float = parameter(8.0, unit="m", low=1.0, high=100.0)
     """The keyframe is searched for within this radius about the candidate."""
     min_share: float = parameter(0.5, low=0.0, high=1.0)
     """At least this share of the features off level ground must have a match in the submap."""
@@ -455,13 +460,13 @@ class BagConfig(Section):
 class LiveConfig(Section):
     """The queues of a live run, in which sweeps wait, and which of them are dropped."""
 
-    queue: int = parameter(20, low=1)
+    queue: int = parameter(20, low=1, high=10_000)
     """At most this many sweeps wait while another one is mapped; when_full applies to any more."""
     when_full: Literal["drop_oldest", "keep_newest", "never"] = parameter("drop_oldest")
     """Room for a new sweep is made in this way: the sweep that has waited longest is dropped, or
     all waiting sweeps are dropped, or none is dropped and the queue grows."""
-    imu_queue: int = parameter(20_000, low=1)
+    imu_queue: int = parameter(20_000, low=1, high=10_000_000)
     """At most this many IMU samples wait for the next sweep; the oldest are dropped first."""
-    imu_wait: float = parameter(0.2, unit="s", low=0.0)
+    imu_wait: float = parameter(0.2, unit="s", low=0.0, high=60.0)
     """A sweep waits for the IMU samples up to its end, but not longer than this after it was
     received; until the map is levelled, it waits imu.still_seconds more."""

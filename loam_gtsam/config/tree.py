@@ -13,7 +13,16 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from loam_gtsam.config import sections
-from loam_gtsam.config.base import Section, meaning, nearest, nested, out_of_order, override, shown
+from loam_gtsam.config.base import (
+    Section,
+    clipped,
+    meaning,
+    nearest,
+    nested,
+    out_of_order,
+    override,
+    shown,
+)
 from loam_gtsam.types import ConfigError
 
 
@@ -74,22 +83,25 @@ class Config(Section):
         Steps, door frames and furniture are smaller than the voxels of a street. With half of
         the spacing, twice as many neighbours fix a normal as well as before.
         """
-        matching = self.matching.model_copy(
-            update={"neighbours": round(self.matching.neighbours / SMALL)}
-        )
         return self.model_copy(
             update={
-                "features": _scaled(self.features, "plane_voxel"),
-                "map": _scaled(self.map, "edge_voxel", "plane_voxel"),
-                "matching": matching,
-                "covariance": _scaled(self.covariance, "ground_cell"),
+                "features": _scaled(self.features, SMALL, "plane_voxel"),
+                "map": _scaled(self.map, SMALL, "edge_voxel", "plane_voxel"),
+                "matching": _scaled(self.matching, 1.0 / SMALL, "neighbours"),
+                "covariance": _scaled(self.covariance, SMALL, "ground_cell"),
             }
         )
 
 
-def _scaled(section: Section, *names: str) -> Section:
-    """The section with these lengths as they are in small places."""
-    return section.model_copy(update={name: SMALL * getattr(section, name) for name in names})
+def _scaled(section: Section, factor: float, *names: str) -> Section:
+    """The section with these parameters times a factor, as far as their bounds let them."""
+    values = {name: getattr(section, name) for name in names}
+    return section.model_copy(
+        update={
+            name: type(value)(clipped(section, name, factor * value))
+            for name, value in values.items()
+        }
+    )
 
 
 SMALL = 0.5

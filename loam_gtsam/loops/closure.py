@@ -187,7 +187,8 @@ class ScanLoopCloser:
         config = self.config
         if len(keyframe.edges) + len(keyframe.planes) == 0:
             return Rejection.NO_FEATURES
-        travelled = keyframe.travelled - np.array([other.travelled for other in history.keyframes])
+        before = history.keyframes[: max(keyframe.index - 1, 0)]  # neighbours are no loop
+        travelled = keyframe.travelled - np.array([other.travelled for other in before])
         old = np.flatnonzero(travelled >= config.min_way)
         if len(old) == 0:
             return Rejection.TOO_RECENT

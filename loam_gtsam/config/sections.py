@@ -364,7 +364,7 @@ class ImuConfig(Section):
     """The attitude filter, which replaces a missing orientation, has this time constant."""
     lag: int = parameter(20, low=2, high=1000)
     """The graph of the tight coupling keeps this many frames."""
-    gravity: float = parameter(9.81, unit="m/s^2", low=0.0)
+    gravity: float = parameter(9.81, unit="m/s^2", low=1.5, high=100.0)
     """The gravitational acceleration has this magnitude at the place of the recording."""
     gyro_noise: float = parameter(2e-4, unit="rad/s/sqrt(Hz)", low=1e-9)
     """The white noise of the gyro has this density."""

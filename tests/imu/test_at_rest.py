@@ -78,7 +78,7 @@ def test_still_window_gives_bias_gravity_and_orientation():
     assert np.allclose(window.acceleration, truth.inv().apply([0, 0, G]), atol=0.02)
     assert angle(window.world_R_lidar, truth) < 1e-3
     assert window.disagreement < 2e-3
-    without = ImuBuffer(CONFIG.changed(gravity=0.0), samples)
+    without = ImuBuffer(CONFIG.changed(gravity=1.5), samples)
     assert without.rest_at(int(ns(0.6))) is None
     assert ImuBuffer(CONFIG, moving()).rest_at(int(ns(1.0))) is None
     # 0.1 s of rest before and the first sweep are enough.

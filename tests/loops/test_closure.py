@@ -204,6 +204,18 @@ def test_where_not_to_look():
     assert reasons(settings(**tight | {"gate_drift": 1.0}))[Rejection.OUT_OF_REACH] == 0
 
 
+def test_a_keyframe_is_no_loop_with_itself_or_the_one_before():
+    config, rng = settings(min_way=0.0, gate=50.0), np.random.default_rng(0)
+    graph, closer = PoseGraph(config), ScanLoopCloser(config)
+    poses = [gtsam.Pose3(gtsam.Rot3(), np.array([5.0 * k, 0, 0])) for k in range(3)]
+    for number, (pose, update) in enumerate(zip(poses, updates(poses), strict=True)):
+        keyframe = graph.add(update, World(1).seen(pose, update.stamp, rng))
+        loop = closer.detect(keyframe, graph)
+        assert loop is None or (loop.earlier, loop.later) == (0, 2)
+        assert closer.statistics.rejected[Rejection.TOO_RECENT] == min(number + 1, 2)
+    assert closer.statistics.candidates == 1
+
+
 def test_what_loops_have_tied_is_looked_for_less_far():
     """The drift that nobody knows grows with the way from the last loop, not from the start."""
     graph = PoseGraph(settings())

@@ -129,7 +129,9 @@ def _table(
         cells = row.split(separator)
         try:
             numbers = [float(cells[1 + column]) for column in order]
-            stamps.append(int(cells[0]) if nanoseconds else tables.seconds_to_ns(cells[0]))
+            stamps.append(
+                tables.whole_number(cells[0]) if nanoseconds else tables.seconds_to_ns(cells[0])
+            )
             poses.append(_pose(numbers))
         except (ValueError, IndexError) as error:
             raise DatasetError(

@@ -13,10 +13,11 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from loam_gtsam.datasets.decode.tables import whole_number
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import is_pose, pose_key, pose_number
-from loam_gtsam.types import DatasetError, FloatArray, InputError, OutputError
+from loam_gtsam.types import MAX_STAMP, DatasetError, FloatArray, InputError, OutputError
 
 G2O_SUFFIX, GTSAM_SUFFIXES = ".g2o", (".graph", ".values", ".stamps")
 """Suffixes of the files; GTSAM's format takes three files side by side."""
@@ -108,7 +109,7 @@ def _read_g2o(path: Path) -> SavedGraph:
         where = f"{path}:{number}"
         tag, *fields = line.split() or ("#",)
         if line.startswith(_STAMP) and len(fields) == 3:
-            stamps[_key(fields[1], where)] = _integer(fields[2], where)
+            stamps[_key(fields[1], where)] = _integer(fields[2], where, MAX_STAMP)
         if tag.startswith("#"):
             continue
         if tag not in _NUMBERS:
@@ -169,16 +170,17 @@ def _information(upper: FloatArray, where: str) -> FloatArray:
     return swapped
 
 
-def _integer(word: str, where: str) -> int:
+def _integer(word: str, where: str, most: int) -> int:
     try:
-        return int(word)
+        return whole_number(word, most=most)
     except ValueError:
-        raise DatasetError(f"{where}: expected a whole number, got {word[:40]!r}") from None
+        expected = f"expected a whole number of at most {most}"
+        raise DatasetError(f"{where}: {expected}, got {word[:40]!r}") from None
 
 
 def _key(word: str, where: str) -> int:
-    number = _integer(word, where)
-    if not 0 <= number < 1 << 63:
+    number = _integer(word, where, (1 << 63) - 1)
+    if number < 0:
         raise DatasetError(f"{where}: expected a number of a pose from 0 on, got {number}")
     return _key_of(number)
 
@@ -250,7 +252,7 @@ def _read_gtsam(path: Path) -> SavedGraph:
             words, where = line.split(), f"{part}:{number}"
             if len(words) != 2:
                 raise DatasetError(f"{where}: expected a key and a stamp, got {line[:80]!r}")
-            stamps[_key(words[0], where)] = _integer(words[1], where)
+            stamps[_key(words[0], where)] = _integer(words[1], where, MAX_STAMP)
     return SavedGraph(graph, poses, stamps)
 
 

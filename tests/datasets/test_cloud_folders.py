@@ -98,6 +98,9 @@ def test_four_columns_stay_four(tmp_path):
 def test_names_of_nuscenes_are_stamps(tmp_path):
     five(tmp_path, "n015-2018-07-24__LIDAR_TOP__1532402927647951.pcd.bin")
     assert KittiDataset(tmp_path).stamps.tolist() == [1532402927647951000]
+    five(tmp_path, f"n015-2018-07-24__LIDAR_TOP__{'9' * 16}.pcd.bin")  # times 1000 beyond 64 bits
+    with pytest.raises(DatasetError, match="expected microseconds in names of files: out of range"):
+        KittiDataset(tmp_path)
 
 
 @pytest.mark.parametrize(("below", "offset"), [("velodyne", ELEVATION_DEG), ("", 0.0)])

@@ -82,11 +82,14 @@ def test_mulran_says_what_is_missing_or_broken(tmp_path: Path) -> None:
     files[0].write_bytes(files[0].read_bytes()[: 30_000 * 16])
     files[1].write_bytes(files[1].read_bytes()[:-3])
     files[2].unlink()
+    with (root / "data_stamp.csv").open("a") as listing:
+        listing.writelines(f"{stamp},ouster\n" for stamp in ("9" * 5011, 2**63, "abc"))
     dataset = open_dataset(root)
     first, second = dataset
     assert "30000 points, expected 1024 firings of 64 = 65536" in first.message
     assert "1048573 bytes is not a multiple of 16 (x, y, z, intensity)" in second.message
     problems = " ".join(dataset.info().problems)
+    assert "data_stamp.csv: 3 rows of ouster without a valid stamp" in problems
     assert f"data_stamp.csv lists 1 sweeps without a file, the first {STAMPS[2]}" in problems
     (root / "Ouster" / "front.bin").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"front.bin: expected a name that is the stamp"):

@@ -3,13 +3,53 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
-from loam_gtsam.datasets.decode.tables import clean_imu, seconds_to_ns
+from loam_gtsam.datasets.decode.tables import clean_imu, read_table, seconds_to_ns, whole_number
+from loam_gtsam.datasets.truth import read_truth
+from loam_gtsam.types import DatasetError
 
 
 def test_stamps_keep_every_nanosecond() -> None:
     assert seconds_to_ns("1700000000.123456789") == 1_700_000_000_123_456_789
     assert seconds_to_ns("1e-9") == 1
+
+
+WRONG = ["9" * 5011, str(2**63), "-9" + "0" * 18, "1e5", "1_0", chr(0x0661), "nan", "", "+", "1 2"]
+
+
+@pytest.mark.parametrize("text", WRONG, ids=lambda text: text[:9])
+def test_what_is_no_stamp_is_refused_shortly(text, tmp_path) -> None:
+    with pytest.raises(ValueError, match=r"^(not a whole number|out of range): '") as caught:
+        whole_number(text)
+    assert len(str(caught.value)) < 80
+    table = tmp_path / "some.csv"
+    for cells, columns in (
+        (text, "ns x"),
+        (f"{text},0", "secs nsecs x"),
+        (f"1,{text}", "secs nsecs x"),
+    ):
+        table.write_text(f"{cells},0.5")
+        with pytest.raises(DatasetError, match=r"some\.csv:1: "):
+            read_table(table, columns, ",")
+    table.write_text(f"1700000000000000000,0,0,0,1,0,0,0\n{text},0,0,0,1,0,0,0")
+    if text[:1] in tuple("+-0123456789"):  # else it is a headline
+        with pytest.raises(DatasetError, match=r"some\.csv: "):
+            read_truth(table)
+
+
+def test_whole_numbers_up_to_the_limit() -> None:
+    assert whole_number(f" -{2**62} ") == -(2**62)
+    assert whole_number("+0012", 1000, 12_000) == 12_000
+    with pytest.raises(ValueError, match="out of range"):
+        whole_number("13", 1000, 12_000)
+
+
+@pytest.mark.parametrize("text", ["1" * 5011, "1e400", "-1e30"])
+def test_what_is_no_time_in_seconds_is_refused_shortly(text) -> None:
+    with pytest.raises(ValueError, match=r"^(not a time in seconds|out of range): '") as caught:
+        seconds_to_ns(text)
+    assert len(str(caught.value)) < 80
 
 
 def imu_values(count: int) -> np.ndarray:

@@ -110,7 +110,12 @@ EDGE = f"EDGE_SE3:QUAT 0 1 1 0 0 0 0 0 1 {EYE}\n"
         (POSES + EDGE.replace("0 1 1", "0 0 1"), ":3: expected a motion between two poses"),
         (POSES + EDGE.replace(EYE, "-" + EYE), ":3: expected a positive definite information"),
         (POSES + EDGE.replace("0 0 0 1", "0 0 0 2", 1), ":3: expected a quaternion of length 1"),
-        (POSES + EDGE.replace("0 1 1", "0 1.5 1"), ":3: expected a whole number, got '1.5'"),
+        (
+            POSES + EDGE.replace("0 1 1", "0 1.5 1"),
+            ":3: expected a whole number of at most 9223372036854775807, got '1.5'",
+        ),
+        (POSES + EDGE.replace("0 1 1", f"0 {'9' * 5011} 1"), f"got '{'9' * 40}'"),
+        (POSES + f"# stamp_ns 0 {2**62 + 1}", "a whole number of at most 4611686018427387904"),
         (POSES + EDGE.replace("0 1 1", "0 -1 1"), ":3: expected a number of a pose from 0 on"),
         (POSES + EDGE.replace(EYE, EYE.replace("1", "nan")), ":3: expected finite numbers"),
         (POSES + EDGE.replace(EYE, EYE.replace("1", "x")), ":3: could not convert"),

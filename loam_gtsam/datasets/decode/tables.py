@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -28,19 +29,37 @@ _ABSURD = 1e6  # rad/s and m/s^2 that no IMU measures
 UNIT_TOLERANCE = 0.1
 """Limit by which the length of a quaternion may differ from one for it to be an orientation."""
 
+_WHOLE = re.compile(r"[+-]?[0-9]+")
+_LONGEST = 40  # characters of a number: of any stamp, with zeros before it
+
 _Row = TypeVar("_Row")
+
+
+def whole_number(text: str, unit: int = 1, most: int = MAX_STAMP) -> int:
+    """Decimal digits as so many ``unit``; a ValueError unless it is within ``most`` of zero."""
+    word = text.strip()
+    if not _WHOLE.fullmatch(word):
+        raise ValueError(f"not a whole number: {_shown(word)}")
+    if len(word) > _LONGEST or abs(number := int(word) * unit) > most:
+        raise ValueError(f"out of range: {_shown(word)}")
+    return number
 
 
 def seconds_to_ns(text: str) -> int:
     """Decimal seconds as integer nanoseconds; no detour over binary floating point."""
+    word = text.strip()
     try:
-        nanoseconds = Decimal(text.strip()) * 10**9
+        nanoseconds = Decimal(word) * 10**9
         # before it becomes an integer, which may have a million digits
         if not abs(nanoseconds) <= MAX_STAMP:
-            raise ValueError(f"out of range: {text.strip()!r}")
+            raise ValueError(f"out of range: {_shown(word)}")
         return int(nanoseconds.to_integral_value())
     except ArithmeticError as error:
-        raise ValueError(f"not a time in seconds: {text.strip()!r}") from error
+        raise ValueError(f"not a time in seconds: {_shown(word)}") from error
+
+
+def _shown(word: str) -> str:
+    return repr(word if len(word) <= _LONGEST else f"{word[:_LONGEST]}...")
 
 
 def read_lines(path: Path) -> list[str]:
@@ -144,10 +163,9 @@ def _read_rows(
 def _stamp(clock: str, cells: list[str]) -> int:
     if clock == "t":
         return seconds_to_ns(cells[0])
-    nanoseconds = int(cells[0]) if clock == "ns" else int(cells[0]) * 10**9 + int(cells[1])
-    if abs(nanoseconds) > MAX_STAMP:
-        raise ValueError(f"out of range: {cells[0].strip()!r}")
-    return nanoseconds
+    if clock == "ns":
+        return whole_number(cells[0])
+    return whole_number(str(whole_number(cells[0], 10**9) + whole_number(cells[1])))
 
 
 def sorted_trajectory(

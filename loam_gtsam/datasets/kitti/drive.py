@@ -19,7 +19,7 @@ from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.point_times import SWEEP_SECONDS
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.geometry import inverse_pose
-from loam_gtsam.types import MAX_STAMP, DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
+from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
 _RAW = "velodyne_points"
 _EARTH_RADIUS = 6378137.0  # metres, as in the development kit
@@ -38,11 +38,17 @@ def sweep_stamps(root: Path, files: Sequence[Path], problems: list[str]) -> IntA
     if path.is_file():
         stamps = tables.read_stamps(path)
     elif all(names):  # nuScenes: microseconds
-        stamps = np.array([int(name[1]) for name in names if name], np.int64) * 1000
+        try:
+            listed = [tables.whole_number(name[1], 1000) for name in names if name]
+        except ValueError as error:
+            raise DatasetError(
+                f"{root}: expected microseconds in names of files: {error}"
+            ) from error
+        stamps = np.array(listed, np.int64)
     elif raw.is_file():
-        path, listed = raw, read_dates(raw)
-        stamps = _of_files(listed, files)
-        if missing := len(listed) - len(stamps):
+        path, dates = raw, read_dates(raw)
+        stamps = _of_files(dates, files)
+        if missing := len(dates) - len(stamps):
             problems.append(f"{missing} sweeps of {path.name} have no file")
     else:
         problems.append("no times.txt: 10 Hz assumed")
@@ -78,10 +84,10 @@ def read_dates(path: Path) -> IntArray:
     def nanoseconds(line: str) -> int:
         date, _, fraction = line.partition(".")
         moment = datetime.strptime(date, "%Y-%m-%d %H:%M:%S").replace(tzinfo=UTC)
-        stamp = int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}"[:9])
-        if abs(stamp) > MAX_STAMP:
-            raise ValueError("out of range")
-        return stamp
+        if fraction.strip("0123456789"):
+            raise ValueError(f"not a fraction of a second: {fraction[:20]!r}")
+        seconds = tables.whole_number(str(int(moment.timestamp())), 10**9)
+        return tables.whole_number(str(seconds + int(f"{fraction:0<9}"[:9])))
 
     return np.array(tables.convert_lines(path, nanoseconds, "a date and time"), dtype=np.int64)
 

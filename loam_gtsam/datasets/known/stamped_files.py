@@ -128,12 +128,19 @@ class StampedFiles(SweepFiles):
         return tables.read_poses(path, self._problems)
 
     def _look_for_missing(self, listing: Path | None, sensor: str) -> None:
-        """A problem if a list of ``stamp,sensor`` rows names sweeps that have no file."""
+        """A problem if a list of ``stamp,sensor`` rows names sweeps without a file, or no stamp."""
         if listing is None:
             return
         rows = [line.partition(",") for line in tables.read_lines(listing)]
-        own = [stamp.strip() for stamp, _, name in rows if name.strip() == sensor]
-        listed = [int(stamp) for stamp in own if stamp.isdecimal()]
+        listed, wrong = [], 0
+        for stamp, _, name in rows:
+            if name.strip() == sensor:
+                try:
+                    listed.append(tables.whole_number(stamp))
+                except ValueError:
+                    wrong += 1
+        if wrong:
+            self._problems.append(f"{listing.name}: {wrong} rows of {sensor} without a valid stamp")
         missing = np.setdiff1d(np.array(listed, np.int64), self.stamps)
         if len(missing):
             self._problems.append(

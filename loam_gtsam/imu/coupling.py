@@ -7,6 +7,7 @@ import numpy as np
 from scipy.stats import chi2, norm
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.preintegration import Fused, InertialOdometry, Prediction
@@ -15,11 +16,26 @@ from loam_gtsam.types import FloatArray, ImuSamples, SweepError
 _FORCE = 0.2, 3.0
 """Least and largest mean specific force over a sweep, in multiples of gravity. Less is free fall,
 an accelerometer without gravity or in other units; more is beyond any vehicle, or a fault."""
+_FASTEST = 20.0  # m/s: standard deviation of a speed that nothing told
 _UNLIKELY = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 """Squared Mahalanobis distance from which a pose contradicts its prediction: as unlikely as five
 standard deviations."""
 _OUTWEIGHS = 5  # frames that agree and one that contradicts: the one after it knows no velocity
 _DISTRUST = 3 * _OUTWEIGHS  # from which, less agreements, the accelerometer is not used
+
+
+def _spread(map_T_lidar: gtsam.Pose3, information: FloatArray, seconds: float) -> FloatArray:
+    """Covariance (3, 3) of the velocity between two poses, map frame; any speed where none is seen.
+
+    ``information`` (6, 6) is of the second pose; the first one is taken to be as good.
+    """
+    turns = np.linalg.pinv(information[:3, :3], hermitian=True)
+    shifts = information[3:, 3:] - information[3:, :3] @ turns @ information[:3, 3:]
+    told = 0.5 * seconds**2 * symmetric(shifts)
+    rotation = map_T_lidar.rotation().matrix()
+    covariance = np.linalg.inv(told + np.eye(3) / _FASTEST**2)
+    spread: FloatArray = rotation @ covariance @ rotation.T
+    return spread
 
 
 class TightCoupling:
@@ -106,12 +122,14 @@ class TightCoupling:
                 count = self._contradictions + (-1 if agree else _OUTWEIGHS)
                 self._contradictions = min(max(count, 0), 2 * _DISTRUST)
                 return fused if agree and self.trusted else None
-            velocity = (pose.translation() - last[1].translation()) / ((stamp - last[0]) * 1e-9)
+            seconds = (stamp - last[0]) * 1e-9
+            velocity = (pose.translation() - last[1].translation()) / seconds
+            spread = _spread(pose, information, seconds)
             if self._odometry is not None:
-                self._odometry.restart(stamp, pose, velocity)
+                self._odometry.restart(stamp, pose, velocity, spread)
             else:
                 self._odometry = InertialOdometry(
-                    self.config, gravity, stamp, pose, velocity, gyro_bias
+                    self.config, gravity, stamp, pose, velocity, gyro_bias, spread=spread
                 )
         except SweepError:  # no window can begin here: with the next frame, then
             self._odometry = None

@@ -115,6 +115,7 @@ class InertialOdometry:
     velocity : (3,) m/s of the lidar, map frame
     gyro_bias : (3,) rad/s, to be taken off the samples
     sigmas : of these
+    spread : (3, 3) covariance of the velocity, map frame, on top of that in ``sigmas``
 
     Attributes
     ----------
@@ -137,6 +138,7 @@ class InertialOdometry:
         velocity: FloatArray,
         gyro_bias: FloatArray,
         sigmas: StartSigmas | None = None,
+        spread: FloatArray | None = None,
     ) -> None:
         self.config, self._sigmas = config, sigmas or StartSigmas()
         sigmas = self._sigmas
@@ -155,7 +157,7 @@ class InertialOdometry:
         covariance[GRAVITY, GRAVITY] = _MAGNITUDE_SIGMA**2 * along + across
         bias, still = as_vector(gyro_bias, "gyro_bias"), np.zeros(3)
         state = InertialState(stamp, gtsam.Pose3(), still, still, bias, gravity, covariance)
-        self._start_at(state, map_T_lidar, velocity)
+        self._start_at(state, map_T_lidar, velocity, spread)
 
     def predict(self, stamp: int, samples: ImuSamples) -> Prediction:
         """Pose at ``stamp``, nanoseconds, from the newest frame and the samples since, lidar axes.
@@ -239,7 +241,13 @@ class InertialOdometry:
         pose, velocity = self._of_lidar(self.state, frame.rate)
         return Fused(pose, velocity, own, across, self.state.gyro_bias)
 
-    def restart(self, stamp: int, map_T_lidar: gtsam.Pose3, velocity: FloatArray) -> None:
+    def restart(
+        self,
+        stamp: int,
+        map_T_lidar: gtsam.Pose3,
+        velocity: FloatArray,
+        spread: FloatArray | None = None,
+    ) -> None:
         """Begin a new window at a known pose, e.g. after a gap in the IMU data.
 
         Biases and gravity stay; what the biases may have walked since is added to their variance.
@@ -252,17 +260,24 @@ class InertialOdometry:
         covariance = self.state.covariance.copy()
         covariance[BIASES, BIASES] += np.diag(np.square(walks)) * seconds
         state = replace(self.state, stamp=stamp, covariance=covariance)
-        self._start_at(state, map_T_lidar, velocity)
+        self._start_at(state, map_T_lidar, velocity, spread)
 
     def _start_at(
-        self, state: InertialState, map_T_lidar: gtsam.Pose3, velocity: FloatArray
+        self,
+        state: InertialState,
+        map_T_lidar: gtsam.Pose3,
+        velocity: FloatArray,
+        spread: FloatArray | None,
     ) -> None:
         """Begin a window at a pose of the lidar, with stamp, biases and gravity of ``state``."""
         from_lidar = np.linalg.inv(self._to_lidar)
         known = from_lidar * np.repeat(np.square(self._sigmas.pose), 3) @ from_lidar.T
         map_T_imu = map_T_lidar.compose(self._lidar_T_imu)
         state = replace(state, map_T_imu=map_T_imu, velocity=as_vector(velocity, "velocity"))
-        self._start(_uncorrelated(state, known, self._sigmas.velocity**2 * np.eye(3)))
+        of_velocity = self._sigmas.velocity**2 * np.eye(3)
+        if spread is not None:
+            of_velocity += as_array(spread, "spread", (3, 3))
+        self._start(_uncorrelated(state, known, of_velocity))
 
     def _start(self, state: InertialState, restarts: int = 0) -> None:
         self.restarts += restarts

@@ -186,6 +186,18 @@ def test_a_rejected_prediction_is_not_fused():
     assert coupling.observe(last, now, np.eye(6), DOWN, np.zeros(3)) is None
 
 
+def test_a_speed_along_which_no_scan_sees_may_be_any():
+    """The window begins with the second frame: blind along x of a lidar that faces along y."""
+    turned = gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2.0), np.zeros(3))
+    information = np.diag([1e6] * 3 + [0.0, 1e4, 1e4])
+    coupling, data = TightCoupling(ImuConfig()), resting()
+    last, now = ((NOW + k * FRAME, turned) for k in (0, 1))
+    coupling.observe(last, now, information, DOWN, np.zeros(3))
+    predicted = coupling.predict(NOW + 2 * FRAME, data)
+    body = turned.rotation().matrix().T @ predicted.across[:, 3:] / 0.1  # along the lidar's axes
+    np.testing.assert_allclose(np.diag(body), [20.0**2, 0.27, 0.27], rtol=0.1)
+
+
 def test_the_velocity_of_a_pose_follows_from_how_far_it_is_from_the_expected_one():
     """Right after the start the velocity is hardly known; later a pose changes it little."""
     odometry = InertialOdometry(ImuConfig(), DOWN, NOW, gtsam.Pose3(), np.zeros(3), np.zeros(3))

@@ -38,6 +38,14 @@ def test_what_is_no_stamp_is_refused_shortly(text, tmp_path) -> None:
             read_truth(table)
 
 
+@pytest.mark.parametrize("text", ["nan", "-inf", "1e400", "1e308", "-1e200"])
+def test_a_number_of_which_the_square_is_infinite_is_refused(text, tmp_path) -> None:
+    table = tmp_path / "some.csv"
+    table.write_text(f"1,1e99\n2,{text}")
+    with pytest.raises(DatasetError, match=r"some\.csv:2: .*NaN or infinity"):
+        read_table(table, "ns x", ",")
+
+
 def test_whole_numbers_up_to_the_limit() -> None:
     assert whole_number(f" -{2**62} ") == -(2**62)
     assert whole_number("+0012", 1000, 12_000) == 12_000

@@ -30,6 +30,7 @@ UNIT_TOLERANCE = 0.1
 """Limit by which the length of a quaternion may differ from one for it to be an orientation."""
 
 _WHOLE = re.compile(r"[+-]?[0-9]+")
+_HUGE = 1e100  # its square is finite
 _LONGEST = 40  # characters of a number: of any stamp, with zeros before it
 
 _Row = TypeVar("_Row")
@@ -136,8 +137,8 @@ def pose_matrix(numbers: Sequence[float]) -> FloatArray:
 
 
 def _finite(numbers: Sequence[float]) -> Sequence[float]:
-    if not all(map(math.isfinite, numbers)):
-        raise ValueError("NaN or infinity")
+    if not all(abs(number) < _HUGE for number in numbers):  # NaN compares false
+        raise ValueError("NaN or infinity, or all but that")
     return numbers
 
 

@@ -51,7 +51,7 @@ def test_the_tilt_is_blended_whether_the_topic_is_named_or_not(bag, options):
     assert dataset.info().facts["IMU topic"] == "/imu"
     tilts = [str(update.tilt_prior) for update in run(dataset, preset("loam")).updates]
     assert tilts[1:] == ["blend"] * (FRAMES - 1)
-    without = run(dataset, preset("loam").changed("imu.enabled=false"))
+    without = run(dataset, preset("loam").changed("imu.coupling=off"))
     assert {str(update.tilt_prior) for update in without.updates} == {"none"}
 
 

@@ -101,7 +101,7 @@ class LoamGtsam(EvalioPipeline):
         self._implied |= limits | {"period": self._period}
 
     def set_imu_params(self, params: ImuParams) -> None:
-        """Take noise and gravity, which only pre-integration uses."""
+        """Take noise and gravity, which only the tight coupling uses."""
         known = {
             "imu.gravity": float(np.linalg.norm(params.gravity)),
             "imu.gyro_noise": params.gyro,

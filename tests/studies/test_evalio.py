@@ -118,7 +118,7 @@ def test_parameters_are_those_of_the_configuration() -> None:
     assert all(type(value) in (bool, int, float, str) for value in defaults.values())
     config = set_up(preset="loam", **{"solver.iterations": 7})._pipeline.config
     assert config.solver.iterations == 7
-    assert config.imu.weight != defaults["imu.weight"]  # LOAM's own
+    assert config.imu.prior != defaults["imu.prior"]  # LOAM blends
     # What the data set says fills in what was left at its default.
     assert (config.sensor.min_range, config.sensor.max_range) == (0.7, 90.0)
     assert config.imu.gravity == pytest.approx(9.7)

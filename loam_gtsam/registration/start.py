@@ -35,6 +35,8 @@ _PLACES = 6  # motions between the first two sweeps that are tried beside the ex
 _AGAINST = 3.0
 """Number of features that agree which one outweighs that contradicts: noise makes 3 of 1000 do so.
 Between the rings of the first sweep more of the ground finds planes than on them, at any place."""
+_HOPEFUL = 0.5
+"""Share of the best place's score, by few matches, below which a place is not looked at closer."""
 _FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
 _FARTHEST = 30.0  # metres: largest distance between the first two sweeps
 _TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical axis
@@ -105,9 +107,16 @@ class Start:
             _PLACES,
             most_turn=_TURNING * seconds,
         )
-        best = self._tried(frame, expected.solution.map_T_lidar, solver)
-        for place in places:
-            tried = self._tried(frame, place, solver)
+        quick = [
+            self._tried(frame, place, solver) for place in (expected.solution.map_T_lidar, *places)
+        ]
+        enough = _HOPEFUL * max(tried.total for tried in quick)
+        best, *others = (
+            self._registered(frame, self._with_motion(tried.sweeps), solver)
+            for number, tried in enumerate(quick)
+            if number == 0 or tried.total >= enough
+        )
+        for tried in others:
             if tried.total > CLEARLY * best.total and _told_apart(tried, best):
                 best = tried
         self._sweeps = best.sweeps[:1]
@@ -169,19 +178,29 @@ class Start:
         return moved
 
     def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> _Tried:
-        """The first two sweeps, the second near a pose, and how well they fit each other."""
+        """The first two sweeps, the second near a pose, registered by few matches."""
         first, leeway = self._sweeps[0], frame.predicted.motion.information
         moved = first.map_T_middle.between(map_T_middle)
         second = EarlySweep(frame.matcher.posed, map_T_middle, False, leeway, 0)
         first, second = self._with_motion([first, second])
-        sweeps = [first, replace(second, map_T_middle=first.map_T_middle.compose(moved))]
-        solution = self._solved(frame, sweeps, 1, solver, quickly=True)
-        sweeps = self._with_motion([first, replace(second, map_T_middle=solution.map_T_lidar)])
-        solution = self._solved(frame, sweeps, 1, solver)
-        sweeps[1] = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
-        fit = Fit.of(solution.matches, frame.matcher.offered)
+        second = replace(second, map_T_middle=first.map_T_middle.compose(moved))
+        return self._registered(frame, [first, second], solver, quickly=True)
+
+    def _registered(
+        self,
+        frame: Frame,
+        sweeps: list[EarlySweep],
+        solver: ScanSolver,
+        *,
+        quickly: bool = False,
+    ) -> _Tried:
+        """The second of two sweeps registered with the first, and how well they fit each other."""
+        solution = self._solved(frame, sweeps, 1, solver, quickly=quickly)
+        matcher = frame.matcher.with_few_matches() if quickly else frame.matcher
+        fit = Fit.of(solution.matches, matcher.offered)
         total = fit.total - _AGAINST * (fit.share - fit.total) if solution.solved else 0.0
-        return _Tried(max(total, 0.0), sweeps, solution)
+        second = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
+        return _Tried(max(total, 0.0), [sweeps[0], second], solution)
 
     def _solved(
         self,

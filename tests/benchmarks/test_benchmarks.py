@@ -174,7 +174,7 @@ def test_loops_are_found_in_a_town_and_false_ones_refused(
 
 
 def test_killed_runs_go_on(here: pytest.MonkeyPatch) -> None:
-    here.setattr("sys.argv", ["kills", "--kills", "2", "--frames", "6"])
+    here.setattr("sys.argv", ["kills", "--kills", "1", "--frames", "5"])
     kills.main()
 
 

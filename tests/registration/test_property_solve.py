@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -182,19 +183,24 @@ def features() -> tuple[Features, ...]:
     return tuple(extract_features(sweep, ALL) for sweep in sweeps())
 
 
-def driven(first: gtsam.Pose3, config: Config = ALL) -> list[gtsam.Pose3]:
-    mapper = Mapper(config)
+def driven(first: gtsam.Pose3) -> list[gtsam.Pose3]:
+    mapper = Mapper(ALL)
     updates = [mapper.register(features()[0], first)]
     updates += [mapper.register(part) for part in features()[1:]]
     assert all(update.status.solved for update in updates[1:])
     return [update.map_T_lidar for update in updates]
 
 
-@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+@cache
+def driven_from_the_origin() -> list[gtsam.Pose3]:
+    return driven(gtsam.Pose3())
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_a_run_in_a_map_shifted_by_cubes_and_turned_by_quarters_is_the_same(quarters: int) -> None:
     turn = gtsam.Rot3.Yaw(0.5 * np.pi * quarters)
     other_T_map = gtsam.Pose3(turn, np.array([50.0, -100.0, 50.0]))
-    for here, there in zip(driven(gtsam.Pose3()), driven(other_T_map), strict=True):
+    for here, there in zip(driven_from_the_origin(), driven(other_T_map), strict=True):
         assert apart(other_T_map.compose(here), there) < 1e-5
 
 
@@ -202,14 +208,19 @@ def test_a_run_in_a_map_shifted_by_cubes_and_turned_by_quarters_is_the_same(quar
 @given(rng=generators())
 def test_a_run_in_any_other_frame_is_the_same_but_for_the_voxels(rng: np.random.Generator) -> None:
     other_T_map = gtsam.Pose3.Expmap(np.append(rng.normal(0, 1, 3), rng.normal(0, 100, 3)))
-    for here, there in zip(driven(gtsam.Pose3()), driven(other_T_map), strict=True):
+    for here, there in zip(driven_from_the_origin(), driven(other_T_map), strict=True):
         step = other_T_map.compose(here).localCoordinates(there)
         # Other voxels keep other points: 0.24 degrees and 24 mm are seen with this sparse sensor.
         assert np.degrees(np.linalg.norm(step[:3])) < 0.5
         assert np.linalg.norm(step[3:]) < 0.05
 
 
-def poses(scans: list[Scan]) -> list[gtsam.Pose3]:
+@cache
+def poses_of_the_sweeps() -> list[gtsam.Pose3]:
+    return poses(sweeps())
+
+
+def poses(scans: Sequence[Scan]) -> list[gtsam.Pose3]:
     pipeline = Pipeline(ALL)
     updates = [pipeline.process(scan) for scan in scans]
     assert all(update.status.solved for update in updates[1:])
@@ -228,13 +239,13 @@ def test_the_order_of_the_points_of_a_sweep_does_not_matter(rng: np.random.Gener
             replace(scan, points=scan.points[order], times=scan.times[order],
                     rings=scan.rings[order], rows=0)
         )  # fmt: skip
-    for here, there in zip(poses(list(sweeps())), poses(shuffled), strict=True):
+    for here, there in zip(poses_of_the_sweeps(), poses(shuffled), strict=True):
         assert apart(here, there) < 1e-9
 
 
 def test_a_drive_through_the_mirror_is_the_mirrored_drive() -> None:
     through = [replace(scan, points=scan.points @ MIRROR.astype(np.float32)) for scan in sweeps()]
-    for here, there in zip(poses(list(sweeps())), poses(through), strict=True):
+    for here, there in zip(poses_of_the_sweeps(), poses(through), strict=True):
         step = mirror(here).localCoordinates(there)
         assert np.degrees(np.linalg.norm(step[:3])) < 0.1
         assert np.linalg.norm(step[3:]) < 5e-3

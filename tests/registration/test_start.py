@@ -12,6 +12,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration import start
 from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
 
 CONFIG = Config().changed("imu.coupling=off")
@@ -76,6 +77,31 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
         for one in features:
             mapper.register(one)
         assert len(asked) == searches
+
+
+def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch):
+    _, features = features_of("street_loop", 2, speed=20.0, start="moving")
+    found, closer = [], []
+    for share in (0.0, start._HOPEFUL, 1.0):
+        monkeypatch.setattr(start, "_HOPEFUL", share)
+        solver = Counting(CONFIG.solver)
+        mapper = Mapper(CONFIG, solver=solver)
+        found.append([mapper.register(one).map_T_lidar.matrix() for one in features])
+        closer.append(solver.offered.count(max(solver.offered)))
+    assert np.array_equal(*found[:2])
+    assert closer[0] > closer[1] > closer[2]
+
+
+class Counting(GtsamSolver):
+    """Notes how many features each solve may match."""
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.offered = []
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        self.offered.append(associate.offered)
+        return super().solve(associate, guess, priors, motion)
 
 
 def test_the_search_leaves_the_map_of_the_motion_that_it_chose(monkeypatch):

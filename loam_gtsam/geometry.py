@@ -218,6 +218,11 @@ def fit_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray, FloatArr
     return centres, normals, symmetric_eigenvector(covariance, eigenvalues[2]), eigenvalues
 
 
+def interpolated(moments: FloatArray | float, times: FloatArray, values: FloatArray) -> FloatArray:
+    """(..., C) values at (...) moments, from (N, C) at ascending times; held beyond the ends."""
+    return np.stack([np.interp(moments, times, column) for column in values.T], axis=-1)
+
+
 def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
     """One integer per voxel of edge length ``size``, metres; keys sort by x, then y, then z.
 

@@ -285,9 +285,8 @@ class Mapper:
         self.monitor.accept(fit, solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
-        alone = None if scan is None else scan.with_factors(solution.map_T_lidar, frame.priors)
         posed, solution, pose, tilt, fused = with_imu(
-            self.imu, posed, frame.matcher.last, solution, alone
+            self.imu, posed, frame.matcher.last, solution, scan, frame.priors
         )
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)

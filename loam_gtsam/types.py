@@ -188,6 +188,11 @@ class FeatureSweep:
     odom_T_lidar: gtsam.Pose3
     cloud: NDArray[np.floating] | None = None
 
+    @property
+    def stamp(self) -> int:
+        """Of the features."""
+        return self.features.stamp
+
 
 @dataclass(frozen=True, slots=True)
 class BadSweep:

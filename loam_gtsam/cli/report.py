@@ -194,7 +194,7 @@ def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:
     imu = dataset.imu if config.imu.coupling != "off" else None
     if imu is None or len(imu.stamps) == 0:
         return []
-    stamp = sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
+    stamp = sweep.stamp
     first, last = int(imu.stamps.min()), int(imu.stamps.max())
     if first <= stamp <= last:
         return []

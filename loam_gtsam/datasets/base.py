@@ -15,7 +15,6 @@ from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
 from loam_gtsam.types import (
     BadSweep,
     DatasetError,
-    FeatureSweep,
     FloatArray,
     ImuSamples,
     InputError,
@@ -182,9 +181,8 @@ class PartOf(ChangedDataset):
     def __iter__(self) -> Iterator[Sweep]:
         first: int | None = None
         for number, sweep in enumerate(self._dataset):
-            stamp = sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
-            first = stamp if first is None else first
-            seconds = (stamp - first) * 1e-9
+            first = sweep.stamp if first is None else first
+            seconds = (sweep.stamp - first) * 1e-9
             if seconds > self._window[1]:
                 return
             beyond = number - self._slice.start

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.features import thinned
-from loam_gtsam.geometry import cross, move_points
+from loam_gtsam.geometry import cross, interpolated, move_points
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, SweepMotion
 
@@ -112,8 +112,7 @@ class MovingSweep:
         """(..., 3) the way from the straight line."""
         if self._bend is None:
             return np.zeros(3)
-        times, path = self._bend
-        return np.stack([np.interp(seconds, times, column) for column in path.T], axis=-1)
+        return interpolated(seconds, *self._bend)
 
     def at(self, twist: FloatArray) -> PosedSweep:
         """The sweep de-skewed for a (6,) body velocity at the reference time, rad/s and m/s."""
@@ -217,7 +216,7 @@ def _turns_by_orientation(
     inside = Rotation.from_quat(samples.orientation[known]).as_matrix()
     world = np.concatenate([[before.matrix()], inside, [after.matrix()]])
     turns = Rotation.from_matrix(middle.matrix().T @ world).as_rotvec()
-    return np.stack([np.interp(moments, times, angle) for angle in turns.T], axis=-1)
+    return interpolated(moments, times, turns)
 
 
 def _rotated(points: FloatArray, turns: FloatArray) -> FloatArray:

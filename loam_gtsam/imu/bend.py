@@ -6,7 +6,7 @@ import numpy as np
 from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.geometry import cross
+from loam_gtsam.geometry import cross, interpolated
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import FloatArray
 
@@ -52,19 +52,14 @@ def bend(
     if turns is None:
         return None
     rotations = Rotation.from_rotvec(turns)
-    felt: FloatArray = _at(knots, times, samples.acceleration[needed]) - acceleration_bias
+    felt: FloatArray = interpolated(knots, times, samples.acceleration[needed]) - acceleration_bias
     acceleration = rotations.apply(felt) + gravity
     here = int(np.searchsorted(knots, 0.0))
     velocity = cumulative_trapezoid(acceleration, knots, axis=0, initial=0.0)
     path = cumulative_trapezoid(velocity - velocity[here], knots, axis=0, initial=0.0)
     path -= path[here]
     # The IMU goes round the lidar.
-    rate = _at(np.zeros(1), times, samples.gyro[needed] - buffer.gyro_bias)
+    rate = interpolated(np.zeros(1), times, samples.gyro[needed] - buffer.gyro_bias)
     path -= rotations.apply(lidar_t_imu) - lidar_t_imu
     path += knots[:, None] * cross(rate[0], lidar_t_imu)
-    return _at(seconds, knots, path)
-
-
-def _at(moments: FloatArray, times: FloatArray, values: FloatArray) -> FloatArray:
-    """(K, 3) values at some moments, from (N, 3) at ascending times; held beyond the ends."""
-    return np.stack([np.interp(moments, times, column) for column in values.T], axis=1)
+    return interpolated(seconds, knots, path)

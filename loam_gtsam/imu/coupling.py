@@ -11,7 +11,7 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.preintegration import Fused, InertialOdometry, Prediction
-from loam_gtsam.types import FloatArray, ImuSamples, SweepError
+from loam_gtsam.types import FloatArray, SweepError
 
 _FORCE = 0.2, 3.0
 """Least and largest mean specific force over a sweep, in multiples of gravity. Less is free fall,
@@ -65,9 +65,10 @@ class TightCoupling:
         if self._odometry is None:
             return None
         margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
-        if not self._believable(buffer.samples_between(since, stamp)):
-            return None
         samples = buffer.samples_between(since - margin, stamp + margin)
+        inside = slice(*np.searchsorted(samples.stamps, [since, stamp + 1]))
+        if not self._believable(samples.acceleration[inside]):
+            return None
         try:
             prediction = self._odometry.predict(stamp, samples)
         except SweepError:
@@ -88,12 +89,13 @@ class TightCoupling:
         ``map_R_lidar`` (3, 3) is the rotation at ``stamp``; ``gravity`` (3,) m/s^2, map frame,
         stands for it until it is estimated.
         """
+        if not self.trusted:
+            return None
         bias = np.zeros(3)
         if self._odometry is not None:
             gravity, bias = self._odometry.state.map_gravity, self._odometry.state.acceleration_bias
         first, last = (stamp + round(float(end) * 1e9) for end in (seconds[0], seconds[-1]))
-        samples = buffer.samples_between(first, last)
-        if not self.trusted or not self._believable(samples):
+        if not self._believable(buffer.samples_between(first, last).acceleration):
             return None
         lever = np.asarray(self.config.lidar_t_imu, np.float64)
         return bend(buffer, stamp, seconds, gravity @ map_R_lidar, bias, lever)
@@ -135,9 +137,9 @@ class TightCoupling:
             self._odometry = None
         return None
 
-    def _believable(self, samples: ImuSamples) -> bool:
-        """Whether a lidar that is carried about may feel such accelerations."""
-        if not len(samples.stamps):
+    def _believable(self, acceleration: FloatArray) -> bool:
+        """Whether a lidar that is carried about may feel such (N, 3) accelerations, m/s^2."""
+        if not len(acceleration):
             return False
-        force = np.linalg.norm(samples.acceleration, axis=1).mean() / max(self.config.gravity, 1.0)
+        force = np.linalg.norm(acceleration, axis=1).mean() / max(self.config.gravity, 1.0)
         return bool(_FORCE[0] < force < _FORCE[1])

@@ -15,7 +15,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, G, V, X
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.geometry import cross
+from loam_gtsam.geometry import cross, interpolated
 from loam_gtsam.types import FloatArray, ImuSamples, InputError, SweepError
 
 STATE = 18
@@ -133,10 +133,9 @@ def _predict(
 ) -> tuple[InertialState, FloatArray, gtsam.NonlinearFactor, FloatArray]:
     """State of frame ``n`` from the one before, transition, factor between the two, last rate."""
     # Offsets in integers first: floats do not hold nanoseconds since 1970.
-    times = (samples.stamps - last.stamp) * 1e-9
+    times: FloatArray = (samples.stamps - last.stamp).astype(np.float64) * 1e-9
     knots = np.concatenate([[0.0], times[1:-1], [(stamp - last.stamp) * 1e-9]])
-    columns = (*samples.gyro.T, *samples.acceleration.T)
-    joined = np.stack([np.interp(knots, times, column) for column in columns], axis=1)
+    joined = interpolated(knots, times, np.hstack([samples.gyro, samples.acceleration]))
     steps, means = np.diff(knots), 0.5 * (joined[1:] + joined[:-1])
     gyro, acceleration = means[:, :3], means[:, 3:]
     # GTSAM takes the attitude at the beginning of a step for all of it. In the middle the

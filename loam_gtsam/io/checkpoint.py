@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from loam_gtsam.io.atomic import atomic_file, make_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.types import DatasetError, FeatureSweep, MapUpdate, OutputError, Sweep
+from loam_gtsam.types import DatasetError, MapUpdate, OutputError, Sweep
 
 _HEADER = "header"
 _FILE = re.compile(r"(frames_\d+_\d+|state_\d+)\.npz")
@@ -208,7 +208,7 @@ class Progress:
         """The sweeps after those that are done."""
         for number, done in enumerate(self.stamps):
             sweep = next(sweeps, None)
-            stamp = None if sweep is None else _stamp(sweep[0])
+            stamp = None if sweep is None else sweep[0].stamp
             if stamp != done:
                 raise DatasetError(
                     f"sweep {number}: expected the stamp {done} ns of the run to go on with, got "
@@ -219,7 +219,7 @@ class Progress:
 
     def add(self, sweep: Sweep, update: MapUpdate) -> None:
         """A frame is done."""
-        self.stamps.append(_stamp(sweep))
+        self.stamps.append(sweep.stamp)
         self.updates.append(update)
         self.whole = True
 
@@ -232,10 +232,6 @@ class Progress:
         """Write a checkpoint, unless a frame was cut off in the middle."""
         if self._checkpoint is not None and self.whole:
             self._checkpoint.save(self.stamps, self.updates, *self._state())
-
-
-def _stamp(sweep: Sweep) -> int:
-    return sweep.features.stamp if isinstance(sweep, FeatureSweep) else sweep.stamp
 
 
 def _is_ours(path: Path) -> bool:

@@ -27,6 +27,7 @@ from loam_gtsam.imu_prior import (
 )
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
+from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.types import FloatArray, TiltPrior
 
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
@@ -52,11 +53,16 @@ def with_imu(
     posed: PosedSweep,
     last: Moment | None,
     solution: Solution,
-    alone: tuple[gtsam.Pose3, FloatArray] | None,
+    scan: ScanError | None,
+    factors: Sequence[gtsam.NonlinearFactor],
 ) -> Registration:
-    """What :meth:`ImuTracker.add_scan` makes of a solved sweep; the sweep as solved without one."""
+    """What :meth:`ImuTracker.add_scan` makes of a solved sweep; the sweep as solved without one.
+
+    ``scan`` is the error of the scan, and ``factors`` are those it was solved with.
+    """
     if imu is None:
         return Registration(posed, solution, solution.map_T_lidar.compose(posed.middle_T_reference))
+    alone = None if scan is None else scan.with_factors(solution.map_T_lidar, factors)
     return imu.add_scan(posed, last, solution, alone)
 
 

@@ -98,7 +98,7 @@ class PoseErrors:
         ]
         self._drift_factor = config.covariance.drift
         self._small = False
-        self._is_empty = True
+        self._scans = 0  # that :meth:`of_scan` was given
         graph = config.solver.method == "gtsam"
         self._kernel = config.solver.kernel
         self._kernel_width = config.solver.kernel_width if graph else np.inf
@@ -112,16 +112,15 @@ class PoseErrors:
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
-        self._is_first = True
 
     def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
         """The error of a solved scan; to be called once for each, in order.
 
         ``small`` tells whether the place is small.
         """
-        self._is_first, self._is_empty = self._is_empty, False
+        self._scans += 1
         config, seen = self._places[small]
-        if small != self._small and not self._is_first:
+        if small != self._small and self._scans > 1:
             # The ground is the same, only in other cells.
             found = solution.matches
             points = np.concatenate([found.edges.points, found.planes.points])
@@ -145,7 +144,7 @@ class PoseErrors:
         The sweep has the motion of the solution, which is at its middle; ``fused`` is that pose by
         scan and IMU together.
         """
-        first = self._is_first
+        first = self._scans == 1
         if scan is None:
             self._last = None
             return update
@@ -212,7 +211,7 @@ class PoseErrors:
 
     def skipped(self, sweep: MovingSweep) -> None:
         """Account for a sweep whose pose is the expected one; the very first begins the map."""
-        if self._first is None and self._is_empty:
+        if self._first is None and not self._scans:
             self._first = sweep
         self._expected.coast(sweep.stamp, turned=_turned(sweep))
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.stats import chi2, norm
 
-from loam_gtsam.geometry import inverse_pose, transform
+from loam_gtsam.geometry import interpolated, inverse_pose, transform
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory
 
@@ -113,8 +113,7 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
         poses[:, :3, :3] = turned.as_matrix()
     else:  # positions alone
         poses[:, :3, :3] = np.nan
-    for axis in range(3):
-        poses[:, axis, 3] = np.interp(queries, times, trajectory.map_T_lidar[:, axis, 3])
+    poses[:, :3, 3] = interpolated(queries, times, trajectory.map_T_lidar[:, :3, 3])
     return Trajectory(np.asarray(stamps, np.int64), poses)
 
 

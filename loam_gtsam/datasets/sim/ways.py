@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from loam_gtsam.geometry import interpolated
 from loam_gtsam.types import FloatArray
 
 _FINE = 0.05  # metres between the points of a way while it is rounded
@@ -62,8 +63,7 @@ def distances_along(way: FloatArray) -> FloatArray:
 
 def points_along(way: FloatArray, metres: FloatArray) -> FloatArray:
     """(M, D) points so far along a way of (N, D) points, of which no two in a row are the same."""
-    distances = distances_along(way)
-    return np.stack([np.interp(metres, distances, column) for column in way.T], axis=1)
+    return interpolated(metres, distances_along(way), way)
 
 
 def rounded(corners: FloatArray, blur: float, spacing: float, closed: bool) -> FloatArray:

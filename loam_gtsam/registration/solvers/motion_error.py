@@ -7,12 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from loam_gtsam.config import SolverConfig
-from loam_gtsam.geometry import symmetric
+from loam_gtsam.geometry import positive_root, symmetric
+from loam_gtsam.registration.solvers.scan_error import SCAN_VARIANCE
 from loam_gtsam.types import FloatArray
 
-_SCAN_VARIANCE = 4.0
-"""Variance of a scan's error over that of its raw covariance; see
-:mod:`loam_gtsam.registration.imu_tracker`."""
 _GYRO_RATE = 0.01
 """Error of a gyro's rate, rad/s: 0.6 degrees/s, a bias that was not learnt yet."""
 _LEAST = 1e-12  # (rad/s)^2 and (m/s)^2: keeps the velocity's covariance regular
@@ -83,7 +81,7 @@ class MotionError:
         (6, 6) raw covariance of what else decides.
         """
         since, seconds = self._seconds(stamp, self._solved), self._seconds(stamp, self._last)
-        scan = _SCAN_VARIANCE * raw
+        scan = SCAN_VARIANCE * raw
         velocity, missed = self._known(turned=turned), self._by_acceleration(since, turned=turned)
         tied = share - np.eye(6)
         noise = tied @ self._pose @ tied.T + scan
@@ -92,9 +90,9 @@ class MotionError:
         if turned:  # the scan has no say in the velocity
             passed_on[:3] = np.eye(6)[:3]
             noise[:3] = noise[:, :3] = 0.0
-        before = _root(velocity)
+        before = positive_root(velocity)
         self.velocity = symmetric(passed_on @ velocity @ passed_on.T + noise) + _LEAST * np.eye(6)
-        kept = np.linalg.solve(_root(self.velocity), passed_on @ before)
+        kept = np.linalg.solve(positive_root(self.velocity), passed_on @ before)
         left, values, right = np.linalg.svd(kept)
         # What is tied to the map by 1 - share is drawn back to the map by that in the next frame.
         lasting = share @ share
@@ -127,10 +125,3 @@ class MotionError:
     @staticmethod
     def _seconds(stamp: int, since: int | None) -> float:
         return 0.1 if since is None else max((stamp - since) * 1e-9, 1e-3)
-
-
-def _root(covariance: FloatArray) -> FloatArray:
-    """The symmetric square root."""
-    values, vectors = np.linalg.eigh(covariance)
-    root: FloatArray = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
-    return root

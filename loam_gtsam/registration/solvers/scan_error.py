@@ -20,9 +20,10 @@ _PRIOR_CELLS = 6.0
 cells the scores alone do not span the six directions."""
 _LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
-_SCAN_VARIANCE = 4.0
-"""By which the raw information of a scan that does not see all directions is divided: there the map
-was made by the same guesses, and agrees with them."""
+SCAN_VARIANCE = 4.0
+"""Variance of a scan's error over that of its raw covariance, where the scatter of the residuals
+does not tell it: where some direction is not seen, the map was made by the same guesses as the
+scan, and agrees with them."""
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
@@ -86,11 +87,6 @@ class SeenGround:
         self._size = size
         self._remembered = remembered
         self._younger, self._older = KeyTable(_NO_KEYS), KeyTable(_NO_KEYS)
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether nothing has been matched yet."""
-        return len(self._younger) + len(self._older) == 0
 
     def cells(self, points_map: FloatArray) -> tuple[IntArray, BoolArray]:
         """Cell numbers (N,) of points (N, 3), metres, and which of C cells are new; adds them."""
@@ -161,7 +157,7 @@ def scan_error(
     parts = meat + priors, renewed, total - expected
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
     shares = bread @ user, bread @ expected
-    alone = information / _SCAN_VARIANCE
+    alone = information / SCAN_VARIANCE
     if solution.weak is None:
         scatter = meat + config.drift * fresh.T @ fresh  # new ground has errors of its own
         alone = information @ np.linalg.lstsq(scatter, information, rcond=None)[0]

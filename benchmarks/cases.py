@@ -247,7 +247,7 @@ def run_case(case: Case, peers: bool = True) -> CaseResult:
     if case.missing:
         return CaseResult(case.name, case.note, problem="skipped: no data")
     dataset = open_case(case)
-    # The peers have no IMU; what one brings is in `python -m benchmarks.scenes`.
+    # The peers have no IMU; what one brings is in `python -m benchmarks.worlds`.
     alone = Config().changed("imu.coupling=off")
     config = effective_config(alone, dataset)
     rivals = [KissIcp(v) for v in case.kiss] if peers and load("kiss_icp") is not None else []

@@ -54,6 +54,7 @@ from loam_gtsam.mapper import make_solver
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers import MotionPrior, Solution, match_rows
+from loam_gtsam.studies.same_matches import disturbed
 from loam_gtsam.types import BoolArray, FloatArray
 
 
@@ -154,16 +155,6 @@ def robust(matches: ScanMatches, kernel: str) -> ScanMatches:
         replace(edges, weights=shrunk(edges.weights, pulls[0])),
         replace(planes, weights=shrunk(planes.weights, pulls[1])),
     )
-
-
-def disturbed(
-    truth: gtsam.Pose3, metres: float, degrees: float, rng: np.random.Generator
-) -> gtsam.Pose3:
-    """The pose, moved and turned by so much in random directions."""
-    turn, shift = rng.standard_normal((2, 3))
-    turn *= np.radians(degrees) / np.linalg.norm(turn)
-    shift *= metres / np.linalg.norm(shift)
-    return truth.compose(gtsam.Pose3(gtsam.Rot3.Expmap(turn), shift))
 
 
 def with_random_points(points: FloatArray, share: float, rng: np.random.Generator) -> FloatArray:

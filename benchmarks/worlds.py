@@ -14,32 +14,27 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
-from itertools import groupby, islice
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2, norm
 
 from benchmarks.cases import ROOT, data_folder
 from benchmarks.process import processor_clock
-from benchmarks.scene_tables import tilts
 from loam_gtsam.config import Config
-from loam_gtsam.datasets import Dataset, SimulatedWorld, Sweep, open_dataset
-from loam_gtsam.datasets.base import ChangedDataset, DatasetInfo
+from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
+from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.pipeline import RunResult, run
-from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.studies.evaluation import absolute_error, interpolate
+from loam_gtsam.studies import evaluation
+from loam_gtsam.studies.evaluation import FIVE_SIGMA, FREEDOM, absolute_error, interpolate
 from loam_gtsam.types import FloatArray, FrameStatus, LoamError, MapUpdate, Trajectory
 
 WINDOWS = (1, 10, 50)
 """Frames over which the error of a motion is held against its covariance."""
 START = 0
 """The window that stands for the pose since the start of the map."""
-FREEDOM = 6
-FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), FREEDOM))
-"""Squared Mahalanobis distance of a pose that is as unlikely as five standard deviations."""
 _START = 30  # sweeps that are the start of a run
 _FEW = 3  # samples below which a mean says nothing
 
@@ -71,25 +66,7 @@ class World:
             dataset = open_dataset(data_folder() / self.scene)
         else:
             dataset = SimulatedWorld(self.scene, seed=seed, imu=imu or "white", **self.options)
-        return dataset if self.every == 1 and not self.first else EveryNth(dataset, self)
-
-
-class EveryNth(ChangedDataset):
-    """Some of the sweeps of a data set, at even distances; the others are missing."""
-
-    def __init__(self, dataset: Dataset, world: World) -> None:
-        super().__init__(dataset, f"every {world.every}")
-        self._part = slice(world.first, None, world.every)
-
-    def __len__(self) -> int:
-        return len(range(len(self._dataset))[self._part])
-
-    def __iter__(self) -> Iterator[Sweep]:
-        return islice(self._dataset, self._part.start, None, self._part.step)
-
-    def info(self) -> DatasetInfo:
-        """Of the other data set."""
-        return self._info(every=str(self._part.step))
+        return PartOf(dataset, self.first, self.every)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,14 +79,10 @@ class Mode:
     more: tuple[str, ...] = ()
 
     @property
-    def coupling(self) -> str:
-        """Of the IMU: tight, unless the changes say otherwise."""
-        return "off" if self.imu is None else "tight"
-
-    @property
     def config(self) -> Config:
         """The default with the changes, and more of them as ``KEY=VALUE``."""
-        return Config().changed({"imu.coupling": self.coupling}, self.changes, *self.more)
+        coupling = "off" if self.imu is None else "tight"
+        return Config().changed({"imu.coupling": coupling}, self.changes, *self.more)
 
 
 MODES = (
@@ -275,36 +248,26 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
 def squared_errors(
     updates: Sequence[MapUpdate], true: Sequence[gtsam.Pose3], window: int
 ) -> dict[int, float | None]:
-    """By number of the later frame: squared Mahalanobis distance of each motion over a window.
+    """As :func:`loam_gtsam.studies.evaluation.squared_errors`; None for what is no covariance."""
+    found = evaluation.squared_errors(updates, true, window)
+    return {k: value if np.isfinite(value) else None for k, value in found.items()}
 
-    For the window :data:`START`, of each pose against the first one, which is where the map is and
-    has no error. Only solved frames count; None stands for what is no covariance.
+
+def tilts(estimate: FloatArray, truth: FloatArray) -> FloatArray:
+    """(N,) angles between the up axes, seen from the lidar: roll and pitch together, rad.
+
+    ``estimate`` and ``truth`` are (N, 4, 4) in frames with z up.
     """
-    found = {}
-    for k in range(window or 1, len(updates)):
-        start = k - window if window else 0
-        earlier, later = updates[start], updates[k]
-        if later.uncertainty is None or (window and earlier.uncertainty is None):
-            continue
-        covariance = relative_covariance(earlier, later) if window else later.covariance
-        moved = earlier.map_T_lidar.between(later.map_T_lidar)
-        found[k] = _squared(moved.localCoordinates(true[start].between(true[k])), covariance)
-    return found
+    up, wanted = estimate[:, 2, :3], truth[:, 2, :3]
+    angles: FloatArray = np.arctan2(
+        np.linalg.norm(np.cross(up, wanted), axis=1), (up * wanted).sum(axis=1)
+    )
+    return angles
 
 
 def name_of(window: int) -> str:
     """Of a window in tables."""
     return str(window) if window else "start"
-
-
-def _squared(error: FloatArray, covariance: FloatArray) -> float | None:
-    """Squared Mahalanobis distance of a (6,) error; None if the covariance is not a covariance."""
-    try:
-        root = np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:
-        return None
-    whitened = np.linalg.solve(root, error)
-    return float(whitened @ whitened)
 
 
 # -- tables ----------------------------------------------------------------------------------------

@@ -295,22 +295,31 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
     chosen = [updates[n] for n in inside]
     truth = interpolate(reference, np.array([update.stamp for update in chosen], np.int64))
     _need_orientation("nees", truth.map_T_lidar)
-    true = [gtsam.Pose3(pose) for pose in truth.map_T_lidar]
-    frames, squared = [], []
-    for k in range(window or 1, len(chosen)):
+    found = squared_errors(chosen, [gtsam.Pose3(pose) for pose in truth.map_T_lidar], window)
+    squared = np.array(list(found.values()), np.float64)
+    finite = squared[np.isfinite(squared)]
+    mean = float(finite.mean()) / FREEDOM if len(finite) else np.nan
+    return Nees(mean, np.array([inside[k] for k in found], np.int64), squared)
+
+
+def squared_errors(
+    updates: Sequence[MapUpdate], true: Sequence[gtsam.Pose3], window: int = 0
+) -> dict[int, float]:
+    """Squared Mahalanobis distances by the index of the later frame, as in :class:`Nees`.
+
+    ``true`` are the poses of the updates; the window is that of :func:`nees`.
+    """
+    found = {}
+    for k in range(window or 1, len(updates)):
         start = k - window if window else 0
-        before, now = chosen[start], chosen[k]
+        before, now = updates[start], updates[k]
         if now.uncertainty is None or (window and before.uncertainty is None):
             continue
         covariance = relative_covariance(before, now) if window else now.covariance
         moved = before.map_T_lidar.between(now.map_T_lidar)
         error = moved.localCoordinates(true[start].between(true[k]))
-        frames.append(inside[k])
-        squared.append(_mahalanobis(error, covariance))
-    found = np.array(squared, np.float64)
-    finite = found[np.isfinite(found)]
-    mean = float(finite.mean()) / FREEDOM if len(finite) else np.nan
-    return Nees(mean, np.array(frames, np.int64), found)
+        found[k] = _mahalanobis(error, covariance)
+    return found
 
 
 def _mahalanobis(error: FloatArray, covariance: FloatArray) -> float:

@@ -282,7 +282,7 @@ class _Judge:
         driver = next(iter(self.solvers)) if self.driver == TRUTH else self.driver
         if self.round is not None:  # the mapper looks again, or elsewhere
             return self.solvers[driver].solve(matcher, guess, priors, motion)
-        away = [_disturbed(guess, *level, self._random) for level in self._disturbances]
+        away = [disturbed(guess, *level, self._random) for level in self._disturbances]
         found, returned = {}, {}
         for name, solver in self.solvers.items():
             spent: list[float] = []
@@ -344,7 +344,7 @@ def _near(goal: gtsam.Pose3, end: gtsam.Pose3) -> bool:
     return metres < SAME_M and degrees < SAME_DEG
 
 
-def _disturbed(
+def disturbed(
     pose: gtsam.Pose3, metres: float, degrees: float, random: np.random.Generator
 ) -> gtsam.Pose3:
     """The pose, moved and turned by so much in random directions."""

@@ -23,7 +23,6 @@ from benchmarks import (
     peers,
     recorded,
     robustness,
-    scenes,
     soak,
     soak_faults,
     study,
@@ -32,7 +31,6 @@ from benchmarks import (
 )
 from benchmarks.cases import Case, CaseResult, PeerResult, judge
 from benchmarks.growth_report import GrowthResult
-from benchmarks.scene_tables import along, drift, tilt
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.types import FloatArray, FrameStatus, InputError, MapUpdate, SweepFault, Uncertainty
@@ -61,7 +59,7 @@ class InProcess:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    for module in (growth, robustness, soak, worlds, scenes, study, loops):
+    for module in (growth, robustness, soak, worlds, study, loops):
         if hasattr(module, "ProcessPoolExecutor"):
             monkeypatch.setattr(module, "ProcessPoolExecutor", InProcess)
     return monkeypatch
@@ -137,17 +135,6 @@ def test_disturbed_runs_fill_the_page(tmp_path: Path, here: pytest.MonkeyPatch) 
     for name in robustness.COMMON:
         case = robustness.disturbed(room, name, ABSENT)
         assert len(list(case.dataset)) == len(case.dataset) <= 24
-
-
-def test_scenes_are_run_with_every_solver_and_imu(tmp_path: Path, here: pytest.MonkeyPatch) -> None:
-    slopes = scenes.Place("slopes", frames=5, columns=1200, aids=("none", "equivalent"))
-    here.setattr(scenes, "QUICK", (slopes, scenes.Place(scenes.TOWN)))
-    assert scenes.main(["--quick", "--data", str(tmp_path), "--output", str(tmp_path)]) == 0
-    solvers, imu = table(tmp_path / "solvers.csv"), table(tmp_path / "imu.csv")
-    assert [row["variant"] for row in solvers] == ["default", "loam", "aloam"]
-    assert [row["variant"] for row in imu] == ["none", "equivalent", "equivalent"]
-    # The scene starts on a slope of 5 degrees; none of it is an error of the estimate.
-    assert max(float(row["tilt_deg"]) for row in imu) < 0.5
 
 
 def test_solvers_are_compared_from_wrong_starts(tmp_path: Path, here: pytest.MonkeyPatch) -> None:
@@ -302,16 +289,9 @@ def test_recovery_counts_sweeps_until_the_error_is_back_to_stay() -> None:
     assert robustness.recovery(np.where(np.arange(30) < 10, 0.02, 1.0), calm, (10,)) == "never"
 
 
-def test_drift_tilt_and_way_along_are_those_of_made_up_paths() -> None:
+def test_tilts_are_those_of_made_up_poses() -> None:
     truth = np.tile(np.eye(4), (11, 1, 1))
-    truth[:, 0, 3] = np.linspace(0.0, 10.0, 11)
-    found = truth.copy()
-    found[:, 2, 3] += 5.0  # another origin
-    found[3, 2, 3] -= 0.2
-    assert drift(found, truth) == pytest.approx(0.2)
     pitched = gtsam.Pose3(gtsam.Rot3.Pitch(np.radians(3.0)), np.zeros(3)).matrix()
     yawed = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.zeros(3)).matrix()
-    assert tilt(yawed @ truth, truth) == pytest.approx(0.0, abs=1e-9)
-    assert tilt(truth @ pitched, truth) == pytest.approx(3.0)
-    found[-1, :3, 3] += [-0.2, 3.0, 0.0]
-    assert along(found, truth) == pytest.approx(-2.0)
+    assert np.degrees(worlds.tilts(yawed @ truth, truth)) == pytest.approx(0.0, abs=1e-9)
+    assert np.degrees(worlds.tilts(truth @ pitched, truth)) == pytest.approx(3.0)

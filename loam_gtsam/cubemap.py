@@ -148,21 +148,19 @@ class CubeMap:
     def neighbourhood(self, map_T_lidar: FloatArray) -> tuple[CubeIndex, ...]:
         """Cubes around the sensor's that hold points and, if configured, are in view; ascending.
 
-        Parameters
-        ----------
-        map_T_lidar : (4, 4) sensor pose
-
-        Raises
-        ------
-        InputError
-            If the pose is not a finite (4, 4) array in range of the voxel grid.
+        ``map_T_lidar`` is the (4, 4) sensor pose. Raises InputError if it is not finite, or out of
+        range of the voxel grid.
         """
-        pose = as_array(map_T_lidar, "map_T_lidar", (4, 4))
-        around = Window.around(self._grid.cube_of(pose[:3, 3]), self._config.neighbourhood)
-        cubes = tuple(sorted(around.choose(self._cubes)))
+        cubes = self.surroundings(map_T_lidar)
         if not cubes or not self._config.field_of_view:
             return cubes
-        return cubes_in_view(cubes, pose, self._grid.cube_size)
+        return cubes_in_view(cubes, map_T_lidar, self._grid.cube_size)
+
+    def surroundings(self, map_T_lidar: FloatArray) -> tuple[CubeIndex, ...]:
+        """As :meth:`neighbourhood`, in view or not."""
+        pose = as_array(map_T_lidar, "map_T_lidar", (4, 4))
+        around = Window.around(self._grid.cube_of(pose[:3, 3]), self._config.neighbourhood)
+        return tuple(sorted(around.choose(self._cubes)))
 
     def insert(
         self,

@@ -187,6 +187,9 @@ class Mapper:
             else:
                 self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
                 update = unplaced(frame, outcome, self.monitor)
+                if update.status is FrameStatus.FEW_MATCHES and self.config.map.insert_unmatched:
+                    self._start = None
+                    self._insert(*placed, update.status, update.message, clock)
         if not update.status.solved:
             self._errors.skipped(sweep)
         self.last = replace(update, timings=clock.seconds)
@@ -255,11 +258,8 @@ class Mapper:
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""
         assert self.last is not None
-        found, twist, stamp = (
-            found_at(frame, frame.solve(self.solver)),
-            self.last.twist,
-            frame.sweep.stamp,
-        )
+        twist, stamp = self.last.twist, frame.sweep.stamp
+        found = found_at(frame, frame.solve(self.solver))
         if self._start is not None:
             found = self._start.first_motion(frame, found, self.solver)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
@@ -309,7 +309,8 @@ class Mapper:
         middle = posed.map_T_middle(map_T_lidar)
         matches = None if solution is None else solution.matches
         self.maps.insert(posed, middle, self.keyframe, matches)
-        self._moment = Moment(posed.sweep.stamp, middle, status is not FrameStatus.SPARSE_MAP)
+        known = status.solved or status is FrameStatus.FIRST
+        self._moment = Moment(posed.sweep.stamp, middle, known)
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")
         return make_update(posed, map_T_lidar, status, message, solution, tilt)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.worlds import room_features
 
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -199,6 +199,22 @@ def test_few_matches_keep_the_guess_and_do_not_insert(mapped, rng):
     # and the run goes on
     back = mapped.register(room_features(gtsam.Pose3(), 2 * SECOND, rng), guess=gtsam.Pose3())
     assert back.status.solved
+
+
+@pytest.mark.parametrize("name", ["loam", "aloam"])
+def test_a_classical_run_goes_on_where_a_sweep_matched_nothing(rng, name):
+    """The sweep goes into the map as in LOAM, so that the next one has something to match."""
+    mapper = Mapper(preset(name).changed("imu.coupling=off"))
+    for i in range(3):
+        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng))
+    far = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, 30.0]))  # in the same cubes
+    last = [
+        mapper.register(room_features(gtsam.Pose3(), i * SECOND // 10, rng), guess=far)
+        for i in range(3, 6)
+    ]
+    assert last[0].status is FrameStatus.FEW_MATCHES
+    assert np.isnan(last[0].covariance).all()
+    assert [update.status.solved for update in last[1:]] == [True, True]
 
 
 def test_the_iteration_limit_is_reported(rng):

@@ -111,7 +111,7 @@ _CLASSICAL = {
     "features": {"range_noise": 0.0, "post_depth": 0.0},
     "deskew": {"refine": False, "rotation": "constant_velocity"},
     "odometry.method": "scan_to_scan",
-    "map": {"insertion": "centroid", "small_below": 0.0},
+    "map": {"insertion": "centroid", "small_below": 0.0, "insert_unmatched": True},
     "matching": {
         "max_edges": 0,
         "max_planes": 0,

@@ -245,7 +245,7 @@ def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpd
         status, message = FrameStatus.LOST, outcome.message
     else:
         # Once may be chance; a sweep that has plenty to match is searched for the next time.
-        monitor.lost += frame.matcher.offered >= 2 * least
+        monitor.lost += monitor.config.enabled and frame.matcher.offered >= 2 * least
         status = FrameStatus.FEW_MATCHES
         message = f"{len(solution.matches)} matches; {least} are needed"
     predicted = frame.predicted

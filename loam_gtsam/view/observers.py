@@ -9,7 +9,7 @@ import numpy as np
 
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
-from loam_gtsam.geometry import transform
+from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.mapper import Mapper, Registered
 from loam_gtsam.pipeline import Observer, Pipeline
 from loam_gtsam.types import (
@@ -135,15 +135,18 @@ def map_view(update: MapUpdate, pipeline: Pipeline, path: Sequence[FloatArray]) 
     positions of all frames so far, in the frame of the mapper.
     """
     map_T_odom = _correction(pipeline)
-    cloud = surrounding_cloud(update, pipeline.mapper)
-    points, is_plane = transform(map_T_odom, cloud[:, :3]), cloud[:, 3] > 0.0
+    pose, maps = update.map_T_lidar.matrix(), pipeline.mapper.maps
+    edges, planes = (
+        transform(map_T_odom, cubes.points(cubes.neighbourhood(pose)))
+        for cubes in (maps.edges, maps.planes)
+    )
     positions = np.array(path).reshape(-1, 3)
     ends, on = np.zeros((0, 2, 3)), np.zeros(0, np.bool_)
     if pipeline.loops is not None and len(pipeline.loops.graph):
         keyframes = pipeline.loops.graph.poses()[:, :3, 3]
         positions = np.concatenate([keyframes, transform(map_T_odom, positions[-1:])])
         ends, on = pipeline.loops.loop_ends()
-    return MapView(points[~is_plane], points[is_plane], positions, ends, on)
+    return MapView(edges, planes, positions, ends, on)
 
 
 def matched_points(seen: Registered) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -190,16 +193,17 @@ def registered_cloud(sweep: Sweep, update: MapUpdate, mapper: Mapper) -> FloatAr
 
 
 def surrounding_cloud(update: MapUpdate, mapper: Mapper) -> FloatArray:
-    """Map points around the sensor, those that the next sweep is matched with.
+    """Map points of all cubes around the sensor, one for each voxel of the map of edges, as LOAM's.
 
-    They are (N, 4) metres, map frame, and the intensity: 0 of edge, 1 of plane points.
+    They are (N, 4) metres, map frame, and the intensity: 0 of edge, 1 of plane points, and between
+    where a voxel has both.
     """
     pose = update.map_T_lidar.matrix()
     parts = []
     for intensity, cubes in enumerate((mapper.maps.edges, mapper.maps.planes)):
-        points = cubes.points(cubes.neighbourhood(pose))
+        points = cubes.points(cubes.surroundings(pose))
         parts.append(np.column_stack([points, np.full(len(points), float(intensity))]))
-    return np.concatenate(parts)
+    return voxel_filter(np.concatenate(parts), mapper.maps.config.map.edge_voxel)
 
 
 def _deskewed(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from loam_gtsam.config import Config, DeskewConfig
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.geometry import transform
+from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.run_files import write_npz
 from loam_gtsam.loops.keyframes import LoopClosure
@@ -293,8 +294,18 @@ def test_the_whole_of_a_run_is_recorded(tmp_path: Path) -> None:
     counts = topics(tmp_path / "run.bag")
     assert (counts[ODOMETRY], counts[REGISTERED], counts[SURROUND]) == (6, 5, 2)
     surround = surrounding_cloud(outcome.updates[-1], mappers[-1])
-    assert np.array_equal(surround[surround[:, 3] == 0, :3], outcome.edge_points)
-    assert np.array_equal(surround[surround[:, 3] == 1, :3], outcome.plane_points)
+    kinds = outcome.edge_points, outcome.plane_points
+    rows = [np.column_stack([p, np.full(len(p), float(n))]) for n, p in enumerate(kinds)]
+    whole = np.concatenate(rows)
+    size = mappers[-1].maps.config.map.edge_voxel
+    assert np.array_equal(surround, voxel_filter(whole, size))
+    assert 0.7 * len(whole) < len(surround) < len(whole)
+    # All round, though the sensor sees no more than two thirds of the cubes at once.
+    turned = outcome.updates[-1].map_T_lidar.compose(
+        gtsam.Pose3(gtsam.Rot3.Pitch(np.pi / 2), np.zeros(3))
+    )
+    upright = replace(outcome.updates[-1], map_T_lidar=turned)
+    assert np.array_equal(surrounding_cloud(upright, mappers[-1]), surround)
     cloud = registered_cloud(sweeps[4], outcome.updates[4], mappers[-1])
     # On the walls of the map: the voxels of plane points are 0.4 m wide.
     distances = np.linalg.norm(cloud[::50, None, :3] - surround[None, :, :3], axis=2).min(axis=1)

@@ -54,7 +54,7 @@ class ImuSummary:
     gyro_bias : (3,) rad/s, lidar frame, as learnt in the end
     sweep_motions, tilt_priors : how many frames had which
     gyro_trusted : whether the gyro still agreed with the scans in the end
-    problem : a sentence if the rotation of the IMU to the lidar looks wrong, else empty
+    problems : sentences on what the turns of the scans say about clock, unit and mounting
     """
 
     report: ImuReport
@@ -63,7 +63,7 @@ class ImuSummary:
     sweep_motions: Mapping[str, int]
     tilt_priors: Mapping[str, int]
     gyro_trusted: bool
-    problem: str
+    problems: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -436,7 +436,7 @@ def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
         sweep_motions=Counter(str(update.sweep_motion) for update in updates),
         tilt_priors=Counter(str(update.tilt_prior) for update in updates),
         gyro_trusted=aid.trusted_gyro is not None,
-        problem=aid.mounting_problem,
+        problems=aid.problems,
     )
 
 

@@ -271,7 +271,7 @@ def test_an_imu_levels_the_map_deskews_and_holds_the_tilt(shaken, sweeps):
     assert result.imu.level.source == "still"
     assert result.imu.report.orientation == "ahrs"
     assert result.imu.gyro_trusted
-    assert result.imu.problem == ""
+    assert result.imu.problems == ()
     np.testing.assert_allclose(result.imu.gyro_bias, (0.002, -0.001, 0.0015), atol=0.002)
     assert up_error(result, shaken) < 0.5
     without = run(data_of(shaken, sweeps), with_imu(coupling="off"))
@@ -342,7 +342,7 @@ def test_with_wrong_extrinsics_the_gyro_is_given_up_and_the_run_tracks(shaken, s
     assert not result.imu.gyro_trusted
     assert result.imu.sweep_motions["constant_velocity"] > 20
     assert str(result.updates[-1].sweep_motion) == "constant_velocity"
-    assert "lidar_R_imu_deg" in result.imu.problem
+    assert "lidar_R_imu_deg" in result.imu.problems[0]
     assert ate(result, shaken) < 0.03
     # The guess does without it as well.
     last = result.updates[-2]

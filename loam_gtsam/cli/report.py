@@ -137,7 +137,7 @@ def _imu_problems(imu: ImuSummary) -> list[str]:
             "IMU: its gyro turned unlike the scans and was given up; check imu.lidar_R_imu_deg, "
             "units and stamps"
         )
-    return [*problems, imu.problem] if imu.problem else problems
+    return [*problems, *imu.problems]
 
 
 def _odd_frames(updates: Sequence[MapUpdate]) -> list[str]:
@@ -194,8 +194,8 @@ def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:
     imu = dataset.imu if config.imu.coupling != "off" else None
     if imu is None or len(imu.stamps) == 0:
         return []
-    stamp = sweep.stamp
-    first, last = int(imu.stamps.min()), int(imu.stamps.max())
+    stamp, offset = sweep.stamp, round(config.imu.time_offset * 1e9)
+    first, last = int(imu.stamps.min()) + offset, int(imu.stamps.max()) + offset
     if first <= stamp <= last:
         return []
     return [

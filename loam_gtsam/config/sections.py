@@ -356,6 +356,9 @@ class ImuConfig(Section):
     )
     """Roll and pitch of a frame are the mean over this duration, brought to the moment of the frame
     by the gyro; 0 takes those of the moment itself."""
+    time_offset: float = parameter(0.0, unit="s", low=-10.0, high=10.0)
+    """This is added to the stamps of the samples, where the IMU has another clock than the sweeps:
+    negative if its stamps are late. The end of a run says by how much they are."""
     max_gap: float = parameter(0.1, unit="s", low=1e-3, high=60.0)
     """A gap between samples that is longer than this is not bridged."""
     lidar_R_imu_deg: tuple[Angle, Angle, Angle] = parameter((0.0, 0.0, 0.0), unit="degrees")

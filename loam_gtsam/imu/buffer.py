@@ -1,12 +1,14 @@
 """The IMU buffer: samples in any order go in, orientation and rotation at any time come out.
 
-Everything that leaves it is in lidar axes: ``lidar_R_imu_deg`` is applied when samples enter.
+Everything that leaves it is in lidar axes and on the clock of the sweeps: ``lidar_R_imu_deg`` and
+``time_offset`` are applied when samples enter.
 Stamps are subtracted as integers before they become seconds.
 """
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
 import gtsam
 import numpy as np
@@ -15,6 +17,7 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.geometry import as_array, as_stamps, as_vector
 from loam_gtsam.imu.at_rest import RestWindow, find_rest, rest_at_start
 from loam_gtsam.imu.attitude_filter import BLOCK, GravityFilter
+from loam_gtsam.imu.diagnosis import samples_problems
 from loam_gtsam.imu.quality import ImuReport, QualityLog
 from loam_gtsam.imu.quaternions import (
     as_rot3,
@@ -169,6 +172,7 @@ class ImuBuffer:
         stamps, values = _checked(samples)
         finite = (np.abs(values[:, 4:]) < _ABSURD).all(axis=1)  # NaN compares false
         finite &= (stamps >= -MAX_STAMP) & (stamps <= MAX_STAMP)
+        stamps = stamps + round(self._config.time_offset * 1e9)
         counts["not_finite"] += len(stamps) - int(finite.sum())
         stamps, values = stamps[finite], values[finite]
         if len(stamps) == 0:
@@ -220,7 +224,11 @@ class ImuBuffer:
     def report(self) -> ImuReport:
         """Numbers of all samples so far, and what was wrong with them."""
         filtered = self._orientations() is not None
-        return self._quality.report(self._store.samples.stamps, self._rest_at_start(), filtered)
+        samples, rest = self._store.samples, self._rest_at_start()
+        if not self._quality.measured:
+            samples = replace(samples, orientation=None)
+        wrong = samples_problems(samples, self._config, rest)
+        return self._quality.report(samples.stamps, rest, filtered, wrong)
 
     def orientation(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar`` (world z up), interpolated between the neighbours.

@@ -1,11 +1,11 @@
-"""What was wrong with the IMU of a run, in numbers and in sentences: samples and mounting."""
+"""What was wrong with the samples of an IMU, in numbers and in sentences."""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
@@ -14,16 +14,6 @@ from loam_gtsam.types import FloatArray, IntArray
 
 FROZEN_TURN = 0.2
 """rad/s; an orientation that never changes while the gyro measures more is a placeholder."""
-TILT_LIMIT = np.deg2rad(5.0)
-"""rad between up by the orientation and up by the accelerometer at rest, from which on one of them
-is called wrong: an accelerometer bias of 0.85 m/s^2, ten times that of a consumer MEMS."""
-
-EXTRINSIC_LIMIT = np.deg2rad(5.0)
-"""rad from which on a configured rotation is called wrong."""
-EXTRINSIC_SIGMA = np.deg2rad(1.5)
-"""rad, largest standard deviation of the better rotation about any axis for it to be believed."""
-EXTRINSIC_FRAMES = 20
-"""Pairs of frames below which nothing is said."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,11 +96,14 @@ class QualityLog:
         self._dropped_gaps += len(gaps)
         self._longest_gap = max(self._longest_gap, int(gaps.max(initial=0)))
 
-    def report(self, stamps: IntArray, rest: RestWindow | None, filtered: bool) -> ImuReport:
+    def report(
+        self, stamps: IntArray, rest: RestWindow | None, filtered: bool, wrong: Sequence[str] = ()
+    ) -> ImuReport:
         """The report on all samples so far.
 
-        ``stamps`` (N,) are of the samples held, ``rest`` is that at the start of the run, and
-        ``filtered`` says whether there is an orientation at all.
+        ``stamps`` (N,) are of the samples held, ``rest`` is that at the start of the run,
+        ``filtered`` says whether there is an orientation at all, and ``wrong`` are the
+        problems of the values.
         """
         samples, counts = self._dropped + len(stamps), self._counts
         source, problem = self._source(samples, rest, filtered)
@@ -120,6 +113,7 @@ class QualityLog:
         )
         problems = [frozen] if self._quaternions and not self.measured else []
         problems += [problem] if problem else []
+        problems += wrong
         for fault, what in _FAULTS.items():
             if counts[fault] and (fault != "no_orientation" or source == "ahrs"):
                 problems.append(f"IMU: {counts[fault]} samples {what}")
@@ -151,15 +145,7 @@ class QualityLog:
     def _source(self, samples: int, rest: RestWindow | None, filtered: bool) -> tuple[str, str]:
         """Where the orientation comes from, and what is wrong with that, "" if nothing."""
         if self.measured:
-            if rest is None or not rest.disagreement > TILT_LIMIT:
-                return "ahrs", ""
-            return "ahrs", (
-                "IMU: at rest at the start, up by the orientation and up by the accelerometer "
-                f"are {np.rad2deg(rest.disagreement):.0f} degrees apart: expected the "
-                "orientation of the IMU in a world with z up (not the north-east-down one) and "
-                "an acceleration that reads +9.8 upwards; correct the driver or set imu.prior "
-                "to off"
-            )
+            return "ahrs", ""
         if not samples:
             return "none", ""
         if not filtered:
@@ -173,45 +159,3 @@ class QualityLog:
                 "roll and pitch may be off by several degrees"
             )
         return "gravity_filter", ""
-
-
-def extrinsic_problem(by_scan: FloatArray, by_gyro: FloatArray, lidar_R_imu: gtsam.Rot3) -> str:
-    """Say so if another ``lidar_R_imu_deg`` would fit the motion of the scans better.
-
-    The rotations from frame to frame by the gyro and by the scans are the same vectors in two sets
-    of axes; the rotation between the sets is found in closed form (Wahba's problem by SVD:
-    Markley, J. Astronautical Sciences 36, 1988).
-
-    Parameters
-    ----------
-    by_scan, by_gyro : (N, 3) rotation vectors from frame to frame, rad, lidar axes
-    lidar_R_imu : the configured rotation
-
-    Returns
-    -------
-    A sentence if the best rotation is more than :data:`EXTRINSIC_LIMIT` away and known to
-    :data:`EXTRINSIC_SIGMA`, else "": then all is well or the motion was too poor to tell.
-    """
-    if len(by_scan) < EXTRINSIC_FRAMES:
-        return ""
-    # How far, unlike about which axis, does not depend on the extrinsics: a pair that disagrees
-    # in that is a lost track or a gyro fault, and would only mislead.
-    unlike = np.abs(np.linalg.norm(by_scan, axis=1) - np.linalg.norm(by_gyro, axis=1))
-    fair = unlike <= 3.0 * np.median(unlike) + 1e-9
-    by_scan, by_gyro = by_scan[fair], by_gyro[fair]
-    left, strength, right = np.linalg.svd(by_scan.T @ by_gyro)
-    sign = float(np.sign(np.linalg.det(left) * np.linalg.det(right)))
-    better = gtsam.Rot3(left @ np.diag([1.0, 1.0, sign]) @ right)
-    away = float(np.linalg.norm(gtsam.Rot3.Logmap(better)))
-    residuals = by_scan - by_gyro @ better.matrix().T
-    variance = float((residuals**2).sum()) / (3 * len(residuals) - 3)
-    # Information about the axis known least, unit weights. Products of the two, not squares of one:
-    # noise, which is not the same in both, must not pass for motion.
-    weakest = strength[1] + sign * strength[2]
-    if away <= EXTRINSIC_LIMIT or variance > EXTRINSIC_SIGMA**2 * weakest:
-        return ""
-    angles = np.rad2deg(better.compose(lidar_R_imu).rpy()).round().astype(int)
-    return (
-        f"IMU: its rotations fit those of the scans better by {np.rad2deg(away):.0f} degrees with "
-        f"imu.lidar_R_imu_deg = {angles.tolist()}; check how the IMU is mounted"
-    )

@@ -262,5 +262,5 @@ def _imu_part(imu: ImuSummary) -> dict[str, Any]:
         "sweep_motions": dict(imu.sweep_motions),
         "gyro_bias_rad_s": imu.gyro_bias.tolist(),
         "gyro_trusted": imu.gyro_trusted,
-        "problems": [*report.problems, *([imu.problem] if imu.problem else [])],
+        "problems": [*report.problems, *imu.problems],
     }

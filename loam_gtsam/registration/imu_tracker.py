@@ -13,9 +13,9 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.coupling import TightCoupling
+from loam_gtsam.imu.diagnosis import LATEST, scans_problems
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import Fused, Prediction
-from loam_gtsam.imu.quality import extrinsic_problem
 from loam_gtsam.imu_prior import (
     blend,
     blend_direction,
@@ -86,7 +86,8 @@ class ImuTracker:
         """Forget all frames: as a new tracker on the same buffer, with the bias it was given."""
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
-        self._disagreements, self._turns = 0, np.zeros((0, 6))
+        self._disagreements = 0
+        self._spans, self._turns = np.zeros((0, 2), np.int64), np.zeros((0, 6))
         self._coupling = TightCoupling(self.config)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -103,9 +104,16 @@ class ImuTracker:
         return self.buffer if self._disagreements < _DISTRUST else None
 
     @property
-    def mounting_problem(self) -> str:
-        """What :func:`extrinsic_problem` says of the frames compared so far, "" if nothing."""
-        return extrinsic_problem(self._turns[:, :3], self._turns[:, 3:], self.buffer.lidar_R_imu)
+    def problems(self) -> tuple[str, ...]:
+        """What :func:`loam_gtsam.imu.diagnosis.scans_problems` says of the frames so far."""
+        if not len(self._spans):
+            return ()
+        more = round((LATEST + 1.0) * 1e9)
+        samples = self.buffer.samples_between(
+            int(self._spans.min()) - more, int(self._spans.max()) + more
+        )
+        turns = self._turns[:, :3], self._turns[:, 3:]
+        return scans_problems(self._spans, *turns, samples, self.config)
 
     def rotation_between(self, first: int, second: int) -> gtsam.Rot3 | None:
         """``first_R_second`` of two stamps by the gyro; None while it is not to be trusted."""
@@ -201,6 +209,7 @@ class ImuTracker:
         scan = last[1].rotation().between(now[1].rotation())
         by_scan, by_gyro = gtsam.Rot3.Logmap(scan), gtsam.Rot3.Logmap(turned)
         self._turns = np.vstack([self._turns, np.hstack([by_scan, by_gyro])])[-_PAIRS:]
+        self._spans = np.vstack([self._spans, [last[0], now[0]]])[-_PAIRS:]
         if _disagree(scan, turned, *_DISAGREEMENT):
             self._disagreements = min(self._disagreements + 1, 2 * _DISTRUST)
             return

@@ -136,6 +136,7 @@ class LiveImu:
 
     def __init__(self, config: ImuConfig, capacity: int | None) -> None:
         self._config = config
+        self._offset = round(config.time_offset * 1e9)
         self.dropped = self.late = 0
         self._waiting: deque[Row] = deque(maxlen=capacity)
         self._last: int | None = None
@@ -151,7 +152,7 @@ class LiveImu:
         """A new sample, finite."""
         self.dropped += len(self._waiting) == self._waiting.maxlen
         self._waiting.append(row)
-        self._last = row[0]
+        self._last = row[0] + self._offset
 
     def covers(self, stamp: int) -> bool:
         """Whether samples have come up to that moment.
@@ -169,7 +170,7 @@ class LiveImu:
     def hand_over(self, rows: Sequence[Row], until: int) -> None:
         """Put samples into the buffer before a sweep is mapped that ends at ``until``."""
         if self._mapped is not None:
-            self.late += sum(stamp <= self._mapped for stamp, _ in rows)
+            self.late += sum(stamp + self._offset <= self._mapped for stamp, _ in rows)
         self._mapped = until
         # A sweep with a stamp from the future must not cost the samples of the next ones.
         self.buffer.forget_old(until if self._last is None else min(until, self._last))

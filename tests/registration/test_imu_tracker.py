@@ -358,9 +358,9 @@ def test_the_check_of_the_mounting_sees_frames_whose_samples_are_forgotten():
     compare(tracker, zip(stamps.tolist(), poses, strict=True))
     tracker.buffer.forget_old(NOW + 120 * 10**9)
     assert len(tracker.buffer) < 200
-    assert "[0, 0, 90]" in tracker.mounting_problem
+    assert "[0, 0, 90]" in tracker.problems[0]
     tracker.reset()
-    assert tracker.mounting_problem == ""
+    assert tracker.problems == ()
 
 
 def accelerating(acceleration, seconds=2.0):

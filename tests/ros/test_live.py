@@ -48,6 +48,7 @@ from loam_gtsam.pipeline import Pipeline, RunResult, imu_buffer, run
 from loam_gtsam.registration.odometry import make_odometry
 from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.ros.live import LiveMapper, LiveResult
+from loam_gtsam.ros.live_inputs import LiveImu
 from loam_gtsam.ros.live_report import OTHER_REASONS, LiveLog
 from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, SweepFault
 
@@ -384,6 +385,16 @@ def test_a_sweep_waits_for_its_samples_and_no_longer(bag: Path) -> None:
     # Those of the times of the first two sweeps came after them.
     late = live.report().late["imu"]
     assert late == sum(m.received - 3 * MS <= sweeps[1].received - 20 * MS for m in samples)
+
+
+def test_sweeps_wait_for_samples_by_the_clock_that_is_put_right() -> None:
+    imu = LiveImu(ImuConfig(time_offset=-0.05), None)
+    imu.add((1000 * MS, np.zeros(10)))
+    assert imu.covers(950 * MS)
+    assert not imu.covers(951 * MS)
+    imu.hand_over(imu.take(), 950 * MS)
+    imu.hand_over([(1000 * MS, np.zeros(10)), (1001 * MS, np.zeros(10))], 960 * MS)
+    assert imu.late == 1
 
 
 def test_impatience_is_counted_and_changes_the_result(bag: Path, offline: RunResult) -> None:

@@ -109,9 +109,8 @@ class ImuTracker:
         if not len(self._spans):
             return ()
         more = round((LATEST + 1.0) * 1e9)
-        samples = self.buffer.samples_between(
-            int(self._spans.min()) - more, int(self._spans.max()) + more
-        )
+        first, last = int(self._spans.min()) - more, int(self._spans.max()) + more
+        samples = self.buffer.samples_between(first, last)
         turns = self._turns[:, :3], self._turns[:, 3:]
         return scans_problems(self._spans, *turns, samples, self.config)
 

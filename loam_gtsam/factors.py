@@ -293,11 +293,18 @@ def scan_match_factor(key: int, rows: MatchRows) -> gtsam.CustomFactor:
     factors with sigma ``1 / scale`` (module docstring), at a cost per evaluation that does not
     depend on the number of matches. InputError if there are no rows.
     """
+    residual = scan_match_residual(rows)
+    return _pose_factor(key, gtsam.noiseModel.Unit.Create(13), residual)
+
+
+def scan_match_residual(
+    rows: MatchRows,
+) -> Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]]:
+    """The function of a pose behind :func:`scan_match_factor`: residual (13,), Jacobian (13, 6)."""
     if len(rows.points) == 0:
         raise InputError("scan_match_factor: expected at least one match, got none")
     anchor, root = _compressed(rows)
-    residual = partial(_compressed_residual, anchor=anchor, root=root)
-    return _pose_factor(key, gtsam.noiseModel.Unit.Create(len(root)), residual)
+    return partial(_compressed_residual, anchor=anchor, root=root)
 
 
 def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:

@@ -1,4 +1,4 @@
-"""The commands of ``loam-gtsam``: demo, run, compare, study, inspect, optimize, config.
+"""The commands of ``loam-gtsam``: demo, run, compare, study, inspect, optimize, refine, ...
 
 Exit codes: 0 done, 1 an error, 2 wrong usage, 130 stopped by Ctrl-C, 143 by SIGTERM. What a command
 needs is imported when the command runs: ``--help`` and the completion of a shell answer at once.
@@ -17,6 +17,7 @@ from loam_gtsam.cli.options import (
     DemoOptions,
     InspectOptions,
     OptimizeOptions,
+    RefineOptions,
     RunOptions,
     StudyOptions,
     command,
@@ -139,6 +140,19 @@ def inspect(options: InspectOptions) -> int:
 def optimize(options: OptimizeOptions) -> int:
     """Optimise a saved pose graph, robust against wrong loops."""
     from loam_gtsam.cli.optimize import execute
+
+    return execute(options)
+
+
+@app.command(short_help="Adjust planes and poses of a finished run.")
+@command
+def refine(options: RefineOptions) -> int:
+    """Adjust all planes of the map of a finished run together with its poses.
+
+    PATH is the data set that was run: it is read once more. Trajectory, covariances, map, report
+    and a cross-section go to RUN/refined.
+    """
+    from loam_gtsam.cli.refine import execute
 
     return execute(options)
 

@@ -261,6 +261,11 @@ class RunOptions(OutputOptions, PartOptions):
         "(loops.enabled).",
         "--loops",
     )
+    refine: bool = flag(
+        "Adjust all planes of the map together with the poses when the run is done; the results "
+        "go to DIR/refined, as with loam-gtsam refine.",
+        "--refine",
+    )
     workers: int | None = option(
         "Processes that extract features ahead of the solve; by default one for more than 200 "
         "sweeps. The result is the same.",
@@ -410,6 +415,20 @@ class OptimizeOptions(Options):
         min=0.0,
     )
     overwrite: bool = flag("Replace an existing file.", "--overwrite")
+    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefineOptions(SourceOptions):
+    """Options of ``refine``."""
+
+    run: Path = argument("RUN", "Folder with the results of loam-gtsam run PATH.")
+    rounds: int = option("Search for planes, and solve, at most so often.", default=6, min=1)
+    points: int = option("Points of a sweep at most.", default=3000, min=100)
+    plot: bool | None = option(
+        "Draw pictures [default: if matplotlib is installed].", "--plot/--no-plot"
+    )
+    overwrite: bool = flag("Replace earlier results in RUN/refined.", "--overwrite")
     quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
 
 

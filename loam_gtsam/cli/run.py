@@ -13,6 +13,7 @@ from rich.console import Console
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RunOptions
+from loam_gtsam.cli.refine import refine_folder
 from loam_gtsam.cli.report import profile_table, summary
 from loam_gtsam.cli.results import RUN_OUTPUTS, Results, is_complete
 from loam_gtsam.config import Config
@@ -81,6 +82,8 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
         Console().print(summary(result, dataset.name, seconds, results.accuracy, problems))
         console.print_written(stop, len(result.updates), total, folder, files)
         _print_hints(options, folder, stop)
+    if options.refine and ended and any(update.status.solved for update in result.updates):
+        refine_folder(folder, dataset, plot=plot, overwrite=True, quiet=options.quiet)
     nothing = f"{dataset.name}: none of the {len(result.updates)} sweeps could be used"
     return console.exit_code(result.error, stop, result.updates, nothing)
 

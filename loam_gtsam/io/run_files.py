@@ -83,6 +83,8 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     arrays = {
         "stamps": _column(updates, "stamp", np.int64),
         "map_T_lidar": stack_poses(u.map_T_lidar for u in updates),
+        "map_T_middle": stack_poses(u.map_T_middle or u.map_T_lidar for u in updates),
+        "middle_stamps": _column(updates, "middle_stamp", np.int64),
         "status": _column(updates, "status", np.str_),
         "messages": _column(updates, "message", np.str_),
         "covariances": _column(updates, "covariance", shape=(6, 6)),

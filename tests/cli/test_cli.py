@@ -497,3 +497,20 @@ def test_sweep_is_the_old_name_of_study_and_says_so_and_no_help_is_cut_off(monke
     commands = loam("--help").output.partition("Commands:")[2]
     assert "\n  sweep" not in commands
     assert "..." not in commands
+
+
+def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
+    spec = "sim:room?frames=12&columns=600"
+    assert loam("run", spec, "--output", "out", "--refine", "--no-plot", "--quiet").exit_code == 0
+    report = json.loads(Path("out/refined/report.json").read_text())
+    assert report["frames"] == 12
+    assert report["after"]["ate_rmse_m"] < 0.01
+    lines = Path("out/refined/trajectory_covariance.csv").read_text().splitlines()
+    assert len(lines) == 13
+    told = loam("refine", spec, "out", "--rounds", "1", "--points", "500")
+    assert told.exit_code == 0
+    assert "thickness of common planes" in told.output
+    assert Path("out/refined-2/section.png").stat().st_size > 1000
+    missing = loam("refine", spec, "nothing")
+    assert missing.exit_code == 1
+    assert "expected the folder of a finished run" in missing.output

@@ -119,6 +119,14 @@ def two_sessions(names: Names, output: str) -> None:
     assert Path("both.ply").stat().st_size > 100_000
 
 
+def refined_run(names: Names, output: str) -> None:
+    before, after = names["errors"]
+    assert after < 0.6 * before
+    assert names["thick"][1] < names["thick"][0]
+    assert names["off"] < 0.01
+    assert names["graph"].size() == 2
+
+
 CHECKS: dict[str, Callable[[Names, str], None]] = {
     "01_map_a_built_in_scene.py": built_in_scene,
     "02_numpy_arrays.py": numpy_arrays,
@@ -132,6 +140,7 @@ CHECKS: dict[str, Callable[[Names, str], None]] = {
     "10_own_loop_closer.py": own_loop_closer,
     "11_optimise_a_saved_graph.py": saved_graph,
     "12_merge_two_sessions.py": two_sessions,
+    "13_refine_a_run.py": refined_run,
 }
 
 

@@ -1,0 +1,67 @@
+"""The frames of a finished run, read from the ``run.npz`` that it wrote."""
+
+from __future__ import annotations
+
+import zipfile
+from pathlib import Path
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.types import DatasetError, FrameStatus, MapUpdate, Uncertainty
+
+
+def read_updates(path: str | Path) -> list[MapUpdate]:
+    """Stamps, poses, statuses, twists, covariances and their parts of the frames of a run.
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read, or is not one of
+        :func:`~loam_gtsam.io.run_files.write_npz`.
+    """
+    try:
+        with np.load(path) as file:
+            columns = {name: file[name] for name in _NEEDED}
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        raise DatasetError(f"{path}: expected the run.npz of a finished run: {error}") from error
+    updates = []
+    for row in range(len(columns["stamps"])):
+        at = {name: column[row] for name, column in columns.items()}
+        status = FrameStatus(str(at["status"]))
+        uncertainty = None
+        if status.solved and np.isfinite(at["own_covariances"]).all():
+            follows = int(at["follows"])
+            uncertainty = Uncertainty(
+                own=at["own_covariances"],
+                shared=at["shared_covariances"],
+                follows=None if follows < 0 else follows,
+                drift=at["drift_covariances"],
+                residual_variance=float(at["residual_variances"]),
+                effective_matches=float(at["effective_matches"]),
+                blind=at["blind_drifts"],
+                forgotten=at["forgotten"],
+            )
+        updates.append(
+            MapUpdate(
+                int(at["stamps"]),
+                gtsam.Pose3(at["map_T_lidar"]),
+                status,
+                covariance=at["covariances"],
+                twist=at["twists"],
+                uncertainty=uncertainty,
+                map_T_middle=gtsam.Pose3(at["map_T_middle"]) if at["middle_stamps"] else None,
+                middle_stamp=int(at["middle_stamps"]),
+                localizability=at["localizability"],
+                directions=at["directions"],
+            )
+        )
+    return updates
+
+
+_NEEDED = (
+    "stamps", "map_T_lidar", "status", "covariances", "twists", "own_covariances",
+    "shared_covariances", "drift_covariances", "follows", "residual_variances",
+    "effective_matches", "blind_drifts", "forgotten", "localizability", "directions",
+    "map_T_middle", "middle_stamps",
+)  # fmt: skip

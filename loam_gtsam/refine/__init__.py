@@ -1,0 +1,1 @@
+"""Adjustment of all planes of the map together with the poses."""

@@ -1,0 +1,112 @@
+"""What a run knew of the motion between its sweeps, as factors of the adjustment."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.geometry import symmetric
+from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph
+from loam_gtsam.loops.keyframes import noise_model
+from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate
+
+_UNKNOWN: FloatArray = np.diag(np.repeat([0.1, 1.0], 3) ** 2)
+"""Covariance of a motion to or from a sweep that was not solved."""
+_LOOP_KERNEL = 3.0
+"""Width of the Huber kernel on a loop closure, of which a right one has a norm of sqrt(6)."""
+
+
+def told_directions(updates: Sequence[MapUpdate], least: float) -> FloatArray:
+    """Projectors (N, 6, 6) of the poses onto the directions that the run saw in each sweep.
+
+    A direction that fewer than ``least`` matches fix (``solver.min_aligned``) is left out. All are
+    kept where the run did not look.
+    """
+    keep = np.tile(np.eye(6), (len(updates), 1, 1))
+    for number, update in enumerate(updates):
+        known = np.isfinite(update.directions).all() and np.isfinite(update.localizability).all()
+        weak = update.localizability < least
+        if known and weak.any():
+            # The rows of ``directions`` are orthonormal by the motion that they give the points.
+            dual = np.linalg.pinv(update.directions).T
+            keep[number] -= update.directions[weak].T @ dual[weak]
+    return keep
+
+
+def odometry_factors(
+    updates: Sequence[MapUpdate], map_T_middle: FloatArray, keep: FloatArray | None = None
+) -> gtsam.NonlinearFactorGraph:
+    """Between factors of consecutive sweeps, with the covariances that the run calibrated.
+
+    They come from the same points as the planes, so that where the planes decide, they add little
+    that is new; they decide along directions that no plane fixes.
+
+    Parameters
+    ----------
+    updates : N frames of a run, in their order
+    map_T_middle : (N, 4, 4) their poses
+    keep : (N, 6, 6) of :func:`told_directions`. Along what is left out, an error of the velocity
+        persists: over n sweeps it grows with n and not with its root, so that each variance along
+        it is taken n times.
+    """
+    keep = np.tile(np.eye(6), (len(updates), 1, 1)) if keep is None else keep
+    blind = np.eye(6) - keep
+    length = _stretches(np.abs(blind).max(axis=(1, 2)) > 0.0)
+    graph = gtsam.NonlinearFactorGraph()
+    for number, (earlier, later) in enumerate(pairwise(updates)):
+        known = earlier.uncertainty is not None and later.uncertainty is not None
+        covariance = relative_covariance(earlier, later) if known else _UNKNOWN
+        left_out = blind[number + 1]
+        extra = max(length[number + 1] - 1, 0) * left_out @ covariance @ left_out.T
+        covariance = symmetric(covariance + extra)
+        motion = gtsam.Pose3(map_T_middle[number]).between(gtsam.Pose3(map_T_middle[number + 1]))
+        keys = gtsam.symbol("x", number), gtsam.symbol("x", number + 1)
+        graph.add(gtsam.BetweenFactorPose3(*keys, motion, noise_model(covariance)))
+    return graph
+
+
+def _stretches(mask: BoolArray) -> IntArray:
+    """(N,) length of the run of true values that each is in; 0 for the others."""
+    length = np.zeros(len(mask), np.int64)
+    for start in np.flatnonzero(mask & ~np.concatenate([[False], mask[:-1]])):
+        rest = np.flatnonzero(~mask[start:])
+        end = start + rest[0] if len(rest) else len(mask)
+        length[start:end] = end - start
+    return length
+
+
+def loop_factors(
+    graph: SavedGraph,
+    solved: OptimizedGraph,
+    stamps: IntArray,
+    to_middle: Sequence[gtsam.Pose3],
+) -> gtsam.NonlinearFactorGraph:
+    """The loop closures of a run that agree with the others, between the middles of the sweeps.
+
+    Parameters
+    ----------
+    graph, solved : pose graph of the run with its stamps, and its solution
+    stamps : (N,) nanoseconds of the poses of all frames
+    to_middle : N poses of the middle of each sweep, seen from its reference time
+    """
+    found = gtsam.NonlinearFactorGraph()
+    frame = {int(stamp): number for number, stamp in enumerate(stamps)}
+    for place, report in zip(graph.loops, solved.loops, strict=True):
+        factor: Any = graph.factors.at(place)
+        ends = [frame.get(graph.stamps.get(key, -1)) for key in factor.keys()]  # noqa: SIM118
+        if not report.active or ends[0] is None or ends[1] is None:
+            continue
+        one, two = to_middle[ends[0]], to_middle[ends[1]]
+        motion = one.inverse().compose(factor.measured()).compose(two)
+        turn = two.inverse().AdjointMap()
+        noise = noise_model(symmetric(turn @ factor.noiseModel().covariance() @ turn.T))
+        kernel = gtsam.noiseModel.mEstimator.Huber.Create(_LOOP_KERNEL)
+        keys = gtsam.symbol("x", ends[0]), gtsam.symbol("x", ends[1])
+        robust = gtsam.noiseModel.Robust.Create(kernel, noise)
+        found.add(gtsam.BetweenFactorPose3(*keys, motion, robust))
+    return found

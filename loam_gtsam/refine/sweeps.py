@@ -1,0 +1,195 @@
+"""The points of the sweeps, and where they were measured: a path that follows the adjusted poses.
+
+Unlike the mapper's features, these points are no centroids: the mean of the points in a voxel of
+the lidar's frame moves with the lidar, and an adjustment of all sweeps would take that for a
+motion (in a corridor 0.7 mm a sweep).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import Config
+from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.geometry import as_array, as_points, as_vector, cross
+from loam_gtsam.types import (
+    Features,
+    FeatureSweep,
+    FloatArray,
+    InputError,
+    IntArray,
+    Scan,
+    Sweep,
+)
+
+_NEAR = 10
+"""Sweeps before and after one over which errors of the path are averaged."""
+_MISSED, _AT_END = 0.3, 5.0
+"""Error of the path over what a polynomial of degree two misses of it: within a stretch of sweeps
+(one of degree four remains), and at its ends, where it goes beyond the poses."""
+_GAP = 2.5
+"""Sweeps, as the median from one to the next, across which no velocity is taken."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SweepPoints:
+    """Points of one sweep on smooth surfaces, as they were measured.
+
+    Attributes
+    ----------
+    stamp : nanoseconds of the middle of the sweep, to which its pose belongs
+    points : (N, 3) metres, lidar frame, each at its own time
+    seconds : (N,) from the middle; all zero if the points are de-skewed already
+    reference : seconds from the middle to the reference time, for which poses are reported
+    """
+
+    stamp: int
+    points: FloatArray
+    seconds: FloatArray
+    reference: float = 0.0
+
+    def __post_init__(self) -> None:
+        points = as_points(self.points, "SweepPoints.points")
+        object.__setattr__(self, "points", points)
+        seconds = as_vector(self.seconds, "SweepPoints.seconds", len(points))
+        object.__setattr__(self, "seconds", seconds)
+
+
+def sweep_points(features: Features, config: Config, most: int = 3000) -> SweepPoints:
+    """The plane points of a sweep, at most ``most`` of them, evenly spread over the sweep."""
+    first, end = features.span
+    moving = config.deskew.enabled and end > first
+    middle = 0.5 * (first + end) if moving else 0.0
+    count = len(features.planes)
+    order = np.argsort(features.plane_times, kind="stable")
+    rows = order[np.linspace(0, count - 1, min(most, count)).astype(int)]
+    seconds = features.plane_times[rows] - middle if moving else np.zeros(len(rows))
+    stamp = features.stamp + round(middle * 1e9)
+    return SweepPoints(stamp, features.planes[rows], seconds, -middle)
+
+
+def extract_points(sweep: Sweep, config: Config, most: int = 3000) -> SweepPoints:
+    """The points of a sweep of a data set, not averaged.
+
+    Raises
+    ------
+    SweepError
+        If the sweep has no usable points.
+    InputError
+        If the sweep could not be read.
+    """
+    if isinstance(sweep, FeatureSweep):
+        return sweep_points(sweep.features, config, most)
+    if not isinstance(sweep, Scan):
+        raise InputError(f"sweep: expected a Scan or a FeatureSweep, got {type(sweep).__name__}")
+    every = config.changed("features.plane_voxel=0.0")
+    return sweep_points(extract_features(sweep, every), config, most)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Path:
+    """The motion about the middles of N sweeps, from the poses around each.
+
+    Attributes
+    ----------
+    map_T_middle : (N, 4, 4)
+    powers : (N, 4, 6) coefficients of t, t^2, t^3, t^4, with t the seconds from the middle: the
+        lidar is at ``map_T_middle Exp(xi(t))``, tangent order of the package
+    coarse : (N, 4, 6) the same through the two nearest neighbours alone
+    """
+
+    map_T_middle: FloatArray
+    powers: FloatArray
+    coarse: FloatArray
+
+    @classmethod
+    def through(cls, stamps: IntArray, map_T_middle: FloatArray) -> Path:
+        """Through the pose of each sweep and up to two neighbours on either side.
+
+        A sweep in the middle of others has a polynomial of degree four through five poses; at a gap
+        in time, where the neighbours of one side are missing, the degree is at most two. A sweep
+        without neighbours is at rest.
+        """
+        poses = as_array(map_T_middle, "map_T_middle", (len(stamps), 4, 4))
+        count = len(poses)
+        seconds = (stamps - stamps[:1]) * 1e-9
+        steps = np.diff(seconds)
+        if not (steps > 0.0).all():
+            raise InputError("stamps: expected increasing nanoseconds, got others; sort the sweeps")
+        linked = steps <= _GAP * np.median(steps) if count > 1 else np.zeros(0, np.bool_)
+        stretch = np.concatenate([[0], np.cumsum(~linked)])
+        frames = [gtsam.Pose3(pose) for pose in poses]
+        powers, coarse = np.zeros((2, count, 4, 6))
+        for k in range(count):
+            near = [n for n in range(max(k - 2, 0), min(k + 3, count)) if stretch[n] == stretch[k]]
+            near.remove(k)
+            near = [near[n] for n in np.argsort(np.abs(np.array(near) - k), kind="stable")]
+            times = seconds[near] - seconds[k]
+            away = np.array([gtsam.Pose3.Logmap(frames[k].between(frames[n])) for n in near])
+            for found, most in ((powers, len(near) if len(near) == 4 else 2), (coarse, 2)):
+                degrees = np.arange(1, min(most, len(near)) + 1)
+                if len(degrees):
+                    matrix = times[: len(degrees), None] ** degrees
+                    found[k, : len(degrees)] = np.linalg.solve(matrix, away[: len(degrees)])
+        return cls(poses, powers, coarse)
+
+    def errors(self, seconds: FloatArray) -> FloatArray:
+        """(N, 6) variances of the motion from the middles to times (N,) beside them.
+
+        A polynomial of degree two misses what the motion has of higher degrees, and one of degree
+        four some share of it. What the two differ by is averaged over the sweeps near by.
+        """
+        times = seconds[:, None, None] ** np.arange(1, 5)[:, None]
+        missed = ((self.powers - self.coarse) * times).sum(axis=1) ** 2
+        whole = np.abs(self.powers[:, 2:]).max(axis=(1, 2)) > 0.0
+        numbers = np.flatnonzero(whole)
+        if not len(numbers):
+            return np.zeros_like(missed)
+        window = np.ones(2 * _NEAR + 1)
+        sums = [np.convolve(column, window, "same") for column in (missed * whole[:, None]).T]
+        mean = np.stack(sums, axis=1) / np.maximum(np.convolve(whole, window, "same"), 1.0)[:, None]
+        nearest = numbers[np.abs(np.arange(len(whole))[:, None] - numbers).argmin(axis=1)]
+        variances: FloatArray = np.where(whole[:, None], _MISSED**2, _AT_END**2) * mean[nearest]
+        return variances
+
+    def motion(self, number: int, seconds: FloatArray) -> FloatArray:
+        """``xi`` (M, 6) at times (M,) from the middle of a sweep."""
+        found: FloatArray = (seconds[:, None] ** np.arange(1, 5)) @ self.powers[number]
+        return found
+
+    def deskewed(self, number: int, sweep: SweepPoints) -> FloatArray:
+        """Points of a sweep as seen from its middle, (N, 3) metres."""
+        if not sweep.seconds.any():
+            return sweep.points
+        return _moved(sweep.points, self.motion(number, sweep.seconds))
+
+    def at(self, number: int, seconds: float) -> gtsam.Pose3:
+        """``map_T_lidar`` so many seconds from the middle of a sweep."""
+        step = self.motion(number, np.array([seconds]))[0]
+        return gtsam.Pose3(self.map_T_middle[number]).compose(gtsam.Pose3.Expmap(step))
+
+
+def _moved(points: FloatArray, motions: FloatArray) -> FloatArray:
+    """Points (N, 3), each moved by ``Exp`` of its own tangent vector (N, 6)."""
+    axis, way, point = motions[:, :3].T.copy(), motions[:, 3:].T, points.T.copy()
+    angle = np.maximum(np.sqrt((axis * axis).sum(axis=0)), 1e-9)
+    sine = np.sin(angle) / angle
+    versine = 2.0 * (np.sin(0.5 * angle) / angle) ** 2
+    rest = np.where(angle < 1e-2, 1.0 / 6.0 - angle**2 / 120.0, (1.0 - sine) / angle**2)
+    turned = cross(axis, point)
+    across = cross(axis, way)
+    moved = point + sine * turned + versine * cross(axis, turned)
+    moved += way + versine * across + rest * cross(axis, across)
+    result: FloatArray = np.ascontiguousarray(moved.T)
+    return result
+
+
+def stacked(path: Path, sweeps: Sequence[SweepPoints]) -> tuple[FloatArray, IntArray]:
+    """Points of all sweeps, each as seen from the middle of its sweep, and the sweeps' numbers."""
+    points = [path.deskewed(number, sweep) for number, sweep in enumerate(sweeps)]
+    numbers = np.repeat(np.arange(len(sweeps)), [len(part) for part in points])
+    return np.concatenate([np.empty((0, 3)), *points]), numbers

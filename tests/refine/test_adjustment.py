@@ -1,0 +1,238 @@
+"""The adjustment of planes and poses: closed forms, gains, refusals."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from support.jacobians import numerical
+
+from loam_gtsam import Config, SimulatedWorld, absolute_error, run
+from loam_gtsam.refine.adjustment import Settings, refine
+from loam_gtsam.refine.elimination import eliminated, refitted, sightings
+from loam_gtsam.refine.runs import refine_run, run_points
+from loam_gtsam.refine.surfaces import find_planes, voxel_sizes
+from loam_gtsam.refine.sweeps import Path, SweepPoints
+from loam_gtsam.studies.map_quality import common_thickness, map_quality
+from loam_gtsam.types import InputError, Trajectory
+
+SIZES = voxel_sizes(3.2, 0.4)
+SECOND = 1_000_000_000
+
+
+def _room(rng, count):
+    """Points on floor and four walls of a room of 6 x 5 x 3 m, and their walls."""
+    points = rng.uniform([-3.0, -2.5, 0.0], [3.0, 2.5, 3.0], (count, 3))
+    wall = rng.integers(0, 5, count)
+    for number, (axis, value) in enumerate([(0, -3.0), (0, 3.0), (1, -2.5), (1, 2.5), (2, 0.0)]):
+        points[wall == number, axis] = value
+    return points, wall
+
+
+def _scene(sweeps=6, count=900, noise=0.01, off=0.01, seed=0, extra=None):
+    """Sweeps of the room that stand still while they are taken, true poses and wrong ones."""
+    rng = np.random.default_rng(seed)
+    poses, found = [], []
+    for number in range(sweeps):
+        twist = rng.normal(size=6) * [0.1, 0.1, 0.4, 0.4, 0.4, 0.1] + [0, 0, 0, 0, 0, 1.3]
+        pose = gtsam.Pose3.Expmap(twist)
+        points, _ = _room(rng, count)
+        points += rng.normal(size=points.shape) * noise
+        if extra is not None:
+            points = np.vstack([points, extra(np.random.default_rng(number), number)])
+        local = (points - pose.translation()) @ pose.rotation().matrix()
+        found.append(SweepPoints(number * SECOND, local, np.zeros(len(local))))
+        poses.append(pose)
+    steps = rng.normal(size=(sweeps, 6)) * off * np.array([0.3, 0.3, 0.3, 1.0, 1.0, 1.0])
+    steps[0] = 0.0
+    wrong = [pose.retract(step).matrix() for pose, step in zip(poses, steps, strict=True)]
+    return tuple(found), np.array([pose.matrix() for pose in poses]), np.array(wrong)
+
+
+def _errors(poses, truth):
+    relative = [np.linalg.inv(p[0]) @ p for p in (poses, truth)]
+    return np.linalg.norm(relative[0][:, :3, 3] - relative[1][:, :3, 3], axis=1)
+
+
+def _seen(sweeps, poses):
+    points = np.concatenate([sweep.points for sweep in sweeps])
+    numbers = np.repeat(np.arange(len(sweeps)), [len(sweep.points) for sweep in sweeps])
+    placed = np.einsum("nij,nj->ni", poses[numbers, :3, :3], points) + poses[numbers, :3, 3]
+    planes = find_planes(placed, numbers, 0.03, SIZES)
+    return planes, sightings(points, numbers, planes)
+
+
+def test_the_gradient_is_the_derivative_of_the_cost_with_every_plane_at_its_best() -> None:
+    sweeps, _, poses = _scene()
+    planes, seen = _seen(sweeps, poses)
+    planes, _ = refitted(poses, planes, seen)
+    gradient = eliminated(poses, planes, seen).gradient
+    scale = np.abs(gradient).max()
+    for number in (0, 3):
+
+        def cost(pose, number=number):
+            moved = poses.copy()
+            moved[number] = pose.matrix()
+            return np.array([refitted(moved, planes, seen)[1]])
+
+        expected = numerical(cost, gtsam.Pose3(poses[number]))[0]
+        np.testing.assert_allclose(gradient[6 * number :][:6], expected, atol=1e-4 * scale)
+
+
+def test_the_whole_map_can_move_without_cost() -> None:
+    sweeps, poses, _ = _scene()
+    planes, seen = _seen(sweeps, poses)
+    reduced = eliminated(poses, refitted(poses, planes, seen)[0], seen).hessian
+    together = np.vstack([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses])
+    cost = np.diag(together.T @ (reduced @ together))
+    assert (np.abs(cost) < 0.02 * reduced.diagonal().max()).all()
+    assert np.abs(reduced - reduced.T).max() < 1e-6 * reduced.diagonal().max()
+
+
+def test_poses_and_walls_are_found_and_as_well_as_they_are_told_to_be() -> None:
+    squared = []
+    for seed in range(4):
+        sweeps, truth, wrong = _scene(seed=seed)
+        result = refine(sweeps, wrong)
+        assert _errors(result.path.map_T_middle, truth).max() < 0.3 * _errors(wrong, truth).max()
+        poses = [gtsam.Pose3(pose) for pose in result.path.map_T_middle]
+        for number in range(1, 6):
+            true = gtsam.Pose3(truth[0]).between(gtsam.Pose3(truth[number]))
+            error = poses[0].between(poses[number]).localCoordinates(true)
+            covariance = result.relative_covariance(0, number)
+            squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
+    assert 0.5 < np.mean(squared) < 2.0
+    offsets = np.abs(result.planes.axes[:, :, 0]).max(axis=1)
+    assert (offsets > 0.99).mean() > 0.9  # walls, seen from the first pose which is nearly level
+    assert (np.sqrt(result.plane_covariances()[:, 2]) < 0.01).all()
+
+
+def test_the_same_input_gives_the_same_bits() -> None:
+    sweeps, _, wrong = _scene(sweeps=4, count=500)
+    first, second = (refine(sweeps, wrong, settings=Settings(rounds=2)) for _ in range(2))
+    assert np.array_equal(first.path.map_T_middle, second.path.map_T_middle)
+
+
+def test_something_that_moves_does_not_bend_the_map() -> None:
+    def car(rng, number):
+        """A side of 2 x 1 m, which is 4 cm ahead of where it was in the sweep before."""
+        side = rng.uniform([-1.0, 0.0, 0.5], [1.0, 0.0, 1.5], (200, 3))
+        return side + np.array([0.0, 0.04 * number, 0.0])
+
+    sweeps, truth, wrong = _scene(extra=car)
+    without = _scene()
+    assert np.array_equal(without[2], wrong)
+    still = _errors(refine(without[0], wrong).path.map_T_middle, truth).max()
+    moving = _errors(refine(sweeps, wrong).path.map_T_middle, truth).max()
+    assert moving < still + 0.002
+
+
+def test_a_wrong_loop_does_not_bend_the_map_and_a_position_holds_it() -> None:
+    sweeps, truth, wrong = _scene()
+    factors = gtsam.NonlinearFactorGraph()
+    kernel = gtsam.noiseModel.mEstimator.Huber.Create(3.0)
+    noise = gtsam.noiseModel.Robust.Create(kernel, gtsam.noiseModel.Isotropic.Sigma(6, 0.05))
+    far = gtsam.Pose3(gtsam.Rot3(), np.array([5.0, 0.0, 0.0]))
+    keys = gtsam.symbol("x", 0), gtsam.symbol("x", 5)
+    factors.add(gtsam.BetweenFactorPose3(*keys, far, noise))
+    straight = _errors(refine(sweeps, wrong).path.map_T_middle, truth).max()
+    bent = _errors(refine(sweeps, wrong, factors).path.map_T_middle, truth).max()
+    assert bent < straight + 0.001
+    held = gtsam.NonlinearFactorGraph()
+    there = gtsam.Pose3(gtsam.Rot3(), np.array([100.0, 0.0, 0.0]))
+    held.add(gtsam.PriorFactorPose3(keys[1], there, gtsam.noiseModel.Isotropic.Sigma(6, 1e-3)))
+    result = refine(sweeps, wrong, held)
+    assert np.allclose(result.path.map_T_middle[5, :3, 3], [100.0, 0.0, 0.0], atol=1e-3)
+
+
+def test_what_cannot_be_adjusted_is_refused() -> None:
+    sweeps, _, poses = _scene(sweeps=4, count=500)
+    with pytest.raises(InputError, match="3 or more sweeps, got 2"):
+        refine(sweeps[:2], poses[:2])
+    apart = poses.copy()
+    apart[:, 0, 3] += 100.0 * np.arange(4)
+    with pytest.raises(InputError, match="no plane is seen by three sweeps"):
+        refine(sweeps, apart)
+    loose = poses.copy()
+    loose[3, 0, 3] += 100.0
+    with pytest.raises(InputError, match="1 sweeps, number 3 the first, share no plane"):
+        refine(sweeps, loose)
+    foreign = gtsam.NonlinearFactorGraph()
+    unit = gtsam.noiseModel.Unit.Create(6)
+    foreign.add(gtsam.PriorFactorPose3(gtsam.symbol("x", 9), gtsam.Pose3(), unit))
+    with pytest.raises(InputError, match="factor 0 has a key that is not x0 to x3"):
+        refine(sweeps, poses, foreign)
+    sweeps, _, poses = _scene(sweeps=4, count=6000)
+    floor = [replace(s, points=s.points[p[:, 2] < 0.05], seconds=s.seconds[p[:, 2] < 0.05])
+             for s, p in ((s, s.points @ t[:3, :3].T + t[:3, 3])
+                          for s, t in zip(sweeps, poses, strict=True))]  # fmt: skip
+    with pytest.raises(InputError, match="leave a direction of the poses free"):
+        refine(floor, poses)
+    with pytest.raises(InputError, match="positive sigma"):
+        Settings(sigma=0.0)
+
+
+def test_the_path_follows_a_motion_that_bends() -> None:
+    def pose(t):
+        return gtsam.Pose3.Expmap(np.array([0.1 * np.sin(3 * t), 0.0, 0.5 * t, 2 * t, t**2, 0.0]))
+
+    times = 0.1 * np.arange(12)
+    stamps = np.round(times * 1e9).astype(np.int64)
+    path = Path.through(stamps, np.array([pose(t).matrix() for t in times]))
+    for number, tolerance in ((5, 2e-5), (0, 2e-3)):
+        off = path.at(number, -0.05).between(pose(times[number] - 0.05))
+        assert np.linalg.norm(gtsam.Pose3.Logmap(off)) < tolerance
+    sweep = SweepPoints(int(stamps[5]), np.ones((3, 3)) * 5.0, np.array([-0.05, 0.0, 0.05]))
+    there = [pose(times[5] + s).transformFrom(np.full(3, 5.0)) for s in sweep.seconds]
+    moved = [pose(times[5]).transformFrom(p) for p in path.deskewed(5, sweep)]
+    np.testing.assert_allclose(moved, there, atol=2e-4)
+    gap = np.where(np.arange(12) < 6, stamps, stamps + 5 * SECOND)
+    halves = Path.through(gap, path.map_T_middle)
+    assert not halves.powers[5, 2:].any()  # no velocity across the gap
+
+
+@pytest.fixture(scope="module")
+def room():
+    world = SimulatedWorld("room", frames=25, columns=900)
+    config = Config().changed("imu.coupling=off")
+    result = run(world, config)
+    points = run_points(world, result.updates, result.config, most=2000)
+    return world, result, points
+
+
+def test_a_run_gets_better_and_its_covariances_are_right(room) -> None:
+    world, result, points = room
+    refined = refine_run(points, result.updates)
+    before = absolute_error(result.trajectory, world.truth).rmse
+    after = absolute_error(refined.trajectory, world.truth).rmse
+    assert after < 0.6 * before
+    assert np.array_equal(refined.trajectory.stamps, result.trajectory.stamps)
+    first, last = (map_quality(*refined.held_out(refined=on)) for on in (False, True))
+    before, after, planes = common_thickness(first, last)
+    assert after < before
+    assert planes > 50
+    assert last.planar_share > first.planar_share
+    assert last.entropy < first.entropy
+    truth = {int(s): gtsam.Pose3(p) for s, p in
+             zip(world.truth.stamps, world.truth.map_T_lidar, strict=True)}  # fmt: skip
+    poses, squared = refined.trajectory, []
+    for k in range(0, 20, 2):
+        here, there = (gtsam.Pose3(poses.map_T_lidar[n]) for n in (k, k + 5))
+        true = truth[int(poses.stamps[k])].between(truth[int(poses.stamps[k + 5])])
+        error = here.between(there).localCoordinates(true)
+        covariance = refined.refined.relative_covariance(k, k + 5)
+        squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
+    assert 0.25 < np.mean(squared) < 4.0
+    assert len(refined.map_points(0.2)) > 1000
+
+
+def test_the_data_set_of_another_run_is_refused(room) -> None:
+    world, result, _ = room
+    updates = [replace(update, stamp=update.stamp + 7) for update in result.updates]
+    with pytest.raises(InputError, match=r"expected the stamp .* give the data set of the run"):
+        run_points(world, updates, result.config)
+    points = run_points(SimulatedWorld("room", frames=3, columns=400), result.updates[:3],
+                        result.config, most=300)  # fmt: skip
+    other = Trajectory.from_poses([1, 2, 3], [gtsam.Pose3()] * 3)
+    with pytest.raises(InputError, match="stamps of the run's poses"):
+        refine_run(points, result.updates[:3], trajectory=other)

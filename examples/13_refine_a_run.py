@@ -5,9 +5,9 @@ import numpy as np
 
 from loam_gtsam import Config, SimulatedWorld, absolute_error, run
 from loam_gtsam.factors import plane_rows
-from loam_gtsam.refine.factors import sweep_match_factor
+from loam_gtsam.refine.between_factors import sweep_match_factor
+from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.refine.runs import refine_run, run_points
-from loam_gtsam.studies.map_quality import common_thickness, map_quality
 
 world = SimulatedWorld("room", frames=25, columns=900)
 result = run(world, Config().changed("imu.coupling=off"))

@@ -22,9 +22,9 @@ from loam_gtsam.io.run_files import write_covariances, write_ply
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.refine.adjustment import Round, Settings
+from loam_gtsam.refine.map_quality import MapQuality, common_thickness, map_quality
 from loam_gtsam.refine.runs import RefinedRun, refine_run, run_points
 from loam_gtsam.studies.evaluation import absolute_error
-from loam_gtsam.studies.map_quality import MapQuality, common_thickness, map_quality
 from loam_gtsam.types import (
     DatasetError,
     FloatArray,

@@ -21,7 +21,7 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
         :func:`~loam_gtsam.io.run_files.write_npz`.
     """
     try:
-        with np.load(path) as file:
+        with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in _NEEDED}
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: expected the run.npz of a finished run: {error}") from error

@@ -13,7 +13,7 @@ from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.refine.adjustment import Refined, Round, Settings, refine
-from loam_gtsam.refine.odometry import loop_factors, odometry_factors, told_directions
+from loam_gtsam.refine.motion_factors import loop_factors, odometry_factors, told_directions
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
 from loam_gtsam.types import (
     FloatArray,

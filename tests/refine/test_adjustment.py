@@ -10,10 +10,10 @@ from support.jacobians import numerical
 from loam_gtsam import Config, SimulatedWorld, absolute_error, run
 from loam_gtsam.refine.adjustment import Settings, refine
 from loam_gtsam.refine.elimination import eliminated, refitted, sightings
+from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.surfaces import find_planes, voxel_sizes
 from loam_gtsam.refine.sweeps import Path, SweepPoints
-from loam_gtsam.studies.map_quality import common_thickness, map_quality
 from loam_gtsam.types import InputError, Trajectory
 
 SIZES = voxel_sizes(3.2, 0.4)

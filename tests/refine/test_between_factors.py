@@ -6,7 +6,7 @@ import pytest
 from support.jacobians import numerical
 
 from loam_gtsam.factors import concatenate_rows, line_rows, plane_rows
-from loam_gtsam.refine.factors import (
+from loam_gtsam.refine.between_factors import (
     distribution_rows,
     point_to_line_between_factor,
     point_to_plane_between_factor,

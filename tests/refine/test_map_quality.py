@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from loam_gtsam.studies.map_quality import common_thickness, map_quality
+from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.types import InputError
 
 

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from enum import StrEnum
+from functools import partial
+
+_log = logging.getLogger(__name__)
+_INDETERMINATE = "Indeterminate linear system"  # how a RuntimeError of GTSAM begins
 
 
 class LoamError(Exception):
@@ -23,6 +30,94 @@ class DatasetError(LoamError):
 
 class OutputError(LoamError):
     """A file or a picture could not be written."""
+
+
+class PartError(LoamError):
+    """A part of a user's own raised an exception, which is the ``__cause__``.
+
+    Attributes
+    ----------
+    part : the name of the part: ``solver``, ``extra_factors``, ``loop_closer``, ``odometry``,
+        ``features``, ``observe``, ``on_frame``, or ``graph`` for factors in the pose graph
+    indeterminate : whether GTSAM found a linear system that does not determine its variables
+    """
+
+    def __init__(self, part: str, code: object, error: Exception) -> None:
+        self.part, text = part, str(error).strip()
+        self.indeterminate = isinstance(error, RuntimeError) and text.startswith(_INDETERMINATE)
+        if self.indeterminate:
+            text = (
+                f"{text.splitlines()[0]} of GTSAM: the factors do not determine a variable; give "
+                "it a prior, or check the noise models"
+            )
+        kind = type(error).__name__
+        super().__init__(f"{part} of your own ({_name(code)}) raised {kind}: {text}")
+
+
+@contextmanager
+def own_code(part: str, code: object) -> Iterator[None]:
+    """A block in which a user's code runs: what it raises becomes a :class:`PartError`.
+
+    An error of this package keeps its type and gets a note that names the part. ``code`` is the
+    user's object or function, or says in words what it is; with one of this package, or None,
+    errors stay as they are.
+    """
+    try:
+        yield
+    except PartError:
+        raise
+    except Exception as error:
+        if not is_own(code):
+            raise
+        if isinstance(error, LoamError):
+            error.add_note(f"raised in {part} of your own ({_name(code)})")
+            raise
+        raise PartError(part, code, error) from error
+
+
+def is_own(code: object) -> bool:
+    """Whether an object or a function is a user's own, and none of this package."""
+    while isinstance(code, partial):
+        code = code.func
+    of = code if hasattr(code, "__qualname__") else type(code)
+    package = __name__.partition(".")[0]
+    return code is not None and str(of.__module__).partition(".")[0] != package
+
+
+class PartFaults:
+    """What is done about exceptions in parts of a user's own, by ``parts.on_error``.
+
+    With ``stop`` they are raised; with ``continue`` the log has the first one of each part.
+    """
+
+    def __init__(self, on_error: str) -> None:
+        self._stop = on_error == "stop"
+        self._told: set[str] = set()
+
+    def take(self, error: LoamError) -> None:
+        """Raise an exception, or log it if it is the first of its part."""
+        if self._stop:
+            raise error
+        part = error.part if isinstance(error, PartError) else type(error).__name__
+        if part not in self._told:
+            self._told.add(part)
+            _log.warning("%s; the run goes on without, and does not say so again", error)
+
+    @contextmanager
+    def forgiven(self) -> Iterator[None]:
+        """A block without which a frame is complete."""
+        try:
+            yield
+        except LoamError as error:
+            self.take(error)
+
+
+def _name(code: object) -> str:
+    if isinstance(code, str):
+        return code
+    while isinstance(code, partial):
+        code = code.func
+    return str(getattr(code, "__qualname__", type(code).__qualname__))
 
 
 class SweepFault(StrEnum):
@@ -51,6 +146,8 @@ class SweepFault(StrEnum):
     """The stamp is so much later than that of the last sweep used that it is doubted."""
     CLOCK_SET_BACK = "clock_set_back"
     """Several sweeps in a row are earlier than the last one used; only a reset helps."""
+    PART_FAILED = "part_failed"
+    """A part of a user's own raised an exception, and ``parts.on_error`` is ``continue``."""
     CLOCK_SET_AHEAD = "clock_set_ahead"
     """Several sweeps in a row are far ahead; from the next one on their clock is followed."""
 

@@ -13,9 +13,11 @@ from typing import Any
 import gtsam
 
 from loam_gtsam.config import Config
+from loam_gtsam.errors import own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
 from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.io.rollback import whole
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker, with_imu
 from loam_gtsam.registration.matches import ScanMatches
@@ -34,7 +36,12 @@ from loam_gtsam.registration.relocalization import (
 )
 from loam_gtsam.registration.report import Clock, make_update, problem_of, status_of
 from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make_solver
-from loam_gtsam.registration.solvers.own_factors import ExtraFactors, PoseContext, own_factors
+from loam_gtsam.registration.solvers.own_factors import (
+    ExtraFactors,
+    NamedSolver,
+    PoseContext,
+    own_factors,
+)
 from loam_gtsam.registration.start import Start
 from loam_gtsam.types import (
     ConfigError,
@@ -132,6 +139,7 @@ class Mapper:
             self.imu.reset()
         self._forget()
 
+    @whole
     def register(
         self,
         features: Features,
@@ -154,7 +162,8 @@ class Mapper:
         Returns
         -------
         MapUpdate
-            Never raises for what a sweep contains: see its ``status``.
+            Never raises for what a sweep contains: see its ``status``. What a part of a user's own
+            raises is a PartError, and the mapper is as before the call.
         """
         clock = Clock()
         self.registered = None
@@ -209,6 +218,8 @@ class Mapper:
         """Edge and plane points of the whole map, archive included, (E, 3) and (P, 3), metres."""
         return self.maps.points()
 
+    _named = property(lambda self: NamedSolver(self.solver, self.extra_factors))
+
     # -- the steps of a frame ----------------------------------------------------------------
 
     def _check(self, features: Features) -> MapUpdate | None:
@@ -258,36 +269,36 @@ class Mapper:
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""
         assert self.last is not None
+        found = found_at(frame, frame.solve(self._named))
         twist, stamp = self.last.twist, frame.sweep.stamp
-        found = found_at(frame, frame.solve(self.solver))
         if self._start is not None:
-            found = self._start.first_motion(frame, found, self.solver)
+            found = self._start.first_motion(frame, found, self._named)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
         if self.imu is not None and (
             doubt or self.imu.contradicted(self._moment, found.solution, stamp)
         ):
             sweep, before = MovingSweep(features, self.config), (self.last, self._moment, None)
             alone = predict(sweep, *before, self.config.solver)
-            frame, found = second_opinion(frame, found, alone, self.solver)
+            frame, found = second_opinion(frame, found, alone, self._named)
             if frame.predicted is alone:
                 self.imu.reject()
                 doubt = doubtful(frame, found.solution, self.monitor, twist)
-        solution, monitor = found.solution, self.monitor
-        return frame, search(frame, solution, monitor, self.solver) if doubt else found
+        return frame, search(frame, found.solution, self.monitor, self._named) if doubt else found
 
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
         if self._start is not None:
-            frame, found = self._start.add(frame, found, self.keyframe, self.solver)
+            frame, found = self._start.add(frame, found, self.keyframe, self._named)
             self._start = None if self._start.complete else self._start
         solution = found.solution
         fit = Fit.of(solution.matches, frame.matcher.offered)
         self.monitor.accept(fit, solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
-        posed, solution, pose, tilt, fused = with_imu(
-            self.imu, posed, frame.matcher.last, solution, scan, frame.priors
-        )
+        with own_code("extra_factors", self.extra_factors):
+            posed, solution, pose, tilt, fused = with_imu(
+                self.imu, posed, frame.matcher.last, solution, scan, frame.priors
+            )
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         update = self._errors.calibrated(update, frame.sweep, solution, scan, fused)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from typing import Any, TypedDict, TypeVar, Unpack
@@ -13,11 +13,13 @@ import gtsam
 
 from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, dump_config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead
+from loam_gtsam.errors import PartFaults, is_own, own_code
+from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.level import Level
 from loam_gtsam.imu.quality import ImuReport
 from loam_gtsam.io.checkpoint import Checkpoint, Progress
+from loam_gtsam.io.rollback import whole
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import Mapper
@@ -32,9 +34,12 @@ from loam_gtsam.types import (
     FloatArray,
     FrameStatus,
     InputError,
+    LoamError,
     MapUpdate,
+    PartError,
     Scan,
     Sweep,
+    SweepFault,
     Trajectory,
 )
 
@@ -160,6 +165,7 @@ class Pipeline:
     ----------
     mapper : registers the sweeps
     odometry : predicts them; None leaves it to the mapper (constant velocity, IMU)
+    faults : what is done about exceptions in parts of a user's own
     loops : keyframes and loops; None if none are looked for
     """
 
@@ -171,6 +177,7 @@ class Pipeline:
         **parts: Unpack[Parts],
     ) -> None:
         self.config = config or Config()
+        self.faults = PartFaults(self.config.parts.on_error)
         solver, factors = parts.get("solver"), parts.get("extra_factors")
         self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
@@ -200,16 +207,33 @@ class Pipeline:
         Parameters
         ----------
         extraction : of its features; made here if None
+
+        Raises
+        ------
+        PartError
+            If a part of a user's own raises and ``parts.on_error`` is ``stop``; then nothing
+            has changed, and the sweep can be tried again.
         """
         if isinstance(sweep, BadSweep):
             return self.mapper.skip(sweep.stamp + self._to_reference, sweep.message)
-        if isinstance(sweep, FeatureSweep):
-            return self._process_features(sweep)
-        if not isinstance(sweep, Scan):
+        if not isinstance(sweep, (Scan, FeatureSweep)):
             raise InputError(
                 f"sweep: expected a Scan, got {type(sweep).__name__}; Scan(points=..., stamp=...) "
                 "makes one of an array"
             )
+        # The mapper itself is whole in any case; this is for what runs after it.
+        late = is_own(self.odometry) or (self.loops is not None and self.loops.has_own_parts)
+        step = self._whole_step if late else self._step
+        try:
+            return step(sweep, extraction)
+        except LoamError as error:
+            self.faults.take(error)
+            stamp = sweep.stamp + self._to_reference
+            return self.mapper.skip(stamp, str(error), SweepFault.PART_FAILED)
+
+    def _step(self, sweep: Scan | FeatureSweep, extraction: Extraction | None) -> MapUpdate:
+        if isinstance(sweep, FeatureSweep):
+            return self._process_features(sweep)
         if extraction is None:
             extraction = extract(sweep, self.config, self._features)
         features, last = extraction.features, self.mapper.last
@@ -217,8 +241,10 @@ class Pipeline:
             stamp = sweep.stamp + self._to_reference
             return self.mapper.skip(stamp, extraction.problem, extraction.fault)
         self._to_reference = features.stamp - sweep.stamp
-        started = time.perf_counter()
-        guess = None if self.odometry is None else self.odometry.guess(features, last)
+        started, guess = time.perf_counter(), None
+        if self.odometry is not None:
+            with self.faults.forgiven(), own_code("odometry", self.odometry):
+                guess = self.odometry.guess(features, last)
         guessed = time.perf_counter() - started
         if guess is None:
             update = self.mapper.register(features)
@@ -227,10 +253,13 @@ class Pipeline:
             pose = None if last is None else guess.map_T_lidar
             update = self.mapper.register(features, pose, guess.twist)
         if self.odometry is not None and update.status not in _REFUSED:
-            self.odometry.remember(features)
+            with self.faults.forgiven(), own_code("odometry", self.odometry):
+                self.odometry.remember(features)
         update = self._with_loops(update, features)
         timings = {"features": extraction.seconds, "odometry": guessed}
         return replace(update, timings=timings | dict(update.timings))
+
+    _whole_step = whole(_step)
 
     def _process_features(self, sweep: FeatureSweep) -> MapUpdate:
         """The guess is the last pose, moved by the increment of the recorded odometry (LOAM)."""
@@ -302,8 +331,7 @@ class Pipeline:
 
 
 Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
-"""Called after each frame with the sweep, its result and the pipeline (its mapper, its loops), to
-look and not to change."""
+"""Called after each frame with the sweep, its result and the pipeline, to look, not to change."""
 
 
 def _sections(name: str, config: Section) -> dict[str, Any]:
@@ -387,6 +415,8 @@ def run(
         If the data set cannot be read.
     OutputError
         If the checkpoint is of another run.
+    PartError
+        If a part of your own raises, an observer included, and ``parts.on_error`` is ``stop``.
     """
     if not hasattr(dataset, "sensor"):
         raise InputError(
@@ -401,19 +431,20 @@ def run(
     about = {"data set": dataset.name, "configuration": dump_config(config)}
     progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
-    interrupted = False
-    error: Exception | None = None
-    source = progress.rest(islice(_timed(dataset), max_frames))
+    interrupted, error = False, None
+    source = progress.rest(islice(timed(dataset), max_frames))
     try:
         for sweep, seconds, extraction in extract_ahead(source, config, workers):
             progress.whole = False
             update = pipeline.process(sweep, extraction)
             update = replace(update, timings={"read": seconds} | dict(update.timings))
             progress.add(sweep, update)
-            if observe is not None:
-                observe(sweep, update, pipeline)
-            if on_frame is not None:
-                on_frame(len(updates) - 1, update)
+            with pipeline.faults.forgiven(), own_code("observe", observe):
+                if observe is not None:
+                    observe(sweep, update, pipeline)
+            with pipeline.faults.forgiven(), own_code("on_frame", on_frame):
+                if on_frame is not None:
+                    on_frame(len(updates) - 1, update)
             progress.save_if_due()
         if max_frames is not None and len(updates) == max_frames:
             progress.save()  # a longer run can go on from here
@@ -421,10 +452,11 @@ def run(
         interrupted = True
         progress.save()
     except Exception as caught:
+        progress.whole |= isinstance(caught, PartError)  # the pipeline is as before the sweep
+        progress.save()
         if not (keep_partial and updates):
             raise
         error = caught
-        progress.save()
     return pipeline.result(updates, interrupted=interrupted, error=error)
 
 
@@ -438,15 +470,3 @@ def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
         gyro_trusted=aid.trusted_gyro is not None,
         problems=aid.problems,
     )
-
-
-def _timed(dataset: Dataset) -> Iterator[tuple[Sweep, float]]:
-    """The sweeps, each with the seconds it took to read."""
-    sweeps = iter(dataset)
-    while True:
-        started = time.perf_counter()
-        try:
-            sweep = next(sweeps)
-        except StopIteration:
-            return
-        yield sweep, time.perf_counter() - started

@@ -25,6 +25,7 @@ from loam_gtsam.errors import DatasetError as DatasetError
 from loam_gtsam.errors import InputError as InputError
 from loam_gtsam.errors import LoamError as LoamError
 from loam_gtsam.errors import OutputError as OutputError
+from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
 

@@ -43,6 +43,7 @@ class Config(Section):
     loops: sections.LoopConfig = sections.LoopConfig()
     bag: sections.BagConfig = sections.BagConfig()
     live: sections.LiveConfig = sections.LiveConfig()
+    parts: sections.PartsConfig = sections.PartsConfig()
 
     @model_validator(mode="after")
     def _check_matches(self) -> Self:

@@ -135,7 +135,7 @@ def _table(
             poses.append(_pose(numbers))
         except (ValueError, IndexError) as error:
             raise DatasetError(
-                f"{path}: {row[:80]!r}: {error}; expected lines like the first one"
+                f"{path}: {row[:80]!r}: {str(error)[:80]}; expected lines like the first one"
             ) from error
     return np.array(stamps, np.int64), np.array(poses, np.float64)
 

@@ -17,6 +17,7 @@ from multiprocessing.reduction import ForkingPickler
 from typing import Any
 
 from loam_gtsam.config import Config
+from loam_gtsam.errors import own_code
 from loam_gtsam.frontend.features import extract_features, thinned
 from loam_gtsam.types import Features, Scan, Sweep, SweepError, SweepFault
 
@@ -48,7 +49,8 @@ class Extraction:
 def extract(scan: Scan, config: Config, front_end: FrontEnd | None = None) -> Extraction:
     """Extract the features of a sweep in this process; no content of a sweep raises an error.
 
-    ``front_end`` takes the place of :func:`~loam_gtsam.frontend.features.extract_features`.
+    ``front_end`` takes the place of :func:`~loam_gtsam.frontend.features.extract_features`; what
+    it raises is a PartError.
 
     With ``odometry.method: constant_velocity`` the features are thinned to the voxels of the map,
     as the mapper would do it, so that less is handed over. ``scan_to_scan`` needs all of them.
@@ -56,7 +58,11 @@ def extract(scan: Scan, config: Config, front_end: FrontEnd | None = None) -> Ex
     started = time.perf_counter()
     features, problem, fault = None, "", None
     try:
-        features = extract_features(scan, config) if front_end is None else front_end(scan)
+        if front_end is None:
+            features = extract_features(scan, config)
+        else:
+            with own_code("features", front_end):
+                features = front_end(scan)
         if config.odometry.method == "constant_velocity":
             features = thinned(features, config.map)
     except SweepError as error:
@@ -114,6 +120,18 @@ def extract_ahead(
             yield sweep, number, None if worker is None else worker.receive()
     if error is not None:
         raise error
+
+
+def timed(dataset: Iterable[Sweep]) -> Iterator[tuple[Sweep, float]]:
+    """The sweeps, each with the seconds it took to read."""
+    sweeps = iter(dataset)
+    while True:
+        started = time.perf_counter()
+        try:
+            sweep = next(sweeps)
+        except StopIteration:
+            return
+        yield sweep, time.perf_counter() - started
 
 
 class _Worker:

@@ -8,7 +8,9 @@ Stamps are subtracted as integers before they become seconds.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -162,6 +164,10 @@ class ImuBuffer:
     @gyro_bias.setter
     def gyro_bias(self, bias: FloatArray) -> None:
         self._bias = as_vector(bias, "gyro_bias").copy()
+
+    def remember(self) -> Callable[[], None]:
+        """A function that brings the bias back; samples do not depend on the frames."""
+        return partial(setattr, self, "_bias", self._bias)
 
     def add(self, samples: ImuSamples) -> None:
         """Put in one or many samples, in any order, overlapping others or not.

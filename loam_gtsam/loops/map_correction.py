@@ -10,8 +10,10 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
+from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, ScanLoopCloser
+from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.types import BoolArray, Features, FloatArray, MapUpdate
@@ -38,6 +40,7 @@ class LoopMapping:
         self.graph = PoseGraph(self._config)
         self.closer: LoopCloser = closer or ScanLoopCloser(self._config)
         self.points_moved = 0
+        self._faults = PartFaults(self._config.parts.on_error)
         # odom_T_lidar of the keyframes, to which their map points are fixed.
         self._placed: list[gtsam.Pose3] = []
 
@@ -50,20 +53,31 @@ class LoopMapping:
         self._placed = []
 
     @property
+    def has_own_parts(self) -> bool:
+        """Whether closer or factors of the graph are a user's own."""
+        return is_own(self.closer) or self.graph.has_own_factors
+
+    @property
     def map_T_odom(self) -> gtsam.Pose3:
         """What leads from the mapper's poses and points to the corrected ones."""
         return self.graph.correction
 
     def add(self, update: MapUpdate, features: Features) -> bool:
-        """Add a frame that the mapper has just registered; returns whether a loop was closed."""
+        """Add a frame that the mapper has just registered; returns whether a loop was closed.
+
+        Raises PartError if the closer raises, or a factor of a user's own in the graph.
+        """
         aid = self._mapper.imu
         self.graph.imu = None if aid is None else aid.trusted_gyro  # which the mapper may give up
-        keyframe = self.graph.add(update, features)
+        with own_code("graph", "factors" if self.graph.has_own_factors else None):
+            keyframe = self.graph.add(update, features)
         if keyframe is None:
             return False
         self._placed.append(keyframe.odom_T_lidar)
         self._mapper.keyframe = keyframe.index
-        loop = self.closer.detect(keyframe, self.graph)
+        loop: LoopClosure | None = None
+        with self._faults.forgiven(), own_code("loop_closer", self.closer):
+            loop = self.closer.detect(keyframe, self.graph)
         if loop is None or not self.graph.add_loop(loop):
             return False
         config = self._config.pose_graph

@@ -84,6 +84,11 @@ class FactorGraph:
         noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
         self.add_factor(gtsam.AttitudeFactorPose3(self._key(index), there, noise, here))
 
+    @property
+    def has_own_factors(self) -> bool:
+        """Whether there may be factors beside those of odometry and loop closures."""
+        return self._graph.has_own_factors
+
     def pose(self, index: int) -> gtsam.Pose3:
         """``map_T_lidar`` of a keyframe."""
         return self._graph.values.atPose3(self._key(index))

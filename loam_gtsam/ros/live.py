@@ -18,6 +18,7 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, decode_imu
+from loam_gtsam.errors import own_code
 from loam_gtsam.imu.buffer import REST_AHEAD
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.pipeline import Observer, Pipeline
@@ -263,7 +264,8 @@ class LiveMapper:
         update = self.pipeline.process(current.sweep)
         mapped = self._clock()
         if self._observe is not None:
-            self._observe(current.sweep, update, self.pipeline)
+            with self.pipeline.faults.forgiven(), own_code("observe", self._observe):
+                self._observe(current.sweep, update, self.pipeline)
         result = LiveResult(current.sweep, update, current.received, started, mapped, self._clock())
         with self._lock:
             self._log.mapped(update, result.seconds)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,8 @@ class Archive:
         self._grid = grid
         self._bytes = 0
         self._memory: dict[CubeIndex, CubePoints] = {}  # oldest first
-        self._disk: dict[CubeIndex, int] = {}  # number of points
+        self._disk: dict[CubeIndex, tuple[int, Path]] = {}  # number of points, and the file
+        self._stale: list[Path] | None = None  # to be removed, once nothing is remembered
         self._folder: Path | None = None
         self.dropped_cubes = self.dropped_points = 0
         if folder is not None:
@@ -78,13 +80,26 @@ class Archive:
             copy.store(index, content)
         return copy
 
+    def remember(self) -> Callable[[], None]:
+        """A function that brings the archive back to what it is now, until this is called again."""
+        for path in self._stale or ():
+            path.unlink(missing_ok=True)
+        self._stale = []
+        before = vars(self).copy() | {
+            "_memory": self._memory.copy(),
+            "_disk": self._disk.copy(),
+            "_stale": [],  # the files are in use again
+        }
+        return partial(vars(self).update, before)
+
     def indices(self) -> list[CubeIndex]:
         """Cubes in the archive, oldest first, those in memory before those on disk."""
         return [*self._memory, *self._disk]
 
     def count(self) -> int:
         """Points in the archive."""
-        return sum(len(held.points) for held in self._memory.values()) + sum(self._disk.values())
+        on_disk = sum(count for count, _ in self._disk.values())
+        return sum(len(held.points) for held in self._memory.values()) + on_disk
 
     def store(self, index: CubeIndex, content: CubePoints) -> None:
         """Keep a cube that is not in the archive; the oldest cubes make room for it."""
@@ -98,14 +113,16 @@ class Archive:
         """Points of an archived cube; None, and the cube counts as dropped, if unreadable."""
         if index in self._memory:
             return self._memory[index]
+        count, path = self._disk[index]
         try:
             # Mapped, so that a damaged header cannot claim more memory than the file has bytes.
-            rows = np.load(self._path(index), mmap_mode="r", allow_pickle=False)
-            expected = (self._disk[index], _COLUMNS)
+            rows = np.load(path, mmap_mode="r", allow_pickle=False)
+            expected = (count, _COLUMNS)
             if rows.shape != expected or rows.dtype != np.float64:
                 raise ValueError(f"expected {expected} float64, got {rows.shape} {rows.dtype}")
         except (OSError, ValueError) as error:
-            self._drop(self._disk.pop(index), f"cannot read {self._path(index)}: {error}")
+            del self._disk[index]
+            self._drop(count, f"cannot read {path}: {error}")
             return None
         return CubePoints(np.array(rows[:, :3], order="C"), rows[:, 3:].astype(np.int32))
 
@@ -124,8 +141,11 @@ class Archive:
         if index in self._memory:
             self._bytes -= self._memory.pop(index).nbytes
         elif index in self._disk:
-            del self._disk[index]
-            self._path(index).unlink(missing_ok=True)
+            path = self._disk.pop(index)[1]
+            if self._stale is None:
+                path.unlink(missing_ok=True)
+            else:
+                self._stale.append(path)
         return None if content is None else Cube.of(content, self._grid)
 
     def take_out(self, owners: Owners) -> list[CubePoints]:
@@ -155,7 +175,9 @@ class Archive:
         if self._folder is None:
             self._drop(len(points), "archive_megabytes is used up and archive_dir is not set")
             return
-        path = self._path(index)
+        path = self._folder / "cube_{}_{}_{}.npy".format(*index)
+        while path in (self._stale or ()):  # what is remembered may need the old file
+            path = path.with_stem(f"{path.stem}_")
         temporary = path.with_suffix(".tmp")
         try:
             with temporary.open("wb") as file:
@@ -164,7 +186,7 @@ class Archive:
         except OSError as error:
             self._drop(len(points), f"cannot write {path}: {error}")
         else:
-            self._disk[index] = len(points)
+            self._disk[index] = len(points), path
 
     def _drop(self, n_points: int, reason: str) -> None:
         """Count a loss; say it once, as a full disk would say it for every cube."""
@@ -177,7 +199,3 @@ class Archive:
                 n_points,
                 reason,
             )
-
-    def _path(self, index: CubeIndex) -> Path:
-        assert self._folder is not None
-        return self._folder / "cube_{}_{}_{}.npy".format(*index)

@@ -127,10 +127,12 @@ class Cube(KeyTable):
         new.highs[taken] = np.maximum(new.highs[taken], old)
         # Rounding may put a mean just outside its points, and so into another voxel or cube.
         means = np.clip(new.sums / new.counts[:, None], new.lows, new.highs)
+        held = held.copy()
         held[at[taken]] = means[taken]
+        self._put(keys, held, *self.columns[2:])
         free = np.flatnonzero(~taken)
         self.append(*(column.take(free, axis=0) for column in (new.keys, means, new.tags)))
-        self.merge()  # the next call changes points in place
+        self.merge()
 
     def take_out(self, owners: Owners) -> CubePoints:
         """Remove the points of some owners, and return them."""

@@ -15,7 +15,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from support.bags import KINDS, cloud, imu, loam_recording, store_of, write_bag
-from support.strategies import FEW, START, mutated, mutations
+from support.strategies import FEW, START, TOKENS, mutated, mutations, replaced
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import open_dataset
@@ -132,19 +132,14 @@ TEXTS = {
     "t_ns/0.u64": np.linspace(0, 1e8, 40).astype("<u8").tobytes().decode("latin1"),
     "velodyne/0.bin": np.full((40, 4), 2.0, "<f4").tobytes().decode("latin1"),
 }
-TOKENS = ["nan", "inf", "-1", "1e400", "1e9999999", "-1e30", "1e18", "9" * 40, "", "x", "\x00", "#",
-          "0001-01-01 00:00:00.1", "9999-12-31 23:59:60"]  # fmt: skip
-
-
 @st.composite
 def texts(draw: st.DrawFn, text: str) -> bytes:
     """A file of numbers in which words were replaced, or whose bytes were mutated."""
     if draw(st.booleans()):
         return mutated(text.encode("latin1"), draw(mutations()))
-    words = text.replace(",", " , ").replace("\n", " \n ").split(" ")
-    for _ in range(draw(st.integers(1, 3))):
-        words[draw(st.integers(0, len(words) - 1))] = draw(st.sampled_from(TOKENS))
-    return " ".join(words).replace(" , ", ",").replace(" \n ", "\n").encode("latin1")
+    place = st.floats(0.0, 1.0, exclude_max=True)
+    word = st.tuples(place, st.sampled_from(TOKENS))
+    return replaced(text, draw(st.lists(word, min_size=1, max_size=3)))
 
 
 @given(data=st.data())

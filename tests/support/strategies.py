@@ -180,17 +180,31 @@ Step = tuple[str, float, int, int]
 """What goes wrong with the bytes of a file: kind, place (share of the length), size, number."""
 
 
+STEP_KINDS = ["cut", "flip", "number", "remove", "repeat", "noise", "zero"]
+STEP_SIZES = [1, 2, 4, 8, 100, 5000]
+STEP_NUMBERS = [0, 1, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63]
+TOKENS = ["nan", "inf", "-1", "1e400", "1e9999999", "-1e30", "1e18", "9" * 40, "9" * 5011, "", "x",
+          str(2**63), "\x00", "#", "0001-01-01 00:00:00.1", "9999-12-31 23:59:60"]  # fmt: skip
+"""Words that take the place of others in texts."""
+
+
 def mutations() -> st.SearchStrategy[list[Step]]:
     """What :func:`mutated` does to a file."""
-    kinds = ["cut", "flip", "number", "remove", "repeat", "noise", "zero"]
-    wild = [0, 1, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**40, 2**63]
     step = st.tuples(
-        st.sampled_from(kinds),
+        st.sampled_from(STEP_KINDS),
         st.floats(0.0, 1.0, exclude_max=True),
-        st.sampled_from([1, 2, 4, 8, 100, 5000]),
-        st.sampled_from(wild) | st.integers(0, 255),
+        st.sampled_from(STEP_SIZES),
+        st.sampled_from(STEP_NUMBERS) | st.integers(0, 255),
     )
     return st.lists(step, min_size=1, max_size=4)
+
+
+def replaced(text: str, replacements: list[tuple[float, str]]) -> bytes:
+    """A text in which words, at shares of their number, were replaced."""
+    words = text.replace(",", " , ").replace("\n", " \n ").split(" ")
+    for place, token in replacements:
+        words[int(place * len(words))] = token
+    return " ".join(words).replace(" , ", ",").replace(" \n ", "\n").encode("latin1")
 
 
 def mutated(data: bytes, steps: list[Step]) -> bytes:

@@ -111,7 +111,7 @@ def read_npy(path: Path, stamp: int) -> PackedCloud:
     """An array: (N, 3) or (N, 4), x y z intensity, or (N,) with named fields; ``stamp`` in ns."""
     try:
         array = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError) as error:
+    except Exception as error:  # numpy parses the header as Python, and believes its sizes
         raise DatasetError(f"{path}: the array cannot be read: {error}") from error
     if array.dtype.names:
         return _of_structure(path, stamp, array.reshape(-1))

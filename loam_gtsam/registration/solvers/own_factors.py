@@ -8,8 +8,15 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
+from loam_gtsam.errors import is_own, own_code
 from loam_gtsam.factors import checked_factor
-from loam_gtsam.registration.solvers.base import POSE_KEY
+from loam_gtsam.registration.solvers.base import (
+    POSE_KEY,
+    Associate,
+    MotionPrior,
+    ScanSolver,
+    Solution,
+)
 from loam_gtsam.types import FloatArray, InputError
 
 LAST_KEY: int = gtsam.symbol("x", 1)
@@ -46,11 +53,14 @@ def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.Nonline
 
     Raises
     ------
+    PartError
+        If the callable raises.
     InputError
         If the callable returns anything but a sequence of GTSAM factors on these keys; GTSAM's own
         errors name no cause.
     """
-    factors: object = extra(context)
+    with own_code("extra_factors", extra):
+        factors: object = extra(context)
     if not isinstance(factors, Sequence):
         raise InputError(
             "extra_factors: expected a list of factors, empty if there are none; got "
@@ -70,6 +80,30 @@ def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.Nonline
                 f"{type(factor).__name__} on the keys {keys}"
             )
     return ready
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NamedSolver(ScanSolver):
+    """A solver whose exceptions name the part of a user's own that raised them.
+
+    ``factors`` is where a user's factors come from; None if there are none.
+    """
+
+    solver: ScanSolver
+    factors: object
+
+    def solve(
+        self,
+        associate: Associate,
+        guess: gtsam.Pose3,
+        priors: Sequence[gtsam.NonlinearFactor] = (),
+        motion: MotionPrior | None = None,
+    ) -> Solution:
+        """See :meth:`ScanSolver.solve`."""
+        own = is_own(self.solver)
+        part, code = ("solver", self.solver) if own else ("extra_factors", self.factors)
+        with own_code(part, code):
+            return self.solver.solve(associate, guess, priors, motion)
 
 
 def _with_last_held(factor: gtsam.NonlinearFactor, context: PoseContext) -> gtsam.NonlinearFactor:

@@ -457,6 +457,8 @@ def run(
         if not (keep_partial and updates):
             raise
         error = caught
+    finally:
+        progress.end()
     return pipeline.result(updates, interrupted=interrupted, error=error)
 
 

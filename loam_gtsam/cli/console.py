@@ -21,7 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
-from loam_gtsam.io.atomic import make_folder, staged_files
+from loam_gtsam.io.atomic import make_folder, staged_files, used_alone
 from loam_gtsam.pipeline import OnFrame
 from loam_gtsam.types import DatasetError, MapUpdate, OutputError
 from loam_gtsam.view import plots
@@ -34,7 +34,7 @@ def output_folder(wanted: Path, known: Sequence[str], *, overwrite: bool) -> Ite
     """Make the folder for results, and remove it if an error leaves it empty.
 
     If ``wanted`` holds any of the ``known`` results, a new folder beside it is made (``wanted-2``,
-    ...), unless ``overwrite`` is given.
+    ...), unless ``overwrite`` is given. OutputError if another run uses the folder.
     """
     if not overwrite and any((wanted / name).exists() for name in known):
         wanted = wanted if wanted.name not in ("", "..") else wanted.resolve()
@@ -42,7 +42,9 @@ def output_folder(wanted: Path, known: Sequence[str], *, overwrite: bool) -> Ite
         wanted = next(folder for folder in candidates if not folder.exists())
     is_new = not wanted.exists()
     try:
-        yield make_folder(wanted)
+        folder = make_folder(wanted)
+        with used_alone(folder):
+            yield folder
     except BaseException:
         if is_new:
             with suppress(OSError):  # it is not empty, or was not made

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import logging
+import os
 import signal
 import time
 from collections import deque
@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from itertools import cycle
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
+from multiprocessing.heap import Arena
 from multiprocessing.reduction import ForkingPickler
-from typing import Any
 
 from loam_gtsam.config import Config
 from loam_gtsam.errors import own_code
@@ -29,6 +29,8 @@ _SLOT = 1 << 23
 """Bytes of memory for each sweep in flight: 350,000 points with times and rings."""
 _PATIENCE = 5.0
 """Seconds that a process is given to end, for it may be at work."""
+_SILENCE = 60.0
+"""Seconds after which a process that does not answer is given up, stopped or hung."""
 
 _log = logging.getLogger(__name__)
 
@@ -88,21 +90,22 @@ def extract_ahead(
     ------
     sweep, number, extraction
         The extraction is None if the caller is to extract the features: without processes, if a
-        process died, or if a sweep is too large to be handed over. It is None, too, for sweeps
-        that are no scans.
+        process died or does not answer, or if a sweep is too large to be handed over. It is None,
+        too, for sweeps that are no scans.
     """
-    if workers == 0:
-        for sweep, number in sweeps:
+    source = iter(sweeps)
+    crew = _crew(config, workers)
+    if not crew:
+        for sweep, number in source:
             yield sweep, number, None
         return
-    source = iter(sweeps)
     waiting: deque[tuple[Sweep, float, _Worker | None]] = deque()
     error: Exception | None = None
     more = True
     with ExitStack() as stack:
-        team = cycle([stack.enter_context(_Worker(config)) for _ in range(workers)])
+        team = cycle([stack.enter_context(worker) for worker in crew])
         while True:
-            while more and len(waiting) <= _AHEAD * workers:
+            while more and len(waiting) <= _AHEAD * len(crew):
                 try:
                     sweep, number = next(source)
                 except StopIteration:
@@ -134,18 +137,35 @@ def timed(dataset: Iterable[Sweep]) -> Iterator[tuple[Sweep, float]]:
         yield sweep, time.perf_counter() - started
 
 
+def _crew(config: Config, workers: int) -> list[_Worker]:
+    """The processes, as many of them as memory and system allow."""
+    crew: list[_Worker] = []
+    try:
+        for _ in range(workers):
+            crew.append(_Worker(config))
+    except OSError as error:
+        others = f"{len(crew)} of {workers} are used" if crew else "the features are extracted here"
+        _log.warning("no process for feature extraction: %s; %s", error.strerror or error, others)
+    return crew
+
+
 class _Worker:
     """A process that extracts the features of sweeps in the order in which they are sent."""
 
     def __init__(self, config: Config) -> None:
         context = get_context("spawn")  # a forked child of a process with threads may hang
+        memory = _memory(_IN_FLIGHT * _SLOT)
         self._pipe, far = context.Pipe()
-        memory = context.RawArray(ctypes.c_byte, _IN_FLIGHT * _SLOT)
         # The pipe only tells numbers of bytes: through it sweeps took 2 of the 15 ms of a frame.
         self._outgoing, self._incoming = _slots(memory), _slots(memory)
         self._process = context.Process(target=_serve, args=(far, memory, config), daemon=True)
-        self._process.start()
-        far.close()  # otherwise the death of the process would not close the pipe
+        try:
+            self._process.start()
+        except OSError:
+            self._pipe.close()
+            raise
+        finally:
+            far.close()  # otherwise the death of the process would not close the pipe
         self._alive = True
 
     def __enter__(self) -> _Worker:
@@ -153,8 +173,10 @@ class _Worker:
 
     def __exit__(self, *_: object) -> None:
         self._pipe.close()
-        self._process.join(_PATIENCE)
-        self._process.kill()
+        self._process.join(_PATIENCE if self._alive else 0.0)
+        self._process.kill()  # it may be stopped
+        self._process.join()
+        self._process.close()
 
     def send(self, scan: Scan) -> bool:
         """Have a sweep worked on; False if the sweep is too large, or the process is dead."""
@@ -170,6 +192,8 @@ class _Worker:
         """The features of the first sweep not received yet; None if the process cannot say."""
         if self._alive:
             with self._watched():
+                if not self._pipe.poll(_SILENCE):
+                    raise TimeoutError(f"did not answer for {_SILENCE:g} s")
                 slot, size = next(self._incoming), self._pipe.recv()
                 extraction: Extraction | None = ForkingPickler.loads(slot[:size])
                 return extraction
@@ -179,18 +203,29 @@ class _Worker:
     def _watched(self) -> Iterator[None]:
         try:
             yield
-        except (EOFError, OSError):
+        except (EOFError, OSError) as error:
             self._alive = False
-            _log.warning("a process for feature extraction died; the features are extracted here")
+            what = error if isinstance(error, TimeoutError) else "died"
+            _log.warning(
+                "a process for feature extraction %s; the features are extracted here", what
+            )
 
 
-def _slots(memory: Any) -> Iterator[memoryview]:
+def _memory(size: int) -> Arena:
+    """Shared memory that is there: a file that is full when it is written kills the process."""
+    arena = Arena(size)
+    if hasattr(os, "posix_fallocate"):
+        os.posix_fallocate(arena.fd, 0, size)
+    return arena
+
+
+def _slots(memory: Arena) -> Iterator[memoryview]:
     """The parts of the shared memory, one after the other, over and over."""
-    view = memoryview(memory).cast("B")
+    view = memoryview(memory.buffer)
     return cycle([view[start : start + _SLOT] for start in range(0, len(view), _SLOT)])
 
 
-def _serve(pipe: Connection, memory: Any, config: Config) -> None:
+def _serve(pipe: Connection, memory: Arena, config: Config) -> None:
     """In the process: answer each sweep, until the caller closes the pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the caller to handle
     with suppress(EOFError, OSError):

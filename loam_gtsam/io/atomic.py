@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import logging
 import os
 import re
 import shutil
@@ -17,6 +19,7 @@ import numpy as np
 
 from loam_gtsam.types import OutputError
 
+_log = logging.getLogger(__name__)
 _STAGED = ".loam_gtsam_new"  # folder of new files among the old ones, until all are written
 
 
@@ -92,6 +95,49 @@ def make_folder(directory: str | Path) -> Path:
     except OSError as error:
         raise _refused(f"{folder}: cannot make this output folder", error) from error
     return folder
+
+
+@contextmanager
+def used_alone(folder: Path) -> Iterator[None]:
+    """A block in which this process alone uses a folder that is there.
+
+    The lock is on the folder itself: it ends with the process, whatever ends that, and leaves no
+    file. File systems without locks have none.
+
+    Raises
+    ------
+    OutputError
+        If another process, or another run in this one, uses the folder.
+    """
+    held = lock_folder(folder)
+    try:
+        yield
+    finally:
+        unlock_folder(held)
+
+
+def lock_folder(folder: Path) -> int | None:
+    """Lock a folder as :func:`used_alone` does; returns what :func:`unlock_folder` wants."""
+    held: int | None = None
+    try:
+        held = os.open(folder, os.O_RDONLY)
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        unlock_folder(held)
+        raise OutputError(
+            f"{folder}: another run uses this folder; wait for its end or choose another folder"
+        ) from error
+    except OSError as error:
+        unlock_folder(held)
+        _log.info("%s: cannot be locked: %s", folder, error)
+        return None
+    return held
+
+
+def unlock_folder(held: int | None) -> None:
+    """End a lock."""
+    if held is not None:
+        os.close(held)
 
 
 @contextmanager

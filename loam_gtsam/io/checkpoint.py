@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.io.atomic import atomic_file, make_folder
+from loam_gtsam.io.atomic import atomic_file, lock_folder, make_folder, unlock_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import DatasetError, MapUpdate, OutputError, Sweep
@@ -42,7 +42,7 @@ class Checkpoint:
 
     Parameters
     ----------
-    folder : made when the first checkpoint is written; only files of checkpoints are ever removed
+    folder : which one run at a time may use; only files of checkpoints are ever removed
     seconds : of wall-clock time from one checkpoint to the next
     resume : go on from the checkpoint in the folder, if there is one; else it is removed
 
@@ -95,7 +95,7 @@ class Checkpoint:
             raise OutputError(f"a checkpoint of this run is not possible: {error}") from error
         newest = self._newest()
         if newest is None or not self._resume:
-            self.remove()
+            self._clear()
             for path in self._files():
                 raise OutputError(
                     f"{path}: the file has the name of a checkpoint's file, but is none; delete "
@@ -153,6 +153,11 @@ class Checkpoint:
 
     def remove(self) -> None:
         """Remove the checkpoint; other files in the folder stay, and then the folder as well."""
+        self._clear()
+        with suppress(OSError):
+            self.folder.rmdir()  # fails if it is not empty
+
+    def _clear(self) -> None:
         with suppress(OSError):
             for path in self._files():
                 if _is_ours(path):
@@ -160,7 +165,6 @@ class Checkpoint:
             for path in self.folder.glob(".*.tmp"):  # by a process that was killed
                 if _UNFINISHED.fullmatch(path.name):
                     path.unlink(missing_ok=True)
-            self.folder.rmdir()  # fails if it is not empty
 
     def _files(self) -> Iterator[Path]:
         return (path for path in self.folder.glob("*.npz") if _FILE.fullmatch(path.name))
@@ -182,7 +186,7 @@ class Checkpoint:
 
 
 class Progress:
-    """The frames of a run so far, and its checkpoints.
+    """The frames of a run so far, and its checkpoints, whose folder no other run may use.
 
     Parameters
     ----------
@@ -201,8 +205,16 @@ class Progress:
         self.whole = True  # not in the middle of a frame
         self.stamps: list[int] = []
         self.updates: list[MapUpdate] = []
+        self._lock: int | None = None
         if checkpoint is not None:
-            self.stamps, self.updates = checkpoint.begin(about, *state())
+            with suppress(OSError):  # the log will say so
+                checkpoint.folder.mkdir(parents=True, exist_ok=True)
+            self._lock = lock_folder(checkpoint.folder)
+            try:
+                self.stamps, self.updates = checkpoint.begin(about, *state())
+            except BaseException:
+                self.end()
+                raise
 
     def rest(self, sweeps: Iterator[tuple[Sweep, float]]) -> Iterator[tuple[Sweep, float]]:
         """The sweeps after those that are done."""
@@ -210,6 +222,7 @@ class Progress:
             sweep = next(sweeps, None)
             stamp = None if sweep is None else sweep[0].stamp
             if stamp != done:
+                self.end()
                 raise DatasetError(
                     f"sweep {number}: expected the stamp {done} ns of the run to go on with, got "
                     f"{'no more sweeps' if stamp is None else stamp}; resume with the same data "
@@ -222,6 +235,14 @@ class Progress:
         self.stamps.append(sweep.stamp)
         self.updates.append(update)
         self.whole = True
+
+    def end(self) -> None:
+        """Leave the folder to other runs; to be called once, however the run ends."""
+        unlock_folder(self._lock)
+        self._lock = None
+        if self._checkpoint is not None:
+            with suppress(OSError):
+                self._checkpoint.folder.rmdir()  # fails if it is not empty
 
     def save_if_due(self) -> None:
         """Write a checkpoint, if it is time."""

@@ -132,6 +132,8 @@ TEXTS = {
     "t_ns/0.u64": np.linspace(0, 1e8, 40).astype("<u8").tobytes().decode("latin1"),
     "velodyne/0.bin": np.full((40, 4), 2.0, "<f4").tobytes().decode("latin1"),
 }
+
+
 @st.composite
 def texts(draw: st.DrawFn, text: str) -> bytes:
     """A file of numbers in which words were replaced, or whose bytes were mutated."""

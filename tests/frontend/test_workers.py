@@ -1,7 +1,10 @@
 """Features extracted ahead, in processes of their own."""
 
+import errno
 import logging
 import multiprocessing
+import os
+import signal
 
 import numpy as np
 import pytest
@@ -80,6 +83,40 @@ def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog):
     assert caplog.text.count("died") == 1
     whole = run(ListDataset(sweeps))
     assert np.array_equal(killed.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
+
+
+def test_a_process_that_is_stopped_costs_nothing_but_time(sweeps, caplog, monkeypatch):
+    def stop(number, update):
+        if number == 0:  # the process has answered once, and is quick from now on
+            monkeypatch.setattr("loam_gtsam.frontend.workers._SILENCE", 0.5)
+            (child,) = multiprocessing.active_children()
+            os.kill(child.pid, signal.SIGSTOP)
+
+    stopped = run(ListDataset(sweeps), workers=1, on_frame=stop)
+    assert caplog.text.count("did not answer for 0.5 s") == 1
+    assert multiprocessing.active_children() == []
+    whole = run(ListDataset(sweeps))
+    assert np.array_equal(stopped.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
+
+
+@pytest.mark.parametrize(("room", "used"), [(0, 0), (1, 1), (2, 2)])
+def test_without_shared_memory_there_are_fewer_processes(sweeps, caplog, monkeypatch, room, used):
+    asked = []
+
+    def fallocate(*given):
+        asked.append(given)
+        if len(asked) > room:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(os, "posix_fallocate", fallocate)
+    found = extract_ahead(numbered(sweeps[:3]), Config(), 2)
+    first = next(found)[2]
+    assert (first is None) is (used == 0)
+    assert len(multiprocessing.active_children()) == used
+    assert [number for _, number, _ in found] == [1.0, 2.0]
+    assert multiprocessing.active_children() == []
+    assert caplog.text.count("No space left on device") == (used < 2)
+    assert ("the features are extracted here" in caplog.text) is (used == 0)
 
 
 def test_a_sweep_too_large_to_hand_over_is_left_to_the_caller(sweeps):

@@ -1,12 +1,22 @@
 """Files are whole or not there, whatever interrupts the writing."""
 
+import errno
+import fcntl
 import json
 import os
+import signal
 
 import numpy as np
 import pytest
 
-from loam_gtsam.io.atomic import ClosingWriter, atomic_file, make_folder, staged_files, write_json
+from loam_gtsam.io.atomic import (
+    ClosingWriter,
+    atomic_file,
+    make_folder,
+    staged_files,
+    used_alone,
+    write_json,
+)
 from loam_gtsam.types import OutputError
 
 
@@ -110,3 +120,32 @@ def test_files_whose_move_was_cut_off_are_not_taken_for_complete(moved, tmp_path
     assert not (tmp_path / "last").exists()
     write(tmp_path, ["a", "b", "last"], "newer")
     assert content(tmp_path) == {"a": "newer", "b": "newer", "last": "newer"}
+
+
+def test_a_folder_is_used_by_one_run_at_a_time_and_free_when_that_was_killed(tmp_path):
+    ready, told = os.pipe()
+    child = os.fork()
+    if child == 0:
+        with used_alone(tmp_path):
+            os.write(told, b"x")
+            signal.pause()
+    os.read(ready, 1)
+    try:
+        with pytest.raises(OutputError, match="another run uses this folder"), used_alone(tmp_path):
+            pass
+    finally:
+        os.kill(child, signal.SIGKILL)
+        os.waitpid(child, 0)
+    with used_alone(tmp_path):
+        assert list(tmp_path.iterdir()) == []
+    with used_alone(tmp_path):
+        pass
+
+
+def test_where_folders_cannot_be_locked_there_is_no_lock(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    with used_alone(tmp_path), used_alone(tmp_path):
+        pass

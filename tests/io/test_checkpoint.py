@@ -13,7 +13,7 @@ from support.cli import loam
 from support.list_dataset import ListDataset
 
 from loam_gtsam.config import Config, preset
-from loam_gtsam.datasets import open_dataset
+from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.loops.closure import ScanLoopCloser
 from loam_gtsam.loops.keyframes import LoopClosure
@@ -290,3 +290,18 @@ def test_killed_again_and_again_a_run_comes_to_the_same_end(tmp_path):
 def reached(folder, frames):
     states = [path.stem for path in (folder / "checkpoint").glob("state_*.npz")]
     return any(int(name.removeprefix("state_")) >= frames for name in states)
+
+
+def test_two_runs_at_a_time_do_not_share_a_checkpoint(tmp_path):
+    world = SimulatedWorld("room", frames=2, columns=60)
+
+    def second(number, update):
+        if number == 0:
+            with pytest.raises(OutputError, match="another run uses this folder"):
+                run(world, checkpoint=Checkpoint(tmp_path / "here"))
+
+    first = run(world, checkpoint=Checkpoint(tmp_path / "here"), on_frame=second)
+    assert len(first.updates) == 2
+    assert not (tmp_path / "here").exists()  # for nothing was saved in it
+    assert len(run(world, checkpoint=Checkpoint(tmp_path / "here", seconds=0.0)).updates) == 2
+    assert len(run(world, checkpoint=Checkpoint(tmp_path / "here", resume=True)).updates) == 2

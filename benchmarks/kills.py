@@ -1,6 +1,6 @@
 """Runs that are killed at random moments: are results ever half, and does ``--resume`` go on.
 
-``python -m benchmarks.kills [--kills 50] [--frames 400] [--seed 0]``
+``python -m benchmarks.kills [--kills 50] [--frames 100] [--seed 0]``
 """
 
 from __future__ import annotations
@@ -21,19 +21,44 @@ from loam_gtsam.io.run_files import RUN_FILES
 _BYTES = ("trajectory.tum", "trajectory_kitti.txt", "trajectory_covariance.csv", "map.ply")
 """Files that hold no times."""
 _STAGES = ("stage_names", "stage_seconds")
+_ROOM, _BLOCK = "sim:room?columns=300&imu=mems&speed=3", "sim:street_loop?columns=450&imu=mems"
+MODES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "without IMU": (_BLOCK, ("--set", "imu.coupling=off")),
+    "tight IMU": (_BLOCK, ()),
+    "loose IMU": (_BLOCK, ("--set", "imu.coupling=loose")),
+    "IMU's tilt in the solve": (_BLOCK, ("--set", "imu.prior=sigma")),
+    "small places": ("sim:stairwell?columns=300&imu=mems", ()),
+    "loops": (_ROOM, ("--loops", "--set", "pose_graph.keyframe_distance=0.3")),
+    "loops, loose IMU": (_ROOM, ("--loops", "--set", "imu.coupling=loose")),
+    "a process for features": (_ROOM, ("--workers", "1")),
+    "scan to scan": (_BLOCK, ("--set", "odometry.method=scan_to_scan")),
+    "preset loam": (_BLOCK, ("--preset", "loam")),
+    "archive on disk": (_BLOCK, ("--set", "map.cube_size=5.0", "--set", "map.window=[3, 3, 3]",
+                        "--set", "map.window_margin=1", "--set", "map.neighbourhood=[3, 3, 3]",
+                        "--set", "map.archive_megabytes=0.01",
+                        "--set", "map.archive_dir={scratch}/cubes")),
+}  # fmt: skip
+"""World and options of the runs that are gone on with."""
 
 
 def main() -> None:
     """Kill, go on, compare; exits with 1 if anything differs."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--kills", type=int, default=50, help="half of them of either kind")
-    parser.add_argument("--frames", type=int, default=400)
+    parser.add_argument("--kills", type=int, default=50, help="a fifth of them while replacing")
+    parser.add_argument("--frames", type=int, default=100)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
     chance = random.Random(options.seed)
+    replaced = -(-options.kills // 5)
+    each, more = divmod(options.kills - replaced, len(MODES))
+    faults: list[str] = []
     with tempfile.TemporaryDirectory() as scratch:
-        faults = _resumed(Path(scratch), options.frames, options.kills // 2, chance)
-        faults += _replaced(Path(scratch), (options.kills + 1) // 2, chance)
+        for number, mode in enumerate(MODES):
+            kills = each + (number < more)
+            found = _resumed(Path(scratch), mode, options.frames, kills, chance)
+            print(f"{mode}: {kills} kills, {len(found)} faults", flush=True)
+            faults += [f"{mode}: {fault}" for fault in found]
+        faults += _replaced(Path(scratch), replaced, chance)
     for fault in faults:
         print(fault)
     print(f"{options.kills} kills, {len(faults)} faults")
@@ -41,39 +66,36 @@ def main() -> None:
         raise SystemExit(1)
 
 
-def _resumed(scratch: Path, frames: int, kills: int, chance: random.Random) -> list[str]:
+def _resumed(scratch: Path, mode: str, frames: int, kills: int, chance: random.Random) -> list[str]:
     """One run after another that is killed and gone on with, until it is complete."""
-    whole, killed = scratch / "whole", scratch / "killed"
-    seconds = _complete(whole, frames)
+    if not kills:
+        return []
+    whole, killed = (scratch / name / mode.replace("'", "") for name in ("whole", "killed"))
+    command = _command(killed, frames, mode, "--resume", "--checkpoint", "0.2")
+    seconds = _complete(_command(whole, frames, mode))
     faults: list[str] = []
-    runs = 0
     while kills:
-        if _killed(
-            _command(killed, frames, "--resume", "--checkpoint", "0.2"), chance, seconds / 3
-        ):
+        if _killed(command, chance, 1.1 * seconds):
             kills -= 1
             if (killed / "summary.json").exists():
                 faults += _differences(killed, whole)
         else:
-            runs += 1
             faults += _differences(killed, whole)
             shutil.rmtree(killed)
-    _complete(killed, frames, "--resume")
-    faults += _differences(killed, whole)
-    print(f"{runs + 1} runs of {frames} sweeps came to their ends")
-    return faults
+    _complete(command)
+    return faults + _differences(killed, whole)
 
 
 def _replaced(scratch: Path, kills: int, chance: random.Random) -> list[str]:
     """Results that are replaced by those of a longer run, which is killed."""
     old, new, killed = (scratch / name for name in ("old", "new", "replaced"))
-    _complete(old, 10)
-    seconds = _complete(new, 20)
+    _complete(_command(old, 10))
+    seconds = _complete(_command(new, 20))
     shutil.copytree(old, killed)
     faults: list[str] = []
     replaced = cut_off = 0
     for _ in range(kills):
-        _killed(_command(killed, 20, "--overwrite"), chance, 1.1 * seconds)
+        _killed(_command(killed, 20, "without IMU", "--overwrite"), chance, 1.1 * seconds)
         if not (killed / "summary.json").exists():
             cut_off += 1  # in the milliseconds of the move: nothing says that they are complete
         elif not _differences(killed, new):
@@ -89,16 +111,18 @@ def _replaced(scratch: Path, kills: int, chance: random.Random) -> list[str]:
     return faults
 
 
-def _command(folder: Path, frames: int, *options: str) -> list[str]:
-    world = f"sim:street_loop?frames={frames}"
-    run = [sys.executable, "-m", "loam_gtsam.cli", "run", world, "--output", str(folder)]
-    return [*run, "--quiet", "--workers", "0", *options]
+def _command(folder: Path, frames: int, mode: str = "without IMU", *options: str) -> list[str]:
+    world, settings = MODES[mode]
+    run = [sys.executable, "-m", "loam_gtsam.cli", "run", f"{world}&frames={frames}"]
+    run += ["--output", str(folder), "--quiet", "--no-plot"]
+    run += [setting.format(scratch=folder.parent.parent) for setting in settings]
+    return [*run, *(() if "--workers" in settings else ("--workers", "0")), *options]
 
 
-def _complete(folder: Path, frames: int, *options: str) -> float:
+def _complete(command: list[str]) -> float:
     """Seconds that a run takes."""
     started = time.monotonic()
-    subprocess.run(_command(folder, frames, *options), check=True)
+    subprocess.run(command, check=True)
     return time.monotonic() - started
 
 

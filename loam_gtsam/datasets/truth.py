@@ -11,6 +11,7 @@ import numpy as np
 
 from loam_gtsam.datasets.decode import tables
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import BadSweep, DatasetError, FloatArray, IntArray, Trajectory
 
 _BAGS = (".bag", ".mcap", ".db3")
@@ -161,12 +162,12 @@ def _without_stamps(
             f"of sweeps with known stamps is {known}"
         )
     try:
-        poses = np.array([[float(word) for word in row.split()] for row in rows]).reshape(-1, 3, 4)
+        whole = [tables.rigid_matrix([float(word) for word in row.split()]) for row in rows]
     except ValueError as error:
-        raise DatasetError(f"{path}: expected 12 numbers in every line: {error}") from error
-    whole = np.tile(np.eye(4), (len(poses), 1, 1))
-    whole[:, :3] = poses
-    return stamps, np.linalg.inv(whole[0]) @ whole
+        raise DatasetError(
+            f"{path}: expected 12 numbers of a rigid transform in every line: {str(error)[:80]}"
+        ) from error
+    return stamps, inverse_pose(whole[0]) @ np.array(whole)
 
 
 def _of_bag(path: Path, topic: str | None, problems: list[str]) -> tuple[IntArray, FloatArray]:

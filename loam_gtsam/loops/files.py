@@ -193,7 +193,7 @@ def _floats(words: list[str], where: str) -> FloatArray:
     try:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
-        raise DatasetError(f"{where}: {error}") from None
+        raise DatasetError(f"{where}: {str(error)[:80]}") from None
     if not np.isfinite(numbers).all():
         raise DatasetError(f"{where}: expected finite numbers")
     return numbers

@@ -209,7 +209,7 @@ def _named(name: str, key: str, entries: Mapping[str, Any]) -> Iterable[tuple[st
 
 def _mapping(where: str, value: Any, known: tuple[str, ...] = ()) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ConfigError(f"{where}: expected a mapping, got {value!r}")
+        raise ConfigError(f"{where}: expected a mapping, got {str(value)[:80]!r}")
     for key in value:
         if not isinstance(key, str):
             raise ConfigError(f"{where}: expected names as keys, got {key!r}; put it in quotes")

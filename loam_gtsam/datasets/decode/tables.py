@@ -30,6 +30,8 @@ UNIT_TOLERANCE = 0.1
 """Limit by which the length of a quaternion may differ from one for it to be an orientation."""
 
 _WHOLE = re.compile(r"[+-]?[0-9]+")
+_ROUNDED = 1e-2
+"""Digits that are missing in the rotations of files."""
 _HUGE = 1e100  # its square is finite
 _LONGEST = 40  # characters of a number: of any stamp, with zeros before it
 
@@ -134,6 +136,17 @@ def pose_matrix(numbers: Sequence[float]) -> FloatArray:
     pose[:3, :3] = gtsam.Rot3.Quaternion(w / length, x / length, y / length, z / length).matrix()
     pose[:3, 3] = numbers[:3]
     return pose
+
+
+def rigid_matrix(numbers: Sequence[float]) -> FloatArray:
+    """(4, 4) transform of the 12 numbers of its first three rows; ValueError if it is not rigid."""
+    rows = np.reshape(_finite(numbers), (3, 4))
+    rotation = rows[:, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=_ROUNDED)
+        if not (proper and np.linalg.det(rotation) > 0.0):
+            raise ValueError("no rigid transform")
+    return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 
 def _finite(numbers: Sequence[float]) -> Sequence[float]:

@@ -28,6 +28,8 @@ _ANGLES = slice(3, 6)  # roll, pitch, yaw: radians; yaw 0 is east
 _ACCELERATION, _GYRO = slice(11, 14), slice(17, 20)
 """Along x, y, z of the unit, m/s^2 with gravity, rad/s."""
 _OXTS_VALUES = 30
+_NORTHERNMOST = 89.9  # degrees: the Mercator projection has no poles
+_FAR = 1e6  # metres and degrees that no packet has
 _BRIDGED_NS = 100_000_000  # default of ``imu.max_gap``
 
 
@@ -117,8 +119,13 @@ def read_oxts(root: Path) -> tuple[IntArray, FloatArray] | None:
             if len(words) != _OXTS_VALUES:
                 raise ValueError(f"{len(words)} values")
             values[row] = [float(word) for word in words]
+            if not abs(values[row, _LATITUDE]) < _NORTHERNMOST:
+                raise ValueError(f"a latitude of {values[row, _LATITUDE]:g} degrees")
+            if not (np.abs(values[row, : _ANGLES.stop]) < _FAR).all():
+                raise ValueError("no position and angles")
         except ValueError as error:
-            raise DatasetError(f"{file}: expected {_OXTS_VALUES} numbers: {error}") from error
+            text = f"{file}: expected {_OXTS_VALUES} numbers: {str(error)[:80]}"
+            raise DatasetError(text) from error
     return stamps, values
 
 
@@ -159,9 +166,10 @@ def lidar_T_imu_of(root: Path) -> FloatArray | None:
     numbers = _calibration(path)
     try:
         rows = np.column_stack([np.reshape(numbers["R"], (3, 3)), np.reshape(numbers["T"], 3)])
+        return tables.rigid_matrix(rows.ravel().tolist())
     except (KeyError, ValueError) as error:
-        raise DatasetError(f"{path}: expected R: with 9 and T: with 3 numbers") from error
-    return _homogeneous(rows)
+        text = f"{path}: expected R: with 9 and T: with 3 numbers of a rigid transform"
+        raise DatasetError(text) from error
 
 
 def camera_T_lidar_of(root: Path) -> FloatArray | None:
@@ -171,9 +179,10 @@ def camera_T_lidar_of(root: Path) -> FloatArray | None:
     if "Tr" not in numbers:
         return None
     try:
-        return _homogeneous(np.reshape(numbers["Tr"], (3, 4)))
+        return tables.rigid_matrix(numbers["Tr"])
     except ValueError as error:
-        raise DatasetError(f"{path}: expected Tr: with 12 numbers") from error
+        text = f"{path}: expected Tr: with 12 numbers of a rigid transform"
+        raise DatasetError(text) from error
 
 
 def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> Trajectory | None:
@@ -183,17 +192,13 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
         return None
 
     def pose(line: str) -> FloatArray:
-        return _homogeneous(np.reshape([float(word) for word in line.split()], (3, 4)))
+        return tables.rigid_matrix([float(word) for word in line.split()])
 
-    poses = tables.convert_lines(path, pose, "12 numbers")
+    poses = tables.convert_lines(path, pose, "12 numbers of a rigid transform")
     if len(poses) != len(stamps):
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")
     moved = inverse_pose(camera_T_lidar) @ np.reshape(poses, (-1, 4, 4)) @ camera_T_lidar
     return Trajectory(stamps, moved)
-
-
-def _homogeneous(rows: FloatArray) -> FloatArray:
-    return np.vstack([rows, [0.0, 0.0, 0.0, 1.0]])
 
 
 def _calibration(path: Path) -> dict[str, list[float]]:

@@ -233,14 +233,14 @@ class KittiDataset(SweepFiles):
 
 def raise_elevation(points: NDArray[np.floating], angle: float) -> NDArray[np.floating]:
     """Turn every ray up by ``angle`` (rad), about the horizontal axis perpendicular to it."""
-    horizontal = np.hypot(points[:, 0], points[:, 1])
     cosine, sine = np.cos(angle), np.sin(angle)
-    with np.errstate(invalid="ignore", divide="ignore"):
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        horizontal = np.hypot(points[:, 0], points[:, 1])
         scale = np.where(horizontal > 0.0, cosine - sine * points[:, 2] / horizontal, 1.0)
-    raised = points * scale[:, None]
-    up = cosine * points[:, 2] + sine * horizontal
-    raised[:, 2] = np.where(horizontal > 0.0, up, points[:, 2])
-    return raised.astype(points.dtype)
+        raised = points * scale[:, None]
+        up = cosine * points[:, 2] + sine * horizontal
+        raised[:, 2] = np.where(horizontal > 0.0, up, points[:, 2])
+        return raised.astype(points.dtype)
 
 
 def find_sweeps(path: Path) -> Path | None:

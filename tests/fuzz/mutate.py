@@ -165,10 +165,17 @@ def batch(
     done.value = numbers.stop
 
 
-def all_of(name: str, target: Any, numbers: range, seed: int) -> list[tuple[int, str]]:
-    """What was found in a format; a process that dies is another finding, and the rest follows."""
+def all_of(name: str, target: Any, numbers: range, seed: int) -> int:
+    """Number of findings in a format; a process that dies is another one, and the rest follows."""
     context = multiprocessing.get_context("fork")
-    problems: list[tuple[int, str]] = []
+    seen: Counter[str] = Counter()
+
+    def take(number: int, problem: str) -> None:
+        place = problem.partition(" at ")[2].partition(" [")[0] or problem.partition(":")[0]
+        if not seen[place]:
+            print(f"  {number}: {problem}", flush=True)
+        seen[place] += 1
+
     while len(numbers):
         done, found = context.Value("q", numbers.start), context.SimpleQueue()
         process = context.Process(
@@ -178,14 +185,14 @@ def all_of(name: str, target: Any, numbers: range, seed: int) -> list[tuple[int,
         while process.is_alive():
             process.join(0.2)
             while not found.empty():
-                problems.append(found.get())
+                take(*found.get())
         while not found.empty():
-            problems.append(found.get())
+            take(*found.get())
         if done.value >= numbers.stop:
             break
-        problems.append((done.value, f"the process died: exit code {process.exitcode}"))
+        take(done.value, f"the process died: exit code {process.exitcode}")
         numbers = range(done.value + 1, numbers.stop)
-    return problems
+    return seen.total()
 
 
 def main() -> int:
@@ -208,16 +215,10 @@ def main() -> int:
             continue
         started = time.monotonic()
         numbers = range(options.first, options.first + count)
-        problems = all_of(name, target, numbers, options.seed)
-        totals.update(mutants=count, findings=len(problems))
-        print(f"{name}: {count}, {len(problems)} findings, {time.monotonic() - started:.0f} s")
-        seen: set[str] = set()
-        for number, problem in problems:
-            place = problem.partition(" at ")[2].partition(" [")[0] or problem
-            if place not in seen:
-                seen.add(place)
-                print(f"  {number}: {problem}", flush=True)
-        sys.stdout.flush()
+        findings = all_of(name, target, numbers, options.seed)
+        totals.update(mutants=count, findings=findings)
+        seconds = time.monotonic() - started
+        print(f"{name}: {count}, {findings} findings, {seconds:.0f} s", flush=True)
     print(f"{totals['mutants']} mutants, {totals['findings']} findings ({CONTENT})")
     return int(totals["findings"] > 0)
 

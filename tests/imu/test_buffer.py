@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.imu import CONFIG, START, angle, as_seen_by, motion, moving, ns, part, rot
 
+from loam_gtsam.config import ImuConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.types import InputError
+from loam_gtsam.io.state import freeze
+from loam_gtsam.types import ImuSamples, InputError
 
 
 @pytest.mark.parametrize("start", [0.4, 1.2345678, 2.7])
@@ -350,3 +352,23 @@ def test_forgotten_samples_are_left_out_and_taken_again_after_the_clock_was_set_
     assert live.rotation_between(last - 10**8, last) is not None
     expected = ImuBuffer(CONFIG, back).orientation(last)
     assert live.orientation(last).equals(expected, 0.0)
+
+
+def test_a_day_of_samples_takes_no_more_memory_than_an_hour():
+    """At 20 Hz, a minute at a time, with a gap, repeats and late ones; through the filter."""
+    config = ImuConfig()
+    buffer, rng, sizes = ImuBuffer(config), np.random.default_rng(0), []
+    count, minute = 1200, 60 * 10**9
+    for number in range(24 * 60):
+        stamps = number * minute + np.arange(count, dtype=np.int64) * 50_000_000
+        stamps = np.concatenate([stamps[:600], stamps[610:], stamps[5:9], stamps[:3] - 2 * minute])
+        gyro, noise = rng.normal(0.0, 0.1, (2, len(stamps), 3))
+        buffer.add(ImuSamples(stamps, None, gyro, 5.66 + noise))
+        newest = (number + 1) * minute
+        assert (buffer.orientation(newest - 2 * 10**9) is None) is False
+        buffer.forget_old(newest)
+        if number % 60 == 59:
+            frozen = freeze({"buffer": buffer}, {"config": config})
+            sizes.append(sum(part.nbytes for part in frozen.values()))
+    assert max(sizes[1:]) < 1.2 * sizes[0]
+    assert buffer.report.samples > 24 * 60 * 1000

@@ -96,8 +96,7 @@ class Mapper:
     Raises
     ------
     ConfigError
-        If the configured solver has no place for the configured use of the IMU, or for factors of
-        a user's own.
+        If the configured solver has no place for factors of the IMU, or of a user's own.
     """
 
     def __init__(
@@ -291,14 +290,12 @@ class Mapper:
             frame, found = self._start.add(frame, found, self.keyframe, self._named)
             self._start = None if self._start.complete else self._start
         solution = found.solution
-        fit = Fit.of(solution.matches, frame.matcher.offered)
-        self.monitor.accept(fit, solution.map_T_lidar)
+        self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
+        told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
-            posed, solution, pose, tilt, fused = with_imu(
-                self.imu, posed, frame.matcher.last, solution, scan, frame.priors
-            )
+            posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         update = self._errors.calibrated(update, frame.sweep, solution, scan, fused)

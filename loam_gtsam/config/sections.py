@@ -72,11 +72,9 @@ class FeatureConfig(Section):
     occlusion_gap: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """Two neighbours with a squared distance above this may be the rim of an occlusion."""
     occlusion_ratio: float = parameter(0.1, source="LOAM", low=0.0)
-    """Two neighbours are on one ray if their distance, scaled to one range and divided by the
-    range, is below this."""
+    """Neighbours are on one ray if their distance, scaled to one range, is below this times it."""
     grazing_ratio: float = parameter(0.0002, source="LOAM", low=0.0)
-    """A beam grazes the surface if both squared gaps beside its point exceed this times the squared
-    range of the point."""
+    """A beam grazes if both squared gaps beside its point exceed this times its squared range."""
     plane_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
     """The plane points of one ring are thinned to one per voxel of this size."""
 
@@ -291,9 +289,9 @@ class SolverConfig(Section):
     min_aligned: float = parameter(8.0, low=0.0)
     """A direction is degenerate if fewer matches than this fix it, counted as if their normals
     pointed that way."""
-    acceleration_sigma: float = parameter(2.0, unit="m/s^2", low=1e-6)
+    acceleration_sigma: float = parameter(2.0, unit="m/s^2", low=1e-6, high=1e4)
     """Along degenerate directions, constant velocity is believed to within this acceleration."""
-    turn_sigma: float = parameter(2.0, unit="rad/s^2", low=1e-6)
+    turn_sigma: float = parameter(2.0, unit="rad/s^2", low=1e-6, high=1e4)
     """Along degenerate directions, a constant turn rate is believed to within this acceleration."""
     start_speed: float = parameter(10.0, unit="m/s", low=1e-6)
     """Along degenerate directions, the speed at the start of a run is zero to within this."""

@@ -1,10 +1,10 @@
 """Thousands of sweeps with every fault there is, again and again: ``python -m benchmarks.soak``.
 
-Drives round and round a room and a block of the built-in world, whose sweeps, stamps and IMU
-samples are spoilt as :mod:`benchmarks.soak_faults` says. No exception may leave the pipeline, its
-memory must not grow, the good frames must stay accurate, and the report of the run must count every
-fault that was injected, no more and no less; else the exit code is 1. ``soak.md`` has the tables,
-``soak_*.csv`` and ``.png`` the curves.
+Drives round and round a room and a block of the built-in world, or with ``--places`` through other
+places once, whose sweeps, stamps and IMU samples are spoilt as :mod:`benchmarks.soak_faults` says.
+No exception may leave the pipeline, its memory must not grow, the good frames must stay accurate,
+and the report of the run must count every fault that was injected, no more and no less; else the
+exit code is 1. ``soak.md`` has the tables, ``soak_*.csv`` and ``.png`` the curves.
 """
 
 from __future__ import annotations
@@ -38,6 +38,12 @@ from loam_gtsam.view.plots import available, plot_curves
 FRAMES, QUICK = 10_000, 300
 SCENES = {"room": 300, "street_loop": 450}
 """Firings a sweep: a sixth and a quarter of the sensor's own."""
+PLACES = dict.fromkeys(
+    ("park", "forest", "square", "rooms", "garage", "stairwell", "tunnel_pilasters", "bridge"), 450
+)
+"""Likewise, of places where a fault may cost more than its sweep: only exceptions and counts are
+judged."""
+_FRAMES_OF_A_PLACE = 240
 _BOUNDED = "room"
 """The map of the block gets denser all the time, as noise fills further voxels."""
 _ATE = 0.05
@@ -110,14 +116,19 @@ class SoakResult:
         equal = sum(injected == counted for _, injected, counted in self.counts())
         total = len(list(self.counts()))
         judged = self.scene == _BOUNDED and len(self.columns["faults"]) >= _JUDGED
+        known = self.scene in SCENES
+        solved = self.sound[0] == self.sound[1] if known else None
         return {
             "exceptions": (str(raised), Verdict("0", raised == 0)),
             "counts that are exact": (f"{equal} of {total}", Verdict("all", equal == total)),
             "sound sweeps solved": (
                 f"{self.sound[1]} of {self.sound[0]}",
-                Verdict("all", self.sound[0] == self.sound[1]),
+                Verdict("all", solved),
             ),
-            "ATE [m]": (f"{self.ate:.4f}", Verdict(f"<= {_ATE:g}", self.ate <= _ATE)),
+            "ATE [m]": (
+                f"{self.ate:.4f}",
+                Verdict(f"<= {_ATE:g}", self.ate <= _ATE if known else None),
+            ),
             "largest error [m]": (f"{self.largest:.3f}", Verdict("-", None)),
             "memory [MB per 1,000 sweeps]": (
                 f"{self.growth:+.2f}",
@@ -133,7 +144,7 @@ class SoakResult:
 
 def soak(scene: str, frames: int, seed: int = 0) -> SoakResult:
     """Drive so many sweeps of a scene, spoilt, through a pipeline."""
-    world = SimulatedWorld(scene, frames=frames, columns=SCENES[scene])
+    world = SimulatedWorld(scene, frames=frames, columns=(SCENES | PLACES)[scene])
     drive = FaultyDrive(world, seed)
     config = effective_config(Config(), world)
     pipeline = Pipeline(config, imu=imu_buffer(drive, config))
@@ -234,11 +245,11 @@ def _scene(result: SoakResult) -> Iterator[str]:
     points = result.columns["map_points"]
     growth = ", ".join(f"{result.slope(k / 5, (k + 1) / 5):.1f}" for k in range(1, 5))
     yield f"\n## {result.scene}\n"
+    firings = (SCENES | PLACES)[result.scene]
     yield (
-        f"{len(points)} sweeps of {SCENES[result.scene]} firings delivered, {injected.total()} "
-        f"faults. From the second to the last fifth of them memory grew by {growth} MB per 1,000 "
-        f"sweeps; map points: {points[len(points) // 5]:.0f} after a fifth, {points[-1]:.0f} in "
-        "the end.\n"
+        f"{len(points)} sweeps of {firings} firings delivered, {injected.total()} faults. "
+        f"From the second to the last fifth of them memory grew by {growth} MB per 1,000 sweeps; "
+        f"map points: {points[len(points) // 5]:.0f} after a fifth, {points[-1]:.0f} in the end.\n"
     )
     yield "| what | value | target |\n|---|---|---|"
     for label, (value, verdict) in result.verdicts().items():
@@ -260,17 +271,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help=f"{QUICK} sweeps of the block")
     parser.add_argument("--frames", type=int, help=f"sweeps of each scene; {FRAMES} by default")
     parser.add_argument("--seed", type=int, default=0, help="of the faults")
+    parser.add_argument("--places", action="store_true", help=f"{_FRAMES_OF_A_PLACE} sweeps of "
+                        f"each of {', '.join(PLACES)} instead")  # fmt: skip
     parser.add_argument("--output", type=Path, help="folder for the results; docs/benchmarks, or "
                         "benchmarks/results if only a part is run")  # fmt: skip
     options = parser.parse_args(arguments)
-    part = options.quick or options.frames is not None
-    frames = QUICK if options.quick else options.frames or FRAMES
+    part = options.quick or options.places or options.frames is not None
+    usual = QUICK if options.quick else _FRAMES_OF_A_PLACE if options.places else FRAMES
+    frames = options.frames or usual
     if frames < 2 * QUICK // 3:
         parser.error(f"--frames: expected at least {2 * QUICK // 3}, got {frames}")
     folder = options.output or ROOT / ("benchmarks/results" if part else "docs/benchmarks")
-    scenes = ["street_loop"] if options.quick else list(SCENES)
+    scenes = ["street_loop"] if options.quick else list(PLACES if options.places else SCENES)
     # Processes of their own, started afresh: the memory of one run is not that of the other.
-    with ProcessPoolExecutor(len(scenes), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        min(len(scenes), len(SCENES)), mp_context=get_context("spawn"), max_tasks_per_child=1
+    ) as pool:
         runs = [pool.submit(soak, scene, frames, options.seed) for scene in scenes]
         results = [run.result() for run in runs]
     for result in results:

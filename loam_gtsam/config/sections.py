@@ -474,10 +474,3 @@ class LiveConfig(Section):
     imu_wait: float = parameter(0.2, unit="s", low=0.0, high=60.0)
     """A sweep waits for the IMU samples up to its end, but not longer than this after it was
     received; until the map is levelled, it waits imu.still_seconds more."""
-
-
-class PartsConfig(Section):
-    """Parts of a user's own: solver, factors, loop closer, odometry, front end, observer."""
-
-    on_error: Literal["stop", "continue"] = parameter("stop")
-    """An exception in a part stops the run, or the log says it once and the run goes on without."""

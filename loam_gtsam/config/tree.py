@@ -23,6 +23,7 @@ from loam_gtsam.config.base import (
     override,
     shown,
 )
+from loam_gtsam.config.own_parts import PartsConfig
 from loam_gtsam.types import ConfigError
 
 
@@ -43,7 +44,7 @@ class Config(Section):
     loops: sections.LoopConfig = sections.LoopConfig()
     bag: sections.BagConfig = sections.BagConfig()
     live: sections.LiveConfig = sections.LiveConfig()
-    parts: sections.PartsConfig = sections.PartsConfig()
+    parts: PartsConfig = PartsConfig()
 
     @model_validator(mode="after")
     def _check_matches(self) -> Self:

@@ -304,6 +304,9 @@ class SolverConfig(Section):
     degeneracy_projector: Literal["correct", "published"] = parameter("correct")
     """The method loam projects by V^-1 V2 with eigenvectors as rows (correct), or as columns like
     the published Eigen port, which is no projection onto the good directions; only to study it."""
+    shorten_steps: bool = parameter(True)
+    """The method loam halves a step that does not lower the cost as the gradient promises; without
+    this, the pose moves back and forth where edges alone fix it. LOAM takes every step."""
     huber_delta: float = parameter(0.1, unit="m", source="A-LOAM", low=0.0)
     """The loss of the method aloam turns linear at this residual; 0 keeps it quadratic."""
     cost_tolerance: float = parameter(1e-6, source="the default of Ceres", low=0.0)

@@ -128,7 +128,7 @@ _CLASSICAL = {
         "weight_range": "map",
         "keep_translation": 0.0,
     },
-    "solver": {"step_sigmas": 0.0, "min_map_edges": 11},
+    "solver": {"step_sigmas": 0.0, "min_map_edges": 11, "shorten_steps": False},
     "relocalization.enabled": False,
 }
 

@@ -129,7 +129,11 @@ class ScoredComparison:
         guesses = "every solver predicts its guesses from its own motion"
         if self.comparison.shared_guess:
             guesses = "every solver of this package starts from the guess of the first of them"
-        problems = [f"{run.name}: {s.problem}" for run, s in self.rows if s.problem]
+        whose: dict[str, list[str]] = {}
+        for run, scores in self.rows:
+            if scores.problem:
+                whose.setdefault(scores.problem, []).append(run.name)
+        problems = [f"{', '.join(names)}: {problem}" for problem, names in whose.items()]
         return [about, guesses, *self.comparison.notes, *problems]
 
 

@@ -23,6 +23,8 @@ INK, FAINT, PATH, TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
 _STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d",
                   "#54a24b", "#bab0ac", "#ff9da6")  # fmt: skip
 _RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8", "#7a5230")
+_RUN_LINES = tuple((colour, style) for style in ("-", "--", ":") for colour in _RUN_COLOURS)
+"""Colour and style of the line of a run, in the order of the runs."""
 _DPI = 110
 _HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
 """Pale ground, dark walls: what stands out of the ground stands out of the page."""
@@ -52,8 +54,8 @@ def plot_trajectory(
     truth : reference poses in the map frame (align them first), or None
     loops : (L, 2, 3) ends of loops in the map and (L,) which are used; the others are dotted
     """
-    lines = [] if truth is None else [("truth", truth, TRUTH, 3.0)]
-    figure, top = _trajectory_figure(7.0, [*lines, ("estimate", trajectory, PATH, 1.4)])
+    lines = [] if truth is None else [("truth", truth, (TRUTH, "-"), 3.0)]
+    figure, top = _trajectory_figure(7.0, [*lines, ("estimate", trajectory, (PATH, "-"), 1.4)])
     start = trajectory.map_T_lidar[:1, :3, 3]
     top.plot(start[:, 0], start[:, 1], "o", color=INK, ms=6, label="start")
     if loops is not None:
@@ -160,9 +162,9 @@ def plot_trajectories(
     path: str | Path, trajectories: Mapping[str, Trajectory], truth: Trajectory | None = None
 ) -> None:
     """Draw several paths, all in one frame (align them first), from above, and their heights."""
-    lines = [] if truth is None else [("truth", truth, TRUTH, 4.0)]
-    named = zip(trajectories.items(), cycle(_RUN_COLOURS), strict=False)
-    lines += [(name, trajectory, colour, 1.3) for (name, trajectory), colour in named]
+    lines = [] if truth is None else [("truth", truth, (TRUTH, "-"), 4.0)]
+    named = zip(trajectories.items(), cycle(_RUN_LINES), strict=False)
+    lines += [(name, trajectory, line, 1.3) for (name, trajectory), line in named]
     figure, top = _trajectory_figure(7.5, lines)
     _legend_above(figure, *top.get_legend_handles_labels())
     save_figure(figure, path)
@@ -179,7 +181,7 @@ def plot_curves(
 
     Parameters
     ----------
-    panels : label of the vertical axis -> solver -> (N,) x and (N,) y; a solver has the colour of
+    panels : label of the vertical axis -> solver -> (N,) x and (N,) y; a solver has the line of
         its place in the first panel
     log : logarithmic vertical axes; values below a millionth of the panel's largest, which are
         rounding, are left out
@@ -188,9 +190,9 @@ def plot_curves(
     rows = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
     for axes, (ylabel, curves) in zip(rows, panels.items(), strict=True):
         largest = max((float(np.nanmax(y)) for _, y in curves.values() if len(y)), default=0.0)
-        for (name, (x, y)), colour in zip(curves.items(), cycle(_RUN_COLOURS), strict=False):
+        for (name, (x, y)), (colour, style) in zip(curves.items(), cycle(_RUN_LINES), strict=False):
             axes.plot(x, np.where(y > 1e-6 * largest, y, np.nan) if log else y, color=colour,
-                      lw=1.4, label=name if len(x) else None)  # fmt: skip
+                      ls=style, lw=1.4, label=name if len(x) else None)  # fmt: skip
         if log:
             axes.set_yscale("log")
         else:
@@ -218,15 +220,15 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
 
 
 def _trajectory_figure(
-    height: float, lines: Sequence[tuple[str, Trajectory, str, float]]
+    height: float, lines: Sequence[tuple[str, Trajectory, tuple[str, str], float]]
 ) -> tuple[Any, Any]:
     figure = empty_figure(9.0, height)
     top, side = figure.subplots(2, 1, height_ratios=(4, 1))
-    for name, trajectory, colour, width in lines:
+    for name, trajectory, (colour, style), width in lines:
         xyz = trajectory.map_T_lidar[:, :3, 3]
-        top.plot(xyz[:, 0], xyz[:, 1], color=colour, lw=width, label=name)
+        top.plot(xyz[:, 0], xyz[:, 1], color=colour, ls=style, lw=width, label=name)
         travelled = np.cumsum(np.linalg.norm(np.diff(xyz, axis=0, prepend=xyz[:1]), axis=1))
-        side.plot(travelled, xyz[:, 2], color=colour, lw=width)
+        side.plot(travelled, xyz[:, 2], color=colour, ls=style, lw=width)
     top.set_aspect("equal", adjustable="datalim")
     top.set(xlabel="x [m]", ylabel="y [m]")
     side.set(xlabel="distance travelled [m]", ylabel="z [m]")

@@ -25,8 +25,6 @@ from benchmarks import (
     robustness,
     soak,
     soak_faults,
-    study,
-    study_figures,
     worlds,
 )
 from benchmarks.cases import Case, CaseResult, PeerResult, judge
@@ -59,7 +57,7 @@ class InProcess:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    for module in (growth, robustness, soak, worlds, study, loops):
+    for module in (growth, robustness, soak, worlds, loops):
         if hasattr(module, "ProcessPoolExecutor"):
             monkeypatch.setattr(module, "ProcessPoolExecutor", InProcess)
     return monkeypatch
@@ -135,22 +133,6 @@ def test_disturbed_runs_fill_the_page(tmp_path: Path, here: pytest.MonkeyPatch) 
     for name in robustness.COMMON:
         case = robustness.disturbed(room, name, ABSENT)
         assert len(list(case.dataset)) == len(case.dataset) <= 24
-
-
-def test_solvers_are_compared_from_wrong_starts(tmp_path: Path, here: pytest.MonkeyPatch) -> None:
-    tiny = study.Effort(first=4, targets=1, starts=2, columns=600, mapped=3)
-    for name, value in {"QUICK": tiny, "CHANGES": (study_figures.FIRST,), "METRES": (0.05, 2.0),
-                        "DEGREES": (1.0,), "SHARES": (0.0, study.SHARE)}.items():  # fmt: skip
-        for module in (study, study_figures):
-            here.setattr(module, name, value, raising=False)
-    assert study.main(["--quick", "--output", str(tmp_path)]) == 0
-    rows = table(tmp_path / "study/trials.csv")
-    small = [
-        r for r in rows if (r["study"], r["solver"], r["level"]) == ("metres", "default", "0.05")
-    ]
-    assert float(small[0]["success"]) == 100.0
-    for name in ("basin", "outliers", "changes", "corridor"):
-        assert (tmp_path / f"images/study_{name}.png").stat().st_size > 10_000
 
 
 def test_loops_are_found_in_a_town_and_false_ones_refused(

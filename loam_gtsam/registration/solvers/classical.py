@@ -32,6 +32,10 @@ _LOAM_ORDER = [1, 2, 0]
 _START_RADIUS = 1e4
 _MAX_RADIUS = 1e16
 _DIAGONAL = (1e-6, 1e32)
+_HALVINGS = 4  # of a step of LOAM's at most
+_FALL = 0.25
+"""Least share of the fall of the cost, as far as the gradient promises it, for which a step of
+LOAM's is taken at its length (Armijo's rule); a step to the optimum of a parabola has half."""
 _MIN_DECREASE = 1e-3  # share of the predicted fall of the cost from which a step is taken
 
 
@@ -105,6 +109,10 @@ class ClassicalSolver(_SolverWithoutPriors):
     Estimation Problems, ICRA 2016). With a threshold of 0, those that ``GtsamSolver`` finds
     degenerate are.
 
+    With ``config.shorten_steps``, a step that hardly lowers the cost is halved: along directions
+    that edges alone fix, LOAM's rows make steps twice too long, and the pose would move back and
+    forth without end.
+
     Notes
     -----
     With fewer than ``config.min_matches`` matches the published code makes no step and adds the
@@ -130,12 +138,14 @@ class ClassicalSolver(_SolverWithoutPriors):
     def _optimise(self, matches: ScanMatches, pose: gtsam.Pose3, kept: FloatArray) -> Solution:
         residual, jacobian = loam_rows(matches, pose).residuals(pose)
         a = jacobian @ euler_jacobian(pose)
-        step = kept @ _solve_by_qr(a.T @ a, -a.T @ residual)
-        moved = _add_euler(pose, step)
-        after, jacobian = loam_rows(matches, moved).residuals(moved)
-        costs = 0.5 * float(residual @ residual), 0.5 * float(after @ after)
+        step, steps = kept @ _solve_by_qr(a.T @ a, -a.T @ residual), 1
         small = _is_small(step, self.config)
-        return Solution(moved, True, small, matches, 1, 1, *costs, jacobian.T @ jacobian)
+        before, slope = 0.5 * float(residual @ residual), float(residual @ a @ step)
+        moved, cost, jacobian = _after(matches, pose, step)
+        while self.config.shorten_steps and steps <= _HALVINGS and cost > before + _FALL * slope:
+            step, slope, steps = 0.5 * step, 0.5 * slope, steps + 1
+            moved, cost, jacobian = _after(matches, pose, step)
+        return Solution(moved, True, small, matches, 1, steps, before, cost, jacobian.T @ jacobian)
 
 
 class ALoamSolver(_SolverWithoutPriors):
@@ -190,6 +200,15 @@ class ALoamSolver(_SolverWithoutPriors):
         information = turn.T @ normal @ turn
         small = _is_small(first.localCoordinates(pose), self.config)
         return Solution(pose, True, small, matches, 1, steps, start, cost, information)
+
+
+def _after(
+    matches: ScanMatches, pose: gtsam.Pose3, step: FloatArray
+) -> tuple[gtsam.Pose3, float, FloatArray]:
+    """Pose, cost and Jacobian of LOAM's rows after a step from a pose."""
+    moved = _add_euler(pose, step)
+    residual, jacobian = loam_rows(matches, moved).residuals(moved)
+    return moved, 0.5 * float(residual @ residual), jacobian
 
 
 def loam_rows(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> MatchRows:

@@ -135,8 +135,7 @@ class MapConfig(Section):
     """New points enter a cube in this way: settled keeps the first point of a voxel, and one of
     each face of a thin wall; centroid filters the cube again with its new points, as LOAM does."""
     insert_unmatched: bool = parameter(False)
-    """A sweep with too few matches is inserted at its expected pose, as by LOAM and A-LOAM; else it
-    is left out of the map."""
+    """A sweep with too few matches is inserted where it is expected, as by LOAM; else left out."""
     archive_megabytes: float = parameter(512.0, unit="MB", low=0.0)
     """Cubes that left the window take at most this much memory. Beyond it, the oldest go to
     archive_dir, or are dropped and counted if archive_dir is not set."""

@@ -20,7 +20,7 @@ thick = common_thickness(before, after)
 errors = [absolute_error(t, world.truth).rmse for t in (result.trajectory, refined.trajectory)]
 print(f"thickness of the walls {1e3 * thick[0]:.1f} -> {1e3 * thick[1]:.1f} mm")
 print(f"error {1e3 * errors[0]:.1f} -> {1e3 * errors[1]:.1f} mm")
-sigmas = np.sqrt(np.diag(refined.refined.relative_covariance(5, 15)))
+sigmas = np.sqrt(np.diag(refined.relative_covariance(5, 15)))
 print("motion from frame 5 to 15, standard deviations (rad, m):", np.round(sigmas, 5))
 
 # A graph of your own: planes of one sweep (the target), seen in another, both poses free.

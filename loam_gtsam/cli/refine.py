@@ -114,7 +114,7 @@ def _write(
     trajectory = found.trajectory
     write_tum(folder / FILES[0], trajectory, comments={"refined": "planes and poses adjusted"})
     write_kitti(folder / FILES[1], trajectory)
-    told = zip(trajectory.stamps, trajectory.map_T_lidar, found.refined.covariances, strict=True)
+    told = zip(trajectory.stamps, trajectory.map_T_lidar, found.covariances, strict=True)
     poses = [MapUpdate(int(s), gtsam.Pose3(p), FrameStatus.OK, covariance=c) for s, p, c in told]
     write_covariances(folder / FILES[2], poses)
     write_ply(folder / FILES[3], np.empty((0, 3)), found.map_points(config.map.edge_voxel))

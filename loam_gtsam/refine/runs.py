@@ -15,7 +15,9 @@ from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.refine.adjustment import Refined, Round, Settings, refine
 from loam_gtsam.refine.motion_factors import loop_factors, odometry_factors, told_directions
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
+from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import (
+    BoolArray,
     FloatArray,
     FrameStatus,
     InputError,
@@ -110,16 +112,42 @@ class RefinedRun:
     points : of the frames
     before : path of the run, with which the adjustment began
     refined : the adjustment
+    updates : N frames of the run that have a pose
+    seen : (N,) whether the run saw all directions of each
     """
 
     points: RunPoints
     before: Path
     refined: Refined
+    updates: tuple[MapUpdate, ...]
+    seen: BoolArray
 
     @property
     def trajectory(self) -> Trajectory:
         """One pose per frame that has one, at the stamps of the run."""
         return self.refined.trajectory
+
+    @property
+    def covariances(self) -> FloatArray:
+        """(N, 6, 6) of the poses, the first one being exact.
+
+        From the first sweep on of which the run did not see all directions they are those of the
+        run, or NaN if it has none: where nothing tells, planes know no better, and a chain of
+        motions forgets that an error of the velocity persists.
+        """
+        clear = np.logical_and.accumulate(self.seen)[:, None, None]
+        told = np.array([update.covariance for update in self.updates])
+        return np.where(clear, self.refined.covariances, told)
+
+    def relative_covariance(self, earlier: int, later: int) -> FloatArray:
+        """(6, 6) of the motion between two poses, perturbation on the right of the later one.
+
+        It is that of the run if there is a sweep between of which the run did not see all
+        directions.
+        """
+        if self.seen[earlier : later + 1].all():
+            return self.refined.relative_covariance(earlier, later)
+        return relative_covariance(self.updates[earlier], self.updates[later])
 
     def held_out(self, *, refined: bool = True) -> tuple[FloatArray, IntArray]:
         """Points that took no part, (M, 3) metres in the refined or the first map; their sweeps."""
@@ -208,4 +236,6 @@ def refine_run(
         points.used, before.map_T_middle, every, settings,
         keep=keep, for_covariances=told, on_round=on_round,
     )  # fmt: skip
-    return RefinedRun(points, before, found)
+    seen: BoolArray = (keep == np.eye(6)).all(axis=(1, 2))
+    seen &= np.array([update.status.solved or update.status in _SEEN for update in frames])
+    return RefinedRun(points, before, found, tuple(frames), seen)

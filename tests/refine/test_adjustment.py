@@ -11,9 +11,11 @@ from loam_gtsam import Config, SimulatedWorld, absolute_error, run
 from loam_gtsam.refine.adjustment import Settings, refine
 from loam_gtsam.refine.elimination import eliminated, refitted, sightings
 from loam_gtsam.refine.map_quality import common_thickness, map_quality
+from loam_gtsam.refine.motion_factors import told_directions
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.surfaces import find_planes, voxel_sizes
 from loam_gtsam.refine.sweeps import Path, SweepPoints
+from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import InputError, Trajectory
 
 SIZES = voxel_sizes(3.2, 0.4)
@@ -220,10 +222,23 @@ def test_a_run_gets_better_and_its_covariances_are_right(room) -> None:
         here, there = (gtsam.Pose3(poses.map_T_lidar[n]) for n in (k, k + 5))
         true = truth[int(poses.stamps[k])].between(truth[int(poses.stamps[k + 5])])
         error = here.between(there).localCoordinates(true)
-        covariance = refined.refined.relative_covariance(k, k + 5)
+        covariance = refined.relative_covariance(k, k + 5)
         squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
     assert 0.25 < np.mean(squared) < 4.0
     assert len(refined.map_points(0.2)) > 1000
+    assert refined.seen.all()
+    # A sweep that did not see a direction: what the run told of it holds from there on.
+    fourth = result.updates[4]
+    weak = replace(fourth, localizability=np.array([0.0, 99.0, 99.0, 99.0, 99.0, 99.0]))
+    blind = replace(refined, seen=np.arange(25) != 4)
+    assert np.array_equal(blind.covariances[4:], [u.covariance for u in result.updates[4:]])
+    assert np.array_equal(blind.covariances[:4], refined.covariances[:4])
+    told = relative_covariance(result.updates[2], result.updates[8])
+    assert np.array_equal(blind.relative_covariance(2, 8), told)
+    keep = told_directions([result.updates[3], weak], 10.0)
+    assert np.array_equal(keep[0], np.eye(6))
+    np.testing.assert_allclose(keep[1] @ weak.directions[0], 0.0, atol=1e-9)
+    np.testing.assert_allclose(keep[1] @ weak.directions[1], weak.directions[1], atol=1e-9)
 
 
 def test_the_data_set_of_another_run_is_refused(room) -> None:

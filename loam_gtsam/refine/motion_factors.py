@@ -70,6 +70,28 @@ def odometry_factors(
     return graph
 
 
+def long_motion_factors(
+    updates: Sequence[MapUpdate], map_T_middle: FloatArray, span: int = 50
+) -> gtsam.NonlinearFactorGraph:
+    """Between factors over ``span`` sweeps, each beginning half of that after the one before.
+
+    The own error of a frame counts in every step of a chain, and cancels in truth: over long ways
+    the run knows more than its steps, above all along a corridor, of which planes tell little.
+    Sweeps that were not solved begin and end none. For the parameters see
+    :func:`odometry_factors`.
+    """
+    graph = gtsam.NonlinearFactorGraph()
+    for first in range(1, len(updates) - span, max(span // 2, 1)):
+        last = first + span
+        if updates[first].uncertainty is None or updates[last].uncertainty is None:
+            continue
+        noise = noise_model(relative_covariance(updates[first], updates[last]))
+        motion = gtsam.Pose3(map_T_middle[first]).between(gtsam.Pose3(map_T_middle[last]))
+        keys = gtsam.symbol("x", first), gtsam.symbol("x", last)
+        graph.add(gtsam.BetweenFactorPose3(*keys, motion, noise))
+    return graph
+
+
 def _stretches(mask: BoolArray) -> IntArray:
     """(N,) length of the run of true values that each is in; 0 for the others."""
     length = np.zeros(len(mask), np.int64)

@@ -13,7 +13,12 @@ from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.refine.adjustment import Refined, Round, Settings, refine
-from loam_gtsam.refine.motion_factors import loop_factors, odometry_factors, told_directions
+from loam_gtsam.refine.motion_factors import (
+    long_motion_factors,
+    loop_factors,
+    odometry_factors,
+    told_directions,
+)
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import (
@@ -223,6 +228,9 @@ def refine_run(
     keep = told_directions(frames, min_aligned)
     every = odometry_factors(frames, np.array(odometry))
     told = odometry_factors(frames, np.array(odometry), keep)
+    far = long_motion_factors(frames, np.array(odometry))
+    every.push_back(far)
+    told.push_back(far)
     if graph is not None:
         solved = optimize_graph(graph)
         loops = loop_factors(graph, solved, stamps, to_middle)

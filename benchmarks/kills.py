@@ -95,7 +95,7 @@ def _replaced(scratch: Path, kills: int, chance: random.Random) -> list[str]:
     faults: list[str] = []
     replaced = cut_off = 0
     for _ in range(kills):
-        _killed(_command(killed, 20, "without IMU", "--overwrite"), chance, 1.1 * seconds)
+        _killed(_command(killed, 20, "without IMU", "--overwrite"), chance, 1.5 * seconds)
         if not (killed / "summary.json").exists():
             cut_off += 1  # in the milliseconds of the move: nothing says that they are complete
         elif not _differences(killed, new):

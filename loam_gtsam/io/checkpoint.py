@@ -113,7 +113,7 @@ class Checkpoint:
                 frames.updates += part.updates
             thaw(state, roots, shared)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            problem = f"{newest}: the checkpoint cannot be read: {error}"
+            problem = f"{newest}: the checkpoint cannot be read: {str(error)[:200]}"
             raise OutputError(f"{problem}; start again without resuming") from error
         self._written = time.monotonic()
         return frames.stamps, frames.updates

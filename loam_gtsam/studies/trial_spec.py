@@ -12,6 +12,7 @@ from urllib.parse import parse_qsl
 from ruamel.yaml import YAML
 
 from loam_gtsam.config import Config, load_config, preset
+from loam_gtsam.config.base import shown
 from loam_gtsam.studies.contenders import METHODS, with_solver
 from loam_gtsam.studies.factories import PARTS, is_factory
 from loam_gtsam.studies.peers import PEERS
@@ -63,7 +64,9 @@ class _Sequence:
         try:
             return None if seed is None else int(seed)
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"{self.where}: seed: expected an integer, got {seed!r}") from error
+            raise ConfigError(
+                f"{self.where}: seed: expected an integer, got {shown(seed)}"
+            ) from error
 
     def seeds(self, given: list[int]) -> list[int | None]:
         return [*(given or [self.own_seed or 0])] if self.is_world else [None]
@@ -165,7 +168,7 @@ def _kind(name: str) -> str:
 def _changed(config: Config, where: str, changes: Mapping[str, Any]) -> Config:
     for key in changes:
         if "." not in key:
-            raise ConfigError(f"{where}: expected SECTION.KEY: VALUE, got {key!r}")
+            raise ConfigError(f"{where}: expected SECTION.KEY: VALUE, got {shown(key)}")
     return config.changed(changes, source=where)
 
 
@@ -174,7 +177,9 @@ def _seeds(where: str, value: Any, sequences: Mapping[str, _Sequence]) -> list[i
         return []
     numbers = isinstance(value, list) and all(type(seed) is int and seed >= 0 for seed in value)
     if not numbers or not value or len(set(value)) < len(value):
-        raise ConfigError(f"{where}: expected a list of different integers from 0, got {value!r}")
+        raise ConfigError(
+            f"{where}: expected a list of different integers from 0, got {shown(value)}"
+        )
     worlds = [sequence for sequence in sequences.values() if sequence.is_world]
     if not worlds:
         raise ConfigError(
@@ -191,13 +196,13 @@ def _metrics(where: str, value: Any) -> tuple[str, ...]:
     if value is None:
         return ("ate_m",)
     if not isinstance(value, list) or not value or any(name not in METRICS for name in value):
-        raise ConfigError(f"{where}: expected a list of {', '.join(METRICS)}; got {value!r}")
+        raise ConfigError(f"{where}: expected a list of {', '.join(METRICS)}; got {shown(value)}")
     return tuple(value)
 
 
 def _count(where: str, value: Any) -> int | None:
     if value is not None and (type(value) is not int or value < 1):
-        raise ConfigError(f"{where}: expected a number of sweeps, at least 1, got {value!r}")
+        raise ConfigError(f"{where}: expected a number of sweeps, at least 1, got {shown(value)}")
     return value
 
 
@@ -209,10 +214,12 @@ def _named(name: str, key: str, entries: Mapping[str, Any]) -> Iterable[tuple[st
 
 def _mapping(where: str, value: Any, known: tuple[str, ...] = ()) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise ConfigError(f"{where}: expected a mapping, got {str(value)[:80]!r}")
+        raise ConfigError(f"{where}: expected a mapping, got {shown(value)}")
     for key in value:
         if not isinstance(key, str):
-            raise ConfigError(f"{where}: expected names as keys, got {key!r}; put it in quotes")
+            raise ConfigError(
+                f"{where}: expected names as keys, got {shown(key)}; put it in quotes"
+            )
         if known and key not in known:
             raise ConfigError(f"{where}: unknown key {key!r} (known: {', '.join(known)})")
     return value

@@ -423,7 +423,7 @@ class RefineOptions(SourceOptions):
     """Options of ``refine``."""
 
     run: Path = argument("RUN", "Folder with the results of loam-gtsam run PATH.")
-    rounds: int = option("Search for planes, and solve, at most so often.", default=6, min=1)
+    rounds: int = option("Search for planes, and solve, at most so often.", default=5, min=1)
     points: int = option("Points of a sweep at most.", default=3000, min=100)
     plot: bool | None = option(
         "Draw pictures [default: if matplotlib is installed].", "--plot/--no-plot"

@@ -45,13 +45,13 @@ FILES = (
 def execute(options: RefineOptions) -> int:
     """Refine a run; returns the exit code."""
     return refine_folder(
-        options.run, options.dataset(), Settings(rounds=options.rounds), most=options.points,
+        options.run, options.dataset(), rounds=options.rounds, most=options.points,
         plot=options.plot, overwrite=options.overwrite, quiet=options.quiet,
     )  # fmt: skip
 
 
 def refine_folder(
-    folder: Path, dataset: Dataset, settings: Settings | None = None, *, most: int = 3000,
+    folder: Path, dataset: Dataset, *, rounds: int = 5, most: int = 3000,
     plot: bool | None = None, overwrite: bool = False, quiet: bool = False,
 ) -> int:  # fmt: skip
     """Refine the run in a folder, whose data set is read once more; into ``folder/refined``."""
@@ -67,17 +67,17 @@ def refine_folder(
     if (folder / "pose_graph.g2o").exists():
         graph = read_graph(folder / "pose_graph.g2o")
         trajectory = _corrected(folder, updates)
-    settings = settings or Settings(sigma=config.matching.point_sigma)
+    settings = Settings(rounds=rounds, sigma=config.matching.point_sigma)
     with console.progress_bar("points", len(updates), quiet=quiet) as show:
         points = run_points(
             dataset, updates, config, most=most, on_sweep=lambda number: show(number + 1, "")
         )
-    rounds: list[Round] = []
+    done: list[Round] = []
     with console.progress_bar("rounds", settings.rounds, quiet=quiet) as show:
 
-        def on_round(done: Round) -> None:
-            rounds.append(done)
-            show(len(rounds), f"moved by {1e3 * done.moved:.1f} mm")
+        def on_round(last: Round) -> None:
+            done.append(last)
+            show(len(done), f"moved by {1e3 * last.moved:.1f} mm")
 
         found = refine_run(
             points, updates, trajectory=trajectory, graph=graph, settings=settings,

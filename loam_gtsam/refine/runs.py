@@ -204,8 +204,8 @@ def refine_run(
     factors : further ones, on the poses of the middles of the sweeps: ``gtsam.symbol("x", n)`` is
         that of frame ``points.frames[n]``
 
-    min_aligned : matches that must fix a direction (``solver.min_aligned``); along others the
-        motion stays what the run took it for
+    min_aligned : matches that must fix a direction (``solver.min_aligned``); sweeps of which one
+        is not fixed stay as the run had them
 
     Raises
     ------
@@ -240,10 +240,13 @@ def refine_run(
         every.push_back(factors)
         told.push_back(factors)
     before = Path.through(middles, np.array(first))
+    # A sweep that the run did not see whole stays as the run had it, relative to its neighbours.
+    whole = (keep == np.eye(6)).all(axis=(1, 2))
+    asked = keep * whole[:, None, None]
     found = refine(
         points.used, before.map_T_middle, every, settings,
-        keep=keep, for_covariances=told, on_round=on_round,
+        keep=asked, for_covariances=told, on_round=on_round,
     )  # fmt: skip
-    seen: BoolArray = (keep == np.eye(6)).all(axis=(1, 2))
+    seen: BoolArray = whole.copy()
     seen &= np.array([update.status.solved or update.status in _SEEN for update in frames])
     return RefinedRun(points, before, found, tuple(frames), seen)

@@ -15,7 +15,9 @@ from itertools import pairwise
 from pathlib import Path
 
 import gtsam
+import matplotlib
 import numpy as np
+from PIL import Image
 
 from loam_gtsam import (
     Config,
@@ -30,7 +32,7 @@ from loam_gtsam import (
 from loam_gtsam.datasets import build_city
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.geometry import transform
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.view.frame_plot import plot_frame
 from loam_gtsam.view.observers import frame_view, map_view
 from loam_gtsam.view.plots import plot_loops, plot_map
@@ -44,6 +46,60 @@ DRIFT = np.radians(0.012)
 """rad a metre by which the odometry of the town turns too far."""
 TURN_WALK_DEG = 0.1
 """What the pose graph is told of that: five times the default."""
+
+
+SIZE, FOCAL = (640, 320), 400.0
+"""Width and height of the moving picture, and the focal length of its camera, pixels."""
+EYE, SEEN = np.array([-26.0, 0.0, 17.0]), np.array([14.0, 0.0, -2.0])
+"""Metres from the lidar, along its heading: where the camera is, and where it looks."""
+HEIGHTS = -5.0, 9.0
+"""Metres that the colours of the map span, from the lidar's height at the start."""
+SWEEP = np.array([255, 255, 255])
+
+
+def drive(path: Path, frames: int) -> None:
+    """A map being built, seen from behind and above: map by height, the newest sweep in white."""
+    world = SimulatedWorld("street_loop", sensor="hdl32", frames=frames)
+    pipeline, pictures, heading = Pipeline(), [], 0.0
+    for number, sweep in enumerate(world):
+        update = pipeline.process(sweep)
+        yaw = update.map_T_lidar.rotation().yaw()
+        heading += 0.15 * float(np.angle(np.exp(1j * (yaw - heading))))  # the camera is lazy
+        if number % 5:
+            continue
+        points = np.concatenate(pipeline.map_points())
+        share = (points[:, 2] - HEIGHTS[0]) / (HEIGHTS[1] - HEIGHTS[0])
+        colours = (255 * matplotlib.colormaps["turbo"](share)[:, :3]).astype(np.int64)
+        now = transform(update.map_T_lidar.matrix(), sweep.points[::6].astype(np.float64))
+        points = np.concatenate([points, now])
+        colours = np.concatenate([colours, np.tile(SWEEP, (len(now), 1))])
+        pictures.append(seen(points, colours, update.map_T_lidar.translation(), heading))
+    first, *others = pictures
+    small = {"quality": 25, "method": 6}
+    first.save(path, save_all=True, append_images=others, duration=100, loop=0, **small)
+
+
+def seen(points: FloatArray, colours: IntArray, at: FloatArray, heading: float) -> Image.Image:
+    """Points (N, 3) and their colours (N, 3) of 255 through the eye of the camera."""
+    turn = gtsam.Rot3.Yaw(heading).matrix()
+    eye, forward = at + turn @ EYE, turn @ (SEEN - EYE)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(forward, right), forward])
+    points = (points - eye) @ axes.T
+    ahead = points[:, 2] > 1.0
+    points, colours = points[ahead], colours[ahead]
+    columns, rows = (FOCAL * points[:, :2] / points[:, 2:]).T.round().astype(np.int64)
+    columns, rows = columns + SIZE[0] // 2, rows + SIZE[1] // 2
+    nearest_last = np.argsort(-points[:, 2], kind="stable")
+    picture = np.full((SIZE[1], SIZE[0], 3), 18, np.uint8)
+    for down, across in ((0, 0), (0, 1), (1, 0), (1, 1)):  # two by two pixels a point
+        inside = (columns + across >= 0) & (columns + across < SIZE[0])
+        inside &= (rows + down >= 0) & (rows + down < SIZE[1])
+        order = nearest_last[inside[nearest_last]]
+        picture[rows[order] + down, columns[order] + across] = colours[order]
+    return Image.fromarray(picture)
 
 
 def street_map(path: Path, frames: int) -> None:
@@ -115,6 +171,7 @@ def streets() -> FloatArray:
 
 
 PICTURES: dict[str, tuple[Callable[[Path, int], None], int]] = {
+    "drive.webp": (drive, 280),
     "street_loop_map.png": (street_map, 709),
     "frame_matches.png": (one_frame, 90),
     "town_loops.png": (town_loops, 700),

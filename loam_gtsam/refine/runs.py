@@ -203,7 +203,6 @@ def refine_run(
     graph : pose graph of the run, whose loop closures are used unless they contradict the others
     factors : further ones, on the poses of the middles of the sweeps: ``gtsam.symbol("x", n)`` is
         that of frame ``points.frames[n]``
-
     min_aligned : matches that must fix a direction (``solver.min_aligned``); sweeps of which one
         is not fixed stay as the run had them
 

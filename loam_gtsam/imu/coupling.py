@@ -16,6 +16,12 @@ from loam_gtsam.types import FloatArray, SweepError
 _FORCE = 0.2, 3.0
 """Least and largest mean specific force over a sweep, in multiples of gravity. Less is free fall,
 an accelerometer without gravity or in other units; more is beyond any vehicle, or a fault."""
+_USUAL, _LONG = (0.7, 1.4), 2.0
+"""The same of the median over so many seconds: no vehicle falls or soars for long. One whose
+accelerometer has no gravity feels enough of it while it brakes."""
+_HARDEST = 1.0
+"""Largest acceleration over a sweep, in multiples of gravity, with which the estimate may begin. If
+it seems larger, down is not where the orientation has it."""
 _FASTEST = 20.0  # m/s: standard deviation of a speed that nothing told
 _UNLIKELY = float(chi2.isf(2.0 * norm.sf(5.0), 6))
 """Squared Mahalanobis distance from which a pose contradicts its prediction: as unlikely as five
@@ -65,10 +71,9 @@ class TightCoupling:
         if self._odometry is None:
             return None
         margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
-        samples = buffer.samples_between(since - margin, stamp + margin)
-        inside = slice(*np.searchsorted(samples.stamps, [since, stamp + 1]))
-        if not self._believable(samples.acceleration[inside]):
+        if not self._believable(since, stamp, buffer):
             return None
+        samples = buffer.samples_between(since - margin, stamp + margin)
         try:
             prediction = self._odometry.predict(stamp, samples)
         except SweepError:
@@ -92,17 +97,19 @@ class TightCoupling:
         if not self.trusted:
             return None
         bias = np.zeros(3)
+        first, last = (stamp + round(float(end) * 1e9) for end in (seconds[0], seconds[-1]))
+        if not self._believable(first, last, buffer):
+            return None
         if self._odometry is not None:
             gravity, bias = self._odometry.state.map_gravity, self._odometry.state.acceleration_bias
-        first, last = (stamp + round(float(end) * 1e9) for end in (seconds[0], seconds[-1]))
-        if not self._believable(buffer.samples_between(first, last).acceleration):
+        elif not self._is_down(gravity @ map_R_lidar, first, last, buffer):
             return None
         lever = np.asarray(self.config.lidar_t_imu, np.float64)
         return bend(buffer, stamp, seconds, gravity @ map_R_lidar, bias, lever)
 
     def observe(
         self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3],
-        information: FloatArray, gravity: FloatArray, gyro_bias: FloatArray,
+        information: FloatArray, gravity: FloatArray, buffer: ImuBuffer,
     ) -> Fused | None:  # fmt: skip
         """Take in what the scan alone said about a moment; the pose by both.
 
@@ -112,7 +119,7 @@ class TightCoupling:
         ----------
         last, now : stamp, nanoseconds, and ``map_T_lidar`` of the frame before and of this one
         information : (6, 6) of the second pose, zero where the scan is not believed
-        gravity, gyro_bias : (3,) m/s^2 in the map frame and rad/s, with which the estimate begins
+        gravity : (3,) m/s^2, map frame, with which the estimate begins, as with the buffer's bias
         """
         stamp, pose = now
         if stamp <= last[0]:  # sweeps of unlike length
@@ -129,17 +136,27 @@ class TightCoupling:
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
                 self._odometry.restart(stamp, pose, velocity, spread)
-            else:
+            elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):
                 self._odometry = InertialOdometry(
-                    self.config, gravity, stamp, pose, velocity, gyro_bias, spread=spread
+                    self.config, gravity, stamp, pose, velocity, buffer.gyro_bias, spread=spread
                 )
         except SweepError:  # no window can begin here: with the next frame, then
             self._odometry = None
         return None
 
-    def _believable(self, acceleration: FloatArray) -> bool:
-        """Whether a lidar that is carried about may feel such (N, 3) accelerations, m/s^2."""
-        if not len(acceleration):
-            return False
-        force = np.linalg.norm(acceleration, axis=1).mean() / max(self.config.gravity, 1.0)
-        return bool(_FORCE[0] < force < _FORCE[1])
+    def _believable(self, first: int, last: int, buffer: ImuBuffer) -> bool:
+        """Whether a lidar that is carried about may feel what it felt between two stamps."""
+        samples = buffer.samples_between(min(first, last - round(_LONG * 1e9)), last)
+        force = np.linalg.norm(samples.acceleration, axis=1) / max(self.config.gravity, 1.0)
+        now = force[np.searchsorted(samples.stamps, first) :]
+        return bool(
+            len(now)
+            and _FORCE[0] < now.mean() < _FORCE[1]
+            and _USUAL[0] < np.median(force) < _USUAL[1]
+        )
+
+    def _is_down(self, gravity: FloatArray, first: int, last: int, buffer: ImuBuffer) -> bool:
+        """Whether gravity (3,), lidar axes, may be that of what was felt between two stamps."""
+        force = buffer.samples_between(first, last).acceleration
+        most = _HARDEST * max(self.config.gravity, 1.0)
+        return bool(len(force) and np.linalg.norm(force.mean(axis=0) + gravity) < most)

@@ -291,8 +291,7 @@ class ImuTracker:
         """
         if self.config.coupling != "tight" or self.level is None:
             return None
-        bias = self.buffer.gyro_bias
-        return self._coupling.observe(last, now, information, self._down(), bias)
+        return self._coupling.observe(last, now, information, self._down(), self.buffer)
 
     def _down(self) -> FloatArray:
         assert self.level is not None

@@ -245,7 +245,9 @@ def test_the_odometry_benchmark_s_poses_must_fit_the_sweeps(tmp_path: Path) -> N
     with pytest.raises(DatasetError, match=r"00.txt: 5 poses for 6 sweeps"):
         _ = open_dataset(sequence).truth
     file.write_text("\n".join([*lines[:3], "1 2 3", *lines[4:]]) + "\n")
-    with pytest.raises(DatasetError, match=r"00.txt:4: expected 12 numbers of a rigid transform, got '1 2 3'"):
+    with pytest.raises(
+        DatasetError, match=r"00.txt:4: expected 12 numbers of a rigid transform, got '1 2 3'"
+    ):
         _ = open_dataset(sequence).truth
     file.unlink()
     assert open_dataset(sequence).truth is None

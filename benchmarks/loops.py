@@ -86,7 +86,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns the exit code."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.loops", description=__doc__)
     parser.add_argument(
-        "--quick", action="store_true", help="one short drive, coarse sweeps, one drift"
+        "--quick",
+        action="store_true",
+        help="one drive that is too short for a loop",
     )
     parser.add_argument("--seeds", type=int, default=20, help="drives")
     parser.add_argument("--city", type=Path, help="poses of a way, 12 numbers a line")
@@ -96,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for line in city(options.city):
             print(line, flush=True)
         return 0
-    metres, columns = (700.0, 400) if options.quick else (1000.0, 600)
+    metres, columns = (150.0, 400) if options.quick else (1000.0, 600)
     seeds = range(1 if options.quick else options.seeds)
     with ProcessPoolExecutor(None, get_context("spawn")) as pool:
         drifts = DRIFTS[-1:] if options.quick else DRIFTS

@@ -17,7 +17,6 @@ from benchmarks import __main__ as tool
 from benchmarks import (
     cases,
     growth,
-    kills,
     loops,
     ouster,
     peers,
@@ -135,16 +134,9 @@ def test_disturbed_runs_fill_the_page(tmp_path: Path, here: pytest.MonkeyPatch) 
         assert len(list(case.dataset)) == len(case.dataset) <= 24
 
 
-def test_loops_are_found_in_a_town_and_false_ones_refused(
-    tmp_path: Path, here: pytest.MonkeyPatch
-) -> None:
+def test_drives_are_looked_through_for_loops(tmp_path: Path) -> None:
     assert loops.main(["--quick", "--output", str(tmp_path)]) == 0
     assert "| drift | drives | recall |" in (tmp_path / "loops.md").read_text("utf-8")
-
-
-def test_killed_runs_go_on(here: pytest.MonkeyPatch) -> None:
-    here.setattr("sys.argv", ["kills", "--kills", "1", "--frames", "5"])
-    kills.main()
 
 
 def test_every_fault_of_the_soak_is_injected_and_counted(

@@ -34,6 +34,11 @@ from loam_gtsam.voxels.grid import CubeIndex, Grid, Window, cubes_in_view
 from loam_gtsam.voxels.tags import Faces, look, tags_of
 from loam_gtsam.voxels.trees import Neighbours, TreeCache
 
+Chosen = Iterable[CubeIndex] | None
+"""Cubes to be looked at; None is all cubes of the window."""
+Contents = dict[CubeIndex, CubePoints]
+"""Points and tags by cube, ascending."""
+
 
 @dataclass(frozen=True, slots=True)
 class CubeMapStats:
@@ -66,6 +71,7 @@ class CubeMap:
     ----------
     config : cubes, window, neighbourhood, insertion policy and archive
     voxel_size : metres; the voxel grid is anchored at the map origin
+    archive : cubes outside the window, those of a saved map for example; an empty one if None
 
     Attributes
     ----------
@@ -77,15 +83,16 @@ class CubeMap:
         If ``voxel_size`` is not positive, or no folder can be made in ``config.archive_dir``.
     """
 
-    def __init__(self, config: MapConfig, voxel_size: float) -> None:
+    def __init__(self, config: MapConfig, voxel_size: float, archive: Archive | None = None):
         if not 0.0 < voxel_size < np.inf:
             raise ConfigError(f"voxel_size: expected metres above 0, got {voxel_size!r}")
         self._config = config
         self._grid = Grid(config.cube_size, float(voxel_size))
         self._window = Window.around((0, 0, 0), config.window)
-        self._cubes: dict[CubeIndex, Cube] = {}
         self._trees = TreeCache()
-        self._archive = Archive(self._grid, config.archive_megabytes, config.archive_dir)
+        self._archive = archive or Archive(self._grid, config.archive_megabytes, config.archive_dir)
+        inside = self._window.choose(self._archive.indices())
+        self._cubes = {index: self._archive.take(index) or Cube() for index in inside}
         self.owner = 0
         self._evicted = self._restored = self._outside = 0
 
@@ -198,9 +205,8 @@ class CubeMap:
 
     def fill(self, other: CubeMap, *, archived: bool = False) -> None:
         """Add the points of another map, archived ones if asked, to free voxels: none is moved."""
-        parts = [other._cubes[index].content for index in sorted(other._cubes)]
-        parts += [content for _, content in other._archive.contents()] if archived else []
-        self._put(joined(parts), archive=archived, settle=True)
+        held = other.contents(archived=archived)
+        self._put(joined([*held.values()]), archive=archived, settle=True)
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points of the window and of the archive, after a loop closure; return how many.
@@ -276,9 +282,7 @@ class CubeMap:
             return Neighbours.none(len(queries), k)
         return self._trees.over(held, self._cubes).nearest(queries, k, max_distance)
 
-    def points(
-        self, cubes: Iterable[CubeIndex] | None = None, *, archived: bool = False
-    ) -> FloatArray:
+    def points(self, cubes: Chosen = None, *, archived: bool = False) -> FloatArray:
         """Map points, ordered by cube and voxel, (N, 3) metres, map frame, a copy.
 
         Parameters
@@ -286,13 +290,15 @@ class CubeMap:
         cubes : which; all cubes of the window when None
         archived : with ``cubes=None``, include the archive: the whole map
         """
-        if cubes is None:
-            held = {index: cube.points for index, cube in self._cubes.items()}
-            if archived:
-                held |= {index: stored.points for index, stored in self._archive.contents()}
-        else:
-            held = {index: self._cubes[index].points for index in cubes if index in self._cubes}
-        return np.concatenate([NO_POINTS, *(held[index] for index in sorted(held))])
+        found = self.contents(cubes, archived=archived)
+        return np.concatenate([NO_POINTS, *(content.points for content in found.values())])
+
+    def contents(self, cubes: Chosen = None, *, archived: bool = False) -> Contents:
+        """Points and tags by cube, in the order of :meth:`points`."""
+        chosen = self._cubes.keys() if cubes is None else self._cubes.keys() & set(cubes)
+        held = {index: self._cubes[index].content for index in chosen}
+        held |= dict(self._archive.contents()) if archived and cubes is None else {}
+        return dict(sorted(held.items()))
 
     def thinned(self, factor: float) -> CubeMap:
         """A map of the points of the window, with voxels ``factor`` times as large."""
@@ -302,7 +308,7 @@ class CubeMap:
         thin.insert(self.points())
         return thin
 
-    def count(self, cubes: Iterable[CubeIndex] | None = None) -> int:
+    def count(self, cubes: Chosen = None) -> int:
         """Points in the given cubes, or in the whole window."""
         if cubes is None:
             return sum(map(len, self._cubes.values()))

@@ -181,7 +181,7 @@ class Mapper:
         clock.lap("prepare")
         placed = predicted.posed, predicted.map_T_lidar
         if self.last is None:
-            self._start = Start(predicted, self.keyframe) if self.config.deskew.refine else None
+            self._start = Start.of_map(predicted, self.keyframe, self.maps)
             update = self._insert(*placed, FrameStatus.FIRST, "the map starts here", clock)
         elif sparse := not self.monitor.lost and self.maps.too_sparse(predicted, self.config):
             self._start = None

@@ -22,6 +22,7 @@ from loam_gtsam.io.checkpoint import Checkpoint, Progress
 from loam_gtsam.io.rollback import whole
 from loam_gtsam.loops.closure import LoopCloser
 from loam_gtsam.loops.map_correction import LoopMapping
+from loam_gtsam.loops.places import Places
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Odometry, make_odometry
@@ -86,6 +87,7 @@ class RunResult:
     imu : what was made of the IMU; None without one
     loops : keyframes and loops; None if none were looked for. ``updates`` are then in the frame
         ``odom``; ``trajectory`` and the map are corrected
+    pipeline : as it is after the last sweep, for :func:`loam_gtsam.maps.map_file.save_map`
     """
 
     config: Config
@@ -97,6 +99,7 @@ class RunResult:
     error: Exception | None = None
     imu: ImuSummary | None = None
     loops: LoopMapping | None = None
+    pipeline: Pipeline | None = None
 
     def __repr__(self) -> str:
         """A line: all that is in it would fill the screen for minutes."""
@@ -167,6 +170,7 @@ class Pipeline:
     odometry : predicts them; None leaves it to the mapper (constant velocity, IMU)
     faults : what is done about exceptions in parts of a user's own
     loops : keyframes and loops; None if none are looked for
+    places : where the map can be recognised, once it is saved
     """
 
     def __init__(
@@ -186,6 +190,7 @@ class Pipeline:
         self._features = parts.get("features")
         self._last_odom: gtsam.Pose3 | None = None
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
+        self.places = Places(self.config)
         self.loops: LoopMapping | None = None
         closer = parts.get("loop_closer")
         if self.config.loops.enabled or closer is not None:
@@ -198,6 +203,7 @@ class Pipeline:
             self.odometry.reset()
         if self.loops is not None:
             self.loops.reset()
+        self.places.reset()
         self._last_odom = None
         self._to_reference = 0
 
@@ -274,13 +280,13 @@ class Pipeline:
         return self._with_loops(update, sweep.features)
 
     def _with_loops(self, update: MapUpdate, features: Features) -> MapUpdate:
-        """Show the frame to the pose graph, if there is one."""
+        """Show the frame to the places, and to the pose graph, if there is one."""
+        self.places.add(update, self.mapper.registered)
         if self.loops is None or not update.status.solved:
             return update
         started = time.perf_counter()
         self.loops.add(update, features)
-        seconds = time.perf_counter() - started
-        return replace(update, timings=dict(update.timings) | {"loops": seconds})
+        return replace(update, timings={**update.timings, "loops": time.perf_counter() - started})
 
     def state(self) -> tuple[dict[str, Any], dict[str, Any]]:
         """What changes from frame to frame, and what does not, for :mod:`loam_gtsam.io.state`."""
@@ -327,6 +333,7 @@ class Pipeline:
             error=error,
             imu=None if mapper.imu is None else _imu_summary(mapper.imu, updates),
             loops=self.loops,
+            pipeline=self,
         )
 
 
@@ -353,9 +360,8 @@ def effective_config(config: Config, dataset: Dataset) -> Config:
 
 def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
     """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset."""
-    prefix = "imu."
-    imu = {k.removeprefix(prefix): v for k, v in implied.items() if k.startswith(prefix)}
-    sensor = {k: v for k, v in implied.items() if not k.startswith(prefix)}
+    imu = {k.removeprefix("imu."): v for k, v in implied.items() if k.startswith("imu.")}
+    sensor = {k: v for k, v in implied.items() if not k.startswith("imu.")}
     return config.changed(sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
 
 

@@ -6,6 +6,8 @@ older keyframes lie elsewhere, seen from the newest one, their map points move t
 
 from __future__ import annotations
 
+from copy import deepcopy
+
 import gtsam
 import numpy as np
 
@@ -16,6 +18,7 @@ from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, ScanLoopCloser
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.mapper import Mapper
+from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.types import BoolArray, Features, FloatArray, MapUpdate
 
 
@@ -132,6 +135,13 @@ class LoopMapping:
         pairs = [(loop.earlier, loop.later) for loop in self.graph.loops]
         indices = np.array(pairs, np.int64).reshape(-1, 2)
         return positions[indices], np.array(self.graph.active, np.bool_)
+
+    def corrected_maps(self) -> MapPair:
+        """A copy of the mapper's maps in which all keyframes are where the graph has them."""
+        maps = deepcopy(self._mapper.maps)
+        poses = zip(map(gtsam.Pose3, self.graph.poses()), self._placed, strict=True)
+        maps.move({n: pose.compose(at.inverse()).matrix() for n, (pose, at) in enumerate(poses)})
+        return maps
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole corrected map, (E, 3) and (P, 3) metres.

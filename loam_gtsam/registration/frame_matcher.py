@@ -44,7 +44,10 @@ class MapPair:
     Attributes
     ----------
     small : whether the place is small, so that the maps with small voxels are in use
+    frozen : whether sweeps never go into the maps
     """
+
+    frozen = False
 
     def __init__(self, config: Config) -> None:
         self._configs = config, config.of_small_places()
@@ -134,6 +137,16 @@ class MapPair:
         kinds = zip(self._open, self._small, strict=True)
         edges, planes = (_points(*maps, moves or {}) for maps in kinds)
         return edges, planes
+
+    def layers(self) -> dict[str, CubeMap]:
+        """All maps: edges and planes of the open, and of small places."""
+        (edges, planes), (small_edges, small_planes) = self._open, self._small
+        return {
+            "edges": edges,
+            "planes": planes,
+            "small_edges": small_edges,
+            "small_planes": small_planes,
+        }
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points with the keyframes they belong to; returns the number of points moved.

@@ -16,7 +16,7 @@ import numpy as np
 
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
-from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
     CLEARLY,
@@ -82,6 +82,12 @@ class Start:
         self._map_T_first = first.map_T_lidar
         middle, leeway = first.map_T_middle, first.motion.information
         self._sweeps = [EarlySweep(first.posed, middle, True, leeway, keyframe)]
+
+    @classmethod
+    def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
+        """The start of a map; None if no sweep is de-skewed anew, or none goes into the map."""
+        begins = maps.config.deskew.refine and not maps.frozen
+        return cls(first, keyframe) if begins else None
 
     @property
     def complete(self) -> bool:

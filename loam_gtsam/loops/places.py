@@ -1,0 +1,72 @@
+"""Places of a run: where a saved map can be recognised, and how wrong it may be there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.config import Config
+from loam_gtsam.geometry import nearest_positive
+from loam_gtsam.loops.scan_context import scan_context
+from loam_gtsam.mapper import Registered
+from loam_gtsam.types import FloatArray, MapUpdate
+
+Descriptor = NDArray[np.float16]
+"""(rings, sectors) metres, see :func:`~loam_gtsam.loops.scan_context.scan_context`, to 1 cm."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Place:
+    """A place at which a sweep went into the map.
+
+    Attributes
+    ----------
+    stamp : nanoseconds of the pose of the sweep
+    map_T_middle : pose at the middle of the sweep, from which the descriptor is seen
+    covariance : (6, 6) of the map's own error here, as a perturbation on the *left*: along the axes
+        of the map, about its origin. What the sweep's own error adds to it is left out.
+    descriptor : of the features of the sweep
+    """
+
+    stamp: int
+    map_T_middle: gtsam.Pose3
+    covariance: FloatArray
+    descriptor: Descriptor
+
+
+class Places:
+    """Places along a run, as far apart as keyframes are; of ``config``, their parameters are used.
+
+    Attributes
+    ----------
+    all : the places, in the order in which they were visited
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all places."""
+        self.all: list[Place] = []
+
+    def add(self, update: MapUpdate, registered: Registered | None) -> None:
+        """Add the place of a sweep, if it was solved and is far enough from the last place."""
+        uncertainty = update.uncertainty
+        if uncertainty is None or registered is None or not update.status.solved:
+            return
+        pose, config = registered.map_T_middle, self._config.pose_graph
+        if self.all:
+            motion = self.all[-1].map_T_middle.between(pose)
+            turned = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(motion.rotation())))
+            moved = np.linalg.norm(motion.translation())
+            if moved < config.keyframe_distance and turned < config.keyframe_angle_deg:
+                return
+        points = np.concatenate([registered.edges, registered.planes])
+        descriptor = scan_context(points, self._config.loops).astype(np.float16)
+        to_map = update.map_T_lidar.AdjointMap()
+        of_map = nearest_positive(to_map @ (update.covariance - uncertainty.own) @ to_map.T)
+        self.all.append(Place(update.stamp, pose, of_map, descriptor))

@@ -1,0 +1,1 @@
+"""Saved maps: written after a run, opened again, localised in."""

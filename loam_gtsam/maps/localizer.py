@@ -1,0 +1,272 @@
+"""Localisation: the poses of a lidar in a saved map, which stays as it is.
+
+A first fix is searched for anywhere in the map; then the mapper tracks the sweeps. A lidar that is
+lost is searched for anywhere again. The covariances have the map's own error in them: it is
+considered, not estimated (Schmidt, Application of state-space methods to navigation problems,
+1966).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Unpack
+
+import gtsam
+import numpy as np
+from scipy.spatial import cKDTree
+
+from loam_gtsam.config import Config, ImuConfig, SensorConfig
+from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
+from loam_gtsam.geometry import symmetric
+from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.maps.first_fix import PlaceSearch
+from loam_gtsam.maps.frozen import FrozenMaps
+from loam_gtsam.maps.hypotheses import Hypotheses
+from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
+from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.types import (
+    BadSweep,
+    Features,
+    FeatureSweep,
+    FloatArray,
+    FrameStatus,
+    InputError,
+    MapUpdate,
+    Scan,
+    Sweep,
+    Trajectory,
+)
+
+_MARGIN = 2  # cubes between the sensor's neighbourhood and the end of what is read
+_AROUND = 10.0
+"""Metres around a pose in which the earliest place tells the map's error: voxels keep the points
+that were first in them, and a later visit was registered to these."""
+
+
+class Localizer:
+    """Finds sweeps in a saved map, and tracks them there.
+
+    Parameters
+    ----------
+    saved : the map; must stay open
+    config : of the sensor, the solver and so on; what belongs to the map (``map``, and the
+        descriptor in ``loops``) is that of the map. The map's own configuration if None.
+    imu : samples must be in it before the sweeps they belong to; None does without
+    parts : of a user's own, see :class:`~loam_gtsam.pipeline.Parts`, for the tracking
+
+    Attributes
+    ----------
+    config : as used
+    fixed : whether the pose is known
+    fixes : number of times that it was found by a search in the whole map
+
+    Raises
+    ------
+    InputError
+        If the map has no places at which it can be recognised.
+    """
+
+    def __init__(
+        self,
+        saved: SavedMap,
+        config: Config | None = None,
+        *,
+        imu: ImuBuffer | None = None,
+        **parts: Unpack[Parts],
+    ) -> None:
+        if not saved.places:
+            raise InputError(
+                f"{saved.path}: the map has no places at which it can be recognised: its run was "
+                "too short, or never solved; map more of the place"
+            )
+        self.config = config_in(saved, config)
+        self._saved, self._imu, self._parts = saved, imu, parts
+        positions = [place.map_T_middle.translation() for place in saved.places]
+        self._tree = cKDTree(np.array(positions))
+        self._maps = FrozenMaps(self.config, saved)
+        search = PlaceSearch(saved, self._maps, self.config)
+        self._hypotheses = Hypotheses(search, self._maps, self.config)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget where the lidar is."""
+        self._tracking: Pipeline | None = None
+        self._last: MapUpdate | None = None  # that was solved
+        self._seen: MapUpdate | None = None  # that was solved in all directions
+        self._unsolved = 0
+        self.fixes = 0
+        self._hypotheses.forget()
+
+    @property
+    def fixed(self) -> bool:
+        """Whether the pose is known."""
+        return self._tracking is not None
+
+    def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
+        """Localise one sweep; what it contains never raises, see the status of the result.
+
+        The status is ``LOST`` until there is a fix; the pose of such a result means nothing. Only
+        results that are solved (:attr:`~loam_gtsam.FrameStatus.solved`) have a covariance.
+
+        Raises
+        ------
+        DatasetError
+            If a cube of the map cannot be read.
+        PartError
+            If a part of a user's own raises and ``parts.on_error`` is ``stop``.
+        """
+        if isinstance(sweep, Scan) and extraction is None:
+            extraction = extract(sweep, self.config, self._parts.get("features"))
+        if self._tracking is not None:
+            update = self._tracking.process(sweep, extraction)
+            if not self._given_up(update):
+                return self._told(update)
+            self._tracking = None
+            self._hypotheses.forget()
+        features = sweep.features if isinstance(sweep, FeatureSweep) else None
+        if extraction is not None:
+            features = extraction.features
+        if features is None:
+            problem = sweep.message if isinstance(sweep, BadSweep) else ""
+            problem = problem if extraction is None else extraction.problem
+            return self._nowhere(sweep.stamp, FrameStatus.UNUSABLE_SCAN, problem)
+        near = None if self._last is None else self._last.map_T_lidar
+        fix, why = self._hypotheses.add(features, near)
+        if fix is None:
+            return self._nowhere(features.stamp, FrameStatus.LOST, f"no fix: {why}")
+        return self._begin(features, fix)
+
+    def _given_up(self, update: MapUpdate) -> bool:
+        """Whether tracking has ended."""
+        self._unsolved = 0 if update.status.solved else self._unsolved + 1
+        patience = self.config.relocalization.memory
+        return update.status is FrameStatus.LOST or self._unsolved >= patience
+
+    def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:
+        """Track from a fix on."""
+        self._hypotheses.forget()
+        tracking = Pipeline(self.config, imu=self._imu, **self._parts)
+        tracking.mapper.maps = self._maps
+        tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
+        self._tracking, self._unsolved = tracking, 0
+        self.fixes += 1
+        again = "" if self.fixes == 1 else " again"
+        return self._told(replace(fix, message=f"found in the map{again}"))
+
+    def _nowhere(self, stamp: int, status: FrameStatus, message: str) -> MapUpdate:
+        last = self._last
+        pose = gtsam.Pose3() if last is None else last.map_T_lidar
+        return MapUpdate(stamp, pose, status, message)
+
+    def _told(self, update: MapUpdate) -> MapUpdate:
+        """The update with the covariance of its pose in the frame of the map."""
+        if update.uncertainty is None or not update.status.solved:
+            return update
+        self._last = update
+        own = update.uncertainty.own
+        if update.status is FrameStatus.OK:
+            self._seen = update
+        elif self._seen is not None:  # what no scan saw since then has drifted
+            own = relative_covariance(self._seen, update)
+        from_map = update.map_T_lidar.inverse().AdjointMap()
+        of_map = from_map @ self.map_covariance(update.map_T_lidar) @ from_map.T
+        return replace(update, covariance=symmetric(own + of_map))
+
+    def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
+        """(6, 6) of the map's own error at a pose, along the axes of the map, about its origin."""
+        position = map_T_lidar.translation()
+        near = self._tree.query_ball_point(position, _AROUND)
+        number = min(near) if near else int(self._tree.query(position)[1])
+        return self._saved.places[number].covariance
+
+
+def config_in(saved: SavedMap, config: Config | None) -> Config:
+    """The configuration of a mapper in a saved map."""
+    config, own = config or saved.config, saved.config
+    shape = {name: getattr(own.loops, name) for name in ("rings", "sectors", "reach")}
+    window = tuple(n + 2 * _MARGIN for n in own.map.neighbourhood)
+    cubes = own.map.changed(window=window, window_margin=_MARGIN, archive_dir=None)
+    return config.changed(
+        map=cubes,
+        loops=config.loops.changed(enabled=False, **shape),
+        covariance=config.covariance.changed(drift=0.0),  # no ground is new
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Localisation:
+    """What became of a data set in a saved map.
+
+    Attributes
+    ----------
+    config : as used
+    updates : one per sweep
+    fixes : number of times that the pose was found by a search in the whole map
+    interrupted : stopped (Ctrl-C) before the data set ended
+    """
+
+    config: Config
+    updates: Sequence[MapUpdate]
+    fixes: int
+    interrupted: bool = False
+
+    @property
+    def solved(self) -> list[MapUpdate]:
+        """The updates whose poses were found in the map."""
+        return [update for update in self.updates if update.status.solved]
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Their poses in the frame of the map."""
+        solved = self.solved
+        return Trajectory.from_poses([u.stamp for u in solved], [u.map_T_lidar for u in solved])
+
+
+def localise(
+    dataset: Dataset,
+    saved: SavedMap,
+    config: Config | None = None,
+    *,
+    max_frames: int | None = None,
+    on_frame: OnFrame | None = None,
+    workers: int = 0,
+    **parts: Unpack[Parts],
+) -> Localisation:
+    """Localise a data set in a saved map.
+
+    Parameters
+    ----------
+    dataset, saved : see :func:`~loam_gtsam.open_dataset`, :class:`SavedMap`
+    config : see :class:`Localizer`
+    max_frames : stop after so many sweeps
+    on_frame : e.g. to show progress
+    workers : processes that extract the features of the sweeps to come
+    parts : see :class:`Localizer`
+
+    Returns
+    -------
+    Localisation
+        On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
+    """
+    if config is None:  # the sensor may be another one
+        config = saved.config.changed(sensor=SensorConfig(), imu=ImuConfig())
+    config = effective_config(config, dataset)
+    localizer = Localizer(saved, config, imu=imu_buffer(dataset, config), **parts)
+    if parts.get("features") is not None:
+        workers = 0
+    updates: list[MapUpdate] = []
+    interrupted = False
+    source = islice(timed(dataset), max_frames)
+    try:
+        for sweep, seconds, extraction in extract_ahead(source, localizer.config, workers):
+            update = localizer.process(sweep, extraction)
+            updates.append(replace(update, timings={"read": seconds} | dict(update.timings)))
+            if on_frame is not None:
+                on_frame(len(updates) - 1, updates[-1])
+    except KeyboardInterrupt:
+        interrupted = True
+    return Localisation(localizer.config, updates, localizer.fixes, interrupted)

@@ -1,0 +1,282 @@
+"""A map in one file, ``.lgmap``: what a later run needs to find itself in it.
+
+The file is a zip archive without compression: ``map.json``, which says what is in it, and arrays as
+``.npy``; nothing that is read can run code. Every member has the checksum (CRC-32) of the zip
+format, which is tested when the member is read. Cubes are members of their own, so that a long map
+is opened at once and read where the lidar is. The members are listed in docs/localise.md.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import zipfile
+import zlib
+from pathlib import Path
+from typing import Any, Self
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.config import Config, MapConfig, dump_config
+from loam_gtsam.config.tree import parse_config
+from loam_gtsam.cubemap import Contents
+from loam_gtsam.errors import ConfigError
+from loam_gtsam.io.atomic import atomic_file
+from loam_gtsam.io.version import installed_version
+from loam_gtsam.loops.map_correction import LoopMapping
+from loam_gtsam.loops.places import Place
+from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.types import DatasetError, FloatArray, IntArray, stack_poses
+from loam_gtsam.voxels.cubes import CubePoints
+from loam_gtsam.voxels.grid import CubeIndex
+
+SUFFIX = ".lgmap"
+VERSION = 1
+LAYERS = "edges", "planes", "small_edges", "small_planes"
+_FORMAT = "loam_gtsam map"
+_HEADER = "map.json"
+_DATE = (1980, 1, 1, 0, 0, 0)  # the same map makes the same file
+_POINT = np.dtype([("xyz", "<f8", 3), ("owner", "<i4"), ("view", "i1", 4)])
+"""A map point: metres, the number of its keyframe, from where it was seen (voxels/tags.py)."""
+_DAMAGED = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, MemoryError,
+            NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+
+
+def save_map(path: str | Path, pipeline: Pipeline) -> None:
+    """Write the map of a run, corrected by its loops if there are any.
+
+    Parameters
+    ----------
+    path : a file, whose name should end in ``.lgmap``; replaced if it is there
+    pipeline : that made the map, ``RunResult.pipeline`` for example
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; an old one is then as it was.
+    """
+    loops, places = pipeline.loops, pipeline.places.all
+    maps = pipeline.mapper.maps if loops is None else loops.corrected_maps()
+    if loops is not None:
+        places = _corrected(places, loops)
+    contents = {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
+    aid = pipeline.mapper.imu
+    level = None if aid is None else aid.level
+    header = {
+        "format": _FORMAT,
+        "version": VERSION,
+        "made_by": f"loam_gtsam {installed_version()}",
+        "frame": {
+            "origin": "first sweep of the run, at its reference time",
+            "up": None if level is None else level.map_up.tolist(),
+        },
+        "config": dump_config(pipeline.config),
+        "places": len(places),
+        "layers": {
+            name: [[*index, len(cube.points)] for index, cube in cubes.items()]
+            for name, cubes in contents.items()
+        },
+    }
+    with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+        _add(archive, _HEADER, json.dumps(header, indent=1).encode())
+        for name, array in _place_arrays(places).items():
+            _add(archive, f"places/{name}.npy", _bytes_of(array))
+        for name, cubes in contents.items():
+            for index, cube in cubes.items():
+                _add(archive, _cube_name(name, index), _bytes_of(_rows(cube)))
+
+
+class SavedMap:
+    """A map in a file, of which cubes are read when they are asked for.
+
+    Parameters
+    ----------
+    path : a file that :func:`save_map` wrote; it must not change while it is open
+
+    Attributes
+    ----------
+    config : of the run that made the map
+    places : where the map can be recognised
+    layers : numbers of points by cube, by kind of map (:data:`LAYERS`)
+    up : (3,) up in the map; None if the run had no IMU that knew
+
+    Raises
+    ------
+    DatasetError
+        If the file cannot be read, is none of this kind, of another version, or damaged.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        try:
+            self._archive = zipfile.ZipFile(self.path)
+        except FileNotFoundError:
+            raise DatasetError(
+                f"{path}: there is no such file; loam-gtsam run PATH writes map{SUFFIX}"
+            ) from None
+        except _DAMAGED as error:
+            raise DatasetError(
+                f"{path}: expected a map ({SUFFIX}) that loam-gtsam run wrote, got another file, "
+                f"or a part of one: {error}"
+            ) from error
+        try:
+            self._open()
+        except BaseException:
+            self.close()
+            raise
+
+    def _open(self) -> None:
+        try:
+            header = json.loads(self._read(_HEADER))
+            found = (header["format"], header["version"])
+        except _DAMAGED as error:
+            raise self._damaged(_HEADER, error) from error
+        if found != (_FORMAT, VERSION):
+            raise DatasetError(
+                f"{self.path}: expected a {_FORMAT} of version {VERSION}, got {found[0]!s:.40} of "
+                f"version {found[1]!s:.40}; run the data again with this release"
+            )
+        try:
+            self.config: Config = parse_config(header["config"], f"{self.path}: {_HEADER}")
+            self.layers = {
+                name: {
+                    (int(x), int(y), int(z)): int(count)
+                    for x, y, z, count in header["layers"][name]
+                }
+                for name in LAYERS
+            }
+            up = header["frame"]["up"]
+            self.up = None if up is None else np.array(up, np.float64).reshape(3)
+            self.places = self._places(int(header["places"]))
+        except (*_DAMAGED, ConfigError) as error:
+            raise self._damaged(_HEADER, error) from error
+        names = set(self._archive.namelist())
+        for layer, cubes in self.layers.items():
+            for index in cubes:
+                if _cube_name(layer, index) not in names:
+                    raise self._damaged(_cube_name(layer, index), "it is missing")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file."""
+        self._archive.close()
+
+    @property
+    def map_config(self) -> MapConfig:
+        """Voxels and cubes of the map."""
+        return self.config.map
+
+    def __len__(self) -> int:
+        """Number of points, those of small places counted once more."""
+        return sum(sum(cubes.values()) for cubes in self.layers.values())
+
+    def cube(self, layer: str, index: CubeIndex) -> CubePoints:
+        """Read a cube.
+
+        Raises
+        ------
+        DatasetError
+            If it cannot be read, or its checksum does not fit.
+        """
+        name = _cube_name(layer, index)
+        try:
+            rows = self._array(name, _POINT, (self.layers[layer][index],))
+        except _DAMAGED as error:
+            raise self._damaged(name, error) from error
+        tags = np.column_stack([rows["owner"], rows["view"].view("<i4")[:, 0]]).astype(np.int32)
+        return CubePoints(np.ascontiguousarray(rows["xyz"]), tags)
+
+    def contents(self, layer: str) -> Contents:
+        """Read all cubes of a layer."""
+        return {index: self.cube(layer, index) for index in self.layers[layer]}
+
+    def _places(self, count: int) -> list[Place]:
+        rings, sectors = self.config.loops.rings, self.config.loops.sectors
+        shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+            "stamps": (np.dtype("<i8"), (count,)),
+            "map_T_middle": (np.dtype("<f8"), (count, 4, 4)),
+            "covariances": (np.dtype("<f8"), (count, 6, 6)),
+            "descriptors": (np.dtype("<f2"), (count, rings, sectors)),
+        }
+        columns = [self._array(f"places/{name}.npy", *how) for name, how in shapes.items()]
+        return [
+            Place(int(stamp), gtsam.Pose3(pose), covariance, descriptor)
+            for stamp, pose, covariance, descriptor in zip(*columns, strict=True)
+        ]
+
+    def _array(self, name: str, kind: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+        array = np.load(io.BytesIO(self._read(name)), allow_pickle=False)
+        if array.dtype != kind or array.shape != shape:
+            raise ValueError(f"expected {shape} {kind}, got {array.shape} {array.dtype}")
+        fields = [array[part] for part in kind.names or ()] or [array]
+        if not all(np.isfinite(part).all() for part in fields):
+            raise ValueError("expected finite numbers")
+        return np.asarray(array)
+
+    def _read(self, name: str) -> bytes:
+        return self._archive.read(name)  # tests the checksum
+
+    def _damaged(self, name: str, problem: object) -> DatasetError:
+        return DatasetError(
+            f"{self.path}: the map is damaged: {name}: {str(problem)[:200]}; copy the file again, "
+            "or run the data again"
+        )
+
+
+def _corrected(places: list[Place], loops: LoopMapping) -> list[Place]:
+    """The places that are keyframes, where the graph has them, with its covariances."""
+    of_stamp = {place.stamp: place for place in places}
+    found = []
+    for keyframe in loops.graph.keyframes:
+        place = of_stamp.get(keyframe.stamp)
+        if place is None:
+            continue
+        pose = loops.graph.pose(keyframe.index)
+        moved = pose.compose(keyframe.odom_T_lidar.inverse())
+        to_map = pose.AdjointMap()
+        covariance = to_map @ loops.graph.covariance(keyframe.index) @ to_map.T
+        middle = moved.compose(place.map_T_middle)
+        found.append(Place(place.stamp, middle, covariance, place.descriptor))
+    return found
+
+
+def _place_arrays(places: list[Place]) -> dict[str, NDArray[Any]]:
+    poses = stack_poses(place.map_T_middle for place in places)
+    stamps: IntArray = np.array([place.stamp for place in places], np.int64)
+    covariances: FloatArray = np.array([p.covariance for p in places], np.float64)
+    return {
+        "stamps": stamps,
+        "map_T_middle": poses,
+        "covariances": covariances.reshape(-1, 6, 6),
+        "descriptors": np.array([place.descriptor for place in places], np.float16),
+    }
+
+
+def _rows(cube: CubePoints) -> NDArray[Any]:
+    """The points of a cube as they are in the file."""
+    rows = np.zeros(len(cube.points), _POINT)
+    rows["xyz"] = cube.points
+    rows["owner"] = cube.tags[:, 0]
+    rows["view"] = np.ascontiguousarray(cube.tags[:, 1:], "<i4").view(np.int8)
+    return rows
+
+
+def _bytes_of(array: NDArray[Any]) -> bytes:
+    target = io.BytesIO()
+    np.save(target, array, allow_pickle=False)
+    return target.getvalue()
+
+
+def _add(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    archive.writestr(zipfile.ZipInfo(name, _DATE), content)
+
+
+def _cube_name(layer: str, index: CubeIndex) -> str:
+    return "cubes/{}/{}_{}_{}.npy".format(layer, *index)

@@ -16,6 +16,7 @@ from loam_gtsam.cli.options import (
     ConfigOptions,
     DemoOptions,
     InspectOptions,
+    LocaliseOptions,
     OptimizeOptions,
     RefineOptions,
     RunOptions,
@@ -139,9 +140,21 @@ def inspect(options: InspectOptions) -> int:
 @command
 def optimize(options: OptimizeOptions) -> int:
     """Optimise a saved pose graph, robust against wrong loops."""
-    from loam_gtsam.cli.optimize import execute
+    from loam_gtsam.cli.saved import optimise_graph
 
-    return execute(options)
+    return optimise_graph(options)
+
+
+@app.command(short_help="Find a drive in the map of another one, and track it there.")
+@command
+def localise(options: LocaliseOptions) -> int:
+    """Find the sweeps of PATH in a saved map, and track them there; the map stays as it is.
+
+    Exits with 1 if no sweep was found in the map.
+    """
+    from loam_gtsam.cli.saved import localise_in_map
+
+    return localise_in_map(options)
 
 
 @app.command(short_help="Adjust planes and poses of a finished run.")

@@ -163,8 +163,8 @@ class InspectOptions(SourceOptions):
     preset: str | None = option("Named configuration to start from: default, loam or aloam.")
     config: Path | None = option("YAML configuration.", metavar="FILE")
 
-    def settings(self) -> Config:
-        """The preset or the file, then ``--sensor``, then every ``--set``."""
+    def settings(self, otherwise: Config | None = None) -> Config:
+        """The preset or the file, else another one, then ``--sensor``, then every ``--set``."""
         from loam_gtsam.config import load_config, preset
 
         if self.preset is not None and self.config is not None:
@@ -173,6 +173,8 @@ class InspectOptions(SourceOptions):
             )
         if self.config is not None:
             return self.changed(load_config(self.config))
+        if self.preset is None and otherwise is not None:
+            return self.changed(otherwise)
         return self.changed(preset(self.preset or "default"))
 
 
@@ -221,12 +223,12 @@ class PartOptions(InspectOptions):
     extra_factors: str | None = option("Factors of your own on every sweep.", metavar=_FACTORY)
     loop_closer: str | None = option("A loop closer of your own.", metavar=_FACTORY)
 
-    def settings(self) -> Config:
+    def settings(self, otherwise: Config | None = None) -> Config:
         """With ``--solver``, if it names one of the package."""
         from loam_gtsam.studies.contenders import with_solver
         from loam_gtsam.studies.factories import is_factory
 
-        config = super().settings()
+        config = super().settings(otherwise)
         if self.solver is None or is_factory(self.solver):
             return config
         return with_solver(config, self.solver)
@@ -301,6 +303,19 @@ class RunOptions(OutputOptions, PartOptions):
             raise OutputError(
                 f"--bag {self.bag}: the input must not be replaced; choose another name"
             )
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocaliseOptions(OutputOptions, PartOptions):
+    """Options of ``localise``."""
+
+    map: Path = argument("MAP", "A map (.lgmap) that a run wrote, or the folder of its results.")
+    frames: int | None = option("Stop after so many sweeps.", min=1)
+    workers: int | None = option(
+        "Processes that extract features ahead; by default one for more than 200 sweeps.",
+        min=0,
+        max=16,
+    )
 
 
 @dataclass(frozen=True, kw_only=True)

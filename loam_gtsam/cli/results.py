@@ -16,6 +16,7 @@ from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
+from loam_gtsam.maps.map_file import SUFFIX, save_map
 from loam_gtsam.pipeline import RunResult, effective_config
 from loam_gtsam.studies import evaluation
 from loam_gtsam.types import FrameStatus, InputError, LoamError, OutputError, Trajectory
@@ -26,7 +27,10 @@ PLOT_FILES = ("trajectory.png", "map.png", "frame.png", "timings.png")
 ERROR_PLOT = "errors.png"
 TRUTH_FILE, MATCHED_FILE = "truth.tum", "truth_matched.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
-RUN_OUTPUTS = (*RUN_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE, MATCHED_FILE)
+MAP_FILE = f"map{SUFFIX}"
+BASE_FILES = (*RUN_FILES, MAP_FILE)
+"""What every run writes."""
+RUN_OUTPUTS = (*BASE_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE, MATCHED_FILE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,8 +81,10 @@ class Results:
         """Write all files into a folder; returns their names."""
         extra = {"whole": self.whole, "accuracy": self.accuracy or None}
         extra["input"] = asdict(self.info)
-        files = list(RUN_FILES)
+        files = list(BASE_FILES)
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
+        if self.run.pipeline is not None:
+            save_map(folder / MAP_FILE, self.run.pipeline)
         if self.truth is not None:
             write_tum(folder / TRUTH_FILE, self.truth)
             files.append(TRUTH_FILE)

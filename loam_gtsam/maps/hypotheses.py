@@ -17,7 +17,11 @@ SWEEPS = 3
 """Sweeps in a row, each solved with a known motion, that must fit before a fix is believed."""
 _HYPOTHESES = 3  # that are followed at a time
 _HOPEFUL = 0.5  # share of the best candidate's fit from which another one is followed, too
-_CLEARLY = 0.75  # share of the fix's own fit that no other place may reach
+_CLEARLY = ((0.9, 0.75), (0.75, 0.5))
+"""The less a place is as it was, the clearer must it stand out: least share of the matches that
+agree, and share of the fix's own fit that no other place may then reach. Wrong registrations have
+0.75 at most, right ones in an unchanged place 0.97 or more (``loops.min_agreement``). Of poses near
+by, where the same walls fit by half, the first share is asked."""
 _LEAST_SHARE = 0.25
 """Share of the features off level ground that must have a match: fewer may be chance, and much of a
 place may have changed since it was mapped."""
@@ -40,7 +44,7 @@ class Hypothesis:
         self.last = mapper.register(features, start.compose(posed.middle_T_reference), posed.twist)
 
     def follow(self, features: Features, search: PlaceSearch, config: Config) -> bool:
-        """Whether the next sweep is solved, too."""
+        """Whether the next sweep is solved, too, and the last ones may yet fit."""
         guess: gtsam.Pose3 | None = None
         twist: FloatArray | None = None
         if self._start is not None:  # the second sweep may be metres away from the first
@@ -60,17 +64,23 @@ class Hypothesis:
             return False
         offered = _offered(self.last, self._mapper.maps.config)
         self.fits.append(standing_fit(seen.matches, offered, seen.map_T_middle))
-        return True
+        last = [fit.agreement for fit in self.fits[-SWEEPS:]]
+        return len(last) < SWEEPS or max(last) >= _CLEARLY[-1][0]
 
-    def stands(self, config: Config) -> bool:
-        """Whether the last sweeps fit the map, and no direction was left free."""
+    @property
+    def pose(self) -> gtsam.Pose3:
+        """At the middle of the last sweep."""
+        return self.last.map_T_middle or self.last.map_T_lidar
+
+    def rivals_below(self) -> float:
+        """Share of its own fit that no other place may reach; 0 if it does not stand anyway."""
         last = self.fits[-SWEEPS:]
-        return (
-            len(last) == SWEEPS
-            and self.last.status is FrameStatus.OK
-            and min(fit.agreement for fit in last) >= config.loops.min_agreement
-            and min(fit.share for fit in last) >= _LEAST_SHARE
-        )
+        if len(last) < SWEEPS or self.last.status is not FrameStatus.OK:
+            return 0.0
+        if min(fit.share for fit in last) < _LEAST_SHARE:
+            return 0.0
+        agreement = min(fit.agreement for fit in last)
+        return next((share for least, share in _CLEARLY if agreement >= least), 0.0)
 
 
 class Hypotheses:
@@ -100,37 +110,56 @@ class Hypotheses:
         """
         sweep = MovingSweep(features, self._config)
         self._held = [h for h in self._held if h.follow(features, self._search, self._config)]
-        self._held.sort(key=lambda held: -held.fits[-1].total)
-        for held in [held for held in self._held if held.stands(self._config)]:
+        self._held = _different(sorted(self._held, key=lambda held: -held.fits[-1].total))
+        message = ""
+        for held in [held for held in self._held if held.rivals_below() > 0.0]:
             rivals = self._rivals(sweep.at(held.last.twist), features, held)
             if not rivals:
                 return held.last, ""
-            message = f"{len(rivals) + 1} places fit the map alike"
+            message = f"{len(rivals)} other poses fit the map nearly as well as the best"
             self._begin(sweep.at(held.last.twist), features, rivals)
-            return None, message
+            break
         if self._held:
-            fit = self._held[0].fits[-1]
-            return None, f"{len(self._held)} places are followed; best: {_told(fit)}"
+            followed = f"{len(self._held)} poses are followed"
+            return None, message or f"{followed}; the best: {_told(self._held[0].fits[-1])}"
         posed = sweep.at(np.zeros(6))
         found = self._search.find(posed, features.reach, near)
         self._begin(posed, features, found)
-        return None, f"best place: {_told(found[0].fit)}" if found else "no place fits"
+        return None, f"the best pose: {_told(found[0].fit)}" if found else "no place fits"
 
     def _begin(self, posed: PosedSweep, features: Features, found: list[Candidate]) -> None:
+        """Follow the best of what was found, if they are not followed already."""
         for candidate in found[:_HYPOTHESES]:
-            if candidate.fit.total >= _HOPEFUL * found[0].fit.total:
+            start, hopeful = candidate.map_T_middle, _HOPEFUL * found[0].fit.total
+            known = any(same(start, held.pose) for held in self._held)
+            if candidate.fit.total >= hopeful and not known and len(self._held) < 2 * _HYPOTHESES:
                 mapper = Mapper(self._config)
                 mapper.maps = self._maps
-                start = candidate.map_T_middle
                 self._held.append(Hypothesis(posed, features, start, mapper))
 
     def _rivals(self, posed: PosedSweep, features: Features, held: Hypothesis) -> list[Candidate]:
-        """Other poses at which the sweep fits nearly as well."""
-        found = self._search.find(posed, features.reach, held.last.map_T_middle)
-        here = held.last.map_T_middle or held.last.map_T_lidar
-        own = [c for c in found if same(c.map_T_middle, here)]
-        least = _CLEARLY * max((c.fit.total for c in own), default=0.0)
-        return [c for c in found if c not in own and c.fit.total >= least]
+        """Other poses at which the sweep fits nearly as well, or better."""
+        found = self._search.find(posed, features.reach, held.pose)
+        own = [c.fit.total for c in found if same(c.map_T_middle, held.pose)]
+        if not own:
+            return found or [Candidate(held.pose, held.fits[-1])]  # not found again: no fix
+        near, far = _CLEARLY[0][1] * own[0], held.rivals_below() * own[0]
+        radius = self._config.loops.search
+        return [
+            c
+            for c in found
+            if not same(c.map_T_middle, held.pose)
+            and c.fit.total >= (far if c.map_T_middle.range(held.pose) > radius else near)
+        ]
+
+
+def _different(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """The first of those that have come to the same pose."""
+    chosen: list[Hypothesis] = []
+    for one in hypotheses:
+        if not any(same(one.pose, other.pose) for other in chosen):
+            chosen.append(one)
+    return chosen
 
 
 def _told(fit: Fit) -> str:

@@ -8,6 +8,7 @@ considered, not estimated (Schmidt, Application of state-space methods to naviga
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -54,7 +55,7 @@ class Localizer:
     ----------
     saved : the map; must stay open
     config : of the sensor, the solver and so on; what belongs to the map (``map``, and the
-        descriptor in ``loops``) is that of the map. The map's own configuration if None.
+        descriptor in ``loops``) is that of the map. That of the map's run if None.
     imu : samples must be in it before the sweeps they belong to; None does without
     parts : of a user's own, see :class:`~loam_gtsam.pipeline.Parts`, for the tracking
 
@@ -184,6 +185,11 @@ class Localizer:
         return self._saved.places[number].covariance
 
 
+def own_settings(saved: SavedMap) -> Config:
+    """The configuration of the run that made a map, for a sensor that may be another one."""
+    return saved.config.changed(sensor=SensorConfig(), imu=ImuConfig())
+
+
 def config_in(saved: SavedMap, config: Config | None) -> Config:
     """The configuration of a mapper in a saved map."""
     config, own = config or saved.config, saved.config
@@ -213,6 +219,11 @@ class Localisation:
     updates: Sequence[MapUpdate]
     fixes: int
     interrupted: bool = False
+
+    @property
+    def status_counts(self) -> dict[str, int]:
+        """How many sweeps ended in which status."""
+        return dict(Counter(str(update.status) for update in self.updates))
 
     @property
     def solved(self) -> list[MapUpdate]:
@@ -252,9 +263,7 @@ def localise(
     Localisation
         On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
     """
-    if config is None:  # the sensor may be another one
-        config = saved.config.changed(sensor=SensorConfig(), imu=ImuConfig())
-    config = effective_config(config, dataset)
+    config = effective_config(config or own_settings(saved), dataset)
     localizer = Localizer(saved, config, imu=imu_buffer(dataset, config), **parts)
     if parts.get("features") is not None:
         workers = 0

@@ -19,9 +19,8 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, MapConfig, dump_config
+from loam_gtsam.config import Config, dump_config
 from loam_gtsam.config.tree import parse_config
-from loam_gtsam.cubemap import Contents
 from loam_gtsam.errors import ConfigError
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
@@ -29,7 +28,7 @@ from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.types import DatasetError, FloatArray, IntArray, stack_poses
-from loam_gtsam.voxels.cubes import CubePoints
+from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex
 
 SUFFIX = ".lgmap"
@@ -168,11 +167,6 @@ class SavedMap:
         """Close the file."""
         self._archive.close()
 
-    @property
-    def map_config(self) -> MapConfig:
-        """Voxels and cubes of the map."""
-        return self.config.map
-
     def __len__(self) -> int:
         """Number of points, those of small places counted once more."""
         return sum(sum(cubes.values()) for cubes in self.layers.values())
@@ -193,9 +187,12 @@ class SavedMap:
         tags = np.column_stack([rows["owner"], rows["view"].view("<i4")[:, 0]]).astype(np.int32)
         return CubePoints(np.ascontiguousarray(rows["xyz"]), tags)
 
-    def contents(self, layer: str) -> Contents:
-        """Read all cubes of a layer."""
-        return {index: self.cube(layer, index) for index in self.layers[layer]}
+    def points(self) -> tuple[FloatArray, FloatArray]:
+        """Edge and plane points of the whole map but those of small places, (E, 3) and (P, 3)."""
+        edges, planes = (
+            [self.cube(layer, index).points for index in self.layers[layer]] for layer in LAYERS[:2]
+        )
+        return np.concatenate([NO_POINTS, *edges]), np.concatenate([NO_POINTS, *planes])
 
     def _places(self, count: int) -> list[Place]:
         rings, sectors = self.config.loops.rings, self.config.loops.sectors

@@ -19,12 +19,11 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam.cli import run as run_command
 from loam_gtsam.cli.console import stop_requests
-from loam_gtsam.cli.results import ERROR_PLOT, PLOT_FILES
+from loam_gtsam.cli.results import BASE_FILES, ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import DatasetInfo
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.io.run_files import RUN_FILES
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
 from loam_gtsam.view import plots as visualization
@@ -87,7 +86,7 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
     text = said("demo", "--scene", "room", "--frames", FRAMES, "--profile")
     folder = Path("loam_gtsam_output/room_vlp16")
     plots = {*PLOT_FILES, ERROR_PLOT} if visualization.available() else set()
-    assert files_in(folder) == {*RUN_FILES, "truth.tum", "truth_matched.tum"} | plots
+    assert files_in(folder) == {*BASE_FILES, "truth.tum", "truth_matched.tum"} | plots
     accuracy = summary_in(folder)["accuracy"]
     assert accuracy["compared_poses"] == FRAMES
     assert accuracy["ate_rmse_m"] < 0.05
@@ -103,7 +102,7 @@ def test_run_opens_built_in_worlds_and_uses_every_option():
         "--config", "mine.yaml", "--sensor", "vlp16", "--set", "solver.iterations=7",
         "--set", "map.window=[11, 11, 5]", "--set", "deskew.enabled=false", "--option", "seed=3",
     )  # fmt: skip
-    assert files_in("out") == {*RUN_FILES, "truth.tum", "truth_matched.tum"}
+    assert files_in("out") == {*BASE_FILES, "truth.tum", "truth_matched.tum"}
     config = load_config("out/config.yaml")
     assert config.sensor.model == "vlp16"
     assert (config.solver.iterations, config.solver.min_matches) == (7, 20)
@@ -130,7 +129,7 @@ def test_an_earlier_run_is_kept_unless_overwrite_is_given(opens, scans):
     opens(scans[:3])
     mapped("--overwrite")
     assert (len(read_tum("out/trajectory.tum")), len(read_tum("out-2/trajectory.tum"))) == (3, 2)
-    assert files_in("out") == {*RUN_FILES, "notes.md"}
+    assert files_in("out") == {*BASE_FILES, "notes.md"}
     assert not Path("out-4").exists()
 
 
@@ -194,7 +193,7 @@ def test_what_is_odd_about_the_input_is_told_after_a_run(opens, scans, monkeypat
 
     monkeypatch.setattr(FakeDataset, "info", damaged)
     assert "input: the index is gone" in mapped("--overwrite")
-    assert files_in("out") == set(RUN_FILES)
+    assert files_in("out") == set(BASE_FILES)
 
 
 @pytest.mark.parametrize("error", [DatasetError("the bag breaks off"), RuntimeError("oops")])
@@ -221,7 +220,7 @@ def test_plots_without_matplotlib(opens, scans, monkeypatch):
     monkeypatch.setattr(visualization, "available", lambda: False)
     opens(scans[:1])
     assert "No pictures without matplotlib" in said("run", "x", "--output", "a")
-    assert files_in("a") == set(RUN_FILES)
+    assert files_in("a") == set(BASE_FILES)
     assert "No pictures" not in mapped()
     assert 'pip install "loam_gtsam[plot]"' in said("run", "x", "--output", "b", "--plot", code=1)
     assert not Path("b").exists()
@@ -337,7 +336,7 @@ def test_a_signal_stops_after_the_frame_and_everything_is_written(number, worker
     assert frames >= (1 if workers else 4)  # the fourth sweep may have been read ahead
     assert f"Stopped by {number.name} after frame {frames} of 1000" in output
     assert "To go on: the same command with --output out --resume" in output
-    assert files_in("out") >= set(RUN_FILES)
+    assert files_in("out") >= set(BASE_FILES)
     assert not [name for name in files_in("out") if name.endswith(".tmp")]
     summary = summary_in("out")
     assert (summary["interrupted"], summary["frames"]) == (True, frames)
@@ -433,7 +432,7 @@ def test_resume_starts_goes_on_and_says_when_all_is_done(opens, scans):
     assert (Path("out") / run_command.CHECKPOINT).is_dir()
     opens(scans[:3])
     mapped("--resume")
-    assert files_in("out") == set(RUN_FILES)
+    assert files_in("out") == set(BASE_FILES)
     assert len(read_tum("out/trajectory.tum")) == 3
     assert "out: complete, 3 sweeps" in mapped("--resume")
     assert not Path("out-2").exists()
@@ -449,13 +448,13 @@ def test_resume_does_not_take_another_run_for_its_own(opens, scans, change):
 def test_a_checkpoint_is_not_run_over(opens, scans):
     opens([*scans[:2], DatasetError("the disk was pulled out")])
     mapped(code=1)
-    for name in RUN_FILES:
+    for name in BASE_FILES:
         (Path("out") / name).unlink()
     opens(scans[:3])
     mapped()
-    assert files_in("out-2") == set(RUN_FILES)
+    assert files_in("out-2") == set(BASE_FILES)
     mapped("--overwrite")
-    assert files_in("out") == set(RUN_FILES)
+    assert files_in("out") == set(BASE_FILES)
 
 
 def test_a_run_that_cannot_start_says_so_at_once_and_leaves_no_folder(opens):

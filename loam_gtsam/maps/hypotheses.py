@@ -22,9 +22,6 @@ _CLEARLY = ((0.9, 0.75), (0.75, 0.5))
 agree, and share of the fix's own fit that no other place may then reach. Wrong registrations have
 0.75 at most, right ones in an unchanged place 0.97 or more (``loops.min_agreement``). Of poses near
 by, where the same walls fit by half, the first share is asked."""
-_LEAST_SHARE = 0.25
-"""Share of the features off level ground that must have a match: fewer may be chance, and much of a
-place may have changed since it was mapped."""
 _FASTEST, _TURNING = 50.0, 3.0  # m/s and rad/s, of the first motion
 
 
@@ -38,17 +35,17 @@ class Hypothesis:
     """
 
     def __init__(self, posed: PosedSweep, features: Features, start: gtsam.Pose3, mapper: Mapper):
-        self._mapper = mapper
+        self._mapper, self._config = mapper, mapper.config
         self._start: tuple[int, gtsam.Pose3] | None = (posed.sweep.stamp, start)
         self.fits: list[Fit] = []
         self.last = mapper.register(features, start.compose(posed.middle_T_reference), posed.twist)
 
-    def follow(self, features: Features, search: PlaceSearch, config: Config) -> bool:
+    def follow(self, features: Features, search: PlaceSearch) -> bool:
         """Whether the next sweep is solved, too, and the last ones may yet fit."""
         guess: gtsam.Pose3 | None = None
         twist: FloatArray | None = None
         if self._start is not None:  # the second sweep may be metres away from the first
-            sweep = MovingSweep(features, config)
+            sweep = MovingSweep(features, self._config)
             posed = sweep.at(self.last.twist)
             seconds = max((sweep.stamp - self._start[0]) * 1e-9, 0.0)
             reach = max(1.0, _FASTEST * seconds), _TURNING * seconds + np.radians(5.0)
@@ -77,8 +74,8 @@ class Hypothesis:
         last = self.fits[-SWEEPS:]
         if len(last) < SWEEPS or self.last.status is not FrameStatus.OK:
             return 0.0
-        if min(fit.share for fit in last) < _LEAST_SHARE:
-            return 0.0
+        if not self.last.localizability[0] >= self._config.loops.min_aligned:
+            return 0.0  # a direction is hardly seen, or it is not known
         agreement = min(fit.agreement for fit in last)
         return next((share for least, share in _CLEARLY if agreement >= least), 0.0)
 
@@ -109,7 +106,7 @@ class Hypotheses:
         ``near`` is a pose, if there is one, around which the sweep is looked for as well.
         """
         sweep = MovingSweep(features, self._config)
-        self._held = [h for h in self._held if h.follow(features, self._search, self._config)]
+        self._held = [h for h in self._held if h.follow(features, self._search)]
         self._held = _different(sorted(self._held, key=lambda held: -held.fits[-1].total))
         message = ""
         for held in [held for held in self._held if held.rivals_below() > 0.0]:

@@ -211,19 +211,20 @@ class SavedMap:
     def _array(self, name: str, kind: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         array = np.load(io.BytesIO(self._read(name)), allow_pickle=False)
         if array.dtype != kind or array.shape != shape:
-            raise ValueError(f"expected {shape} {kind}, got {array.shape} {array.dtype}")
+            raise ValueError(f"{name}: expected {shape} {kind}, got {array.shape} {array.dtype}")
         fields = [array[part] for part in kind.names or ()] or [array]
         if not all(np.isfinite(part).all() for part in fields):
-            raise ValueError("expected finite numbers")
+            raise ValueError(f"{name}: expected finite numbers")
         return np.asarray(array)
 
     def _read(self, name: str) -> bytes:
         return self._archive.read(name)  # tests the checksum
 
     def _damaged(self, name: str, problem: object) -> DatasetError:
+        told = f"there is no {problem}" if isinstance(problem, KeyError) else str(problem)
         return DatasetError(
-            f"{self.path}: the map is damaged: {name}: {str(problem)[:200]}; copy the file again, "
-            "or run the data again"
+            f"{self.path}: the map is damaged: {name}: {told[:200]}; copy the file again, or run "
+            "the data again"
         )
 
 

@@ -1,0 +1,30 @@
+"""A map of a room, made once: the drive, its pipeline, the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+from support.rooms_map import Mapped, world
+
+from loam_gtsam.config import Config
+from loam_gtsam.maps.map_file import SavedMap, save_map
+from loam_gtsam.pipeline import run
+
+
+@pytest.fixture(scope="session")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Mapped:
+    drive = world()
+    config = Config()
+    places = config.pose_graph.changed(keyframe_distance=0.5)
+    result = run(drive, config.changed(pose_graph=places))
+    path = tmp_path_factory.mktemp("maps") / "rooms.lgmap"
+    assert result.pipeline is not None
+    save_map(path, result.pipeline)
+    return Mapped(drive, result, path)
+
+
+@pytest.fixture
+def saved(mapped: Mapped) -> Iterator[SavedMap]:
+    with SavedMap(mapped.path) as opened:
+        yield opened

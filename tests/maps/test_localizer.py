@@ -1,0 +1,192 @@
+"""Localisation in a saved map: found, tracked, lost, carried away, and never found elsewhere."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from support.cli import loam
+from support.rooms_map import FRAMES, Mapped, world
+
+from loam_gtsam.geometry import inverse_pose
+from loam_gtsam.maps.first_fix import Candidate
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, Hypothesis
+from loam_gtsam.maps.localizer import Localizer, localise
+from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.types import BadSweep, FrameStatus, InputError, MapUpdate
+
+NEAR = 0.06  # metres, of a pose in the map
+
+
+def other_drive(mapped: Mapped):
+    """The same way with other noise."""
+    drive = world()
+    drive._seed = 77
+    return drive
+
+
+def errors(mapped: Mapped, drive, updates):
+    """(6,) tangents from solved poses to the true ones, in the frame of the map."""
+    start = mapped.result.updates[0].map_T_lidar.matrix()
+    map_T_world = start @ inverse_pose(mapped.world.world_T_start)
+    true = dict(zip(drive.truth.stamps.tolist(), drive.truth.map_T_lidar, strict=True))
+    poses = [gtsam.Pose3(map_T_world @ drive.world_T_start @ true[u.stamp]) for u in updates]
+    return [u.map_T_lidar.localCoordinates(p) for u, p in zip(updates, poses, strict=True)]
+
+
+def test_a_drive_is_found_and_tracked_and_the_covariance_knows_the_maps_error(mapped, saved):
+    before = mapped.path.read_bytes()
+    drive = other_drive(mapped)
+    found = localise(drive, saved)
+    assert found.fixes == 1
+    statuses = [update.status for update in found.updates]
+    assert set(statuses[:SWEEPS]) == {FrameStatus.LOST}
+    assert set(statuses[SWEEPS:]) == {FrameStatus.OK}
+    assert found.updates[SWEEPS].message == "found in the map"
+    assert len(found.trajectory) == FRAMES - SWEEPS
+    off = errors(mapped, drive, found.solved)
+    assert max(np.linalg.norm(error[3:]) for error in off) < NEAR
+    with_map, without = [], []
+    for error, update in zip(off, found.solved, strict=True):
+        with_map.append(error @ np.linalg.solve(update.covariance, error) / 6.0)
+        without.append(error @ np.linalg.solve(update.uncertainty.own, error) / 6.0)
+        assert np.linalg.eigvalsh(update.covariance - update.uncertainty.own)[0] > -1e-12
+    assert np.mean(with_map) < 2.0
+    assert np.mean(without) > 2.0  # what the map's error is left out of
+    assert mapped.path.read_bytes() == before
+
+
+def test_nothing_is_found_in_the_map_of_another_place(saved):
+    found = localise(world("park", seed=3, frames=12), saved)
+    assert (found.fixes, found.solved) == (0, [])
+    assert {update.status for update in found.updates} == {FrameStatus.LOST}
+    assert all(update.message.startswith("no fix: ") for update in found.updates)
+    assert len(found.trajectory) == 0
+
+
+def test_a_lidar_that_is_carried_away_is_found_again(mapped, saved):
+    """From the end of the way back to its start, from one sweep to the next."""
+    drive, localizer = other_drive(mapped), Localizer(saved)
+    first = [localizer.process(drive.sweep(n)) for n in range(14, 29)]
+    assert localizer.fixed
+    assert localizer.fixes == 1
+    sweeps = [drive.sweep(n) for n in range(8)]
+    shift = first[-1].stamp + 100_000_000 - sweeps[0].stamp
+    second = [localizer.process(replace(sweep, stamp=sweep.stamp + shift)) for sweep in sweeps]
+    pairs = zip(second, sweeps, strict=True)
+    solved = [replace(u, stamp=s.stamp) for u, s in pairs if u.status.solved]
+    off = [np.linalg.norm(error[3:]) for error in errors(mapped, drive, solved)]
+    assert max(off) < 2 * NEAR  # whose motion within the sweep nobody knows at first
+    assert off[-1] < NEAR
+    assert second[-1].status is FrameStatus.OK
+
+
+def test_sweeps_that_cannot_be_used_cost_no_fix_and_a_reset_forgets(mapped, saved):
+    drive, localizer = other_drive(mapped), Localizer(saved)
+    none = localizer.process(BadSweep(drive.sweep(0).stamp - 1, "torn"))
+    assert (none.status, none.message) == (FrameStatus.UNUSABLE_SCAN, "torn")
+    first = [localizer.process(drive.sweep(n)) for n in range(8)]
+    assert first[-1].status.solved
+    bad = localizer.process(BadSweep(drive.sweep(8).stamp, "torn"))
+    assert bad.status is FrameStatus.UNUSABLE_SCAN
+    assert localizer.process(drive.sweep(9)).status.solved
+    localizer.reset()
+    assert not localizer.fixed
+    again = [localizer.process(drive.sweep(n)) for n in range(8)]
+    for one, other in zip(first, again, strict=True):
+        assert one.map_T_lidar.equals(other.map_T_lidar, 0.0)
+
+
+def test_the_maps_error_is_that_of_the_first_visit_near_by(saved):
+    localizer = Localizer(saved)
+    first, last = saved.places[0], saved.places[-1]
+    assert first.map_T_middle.range(last.map_T_middle) < 10.0
+    found = localizer.map_covariance(last.map_T_middle)
+    np.testing.assert_array_equal(found, first.covariance)
+
+
+class Held:
+    """A hypothesis with made-up fits."""
+
+    def __init__(self, agreement, status=FrameStatus.OK, seen=100.0, count=SWEEPS, share=0.3):
+        config = Pipeline().config
+        self.held = Hypothesis.__new__(Hypothesis)
+        self.held._config = config
+        self.held.fits = [Fit(share, agreement)] * count
+        self.held.last = MapUpdate(0, gtsam.Pose3(), status, localizability=np.full(6, seen))
+
+
+@pytest.mark.parametrize(
+    ("held", "below"),
+    [
+        (Held(0.95), 0.75),
+        (Held(0.8), 0.5),
+        (Held(0.7), 0.0),
+        (Held(0.95, count=SWEEPS - 1), 0.0),
+        (Held(0.95, FrameStatus.DEGENERATE), 0.0),
+        (Held(0.95, seen=29.0), 0.0),
+        (Held(0.95, seen=np.nan), 0.0),
+    ],
+)
+def test_a_hypothesis_stands_if_it_fits_and_sees_all_directions(held, below):
+    assert held.held.rivals_below() == below
+
+
+@pytest.mark.parametrize(
+    ("agreement", "rivals", "count"),
+    [
+        (0.95, [(0.0, 0.3), (50.0, 0.2)], 0),
+        (0.95, [(0.0, 0.3), (50.0, 0.25)], 1),  # another place fits nearly as well
+        (0.8, [(0.0, 0.3), (50.0, 0.2)], 1),  # a changed place must stand out more
+        (0.8, [(0.0, 0.3), (3.0, 0.2)], 0),  # than another minimum near by
+        (0.8, [(0.0, 0.3), (3.0, 0.25)], 1),
+        (0.95, [(50.0, 0.1)], 1),  # not found again where it is
+        (0.95, [], 1),
+    ],
+)
+def test_a_fix_needs_that_no_other_place_fits_nearly_as_well(agreement, rivals, count):
+    class Search:
+        def find(self, posed, reach, near=None):
+            found = [Candidate(gtsam.Pose3(gtsam.Rot3(), np.array([x, 0, 0])), Fit(fit, 1.0))
+                     for x, fit in rivals]  # fmt: skip
+            return sorted(found, key=lambda candidate: -candidate.fit.total)
+
+    held = Held(agreement).held
+    hypotheses = Hypotheses(Search(), None, held._config)
+    features = type("Reach", (), {"reach": 20.0})
+    assert len(hypotheses._rivals(None, features, held)) == count
+
+
+def test_a_map_without_places_is_refused(saved):
+    saved.places = []
+    with pytest.raises(InputError, match="no places"):
+        Localizer(saved)
+
+
+def test_the_command_localises_in_the_map_that_a_run_wrote(mapped, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    spec = "sim:rooms?seed=1&frames=10&columns=450"
+    done = loam("localise", spec, mapped.path, "--output", "out", "--no-plot")
+    assert done.exit_code == 0, done.output
+    assert "found 1 times" in done.output
+    summary = json.loads(Path("out/summary.json").read_text())
+    assert (summary["frames"], summary["fixes"], summary["first_fix_frame"]) == (10, 1, SWEEPS)
+    assert len(Path("out/trajectory_covariance.csv").read_text().splitlines()) == 11 - SWEEPS
+    elsewhere = loam("localise", "sim:park?frames=5&columns=450", mapped.path, "--output", "no",
+                     "--no-plot", "--quiet")  # fmt: skip
+    assert elsewhere.exit_code == 1
+    assert "no fix" in elsewhere.output
+    missing = loam("localise", spec, "nothing.lgmap")
+    assert missing.exit_code == 1
+    assert "there is no such file" in missing.output
+
+
+def test_a_map_stays_open_to_its_localizer(mapped):
+    with SavedMap(mapped.path) as saved:
+        assert Localizer(saved).config.map.cube_size == saved.config.map.cube_size

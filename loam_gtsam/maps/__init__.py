@@ -1,1 +1,8 @@
 """Saved maps: written after a run, opened again, localised in."""
+
+from loam_gtsam.maps.localizer import Localisation as Localisation
+from loam_gtsam.maps.localizer import Localizer as Localizer
+from loam_gtsam.maps.localizer import localise as localise
+from loam_gtsam.maps.localizer import own_settings as own_settings
+from loam_gtsam.maps.map_file import SavedMap as SavedMap
+from loam_gtsam.maps.map_file import save_map as save_map

@@ -59,7 +59,7 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
     loops, places = pipeline.loops, pipeline.places.all
     maps = pipeline.mapper.maps if loops is None else loops.corrected_maps()
     if loops is not None:
-        places = _corrected(places, loops)
+        places = corrected(places, loops)
     contents = {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
     aid = pipeline.mapper.imu
     level = None if aid is None else aid.level
@@ -228,7 +228,7 @@ class SavedMap:
         )
 
 
-def _corrected(places: list[Place], loops: LoopMapping) -> list[Place]:
+def corrected(places: list[Place], loops: LoopMapping) -> list[Place]:
     """The places that are keyframes, where the graph has them, with its covariances."""
     of_stamp = {place.stamp: place for place in places}
     found = []

@@ -12,7 +12,9 @@ from loam_gtsam.datasets import open_dataset
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.map_correction import LoopMapping
+from loam_gtsam.loops.places import Place
 from loam_gtsam.mapper import Mapper
+from loam_gtsam.maps.map_file import corrected
 from loam_gtsam.pipeline import Pipeline, imu_buffer
 from loam_gtsam.registration.solvers import GtsamSolver
 
@@ -75,11 +77,27 @@ def test_the_map_follows_its_keyframes():
     assert off > 1e-6  # the mapper's frame is another
     corrected = np.sort(loops.map_points()[0], axis=0)
     np.testing.assert_allclose(corrected, np.sort(wanted, axis=0), atol=2e-3)
+    saved = np.sort(loops.corrected_maps().points()[0], axis=0)
+    np.testing.assert_allclose(saved, corrected, atol=1e-9)
     truth = np.array([pose.translation() for pose in POSES])
     odometry = np.array([update.map_T_lidar.translation() for update in updates(POSES, DRIFT)])
     before = np.linalg.norm(odometry - truth, axis=1).max()
     after = np.linalg.norm(loops.graph.poses()[:, :3, 3] - truth, axis=1).max()
     assert after < 0.5 * before
+
+
+def test_saved_places_are_where_the_graph_has_them():
+    _, loops, _ = driven(first=30)
+    descriptor = np.zeros((2, 3), np.float16)
+    chosen = loops.graph.keyframes[::5]
+    places = [Place(k.stamp, k.odom_T_lidar, np.eye(6), descriptor) for k in chosen]
+    unknown = Place(-1, chosen[0].odom_T_lidar, np.eye(6), descriptor)  # no keyframe
+    for place, keyframe in zip(corrected([unknown, *places], loops), chosen, strict=True):
+        pose = loops.graph.pose(keyframe.index)
+        np.testing.assert_allclose(place.map_T_middle.matrix(), pose.matrix(), atol=1e-9)
+        back = pose.inverse().AdjointMap()
+        told = back @ place.covariance @ back.T
+        np.testing.assert_allclose(told, loops.graph.covariance(keyframe.index), atol=1e-9)
 
 
 def test_the_newest_keyframe_and_its_points_stay():

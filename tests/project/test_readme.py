@@ -140,7 +140,7 @@ def test_parameters_named_in_the_docs_exist() -> None:
     found = 0
     for page in PAGES:
         for section, field in named.findall(page.read_text("utf-8")):
-            if field in ("py", "ply", "png", "csv", "tum", "g2o"):  # a file
+            if field in ("py", "ply", "png", "csv", "tum", "g2o", "lgmap", "json"):  # a file
                 continue
             found += 1
             assert hasattr(getattr(config, section), field), f"{page.name}: {section}.{field}"

@@ -26,6 +26,9 @@ from loam_gtsam.voxels.trees import Neighbours
 _TINY = 1e-9
 _MORE = 2
 """Times as many neighbours are searched for where those of one side are wanted: a wall has two."""
+_ROUGH, _WRONG = 2.0, 4.0
+"""A plane is rough if a neighbour lies farther off than twice the median of the sweep's planes, which
+of flat ones with noise less than one in ten do. It is wrong by four times what is beyond that."""
 _SURE = 2.0
 """Standard deviations beyond which a difference is none of noise (95 %)."""
 
@@ -325,6 +328,7 @@ class _Fits(NamedTuple):
     offsets: FloatArray  # (M,)
     wide: FloatArray  # (3, M) unit directions of the widest extent
     eigenvalues: FloatArray  # (3, M) variances across the plane and along its extents, ascending
+    worst: FloatArray  # (M,) distance of the neighbour that is farthest from the plane
     planar: BoolArray  # (M,) whether the neighbours lie in the plane and span it
 
 
@@ -338,9 +342,10 @@ def _fit(neighbours: FloatArray, config: MatchingConfig) -> _Fits:
     if config.plane_fit == "unit_offset":
         normals, offsets = _unit_offset_planes(group)
     across = _dot(axes, normals[:, None, :]) + offsets
-    planar = np.abs(across).max(axis=0) <= config.plane_tolerance
+    worst = np.abs(across).max(axis=0)
+    planar = worst <= config.plane_tolerance
     planar &= eigenvalues[1] > config.plane_ratio * eigenvalues[2]
-    return _Fits(centres, normals, offsets, wide, eigenvalues, planar)
+    return _Fits(centres, normals, offsets, wide, eigenvalues, worst, planar)
 
 
 def _matched_planes(
@@ -368,6 +373,8 @@ def _matched_planes(
     leverage += aside / np.maximum(eigenvalues[1], _TINY)
     fit = eigenvalues[0], eigenvalues[1], leverage
     sigmas, tilts = _deviations(*fit, 3, config.neighbours, config)
+    if config.fit_uncertainty:
+        sigmas = np.hypot(sigmas, _misfit(fits))
     return PlaneMatches(
         points[rows[keep]],
         normals.T[keep],
@@ -378,6 +385,20 @@ def _matched_planes(
         rows[keep],
         tilts[keep],
     )
+
+
+def _misfit(fits: _Fits) -> FloatArray:
+    """Standard deviations (M,), metres, of planes through points that are not of one plane.
+
+    Neighbours on both sides of a corner, or on two steps, make a plane that cuts the corner. It is
+    known by a neighbour that lies much farther off than those of the sweep's other planes do:
+    docs/maths/matching.md.
+    """
+    if not fits.planar.any():
+        return np.zeros(len(fits.worst))
+    usual = _ROUGH * float(np.median(fits.worst[fits.planar]))
+    beyond: FloatArray = _WRONG * np.sqrt(np.maximum(fits.worst**2 - usual**2, 0.0))
+    return beyond
 
 
 def _unit_offset_planes(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -113,6 +113,23 @@ def test_scatter_of_the_neighbours_raises_the_sigma():
     assert smooth == pytest.approx(0.03 * np.sqrt(1.2), rel=1e-6)
 
 
+@pytest.mark.parametrize("uncertain", [True, False])
+@pytest.mark.parametrize(
+    ("saddle", "beyond"), [(0.019, 0.0), (0.05, 4 * np.sqrt(0.05**2 - 0.02**2))]
+)
+def test_a_plane_much_rougher_than_those_of_the_sweep_is_wrong_by_what_is_beyond(
+    saddle, beyond, uncertain
+):
+    """Of three planes, two are 1 cm rough: up to 2 cm the third is like them."""
+    groups = np.array([plane_group(saddle=by * X) for by in (0.01, 0.01, saddle)])
+    points, config = np.tile(AHEAD, (3, 1)), changed(fit_uncertainty=uncertain)
+    near = np.full((3, 5), 0.25)
+    sigmas = match_planes(points, points, groups, near, np.eye(4), config).sigmas
+    alone = [one(match_planes, AHEAD, group, config).sigmas[0] for group in groups]
+    rough = np.hypot(alone[2], beyond) if uncertain else alone[2]
+    np.testing.assert_allclose(sigmas, [*alone[:2], rough], rtol=1e-6)
+
+
 def test_few_neighbours_leave_one_degree_of_freedom_at_least():
     """Four points leave a plane one, three leave it none: then the scatter counts in full."""
     square = plane_group(saddle=0.1 * X)[:4]

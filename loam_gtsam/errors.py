@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
 import logging
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 
 _log = logging.getLogger(__name__)
+_LONGEST = 80  # characters of a name that is looked for among others
 _INDETERMINATE = "Indeterminate linear system"  # how a RuntimeError of GTSAM begins
 
 
@@ -30,6 +32,14 @@ class DatasetError(LoamError):
 
 class OutputError(LoamError):
     """A file or a picture could not be written."""
+
+
+def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:
+    """The end of a message about an unknown name: which one may be meant, and all there are."""
+    asked, names = name[:_LONGEST] if isinstance(name, str) else "", list(known)
+    close = difflib.get_close_matches(asked, names, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    return hint + (f" (known: {', '.join(sorted(names)) or 'none'})" if listing else "")
 
 
 class PartError(LoamError):

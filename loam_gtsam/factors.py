@@ -36,6 +36,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -219,7 +220,7 @@ def checked_factor(
     def call(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
     ) -> FloatArray:
-        error, derivatives = residual(values)
+        error, derivatives = _both(residual(values))
         error = as_vector(error, "factor residual", rows)
         if jacobians is not None:
             if len(derivatives) != len(keys):
@@ -233,6 +234,20 @@ def checked_factor(
         return error
 
     return gtsam.CustomFactor(noise, keys, call)
+
+
+def _both(returned: object) -> tuple[FloatArray, Sequence[FloatArray]]:
+    """What a residual function returned; InputError if that is no residual with Jacobians."""
+    pair: Any = returned if isinstance(returned, tuple) and len(returned) == 2 else (None, None)
+    if isinstance(pair[1], (list, tuple)):
+        return pair[0], pair[1]
+    given = type(returned).__name__
+    if isinstance(returned, tuple):
+        given = f"({', '.join(type(part).__name__ for part in returned)})"
+    raise InputError(
+        "factor: expected the residual function to return (residual, [Jacobian of each key]); "
+        f"got {given}; gtsam.utils.numerical_derivative differentiates functions"
+    )
 
 
 def point_to_plane_factor(

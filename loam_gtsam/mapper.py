@@ -13,6 +13,7 @@ from typing import Any
 import gtsam
 
 from loam_gtsam.config import Config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.errors import own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
@@ -107,7 +108,7 @@ class Mapper:
         imu: ImuBuffer | None = None,
         extra_factors: ExtraFactors | None = None,
     ) -> None:
-        self.config = config or Config()
+        self.config = as_config(config)
         self.solver = solver or make_solver(self.config.solver)
         _check_factors_have_a_place(self.config, imu, extra_factors, own_solver=solver is not None)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)

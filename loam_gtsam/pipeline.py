@@ -12,6 +12,7 @@ from typing import Any, TypedDict, TypeVar, Unpack
 import gtsam
 
 from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, dump_config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
@@ -180,7 +181,7 @@ class Pipeline:
         imu: ImuBuffer | None = None,
         **parts: Unpack[Parts],
     ) -> None:
-        self.config = config or Config()
+        self.config = as_config(config)
         self.faults = PartFaults(self.config.parts.on_error)
         solver, factors = parts.get("solver"), parts.get("extra_factors")
         self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=factors)
@@ -429,7 +430,7 @@ def run(
             f"dataset: expected a Dataset, got {type(dataset).__name__} without 'sensor'; "
             "open_dataset makes one of a path, ArrayDataset of arrays or Scan objects"
         )
-    config = effective_config(config or Config(), dataset)
+    config = effective_config(as_config(config), dataset)
     imu = imu_buffer(dataset, config)
     pipeline = Pipeline(config, imu=imu, **parts)
     if parts.get("features") is not None:

@@ -140,6 +140,8 @@ def test_what_the_data_set_implies_yields_to_the_user():
 def test_what_is_no_data_set_and_no_sweep_is_told():
     with pytest.raises(InputError, match="got str without 'sensor'; open_dataset makes one"):
         run("somewhere")
+    with pytest.raises(InputError, match="expected a Config, got str 'loam'; preset"):
+        run(SimulatedWorld("room", frames=1), "loam")
     with pytest.raises(InputError, match="expected a Scan, got ndarray"):
         Pipeline().process(np.zeros((5, 3)))
 

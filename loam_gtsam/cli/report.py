@@ -22,7 +22,18 @@ from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buf
 from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Sweep, SweepError
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
-_BLIND = (FrameStatus.LOST, FrameStatus.FEW_MATCHES, FrameStatus.DEGENERATE)
+_TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
+_AXES = ("rx", "ry", "rz", "x", "y", "z")  # of the tangent
+_ADVICE = {
+    FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
+    "docs/imu.md, docs/own_factor.md",
+    FrameStatus.LOST: "too fast or too few matches: use every sweep, check sensor.* and the times "
+    "of the points",
+    FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",
+    FrameStatus.BAD_STAMP: "the stamps of the sweeps are wrong: see loam-gtsam inspect",
+    FrameStatus.NOT_CONVERGED: "try --set solver.iterations=20",
+}
+_ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _MESSAGES, _TRIED_SWEEPS = 3, 5
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
@@ -43,6 +54,7 @@ def summary(
         "frames": f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)",
         "status": _counts(result.status_counts),
         "not used": _counts(result.faults),
+        "weakly constrained": _weak_axes(result),
         "path": f"{path:.1f} m",
         "map": f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points",
         "map, dropped": _dropped(result),
@@ -55,21 +67,35 @@ def summary(
         notes += _imu_problems(result.imu)
     notes += _odd_frames(result.updates)
     texts = [Text(f"  {note}", style="yellow") for note in notes]
-    if warning := _warning(result.updates):
-        texts.append(Text(f"  {warning}", style="bold red"))
+    warning, doubted = _warning(result.updates)
+    if warning:
+        texts.append(Text(f"  {warning}", style="bold red" if doubted else "yellow"))
     return Group(_table(name, rows), *texts)
 
 
-def _warning(updates: Sequence[MapUpdate]) -> str:
-    """One line about the poses that no scan has fixed, "" if there are none."""
-    blind = [number for number, update in enumerate(updates) if update.status in _BLIND]
-    if not blind:
-        return ""
-    counts = _counts(Counter(updates[number].status for number in blind))
+def _warning(updates: Sequence[MapUpdate]) -> tuple[str, bool]:
+    """One line on the frames that are not trustworthy, "" if there are none; whether too many."""
+    odd = [number for number, update in enumerate(updates) if update.status not in _EXPECTED]
+    if not odd:
+        return "", False
+    doubted = len(odd) > _TOO_MANY * len(updates)
+    counts = Counter[str](updates[number].status for number in odd)
+    advice = _ADVICE[FrameStatus(counts.most_common(1)[0][0])]
     return (
-        f"{len(blind)} of {len(updates)} poses are not fixed by their scans ({counts}), first that "
-        f"of frame {blind[0]}: see their covariances"
-    )
+        f"{'DO NOT TRUST THIS RUN: ' if doubted else ''}{len(odd)} of {len(updates)} poses "
+        f"({100.0 * len(odd) / len(updates):.0f} %) are not fixed by their scans "
+        f"({_counts(counts)}), first that of frame {odd[0]}; {advice}"
+    ), doubted
+
+
+def _weak_axes(result: RunResult) -> str:
+    """Axes of the lidar that too few matches fixed in degenerate frames, and in how many."""
+    least, counts = result.config.solver.min_aligned, Counter[str]()
+    for update in result.updates:
+        if update.status is FrameStatus.DEGENERATE:
+            counts.update(np.array(_AXES)[update.axis_localizability < least].tolist())
+    found = ", ".join(f"{axis} in {counts[axis]} frames" for axis in _AXES if counts[axis])
+    return f"{found} (axes of the lidar)" if found else ""
 
 
 def _dropped(result: RunResult) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
@@ -14,6 +13,7 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.scalarbool import ScalarBoolean
 
+from loam_gtsam.errors import nearest
 from loam_gtsam.types import ConfigError
 
 _LONGEST = 200  # characters of a value in an error message
@@ -167,14 +167,6 @@ def shown(value: Any) -> str:
     except ValueError:  # Python refuses to write integers of thousands of digits
         return "a number that is too long"
     return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
-
-
-def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:
-    """The end of a message about an unknown name: which one may be meant, and all there are."""
-    asked = name[:_LONGEST] if isinstance(name, str) else ""
-    close = difflib.get_close_matches(asked, list(known), n=1)
-    hint = f"; did you mean {close[0]!r}?" if close else ""
-    return hint + (f" (known: {', '.join(sorted(known))})" if listing else "")
 
 
 AnySection = TypeVar("AnySection", bound=Section)

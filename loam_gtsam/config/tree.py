@@ -17,14 +17,14 @@ from loam_gtsam.config.base import (
     Section,
     clipped,
     meaning,
-    nearest,
     nested,
     out_of_order,
     override,
     shown,
 )
 from loam_gtsam.config.own_parts import PartsConfig
-from loam_gtsam.types import ConfigError
+from loam_gtsam.errors import nearest
+from loam_gtsam.types import ConfigError, InputError
 
 
 class Config(Section):
@@ -157,6 +157,18 @@ def preset(name: str, where: str = "") -> Config:
     if not isinstance(name, str) or name not in PRESETS:
         raise ConfigError(f"{where}unknown preset {shown(name)}{nearest(name, PRESETS)}")
     return PRESETS[name]
+
+
+def as_config(config: Config | None) -> Config:
+    """The configuration, or the default one if None; InputError for anything else."""
+    if config is None:
+        return Config()
+    if isinstance(config, Config):
+        return config
+    raise InputError(
+        f"config: expected a Config, got {type(config).__name__} {shown(config)}; preset(name), "
+        "load_config(path), config_from_dict(data) and Config().changed(...) make one"
+    )
 
 
 def config_from_dict(data: Mapping[str, Any], source: str = "config") -> Config:

@@ -17,6 +17,7 @@ from loam_gtsam.datasets.base import BagOptions
 from loam_gtsam.datasets.base import Dataset as Dataset
 from loam_gtsam.datasets.base import DatasetInfo as DatasetInfo
 from loam_gtsam.datasets.known.layouts import known_loader
+from loam_gtsam.errors import nearest
 from loam_gtsam.types import DatasetError
 from loam_gtsam.types import Sweep as Sweep
 
@@ -185,6 +186,7 @@ def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> Data
         name, takes = loader.__name__, ", ".join(known)
         raise DatasetError(
             f"{source}: {name} takes no option {', '.join(unknown)}; it takes {takes}"
+            f"{nearest(unknown[0], known, listing=False)}"
         )
     dataset: Dataset = loader(source, **options)
     return dataset

@@ -211,8 +211,9 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
         tried.append(f"elevation: {reason}")
     if found is None:
         raise SweepError(
-            f"no rings for a sweep of {len(columns)} points ({'; '.join(tried)}); give Scan.rings "
-            "or Scan.rows, or set sensor.rings and sensor.model",
+            f"no rings for a sweep of {len(columns)} points ({'; '.join(tried)}); a "
+            "sensor that does not sweep rings, as a Livox, cannot be used; for any other, give "
+            "Scan.rings or Scan.rows, or set sensor.rings and sensor.model",
             SweepFault.BAD_RINGS,
         )
     if found.count < 2 or found.count > MAX_RINGS:

@@ -16,6 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
@@ -90,7 +91,7 @@ class ScanLoopCloser:
     """
 
     def __init__(self, config: Config | None = None) -> None:
-        self._whole = config or Config()
+        self._whole = as_config(config)
         self.config = self._whole.loops
         self._solver = GtsamSolver(self._whole.solver)
         # A trial only has to come near: a full registration follows the best one.

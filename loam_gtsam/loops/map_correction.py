@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, ScanLoopCloser
@@ -38,7 +39,7 @@ class LoopMapping:
     def __init__(
         self, mapper: Mapper, config: Config | None = None, closer: LoopCloser | None = None
     ) -> None:
-        self._config = config or Config()
+        self._config = as_config(config)
         self._mapper = mapper
         self.graph = PoseGraph(self._config)
         self.closer: LoopCloser = closer or ScanLoopCloser(self._config)

@@ -13,6 +13,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
@@ -45,7 +46,7 @@ class PoseGraph(FactorGraph):
     """
 
     def __init__(self, config: Config | None = None, *, imu: ImuBuffer | None = None) -> None:
-        self._whole = config or Config()
+        self._whole = as_config(config)
         self.config = self._whole.pose_graph
         self.imu = imu
         self.reset()

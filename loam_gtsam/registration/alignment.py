@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from loam_gtsam.config import Config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import as_points, voxel_filter
 from loam_gtsam.registration.association import associate
@@ -78,7 +79,7 @@ def align(
     >>> found = align(source, target)  # doctest: +SKIP
     >>> found.target_T_source, np.sqrt(np.diag(found.covariance))  # doctest: +SKIP
     """
-    config = config or Config()
+    config = as_config(config)
     source, target = as_points(source, "source"), as_points(target, "target")
     least = config.solver.min_matches
     for name, cloud in (("source", source), ("target", target)):

@@ -12,6 +12,9 @@ from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import Features, FrameStatus, MapUpdate, SweepFault, TiltPrior
 
+_AXES = ("rx", "ry", "rz", "x", "y", "z")
+"""Of the lidar, in the order of the tangent: rotations in rad, translations in metres."""
+
 
 def make_update(
     posed: PosedSweep,
@@ -87,12 +90,15 @@ def status_of(solution: Solution, message: str) -> tuple[FrameStatus, str]:
     if solution.weak is not None:
         status = FrameStatus.DEGENERATE
         weak = weak_directions_in_words(solution)
-        problem = f"the scan does not tell {weak}; no better known than the expected motion"
+        problem = f"weakly constrained: {weak}; no better known than the expected motion"
     return status, "; ".join(filter(None, (message, problem)))
 
 
 def weak_directions_in_words(solution: Solution) -> str:
-    """The degenerate directions of a solution in words: metres and rad in lidar axes."""
+    """The degenerate directions of a solution: ``x, z (2 directions)``, in lidar axes.
+
+    One that is along no single axis is told by its parts, in metres and rad: ``x -0.31 y``.
+    """
     assert solution.weak is not None
     spanned = np.linalg.svd(solution.weak)[0][:, : solution.n_weak].T
     for row in range(len(spanned)):  # each is to have an axis that the others have not
@@ -102,10 +108,14 @@ def weak_directions_in_words(solution: Solution) -> str:
         spanned = spanned - np.outer(spanned[:, axis], unit)
         spanned[row] = unit
     names = []
-    for unit in spanned:
-        parts = zip(unit, ("rx", "ry", "rz", "x", "y", "z"), strict=True)
-        names.append(" ".join(f"{value:+.2f} {axis}" for value, axis in parts if abs(value) > 0.05))
-    return " or ".join(names)
+    # Positions first: these are asked for more often.
+    for unit in sorted(spanned, key=lambda unit: (int(np.abs(unit).argmax()) + 3) % 6):
+        main = int(np.abs(unit).argmax())
+        parts = enumerate(zip(unit, _AXES, strict=True))
+        rest = [f" {v:+.2f} {axis}" for i, (v, axis) in parts if i != main and abs(v) > 0.05]
+        names.append(_AXES[main] + "".join(rest))
+    count = f"{len(names)} direction" + "s" * (len(names) > 1)
+    return f"{', '.join(names)} ({count})"
 
 
 def distance_in_words(first: gtsam.Pose3, second: gtsam.Pose3) -> str:

@@ -16,6 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from loam_gtsam.config import Config
+from loam_gtsam.config.tree import as_config
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, decode_imu
 from loam_gtsam.errors import own_code
@@ -93,7 +94,7 @@ class LiveMapper:
         loop_closer: LoopCloser | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._config = config = config or Config()
+        self._config = config = as_config(config)
         self._decoder = SweepDecoder(config, features, axes, clouds or CloudStream())
         bounded = config.live.when_full != "never"
         self._imu: LiveImu | None = None

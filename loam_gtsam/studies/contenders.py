@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from loam_gtsam.config import Config, SolverConfig, load_config, preset
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
+from loam_gtsam.errors import nearest
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.frontend.workers import Extraction, extract
 from loam_gtsam.io.version import installed_version
@@ -122,9 +123,9 @@ def make_contender(group: Group, name: str, base: Config) -> Contender:
         return Contender(name.rpartition(":")[2], base, group, make_parts({part: name}, base))
     if name not in METHODS:
         raise ConfigError(
-            f"unknown solver {name!r}; expected {', '.join(METHODS)}, or PACKAGE.MODULE:FACTORY. "
-            "Presets, configuration files and peers have options of their own: --preset, --config, "
-            "--peer"
+            f"unknown solver {name!r}{nearest(name, METHODS, listing=False)}; expected "
+            f"{', '.join(METHODS)}, or PACKAGE.MODULE:FACTORY. Presets, configuration files and "
+            "peers have options of their own: --preset, --config, --peer"
         )
     return Contender(name, with_solver(base, name), group)
 

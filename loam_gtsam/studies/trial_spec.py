@@ -13,6 +13,7 @@ from ruamel.yaml import YAML
 
 from loam_gtsam.config import Config, load_config, preset
 from loam_gtsam.config.base import shown
+from loam_gtsam.errors import nearest
 from loam_gtsam.studies.contenders import METHODS, with_solver
 from loam_gtsam.studies.factories import PARTS, is_factory
 from loam_gtsam.studies.peers import PEERS
@@ -138,8 +139,7 @@ def _config(where: str, value: Any, folder: Path) -> _System:
         if len(entries) > 1:
             raise ConfigError(f"{where}: {peer} is a peer, beside which nothing can be set")
         if peer.partition("?")[0] not in PEERS:
-            known = ", ".join(PEERS)
-            raise ConfigError(f"{where}.peer: unknown peer {peer!r} (known: {known})")
+            raise ConfigError(f"{where}.peer: unknown peer {peer!r}{nearest(peer, PEERS)}")
         return _System(Config(), peer=peer)
     base = entries.get("base", "default")
     if Path(base).suffix in (".yaml", ".yml"):
@@ -151,8 +151,9 @@ def _config(where: str, value: Any, folder: Path) -> _System:
     if solver and not is_factory(solver):
         if solver not in METHODS:
             raise ConfigError(
-                f"{where}.solver: unknown solver {solver!r}; expected {', '.join(METHODS)}, or "
-                "PACKAGE.MODULE:FACTORY; a preset or a configuration file (.yaml) is a 'base'"
+                f"{where}.solver: unknown solver {solver!r}{nearest(solver, METHODS, False)}; "
+                f"expected {', '.join(METHODS)}, or PACKAGE.MODULE:FACTORY; a preset or "
+                "a configuration file (.yaml) is a 'base'"
             )
         config = with_solver(config, parts.pop("solver"))
     return _System(_changed(config, f"{where}.set", changes), parts)
@@ -221,5 +222,5 @@ def _mapping(where: str, value: Any, known: tuple[str, ...] = ()) -> dict[str, A
                 f"{where}: expected names as keys, got {shown(key)}; put it in quotes"
             )
         if known and key not in known:
-            raise ConfigError(f"{where}: unknown key {key!r} (known: {', '.join(known)})")
+            raise ConfigError(f"{where}: unknown key {key!r}{nearest(key, known)}")
     return value

@@ -154,9 +154,22 @@ def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
 
 
 def test_poses_that_no_scan_fixes_are_told_in_one_line():
-    assert "not fixed" not in said("run", "sim:room?frames=3&columns=300", "--output", "room")
+    text = said("run", "sim:room?frames=3&columns=300", "--output", "room")
+    assert "not fixed" not in text
+    assert "weakly constrained" not in text
     text = said("run", "sim:open_field?frames=4&columns=300", "--output", "field")
-    assert "3 of 4 poses are not fixed by their scans (3 degenerate), first that of frame 1" in text
+    told = "DO NOT TRUST THIS RUN: 3 of 4 poses (75 %) are not fixed by their scans (3 degenerate)"
+    assert f"{told}, first that of frame 1; another sensor" in text
+    assert "weakly constrained: x, y, rz (3 directions)" in text
+    assert "rz in 3 frames, x in 3 frames, y in 3 frames (axes of the lidar)" in text
+
+
+def test_a_few_odd_frames_leave_a_run_in_trust(opens):
+    world = SimulatedWorld("room", frames=21, columns=300)
+    opens([*world, BadSweep(world[20].stamp + 1, "damaged")])
+    text = mapped()
+    assert "1 of 22 poses (5 %) are not fixed by their scans (1 unusable_scan)" in text
+    assert "DO NOT TRUST" not in text
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_peers_find_the_path(name, world, sweeps):
 
 def test_settings_are_checked(fake):
     for text, told in (
-        ("kiss-icp?voxels=1", r"unknown setting 'voxels' \(known: deskew, voxel\)"),
+        ("kiss-icp?voxels=1", r"unknown setting 'voxels'; did you mean 'voxel'\?"),
         ("kiss-icp?voxel=-1", "expected metres above 0, or scene"),
         ("kiss-icp?deskew=maybe", "expected true or false"),
         ("kiss-icp?deskew", "SETTING=VALUE"),

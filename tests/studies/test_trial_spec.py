@@ -102,7 +102,7 @@ GTSAM = "configs: {c: gtsam}\n"
         ("a: !!python/name:os.system x", "not valid YAML"),
         (ROOM, "configs: expected at least one"),
         (GTSAM, "sequences: expected at least one"),
-        (ROOM + GTSAM + "sede: [1]", "unknown key 'sede' (known: sequences, configs"),
+        (ROOM + GTSAM + "sede: [1]", "unknown key 'sede'; did you mean 'seeds'? (known: "),
         (ROOM + "configs: {c: gtsm}", "configs.c.solver: unknown solver 'gtsm'"),
         (ROOM + "configs: {c: {peer: kis-icp}}", "configs.c.peer: unknown peer 'kis-icp'"),
         (ROOM + "configs: {c: {base: lom}}", "configs.c.base: unknown preset 'lom'"),

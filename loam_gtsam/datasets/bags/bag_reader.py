@@ -14,6 +14,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from loam_gtsam.datasets.decode.pointcloud2 import decode_imu
 from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS, clean_imu
+from loam_gtsam.errors import nearest
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples
 
 MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_registered")
@@ -83,7 +84,10 @@ def choose_topic(
     listing = ", ".join(f"{name} ({what}, {count})" for name, (what, count) in topics.items())
     if asked is not None:
         if asked not in topics:
-            raise DatasetError(f"{path}: no topic {asked!r}; the bag has: {listing or 'none'}")
+            near = nearest(asked, topics, listing=False)
+            raise DatasetError(
+                f"{path}: no topic {asked!r}; the bag has: {listing or 'none'}{near}"
+            )
         if (what := topics[asked][0]) != kind:
             problem = f"topic {asked!r} is {what}, expected {kind}; the bag has: {listing}"
             raise DatasetError(f"{path}: {problem}")
@@ -93,6 +97,8 @@ def choose_topic(
         kinds = [what.lower() for what, _ in topics.values()]
         packets = any("packet" in k or (k.endswith("scan") and "laser" not in k) for k in kinds)
         hint = "; raw packets become PointCloud2 with the driver of the sensor" if packets else ""
+        if any("livox" in k for k in kinds):
+            hint += "; a Livox does not sweep rings, and cannot be used"
         there = f"the bag has: {listing or 'no messages'}{hint}"
         raise DatasetError(f"{path}: no topic of type {kind}; {there}")
     option = "--imu-topic" if kind.endswith("Imu") else "--topic"

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.errors import nearest
 from loam_gtsam.types import BoolArray, DatasetError, FloatArray
 
 SWEEP_SECONDS = (0.02, 1.0)
@@ -126,7 +127,8 @@ def check_time_options(unit: str | None, stamp_is: str | None) -> None:
     """Raise DatasetError unless both options are known."""
     for name, value, known in (("time_unit", unit, _NANOSECONDS), ("stamp_is", stamp_is, ANCHORS)):
         if value is not None and value not in known:
-            raise DatasetError(f"{name}: expected one of {', '.join(known)}; got {value!r}")
+            near = nearest(value, known, listing=False)
+            raise DatasetError(f"{name}: expected one of {', '.join(known)}; got {value!r}{near}")
 
 
 def _fitting_unit(low: float, high: float, span: float, field: str) -> str:

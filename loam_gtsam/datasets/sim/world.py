@@ -19,6 +19,7 @@ from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.streets import Scene, build_avenue
+from loam_gtsam.errors import nearest
 from loam_gtsam.geometry import as_stamps, inverse_pose
 from loam_gtsam.types import (
     ConfigError,
@@ -271,7 +272,8 @@ def _seconds(stamps: IntArray) -> FloatArray:
 
 def _one_of(name: str, value: str, names: Collection[str]) -> None:
     if value not in names:
-        raise ConfigError(f"{name}: expected one of {', '.join(names)}; got {value!r}")
+        near = nearest(value, names, listing=False)
+        raise ConfigError(f"{name}: expected one of {', '.join(names)}; got {value!r}{near}")
 
 
 def _whole_at_least(least: int, **values: int | None) -> None:

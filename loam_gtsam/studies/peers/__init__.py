@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from urllib.parse import parse_qsl
 
+from loam_gtsam.errors import nearest
 from loam_gtsam.studies.peers.base import Inertial as Inertial
 from loam_gtsam.studies.peers.base import Peer as Peer
 from loam_gtsam.studies.peers.base import PeerError as PeerError
@@ -30,7 +31,7 @@ def make_peer(text: str, imu: Inertial | None = None) -> Peer:
     """
     name, _, query = text.partition("?")
     if name not in PEERS:
-        raise PeerError(f"unknown peer {name!r} (known: {', '.join(sorted(PEERS))})")
+        raise PeerError(f"unknown peer {name!r}{nearest(name, PEERS)}")
     try:
         settings = dict(parse_qsl(query, strict_parsing=bool(query)))
     except ValueError as error:

@@ -13,6 +13,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from loam_gtsam.errors import nearest
 from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, LoamError, MapUpdate, Trajectory
 
 _FAR = 99.0  # per cent of the ranges of a sweep that are within the range of a scene
@@ -146,8 +147,7 @@ def _checked(peer: str, knobs: Mapping[str, Any], settings: Mapping[str, Any]) -
     values = dict(knobs)
     for key, value in settings.items():
         if key not in knobs:
-            known = ", ".join(knobs) or "none"
-            raise PeerError(f"{peer}: unknown setting {key!r} (known: {known})")
+            raise PeerError(f"{peer}: unknown setting {key!r}{nearest(key, knobs)}")
         values[key] = _value(f"{peer}: {key}", knobs[key], value)
     return values
 

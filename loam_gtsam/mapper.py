@@ -12,8 +12,7 @@ from typing import Any
 
 import gtsam
 
-from loam_gtsam.config import Config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, as_config
 from loam_gtsam.errors import own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck

@@ -11,8 +11,7 @@ from typing import Any, TypedDict, TypeVar, Unpack
 
 import gtsam
 
-from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, dump_config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, as_config, dump_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed

@@ -25,6 +25,7 @@ from loam_gtsam.config.sections import SolverConfig as SolverConfig
 from loam_gtsam.config.tree import PRESETS as PRESETS
 from loam_gtsam.config.tree import SMALL as SMALL
 from loam_gtsam.config.tree import Config as Config
+from loam_gtsam.config.tree import as_config as as_config
 from loam_gtsam.config.tree import config_from_dict as config_from_dict
 from loam_gtsam.config.tree import config_to_dict as config_to_dict
 from loam_gtsam.config.tree import dump_config as dump_config

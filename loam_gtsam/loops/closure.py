@@ -15,8 +15,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.config import Config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, as_config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure

@@ -11,8 +11,7 @@ from copy import deepcopy
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, as_config
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, ScanLoopCloser

@@ -12,8 +12,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, as_config
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph

@@ -9,8 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike
 
-from loam_gtsam.config import Config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, as_config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import as_points, voxel_filter
 from loam_gtsam.registration.association import associate

@@ -15,8 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from loam_gtsam.config import Config
-from loam_gtsam.config.tree import as_config
+from loam_gtsam.config import Config, as_config
 from loam_gtsam.datasets.decode.loam_messages import StampMatcher
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream, decode_imu
 from loam_gtsam.errors import own_code

@@ -19,6 +19,7 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buffer
+from loam_gtsam.refine.map_quality import map_quality
 from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Sweep, SweepError
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
@@ -35,6 +36,7 @@ _ADVICE = {
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _MESSAGES, _TRIED_SWEEPS = 3, 5
+_VOXELS = 4  # of the map along the edge of a cell in which a plane is looked for
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
 
@@ -57,6 +59,7 @@ def summary(
         "weakly constrained": _weak_axes(result),
         "path": f"{path:.1f} m",
         "map": f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points",
+        "map, planes": _thickness(result),
         "map, dropped": _dropped(result),
         "accuracy": _accuracy(accuracy),
         "loops": "" if result.loops is None else _loops(result.loops.counts()),
@@ -98,6 +101,13 @@ def _weak_axes(result: RunResult) -> str:
     return f"{found} (axes of the lidar)" if found else ""
 
 
+def _thickness(result: RunResult) -> str:
+    """How thick the planes of the map are: what no truth is needed for."""
+    size = _VOXELS * result.config.map.plane_voxel
+    quality = map_quality(result.plane_points, voxel=size, radius=0.5 * size)
+    return f"{1e3 * quality.thickness:.1f} mm thick (sigma)" if quality.planes else ""
+
+
 def _dropped(result: RunResult) -> str:
     lost = sum(stats.get("dropped_points", 0) for stats in result.map_stats.values())
     return f"{lost} points; see map.archive_megabytes, map.archive_dir" if lost else ""
@@ -111,6 +121,8 @@ def _accuracy(accuracy: Mapping[str, Any]) -> str:
     text = f"ATE {error:.3f} m{share}, at most {accuracy['ate_max_m']:.3f} m"
     if "not_fitted_rmse_m" in accuracy:
         text += f"; {accuracy['not_fitted_rmse_m']:.3f} m if not fitted"
+    if accuracy.get("nees") is not None:
+        text += f"; NEES {accuracy['nees']:.2f} a degree of freedom (1 is consistent)"
     if accuracy.get("ok_beyond_five_sigma"):
         text += f"; {accuracy['ok_beyond_five_sigma']} frames ok are off by more than 5 told sigma"
     return text

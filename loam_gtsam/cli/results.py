@@ -19,7 +19,15 @@ from loam_gtsam.loops.files import write_graph
 from loam_gtsam.maps.map_file import SUFFIX, save_map
 from loam_gtsam.pipeline import RunResult, effective_config
 from loam_gtsam.studies import evaluation
-from loam_gtsam.types import FrameStatus, InputError, LoamError, OutputError, Trajectory
+from loam_gtsam.types import (
+    FloatArray,
+    FrameStatus,
+    InputError,
+    IntArray,
+    LoamError,
+    OutputError,
+    Trajectory,
+)
 from loam_gtsam.view import frame_plot, plots
 from loam_gtsam.view.observers import LastFrame
 
@@ -108,8 +116,19 @@ class Results:
             frame_plot.plot_frame(folder / frame, last.frame(), last.around())
         plots.plot_timings(folder / timings, run.updates)
         if self.error is not None:
-            plots.plot_errors(folder / ERROR_PLOT, self.error.stamps, self.error.translations)
+            error = self.error.stamps, self.error.translations
+            plots.plot_errors(folder / ERROR_PLOT, *error, self._told())
         return [name for name in (*PLOT_FILES, ERROR_PLOT) if (folder / name).exists()]
+
+    def _told(self) -> tuple[IntArray, FloatArray, FloatArray] | None:
+        """Stamps, errors and told standard deviations; None with loops, which change the poses."""
+        if self.truth is None or self.run.loops is not None:
+            return None
+        with suppress(InputError):  # positions alone
+            nees = evaluation.nees(self.run.updates, self.truth)
+            stamps = np.array([self.run.updates[n].stamp for n in nees.frames], np.int64)
+            return stamps, nees.errors, nees.sigmas
+        return None
 
 
 def _without_fit(run: RunResult, truth: Trajectory) -> dict[str, float]:

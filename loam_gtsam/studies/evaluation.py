@@ -6,7 +6,7 @@ positions alone (GPS) has NaN as its orientations; what needs them is then NaN o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -255,11 +255,15 @@ class Nees:
         ends of the window
     squared : (N,) squared Mahalanobis distances of the errors; infinite where the covariance is
         not positive definite
+    errors, sigmas : (N, 6) errors in rad and m, in the tangent at the pose, and the standard
+        deviations that were told of them
     """
 
     mean: float
     frames: IntArray
     squared: FloatArray
+    errors: FloatArray
+    sigmas: FloatArray
 
     @property
     def beyond(self) -> IntArray:
@@ -295,11 +299,14 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
     chosen = [updates[n] for n in inside]
     truth = interpolate(reference, np.array([update.stamp for update in chosen], np.int64))
     _need_orientation("nees", truth.map_T_lidar)
-    found = squared_errors(chosen, [gtsam.Pose3(pose) for pose in truth.map_T_lidar], window)
-    squared = np.array(list(found.values()), np.float64)
+    found = dict(_errors(chosen, [gtsam.Pose3(pose) for pose in truth.map_T_lidar], window))
+    squared = np.array([_mahalanobis(*pair) for pair in found.values()], np.float64)
+    errors = np.array([error for error, _ in found.values()]).reshape(-1, 6)
+    variances = np.array([np.diag(covariance) for _, covariance in found.values()]).reshape(-1, 6)
     finite = squared[np.isfinite(squared)]
     mean = float(finite.mean()) / FREEDOM if len(finite) else np.nan
-    return Nees(mean, np.array([inside[k] for k in found], np.int64), squared)
+    numbers = np.array([inside[k] for k in found], np.int64)
+    return Nees(mean, numbers, squared, errors, np.sqrt(np.maximum(variances, 0.0)))
 
 
 def squared_errors(
@@ -309,7 +316,13 @@ def squared_errors(
 
     ``true`` are the poses of the updates; the window is that of :func:`nees`.
     """
-    found = {}
+    return {k: _mahalanobis(*pair) for k, pair in _errors(updates, true, window)}
+
+
+def _errors(
+    updates: Sequence[MapUpdate], true: Sequence[gtsam.Pose3], window: int
+) -> Iterator[tuple[int, tuple[FloatArray, FloatArray]]]:
+    """Errors (6,) and covariances (6, 6), by the index of the later frame."""
     for k in range(window or 1, len(updates)):
         start = k - window if window else 0
         before, now = updates[start], updates[k]
@@ -317,9 +330,7 @@ def squared_errors(
             continue
         covariance = relative_covariance(before, now) if window else now.covariance
         moved = before.map_T_lidar.between(now.map_T_lidar)
-        error = moved.localCoordinates(true[start].between(true[k]))
-        found[k] = _mahalanobis(error, covariance)
-    return found
+        yield k, (moved.localCoordinates(true[start].between(true[k])), covariance)
 
 
 def _mahalanobis(error: FloatArray, covariance: FloatArray) -> float:

@@ -17,10 +17,14 @@ _ASIDE_DEG, _ABOVE_DEG = 28.0, 33.0  # of the view: beside the sensor's back, ab
 _MAP, _SWEEP = "#b9c3cc", "#6b7a88"
 _ENLARGED = 10.0  # factor for residuals and the ellipse of the covariance
 _SIGMAS = 3.0
+_UNSEEN = 0.35  # of the reach; what is enlarged to more than this hides the frame: an arrow instead
 
 
 def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     """Draw a frame from behind and above: map, sweep, and matches by their residuals.
+
+    Along directions in which the position is hardly known there is an arrow with the size of the
+    uncertainty, and the ellipse is that of the others.
 
     Raises OutputError if matplotlib is missing or the file cannot be written.
     """
@@ -49,21 +53,37 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     path_seen = camera(camera.near(around.path)).T
     axes.plot(*path_seen, color="white", lw=3.5)
     axes.plot(*path_seen, color=PATH, lw=2.0)
-    axes.fill(*camera.ellipse(frame.position_covariance).T, color=INK, lw=0)
+    ellipse, unseen = camera.uncertainty(frame.position_covariance)
+    axes.fill(*ellipse.T, color=INK, lw=0)
+    for end, sigma in unseen:
+        _draw_unseen(axes, end, sigma)
     axes.plot(0.0, 0.0, "o", color=PATH, mec="white", ms=8)
     bar = figure.colorbar(
-        dots, cax=axes.inset_axes((0.02, 0.09, 0.24, 0.022)), orientation="horizontal", extend="max"
-    )
+        dots, ax=axes, location="bottom", extend="max", shrink=0.3, aspect=24, pad=0.01,
+        anchor=(0.0, 1.0),
+    )  # fmt: skip
     bar.set_label(
-        f"residual [standard deviations]\nlines and {_SIGMAS:g}-sigma ellipse: {_ENLARGED:g} x",
-        color=INK,
-    )
+        f"residual [standard deviations]; lines and {_SIGMAS:g}-sigma ellipse: {_ENLARGED:g} x",
+        color=INK, loc="left",
+    )  # fmt: skip
     bar.ax.tick_params(colors=INK, length=0, labelsize=9)
     bar.outline.set_visible(False)
     reach = camera.reach
     axes.set(xlim=(-reach, reach), ylim=(-0.62 * reach, 0.72 * reach), aspect="equal")
     axes.axis("off")
     save_figure(figure, path)
+
+
+def _draw_unseen(axes: Any, end: FloatArray, sigma: float) -> None:
+    """A double arrow along a direction in which the position is known to ``sigma`` metres."""
+    size = np.format_float_positional(_SIGMAS * sigma, 2, fractional=False, trim="-")
+    look = {"arrowstyle": "<|-|>", "color": INK, "lw": 2.2, "shrinkA": 0, "shrinkB": 0}
+    axes.annotate("", xy=tuple(end), xytext=tuple(-end), arrowprops=look)
+    axes.annotate(
+        f"weakly constrained:\n±{size} m (3 sigma)", xy=tuple(end),
+        xytext=(8, 0), textcoords="offset points", color=INK, va="center", fontsize=10,
+        bbox={"fc": "white", "ec": "none", "alpha": 0.85, "pad": 2.0},
+    )  # fmt: skip
 
 
 class _Camera:
@@ -85,10 +105,22 @@ class _Camera:
         across: FloatArray = (points - self._centre) @ self._axes.T
         return across
 
-    def ellipse(self, covariance: FloatArray) -> FloatArray:
-        """(N, 2) outline of 3 sigma, enlarged, around the sensor; empty if it is not known."""
+    def uncertainty(
+        self, covariance: FloatArray
+    ) -> tuple[FloatArray, list[tuple[FloatArray, float]]]:
+        """The ellipse, and (2,) ends of arrows with sigmas in metres where it would hide all."""
         if not np.isfinite(covariance).all():
-            return np.zeros((0, 2))
+            return np.zeros((0, 2)), []
+        variances, directions = np.linalg.eigh(covariance)
+        sigmas = np.sqrt(np.maximum(variances, 0.0))
+        wide = _SIGMAS * _ENLARGED * sigmas > _UNSEEN * self.reach
+        kept = (directions * np.where(wide, 0.0, variances)) @ directions.T
+        arrows = directions[:, wide].T @ self._axes.T * (_UNSEEN * self.reach)
+        arrows *= np.where(arrows[:, :1] < 0.0, -1.0, 1.0)  # labels at the right end
+        return self._ellipse(kept), list(zip(arrows, sigmas[wide].tolist(), strict=True))
+
+    def _ellipse(self, covariance: FloatArray) -> FloatArray:
+        """(N, 2) outline of 3 sigma, enlarged, around the sensor."""
         variances, axes = np.linalg.eigh(self._axes @ covariance @ self._axes.T)
         angles = np.linspace(0.0, 2.0 * np.pi, 61)
         half = _SIGMAS * _ENLARGED * np.sqrt(np.maximum(variances, 0.0))

@@ -26,12 +26,20 @@ _RUN_COLOURS = ("#e4572e", "#2f6db3", "#2e9e6b", "#8e5bb5", "#c9920e", "#17a2b8"
 _RUN_LINES = tuple((colour, style) for style in ("-", "--", ":") for colour in _RUN_COLOURS)
 """Colour and style of the line of a run, in the order of the runs."""
 _DPI = 110
-_HEIGHT_COLOURS = ("#cfdbe3", "#8fc1c9", "#3f8fa6", "#27568a", "#1d2350")
-"""Pale ground, dark walls: what stands out of the ground stands out of the page."""
+_HEIGHT_COLOURS = ("#9fb6c1", "#63adb3", "#2b86a6", "#2b5796", "#2a2463")
+"""Pale ground, dark walls, none so pale that it is lost on white, or so dark that on black."""
+_OVERHEAD = (1.5, 0.3)
+"""Metres from the path, and above it, within which and from which on something is overhead."""
+_LAYER = (0.25, 0.12)
+"""Metres, height of a layer, and share of the occupied cells of that size that have their highest
+point in one layer if it is a ceiling. Walls and fences fill lines of cells, ceilings areas."""
 _MAX_BYTES = 300_000  # larger pictures get fewer colours: they are for READMEs and reports
 _PALETTE = 255
 _LEGEND_COLUMNS = 4
 _MAP_CELLS = 700  # along the longer side of the top view; a picture has about as many pixels
+_WIDE = 0.45  # height over width of a map below which its colour bar lies under it
+_MOST_WAY = 500  # poses of the path that are looked above
+_HIGHEST = 6.5  # inches
 _MIN_CELL = 0.1  # metres; the map is voxel-filtered: smaller cells would be mostly empty
 
 
@@ -76,31 +84,89 @@ def plot_map(
     planes: NDArray[np.floating],
     trajectory: Trajectory | None = None,
 ) -> None:
-    """Draw the map from above, coloured by height, with the path.
+    """Draw the map from above, coloured by height, with the path; indoors without the ceiling.
 
     ``edges`` and ``planes`` are (E, 3) and (P, 3) metres, map frame.
     """
-    figure = empty_figure(9.0, 7.0)
-    axes = figure.subplots()
     points = np.concatenate((edges, planes)).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
-    if len(points):
-        bar = figure.colorbar(_top_view(axes, points), ax=axes, shrink=0.55, aspect=30, pad=0.02)
-        bar.set_label("height [m]")
+    way = np.zeros((0, 3)) if trajectory is None else trajectory.map_T_lidar[:, :3, 3]
+    seen = _below_ceiling(points, way)
+    note = "" if len(seen) == len(points) else ", without the ceiling"
+    spread = np.concatenate((seen, way))[:, :2]
+    width, depth = 1.0, 1.0
+    if len(spread):
+        width, depth = np.ptp(np.percentile(spread, (0.2, 99.8), axis=0), axis=0)
+    share = float(np.clip(depth / max(width, 1e-6), 0.08, 3.0))
+    high = min(8.2 * share, _HIGHEST)  # inches of the axes
+    figure = empty_figure(min(9.0, high / share + 1.8), high + 1.2)
+    axes = figure.subplots()
+    if len(seen):
+        wide = share < _WIDE
+        where, shrink = ("bottom", 0.4) if wide else ("right", 0.6)
+        how = {"location": where, "shrink": shrink, "aspect": 30, "pad": 0.02}
+        bar = figure.colorbar(_top_view(axes, seen), ax=axes, **how)
+        bar.set_label(f"height [m]{note}")
         bar.outline.set_visible(False)
-    if trajectory is not None and len(trajectory):
-        _draw_path(axes, trajectory.map_T_lidar[:, :3, 3])
+    if len(way):
+        _draw_path(axes, way)
     axes.set_aspect("equal")
     axes.margins(0.02)
+    axes.locator_params(axis="y", nbins=max(1, round(2.0 * high)), steps=[1, 2, 5, 10])
     axes.set(xlabel="x [m]", ylabel="y [m]")
     save_figure(figure, path)
 
 
-def plot_errors(path: str | Path, stamps: IntArray, errors: FloatArray) -> None:
-    """Draw how far positions are off the truth, (N,) metres, over stamps, (N,) nanoseconds."""
-    figure = empty_figure(9.0, 3.2)
-    axes = figure.subplots()
+def _below_ceiling(points: FloatArray, way: FloatArray) -> FloatArray:
+    """The points that are not above the middle between the path and the ceiling over it.
+
+    There is a ceiling if something is overhead along more than half of the path, or if a good part
+    of the map has its highest points in one layer.
+    """
+    if not len(points) or not len(way):
+        return points
+    from scipy.spatial import cKDTree
+
+    way = way[:: max(1, len(way) // _MOST_WAY)]
+    away, nearest = cKDTree(way[:, :2]).query(points[:, :2])
+    above = points[:, 2] - way[nearest, 2]
+    high: BoolArray = above > _OVERHEAD[1]
+    over = high & (away < _OVERHEAD[0])
+    if len(np.unique(nearest[over])) > len(way) // 2:
+        low: BoolArray = above < 0.5 * float(np.percentile(above[over], 10))
+        return points[low]
+    size, share = _LAYER
+    order = np.argsort(above, kind="stable")[::-1]
+    cells = np.floor(points[order, :2] / size).astype(np.int64)
+    _, first = np.unique(cells, axis=0, return_index=True)
+    tops = above[order][first]
+    layers = np.round(tops[tops > _OVERHEAD[1]] / size).astype(np.int64)
+    counts = np.bincount(layers) if len(layers) else np.zeros(1, np.int64)
+    if counts.max() < share * len(tops):
+        return points
+    low = above < 0.5 * size * float(counts.argmax())
+    return points[low]
+
+
+def plot_errors(
+    path: str | Path,
+    stamps: IntArray,
+    errors: FloatArray,
+    told: tuple[IntArray, FloatArray, FloatArray] | None = None,
+) -> None:
+    """Draw how far positions are off the truth, over time, and below it what was told of that.
+
+    Parameters
+    ----------
+    stamps, errors : (N,) nanoseconds and metres
+    told : (M,) nanoseconds, (M, 6) errors since the start (rad, m) and their standard deviations;
+        None draws none
+    """
+    figure = empty_figure(9.0, 3.2 if told is None else 7.6)
+    axes, *rows = [figure.subplots()] if told is None else _error_panels(figure)
     seconds = (stamps - stamps[0]) * 1e-9 if len(stamps) else stamps
+    if told is not None and len(stamps):
+        _draw_told(rows, told, int(stamps[0]))
     axes.fill_between(seconds, errors, color=PATH, alpha=0.15, lw=0)
     axes.plot(seconds, errors, color=PATH, lw=1.4)
     rmse = float(np.sqrt(np.mean(errors**2))) if len(errors) else 0.0
@@ -109,6 +175,37 @@ def plot_errors(path: str | Path, stamps: IntArray, errors: FloatArray) -> None:
     axes.legend(frameon=False)
     axes.set(xlabel="time [s]", ylabel="position error [m]")
     save_figure(figure, path)
+
+
+def _error_panels(figure: Any) -> list[Any]:
+    """A panel over the whole width, and six below it: positions left, rotations right."""
+    grid = figure.add_gridspec(4, 2, height_ratios=(1.5, 1.0, 1.0, 1.0))
+    places = [grid[0, :], *(grid[row, column] for column in (1, 0) for row in (1, 2, 3))]
+    return [figure.add_subplot(place) for place in places]
+
+
+def _draw_told(
+    panels: Sequence[Any], told: tuple[IntArray, FloatArray, FloatArray], start: int
+) -> None:
+    """Errors by component in the band of three standard deviations that were told of them."""
+    stamps, errors, sigmas = told
+    seconds = (stamps - start) * 1e-9
+    for k, (axes, name) in enumerate(zip(panels, ("rx", "ry", "rz", "x", "y", "z"), strict=True)):
+        unit, factor = ("deg", np.degrees(1.0)) if k < 3 else ("m", 1.0)
+        error, band = factor * errors[:, k], factor * 3.0 * sigmas[:, k]
+        axes.fill_between(seconds, -band, band, color=TRUTH, alpha=0.35, lw=0, label="±3 sigma")
+        axes.plot(seconds, error, color=PATH, lw=1.1, label="error")
+        # A band as wide as an unseen direction would flatten the error to a line.
+        high = max(
+            float(np.abs(error).max(initial=0.0)), float(np.median(band)) if len(band) else 0
+        )
+        axes.set_ylim(-1.3 * high - 1e-12, 1.3 * high + 1e-12)
+        axes.set_ylabel(f"{name} [{unit}]")
+        if k % 3 == 2:
+            axes.set_xlabel("time [s]")
+        else:
+            axes.tick_params(labelbottom=False)
+    panels[3].legend(frameon=False, ncols=2, fontsize=8, loc="upper left")
 
 
 def plot_loops(
@@ -263,7 +360,7 @@ def _top_view(axes: Any, points: FloatArray) -> Any:
     height = np.full(columns * rows, np.nan)
     order = np.argsort(points[:, 2], kind="stable")
     height[flat[order]] = points[order, 2]  # the last one written, the highest, stays
-    opacity = np.clip(0.4 + 0.3 * np.log1p(count), 0.0, 1.0) * (count > 0)
+    opacity = np.clip(0.55 + 0.25 * np.log1p(count), 0.0, 1.0) * (count > 0)
     return axes.imshow(
         height.reshape(rows, columns),
         alpha=opacity.reshape(rows, columns),

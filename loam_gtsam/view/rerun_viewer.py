@@ -28,6 +28,8 @@ _SIGMAS = 3.0
 _SWEEP, _MAP_EDGE, _MAP_PLANE = (220, 226, 232), (150, 160, 172), (96, 106, 118)
 _EDGE, _PLANE, _PATH = (228, 87, 46), (63, 143, 166), (228, 87, 46)
 _LOOP_ON, _LOOP_OFF, _ELLIPSOID = (46, 158, 107), (194, 34, 47), (238, 202, 59)
+_AXIS_COLOURS = {"x": (214, 64, 69), "y": (46, 158, 107), "z": (63, 108, 201)}
+_AXES = 0.5  # metres, of the origin of the lidar
 _MOST_PATH = 2_000  # points of the trajectory that are drawn at most
 _FINE = (FrameStatus.OK, FrameStatus.FIRST)
 
@@ -80,7 +82,10 @@ class RerunViewer(ClosingWriter):
             self._file.opened()
             self._streams.append(stream)
         self._log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        self._log("map/lidar", self._rr.TransformAxes3D(2.0), static=True)
+        self._log("map/lidar", self._rr.TransformAxes3D(_AXES), static=True)
+        for axis, colour in _AXIS_COLOURS.items():
+            line = self._rr.SeriesLines(colors=[colour], names=[axis], widths=[2.0])
+            self._log(f"frame/sigma_mm/{axis}", line, static=True)
 
     def show(self, frame: FrameView, around: Callable[[], MapView]) -> None:
         """Draw a frame; every tenth with the map, which ``around`` makes.

@@ -97,6 +97,10 @@ def test_errors_are_drawn_over_time(tmp_path):
     visualization.plot_errors(tmp_path / "none.png", stamps[:0], np.zeros(0))
     assert has_colour(tmp_path / "a.png", visualization.PATH)
     assert not has_colour(tmp_path / "none.png", visualization.PATH)
+    told = stamps, np.full((50, 6), 0.001), np.full((50, 6), 0.002)
+    visualization.plot_errors(tmp_path / "told.png", stamps, np.full(50, 0.003), told)
+    sizes = [image.imread(tmp_path / name).shape[0] for name in ("a.png", "told.png")]
+    assert sizes[1] > 1.5 * sizes[0]
 
 
 def test_loops_are_drawn_in_the_last_panel_only(tmp_path):
@@ -114,7 +118,7 @@ def test_loops_are_drawn_in_the_last_panel_only(tmp_path):
 def seen(residuals: np.ndarray, **changes) -> FrameView:
     rng = np.random.default_rng(0)
     points = rng.uniform(-12.0, 12.0, (len(residuals), 3))
-    covariance, sweep = np.diag([0.04, 0.04, 0.04]), rng.uniform(-12.0, 12.0, (3000, 3))
+    covariance, sweep = np.diag([0.0025, 0.0025, 0.0025]), rng.uniform(-12.0, 12.0, (3000, 3))
     values = {"position_covariance": covariance, "sweep": sweep, "residuals": residuals}
     features = dict.fromkeys(("edges", "planes", "points", "feet"), points)
     return frame(0, **(values | features | changes))
@@ -131,10 +135,31 @@ def test_a_frame_shows_its_matches_by_their_residuals(tmp_path):
         plot_frame(tmp_path / f"{name}.png", seen(residuals), NO_MAP)
         shown[name] = [has_colour(tmp_path / f"{name}.png", colour, 600) for colour in colours]
     assert shown == {"good": [True, False], "bad": [False, True]}
-    assert has_colour(tmp_path / "bad.png", visualization.INK, 300)  # the ellipse
+    assert has_colour(tmp_path / "bad.png", visualization.INK, 4000)  # the ellipse
     bare = seen(np.zeros(0), sweep=np.zeros((0, 3)), position_covariance=np.full((3, 3), np.nan))
     plot_frame(tmp_path / "bare.png", bare, NO_MAP)
-    assert not has_colour(tmp_path / "bare.png", visualization.INK, 300)
+    assert not has_colour(tmp_path / "bare.png", visualization.INK, 4000)
+
+
+def test_a_direction_that_is_not_seen_hides_nothing(tmp_path):
+    shown = seen(np.zeros(300), position_covariance=np.diag([25.0, 0.0025, 0.0025]))
+    plot_frame(tmp_path / "f.png", shown, NO_MAP)
+    assert has_colour(tmp_path / "f.png", RESIDUAL_COLOURS[0], 600)
+    assert not has_colour(tmp_path / "f.png", visualization.INK, 30_000)
+
+
+def test_a_map_of_a_room_has_no_ceiling_and_one_of_a_street_has_its_walls():
+    rng = np.random.default_rng(0)
+    floor = np.column_stack([rng.uniform(-4, 4, (4000, 2)), np.full(4000, -1.0)])
+    roof, way = [*floor, 0.0, 0.0, 3.0], circle().map_T_lidar[:, :3, 3] * 0.1
+    far = roof[np.linalg.norm(roof[:, :2], axis=1) > 3.6]  # as with beams that rise little
+    for high in (roof, far):
+        points = np.concatenate([floor, high])
+        assert visualization._below_ceiling(points, way).shape == floor.shape
+        assert visualization._below_ceiling(points, way[:0]).shape == points.shape
+    wall = np.column_stack([np.full(900, 4.0), rng.uniform(-4, 4, 900), rng.uniform(-1, 3, 900)])
+    street = np.concatenate([floor, wall])
+    assert visualization._below_ceiling(street, way).shape == street.shape
 
 
 def test_timings_show_a_colour_per_stage(tmp_path):

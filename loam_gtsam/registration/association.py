@@ -27,8 +27,8 @@ _TINY = 1e-9
 _MORE = 2
 """Times as many neighbours are searched for where those of one side are wanted: a wall has two."""
 _ROUGH, _WRONG = 2.0, 4.0
-"""A plane is rough if a neighbour lies farther off than twice the median of the sweep's planes, which
-of flat ones with noise less than one in ten do. It is wrong by four times what is beyond that."""
+"""A plane is rough if a neighbour lies farther off than twice the median of the sweep's planes, as
+less than one in ten of flat ones do by noise. It is wrong by four times what is beyond that."""
 _SURE = 2.0
 """Standard deviations beyond which a difference is none of noise (95 %)."""
 

@@ -310,6 +310,10 @@ class LocaliseOptions(OutputOptions, PartOptions):
     """Options of ``localise``."""
 
     map: Path = argument("MAP", "A map (.lgmap) that a run wrote, or the folder of its results.")
+    extend: bool = flag(
+        "Add what the map does not have yet, and write the larger map to DIR/map.lgmap; MAP stays.",
+        "--extend",
+    )
     frames: int | None = option("Stop after so many sweeps.", min=1)
     workers: int | None = option(
         "Processes that extract features ahead; by default one for more than 200 sweeps.",

@@ -31,8 +31,8 @@ from loam_gtsam.view import plots
 
 _LISTED = 10  # at most, of the loops that are switched off
 LOCALISED_FILES = (
-    "trajectory.tum", "trajectory_covariance.csv", "run.npz", "config.yaml", "localised.png",
-    "summary.json",
+    "trajectory.tum", "trajectory_covariance.csv", "run.npz", "config.yaml", MAP_FILE,
+    "localised.png", "summary.json",
 )  # fmt: skip
 
 
@@ -104,13 +104,16 @@ def localise_in_map(options: LocaliseOptions) -> int:
             with console.frame_progress(dataset.name, total, stop, quiet=options.quiet) as on_frame:
                 found = localise(
                     dataset, saved, config, max_frames=options.frames, on_frame=on_frame,
-                    workers=worker_count(options.workers, total), **options.parts(config),
+                    workers=worker_count(options.workers, total), extend=options.extend,
+                    **options.parts(config),
                 )  # fmt: skip
             if not found.updates:
                 raise DatasetError(f"{dataset.name}: no sweeps in it; see loam-gtsam inspect")
             summary = _summary(found, dataset, path) | {"seconds": time.perf_counter() - started}
 
             def write(target: Path) -> list[str]:
+                if options.extend:
+                    found.localizer.save(target / MAP_FILE)
                 return _write(target, found, saved, summary, draws=plot)
 
             files = console.write_results(folder, LOCALISED_FILES, "summary.json", write)
@@ -155,8 +158,8 @@ def _write(
     write_npz(folder / LOCALISED_FILES[2], found.updates)
     write_text(folder / LOCALISED_FILES[3], dump_config(found.config))
     if draws:
-        plots.plot_map(folder / LOCALISED_FILES[4], *saved.points(), found.trajectory)
-    write_json(folder / LOCALISED_FILES[5], summary)
+        plots.plot_map(folder / "localised.png", *saved.points(), found.trajectory)
+    write_json(folder / "summary.json", summary)
     return [name for name in LOCALISED_FILES if (folder / name).exists()]
 
 

@@ -6,6 +6,7 @@ and headings. One sweep is not believed: :mod:`loam_gtsam.maps.hypotheses` follo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -14,9 +15,9 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
-from loam_gtsam.maps.frozen import FrozenMaps
-from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
@@ -52,13 +53,14 @@ class PlaceSearch:
 
     Parameters
     ----------
-    saved, maps : the map and its cubes
+    places : of the map
+    maps : its cubes
     config : of the mapper
     """
 
-    def __init__(self, saved: SavedMap, maps: FrozenMaps, config: Config) -> None:
-        self._saved, self._maps, self._config = saved, maps, config
-        keys = [heading_free_key(place.descriptor.astype(np.float64)) for place in saved.places]
+    def __init__(self, places: Sequence[Place], maps: SavedMaps, config: Config) -> None:
+        self._places, self._maps, self._config = places, maps, config
+        keys = [heading_free_key(place.descriptor.astype(np.float64)) for place in places]
         self._tree = cKDTree(np.array(keys).reshape(-1, config.loops.rings))
         near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
         self._solver = GtsamSolver(config.solver.changed(**near))
@@ -72,7 +74,7 @@ class PlaceSearch:
         is that of its features.
         """
         edges, planes = posed.points
-        if not self._saved.places or not len(edges) + len(planes):
+        if not self._places or not len(edges) + len(planes):
             return []
         found: list[Candidate] = []
         starts = self._starts(np.concatenate([edges, planes]))
@@ -108,7 +110,7 @@ class PlaceSearch:
 
     def _starts(self, points: FloatArray) -> list[gtsam.Pose3]:
         """Poses at the places that look most alike."""
-        own, places = scan_context(points, self._config.loops), self._saved.places
+        own, places = scan_context(points, self._config.loops), self._places
         _, near = self._tree.query(heading_free_key(own), k=min(_ALIKE, len(places)))
         compared = []
         for number in np.sort(np.atleast_1d(near)).tolist():

@@ -9,7 +9,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, same, standing_fit
-from loam_gtsam.maps.frozen import FrozenMaps
+from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
@@ -90,12 +90,8 @@ class Hypotheses:
     config : of the mapper
     """
 
-    def __init__(self, search: PlaceSearch, maps: FrozenMaps, config: Config) -> None:
+    def __init__(self, search: PlaceSearch, maps: SavedMaps, config: Config) -> None:
         self._search, self._maps, self._config = search, maps, config
-        self.forget()
-
-    def forget(self) -> None:
-        """Begin anew."""
         self._held: list[Hypothesis] = []
 
     def add(

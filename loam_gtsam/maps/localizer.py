@@ -12,6 +12,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from pathlib import Path
 from typing import Unpack
 
 import gtsam
@@ -24,9 +25,9 @@ from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, time
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.maps.first_fix import PlaceSearch
-from loam_gtsam.maps.frozen import FrozenMaps
 from loam_gtsam.maps.hypotheses import Hypotheses
-from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.maps.map_file import SavedMap, write_map
+from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import (
@@ -57,6 +58,7 @@ class Localizer:
     config : of the sensor, the solver and so on; what belongs to the map (``map``, and the
         descriptor in ``loops``) is that of the map. That of the map's run if None.
     imu : samples must be in it before the sweeps they belong to; None does without
+    extend : add what the map does not have yet, to be saved by :meth:`save`
     parts : of a user's own, see :class:`~loam_gtsam.pipeline.Parts`, for the tracking
 
     Attributes
@@ -77,6 +79,7 @@ class Localizer:
         config: Config | None = None,
         *,
         imu: ImuBuffer | None = None,
+        extend: bool = False,
         **parts: Unpack[Parts],
     ) -> None:
         if not saved.places:
@@ -84,23 +87,29 @@ class Localizer:
                 f"{saved.path}: the map has no places at which it can be recognised: its run was "
                 "too short, or never solved; map more of the place"
             )
-        self.config = config_in(saved, config)
+        self.config = config_in(saved, config, extend=extend)
         self._saved, self._imu, self._parts = saved, imu, parts
+        self._extend = extend
         positions = [place.map_T_middle.translation() for place in saved.places]
         self._tree = cKDTree(np.array(positions))
-        self._maps = FrozenMaps(self.config, saved)
-        search = PlaceSearch(saved, self._maps, self.config)
-        self._hypotheses = Hypotheses(search, self._maps, self.config)
         self.reset()
 
     def reset(self) -> None:
-        """Forget where the lidar is."""
-        self._tracking: Pipeline | None = None
+        """Forget where the lidar is, and what was added to the map."""
+        self._maps = SavedMaps(self.config, self._saved, keep=self._extend)
+        self._places = list(self._saved.places)
+        self._search()
         self._last: MapUpdate | None = None  # that was solved
         self._seen: MapUpdate | None = None  # that was solved in all directions
         self._unsolved = 0
         self.fixes = 0
-        self._hypotheses.forget()
+
+    def _search(self) -> None:
+        """Look for the lidar in the whole map, as it is now."""
+        self._maps.grows = False
+        search = PlaceSearch(self._places, self._maps, self.config)
+        self._hypotheses = Hypotheses(search, self._maps, self.config)
+        self._tracking: Pipeline | None = None
 
     @property
     def fixed(self) -> bool:
@@ -126,8 +135,8 @@ class Localizer:
             update = self._tracking.process(sweep, extraction)
             if not self._given_up(update):
                 return self._told(update)
-            self._tracking = None
-            self._hypotheses.forget()
+            self._add_places()
+            self._search()
         features = sweep.features if isinstance(sweep, FeatureSweep) else None
         if extraction is not None:
             features = extraction.features
@@ -149,7 +158,7 @@ class Localizer:
 
     def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:
         """Track from a fix on."""
-        self._hypotheses.forget()
+        self._maps.grows = self._extend
         tracking = Pipeline(self.config, imu=self._imu, **self._parts)
         tracking.mapper.maps = self._maps
         tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
@@ -168,8 +177,10 @@ class Localizer:
         if update.uncertainty is None or not update.status.solved:
             return update
         self._last = update
-        own = update.uncertainty.own
-        if update.status is FrameStatus.OK:
+        own = update.covariance if self._extend else update.uncertainty.own
+        if self._extend:
+            pass  # the drift since the fix is in it
+        elif update.status is FrameStatus.OK:
             self._seen = update
         elif self._seen is not None:  # what no scan saw since then has drifted
             own = relative_covariance(self._seen, update)
@@ -177,8 +188,24 @@ class Localizer:
         of_map = from_map @ self.map_covariance(update.map_T_lidar) @ from_map.T
         return replace(update, covariance=symmetric(own + of_map))
 
+    def _add_places(self) -> None:
+        """Take over places of new ground; the error of the map before is in theirs, too."""
+        if self._tracking is None or not self._extend:
+            return
+        least = self.config.pose_graph.keyframe_distance
+        for place in self._tracking.places.all:
+            pose = place.map_T_middle
+            if all(pose.range(other.map_T_middle) >= least for other in self._places):
+                covariance = place.covariance + self.map_covariance(pose)
+                self._places.append(replace(place, covariance=covariance))
+
+    def save(self, path: str | Path) -> None:
+        """Write the map with what was added to it; see :func:`~loam_gtsam.maps.save_map`."""
+        self._add_places()
+        write_map(path, self._maps, self._places, self._saved.config, self._saved.up)
+
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
-        """(6, 6) of the map's own error at a pose, along the axes of the map, about its origin."""
+        """(6, 6) of the saved map's own error at a pose, along its axes, about its origin."""
         position = map_T_lidar.translation()
         near = self._tree.query_ball_point(position, _AROUND)
         number = min(near) if near else int(self._tree.query(position)[1])
@@ -190,8 +217,8 @@ def own_settings(saved: SavedMap) -> Config:
     return saved.config.changed(sensor=SensorConfig(), imu=ImuConfig())
 
 
-def config_in(saved: SavedMap, config: Config | None) -> Config:
-    """The configuration of a mapper in a saved map."""
+def config_in(saved: SavedMap, config: Config | None, *, extend: bool = False) -> Config:
+    """The configuration of a mapper in a saved map, which it may extend."""
     config, own = config or saved.config, saved.config
     shape = {name: getattr(own.loops, name) for name in ("rings", "sectors", "reach")}
     window = tuple(n + 2 * _MARGIN for n in own.map.neighbourhood)
@@ -199,7 +226,8 @@ def config_in(saved: SavedMap, config: Config | None) -> Config:
     return config.changed(
         map=cubes,
         loops=config.loops.changed(enabled=False, **shape),
-        covariance=config.covariance.changed(drift=0.0),  # no ground is new
+        # No ground is new, unless the map is extended.
+        covariance=config.covariance if extend else config.covariance.changed(drift=0.0),
     )
 
 
@@ -213,12 +241,14 @@ class Localisation:
     updates : one per sweep
     fixes : number of times that the pose was found by a search in the whole map
     interrupted : stopped (Ctrl-C) before the data set ended
+    localizer : as it is after the last sweep
     """
 
     config: Config
     updates: Sequence[MapUpdate]
     fixes: int
-    interrupted: bool = False
+    interrupted: bool
+    localizer: Localizer
 
     @property
     def status_counts(self) -> dict[str, int]:
@@ -245,6 +275,7 @@ def localise(
     max_frames: int | None = None,
     on_frame: OnFrame | None = None,
     workers: int = 0,
+    extend: bool = False,
     **parts: Unpack[Parts],
 ) -> Localisation:
     """Localise a data set in a saved map.
@@ -256,7 +287,7 @@ def localise(
     max_frames : stop after so many sweeps
     on_frame : e.g. to show progress
     workers : processes that extract the features of the sweeps to come
-    parts : see :class:`Localizer`
+    extend, parts : see :class:`Localizer`
 
     Returns
     -------
@@ -264,7 +295,8 @@ def localise(
         On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
     """
     config = effective_config(config or own_settings(saved), dataset)
-    localizer = Localizer(saved, config, imu=imu_buffer(dataset, config), **parts)
+    imu = imu_buffer(dataset, config)
+    localizer = Localizer(saved, config, imu=imu, extend=extend, **parts)
     if parts.get("features") is not None:
         workers = 0
     updates: list[MapUpdate] = []
@@ -278,4 +310,4 @@ def localise(
                 on_frame(len(updates) - 1, updates[-1])
     except KeyboardInterrupt:
         interrupted = True
-    return Localisation(localizer.config, updates, localizer.fixes, interrupted)
+    return Localisation(localizer.config, updates, localizer.fixes, interrupted, localizer)

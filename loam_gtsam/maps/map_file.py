@@ -12,6 +12,7 @@ import io
 import json
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -27,6 +28,7 @@ from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.types import DatasetError, FloatArray, IntArray, stack_poses
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex
@@ -60,18 +62,32 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
     maps = pipeline.mapper.maps if loops is None else loops.corrected_maps()
     if loops is not None:
         places = corrected(places, loops)
-    contents = {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
     aid = pipeline.mapper.imu
     level = None if aid is None else aid.level
+    write_map(path, maps, places, pipeline.config, None if level is None else level.map_up)
+
+
+def write_map(
+    path: str | Path,
+    maps: MapPair,
+    places: Sequence[Place],
+    config: Config,
+    up: FloatArray | None,
+) -> None:
+    """Write maps and places; ``config`` is that of the maps, ``up`` (3,) is up in them, if known.
+
+    Raises OutputError as :func:`save_map`.
+    """
+    contents = {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
     header = {
         "format": _FORMAT,
         "version": VERSION,
         "made_by": f"loam_gtsam {installed_version()}",
         "frame": {
             "origin": "first sweep of the run, at its reference time",
-            "up": None if level is None else level.map_up.tolist(),
+            "up": None if up is None else up.tolist(),
         },
-        "config": dump_config(pipeline.config),
+        "config": dump_config(config),
         "places": len(places),
         "layers": {
             name: [[*index, len(cube.points)] for index, cube in cubes.items()]
@@ -245,7 +261,7 @@ def corrected(places: list[Place], loops: LoopMapping) -> list[Place]:
     return found
 
 
-def _place_arrays(places: list[Place]) -> dict[str, NDArray[Any]]:
+def _place_arrays(places: Sequence[Place]) -> dict[str, NDArray[Any]]:
     poses = stack_poses(place.map_T_middle for place in places)
     stamps: IntArray = np.array([place.stamp for place in places], np.int64)
     covariances: FloatArray = np.array([p.covariance for p in places], np.float64)

@@ -44,10 +44,10 @@ class MapPair:
     Attributes
     ----------
     small : whether the place is small, so that the maps with small voxels are in use
-    frozen : whether sweeps never go into the maps
+    given : whether the maps were there before the first sweep
     """
 
-    frozen = False
+    given = False
 
     def __init__(self, config: Config) -> None:
         self._configs = config, config.of_small_places()

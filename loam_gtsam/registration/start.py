@@ -85,8 +85,8 @@ class Start:
 
     @classmethod
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
-        """The start of a map; None if no sweep is de-skewed anew, or none goes into the map."""
-        begins = maps.config.deskew.refine and not maps.frozen
+        """The start of a map; None if no sweep is de-skewed anew, or the map is there already."""
+        begins = maps.config.deskew.refine and not maps.given
         return cls(first, keyframe) if begins else None
 
     @property

@@ -12,12 +12,13 @@ import pytest
 from support.cli import loam
 from support.rooms_map import FRAMES, Mapped, world
 
+from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.maps.first_fix import Candidate
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, Hypothesis
 from loam_gtsam.maps.localizer import Localizer, localise
-from loam_gtsam.maps.map_file import SavedMap
-from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.maps.map_file import SavedMap, save_map
+from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.types import BadSweep, FrameStatus, InputError, MapUpdate
 
@@ -40,8 +41,9 @@ def errors(mapped: Mapped, drive, updates):
     return [u.map_T_lidar.localCoordinates(p) for u, p in zip(updates, poses, strict=True)]
 
 
-def test_a_drive_is_found_and_tracked_and_the_covariance_knows_the_maps_error(mapped, saved):
-    before = mapped.path.read_bytes()
+def test_a_drive_is_found_and_tracked_with_the_maps_error_in_its_covariance(
+    mapped, saved, tmp_path
+):
     drive = other_drive(mapped)
     found = localise(drive, saved)
     assert found.fixes == 1
@@ -59,11 +61,12 @@ def test_a_drive_is_found_and_tracked_and_the_covariance_knows_the_maps_error(ma
         assert np.linalg.eigvalsh(update.covariance - update.uncertainty.own)[0] > -1e-12
     assert np.mean(with_map) < 2.0
     assert np.mean(without) > 2.0  # what the map's error is left out of
-    assert mapped.path.read_bytes() == before
+    found.localizer.save(tmp_path / "same.lgmap")
+    assert (tmp_path / "same.lgmap").read_bytes() == mapped.path.read_bytes()
 
 
 def test_nothing_is_found_in_the_map_of_another_place(saved):
-    found = localise(world("park", seed=3, frames=12), saved)
+    found = localise(world("park", seed=3, frames=7), saved)
     assert (found.fixes, found.solved) == (0, [])
     assert {update.status for update in found.updates} == {FrameStatus.LOST}
     assert all(update.message.startswith("no fix: ") for update in found.updates)
@@ -163,6 +166,35 @@ def test_a_fix_needs_that_no_other_place_fits_nearly_as_well(agreement, rivals, 
     assert len(hypotheses._rivals(None, features, held)) == count
 
 
+def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path):
+    """The first third of a drive is mapped; a second drive adds the rest."""
+    short, long = tmp_path / "short.lgmap", tmp_path / "long.lgmap"
+    result = run(PartOf(mapped.world, 0, 1, None, 1.0), mapped.result.config)
+    save_map(short, result.pipeline)
+    drive = other_drive(mapped)
+    with SavedMap(short) as saved:
+        found = localise(drive, saved, extend=True)
+        found.localizer.save(long)
+        with SavedMap(long) as larger:
+            assert len(larger) > 1.2 * len(saved)
+            for layer, cubes in saved.layers.items():
+                for index in cubes:
+                    old = {tuple(row) for row in saved.cube(layer, index).points.tolist()}
+                    new = {tuple(row) for row in larger.cube(layer, index).points.tolist()}
+                    assert old <= new  # no point is moved or lost
+            assert len(larger.places) > len(saved.places)
+            added = larger.places[len(saved.places) :]
+            for place in added:
+                here = place.map_T_middle.inverse().AdjointMap()
+                errors_of = [here @ p.covariance @ here.T for p in (saved.places[-1], place)]
+                assert np.trace(errors_of[1]) >= np.trace(errors_of[0])
+            last = Localizer(larger)
+            updates = [last.process(drive.sweep(n)) for n in range(FRAMES - 6, FRAMES)]
+    off = errors(mapped, drive, [*found.solved, *(u for u in updates if u.status.solved)])
+    assert max(np.linalg.norm(error[3:]) for error in off) < NEAR
+    assert updates[-1].status is FrameStatus.OK
+
+
 def test_a_map_without_places_is_refused(saved):
     saved.places = []
     with pytest.raises(InputError, match="no places"):
@@ -172,12 +204,14 @@ def test_a_map_without_places_is_refused(saved):
 def test_the_command_localises_in_the_map_that_a_run_wrote(mapped, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spec = "sim:rooms?seed=1&frames=10&columns=450"
-    done = loam("localise", spec, mapped.path, "--output", "out", "--no-plot")
+    done = loam("localise", spec, mapped.path, "--output", "out", "--no-plot", "--extend")
     assert done.exit_code == 0, done.output
     assert "found 1 times" in done.output
     summary = json.loads(Path("out/summary.json").read_text())
     assert (summary["frames"], summary["fixes"], summary["first_fix_frame"]) == (10, 1, SWEEPS)
     assert len(Path("out/trajectory_covariance.csv").read_text().splitlines()) == 11 - SWEEPS
+    with SavedMap("out/map.lgmap") as larger, SavedMap(mapped.path) as saved:
+        assert len(larger) >= len(saved)
     elsewhere = loam("localise", "sim:park?frames=5&columns=450", mapped.path, "--output", "no",
                      "--no-plot", "--quiet")  # fmt: skip
     assert elsewhere.exit_code == 1

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from loam_gtsam.io.run_files import write_run
-from loam_gtsam.maps.frozen import FrozenMaps
 from loam_gtsam.maps.localizer import config_in
 from loam_gtsam.maps.map_file import LAYERS, SavedMap, save_map
+from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.types import DatasetError, OutputError
 
 
@@ -66,7 +66,7 @@ def test_cubes_are_read_where_the_lidar_is(mapped, saved, monkeypatch):
 
     monkeypatch.setattr(SavedMap, "cube", counted)
     config = config_in(saved, None)
-    maps = FrozenMaps(config, saved)
+    maps = SavedMaps(config, saved)
     in_reach = sum(len(cubes) for cubes in saved.layers.values())
     assert len(read) == in_reach  # a small map
     far = mapped.result.updates[0].map_T_lidar.matrix()[:3, 3] + [5000.0, 0.0, 0.0]

@@ -1,0 +1,111 @@
+"""The maps of a mapper that were in a file before the first sweep."""
+
+from __future__ import annotations
+
+import gtsam
+
+from loam_gtsam.config import Config
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.maps.map_file import LAYERS, SavedMap
+from loam_gtsam.registration.frame_matcher import MapPair
+from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.voxels.archive import Archive
+from loam_gtsam.voxels.cubes import Cube, CubePoints
+from loam_gtsam.voxels.grid import CubeIndex, Grid
+
+
+class SavedCubes(Archive):
+    """The cubes of one layer of a saved map, read when they are taken.
+
+    ``keep`` tells whether a cube that is stored stays as it is then, in memory; else it is read
+    again when it is next taken.
+    """
+
+    def __init__(self, grid: Grid, saved: SavedMap, layer: str, *, keep: bool) -> None:
+        super().__init__(grid, float("inf"), None)
+        self._saved, self._layer, self._keep = saved, layer, keep
+        self._out: frozenset[CubeIndex] = frozenset()  # of the file, that were taken
+
+    def __len__(self) -> int:
+        return len(self.indices())
+
+    def indices(self) -> list[CubeIndex]:
+        """Cubes of the file that are not taken, and those that are kept."""
+        there = (index for index in self._saved.layers[self._layer] if index not in self._out)
+        return [*there, *super().indices()]
+
+    def count(self) -> int:
+        """Points in them."""
+        counts = self._saved.layers[self._layer]
+        there = sum(count for index, count in counts.items() if index not in self._out)
+        return there + super().count()
+
+    def store(self, index: CubeIndex, content: CubePoints) -> None:
+        """Take a cube back."""
+        if self._keep:
+            super().store(index, content)
+        else:
+            self._out -= {index}
+
+    def read(self, index: CubeIndex) -> CubePoints | None:
+        """Points of a cube; DatasetError if the file is damaged."""
+        if index in self._saved.layers[self._layer] and index not in self._out:
+            return self._saved.cube(self._layer, index)
+        return super().read(index)
+
+    def take(self, index: CubeIndex) -> Cube | None:
+        """Take a cube out, which then is not there until it is stored."""
+        if index not in self._saved.layers[self._layer] or index in self._out:
+            return super().take(index)
+        cube = Cube.of(self._saved.cube(self._layer, index), self._grid)
+        self._out |= {index}
+        return cube
+
+
+class SavedMaps(MapPair):
+    """A saved map in the place of a mapper's own; the mapper then finds its poses in it.
+
+    Parameters
+    ----------
+    config : as of the mapper; its ``map`` must have the voxels and cubes of the saved map
+    saved : must stay open
+    keep : whether what goes into the map stays there
+
+    Attributes
+    ----------
+    grows : whether sweeps go into the maps now; off until it is set
+    """
+
+    given = True
+
+    def __init__(self, config: Config, saved: SavedMap, *, keep: bool = False) -> None:
+        self._saved, self._keep = saved, keep
+        self.grows = False
+        super().__init__(config)
+
+    def clear(self) -> None:
+        """Read anew what is needed."""
+        maps = []
+        for layer, config in zip(LAYERS, [c for c in self._configs for _ in "ep"], strict=True):
+            size = config.map.edge_voxel if layer.endswith("edges") else config.map.plane_voxel
+            grid = Grid(config.map.cube_size, size)
+            archive = SavedCubes(grid, self._saved, layer, keep=self._keep)
+            maps.append(CubeMap(config.map, size, archive if len(archive) else None))
+        self._open, self._small = (maps[0], maps[1]), (maps[2], maps[3])
+        self._thinned = None
+
+    def insert(
+        self,
+        posed: PosedSweep,
+        map_T_middle: gtsam.Pose3,
+        keyframe: int,
+        matches: ScanMatches | None = None,
+    ) -> None:
+        """Add a sweep, if the map grows."""
+        if self.grows:
+            super().insert(posed, map_T_middle, keyframe, matches)
+
+    def move(self, *_: object) -> int:
+        """Nothing: the map stays where it is."""
+        return 0

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.config import Config, ImuConfig, SensorConfig
+from loam_gtsam.config import Config, ImuConfig, SensorConfig, SolverConfig
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
 from loam_gtsam.geometry import symmetric
@@ -43,7 +43,7 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
-_MARGIN = 2  # cubes between the sensor's neighbourhood and the end of what is read
+_BEYOND = 1  # cubes that are read on each side of those around the sensor
 _AROUND = 10.0
 """Metres around a pose in which the earliest place tells the map's error: voxels keep the points
 that were first in them, and a later visit was registered to these."""
@@ -71,6 +71,8 @@ class Localizer:
     ------
     InputError
         If the map has no places at which it can be recognised.
+    ConfigError
+        If the configured solver has no place for factors of the IMU, or of a user's own.
     """
 
     def __init__(
@@ -88,8 +90,8 @@ class Localizer:
                 "too short, or never solved; map more of the place"
             )
         self.config = config_in(saved, config, extend=extend)
-        self._saved, self._imu, self._parts = saved, imu, parts
-        self._extend = extend
+        self._saved, self._parts, self._extend = saved, parts, extend
+        self._tracking = Pipeline(self.config, imu=imu, **parts)
         positions = [place.map_T_middle.translation() for place in saved.places]
         self._tree = cKDTree(np.array(positions))
         self.reset()
@@ -107,14 +109,16 @@ class Localizer:
     def _search(self) -> None:
         """Look for the lidar in the whole map, as it is now."""
         self._maps.grows = False
-        search = PlaceSearch(self._places, self._maps, self.config)
-        self._hypotheses = Hypotheses(search, self._maps, self.config)
-        self._tracking: Pipeline | None = None
+        # A fix needs to know which directions are seen, which not every solver tells.
+        config = self.config.changed(solver=SolverConfig())
+        search = PlaceSearch(self._places, self._maps, config)
+        self._hypotheses = Hypotheses(search, self._maps, config)
+        self._fixed = False
 
     @property
     def fixed(self) -> bool:
         """Whether the pose is known."""
-        return self._tracking is not None
+        return self._fixed
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Localise one sweep; what it contains never raises, see the status of the result.
@@ -131,7 +135,7 @@ class Localizer:
         """
         if isinstance(sweep, Scan) and extraction is None:
             extraction = extract(sweep, self.config, self._parts.get("features"))
-        if self._tracking is not None:
+        if self._fixed:
             update = self._tracking.process(sweep, extraction)
             if not self._given_up(update):
                 return self._told(update)
@@ -159,10 +163,10 @@ class Localizer:
     def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:
         """Track from a fix on."""
         self._maps.grows = self._extend
-        tracking = Pipeline(self.config, imu=self._imu, **self._parts)
-        tracking.mapper.maps = self._maps
-        tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
-        self._tracking, self._unsolved = tracking, 0
+        self._tracking.reset()
+        self._tracking.mapper.maps = self._maps
+        self._tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
+        self._fixed, self._unsolved = True, 0
         self.fixes += 1
         again = "" if self.fixes == 1 else " again"
         return self._told(replace(fix, message=f"found in the map{again}"))
@@ -190,7 +194,7 @@ class Localizer:
 
     def _add_places(self) -> None:
         """Take over places of new ground; the error of the map before is in theirs, too."""
-        if self._tracking is None or not self._extend:
+        if not (self._fixed and self._extend):
             return
         least = self.config.pose_graph.keyframe_distance
         for place in self._tracking.places.all:
@@ -214,15 +218,18 @@ class Localizer:
 
 def own_settings(saved: SavedMap) -> Config:
     """The configuration of the run that made a map, for a sensor that may be another one."""
-    return saved.config.changed(sensor=SensorConfig(), imu=ImuConfig())
+    other = ImuConfig()
+    mounted = {"lidar_t_imu": other.lidar_t_imu, "lidar_R_imu_deg": other.lidar_R_imu_deg}
+    return saved.config.changed(sensor=SensorConfig(), imu=saved.config.imu.changed(**mounted))
 
 
 def config_in(saved: SavedMap, config: Config | None, *, extend: bool = False) -> Config:
     """The configuration of a mapper in a saved map, which it may extend."""
     config, own = config or saved.config, saved.config
     shape = {name: getattr(own.loops, name) for name in ("rings", "sectors", "reach")}
-    window = tuple(n + 2 * _MARGIN for n in own.map.neighbourhood)
-    cubes = own.map.changed(window=window, window_margin=_MARGIN, archive_dir=None)
+    window = tuple(n + 2 * _BEYOND for n in own.map.neighbourhood)
+    margin = max(own.map.neighbourhood) // 2
+    cubes = own.map.changed(window=window, window_margin=margin, archive_dir=None)
     return config.changed(
         map=cubes,
         loops=config.loops.changed(enabled=False, **shape),

@@ -12,6 +12,7 @@ import pytest
 from support.cli import loam
 from support.rooms_map import FRAMES, Mapped, world
 
+from loam_gtsam.config import preset
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.maps.first_fix import Candidate
@@ -20,7 +21,7 @@ from loam_gtsam.maps.localizer import Localizer, localise
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.relocalization import Fit
-from loam_gtsam.types import BadSweep, FrameStatus, InputError, MapUpdate
+from loam_gtsam.types import BadSweep, ConfigError, FrameStatus, InputError, MapUpdate
 
 NEAR = 0.06  # metres, of a pose in the map
 
@@ -193,6 +194,22 @@ def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path):
     off = errors(mapped, drive, [*found.solved, *(u for u in updates if u.status.solved)])
     assert max(np.linalg.norm(error[3:]) for error in off) < NEAR
     assert updates[-1].status is FrameStatus.OK
+
+
+def test_the_classical_systems_track_too_from_a_fix_of_the_default_solver(mapped, saved):
+    """Which do not tell the directions that are seen."""
+    config = preset("aloam").changed(imu=saved.config.imu.changed(coupling="off"))
+    found = localise(PartOf(other_drive(mapped), 0, 1, None, 0.55), saved, config)
+    assert found.fixes == 1
+    assert found.config.solver.method == "aloam"
+    off = errors(mapped, other_drive(mapped), found.solved)
+    assert max(np.linalg.norm(error[3:]) for error in off) < NEAR
+
+
+def test_parts_that_do_not_go_together_are_refused_at_once(mapped, saved):
+    config = preset("loam").changed("imu.prior=equivalent")
+    with pytest.raises(ConfigError, match=r"imu\.prior"):
+        localise(mapped.world, saved, config)
 
 
 def test_a_map_without_places_is_refused(saved):

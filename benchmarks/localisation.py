@@ -47,7 +47,7 @@ class Row:
     starts, right, wrong : first sweeps of the second drive, and the fixes
     sweeps_to_fix, most_sweeps : median and most
     tracked : sweeps that were tracked, from a further start
-    rms_mm, aligned_mm : error of the position in the frame of the map; after alignment
+    rms_mm, aligned_mm : error of the position in the frame of the map; less its mean, in lidar axes
     nees, nees_without : over six freedoms, with and without the map's own error
     elsewhere, elsewhere_fixes : starts in a world of another seed, and fixes, which are all wrong
     """
@@ -112,10 +112,11 @@ def measure(
             elsewhere = first_fixes(saved, other, start, there, seed)
     right = [sweeps for sweeps, is_right in found if is_right]
     positions = errors[:, 3:]
+    spread = positions - positions.mean(axis=0) if len(positions) else positions
     return Row(
         world, seed, starts, len(right), len(found) - len(right),
         float(np.median(right)) if right else np.nan, max(right, default=0),
-        len(errors), 1e3 * _rms(positions), 1e3 * _rms(positions - positions.mean(axis=0)),
+        len(errors), 1e3 * _rms(positions), 1e3 * _rms(spread),
         nees, without, there, len(elsewhere),
     )  # fmt: skip
 

@@ -24,6 +24,7 @@ from loam_gtsam.config import (
     parse_config,
     preset,
 )
+from loam_gtsam.config.completion import completions
 from loam_gtsam.types import ConfigError
 
 FIELDS = [
@@ -318,3 +319,20 @@ def test_an_unreadable_file_is_a_config_error(tmp_path):
         with pytest.raises(ConfigError, match="cannot read the configuration") as caught:
             load_config(path)
         assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kind", "begun", "offered"),
+    [
+        ("sensor", "os1-1", ["os1-16", "os1-128"]),
+        ("preset", "a", ["aloam"]),
+        ("solver", "", ["gtsam", "loam", "aloam"]),
+        ("set", "solver.iter", ["solver.iterations="]),
+        ("set", "solver.method=l", ["solver.method=loam"]),
+        ("set", "loops.enabled=", ["loops.enabled=true", "loops.enabled=false"]),
+        ("set", "solver.iterations=", []),
+        ("set", "solvr.method=", []),
+    ],
+)
+def test_the_shell_completes_names_and_values(kind, begun, offered):
+    assert completions(kind, begun) == offered

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 from collections.abc import Callable
 from dataclasses import MISSING, dataclass, field, fields, replace
@@ -12,6 +13,7 @@ import typer
 
 if TYPE_CHECKING:  # the help of a command needs neither GTSAM nor SciPy
     from loam_gtsam.config import Config
+    from loam_gtsam.config.completion import Kind
     from loam_gtsam.datasets.base import Dataset
     from loam_gtsam.pipeline import Parts
     from loam_gtsam.studies.contenders import Contender
@@ -22,6 +24,12 @@ _TYPER = "typer"
 def option(help: str, *names: str, default: Any = None, **how: Any) -> Any:
     """A field that is an option of a command, with the further arguments of typer.Option."""
     return field(default=default, metadata={_TYPER: typer.Option(*names, help=help, **how)})
+
+
+def _known(kind: Kind) -> Callable[[str], list[str]]:
+    """The ``autocompletion`` of an option; imports nothing before it is asked."""
+    module = "loam_gtsam.config.completion"
+    return lambda incomplete: list(importlib.import_module(module).completions(kind, incomplete))
 
 
 def flag(help: str, *names: str) -> Any:
@@ -119,11 +127,12 @@ class SourceOptions(Options):
         metavar="NUMBERS",
     )
     sensor: str | None = option(
-        "Sensor model (sensor.model): vlp16, hdl32, hdl64, os1-16, os1-32, os1-64 or os1-128."
+        "Model: vlp16, hdl32, hdl64, os1-16, -32, -64 or -128.", autocompletion=_known("sensor")
     )
     overrides: list[str] | None = option(
-        "Change one value; may be given repeatedly.", "--set", metavar="SECTION.KEY=VALUE"
-    )
+        "Change one value; may be given repeatedly.", "--set",
+        metavar="SECTION.KEY=VALUE", autocompletion=_known("set"),
+    )  # fmt: skip
 
     def dataset(self) -> Dataset:
         """Open the data set."""
@@ -160,7 +169,9 @@ class SourceOptions(Options):
 class InspectOptions(SourceOptions):
     """A data set and a configuration."""
 
-    preset: str | None = option("Named configuration to start from: default, loam or aloam.")
+    preset: str | None = option(
+        "Configuration to start from: default, loam or aloam.", autocompletion=_known("preset")
+    )
     config: Path | None = option("YAML configuration.", metavar="FILE")
 
     def settings(self, otherwise: Config | None = None) -> Config:
@@ -216,7 +227,9 @@ class PartOptions(InspectOptions):
     """Parts of a user's own; each is made by a function of one argument, the configuration."""
 
     solver: str | None = option(
-        "gtsam, loam or aloam (solver.method), or a solver of your own.", metavar=f"NAME|{_FACTORY}"
+        "gtsam, loam or aloam (solver.method), or a solver of your own.",
+        metavar=f"NAME|{_FACTORY}",
+        autocompletion=_known("solver"),
     )
     features: str | None = option("A front end of your own.", metavar=_FACTORY)
     odometry: str | None = option("A prediction of your own.", metavar=_FACTORY)

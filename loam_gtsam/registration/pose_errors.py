@@ -19,6 +19,7 @@ from loam_gtsam.registration.solvers import MotionError, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 from loam_gtsam.types import (
     FloatArray,
+    FrameStatus,
     InputError,
     MapUpdate,
     SweepMotion,
@@ -38,16 +39,18 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     The covariance for a factor between two poses: the own errors of both frames and the drift of
     the map between them. The drift before is common to both poses and cancels.
 
-    Both are solved frames of one run. Returns (6, 6), tangent order of the package, perturbation on
-    the right: along the axes of the later frame.
+    Both are frames of one run, the later one solved, the earlier one too or the first: the map
+    begins there, and its pose has no error in it. Returns (6, 6), tangent order of the package,
+    perturbation on the right: along the axes of the later frame.
 
     Raises
     ------
     InputError
         If a frame was not solved, or ``later`` is not later than ``earlier``.
     """
+    begins = earlier.status is FrameStatus.FIRST
     for name, update in (("earlier", earlier), ("later", later)):
-        if update.uncertainty is None:
+        if update.uncertainty is None and not (begins and update is earlier):
             raise InputError(
                 f"{name}: expected a frame that was solved, got one with status {update.status}; "
                 "choose another one"
@@ -56,6 +59,8 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
         raise InputError(
             f"later: expected a stamp after {earlier.stamp}, got {later.stamp}; swap the two"
         )
+    if begins:
+        return later.covariance.copy()
     first, second = earlier.uncertainty, later.uncertainty
     assert first is not None
     assert second is not None

@@ -25,9 +25,9 @@ from loam_gtsam.pipeline import Observer, Pipeline
 from loam_gtsam.registration.odometry import Odometry
 from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
-from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checked_stamp
+from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checked_stamp, sample_rows
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
-from loam_gtsam.types import DatasetError, InputError, MapUpdate, Sweep
+from loam_gtsam.types import DatasetError, ImuSamples, InputError, MapUpdate, Scan, Sweep
 
 _POLL = 0.02  # seconds after which a worker looks whether a sweep has waited for long enough
 
@@ -128,6 +128,16 @@ class LiveMapper:
             self._log.received["cloud"] += 1
             self._enqueue(received, message)
 
+    def add_scan(self, scan: Scan, received: int | None = None) -> None:
+        """Queue a sweep that is no message: whatever there is a driver for, without ROS.
+
+        ``received`` is in nanoseconds of the clock; None is now. Raises InputError if it is no
+        Scan, or this run is one of LOAM's topics.
+        """
+        if not isinstance(scan, Scan):
+            raise InputError(f"add_scan: expected a Scan, got {type(scan).__name__}")
+        self.add_cloud(scan, received)
+
     def add_features(self, topic: str, message: Any, received: int | None = None) -> None:
         """Take a message of LOAM's front end; those whose stamps agree to 5 ms make a sweep.
 
@@ -151,10 +161,16 @@ class LiveMapper:
                 self._enqueue(received, group)
 
     def add_imu(self, message: Any) -> None:
-        """Take a ``sensor_msgs/Imu``; ignored if no IMU is used."""
+        """Take a ``sensor_msgs/Imu`` or :class:`~loam_gtsam.ImuSamples`; ignored without an IMU."""
         if self._imu is None:
             return
         with self._lock:
+            if isinstance(message, ImuSamples):
+                for row in sample_rows(message):
+                    self._log.received["imu"] += 1
+                    self._imu.add(row)
+                self._news.set()
+                return
             self._log.received["imu"] += 1
             try:
                 checked_stamp(message)

@@ -84,8 +84,11 @@ class SweepDecoder:
                 after = 0.5 * self._config.imu.average_seconds
                 needs = sweep.features.stamp + int(np.ceil(after * 1e9)) + 1
                 return ReadySweep(sweep, received, needs)
-            checked_stamp(content)
-            scan = self._clouds.decode(content)
+            if isinstance(content, Scan):
+                scan = content
+            else:
+                checked_stamp(content)
+                scan = self._clouds.decode(content)
         # Whatever a faulty message makes a decoder stumble over: the next one may be good.
         except Exception as error:
             kind = "" if isinstance(error, LoamError) else f"{type(error).__name__}: "
@@ -185,6 +188,15 @@ class LiveImu:
         if self._scale is None:
             self._scale = STANDARD_GRAVITY if is_in_g(acceleration) else 1.0
         self.buffer.add(ImuSamples(stamps, orientation, gyro, acceleration * self._scale))
+
+
+def sample_rows(samples: ImuSamples) -> list[Row]:
+    """Finite samples one by one; without an orientation, their quaternion is none."""
+    none = np.zeros((len(samples.stamps), 4))
+    turns = none if samples.orientation is None else samples.orientation
+    values = np.column_stack([turns, samples.gyro, samples.acceleration])
+    pairs = zip(samples.stamps.tolist(), values, strict=True)
+    return [(stamp, tuple(row.tolist())) for stamp, row in pairs if np.isfinite(row).all()]
 
 
 def checked_stamp(message: Any) -> int:

@@ -34,7 +34,7 @@ def test_the_version_is_that_of_the_project_file_everywhere() -> None:
 COMPLETED = [
     ("loam-gtsam ins", "inspect"),
     ("loam-gtsam run --over", "--overwrite"),
-    ("loam-gtsam run --ba", "--bag"),
+    ("loam-gtsam run --sensor vl", "vlp16"),
 ]
 
 

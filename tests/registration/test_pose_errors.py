@@ -114,6 +114,10 @@ def test_every_solved_frame_has_its_covariances(moving):
     assert first.status is FrameStatus.FIRST
     assert first.uncertainty is None
     assert np.isnan(first.covariance).all()
+    # The map begins at the first frame: its pose has no error there.
+    np.testing.assert_array_equal(relative_covariance(first, others[0]), others[0].covariance)
+    with pytest.raises(InputError, match="later: expected a stamp after"):
+        relative_covariance(first, first)
     for earlier, update in pairwise(others):
         assert update.uncertainty.follows == earlier.stamp
         for matrix in (update.covariance, update.uncertainty.own,

@@ -10,6 +10,7 @@ import time
 from array import array
 from collections import deque
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -44,7 +45,7 @@ from loam_gtsam.datasets.bags.bag_reader import Message
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.loops.keyframes import LoopClosure
-from loam_gtsam.pipeline import Pipeline, RunResult, imu_buffer, run
+from loam_gtsam.pipeline import Pipeline, RunResult, effective_config, imu_buffer, run
 from loam_gtsam.registration.odometry import make_odometry
 from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.ros.live import LiveMapper, LiveResult
@@ -698,6 +699,23 @@ def test_axes_that_cannot_be_told_yet_are_told_by_a_later_sweep() -> None:
 def test_options_that_contradict_each_other_are_errors(options: Any, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         LiveMapper(**options)
+
+
+def test_sweeps_and_samples_need_no_messages() -> None:
+    world = SimulatedWorld("room", frames=3, columns=300)
+    expected = run(world)
+    hurried = count(0, 10**10).__next__  # nothing waits for samples that never come
+    live = LiveMapper(effective_config(Config(), world), imu=True, clock=hurried)
+    live.add_imu(world.imu)
+    updates = []
+    for scan in world:
+        live.add_scan(scan)
+        while (result := live.step()) is not None:
+            updates.append(result.update)
+    np.testing.assert_allclose(poses(updates), poses(expected.updates), atol=1e-9)
+    assert live.report().received["imu"] == len(world.imu.stamps)
+    with pytest.raises(InputError, match="expected a Scan, got ndarray"):
+        live.add_scan(np.zeros((9, 3)))  # type: ignore[arg-type]
 
 
 def test_messages_of_the_other_kind_are_errors() -> None:

@@ -1,0 +1,13 @@
+# loam_gtsam in a container: docker build -t loam_gtsam . && docker run --rm -v "$PWD:/data" loam_gtsam demo
+FROM python:3.12-slim AS build
+COPY . /source
+RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels /source
+
+FROM python:3.12-slim
+COPY --from=build /wheels /wheels
+RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[plot]" && rm -r /wheels
+RUN useradd --create-home mapper
+USER mapper
+WORKDIR /data
+ENTRYPOINT ["loam-gtsam"]
+CMD ["--help"]

@@ -109,10 +109,8 @@ class SourceOptions(Options):
     )
     start: int = option("Number of the first sweep that is used.", default=0, min=0)
     every: int = option("Use only every so many sweeps.", default=1, min=1)
-    begin: float | None = option(
-        "From so many seconds after the start.", min=0.0, metavar="SECONDS"
-    )
-    end: float | None = option("Until so many seconds after the start.", min=0.0, metavar="SECONDS")
+    begin: float | None = option("From so long after the first sweep.", min=0.0, metavar="SECONDS")
+    end: float | None = option("Until so long after the first sweep.", min=0.0, metavar="SECONDS")
     truth: Path | None = option(
         "Reference poses: TUM, EuRoC (csv), KITTI, positions, or a bag (docs/inputs.md).",
         metavar="FILE",

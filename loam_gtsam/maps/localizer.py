@@ -25,7 +25,7 @@ from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, time
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.maps.first_fix import PlaceSearch
-from loam_gtsam.maps.hypotheses import Hypotheses
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
 from loam_gtsam.maps.map_file import SavedMap, write_map
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
@@ -102,8 +102,8 @@ class Localizer:
         self._places = list(self._saved.places)
         self._search()
         self._last: MapUpdate | None = None  # that was solved
-        self._seen: MapUpdate | None = None  # that was solved in all directions
-        self._unsolved = 0
+        self._seen: MapUpdate | None = None  # the last of some that saw all directions
+        self._unsolved = self._sure = 0  # sweeps in a row, and those that saw all directions
         self.fixes = 0
 
     def _search(self) -> None:
@@ -166,7 +166,7 @@ class Localizer:
         self._tracking.reset()
         self._tracking.mapper.maps = self._maps
         self._tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
-        self._fixed, self._unsolved = True, 0
+        self._fixed, self._unsolved, self._sure, self._seen = True, 0, 0, None
         self.fixes += 1
         again = "" if self.fixes == 1 else " again"
         return self._told(replace(fix, message=f"found in the map{again}"))
@@ -184,10 +184,12 @@ class Localizer:
         own = update.covariance if self._extend else update.uncertainty.own
         if self._extend:
             pass  # the drift since the fix is in it
-        elif update.status is FrameStatus.OK:
-            self._seen = update
-        elif self._seen is not None:  # what no scan saw since then has drifted
-            own = relative_covariance(self._seen, update)
+        else:
+            self._sure = self._sure + 1 if update.status is FrameStatus.OK else 0
+            if self._sure >= SWEEPS or self._seen is None:
+                self._seen = update
+            else:  # what no scan saw since then has drifted
+                own = relative_covariance(self._seen, update)
         from_map = update.map_T_lidar.inverse().AdjointMap()
         of_map = from_map @ self.map_covariance(update.map_T_lidar) @ from_map.T
         return replace(update, covariance=symmetric(own + of_map))

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from support.cli import loam
 from support.rooms_map import FRAMES, Mapped, world
+from support.worlds import OWN
+from support.worlds import updates as made_up
 
 from loam_gtsam.config import preset
 from loam_gtsam.datasets.base import PartOf
@@ -105,6 +107,22 @@ def test_sweeps_that_cannot_be_used_cost_no_fix_and_a_reset_forgets(mapped, save
     again = [localizer.process(drive.sweep(n)) for n in range(8)]
     for one, other in zip(first, again, strict=True):
         assert one.map_T_lidar.equals(other.map_T_lidar, 0.0)
+
+
+def test_what_no_sweep_saw_counts_until_some_in_a_row_have_seen_it(saved):
+    localizer = Localizer(saved)
+    seen, unseen = FrameStatus.OK, FrameStatus.DEGENERATE
+    statuses = [seen, unseen, seen, unseen, seen, seen, seen]
+    poses = [gtsam.Pose3(gtsam.Rot3(), np.array([0.1 * n, 0, 0])) for n in range(len(statuses))]
+    drifted = []
+    for update, status in zip(made_up(poses), statuses, strict=True):
+        told = localizer._told(replace(update, status=status))
+        from_map = update.map_T_lidar.inverse().AdjointMap()
+        of_map = from_map @ localizer.map_covariance(update.map_T_lidar) @ from_map.T
+        more = np.trace(told.covariance - OWN - of_map)
+        assert more > -1e-12
+        drifted.append(more > 1e-9)
+    assert drifted == [False, True, True, True, True, True, False]
 
 
 def test_the_maps_error_is_that_of_the_first_visit_near_by(saved):

@@ -374,7 +374,7 @@ def _matched_planes(
     fit = eigenvalues[0], eigenvalues[1], leverage
     sigmas, tilts = _deviations(*fit, 3, config.neighbours, config)
     if config.fit_uncertainty:
-        sigmas = np.hypot(sigmas, _misfit(fits))
+        sigmas = np.hypot(sigmas, _misfit(fits, config.point_sigma))
     return PlaneMatches(
         points[rows[keep]],
         normals.T[keep],
@@ -387,16 +387,16 @@ def _matched_planes(
     )
 
 
-def _misfit(fits: _Fits) -> FloatArray:
+def _misfit(fits: _Fits, noise: float) -> FloatArray:
     """Standard deviations (M,), metres, of planes through points that are not of one plane.
 
     Neighbours on both sides of a corner, or on two steps, make a plane that cuts the corner. It is
-    known by a neighbour that lies much farther off than those of the sweep's other planes do:
-    docs/maths/matching.md.
+    known by a neighbour that lies much farther off than those of the sweep's other planes do, and
+    farther than noise, the standard deviation of a point in metres: docs/maths/matching.md.
     """
     if not fits.planar.any():
         return np.zeros(len(fits.worst))
-    usual = _ROUGH * float(np.median(fits.worst[fits.planar]))
+    usual = max(_ROUGH * float(np.median(fits.worst[fits.planar])), noise)
     beyond: FloatArray = _WRONG * np.sqrt(np.maximum(fits.worst**2 - usual**2, 0.0))
     return beyond
 

@@ -181,15 +181,14 @@ class Localizer:
         if update.uncertainty is None or not update.status.solved:
             return update
         self._last = update
-        own = update.covariance if self._extend else update.uncertainty.own
+        own = update.uncertainty.own
+        self._sure = self._sure + 1 if update.status is FrameStatus.OK else 0
         if self._extend:
-            pass  # the drift since the fix is in it
-        else:
-            self._sure = self._sure + 1 if update.status is FrameStatus.OK else 0
-            if self._sure >= SWEEPS or self._seen is None:
-                self._seen = update
-            else:  # what no scan saw since then has drifted
-                own = relative_covariance(self._seen, update)
+            own = update.covariance  # with the drift since the fix
+        elif self._sure >= SWEEPS or self._seen is None:
+            self._seen = update
+        else:  # what no scan saw since then has drifted
+            own = relative_covariance(self._seen, update)
         from_map = update.map_T_lidar.inverse().AdjointMap()
         of_map = from_map @ self.map_covariance(update.map_T_lidar) @ from_map.T
         return replace(update, covariance=symmetric(own + of_map))

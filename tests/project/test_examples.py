@@ -91,7 +91,7 @@ def ground_and_wheels(names: Names, output: str) -> None:
 def imu_in_a_corridor(names: Names, output: str) -> None:
     constant, inertial = names["errors"]
     assert len(names["blind"]) > 40
-    assert all(" x;" in update.message for update in names["blind"])
+    assert all("constrained: x (1" in update.message for update in names["blind"])
     assert abs(inertial) < 0.02 * names["world"].truth.path_length
     assert abs(inertial) < 0.5 * abs(constant)
 
@@ -121,7 +121,7 @@ def two_sessions(names: Names, output: str) -> None:
 
 def refined_run(names: Names, output: str) -> None:
     before, after = names["errors"]
-    assert after < 0.6 * before
+    assert after < 0.8 * before
     assert names["thick"][1] < names["thick"][0]
     assert names["off"] < 0.01
     assert names["graph"].size() == 2

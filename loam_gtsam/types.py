@@ -32,6 +32,8 @@ from loam_gtsam.errors import SweepFault as SweepFault
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+TANGENT = ("rx", "ry", "rz", "x", "y", "z")
+"""Names of the six components of a tangent vector of a pose: rad, then metres."""
 MAX_STAMP = 1 << 62
 """Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
 _FARTHEST = 1e5

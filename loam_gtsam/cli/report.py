@@ -20,11 +20,18 @@ from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_colu
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buffer
 from loam_gtsam.refine.map_quality import map_quality
-from loam_gtsam.types import BadSweep, FeatureSweep, FrameStatus, MapUpdate, Sweep, SweepError
+from loam_gtsam.types import (
+    TANGENT,
+    BadSweep,
+    FeatureSweep,
+    FrameStatus,
+    MapUpdate,
+    Sweep,
+    SweepError,
+)
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
 _TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
-_AXES = ("rx", "ry", "rz", "x", "y", "z")  # of the tangent
 _ADVICE = {
     FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
     "docs/imu.md, docs/own_factor.md",
@@ -96,8 +103,8 @@ def _weak_axes(result: RunResult) -> str:
     least, counts = result.config.solver.min_aligned, Counter[str]()
     for update in result.updates:
         if update.status is FrameStatus.DEGENERATE:
-            counts.update(np.array(_AXES)[update.axis_localizability < least].tolist())
-    found = ", ".join(f"{axis} in {counts[axis]} frames" for axis in _AXES if counts[axis])
+            counts.update(np.array(TANGENT)[update.axis_localizability < least].tolist())
+    found = ", ".join(f"{axis} in {counts[axis]} frames" for axis in TANGENT if counts[axis])
     return f"{found} (axes of the lidar)" if found else ""
 
 

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.types import MapUpdate, OutputError, stack_poses
+from loam_gtsam.types import TANGENT, MapUpdate, OutputError, stack_poses
 
-_AXES = ("rx", "ry", "rz", "x", "y", "z")
 _PLAIN = ("n_edges", "n_planes", "n_edge_matches", "n_plane_matches", "iterations", "error_after")
 
 
@@ -51,8 +50,8 @@ def to_dataframe(updates: Sequence[MapUpdate]) -> Any:
     columns |= dict(zip(("qx", "qy", "qz", "qw"), turns.T, strict=True))
     variances = np.array([np.diag(u.covariance) for u in updates]).reshape(-1, 6)
     counts = np.array([u.axis_localizability for u in updates]).reshape(-1, 6)
-    columns |= {f"sigma_{axis}": np.sqrt(variances[:, k]) for k, axis in enumerate(_AXES)}
-    columns |= {f"matches_{axis}": counts[:, k] for k, axis in enumerate(_AXES)}
+    columns |= {f"sigma_{axis}": np.sqrt(variances[:, k]) for k, axis in enumerate(TANGENT)}
+    columns |= {f"matches_{axis}": counts[:, k] for k, axis in enumerate(TANGENT)}
     columns |= {name: [str(getattr(u, name)) for u in updates] for name in ("status", "message")}
     columns |= {name: [getattr(u, name) for u in updates] for name in _PLAIN}
     stages = dict.fromkeys(stage for u in updates for stage in u.timings)

@@ -17,7 +17,15 @@ from loam_gtsam.config import dump_config
 from loam_gtsam.io.atomic import atomic_file, make_folder, write_json, write_text
 from loam_gtsam.io.trajectories import stamp_text, write_kitti, write_tum
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.types import FloatArray, IntArray, MapUpdate, Uncertainty, check_array, stack_poses
+from loam_gtsam.types import (
+    TANGENT,
+    FloatArray,
+    IntArray,
+    MapUpdate,
+    Uncertainty,
+    check_array,
+    stack_poses,
+)
 
 if TYPE_CHECKING:
     from loam_gtsam.pipeline import ImuSummary, RunResult
@@ -39,7 +47,6 @@ RUN_FILES = (
     "summary.json",
 )
 """What :func:`write_run` writes."""
-_AXES = ("rx", "ry", "rz", "x", "y", "z")
 
 
 def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
@@ -51,7 +58,7 @@ def write_covariances(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     bad stamp are left out.
     """
     rows, columns = np.triu_indices(6)
-    names = [f"{_AXES[i]}_{_AXES[j]}" for i, j in zip(rows, columns, strict=True)]
+    names = [f"{TANGENT[i]}_{TANGENT[j]}" for i, j in zip(rows, columns, strict=True)]
     lines = [",".join(("stamp_s", "status", *names))]
     for update in updates:
         if not update.status.has_pose:
@@ -243,7 +250,7 @@ def _axes_part(result: RunResult) -> dict[str, Any] | None:
             "lowest": float(column.min()),
             "weak_frames": int(np.count_nonzero(column < least)),
         }
-        for axis, column in zip(_AXES, counts.T, strict=True)
+        for axis, column in zip(TANGENT, counts.T, strict=True)
     }
 
 

@@ -89,6 +89,13 @@ class LoopClosure:
         return gtsam.BetweenFactorPose3(*keys, self.earlier_T_later, noise)
 
 
+def leads_to_keyframe(motion: gtsam.Pose3, config: PoseGraphConfig) -> bool:
+    """Whether a motion since the last keyframe is so large that the next one is due."""
+    turned = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(motion.rotation())))
+    moved = np.linalg.norm(motion.translation())
+    return not (moved < config.keyframe_distance and turned < config.keyframe_angle_deg)
+
+
 def pose_key(index: int) -> int:
     """Key of the pose of a keyframe."""
     return gtsam.symbol("x", index)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config
 from loam_gtsam.geometry import nearest_positive
+from loam_gtsam.loops.keyframes import leads_to_keyframe
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.mapper import Registered
 from loam_gtsam.types import FloatArray, MapUpdate
@@ -58,12 +59,10 @@ class Places:
         uncertainty = update.uncertainty
         if uncertainty is None or registered is None or not update.status.solved:
             return
-        pose, config = registered.map_T_middle, self._config.pose_graph
+        pose = registered.map_T_middle
         if self.all:
             motion = self.all[-1].map_T_middle.between(pose)
-            turned = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(motion.rotation())))
-            moved = np.linalg.norm(motion.translation())
-            if moved < config.keyframe_distance and turned < config.keyframe_angle_deg:
+            if not leads_to_keyframe(motion, self._config.pose_graph):
                 return
         points = np.concatenate([registered.edges, registered.planes])
         descriptor = scan_context(points, self._config.loops).astype(np.float16)

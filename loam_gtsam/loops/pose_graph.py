@@ -21,6 +21,7 @@ from loam_gtsam.loops.keyframes import (
     Keyframe,
     LoopClosure,
     keyframe_points,
+    leads_to_keyframe,
     noise_model,
     odometry_between,
 )
@@ -88,10 +89,7 @@ class PoseGraph(FactorGraph):
                     f"keyframe, got {update.stamp}; add the frames of a run in their order"
                 )
             motion = last.odom_T_lidar.between(update.map_T_lidar)
-            turned = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(motion.rotation())))
-            moved = float(np.linalg.norm(motion.translation()))
-            config = self.config
-            if moved < config.keyframe_distance and turned < config.keyframe_angle_deg:
+            if not leads_to_keyframe(motion, self.config):
                 return None
         travelled = float(np.linalg.norm(motion.translation()))
         travelled += 0.0 if last is None else last.travelled

@@ -20,7 +20,7 @@ from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key,
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
-from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
+from loam_gtsam.registration.relocalization import APART, Fit, likely_poses, sample_features
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FloatArray
@@ -30,8 +30,6 @@ _TRIES = 6  # number of places that are tried
 _STARTS = 3  # number of poses around a place at which a registration starts
 _NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
-APART = 1.5, np.radians(12.0)
-"""Metres and rad from which two poses are two, as for the starts of a search."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -30,15 +30,18 @@ class SavedCubes(Archive):
     def __len__(self) -> int:
         return len(self.indices())
 
+    def _is_in_file(self, index: CubeIndex) -> bool:
+        """Whether a cube of the file is not taken."""
+        return index in self._saved.layers[self._layer] and index not in self._out
+
     def indices(self) -> list[CubeIndex]:
         """Cubes of the file that are not taken, and those that are kept."""
-        there = (index for index in self._saved.layers[self._layer] if index not in self._out)
-        return [*there, *super().indices()]
+        return [*filter(self._is_in_file, self._saved.layers[self._layer]), *super().indices()]
 
     def count(self) -> int:
         """Points in them."""
         counts = self._saved.layers[self._layer]
-        there = sum(count for index, count in counts.items() if index not in self._out)
+        there = sum(count for index, count in counts.items() if self._is_in_file(index))
         return there + super().count()
 
     def store(self, index: CubeIndex, content: CubePoints) -> None:
@@ -50,13 +53,13 @@ class SavedCubes(Archive):
 
     def read(self, index: CubeIndex) -> CubePoints | None:
         """Points of a cube; DatasetError if the file is damaged."""
-        if index in self._saved.layers[self._layer] and index not in self._out:
+        if self._is_in_file(index):
             return self._saved.cube(self._layer, index)
         return super().read(index)
 
     def take(self, index: CubeIndex) -> Cube | None:
         """Take a cube out, which then is not there until it is stored."""
-        if index not in self._saved.layers[self._layer] or index in self._out:
+        if not self._is_in_file(index):
             return super().take(index)
         cube = Cube.of(self._saved.cube(self._layer, index), self._grid)
         self._out |= {index}

@@ -32,7 +32,7 @@ _HEIGHT = 10.0  # largest height above or below the lidar of a point that is sco
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
-_APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
+APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 
 
 @dataclass(frozen=True, slots=True)
@@ -322,7 +322,7 @@ def likely_poses(
         rotation = gtsam.Rot3.Yaw(turn).compose(pose.rotation())
         best.append(gtsam.Pose3(rotation, pose.translation() + np.array([x, y, 0.0])))
         away = np.abs((moves[:, 2] - turn + np.pi) % (2.0 * np.pi) - np.pi)
-        same = (np.linalg.norm(at - at[top], axis=1) < _APART[0]) & (away < _APART[1])
+        same = (np.linalg.norm(at - at[top], axis=1) < APART[0]) & (away < APART[1])
         scores[same] = 0.0
     return best
 

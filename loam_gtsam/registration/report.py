@@ -10,10 +10,7 @@ import numpy as np
 
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.solvers import Solution
-from loam_gtsam.types import Features, FrameStatus, MapUpdate, SweepFault, TiltPrior
-
-_AXES = ("rx", "ry", "rz", "x", "y", "z")
-"""Of the lidar, in the order of the tangent: rotations in rad, translations in metres."""
+from loam_gtsam.types import TANGENT, Features, FrameStatus, MapUpdate, SweepFault, TiltPrior
 
 
 def make_update(
@@ -109,11 +106,11 @@ def weak_directions_in_words(solution: Solution) -> str:
         spanned[row] = unit
     names = []
     # Positions first: these are asked for more often.
-    for unit in sorted(spanned, key=lambda unit: (int(np.abs(unit).argmax()) + 3) % 6):
-        main = int(np.abs(unit).argmax())
-        parts = enumerate(zip(unit, _AXES, strict=True))
+    mains = np.abs(spanned).argmax(axis=1).tolist()
+    for main, unit in sorted(zip(mains, spanned, strict=True), key=lambda pair: (pair[0] + 3) % 6):
+        parts = enumerate(zip(unit, TANGENT, strict=True))
         rest = [f" {v:+.2f} {axis}" for i, (v, axis) in parts if i != main and abs(v) > 0.05]
-        names.append(_AXES[main] + "".join(rest))
+        names.append(TANGENT[main] + "".join(rest))
     count = f"{len(names)} direction" + "s" * (len(names) > 1)
     return f"{', '.join(names)} ({count})"
 

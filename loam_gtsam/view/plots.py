@@ -17,7 +17,15 @@ from numpy.typing import NDArray
 
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.run_files import stage_seconds
-from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, OutputError, Trajectory
+from loam_gtsam.types import (
+    TANGENT,
+    BoolArray,
+    FloatArray,
+    IntArray,
+    MapUpdate,
+    OutputError,
+    Trajectory,
+)
 
 INK, FAINT, PATH, TRUTH = "#22303c", "#d7dde2", "#e4572e", "#9aa5ae"
 _STAGE_COLOURS = ("#4c78a8", "#72b7b2", "#eeca3b", "#f58518", "#e45756", "#b279a2", "#9d755d",
@@ -190,7 +198,7 @@ def _draw_told(
     """Errors by component in the band of three standard deviations that were told of them."""
     stamps, errors, sigmas = told
     seconds = (stamps - start) * 1e-9
-    for k, (axes, name) in enumerate(zip(panels, ("rx", "ry", "rz", "x", "y", "z"), strict=True)):
+    for k, (axes, name) in enumerate(zip(panels, TANGENT, strict=True)):
         unit, factor = ("deg", np.degrees(1.0)) if k < 3 else ("m", 1.0)
         error, band = factor * errors[:, k], factor * 3.0 * sigmas[:, k]
         axes.fill_between(seconds, -band, band, color=TRUTH, alpha=0.35, lw=0, label="±3 sigma")

@@ -260,9 +260,9 @@ class Mapper:
         if self.extra_factors is not None and self._moment is not None:
             context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
             factors += own_factors(self.extra_factors, context)
-        refine = self.config.deskew.refine
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
-        matcher = FrameMatcher.of(*args, refine=refine, inertial=predicted.inertial)
+        steady = self._errors.accelerations
+        matcher = FrameMatcher.of(*args, inertial=predicted.inertial, accelerations=steady)
         return Frame(matcher, predicted, factors)
 
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:

@@ -276,7 +276,7 @@ def test_information_is_that_of_the_reference_time():
 def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres, searches):
     config = Config().changed(
         {
-            "deskew.refine": False,
+            "deskew.model": "predicted",
             "matching.keep_translation": metres,
             "matching.keep_rotation_deg": 5.0,
             "solver.iterations": 2,

@@ -84,10 +84,10 @@ class DeskewConfig(Section):
 
     enabled: bool = parameter(True)
     """Sweeps are de-skewed with the predicted motion, and again with the solution."""
-    refine: bool = parameter(True, source="LOAM de-skews once")
-    """Sweeps are de-skewed again with the solution, the motion between the first two is searched
-    for, and the first eight are registered together; false de-skews once, with the prediction, and
-    takes the platform for at rest at the start."""
+    model: Literal["predicted", "constant", "linear"] = parameter("linear", source="LOAM predicts")
+    """The motion within a sweep is the predicted one (and rest at the start), or leads from the
+    last pose to the solved one (constant), or is solved for with the pose (linear; without IMU).
+    Unless predicted, the first motion is searched for, and eight sweeps are registered together."""
     rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
     """The rotation within a sweep comes from the gyro of an IMU where that covers the sweep, else
     from a constant velocity (auto), or from the attitude of the IMU (orientation)."""

@@ -111,7 +111,7 @@ SMALL = 0.5
 _WIDTH = 100
 _CLASSICAL = {
     "features": {"range_noise": 0.0, "post_depth": 0.0},
-    "deskew": {"refine": False, "rotation": "constant_velocity"},
+    "deskew": {"model": "predicted", "rotation": "constant_velocity"},
     "odometry.method": "scan_to_scan",
     "map": {"insertion": "centroid", "small_below": 0.0, "insert_unmatched": True},
     "matching": {

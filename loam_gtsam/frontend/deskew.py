@@ -114,6 +114,10 @@ class MovingSweep:
             return np.zeros(3)
         return interpolated(seconds, *self._bend)
 
+    def seconds(self, edges: IntArray, planes: IntArray) -> tuple[FloatArray, FloatArray]:
+        """Seconds (N,) from the middle of the sweep to chosen edges and planes, by their rows."""
+        return self._seconds[0].take(edges), self._seconds[1].take(planes)
+
     def at(self, twist: FloatArray) -> PosedSweep:
         """The sweep de-skewed for a (6,) body velocity at the reference time, rad/s and m/s."""
         return PosedSweep(self, twist)

@@ -23,10 +23,10 @@ from loam_gtsam.registration.association import (
     trial_matching,
 )
 from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, joined
-from loam_gtsam.registration.odometry import Moment, Prediction, twist_to
+from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
 from loam_gtsam.registration.report import Clock
-from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
-from loam_gtsam.types import FloatArray
+from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
+from loam_gtsam.types import FloatArray, SweepMotion
 
 _FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
 _THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: some twenty sweeps
@@ -188,6 +188,7 @@ class FrameMatcher(Matcher):
     last: Moment | None  # middle of the last sweep, from which ``deskewed`` takes the motion
     inertial: InertialPrediction | None  # from which it takes the velocity instead
     refine: bool  # whether ``deskewed`` changes anything
+    accelerations: FloatArray | None  # (6,) mean squares by which the velocity is not constant
     clock: Clock  # books the time of every call on the stage ``match``
 
     @classmethod
@@ -199,12 +200,15 @@ class FrameMatcher(Matcher):
         last: Moment | None,
         clock: Clock,
         *,
-        refine: bool,
+        refine: bool = True,
         inertial: InertialPrediction | None = None,
+        accelerations: FloatArray | None = None,
     ) -> FrameMatcher:
-        """The matcher with the configured matching."""
-        rows = _rows_to_match(posed.sweep, config.matching)
-        return cls(posed, maps, config, config.matching, rows, last, inertial, refine, clock)
+        """The matcher with the configured matching and, if it is to ``refine``, de-skew."""
+        rows, model = _rows_to_match(posed.sweep, config.matching), config.deskew.model
+        refine = refine and model != "predicted"
+        steady, matching = accelerations if model == "linear" else None, config.matching
+        return cls(posed, maps, config, matching, rows, last, inertial, refine, steady, clock)
 
     @property
     def offered(self) -> int:
@@ -235,13 +239,37 @@ class FrameMatcher(Matcher):
         self.clock.lap("match")
         return found
 
-    def deskewed(self, map_T_lidar: gtsam.Pose3) -> FrameMatcher:
+    @property
+    def motion_is_free(self) -> bool:
+        """Whether the motion within the sweep is solved for: nothing else tells it."""
+        sweep, last = self.posed.sweep, self.last
+        alone = self.inertial is None and sweep.motion is SweepMotion.CONSTANT_VELOCITY
+        known = self.accelerations is not None and last is not None and sweep.stamp > last.stamp
+        return self.refine and alone and known
+
+    def deskewed(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches) -> FrameMatcher:
         """The matcher of the sweep de-skewed with the motion that leads to a pose."""
         if not self.refine:
             return self
-        sweep = self.posed.sweep
-        twist = twist_to(sweep, self.last, self.inertial, map_T_lidar, self.posed.twist)
-        return replace(self, posed=sweep.at(twist))
+        return replace(self, posed=self.posed.sweep.at(self.twist_to(map_T_lidar, matches)))
+
+    def twist_to(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches | None = None) -> FloatArray:
+        """(6,) body velocity that leads to a pose; ``matches`` have a say in it if it is free."""
+        posed, last = self.posed, self.last
+        mean = twist_to(posed.sweep, last, self.inertial, map_T_lidar, posed.twist)
+        search = None if matches is None else matches.search
+        if matches is None or search is None or not self.motion_is_free:
+            return mean
+        assert last is not None
+        assert self.accelerations is not None
+        config = self.config
+        rows = match_rows(matches, config.solver.kernel_width, config.solver.kernel)
+        edges, planes = posed.sweep.seconds(matches.edges.indices, matches.planes.indices)
+        seconds = np.concatenate([np.repeat(edges, 2), planes])
+        missed = 0.5 * last.seconds_to(posed.sweep.stamp) * np.sqrt(self.accelerations)
+        velocities = search.posed.twist, mean, missed
+        noise = config.features.range_noise
+        return solved_twist(rows, seconds, map_T_lidar, *velocities, noise)
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:
         """The matcher of the sweep de-skewed for a (6,) body velocity, and for no other."""
@@ -307,7 +335,7 @@ class Frame:
         start = self.predicted.map_T_middle
         return solver.solve(self.matcher, start, self.priors, self.predicted.motion)
 
-    def twist_to(self, map_T_middle: gtsam.Pose3) -> FloatArray:
-        """(6,) body velocity that leads from the last sweep to a pose of this one."""
-        m = self.matcher
-        return twist_to(self.sweep, m.last, m.inertial, map_T_middle, m.posed.twist)
+    def twist_of(self, solution: Solution) -> FloatArray:
+        """(6,) body velocity that belongs to a solution."""
+        matches = solution.matches if solution.solved else None
+        return self.matcher.twist_to(solution.map_T_lidar, matches)

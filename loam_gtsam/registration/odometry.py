@@ -10,12 +10,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import OdometryConfig, SolverConfig
+from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import move_points
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
+_STEADIEST = 1e-3  # rad/s, m/s and metres, far below what is measured: the least of some errors
+_UNEVEN = 0.5
+"""Error that the ranges of one side of a sweep have in common, over the noise of a single one. Data
+sheets state an accuracy of 2 to 3 cm as the bound of both."""
+_RANK = 1e-9  # of the largest eigenvalue, below which a scan has no information on a pose
 _NODES = 41  # of the path between the middle of the last sweep and the end of this one
 _BENT = 1.0  # longest time over which accelerations are integrated for that, seconds
 _LONGEST = 10.0  # seconds of extrapolation: after more the pose would be anywhere
@@ -213,6 +219,49 @@ def twist_to(
     if last is None or sweep.stamp <= last.stamp:
         return otherwise
     return sweep.twist_since(last[:2], map_T_middle)
+
+
+def solved_twist(
+    rows: MatchRows,
+    seconds: FloatArray,
+    map_T_middle: gtsam.Pose3,
+    twist: FloatArray,
+    mean: FloatArray,
+    missed: FloatArray,
+    range_noise: float,
+) -> FloatArray:
+    """(6,) body velocity in the middle of a sweep, by its matches and by the mean velocity.
+
+    A point measured s seconds from the middle moves with the velocity s times as far as with the
+    pose. Of that, what a change of the pose explains as well does not count. The ranges of a sensor
+    may be wrong on one side, which looks like a motion: the matches are not believed beyond that.
+
+    Parameters
+    ----------
+    rows : R rows of the matches of a sweep that was de-skewed with ``twist``
+    seconds : (R,) from the middle of the sweep
+    map_T_middle : the solved pose
+    mean, missed : (6,) rad/s and m/s, the mean velocity since the last sweep and the standard
+        deviation of its difference from that in the middle
+    range_noise : metres, of a single range
+    """
+    residuals, by_pose = rows.residuals(map_T_middle)
+    both = np.hstack([by_pose, by_pose * seconds[:, None]])
+    information, pull = both.T @ both, -(both.T @ residuals)
+    # What is left of it where the pose is free to follow the velocity.
+    of_pose, across = information[:6, :6], information[6:, :6]
+    followed = across @ np.linalg.pinv(of_pose, rcond=_RANK, hermitian=True)
+    information = information[6:, 6:] - followed @ across.T
+    pull = pull[6:] - followed @ pull[:6]
+    wrong = max(_UNEVEN * range_noise, _STEADIEST) / max(np.abs(seconds).max(), _SHORTEST)
+    far = float(np.median(np.linalg.norm(rows.points, axis=1)))
+    limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
+    # The inverse of information^-1 + limit^-1, without that of the information.
+    share = limit @ np.linalg.inv(information + limit)
+    believed = np.diag(np.maximum(missed, _STEADIEST) ** -2.0)
+    total = believed + limit - share @ limit
+    solved: FloatArray = twist + np.linalg.solve(total, believed @ (mean - twist) + share @ pull)
+    return solved
 
 
 class ScanToScan(Odometry):

@@ -118,6 +118,11 @@ class PoseErrors:
         self._origin = _Origin()
         self._last: _Middle | None = None
 
+    @property
+    def accelerations(self) -> FloatArray:
+        """(6,) mean squares of the body acceleration, (rad/s^2)^2 and (m/s^2)^2."""
+        return self._motion.variances
+
     def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
         """The error of a solved scan; to be called once for each, in order.
 

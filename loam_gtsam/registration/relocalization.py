@@ -146,7 +146,7 @@ class Lost:
 
 def found_at(frame: Frame, solution: Solution) -> Found:
     """The sweep at a solved pose, with the motion that leads there."""
-    return Found(solution, frame.twist_to(solution.map_T_lidar))
+    return Found(solution, frame.twist_of(solution))
 
 
 def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
@@ -174,7 +174,8 @@ def second_opinion(
     ``alone`` is that prediction; ``frame`` and ``found`` are returned if it does not.
     """
     m = frame.matcher
-    matcher = FrameMatcher.of(alone.posed, m.maps, m.config, m.last, m.clock, refine=m.refine)
+    parts = alone.posed, m.maps, m.config, m.last, m.clock
+    matcher = FrameMatcher.of(*parts, refine=m.refine, accelerations=m.accelerations)
     other = replace(frame, matcher=matcher, predicted=alone)
     solution = other.solve(solver)
     if not solution.solved:
@@ -200,7 +201,7 @@ def search(
     usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
     lost = monitor.lost > 0 or monitor.misfit(before)
     start: gtsam.Pose3 | None = solution.map_T_lidar
-    moving = frame.twist_to(solution.map_T_lidar)
+    moving = frame.twist_of(solution)
     twists = [steady, np.zeros(6) if lost else moving]
     if lost:
         start = _place(frame, solution, monitor, solver)
@@ -209,7 +210,7 @@ def search(
                 _turned(steady, start.rotation().between(frame.predicted.map_T_middle.rotation()))
             )
             if matcher.last is not None and matcher.last.solved:
-                twists.append(frame.twist_to(start))  # it was not carried away, but drove there
+                twists.append(matcher.twist_to(start))  # it was not carried away, but drove there
     best: tuple[Fit, Solution, FloatArray] | None = None
     for twist in twists:
         if start is None:

@@ -86,7 +86,7 @@ class Start:
     @classmethod
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
         """The start of a map; None if no sweep is de-skewed anew, or the map is there already."""
-        begins = maps.config.deskew.refine and not maps.given
+        begins = maps.config.deskew.model != "predicted" and not maps.given
         return cls(first, keyframe) if begins else None
 
     @property
@@ -166,8 +166,7 @@ class Start:
         frame = replace(
             frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
         )
-        twist = frame.twist_to(solution.map_T_lidar)
-        return frame, replace(found, solution=solution, twist=twist)
+        return frame, replace(found, solution=solution, twist=frame.twist_of(solution))
 
     def _with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
         """The sweeps, de-skewed for the motion between their poses."""

@@ -226,9 +226,13 @@ class _Timed(Matcher):
     def again(self, matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> ScanMatches:
         return self._measured(lambda: self._inner.again(matches, map_T_lidar))
 
-    def deskewed(self, map_T_lidar: gtsam.Pose3) -> Matcher:
+    @property
+    def motion_is_free(self) -> bool:
+        return self._inner.motion_is_free
+
+    def deskewed(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches) -> Matcher:
         started = time.perf_counter()
-        inner = self._inner.deskewed(map_T_lidar)
+        inner = self._inner.deskewed(map_T_lidar, matches)
         self._spent.append(time.perf_counter() - started)
         return _Timed(inner, self._spent)
 

@@ -462,11 +462,11 @@ class Counting(GtsamSolver):
         return super().solve(*arguments)
 
 
-@pytest.mark.parametrize("refine", [True, False])
-def test_without_refinement_the_first_sweeps_are_not_registered_anew(refine):
-    config = Config().changed({"deskew.refine": refine})
+@pytest.mark.parametrize("model", ["constant", "predicted"])
+def test_with_a_predicted_motion_the_first_sweeps_are_not_registered_anew(model):
+    config = Config().changed({"deskew.model": model})
     counting = Counting(config.solver)
     mapper = Mapper(config, counting)
     for scan in SimulatedWorld("room", frames=3, columns=300):
         mapper.register(extract_features(scan, config))
-    assert (counting.solves > 2) is refine
+    assert (counting.solves > 2) is (model == "constant")

@@ -12,6 +12,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
+from loam_gtsam.imu.preintegration import Prediction as Inertial
 from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.association import match_planes
 from loam_gtsam.registration.frame_matcher import FrameMatcher, MapPair
@@ -24,8 +25,8 @@ HERE = gtsam.Pose3(gtsam.Rot3.Yaw(0.01), np.array([0.1, 0.02, 0.0]))
 TWIST = np.array([0.0, 0.0, 0.1, 1.0, 0.2, 0.0])
 
 
-def matcher_of(second, last, maps, *, refine=True):
-    return FrameMatcher.of(second.at(TWIST), maps, CONFIG, last, Clock(), refine=refine)
+def matcher_of(second, last, maps, config=CONFIG, **options):
+    return FrameMatcher.of(second.at(TWIST), maps, config, last, Clock(), **options)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +63,7 @@ def test_the_matches_of_a_pose_do_not_depend_on_earlier_calls(parts, matcher):
     for other in (moved(0.02), moved(0.5)):
         matcher(other)
         matcher.again(first, other)
-        matcher.deskewed(other)(other)
+        matcher.deskewed(other, first)(other)
         matcher.with_few_matches()(other)
     assert same(matcher(HERE), first)
     assert same(matcher_of(*parts)(HERE), first)
@@ -91,7 +92,7 @@ def test_away_from_the_search_matches_are_searched_for_anew(matcher):
 def test_deskewing_anew_makes_another_matcher(parts, matcher):
     second, last, _ = parts
     found = matcher(HERE)
-    anew = matcher.deskewed(HERE)
+    anew = matcher.deskewed(HERE, found)
     np.testing.assert_array_equal(anew.posed.twist, second.twist_since(last[:2], HERE))
     assert not same(anew(HERE), found)
     np.testing.assert_array_equal(matcher.posed.twist, TWIST)
@@ -100,7 +101,37 @@ def test_deskewing_anew_makes_another_matcher(parts, matcher):
     kept = anew.again(found, moved(0.01)).planes
     np.testing.assert_array_equal(kept.points, anew.posed.points[1][kept.indices])
     plain = matcher_of(*parts, refine=False)
-    assert plain.deskewed(HERE) is plain
+    assert plain.deskewed(HERE, found) is plain
+
+
+def test_a_free_motion_is_solved_for_with_the_matches(parts):
+    second, last, _ = parts
+    free = matcher_of(*parts, accelerations=np.ones(6))
+    found, mean = free(HERE), second.twist_since(last[:2], HERE)
+    assert free.motion_is_free
+    solved = free.deskewed(HERE, found).posed.twist
+    assert 1e-4 < np.abs(solved - mean).max() < 0.5
+    np.testing.assert_array_equal(free.twist_to(HERE), mean)
+    # Steadily driven, it is the mean velocity.
+    steady = matcher_of(*parts, accelerations=np.zeros(6)).twist_to(HERE, found)
+    assert np.abs(steady - mean).max() < 0.1 * np.abs(solved - mean).max()
+
+
+def test_a_motion_is_not_free_that_is_known_or_assumed(parts):
+    second, last, maps = parts
+    known = {"accelerations": np.ones(6)}
+    constant = CONFIG.changed("deskew.model=constant")
+    inertial = Inertial(HERE, np.zeros(3), np.eye(6), np.zeros((3, 6)))
+    others = [
+        matcher_of(*parts),
+        matcher_of(*parts, refine=False, **known),
+        matcher_of(*parts, inertial=inertial, **known),
+        matcher_of(second, None, maps, **known),
+        matcher_of(second, last._replace(stamp=second.stamp), maps, **known),
+        matcher_of(*parts, **known).moving_at(TWIST),
+        matcher_of(*parts, config=constant, **known),
+    ]
+    assert not any(matcher.motion_is_free for matcher in others)
 
 
 def test_with_few_planes_the_search_is_wide_and_equals_brute_force():

@@ -80,8 +80,10 @@ def test_too_few_matches_in_any_round_give_the_guess_back(method, lost_at):
 class Logged(Matcher):
     """A matcher that writes down every call, with the number of its de-skew and the pose."""
 
-    def __init__(self, log, number=0):
-        self.log, self.number = log, number
+    motion_is_free = False
+
+    def __init__(self, log, number=0, motion_is_free=False):
+        self.log, self.number, self.motion_is_free = log, number, motion_is_free
 
     def __call__(self, pose):
         self.log.append(("search", self.number, pose.x()))
@@ -91,9 +93,9 @@ class Logged(Matcher):
         self.log.append(("again", self.number, pose.x()))
         return matches
 
-    def deskewed(self, pose):
+    def deskewed(self, pose, matches):
         self.log.append(("de-skew", self.number, pose.x()))
-        return Logged(self.log, self.number + 1)
+        return Logged(self.log, self.number + 1, self.motion_is_free)
 
 
 def one_metre(converged_at=None):
@@ -117,6 +119,15 @@ def test_the_sweep_is_deskewed_once_more_at_the_second_round():
     ]  # fmt: skip
     assert (found.iterations, found.solver_iterations, found.converged) == (4, 12, False)
     assert (found.error_before, found.error_after) == (10.0, 6.0)
+
+
+def test_a_free_motion_is_solved_for_in_every_round():
+    log = []
+    rematch(Logged(log, motion_is_free=True), gtsam.Pose3(), changed(iterations=3), one_metre())
+    assert log == [
+        ("search", 0, 0.0), ("de-skew", 0, 1.0), ("again", 1, 1.0), ("de-skew", 1, 2.0),
+        ("again", 2, 2.0),
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("stop", "rounds"), [(True, 2), (False, 5)])

@@ -72,7 +72,7 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
     asked = []
     monkeypatch.setattr(start, "likely_poses", lambda *_, **__: asked.append(1) or [])
     _, features = features_of("avenue", 4, speed=20.0, start="moving")
-    for config, searches in ((CONFIG.changed("deskew.refine=false"), 0), (CONFIG, 1)):
+    for config, searches in ((CONFIG.changed("deskew.model=predicted"), 0), (CONFIG, 1)):
         mapper = Mapper(config)
         for one in features:
             mapper.register(one)

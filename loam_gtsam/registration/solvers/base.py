@@ -32,6 +32,11 @@ class Matcher:
     def __init__(self, associate: Associate) -> None:
         self._associate = associate
 
+    @property
+    def motion_is_free(self) -> bool:
+        """Whether the matches have a say in the motion within the sweep."""
+        return False
+
     def __call__(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:
         """Search for the matches at a pose."""
         return self._associate(map_T_lidar)
@@ -40,8 +45,11 @@ class Matcher:
         """The matches at another pose; lines and planes that were found near by may be kept."""
         return self(map_T_lidar)
 
-    def deskewed(self, map_T_lidar: gtsam.Pose3) -> Matcher:
-        """The matcher of the same sweep, de-skewed with the motion that leads to a pose."""
+    def deskewed(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches) -> Matcher:
+        """The matcher of the same sweep, de-skewed with the motion that leads to a pose.
+
+        ``matches`` are the last ones, with which that pose was found.
+        """
         return self
 
 
@@ -167,7 +175,7 @@ def rematch(
 ) -> Solution:
     """Match and optimise alternately: the outer loop of every solver of the package.
 
-    From the second round on the sweep is de-skewed with the motion that the first round found.
+    From the second round on the sweep is de-skewed with the motion that the round before found.
 
     Parameters
     ----------
@@ -183,10 +191,9 @@ def rematch(
     for iteration in range(1, config.iterations + 1):
         if iteration == 1:
             matches = matcher(pose)
-        elif iteration == 2:
-            # The first optimum knows the motion within the sweep better than the guess. To
-            # de-skew again in later rounds changes nothing that can be measured.
-            matcher = matcher.deskewed(pose)
+        elif iteration == 2 or matcher.motion_is_free:
+            # The first optimum knows a constant velocity well enough for all further rounds.
+            matcher = matcher.deskewed(pose, matches)
         if iteration > 1:
             matches = matcher.again(matches, pose)
         if len(matches) < config.min_matches:

@@ -111,7 +111,7 @@ class GtsamSolver:
         """(W,) share of a displacement along each direction that one more association undoes."""
         away = found.map_T_lidar.retract(_PUSH * doubted.vectors.sum(axis=0))
         if isinstance(associate, Matcher):
-            associate = associate.deskewed(found.map_T_lidar)
+            associate = associate.deskewed(found.map_T_lidar, found.matches)
         matches = associate(away)
         if len(matches) < self.config.min_matches:
             return np.zeros(len(doubted))

@@ -162,8 +162,8 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     points, normals, tilts, weights = _as_planes(matches, map_T_lidar)
     rows = np.hstack([cross(points.T, normals.T).T, normals])
     information = rows.T @ (rows * (weights**2)[:, None])
-    noise = _displacements(points, (weights * tilts) ** 2)
-    unit = _displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
+    noise = displacements(points, (weights * tilts) ** 2)
+    unit = displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
     floor = np.finfo(np.float64).eps * (np.trace(noise) + 1.0)
     columns = _eigenvectors(information, noise + floor * (unit + np.eye(6)))
     scale = np.sqrt(np.einsum("ik,ij,jk->k", columns, unit, columns))
@@ -233,7 +233,7 @@ def _mixed(edges: EdgeMatches, map_T_lidar: gtsam.Pose3, unseen: Directions) -> 
     keep = np.repeat(np.ones(len(edges), np.bool_) if edges.distinct is None else edges.distinct, 2)
     points, normals, tilts = points[keep], normals[keep], tilts[keep]
     across = np.hstack([cross(points.T, normals.T).T, normals]) @ unseen.vectors.T
-    noise = unseen.vectors @ _displacements(points, tilts**2) @ unseen.vectors.T
+    noise = unseen.vectors @ displacements(points, tilts**2) @ unseen.vectors.T
     columns = _eigenvectors(across.T @ across, noise + np.eye(len(unseen)))
     columns = columns / np.linalg.norm(columns, axis=0)
     vectors: FloatArray = columns.T @ unseen.vectors
@@ -292,8 +292,14 @@ def _eigenvectors(form: FloatArray, noise: FloatArray) -> FloatArray:
     return columns
 
 
-def _displacements(points: FloatArray, weights: FloatArray) -> FloatArray:
-    """(6, 6) form: the weighted sum of the points' squared displacements by a motion."""
+def displacements(points: FloatArray, weights: FloatArray) -> FloatArray:
+    """(6, 6) form: the weighted sum of the points' squared displacements by a motion.
+
+    Parameters
+    ----------
+    points : (N, 3) metres
+    weights : (N,)
+    """
     second = (points * weights[:, None]).T @ points
     form = np.zeros((6, 6))
     form[:3, :3] = np.trace(second) * np.eye(3) - second

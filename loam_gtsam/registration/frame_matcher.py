@@ -269,7 +269,7 @@ class FrameMatcher(Matcher):
         missed = 0.5 * last.seconds_to(posed.sweep.stamp) * np.sqrt(self.accelerations)
         velocities = search.posed.twist, mean, missed
         noise = config.features.range_noise
-        return solved_twist(rows, seconds, map_T_lidar, *velocities, noise)
+        return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:
         """The matcher of the sweep de-skewed for a (6,) body velocity, and for no other."""

@@ -85,6 +85,13 @@ class ScanMatches:
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
 
+    @property
+    def tilts(self) -> FloatArray:
+        """(R,) standard deviations of the normals, rad, of the rows: two a line, one a plane."""
+        e, p = self.edges, self.planes
+        tilts = (np.zeros(len(m)) if m.tilts is None else m.tilts for m in (e, p))
+        return np.concatenate([np.repeat(next(tilts), 2), next(tilts)])
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Search:

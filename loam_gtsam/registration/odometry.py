@@ -12,8 +12,9 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import OdometryConfig, SolverConfig
 from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
-from loam_gtsam.geometry import move_points
+from loam_gtsam.geometry import move_points, nearest_positive
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
+from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
 
@@ -21,6 +22,9 @@ _STEADIEST = 1e-3  # rad/s, m/s and metres, far below what is measured: the leas
 _UNEVEN = 0.5
 """Error that the ranges of one side of a sweep have in common, over the noise of a single one. Data
 sheets state an accuracy of 2 to 3 cm as the bound of both."""
+_BY_NOISE = 2.0
+"""Information that the noise of ten independent normals makes is in one case of thirty more than
+this many times its mean."""
 _RANK = 1e-9  # of the largest eigenvalue, below which a scan has no information on a pose
 _NODES = 41  # of the path between the middle of the last sweep and the end of this one
 _BENT = 1.0  # longest time over which accelerations are integrated for that, seconds
@@ -223,6 +227,7 @@ def twist_to(
 
 def solved_twist(
     rows: MatchRows,
+    tilts: FloatArray,
     seconds: FloatArray,
     map_T_middle: gtsam.Pose3,
     twist: FloatArray,
@@ -233,12 +238,14 @@ def solved_twist(
     """(6,) body velocity in the middle of a sweep, by its matches and by the mean velocity.
 
     A point measured s seconds from the middle moves with the velocity s times as far as with the
-    pose. Of that, what a change of the pose explains as well does not count. The ranges of a sensor
-    may be wrong on one side, which looks like a motion: the matches are not believed beyond that.
+    pose. What a change of the pose explains as well does not count, nor what the noise of the
+    normals makes of it; and the matches are not believed beyond the error of one side of the
+    sensor, which looks like a motion. See docs/maths/deskew.md.
 
     Parameters
     ----------
     rows : R rows of the matches of a sweep that was de-skewed with ``twist``
+    tilts : (R,) standard deviations of their normals, rad
     seconds : (R,) from the middle of the sweep
     map_T_middle : the solved pose
     mean, missed : (6,) rad/s and m/s, the mean velocity since the last sweep and the standard
@@ -248,19 +255,21 @@ def solved_twist(
     residuals, by_pose = rows.residuals(map_T_middle)
     both = np.hstack([by_pose, by_pose * seconds[:, None]])
     information, pull = both.T @ both, -(both.T @ residuals)
-    # What is left of it where the pose is free to follow the velocity.
     of_pose, across = information[:6, :6], information[6:, :6]
     followed = across @ np.linalg.pinv(of_pose, rcond=_RANK, hermitian=True)
     information = information[6:, 6:] - followed @ across.T
-    pull = pull[6:] - followed @ pull[:6]
+    alone = np.linalg.pinv(information, rcond=_RANK, hermitian=True)
+    step = alone @ (pull[6:] - followed @ pull[:6])
+    noise = displacements(rows.points, (rows.scales * tilts * seconds) ** 2)
+    information = nearest_positive(information - _BY_NOISE * noise)
     wrong = max(_UNEVEN * range_noise, _STEADIEST) / max(np.abs(seconds).max(), _SHORTEST)
     far = float(np.median(np.linalg.norm(rows.points, axis=1)))
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
     # The inverse of information^-1 + limit^-1, without that of the information.
-    share = limit @ np.linalg.inv(information + limit)
+    seen = limit - limit @ np.linalg.inv(information + limit) @ limit
     believed = np.diag(np.maximum(missed, _STEADIEST) ** -2.0)
-    total = believed + limit - share @ limit
-    solved: FloatArray = twist + np.linalg.solve(total, believed @ (mean - twist) + share @ pull)
+    change = np.linalg.solve(believed + seen, believed @ (mean - twist) + seen @ step)
+    solved: FloatArray = twist + change
     return solved
 
 

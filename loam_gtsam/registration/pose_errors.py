@@ -119,9 +119,9 @@ class PoseErrors:
         self._last: _Middle | None = None
 
     @property
-    def accelerations(self) -> FloatArray:
-        """(6,) mean squares of the body acceleration, (rad/s^2)^2 and (m/s^2)^2."""
-        return self._motion.variances
+    def accelerations(self) -> FloatArray | None:
+        """(6,) mean squares of the body acceleration, (rad/s^2)^2 and (m/s^2)^2; None at first."""
+        return self._motion.variances if self._motion.known else None
 
     def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
         """The error of a solved scan; to be called once for each, in order.
@@ -343,7 +343,12 @@ class _Acceleration:
     def variances(self) -> FloatArray:
         """(6,) (rad/s^2)^2 and (m/s^2)^2."""
         variances: FloatArray = np.maximum(self._mean, 0.0)
-        return variances if self._count >= _KNOWN else np.maximum(variances, self._expected)
+        return variances if self.known else np.maximum(variances, self._expected)
+
+    @property
+    def known(self) -> bool:
+        """Whether enough accelerations were met for their mean to be believed."""
+        return self._count >= _KNOWN
 
     def add(
         self, last: _Middle, stamp: int, map_T_lidar: gtsam.Pose3, covariance: FloatArray

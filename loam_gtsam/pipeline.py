@@ -7,24 +7,26 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
-from typing import Any, TypedDict, TypeVar, Unpack
+from typing import Any, TypedDict, Unpack
 
 import gtsam
 
-from loam_gtsam.config import Config, ImuConfig, Section, SensorConfig, as_config, dump_config
+from loam_gtsam.aiding.gnss import TiedFixes, tie
+from loam_gtsam.aiding.imu_summary import ImuSummary, imu_summary
+from loam_gtsam.aiding.wheels import aided_odometry
+from loam_gtsam.config import Config, Section, as_config, dump_config, with_implied
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.level import Level
-from loam_gtsam.imu.quality import ImuReport
 from loam_gtsam.io.checkpoint import Checkpoint, Progress
 from loam_gtsam.io.rollback import whole
-from loam_gtsam.loops.closure import LoopCloser
+from loam_gtsam.loops.closure import LoopCloser, NoLoops
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Places
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Odometry, make_odometry
 from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
@@ -46,30 +48,6 @@ from loam_gtsam.types import (
 
 OnFrame = Callable[[int, MapUpdate], None]
 """Called after each frame with its number and result."""
-_Section = TypeVar("_Section", SensorConfig, ImuConfig)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ImuSummary:
-    """What was made of the IMU in a run.
-
-    Attributes
-    ----------
-    report : on the samples
-    level : which way is up in the map, and how it was found; None if unknown
-    gyro_bias : (3,) rad/s, lidar frame, as learnt in the end
-    sweep_motions, tilt_priors : how many frames had which
-    gyro_trusted : whether the gyro still agreed with the scans in the end
-    problems : sentences on what the turns of the scans say about clock, unit and mounting
-    """
-
-    report: ImuReport
-    level: Level | None
-    gyro_bias: FloatArray
-    sweep_motions: Mapping[str, int]
-    tilt_priors: Mapping[str, int]
-    gyro_trusted: bool
-    problems: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -88,6 +66,7 @@ class RunResult:
     loops : keyframes and loops; None if none were looked for. ``updates`` are then in the frame
         ``odom``; ``trajectory`` and the map are corrected
     pipeline : as it is after the last sweep, for :func:`loam_gtsam.maps.map_file.save_map`
+    fixes : what became of those of a GNSS receiver; None without ``aiding.gnss``
     """
 
     config: Config
@@ -100,6 +79,7 @@ class RunResult:
     imu: ImuSummary | None = None
     loops: LoopMapping | None = None
     pipeline: Pipeline | None = None
+    fixes: TiedFixes | None = None
 
     def __repr__(self) -> str:
         """A line: all that is in it would fill the screen for minutes."""
@@ -162,6 +142,7 @@ class Pipeline:
     Parameters
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
+    wheels : predict the sweeps, if ``aiding.wheels``
     parts : solver, front end and others of a user's own, see :class:`Parts`
 
     Attributes
@@ -171,6 +152,7 @@ class Pipeline:
     faults : what is done about exceptions in parts of a user's own
     loops : keyframes and loops; None if none are looked for
     places : where the map can be recognised, once it is saved
+    earth : where the map is on the earth, by GNSS; None if unknown
     """
 
     def __init__(
@@ -178,6 +160,7 @@ class Pipeline:
         config: Config | None = None,
         *,
         imu: ImuBuffer | None = None,
+        wheels: WheelSamples | None = None,
         **parts: Unpack[Parts],
     ) -> None:
         self.config = as_config(config)
@@ -185,14 +168,18 @@ class Pipeline:
         solver, factors = parts.get("solver"), parts.get("extra_factors")
         self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=factors)
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
-        own = parts.get("odometry")
+        own = parts.get("odometry") or aided_odometry(self.config, wheels, self.mapper.imu)
         self.odometry = own or make_odometry(self.config.odometry, self.mapper.imu)
+        self._wheels = wheels
         self._features = parts.get("features")
         self._last_odom: gtsam.Pose3 | None = None
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.places = Places(self.config)
         self.loops: LoopMapping | None = None
+        self.earth: GeoReference | None = None
         closer = parts.get("loop_closer")
+        if closer is None and self.config.aiding.gnss and not self.config.loops.enabled:
+            closer = NoLoops()
         if self.config.loops.enabled or closer is not None:
             self.loops = LoopMapping(self.mapper, self.config, closer)
 
@@ -204,7 +191,7 @@ class Pipeline:
         if self.loops is not None:
             self.loops.reset()
         self.places.reset()
-        self._last_odom = None
+        self._last_odom = self.earth = None
         self._to_reference = 0
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
@@ -297,6 +284,8 @@ class Pipeline:
         shared = {"solver": mapper.solver, **_sections("config", self.config)}
         if self._features is not None:
             shared["features"] = self._features
+        if self._wheels is not None:
+            shared["wheels"] = self._wheels
         if mapper.extra_factors is not None:
             shared["extra_factors"] = mapper.extra_factors
         if mapper.imu is not None:
@@ -305,6 +294,16 @@ class Pipeline:
         if loops is not None:
             roots |= {"loops": loops, "graph": loops.graph, "closer": loops.closer}
         return roots, shared
+
+    def tie_to_earth(self, updates: Sequence[MapUpdate], fixes: GnssFixes) -> TiedFixes | None:
+        """Tie the keyframes of a run to the fixes of a receiver, once the run is complete."""
+        if self.loops is None:
+            return None
+        aid = self.mapper.imu
+        up = None if aid is None or aid.level is None else aid.level.map_up
+        tied = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
+        self.earth = tied.reference
+        return tied
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
@@ -316,6 +315,7 @@ class Pipeline:
         *,
         interrupted: bool = False,
         error: Exception | None = None,
+        fixes: TiedFixes | None = None,
     ) -> RunResult:
         """A whole run, from what :meth:`process` said about each of its sweeps."""
         mapper = self.mapper
@@ -331,9 +331,10 @@ class Pipeline:
             },
             interrupted=interrupted,
             error=error,
-            imu=None if mapper.imu is None else _imu_summary(mapper.imu, updates),
+            imu=None if mapper.imu is None else imu_summary(mapper.imu, updates),
             loops=self.loops,
             pipeline=self,
+            fixes=fixes,
         )
 
 
@@ -356,19 +357,6 @@ def effective_config(config: Config, dataset: Dataset) -> Config:
     A field the user changed from its default wins.
     """
     return with_implied(config, dataset.sensor)
-
-
-def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
-    """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset."""
-    imu = {k.removeprefix("imu."): v for k, v in implied.items() if k.startswith("imu.")}
-    sensor = {k: v for k, v in implied.items() if not k.startswith("imu.")}
-    return config.changed(sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
-
-
-def _filled(section: _Section, implied: Mapping[str, Any]) -> _Section:
-    default = type(section)()
-    unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}
-    return section.changed(**unset)
 
 
 def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
@@ -431,7 +419,8 @@ def run(
         )
     config = effective_config(as_config(config), dataset)
     imu = imu_buffer(dataset, config)
-    pipeline = Pipeline(config, imu=imu, **parts)
+    fixes, wheels = aids_of(dataset, config)
+    pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
     if parts.get("features") is not None:
         workers = 0
     about = {"data set": dataset.name, "configuration": dump_config(config)}
@@ -465,16 +454,5 @@ def run(
         error = caught
     finally:
         progress.end()
-    return pipeline.result(updates, interrupted=interrupted, error=error)
-
-
-def _imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
-    return ImuSummary(
-        report=aid.buffer.report,
-        level=aid.level,
-        gyro_bias=aid.buffer.gyro_bias,
-        sweep_motions=Counter(str(update.sweep_motion) for update in updates),
-        tilt_priors=Counter(str(update.tilt_prior) for update in updates),
-        gyro_trusted=aid.trusted_gyro is not None,
-        problems=aid.problems,
-    )
+    tied = None if fixes is None else pipeline.tie_to_earth(updates, fixes)
+    return pipeline.result(updates, interrupted=interrupted, error=error, fixes=tied)

@@ -12,13 +12,14 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
+from loam_gtsam.aiding.imu_summary import ImuSummary
 from loam_gtsam.cli.console import number_table
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.io.run_files import stage_seconds
-from loam_gtsam.pipeline import ImuSummary, RunResult, effective_config, imu_buffer
+from loam_gtsam.pipeline import RunResult, effective_config, imu_buffer
 from loam_gtsam.refine.map_quality import map_quality
 from loam_gtsam.types import (
     TANGENT,
@@ -34,7 +35,7 @@ _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
 _TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
 _ADVICE = {
     FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
-    "docs/imu.md, docs/own_factor.md",
+    "docs/imu.md, docs/gnss.md",
     FrameStatus.LOST: "too fast or too few matches: use every sweep, check sensor.* and the times "
     "of the points",
     FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",
@@ -69,7 +70,8 @@ def summary(
         "map, planes": _thickness(result),
         "map, dropped": _dropped(result),
         "accuracy": _accuracy(accuracy),
-        "loops": "" if result.loops is None else _loops(result.loops.counts()),
+        "loops": _loops(result),
+        "GNSS": "" if result.fixes is None else str(result.fixes),
     }
     notes = [f"input: {problem}" for problem in problems]
     if result.imu is not None:
@@ -135,7 +137,11 @@ def _accuracy(accuracy: Mapping[str, Any]) -> str:
     return text
 
 
-def _loops(counts: dict[str, int]) -> str:
+def _loops(result: RunResult) -> str:
+    config = result.config
+    if result.loops is None or (config.aiding.gnss and not config.loops.enabled):
+        return ""
+    counts = result.loops.counts()
     used = f"{counts.pop('on')} of {counts.pop('loops')} found are used"
     return f"{used}; {_counts({name.replace('_', ' '): n for name, n in counts.items()})}"
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.io.run_files import RUN_FILES, write_run
@@ -36,9 +37,18 @@ ERROR_PLOT = "errors.png"
 TRUTH_FILE, MATCHED_FILE = "truth.tum", "truth_matched.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
 MAP_FILE = f"map{SUFFIX}"
+ENU_FILE = "trajectory_enu.tum"
 BASE_FILES = (*RUN_FILES, MAP_FILE)
 """What every run writes."""
-RUN_OUTPUTS = (*BASE_FILES, *PLOT_FILES, ERROR_PLOT, *LOOP_FILES, TRUTH_FILE, MATCHED_FILE)
+RUN_OUTPUTS = (
+    *BASE_FILES,
+    *PLOT_FILES,
+    ERROR_PLOT,
+    *LOOP_FILES,
+    TRUTH_FILE,
+    MATCHED_FILE,
+    ENU_FILE,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,6 +103,9 @@ class Results:
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
         if self.run.pipeline is not None:
             save_map(folder / MAP_FILE, self.run.pipeline)
+        if self.run.fixes is not None and self.run.fixes.reference is not None:
+            write_enu(folder / ENU_FILE, self.run.trajectory, self.run.fixes.reference)
+            files.append(ENU_FILE)
         if self.truth is not None:
             write_tum(folder / TRUTH_FILE, self.truth)
             files.append(TRUTH_FILE)

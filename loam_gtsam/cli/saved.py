@@ -12,9 +12,10 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import LocaliseOptions, OptimizeOptions
-from loam_gtsam.cli.results import MAP_FILE
+from loam_gtsam.cli.results import ENU_FILE, MAP_FILE
 from loam_gtsam.cli.run import worker_count
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset
@@ -32,7 +33,7 @@ from loam_gtsam.view import plots
 _LISTED = 10  # at most, of the loops that are switched off
 LOCALISED_FILES = (
     "trajectory.tum", "trajectory_covariance.csv", "run.npz", "config.yaml", MAP_FILE,
-    "localised.png", "summary.json",
+    "localised.png", ENU_FILE, "summary.json",
 )  # fmt: skip
 
 
@@ -157,6 +158,8 @@ def _write(
     write_covariances(folder / LOCALISED_FILES[1], found.solved)
     write_npz(folder / LOCALISED_FILES[2], found.updates)
     write_text(folder / LOCALISED_FILES[3], dump_config(found.config))
+    if saved.earth is not None:
+        write_enu(folder / ENU_FILE, found.trajectory, saved.earth)
     if draws:
         plots.plot_map(folder / "localised.png", *saved.points(), found.trajectory)
     write_json(folder / "summary.json", summary)

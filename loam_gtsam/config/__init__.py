@@ -6,6 +6,7 @@ returns a named one; :meth:`Config.changed` and :meth:`Section.changed` change v
 :func:`dump_config` writes YAML with the meaning of every key as a comment.
 """
 
+from loam_gtsam.config.aiding import AidingConfig as AidingConfig
 from loam_gtsam.config.base import Section as Section
 from loam_gtsam.config.base import meaning as meaning
 from loam_gtsam.config.sections import BagConfig as BagConfig
@@ -32,3 +33,4 @@ from loam_gtsam.config.tree import dump_config as dump_config
 from loam_gtsam.config.tree import load_config as load_config
 from loam_gtsam.config.tree import parse_config as parse_config
 from loam_gtsam.config.tree import preset as preset
+from loam_gtsam.config.tree import with_implied as with_implied

@@ -13,6 +13,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from loam_gtsam.config import sections
+from loam_gtsam.config.aiding import AidingConfig
 from loam_gtsam.config.base import (
     Section,
     clipped,
@@ -40,6 +41,7 @@ class Config(Section):
     imu: sections.ImuConfig = sections.ImuConfig()
     relocalization: sections.RelocalizationConfig = sections.RelocalizationConfig()
     covariance: sections.CovarianceConfig = sections.CovarianceConfig()
+    aiding: AidingConfig = AidingConfig()
     pose_graph: sections.PoseGraphConfig = sections.PoseGraphConfig()
     loops: sections.LoopConfig = sections.LoopConfig()
     bag: sections.BagConfig = sections.BagConfig()
@@ -93,6 +95,19 @@ class Config(Section):
                 "covariance": _scaled(self.covariance, SMALL, "ground_cell"),
             }
         )
+
+
+def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
+    """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset."""
+    imu = {k.removeprefix("imu."): v for k, v in implied.items() if k.startswith("imu.")}
+    sensor = {k: v for k, v in implied.items() if not k.startswith("imu.")}
+    return config.changed(sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
+
+
+def _filled(section: Section, implied: Mapping[str, Any]) -> Section:
+    default = type(section)()
+    unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}
+    return section.changed(**unset)
 
 
 def _scaled(section: Section, factor: float, *names: str) -> Section:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo, Loader
+from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
@@ -28,7 +29,7 @@ class ArrayDataset(Loader):
     stamps_s : instead of ``stamps``: float seconds
     times : per array (N,) seconds from its stamp at which each point was measured
     rings : per array (N,) integer beam numbers
-    imu, truth : handed through
+    imu, truth, gnss, wheels : handed through
     name : for output files
     sensor : fields of ``SensorConfig`` these sweeps imply
 
@@ -48,11 +49,14 @@ class ArrayDataset(Loader):
         rings: Sequence[NDArray[np.integer]] | None = None,
         imu: ImuSamples | None = None,
         truth: Trajectory | None = None,
+        gnss: GnssFixes | None = None,
+        wheels: WheelSamples | None = None,
         name: str = "arrays",
         sensor: Mapping[str, Any] | None = None,
     ) -> None:
         entries = list(scans)
         self.name, self.imu, self.truth = name, imu, truth
+        self.gnss, self.wheels = gnss, wheels
         self.sensor: Mapping[str, Any] = dict(sensor or {})
         self._scans: list[Scan] = []
         if ready := [entry for entry in entries if isinstance(entry, Scan)]:

@@ -11,6 +11,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 
 import numpy as np
 
+from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
 from loam_gtsam.types import (
     BadSweep,
@@ -50,12 +51,15 @@ class BagOptions(TimeOptions, total=False):
     ----------
     topic, imu_topic : of sweeps and IMU; None takes the one of the known data set, else the one of
         its type with the most messages
+    gnss_topic, wheels_topic : of a GNSS receiver and of wheels; likewise
     time_field, time_unit, stamp_is : see
         :func:`loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
     """
 
     topic: str | None
     imu_topic: str | None
+    gnss_topic: str | None
+    wheels_topic: str | None
 
 
 @runtime_checkable
@@ -130,6 +134,16 @@ class ChangedDataset(Loader):
     def imu(self) -> ImuSamples | None:
         """IMU of the other data set."""
         return self._dataset.imu
+
+    @property
+    def gnss(self) -> GnssFixes | None:
+        """Fixes of the other data set, if it has any."""
+        return getattr(self._dataset, "gnss", None)
+
+    @property
+    def wheels(self) -> WheelSamples | None:
+        """Wheels of the other data set, if it has any."""
+        return getattr(self._dataset, "wheels", None)
 
     @property
     def truth(self) -> Trajectory | None:

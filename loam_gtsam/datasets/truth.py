@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from loam_gtsam.datasets.decode import tables
+from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import BadSweep, DatasetError, FloatArray, IntArray, Trajectory
@@ -28,7 +29,6 @@ _EXPECTED = (
 )
 _SECONDS_DIGITS = 14
 """A first column of more digits, without a point, is nanoseconds."""
-_RADIUS, _FLATTENING = 6378137.0, 1.0 / 298.257223563  # WGS 84
 
 
 def read_truth(
@@ -200,31 +200,9 @@ def _of_bag(path: Path, topic: str | None, problems: list[str]) -> tuple[IntArra
         turn = getattr(pose, "orientation", None) or pose.rotation
         rows.append([place.x, place.y, place.z, turn.x, turn.y, turn.z, turn.w])
     if kind == _FIX and rows:
-        rows = _east_north_up(np.array(rows, np.float64)).tolist()
+        rows = east_north_up(np.array(rows, np.float64)).tolist()
     try:
         poses = np.array([_pose(row) for row in rows], np.float64).reshape(-1, 4, 4)
     except ValueError as error:
         raise DatasetError(f"{path}, topic {chosen}: {error}") from error
     return np.array(stamps, np.int64), poses
-
-
-def _east_north_up(fixes: FloatArray) -> FloatArray:
-    """(N, 3) metres east, north and up of the first of (N, 3) latitudes, longitudes, heights."""
-    latitude, longitude = np.radians(fixes[:, 0]), np.radians(fixes[:, 1])
-    squared = _FLATTENING * (2.0 - _FLATTENING)
-    normal = _RADIUS / np.sqrt(1.0 - squared * np.sin(latitude) ** 2)
-    across = (normal + fixes[:, 2]) * np.cos(latitude)
-    earth = np.column_stack([
-        across * np.cos(longitude),
-        across * np.sin(longitude),
-        (normal * (1.0 - squared) + fixes[:, 2]) * np.sin(latitude),
-    ])  # fmt: skip
-    (sin_b, cos_b), (sin_l, cos_l) = (
-        (np.sin(angle[0]), np.cos(angle[0])) for angle in (latitude, longitude)
-    )
-    local = np.array([
-        [-sin_l, cos_l, 0.0],
-        [-sin_b * cos_l, -sin_b * sin_l, cos_b],
-        [cos_b * cos_l, cos_b * sin_l, sin_b],
-    ])  # fmt: skip
-    return np.asarray((earth - earth[0]) @ local.T, np.float64)

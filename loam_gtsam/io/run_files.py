@@ -28,7 +28,8 @@ from loam_gtsam.types import (
 )
 
 if TYPE_CHECKING:
-    from loam_gtsam.pipeline import ImuSummary, RunResult
+    from loam_gtsam.aiding.imu_summary import ImuSummary
+    from loam_gtsam.pipeline import RunResult
 
 _NS = 10**9
 _MAX_MESSAGES = 20  # in summary.json; run.npz has them all
@@ -228,6 +229,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "localizability": _axes_part(result),
         "imu": None if result.imu is None else _imu_part(result.imu),
         "loops": None if result.loops is None else result.loops.counts(),
+        "gnss": None if result.fixes is None else result.fixes.as_dict(),
     }
 
 

@@ -17,7 +17,11 @@ _NS = 10**9
 
 
 def write_tum(
-    path: str | Path, trajectory: Trajectory, *, comments: Mapping[str, str] | None = None
+    path: str | Path,
+    trajectory: Trajectory,
+    *,
+    comments: Mapping[str, str] | None = None,
+    pose: str = "map_T_lidar",
 ) -> None:
     """Write ``stamp x y z qx qy qz qw`` per line (TUM format, as evo reads it).
 
@@ -25,8 +29,9 @@ def write_tum(
     ----------
     trajectory : stamps become seconds with nine decimals, exactly
     comments : written as ``# key: value`` at the top
+    pose : what the poses are called there
     """
-    notes = dict(comments or {}) | {"columns": "stamp_s x y z qx qy qz qw (map_T_lidar)"}
+    notes = dict(comments or {}) | {"columns": f"stamp_s x y z qx qy qz qw ({pose})"}
     lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
     poses = trajectory.map_T_lidar
     quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else []

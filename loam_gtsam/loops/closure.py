@@ -51,6 +51,14 @@ class LoopCloser(Protocol):
         ...
 
 
+class NoLoops(LoopCloser):
+    """Finds none: for a pose graph that something else ties."""
+
+    def detect(self, keyframe: Keyframe, history: PoseGraph) -> LoopClosure | None:
+        """See :meth:`LoopCloser.detect`."""
+        return None
+
+
 class Rejection(StrEnum):
     """The reason why a keyframe or a candidate gave no loop closure."""
 

@@ -186,6 +186,24 @@ class PoseGraph(FactorGraph):
         stamps = {keyframe.key: keyframe.stamp for keyframe in self.keyframes}
         return SavedGraph(graph, self.values, stamps)
 
+    def active_factors(self) -> gtsam.NonlinearFactorGraph:
+        """All factors that are in the graph now, those of inactive loop closures left out."""
+        graph = gtsam.NonlinearFactorGraph(self._graph.factors)
+        for loop, active in zip(self.loops, self.active, strict=True):
+            if active:
+                graph.add(loop.factor(self.config.kernel_width))
+        return graph
+
+    def tie(self, factors: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> None:
+        """Add factors that are believed, and go on from a solution with them.
+
+        ``values`` are estimates of all variables, those that ``factors`` add included. Unlike
+        :meth:`add_factor` it takes a thousand factors at once, and checks none.
+        """
+        kept = gtsam.NonlinearFactorGraph(self._graph.factors)
+        kept.push_back(factors)
+        self._graph.restart(values, np.array(self.active, np.bool_), kept)
+
     def optimize(self) -> OptimizedGraph:
         """Solve the whole graph at once, loop closures tested from scratch, and go on from there.
 

@@ -19,7 +19,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.config import Config, ImuConfig, SensorConfig, SolverConfig
+from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
 from loam_gtsam.geometry import symmetric
@@ -207,7 +207,8 @@ class Localizer:
     def save(self, path: str | Path) -> None:
         """Write the map with what was added to it; see :func:`~loam_gtsam.maps.save_map`."""
         self._add_places()
-        write_map(path, self._maps, self._places, self._saved.config, self._saved.up)
+        saved = self._saved
+        write_map(path, self._maps, self._places, saved.config, saved.up, saved.earth)
 
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6, 6) of the saved map's own error at a pose, along its axes, about its origin."""
@@ -233,6 +234,7 @@ def config_in(saved: SavedMap, config: Config | None, *, extend: bool = False) -
     cubes = own.map.changed(window=window, window_margin=margin, archive_dir=None)
     return config.changed(
         map=cubes,
+        aiding=AidingConfig(),  # fixes tie a run, not a drive in a map that stays
         loops=config.loops.changed(enabled=False, **shape),
         # No ground is new, unless the map is extended.
         covariance=config.covariance if extend else config.covariance.changed(drift=0.0),

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.config.tree import parse_config
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import ConfigError
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
@@ -64,7 +65,8 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
         places = corrected(places, loops)
     aid = pipeline.mapper.imu
     level = None if aid is None else aid.level
-    write_map(path, maps, places, pipeline.config, None if level is None else level.map_up)
+    up = None if level is None else level.map_up
+    write_map(path, maps, places, pipeline.config, up, pipeline.earth)
 
 
 def write_map(
@@ -73,8 +75,11 @@ def write_map(
     places: Sequence[Place],
     config: Config,
     up: FloatArray | None,
+    earth: GeoReference | None = None,
 ) -> None:
     """Write maps and places; ``config`` is that of the maps, ``up`` (3,) is up in them, if known.
+
+    ``earth`` is where they are on the earth, if that is known.
 
     Raises OutputError as :func:`save_map`.
     """
@@ -86,6 +91,7 @@ def write_map(
         "frame": {
             "origin": "first sweep of the run, at its reference time",
             "up": None if up is None else up.tolist(),
+            "enu": None if earth is None else earth.as_dict(),
         },
         "config": dump_config(config),
         "places": len(places),
@@ -116,6 +122,7 @@ class SavedMap:
     places : where the map can be recognised
     layers : numbers of points by cube, by kind of map (:data:`LAYERS`)
     up : (3,) up in the map; None if the run had no IMU that knew
+    earth : where the map is on the earth; None if the run had no GNSS receiver
 
     Raises
     ------
@@ -164,6 +171,8 @@ class SavedMap:
             }
             up = header["frame"]["up"]
             self.up = None if up is None else np.array(up, np.float64).reshape(3)
+            enu = header["frame"].get("enu")
+            self.earth = None if enu is None else GeoReference.of_dict(enu)
             self.places = self._places(int(header["places"]))
         except (*_DAMAGED, ConfigError) as error:
             raise self._damaged(_HEADER, error) from error

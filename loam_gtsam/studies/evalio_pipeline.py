@@ -17,12 +17,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, config_from_dict, config_to_dict
+from loam_gtsam.config import Config, config_from_dict, config_to_dict, with_implied
 from loam_gtsam.datasets.decode.extrinsics import extrinsic_settings
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.pipeline import Pipeline, with_implied
+from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.types import FloatArray, ImuSamples, InputError, Scan
 
 try:

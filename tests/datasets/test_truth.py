@@ -11,6 +11,7 @@ from support.trajectories import winding
 
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.base import PartOf
+from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.datasets.truth import extrinsic, read_truth
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.pipeline import run
@@ -110,10 +111,8 @@ def test_topics_of_poses(tmp_path, kind, bag):
         read_truth(path, topic="/other")
 
 
-def test_gps_fixes_become_metres_east_north_and_up(monkeypatch):
-    from loam_gtsam.datasets import truth as module
-
-    metres = module._east_north_up(np.array([
+def test_gps_fixes_become_metres_east_north_and_up():
+    metres = east_north_up(np.array([
         [48.0, 11.0, 500.0], [48.001, 11.0, 500.0], [48.0, 11.001, 510.0],
     ]))  # fmt: skip
     # A thousandth of a degree: of latitude 111.2 m there, of longitude 74.6 m (WGS 84).

@@ -14,7 +14,8 @@ import numpy as np
 
 from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo, Loader
-from loam_gtsam.datasets.decode import extrinsics, pointcloud2, tables
+from loam_gtsam.datasets.decode import aiding, extrinsics, pointcloud2, tables
+from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
 
@@ -30,7 +31,8 @@ class BagDataset(Loader):
     ----------
     path : ROS 1 ``.bag``, ROS 2 bag folder, or a single ``.mcap`` / ``.db3``
     parts : the bags of a recording that was split; ``path`` then only names them
-    options : ``topic``, ``imu_topic``, ``time_field``, ``time_unit``, ``stamp_is``: see
+    options : ``topic``, ``imu_topic``, ``gnss_topic``, ``wheels_topic``, ``time_field``,
+        ``time_unit``, ``stamp_is``: see
         :class:`~loam_gtsam.datasets.base.BagOptions`
 
     Raises
@@ -46,6 +48,8 @@ class BagDataset(Loader):
         if unknown := options.keys() - BagOptions.__annotations__.keys():
             raise TypeError(f"unexpected keyword arguments: {', '.join(sorted(unknown))}")
         topic, imu_topic = options.pop("topic", None), options.pop("imu_topic", None)
+        gnss_topic = options.pop("gnss_topic", None)
+        wheels_topic = options.pop("wheels_topic", None)
         check_time_options(options.get("time_unit"), options.get("stamp_is"))
         self._path, self._parts = Path(path), tuple(parts)
         self.name = self._path.stem
@@ -59,6 +63,9 @@ class BagDataset(Loader):
         self.imu_topic = None
         if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
             self.imu_topic = choose(IMU, imu_topic)
+        self.gnss_topic = bag_reader.find_topic(choose, topics, (aiding.FIX,), gnss_topic)
+        kinds = aiding.TWIST, aiding.ODOMETRY
+        self.wheels_topic = bag_reader.find_topic(choose, topics, kinds, wheels_topic)
         self._count = topics[self.topic][1]
         self._decision: TimeDecision | None = None
         self._peek()
@@ -87,6 +94,29 @@ class BagDataset(Loader):
             return None
         return bag_reader.read_imu(self._path, self.imu_topic, self._problems, self._parts)
 
+    @cached_property
+    def gnss(self) -> GnssFixes | None:
+        """All fixes of the GNSS topic, or None; reads them at the first access."""
+        if self.gnss_topic is None:
+            return None
+        messages = self._contents(self.gnss_topic)
+        return aiding.fixes_of(messages, self.gnss_topic, self._problems)
+
+    @cached_property
+    def wheels(self) -> WheelSamples | None:
+        """The way by the wheels' topic, or None; reads it at the first access."""
+        if self.wheels_topic is None:
+            return None
+        messages = self._contents(self.wheels_topic)
+        return aiding.wheels_of(messages, self.wheels_topic, self._problems)
+
+    def _contents(self, topic: str) -> list[Any]:
+        found = list(self._messages(topic, self._problems))
+        good = [message.content for message in found if not isinstance(message, BadSweep)]
+        if lost := len(found) - len(good):
+            self._problems.append(f"{topic}: {lost} messages cannot be read")
+        return good
+
     @property
     def truth(self) -> Trajectory | None:
         """None: a bag of sweeps carries no reference poses."""
@@ -94,11 +124,15 @@ class BagDataset(Loader):
 
     def info(self) -> DatasetInfo:
         """Description of the bag; reads the first sweeps and the IMU topic."""
-        imu = self.imu  # first: it may find problems
+        imu, _ = self.imu, self.gnss  # first: they may find problems
         facts = dict(self._facts)
         if self.imu_topic is not None:
             facts["IMU topic"] = self.imu_topic
         facts["IMU"] = tables.describe_imu(imu)
+        if self.gnss_topic is not None:
+            facts["GNSS"] = aiding.describe_fixes(self.gnss, self.gnss_topic)
+        if self.wheels_topic is not None:
+            facts["wheels"] = f"{self.wheels_topic}; --wheels uses it"
         kind = bag_reader.bag_kind(self._parts[0] if self._parts else self._path)
         return DatasetInfo(kind, str(self._path), facts, list(self._problems))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from loam_gtsam.datasets.decode import aiding
 from loam_gtsam.datasets.decode.pointcloud2 import decode_imu
 from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS, clean_imu
 from loam_gtsam.errors import nearest
@@ -21,6 +22,14 @@ MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_register
 """Topics on which LOAM and A-LOAM publish clouds in the map."""
 _MOST = 2**63 - 1
 """Neither a length nor nanoseconds are larger; a bag without messages starts there."""
+
+
+_OPTIONS = {
+    "sensor_msgs/msg/Imu": "--imu-topic",
+    aiding.FIX: "--gnss-topic",
+    aiding.TWIST: "--wheels-topic",
+    aiding.ODOMETRY: "--wheels-topic",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +110,7 @@ def choose_topic(
             hint += "; a Livox does not sweep rings, and cannot be used"
         there = f"the bag has: {listing or 'no messages'}{hint}"
         raise DatasetError(f"{path}: no topic of type {kind}; {there}")
-    option = "--imu-topic" if kind.endswith("Imu") else "--topic"
+    option = _OPTIONS.get(kind, "--topic")
     measured = [name for name in candidates if name not in MAPPED] or candidates
     chosen = max(measured, key=lambda name: topics[name][1])  # the first of equals
     if chosen in MAPPED:
@@ -114,6 +123,23 @@ def choose_topic(
             f"{option} chooses another"
         )
     return chosen
+
+
+def find_topic(
+    choose: Callable[[str, str | None], str],
+    topics: Mapping[str, tuple[str, int]],
+    kinds: Sequence[str],
+    asked: str | None,
+) -> str | None:
+    """A topic of the first of some types that a bag has, None if it has none of them.
+
+    ``choose`` is :func:`choose_topic` of the bag; a topic that is ``asked`` for must be of one.
+    """
+    there = {kind for name, (kind, _) in topics.items() if asked in (None, name)}
+    for kind in kinds:
+        if kind in there:
+            return choose(kind, asked)
+    return None if asked is None else choose(kinds[-1], asked)
 
 
 def read_messages(

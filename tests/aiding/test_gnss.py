@@ -1,0 +1,148 @@
+"""Fixes of a GNSS receiver on a pose graph: what they mend, and what must not bend it."""
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+from support.receiver import ANTENNA, CONFIG, ENU_T_MAP, ORIGIN, Drive
+
+from loam_gtsam.aiding.gnss import ANTENNA_KEY, MAP_KEY, fix_factor, tie, write_enu
+from loam_gtsam.datasets.decode.geodesy import east_north_up
+from loam_gtsam.io.trajectories import write_tum
+from loam_gtsam.types import Trajectory
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_the_jacobians_of_a_fix_are_those_of_its_residual():
+    rng = np.random.default_rng(0)
+    key = gtsam.symbol("x", 3)
+    start = gtsam.Values()
+    start.insert(key, gtsam.Pose3.Expmap(rng.normal(size=6)))
+    start.insert(MAP_KEY, gtsam.Pose3.Expmap(rng.normal(size=6)))
+    start.insert(ANTENNA_KEY, rng.normal(size=3))
+    moved = gtsam.Pose3.Expmap(rng.normal(size=6))
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+    factor = fix_factor(key, rng.normal(size=3), noise, moved)
+    ordering = gtsam.Ordering()
+    for variable in (key, MAP_KEY, ANTENNA_KEY):
+        ordering.push_back(variable)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(factor)
+    jacobian, _ = graph.linearize(start).jacobian(ordering)
+
+    def error(step):
+        values = gtsam.Values()
+        values.insert(key, start.atPose3(key).retract(step[:6]))
+        values.insert(MAP_KEY, start.atPose3(MAP_KEY).retract(step[6:12]))
+        values.insert(ANTENNA_KEY, start.atPoint3(ANTENNA_KEY) + step[12:])
+        return factor.unwhitenedError(values)
+
+    steps = 1e-6 * np.eye(15)
+    numeric = np.stack([(error(d) - error(-d)) / 2e-6 for d in steps], axis=1)
+    np.testing.assert_allclose(jacobian, numeric, atol=1e-8)
+
+
+def test_right_fixes_are_used_and_tell_where_the_map_is():
+    drive = Drive()
+    before = drive.errors()[40:].mean()
+    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, UP)
+    assert tied.problem == ""
+    assert tied.used.all()
+    assert tied.reference is not None
+    found = gtsam.Pose3(tied.reference.enu_T_map)
+    shift = east_north_up(tied.reference.origin[None], ORIGIN)[0]
+    away = found.rotation().between(ENU_T_MAP.rotation())
+    error = np.concatenate([gtsam.Rot3.Logmap(away), found.rotation().matrix().T
+                            @ (ENU_T_MAP.translation() - found.translation() - shift)])  # fmt: skip
+    assert error @ np.linalg.solve(tied.reference.covariance, error) < 22.5  # chi squared, 0.1 %
+    assert np.sqrt(tied.reference.covariance[5, 5]) < 0.2
+    assert drive.errors()[40:].mean() < 0.5 * before
+    np.testing.assert_allclose(tied.antenna, ANTENNA, atol=0.15)
+
+
+@pytest.mark.parametrize("kind", ["jump", "frozen", "one"])
+def test_wrong_fixes_are_rejected_and_bend_nothing(kind):
+    clean, drive = Drive(), Drive()
+    wrong = {"jump": slice(20, 32), "frozen": slice(50, 65), "one": slice(40, 41)}[kind]
+    drive.enu[wrong] = drive.enu[50] if kind == "frozen" else drive.enu[wrong] + [30.0, -8.0, 3.0]
+    tie(clean.graph, clean.updates, clean.fixes(), CONFIG, UP)
+    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, UP)
+    rejected = np.flatnonzero(~tied.used)
+    away = np.linalg.norm(drive.enu - clean.enu, axis=1) > 2.5  # a frozen one begins right
+    assert set(np.flatnonzero(away)) <= set(rejected)
+    assert len(rejected) <= away.sum() + 4
+    assert np.abs(drive.errors() - clean.errors()).max() < 0.35
+
+
+def test_covariances_that_are_too_small_are_widened():
+    drive = Drive()
+    drive.covariance = drive.covariance / 16.0
+    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, UP)
+    assert tied.used.mean() > 0.95
+    assert 3.0 < tied.scale < 5.0
+
+
+def test_a_map_that_is_not_levelled_is_found_too():
+    drive = Drive()
+    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, None)
+    assert tied.reference is not None
+    assert abs(np.radians(tied.reference.heading_deg) - 2.2) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("case", "told"),
+    [
+        ("elsewhere", "fixes agree"),
+        ("coarse", "too short"),
+        ("no covariance", "0 of them within the run and with a covariance"),
+        ("later", "0 keyframes have a fix"),
+    ],
+)
+def test_fixes_that_say_nothing_are_not_used_and_the_graph_stays(case, told):
+    drive = Drive()
+    if case == "elsewhere":
+        drive.enu = np.random.default_rng(1).uniform(-300.0, 300.0, drive.enu.shape)
+    if case == "coarse":
+        drive.covariance = 400.0 * np.eye(3)
+    if case == "later":
+        drive.stamps = drive.stamps + 10**12
+    before = drive.graph.poses()
+    tied = tie(drive.graph, drive.updates, drive.fixes(case == "no covariance"), CONFIG, UP)
+    assert tied.reference is None
+    assert told in tied.problem
+    assert not tied.used.any()
+    assert np.array_equal(drive.graph.poses(), before)
+
+
+def test_a_sigma_stands_for_covariances_that_are_not_told():
+    drive = Drive()
+    tied = tie(drive.graph, drive.updates, drive.fixes(True), CONFIG.changed(gnss_sigma=0.3), UP)
+    assert tied.reference is not None
+    assert "fixes used" in str(tied)
+
+
+def test_errors_that_last_make_the_covariance_wider():
+    sigmas = []
+    for memory in (0.0, 2.0):
+        drive = Drive()
+        config = CONFIG.changed(gnss_memory=memory)
+        tied = tie(drive.graph, drive.updates, drive.fixes(), config, UP)
+        assert tied.reference is not None
+        sigmas.append(np.sqrt(tied.reference.covariance[3, 3]))
+    assert sigmas[1] > 2.0 * sigmas[0]
+
+
+def test_poses_in_enu_are_written_with_their_origin(tmp_path):
+    drive = Drive()
+    tied = tie(drive.graph, drive.updates, drive.fixes(), CONFIG, UP)
+    assert tied.reference is not None
+    flat = Trajectory(np.array([5]), np.eye(4)[None])
+    write_enu(tmp_path / "enu.tum", flat, tied.reference)
+    moved = replace(flat, map_T_lidar=tied.reference.enu_T_map[None])
+    write_tum(tmp_path / "same.tum", moved)
+    lines = (tmp_path / "enu.tum").read_text().splitlines()
+    latitude = float(lines[0].split()[3])
+    assert abs(latitude - tied.reference.origin[0]) < 1e-9
+    assert lines[-1] == (tmp_path / "same.tum").read_text().splitlines()[-1]

@@ -78,5 +78,5 @@ def test_what_cannot_be_is_refused(tunnel):
     dataset = ArrayDataset(
         list(tunnel), imu=tunnel.imu, wheels=planar(tunnel), sensor=tunnel.sensor
     )
-    with pytest.raises(ConfigError, match="imu.coupling"):
+    with pytest.raises(ConfigError, match=r"imu\.coupling"):
         run(dataset, Config(aiding=MOUNTED))

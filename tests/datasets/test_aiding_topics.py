@@ -15,13 +15,13 @@ from loam_gtsam.types import DatasetError
 ORIGIN = np.array([47.5, 8.5, 450.0])
 
 
-def fix(store, stamp, place, *, status=0, covariance=np.diag([0.04, 0.04, 0.16]), known=2):
+def fix(store, stamp, place, *, status=0, covariance=(0.04, 0.04, 0.16), known=2):
     types = store.types
     return types["sensor_msgs/msg/NavSatFix"](
         header=header(store, stamp),
         status=types["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
         latitude=float(place[0]), longitude=float(place[1]), altitude=float(place[2]),
-        position_covariance=np.asarray(covariance, np.float64).ravel(),
+        position_covariance=np.diag(covariance).ravel(),
         position_covariance_type=known,
     )  # fmt: skip
 
@@ -44,7 +44,7 @@ def test_topics_are_found_by_their_types(tmp_path, kind):
             0: fix(store, stamp, ORIGIN),
             1: fix(store, stamp, ORIGIN, status=-1),
             2: fix(store, stamp, [np.nan] * 3),
-            3: fix(store, stamp, ORIGIN + [1e-5, 0.0, 1.0], known=0),
+            3: fix(store, stamp, ORIGIN + np.array([1e-5, 0.0, 1.0]), known=0),
         }
         recording.append(("/gps/fix", stamp + LATENCY, fixes[n]))
         recording.append(("/odom", stamp + LATENCY, odometry(store, stamp, [0.5 * n, 0.0, 0.0])))
@@ -59,7 +59,7 @@ def test_topics_are_found_by_their_types(tmp_path, kind):
     assert "2 fixes (/gps/fix)" in info.facts["GNSS"]
     assert any("2 of 4 messages have no fix" in problem for problem in info.problems)
     assert any("1 of 2 fixes without a covariance" in problem for problem in info.problems)
-    with pytest.raises(DatasetError, match="no topic '/fix'.*gps/fix"):
+    with pytest.raises(DatasetError, match=r"no topic '/fix'.*gps/fix"):
         open_dataset(path, gnss_topic="/fix")
     with pytest.raises(DatasetError, match="expected nav_msgs/msg/Odometry"):
         open_dataset(path, wheels_topic="/gps/fix")
@@ -87,9 +87,10 @@ def test_a_run_with_gnss_places_its_map_on_the_earth(tmp_path):
         recording.append(("/points", scan.stamp, message))
     stamps = world.truth.stamps[2:-1]
     noise = np.random.default_rng(0).normal(0.0, 0.01, (len(stamps), 3))
-    for stamp, enu in zip(stamps, world.truth_at(stamps).map_T_lidar[:, :3, 3] + noise, strict=True):
+    positions = world.truth_at(stamps).map_T_lidar[:, :3, 3] + noise
+    for stamp, enu in zip(stamps, positions, strict=True):
         place = geodetic_of((enu @ [[0, 1, 0], [-1, 0, 0], [0, 0, 1]])[None], ORIGIN)[0]
-        known = np.diag([1e-4, 1e-4, 1e-4])
+        known = (1e-4, 1e-4, 1e-4)
         recording.append(("/fix", int(stamp), fix(ROS1, int(stamp), place, covariance=known)))
     path = write_bag(tmp_path / "drive", "ros1", recording)
     near = ["--set", "pose_graph.keyframe_distance=0.1", "--set", "aiding.gnss_memory=0"]

@@ -2,7 +2,7 @@
 
 import gtsam
 import numpy as np
-from support.pose_graphs import FRAME, drifted, frames, settings, square
+from support.pose_graphs import FRAME, SIGMAS, drifted, frames, settings, square
 
 from loam_gtsam.config import AidingConfig
 from loam_gtsam.datasets.decode.aiding import GnssFixes
@@ -18,7 +18,7 @@ CONFIG = AidingConfig(gnss=True, lidar_t_antenna=tuple(ANTENNA), gnss_memory=0.0
 class Drive:
     """Truth, drifted odometry, its graph, and fixes with noise of ``sigma`` between the frames."""
 
-    def __init__(self, seed=0, sigma=0.3, laps=2, step=np.repeat([0.002, 0.02], 3)):
+    def __init__(self, seed=0, sigma=0.3, laps=2, step=SIGMAS):
         rng = np.random.default_rng(seed)
         self.truth = square(10, laps)
         self.updates = frames(drifted(self.truth, rng, step), step)

@@ -12,6 +12,7 @@ from typing import Annotated
 import typer
 
 from loam_gtsam.cli.options import (
+    CleanOptions,
     CompareOptions,
     ConfigOptions,
     DemoOptions,
@@ -168,6 +169,19 @@ def refine(options: RefineOptions) -> int:
     from loam_gtsam.cli.refine import execute
 
     return execute(options)
+
+
+@app.command(short_help="Take what moved out of the map of a finished run.")
+@command
+def clean(options: CleanOptions) -> int:
+    """Take out of the map of a finished run what its sweeps saw through: people, cars.
+
+    PATH is the data set that was run: it is read once more. The map without them, a picture of
+    before and after, and the counts go to RUN/cleaned.
+    """
+    from loam_gtsam.cli.saved import clean_run
+
+    return clean_run(options)
 
 
 @app.command("config")

@@ -66,7 +66,7 @@ def refine_folder(
     graph, trajectory = None, None
     if (folder / "pose_graph.g2o").exists():
         graph = read_graph(folder / "pose_graph.g2o")
-        trajectory = _corrected(folder, updates)
+        trajectory = corrected_trajectory(folder, updates)
     settings = Settings(rounds=rounds, sigma=config.matching.point_sigma)
     with console.progress_bar("points", len(updates), quiet=quiet) as show:
         points = run_points(
@@ -98,7 +98,7 @@ def refine_folder(
     return 0
 
 
-def _corrected(folder: Path, updates: list[MapUpdate]) -> Trajectory:
+def corrected_trajectory(folder: Path, updates: list[MapUpdate]) -> Trajectory:
     """The trajectory of a run with loops, with the stamps of its frames."""
     read = read_truth(folder / "trajectory.tum")
     stamps = np.array([u.stamp for u in updates if u.status.has_pose], np.int64)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -14,23 +16,35 @@ from rich.table import Table
 
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
-from loam_gtsam.cli.options import LocaliseOptions, OptimizeOptions
+from loam_gtsam.cli.options import CleanOptions, LocaliseOptions, OptimizeOptions
+from loam_gtsam.cli.refine import corrected_trajectory
 from loam_gtsam.cli.results import ENU_FILE, MAP_FILE
 from loam_gtsam.cli.run import worker_count
-from loam_gtsam.config import Config, dump_config
+from loam_gtsam.config import Config, dump_config, load_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.atomic import file_name, write_json, write_text
-from loam_gtsam.io.run_files import write_covariances, write_npz
+from loam_gtsam.io.read_run import read_updates
+from loam_gtsam.io.run_files import write_covariances, write_npz, write_ply
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
+from loam_gtsam.maps.cleaning import View, clean_map, views
 from loam_gtsam.maps.localizer import Localisation, localise, own_settings
 from loam_gtsam.maps.map_file import SavedMap
 from loam_gtsam.studies.evaluation import absolute_error
-from loam_gtsam.types import DatasetError, InputError, OutputError, Trajectory
+from loam_gtsam.types import (
+    DatasetError,
+    InputError,
+    MapUpdate,
+    OutputError,
+    Trajectory,
+    stack_poses,
+)
 from loam_gtsam.view import plots
+from loam_gtsam.view.sections import plot_cleaned
 
 _LISTED = 10  # at most, of the loops that are switched off
+CLEANED_FILES = MAP_FILE, "removed.ply", "cleaned.png", "report.json"
 LOCALISED_FILES = (
     "trajectory.tum", "trajectory_covariance.csv", "run.npz", "config.yaml", MAP_FILE,
     "localised.png", ENU_FILE, "summary.json",
@@ -164,6 +178,62 @@ def _write(
         plots.plot_map(folder / "localised.png", *saved.points(), found.trajectory)
     write_json(folder / "summary.json", summary)
     return [name for name in LOCALISED_FILES if (folder / name).exists()]
+
+
+def clean_run(options: CleanOptions) -> int:
+    """Clean the map of a finished run; returns the exit code."""
+    folder, dataset = options.run, options.dataset()
+    for name in ("run.npz", "config.yaml", MAP_FILE):
+        if not (folder / name).exists():
+            raise DatasetError(
+                f"{folder}: expected the folder of a finished run, with {name}; make one with "
+                "loam-gtsam run PATH --output FOLDER"
+            )
+    updates = read_updates(folder / "run.npz")
+    config = load_config(folder / "config.yaml")
+    placed = [update for update in updates if update.status.has_pose]
+    poses = stack_poses(update.map_T_lidar for update in updates)
+    if (folder / "pose_graph.g2o").exists():
+        where = corrected_trajectory(folder, updates).map_T_lidar
+        poses[[update.status.has_pose for update in updates]] = where
+    draws = console.draws_pictures(options.plot)
+    with SavedMap(folder / MAP_FILE) as saved:
+
+        def write(target: Path) -> list[str]:
+            with console.progress_bar("votes", len(updates), quiet=options.quiet) as show:
+                shown = _shown_views(views(dataset, updates, poses, config), updates, show)
+                cleaned = clean_map(saved, shown, config, target / MAP_FILE)
+            gone, kept = cleaned.points[cleaned.moved], cleaned.points[~cleaned.moved]
+            write_ply(target / "removed.ply", np.empty((0, 3)), gone)
+            if draws:
+                way = stack_poses(update.map_T_lidar for update in placed)
+                plot_cleaned(target / CLEANED_FILES[2], kept, gone, way[:, :3, 3])
+            report = {
+                layer: {"points": n, "removed": m} for layer, (n, m) in cleaned.counts.items()
+            }
+            write_json(target / CLEANED_FILES[-1], report)
+            return [name for name in CLEANED_FILES if (target / name).exists()]
+
+        with console.output_folder(
+            folder / "cleaned", CLEANED_FILES, overwrite=options.overwrite
+        ) as target:
+            files = console.write_results(target, CLEANED_FILES, CLEANED_FILES[-1], write)
+    if not options.quiet:
+        report = json.loads((target / CLEANED_FILES[-1]).read_text(encoding="utf-8"))
+        for layer, counts in report.items():
+            if counts["points"]:
+                typer.echo(f"{layer}: {counts['removed']} of {counts['points']} points removed")
+        typer.echo(f"Written to {target}: {', '.join(files)}")
+    return 0
+
+
+def _shown_views(
+    sweeps: Iterable[View], updates: Sequence[MapUpdate], show: Callable[[int, str], None]
+) -> Iterator[View]:
+    """The same views, with progress by their stamps."""
+    for view in sweeps:
+        show(min(view.number + 1, len(updates)), "")
+        yield view
 
 
 def _localised(summary: dict[str, Any]) -> Table:

@@ -1,5 +1,6 @@
 """Saved maps: written after a run, opened again, localised in."""
 
+from loam_gtsam.maps.cleaning import clean_map as clean_map
 from loam_gtsam.maps.localizer import Localisation as Localisation
 from loam_gtsam.maps.localizer import Localizer as Localizer
 from loam_gtsam.maps.localizer import localise as localise

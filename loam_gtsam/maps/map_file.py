@@ -12,7 +12,7 @@ import io
 import json
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -30,7 +30,7 @@ from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.registration.frame_matcher import MapPair
-from loam_gtsam.types import DatasetError, FloatArray, IntArray, stack_poses
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray, IntArray, stack_poses
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex
 
@@ -38,6 +38,7 @@ SUFFIX = ".lgmap"
 VERSION = 1
 LAYERS = "edges", "planes", "small_edges", "small_planes"
 _FORMAT = "loam_gtsam map"
+_PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _HEADER = "map.json"
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same map makes the same file
 _POINT = np.dtype([("xyz", "<f8", 3), ("owner", "<i4"), ("view", "i1", 4)])
@@ -218,6 +219,42 @@ class SavedMap:
             [self.cube(layer, index).points for index in self.layers[layer]] for layer in LAYERS[:2]
         )
         return np.concatenate([NO_POINTS, *edges]), np.concatenate([NO_POINTS, *planes])
+
+    def write_part(
+        self, path: str | Path, keep: Mapping[str, Mapping[CubeIndex, BoolArray]]
+    ) -> None:
+        """Write the map with some of its points only; all else stays to the last bit.
+
+        Parameters
+        ----------
+        path : another file than the map's own
+        keep : which points of each cube of each layer, in the order of :meth:`cube`
+
+        Raises
+        ------
+        DatasetError
+            If a cube cannot be read.
+        OutputError
+            If the file cannot be written.
+        """
+        header = json.loads(self._read(_HEADER))
+        header["layers"] = {
+            layer: [
+                [*index, int(keep[layer][index].sum())]
+                for index in cubes
+                if keep[layer][index].any()
+            ]
+            for layer, cubes in self.layers.items()
+        }
+        with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
+            _add(archive, _HEADER, json.dumps(header, indent=1).encode())
+            for name in _PLACES:
+                _add(archive, f"places/{name}.npy", self._read(f"places/{name}.npy"))
+            for layer, cubes in header["layers"].items():
+                for *cube, _ in cubes:
+                    index = (cube[0], cube[1], cube[2])
+                    rows = _rows(self.cube(layer, index).chosen(keep[layer][index]))
+                    _add(archive, _cube_name(layer, index), _bytes_of(rows))
 
     def _places(self, count: int) -> list[Place]:
         rings, sectors = self.config.loops.rings, self.config.loops.sectors

@@ -71,16 +71,22 @@ class FrameMessages:
     """Serialised messages of one frame after the other.
 
     The poses of all frames are kept, for the path: 14 MB in an hour at 10 Hz. ``ros1`` serialises
-    for ROS 1 bags instead of ROS 2. Raises ConfigError if the names of the frames are empty or
-    equal.
+    for ROS 1 bags instead of ROS 2. With the name of an ``odom_frame`` the frames are those of
+    REP-105: all is in that frame, which is continuous, and ``/tf`` has the transform from the map
+    to it as well. Raises ConfigError if the names of the frames are empty or equal.
     """
 
-    def __init__(self, config: BagConfig, *, ros1: bool = False) -> None:
+    def __init__(self, config: BagConfig, *, ros1: bool = False, odom_frame: str = "") -> None:
         if config.map_frame == config.lidar_frame or not (config.map_frame and config.lidar_frame):
             raise ConfigError(
                 "bag.map_frame, bag.lidar_frame: expected two different names, got "
                 f"{config.map_frame!r} and {config.lidar_frame!r}"
             )
+        if odom_frame in (config.map_frame, config.lidar_frame):
+            raise ConfigError(
+                f"odom_frame: expected another name than those of map and lidar, got {odom_frame!r}"
+            )
+        self._odom = odom_frame
         # The types, as rosbags has them; all of these are the same from Humble to today.
         self.store = get_typestore(Stores.ROS1_NOETIC if ros1 else Stores.ROS2_HUMBLE)
         if ros1:  # not part of that store
@@ -95,18 +101,20 @@ class FrameMessages:
         update: MapUpdate,
         cloud: Callable[[], Points | None] | None = None,
         surround: Callable[[], Points] | None = None,
+        map_T_odom: gtsam.Pose3 | None = None,
     ) -> Iterator[tuple[str, bytes]]:
         """Topic and message, the pose first; each is made when its turn comes.
 
         A frame with a bad stamp has none. One whose messages are not all asked for does not count.
         ``cloud`` and ``surround`` give the points that ``BagWriter.write`` takes; each is called
-        when its message is due. Raises OutputError if a message cannot say the stamp; InputError if
+        when its message is due. ``map_T_odom`` is the correction by the loops, for an odometry
+        frame; None is none. Raises OutputError if a message cannot say the stamp; InputError if
         a cloud is not (N, 4).
         """
         if not update.status.has_pose:
             return
         config = self._config
-        yield TF, self._transform(update)
+        yield TF, self._transforms(update, map_T_odom or gtsam.Pose3())
         yield ODOMETRY, self._odometry(update)
         points = cloud() if cloud is not None and config.registered else None
         if points is not None:
@@ -137,16 +145,22 @@ class FrameMessages:
             twist=self._geometry("TwistWithCovariance", twist=twist, covariance=_UNKNOWN),
         )
 
-    def _transform(self, update: MapUpdate) -> bytes:
-        position = self._xyz("Vector3", update.map_T_lidar.translation())
-        turn = self._quaternion(update.map_T_lidar)
-        stamped = self._geometry(
+    def _transforms(self, update: MapUpdate, map_T_odom: gtsam.Pose3) -> bytes:
+        made = [self._transform(update.map_T_lidar, update.stamp, self._config.lidar_frame)]
+        if self._odom:
+            made.append(
+                self._transform(map_T_odom, update.stamp, self._odom, self._config.map_frame)
+            )
+        return self._serialised(TF, transforms=made)
+
+    def _transform(self, pose: gtsam.Pose3, stamp: int, child: str, parent: str = "") -> Any:
+        position, turn = self._xyz("Vector3", pose.translation()), self._quaternion(pose)
+        return self._geometry(
             "TransformStamped",
-            header=self._header(update.stamp),
-            child_frame_id=self._config.lidar_frame,
+            header=self._header(stamp, parent),
+            child_frame_id=child,
             transform=self._geometry("Transform", translation=position, rotation=turn),
         )
-        return self._serialised(TF, transforms=[stamped])
 
     def _path(self) -> bytes:
         poses = [
@@ -184,7 +198,7 @@ class FrameMessages:
         serialise = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
         return bytes(serialise(self._make(name, **values), name))
 
-    def _header(self, stamp: int) -> Any:
+    def _header(self, stamp: int, frame: str = "") -> Any:
         seconds, rest = divmod(int(stamp), 10**9)
         if not 0 <= seconds < _LAST_SECOND:
             raise OutputError(
@@ -194,7 +208,8 @@ class FrameMessages:
         time = self._make("builtin_interfaces/msg/Time", sec=seconds, nanosec=rest)
         # ROS 1 publishers count in seq; in a bag nothing depends on it.
         counter = {"seq": 0} if self._ros1 else {}
-        values = {"stamp": time, "frame_id": self._config.map_frame}
+        frame = frame or self._odom or self._config.map_frame
+        values = {"stamp": time, "frame_id": frame}
         return self._make("std_msgs/msg/Header", **counter, **values)
 
     def _pose(self, pose: gtsam.Pose3) -> Any:

@@ -36,6 +36,7 @@ PARAMETERS: dict[str, Any] = {
     "sensor": "auto",
     "map_frame": "",
     "lidar_frame": "",
+    "odom_frame": "",
     "time_field": "",
     "time_unit": "",
     "stamp_is": "",
@@ -63,7 +64,7 @@ class LiveNode:
     def __init__(self, node: Any, on_error: Callable[[], object] = lambda: None) -> None:
         values = {key: node.declare_parameter(key, v).value for key, v in PARAMETERS.items()}
         config = config_of(values)
-        self._messages = FrameMessages(config.bag)
+        self._messages = FrameMessages(config.bag, odom_frame=values["odom_frame"])
         self._read = self._messages.store.deserialize_cdr
         self._features: tuple[str, ...] = ()
         if values["loam_topics"]:
@@ -146,10 +147,12 @@ class LiveNode:
     def _observe(self, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
         if self._output is not None:
             self._updates.append(update)
+        loops = pipeline.loops
         frame = self._messages.frame(
             update,
             lambda: registered_cloud(sweep, update, pipeline.mapper),
             lambda: surrounding_cloud(update, pipeline.mapper),
+            None if loops is None else loops.map_T_odom,
         )
         try:
             for topic, message in frame:

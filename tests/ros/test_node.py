@@ -10,6 +10,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import gtsam
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
@@ -20,6 +21,7 @@ from loam_gtsam.config import LiveConfig
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.ros.live_report import LiveReport
 from loam_gtsam.ros.messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, TYPES
@@ -189,6 +191,29 @@ def test_the_files_of_the_run_are_written_when_the_node_ends(
     play(node, LiveNode(node), raw_messages(bag), FRAMES)
     written = read_tum(tmp_path / "run" / "trajectory.tum")
     np.testing.assert_allclose(written.map_T_lidar, offline.trajectory.map_T_lidar, atol=1e-8)
+
+
+def test_frames_by_rep_105(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    moved = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 0.5]))
+    monkeypatch.setattr(LoopMapping, "map_T_odom", moved)
+    settings = bag.parent / "loops.yaml"
+    settings.write_text("loops: {enabled: true}\n")
+    node = FakeNode(odom_frame="odom", map_frame="map", lidar_frame="lidar", config=str(settings))
+    play(node, LiveNode(node), raw_messages(bag), FRAMES)
+    read = [(topic, ROS2.deserialize_cdr(raw, TYPES[topic])) for topic, raw in node.published]
+    chains = [message.transforms for topic, message in read if topic == TF]
+    assert len(chains) == FRAMES
+    for here, there in chains:
+        assert (here.header.frame_id, here.child_frame_id) == ("odom", "lidar")
+        assert (there.header.frame_id, there.child_frame_id) == ("map", "odom")
+        assert here.header.stamp == there.header.stamp
+        at, turn = there.transform.translation, there.transform.rotation
+        rotation = gtsam.Rot3.Quaternion(turn.w, turn.x, turn.y, turn.z)
+        assert gtsam.Pose3(rotation, np.array([at.x, at.y, at.z])).equals(moved, 1e-12)
+    # Poses and clouds are where the mapper has them, in the frame that never jumps.
+    assert {m.header.frame_id for topic, m in read if topic != TF} == {"odom"}
+    with pytest.raises(ConfigError, match="odom_frame"):
+        LiveNode(FakeNode(odom_frame="map", map_frame="map"))
 
 
 def test_topics_of_loam_need_no_imu(tmp_path: Path) -> None:

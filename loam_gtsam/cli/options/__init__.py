@@ -1,5 +1,6 @@
 """Options of the commands, each declared once: a command takes one dataclass of options."""
 
+from loam_gtsam.cli.options.commands import CleanOptions as CleanOptions
 from loam_gtsam.cli.options.commands import CompareOptions as CompareOptions
 from loam_gtsam.cli.options.commands import ConfigOptions as ConfigOptions
 from loam_gtsam.cli.options.commands import DemoOptions as DemoOptions

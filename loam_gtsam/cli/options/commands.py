@@ -251,6 +251,18 @@ class RefineOptions(SourceOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class CleanOptions(SourceOptions):
+    """Options of ``clean``."""
+
+    run: Path = argument("RUN", "Folder with the results of loam-gtsam run PATH.")
+    plot: bool | None = option(
+        "Draw a picture [default: if matplotlib is installed].", "--plot/--no-plot"
+    )
+    overwrite: bool = flag("Replace earlier results in RUN/cleaned.", "--overwrite")
+    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
+
+
+@dataclass(frozen=True, kw_only=True)
 class ConfigOptions(Options):
     """Options of ``config``."""
 

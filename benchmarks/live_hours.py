@@ -27,7 +27,7 @@ from loam_gtsam.types import ImuSamples, Scan
 
 EVERY = 500
 COLUMNS = ("frame", "process_mb", "cpu_ms", "worst_ms", "map_points", "imu_samples", "keyframes",
-           "loops", "not_solved")  # fmt: skip
+           "loops", "forgotten", "not_solved")  # fmt: skip
 _POINT = np.dtype([("xyz", "<f4", 3), ("time", "<f4"), ("ring", "<u2")])
 _FIELDS = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), ("time", 12, 7), ("ring", 16, 4)]
 
@@ -107,7 +107,9 @@ def _state(live: LiveMapper, milliseconds: list[float]) -> tuple[float, ...]:
     maps, imu, loops = pipeline.mapper.maps, pipeline.mapper.imu, pipeline.loops
     assert imu is not None
     points = sum(m.stats.points + m.stats.archived_points for m in (maps.edges, maps.planes))
-    graph = (0, 0) if loops is None else (len(loops.graph), len(loops.graph.loops))
+    graph = 0, 0, 0
+    if loops is not None:
+        graph = len(loops.graph), len(loops.graph.loops), len(loops.graph.forgotten)
     times = float(np.median(milliseconds)), max(milliseconds)
     return memory()[0], *times, points, len(imu.buffer), *graph
 

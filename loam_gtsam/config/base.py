@@ -18,8 +18,9 @@ from loam_gtsam.types import ConfigError
 
 _LONGEST = 200  # characters of a value in an error message
 _PAIR = "pair"
-_HIGHEST = {"m": 1e6, "degrees": 360.0}
-"""Upper bounds by unit: 1000 km, where single precision still resolves 6 cm, and one turn."""
+_HIGHEST = {"m": 1e6, "degrees": 360.0, "m/s": 1e4, "rad/s": 1e4, "m/s^2": 1e4}
+"""Upper bounds by unit: 1000 km, where single precision still resolves 6 cm; one turn; and more
+than any vehicle does (a kilometre from sweep to sweep), where the guess is of no use."""
 _NO_LIMIT = 1_000_000_000
 """Upper bound of all else, which stands for "no limit": it fits into 32 bits as a count, into 63
 as nanoseconds of so many seconds, and its powers are far from infinity."""

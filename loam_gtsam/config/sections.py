@@ -404,6 +404,10 @@ class PoseGraphConfig(Section):
     """In iSAM2 a loop closure has a Huber kernel, this wide after whitening; .inf turns it off."""
     believed_loops: int = parameter(6, low=2, high=1000)
     """At least this many loop closures that agree pairwise are used even against the odometry."""
+    visits: int = parameter(4, low=0, high=10_000)
+    """So many keyframes that come back to a place stay in the graph; of one pass and so many more
+    visits, a further one would lower the standard deviations by less than a tenth, so it is
+    forgotten when the next keyframe comes."""
     follow_distance: float = parameter(0.05, unit="m", low=0.0)
     """Map points follow their keyframe once a loop closure has moved it by more than this as seen
     from the newest keyframe; an error of follow_angle_deg in the newest one is allowed for."""

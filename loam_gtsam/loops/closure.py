@@ -109,8 +109,8 @@ class ScanLoopCloser:
     def reset(self) -> None:
         """Forget all keyframes and what was counted."""
         self.statistics = LoopStatistics()
-        self._descriptors: list[FloatArray] = []
-        self._spreads: list[float] = []
+        self._descriptors: dict[int, FloatArray] = {}  # by the numbers of the keyframes
+        self._spreads: dict[int, float] = {}
 
     def __getstate__(self) -> tuple[Any, ...]:
         return self._whole, self.statistics, self._descriptors, self._spreads
@@ -175,7 +175,7 @@ class ScanLoopCloser:
         final = fit(solution)
         if (rejection := self._judged(final)) is not None:
             return rejection
-        covariance = self._covariance(solution, history.keyframes[candidate], keyframe)
+        covariance = self._covariance(solution, history.keyframe(candidate), keyframe)
         if covariance is None:
             return Rejection.DEGENERATE
         pose = solution.map_T_lidar
@@ -183,29 +183,38 @@ class ScanLoopCloser:
 
     def _describe(self, history: PoseGraph) -> None:
         """Compute descriptor and standard deviation of the position of new keyframes."""
-        for keyframe in history.keyframes[len(self._descriptors) :]:
+        for keyframe in history.keyframes:
+            if keyframe.index in self._spreads:
+                continue
             points = np.concatenate([keyframe.edges, keyframe.planes])
-            self._descriptors.append(scan_context(points, self.config))
+            self._descriptors[keyframe.index] = scan_context(points, self.config)
             # Later loop closures make a pose surer: the standard deviation now is an upper bound.
             spread = np.linalg.eigvalsh(history.covariance(keyframe.index)[3:, 3:])[-1]
-            self._spreads.append(float(np.sqrt(max(spread, 0.0))))
+            self._spreads[keyframe.index] = float(np.sqrt(max(spread, 0.0)))
+        known = {keyframe.index for keyframe in history.keyframes}
+        for index in [index for index in self._spreads if index not in known]:
+            del self._spreads[index], self._descriptors[index]
 
     def _near(self, keyframe: Keyframe, history: PoseGraph) -> IntArray | Rejection:
         """Numbers of the keyframes that may be at the same place."""
         config = self.config
         if len(keyframe.edges) + len(keyframe.planes) == 0:
             return Rejection.NO_FEATURES
-        before = history.keyframes[: max(keyframe.index - 1, 0)]  # neighbours are no loop
-        travelled = keyframe.travelled - np.array([other.travelled for other in before])
-        old = np.flatnonzero(travelled >= config.min_way)
-        if len(old) == 0:
+        old = [  # neighbours are no loop, and one keyframe of a place is enough
+            other
+            for other in history.keyframes
+            if other.index < keyframe.index - 1 and history.visits.is_place(other.index)
+            if keyframe.travelled - other.travelled >= config.min_way
+        ]
+        if not old:
             return Rejection.TOO_RECENT
-        spreads = np.array(self._spreads)[old] + self._spreads[keyframe.index]
-        gate = config.gate + config.gate_sigmas * spreads
-        gate += config.gate_drift * _odometry_distance(keyframe, history)[old]
-        positions = history.poses()[:, :3, 3]
-        away = np.linalg.norm(positions[old] - positions[keyframe.index], axis=1)
-        near = old[away <= gate]
+        spreads = np.array([self._spreads[other.index] for other in old])
+        gate = config.gate + config.gate_sigmas * (spreads + self._spreads[keyframe.index])
+        gate += config.gate_drift * _odometry_distance(keyframe, old, history)
+        positions = np.array([history.pose(other.index).translation() for other in old])
+        here = history.pose(keyframe.index).translation()
+        away = np.linalg.norm(positions - here, axis=1)
+        near: IntArray = np.array([other.index for other in old], np.int64)[away <= gate]
         return near if len(near) else Rejection.OUT_OF_REACH
 
     def _alike(self, index: int, near: IntArray) -> list[tuple[int, float]]:
@@ -237,7 +246,8 @@ class ScanLoopCloser:
         config = self._whole.map.changed(archive_dir=None, insertion="settled")
         maps = CubeMap(config, config.edge_voxel), CubeMap(config, config.plane_voxel)
         beside = self.config.neighbours
-        around = history.keyframes[max(candidate - beside, 0) : candidate + beside + 1]
+        middle = history.keyframes.index(history.keyframe(candidate))
+        around = history.keyframes[max(middle - beside, 0) : middle + beside + 1]
         # The candidate's own features come first: a voxel keeps the first point it gets.
         chosen = [
             other
@@ -289,12 +299,20 @@ def _standing_fit(matches: ScanMatches, offered: int) -> Fit:
     return Fit.of(ScanMatches(matches.edges, subset(matches.planes, standing)), offered - level)
 
 
-def _odometry_distance(keyframe: Keyframe, history: PoseGraph) -> FloatArray:
-    """(N,) metres of odometry to each keyframe: straight back, or by way of one active loop."""
-    travelled = np.array([other.travelled for other in history.keyframes])
-    gone = keyframe.travelled - travelled
-    for loop, on in zip(history.loops, history.active, strict=True):
-        if on:
-            since = keyframe.travelled - travelled[loop.later]
-            gone = np.minimum(gone, since + np.abs(travelled - travelled[loop.earlier]))
+def _odometry_distance(
+    keyframe: Keyframe, others: list[Keyframe], history: PoseGraph
+) -> FloatArray:
+    """(N,) metres of odometry to each of the others: straight back, or by way of one active loop.
+
+    What ties a keyframe to another one in place of a forgotten one is such a loop, too.
+    """
+    at = {known.index: known.travelled for known in history.keyframes}
+    active = zip(history.loops, history.active, strict=True)
+    links = [(loop.earlier, loop.later, 0.0) for loop, on in active if on]
+    links += [(base, index, way) for index, (base, way) in history.visits.ties.items()]
+    to = np.array([other.travelled for other in others])
+    gone = keyframe.travelled - to
+    for earlier, later, way in links:
+        since = keyframe.travelled - at[later] + way
+        gone = np.minimum(gone, since + np.abs(to - at[earlier]))
     return gone

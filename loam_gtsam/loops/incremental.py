@@ -16,6 +16,7 @@ from loam_gtsam.types import BoolArray, FloatArray, InputError, OutputError
 
 _RELINEARIZE = 1e-3  # rad or m a pose moves before iSAM2 linearises anew: an error of second order
 _ROUNDS = 20  # largest number of updates of iSAM2 until the variables stay
+_MOST_STEPS = 100  # beside four for each factor: so many are kept before the graph is begun anew
 _STILL = 1e-5  # rad and m; a variable that moves less in an update stays
 
 _Step = tuple[Any, ...]  # name of a method that changed the graph, and what it was given
@@ -36,6 +37,7 @@ class IncrementalGraph:
         self._loops: list[gtsam.NonlinearFactorGraph] = []  # each of one factor
         self._slots: list[int | None] = []  # place of each loop closure in iSAM2; None: inactive
         self._isam = _new_isam()
+        self._last = -1  # place in iSAM2 of the last one of `factors`
         self._steps: list[_Step] = []
         self.has_own_factors = False
         self._before: dict[str, Any] | None = None
@@ -60,8 +62,8 @@ class IncrementalGraph:
 
     def __setstate__(self, state: list[_Step]) -> None:
         self.__init__()  # type: ignore[misc]
-        calls: tuple[Callable[..., None], ...] = self.add, self.add_loop, self.switch, self.restart
-        repeat = {call.__name__: call for call in calls}
+        calls = self.add, self.add_loop, self.switch, self.restart, self.forget
+        repeat: dict[str, Callable[..., None]] = {call.__name__: call for call in calls}
         for name, *given in state:
             repeat[name](*map(_from_text, given))
 
@@ -90,7 +92,8 @@ class IncrementalGraph:
         self.has_own_factors |= settle
         before = gtsam.Values(self.values) if settle else self.values
         try:
-            self._isam.update(factors, values)
+            result = self._isam.update(factors, values)
+            self._last = result.getNewFactorsIndices()[-1]
             self.values.insert(values)
             if settle:
                 self._settle()
@@ -117,6 +120,26 @@ class IncrementalGraph:
         self._settle()
         self._steps.append(("switch", number, on))
 
+    def forget(self, loops: int) -> None:
+        """Take out the last variable, the last factor, and the last ``loops`` loop closures.
+
+        They must be all that is on that variable. Where more has been done than there is left, the
+        graph is begun anew, so that neither the steps nor iSAM2 grow with what is forgotten.
+        """
+        self._about_to_change()
+        kept = len(self._loops) - loops
+        gone = [slot for slot in self._slots[kept:] if slot is not None]
+        del self._loops[kept:], self._slots[kept:]
+        nothing = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        self._isam.update(*nothing, [*gone, self._last])
+        self.factors.resize(self.factors.size() - 1)
+        self._last = -1
+        self.values = self._isam.calculateBestEstimate()
+        self._settle()
+        self._steps.append(("forget", loops))
+        if len(self._steps) > 4 * (self.factors.size() + len(self._loops)) + _MOST_STEPS:
+            self.restart(self.values, np.array(self.active, np.bool_))
+
     def restart(
         self,
         values: gtsam.Values,
@@ -137,6 +160,7 @@ class IncrementalGraph:
             graph.push_back(self._loops[number])
         self._isam = _new_isam()
         self._isam.update(graph, values)
+        self._last = self.factors.size() - 1
         self.values = self._isam.calculateBestEstimate()
         # Whatever was done before need not be repeated.
         kept = gtsam.NonlinearFactorGraph(self.factors)

@@ -6,7 +6,10 @@ mapper's poses is ``odom``: continuous, and drifting; ``map`` is the corrected o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from operator import attrgetter
 
 import gtsam
 import numpy as np
@@ -60,6 +63,79 @@ class Keyframe:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Forgotten:
+    """Where a keyframe was that is no variable any more, seen from one that is.
+
+    Attributes
+    ----------
+    stamp, odom_T_lidar, session : of the keyframe
+    base : number of the keyframe that stays
+    base_T_lidar : the forgotten pose in its frame
+    """
+
+    stamp: int
+    odom_T_lidar: gtsam.Pose3
+    session: int
+    base: int
+    base_T_lidar: gtsam.Pose3
+
+
+class Journal:
+    """Forgotten keyframes in the order of time: a list that only grows."""
+
+    def __init__(self) -> None:
+        self.all: list[Forgotten] = []
+
+    def remember(self) -> Callable[[], None]:
+        """A function that brings the journal back to what it is now."""
+        size = len(self.all)
+
+        def restore() -> None:
+            del self.all[size:]
+
+        return restore
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tie:
+    """What leads to a keyframe from another one: motion, (6, 6) covariance, metres of way."""
+
+    base: int
+    base_T_lidar: gtsam.Pose3
+    covariance: FloatArray
+    way: float
+
+
+@dataclass(slots=True, eq=False)
+class Visits:
+    """Which keyframes are at one place, and which of them are forgotten.
+
+    Attributes
+    ----------
+    place_of : number of the first keyframe of the place, by the number of each keyframe there; a
+        keyframe that is not in it is a place of its own
+    surplus : number of the newest keyframe if the next one takes its place
+    last : what leads to the newest keyframe, and how many factors there were with it
+    ties : metres of way to a keyframe from the one that took the place of a forgotten one before it
+    journal : the forgotten keyframes
+    """
+
+    place_of: dict[int, int] = field(default_factory=dict)
+    surplus: int | None = None
+    last: tuple[Tie, int] | None = None
+    ties: dict[int, tuple[int, float]] = field(default_factory=dict)
+    journal: Journal = field(default_factory=Journal)
+
+    def is_place(self, index: int) -> bool:
+        """Whether a keyframe is the first one of its place."""
+        return self.place_of.get(index, index) == index
+
+    def count(self, place: int) -> int:
+        """How many keyframes have come back to a place."""
+        return sum(first == place for first in self.place_of.values()) - 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LoopClosure:
     """The motion between two keyframes, found by looking at the same place.
 
@@ -94,6 +170,23 @@ def leads_to_keyframe(motion: gtsam.Pose3, config: PoseGraphConfig) -> bool:
     turned = np.degrees(np.linalg.norm(gtsam.Rot3.Logmap(motion.rotation())))
     moved = np.linalg.norm(motion.translation())
     return not (moved < config.keyframe_distance and turned < config.keyframe_angle_deg)
+
+
+def numbered(keyframes: Sequence[Keyframe], index: int) -> Keyframe:
+    """The keyframe of a number, of some in their order.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    position = bisect_left(keyframes, index, key=attrgetter("index"))
+    if position == len(keyframes) or keyframes[position].index != index:
+        raise InputError(
+            f"keyframe: expected one of the {len(keyframes)} there are, got {index}"
+            + (", which was forgotten" if keyframes and 0 <= index < keyframes[-1].index else "")
+        )
+    return keyframes[position]
 
 
 def pose_key(index: int) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from loam_gtsam.config import PoseGraphConfig
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.incremental import IncrementalGraph
-from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, odometry_between, pose_key
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, numbered, odometry_between, pose_key
 from loam_gtsam.types import BoolArray, FloatArray
 
 _LIKELY = 12.6  # squared Mahalanobis distance that 95 % of right loop closures do not exceed
@@ -83,9 +83,9 @@ def consistent(
     Ends in different sessions have no odometry between them, so nothing contradicts them.
     """
     ends = (one.earlier, two.earlier), (one.later, two.later)
-    if any(keyframes[a].session != keyframes[b].session for a, b in ends):
+    first, second, last, before = (numbered(keyframes, index) for pair in ends for index in pair)
+    if first.session != second.session or last.session != before.session:
         return True
-    (first, second), (last, before) = ([keyframes[index] for index in pair] for pair in ends)
     start, start_covariance = odometry_between(first, second, config)
     end, end_covariance = odometry_between(before, last, config)
     rest = two.earlier_T_later.compose(end)
@@ -146,6 +146,11 @@ class LoopSelection:
         if set(np.flatnonzero(self._graph.active).tolist()) != on:
             self._settle(range(len(self._loops)))
         return self._graph.is_active(number)
+
+    def forget(self, count: int) -> None:
+        """Forget the last ``count`` loop closures, which the graph has none of any more."""
+        del self._loops[len(self._loops) - count :]
+        del self._compared[len(self._loops) :]
 
     def chi_squared(self, number: int) -> float:
         """Squared Mahalanobis distance of a loop closure from what all other factors say."""

@@ -45,7 +45,7 @@ class LoopMapping:
         self.points_moved = 0
         self._faults = PartFaults(self._config.parts.on_error)
         # odom_T_lidar of the keyframes, to which their map points are fixed.
-        self._placed: list[gtsam.Pose3] = []
+        self._placed: dict[int, gtsam.Pose3] = {}
 
     def reset(self) -> None:
         """Forget everything, as the mapper's reset does; a ``reset()`` of the closer is called."""
@@ -53,7 +53,7 @@ class LoopMapping:
         if (reset_closer := getattr(self.closer, "reset", None)) is not None:
             reset_closer()
         self.points_moved = self._mapper.keyframe = 0
-        self._placed = []
+        self._placed = {}
 
     @property
     def has_own_parts(self) -> bool:
@@ -76,16 +76,20 @@ class LoopMapping:
             keyframe = self.graph.add(update, features)
         if keyframe is None:
             return False
-        self._placed.append(keyframe.odom_T_lidar)
+        self._placed[keyframe.index] = keyframe.odom_T_lidar
         self._mapper.keyframe = keyframe.index
         loop: LoopClosure | None = None
         with self._faults.forgiven(), own_code("loop_closer", self.closer):
             loop = self.closer.detect(keyframe, self.graph)
-        if loop is None or not self.graph.add_loop(loop):
-            return False
-        config = self._config.pose_graph
-        self.correct_map(config.follow_distance, config.follow_angle_deg)
-        return True
+        is_closed = loop is not None and self.graph.add_loop(loop)
+        if is_closed:
+            config = self._config.pose_graph
+            self.correct_map(config.follow_distance, config.follow_angle_deg)
+        place = self.graph.visit()
+        if place is not None:  # the points to come belong to a keyframe that stays
+            self._mapper.keyframe = place
+            del self._placed[keyframe.index]
+        return is_closed
 
     def correct_map(self, metres: float = 0.0, degrees: float = 0.0) -> None:
         """Move the map points of keyframes that lie elsewhere, seen from the newest, by more.
@@ -103,11 +107,12 @@ class LoopMapping:
         """Where the keyframes belong in ``odom``, of those that lie elsewhere by more."""
         to_odom = self.map_T_odom.inverse()
         found = {}
-        for index, placed in enumerate(self._placed):
+        newest = [keyframe.odom_T_lidar for keyframe in self.graph.keyframes[-1:]]
+        for index, placed in self._placed.items():
             there = to_odom.compose(self.graph.pose(index))
             step = placed.localCoordinates(there)
             turned, shifted = np.degrees(np.linalg.norm(step[:3])), np.linalg.norm(step[3:])
-            allowed = metres + np.radians(degrees) * self._placed[-1].range(placed)
+            allowed = metres + np.radians(degrees) * newest[0].range(placed)
             if turned > degrees or shifted > allowed:
                 found[index] = there
         return found
@@ -122,6 +127,7 @@ class LoopMapping:
         """Numbers of keyframes, loop closures and active ones, and what the closer counted."""
         graph = self.graph
         counts = {"keyframes": len(graph), "loops": len(graph.loops), "on": sum(graph.active)}
+        counts["forgotten"] = len(graph.forgotten)
         statistics = getattr(self.closer, "statistics", None)
         if isinstance(statistics, LoopStatistics):
             counts["candidates"] = statistics.candidates
@@ -131,16 +137,15 @@ class LoopMapping:
 
     def loop_ends(self) -> tuple[FloatArray, BoolArray]:
         """(L, 2, 3) ends of the loop closures in the map, metres, and (L,) which are active."""
-        positions = self.graph.poses()[:, :3, 3]
-        pairs = [(loop.earlier, loop.later) for loop in self.graph.loops]
-        indices = np.array(pairs, np.int64).reshape(-1, 2)
-        return positions[indices], np.array(self.graph.active, np.bool_)
+        ends = [(loop.earlier, loop.later) for loop in self.graph.loops]
+        positions = [[self.graph.pose(index).translation() for index in pair] for pair in ends]
+        return np.reshape(positions, (-1, 2, 3)), np.array(self.graph.active, np.bool_)
 
     def corrected_maps(self) -> MapPair:
         """A copy of the mapper's maps in which all keyframes are where the graph has them."""
         maps = deepcopy(self._mapper.maps)
-        poses = zip(map(gtsam.Pose3, self.graph.poses()), self._placed, strict=True)
-        maps.move({n: pose.compose(at.inverse()).matrix() for n, (pose, at) in enumerate(poses)})
+        placed, pose = self._placed, self.graph.pose
+        maps.move({n: pose(n).compose(at.inverse()).matrix() for n, at in placed.items()})
         return maps
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from loam_gtsam.geometry import as_vector
 from loam_gtsam.loops.incremental import IncrementalGraph
-from loam_gtsam.loops.keyframes import Keyframe, is_pose_key, noise_model, pose_key
+from loam_gtsam.loops.keyframes import Keyframe, is_pose_key, noise_model, numbered
 from loam_gtsam.types import FloatArray, InputError
 
 _UNDETERMINED = 1e-9  # least singular value that counts, columns of length one
@@ -134,10 +134,7 @@ class FactorGraph:
         return self._graph.covariance(key)
 
     def _key(self, index: int) -> int:
-        count = len(self.keyframes)
-        if not 0 <= index < count:
-            raise InputError(f"keyframe: expected one of the {count} there are, got {index}")
-        return pose_key(index)
+        return numbered(self.keyframes, index).key
 
 
 def _checked(

@@ -41,6 +41,8 @@ class Place:
 class Places:
     """Places along a run, as far apart as keyframes are; of ``config``, their parameters are used.
 
+    Beyond the first one and ``pose_graph.visits`` more at one place, none are kept.
+
     Attributes
     ----------
     all : the places, in the order in which they were visited
@@ -53,6 +55,8 @@ class Places:
     def reset(self) -> None:
         """Forget all places."""
         self.all: list[Place] = []
+        self._last: gtsam.Pose3 | None = None
+        self._positions = np.empty((0, 3))
 
     def add(self, update: MapUpdate, registered: Registered | None) -> None:
         """Add the place of a sweep, if it was solved and is far enough from the last place."""
@@ -60,10 +64,16 @@ class Places:
         if uncertainty is None or registered is None or not update.status.solved:
             return
         pose = registered.map_T_middle
-        if self.all:
-            motion = self.all[-1].map_T_middle.between(pose)
-            if not leads_to_keyframe(motion, self._config.pose_graph):
-                return
+        config = self._config.pose_graph
+        if self._last is not None and not leads_to_keyframe(self._last.between(pose), config):
+            return
+        self._last = pose
+        away = np.linalg.norm(self._positions - pose.translation(), axis=1)
+        near = [self.all[i] for i in np.flatnonzero(away < config.keyframe_distance).tolist()]
+        motions = [place.map_T_middle.between(pose) for place in near]
+        if sum(not leads_to_keyframe(motion, config) for motion in motions) > config.visits:
+            return
+        self._positions = np.vstack([self._positions, pose.translation()])
         points = np.concatenate([registered.edges, registered.planes])
         descriptor = scan_context(points, self._config.loops).astype(np.float16)
         to_map = update.map_T_lidar.AdjointMap()

@@ -18,12 +18,17 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.incremental import IncrementalGraph
 from loam_gtsam.loops.keyframes import (
+    Forgotten,
     Keyframe,
     LoopClosure,
+    Tie,
+    Visits,
     keyframe_points,
     leads_to_keyframe,
     noise_model,
+    numbered,
     odometry_between,
+    pose_key,
 )
 from loam_gtsam.loops.loop_selection import LoopSelection
 from loam_gtsam.loops.own_factors import FactorGraph
@@ -53,15 +58,17 @@ class PoseGraph(FactorGraph):
 
     def reset(self) -> None:
         """Forget everything: the graph is then as a new one."""
-        self.__setstate__((0, [], [], IncrementalGraph()))
+        self.__setstate__((0, [], [], IncrementalGraph(), 0, Visits()))
 
     def __getstate__(self) -> tuple[Any, ...]:
-        return self._session, self.keyframes, self.loops, self._graph
+        return self._session, self.keyframes, self.loops, self._graph, self._added, self.visits
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self._session: int
+        self._added: int
         self.loops: list[LoopClosure]
-        self._session, self.keyframes, self.loops, self._graph = state
+        self.visits: Visits
+        self._session, self.keyframes, self.loops, self._graph, self._added, self.visits = state
         self._selection = LoopSelection(self.config, self._graph, self.keyframes, self.loops)
 
     def __len__(self) -> int:
@@ -94,9 +101,41 @@ class PoseGraph(FactorGraph):
         travelled = float(np.linalg.norm(motion.translation()))
         travelled += 0.0 if last is None else last.travelled
         points = keyframe_points(update, features, self._whole, self.imu)
-        keyframe = Keyframe(len(self), update, travelled, *points, self._session)
+        keyframe = Keyframe(self._added, update, travelled, *points, self._session)
         self._append(keyframe, last)
+        self._added += 1
         return keyframe
+
+    def visit(self) -> int | None:
+        """Say that the newest keyframe has its loop closures; it is forgotten if its place is full.
+
+        A keyframe that comes back to a place, by position and heading and with three standard
+        deviations, is a variable of the graph as long as ``pose_graph.visits`` of them are not. One
+        more would say hardly anything new about other keyframes. So the next one takes its place,
+        and is tied to the keyframe with which it closed a loop.
+
+        Returns
+        -------
+        The number of the first keyframe of the place if the newest one will be forgotten, or None.
+        """
+        newest = self.keyframes[-1]
+        place = self._place(newest)
+        if place is None:
+            return None
+        self.visits.place_of.setdefault(place, place)
+        is_full = self.visits.count(place) >= self.config.visits
+        self.visits.place_of[newest.index] = place
+        self.visits.surplus = newest.index if is_full else None
+        return place if is_full else None
+
+    @property
+    def forgotten(self) -> Sequence[Forgotten]:
+        """Where the keyframes were that were forgotten, in their order."""
+        return self.visits.journal.all
+
+    def keyframe(self, index: int) -> Keyframe:
+        """The keyframe of a number, which is its place in ``keyframes`` until one is forgotten."""
+        return numbered(self.keyframes, index)
 
     def new_session(self) -> None:
         """Begin another run: nothing but loop closures ties its keyframes to those before."""
@@ -124,7 +163,7 @@ class PoseGraph(FactorGraph):
 
     def poses(self) -> FloatArray:
         """(N, 4, 4) ``map_T_lidar`` of all keyframes."""
-        return stack_poses(self.pose(index) for index in range(len(self)))
+        return stack_poses(self.pose(keyframe.index) for keyframe in self.keyframes)
 
     @property
     def correction(self) -> gtsam.Pose3:
@@ -154,17 +193,26 @@ class PoseGraph(FactorGraph):
         updates : frames of the run that the keyframes are of; those with a bad stamp are left out
         session : number of the run, see :meth:`new_session`
         """
-        keyframes = [keyframe for keyframe in self.keyframes if keyframe.session == session]
+        known = [
+            (k.stamp, self.pose(k.index).compose(k.odom_T_lidar.inverse()))
+            for k in self.keyframes
+            if k.session == session
+        ] + [
+            (f.stamp, self.pose(f.base).compose(f.base_T_lidar).compose(f.odom_T_lidar.inverse()))
+            for f in self.forgotten
+            if f.session == session
+        ]
+        known.sort(key=lambda one: one[0])
         good = [update for update in updates if update.status.has_pose]
         stamps = np.array([update.stamp for update in good], np.int64)
-        starts = np.array([keyframe.stamp for keyframe in keyframes], np.int64)
+        starts = np.array([start for start, _ in known], np.int64)
         nexts = np.searchsorted(starts, stamps, side="right").tolist()
         poses = []
         for update, after in zip(good, nexts, strict=True):
-            pose, around = update.map_T_lidar, keyframes[max(after - 1, 0) : after + 1]
-            found = [self.pose(k.index).compose(k.odom_T_lidar.between(pose)) for k in around]
+            pose, around = update.map_T_lidar, known[max(after - 1, 0) : after + 1]
+            found = [map_T_odom.compose(pose) for _, map_T_odom in around]
             if len(found) == 2:
-                share = (update.stamp - around[0].stamp) / (around[1].stamp - around[0].stamp)
+                share = (update.stamp - around[0][0]) / (around[1][0] - around[0][0])
                 step = gtsam.Pose3.Logmap(found[0].between(found[1]))
                 found[0] = found[0].compose(gtsam.Pose3.Expmap(share * step))
             poses.append(found[0] if found else pose)
@@ -222,14 +270,75 @@ class PoseGraph(FactorGraph):
     def _append(self, keyframe: Keyframe, last: Keyframe | None) -> None:
         """Add a keyframe's pose, tied to the last one of its session."""
         factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        tie: Tie | None = None
         if last is None or last.session != keyframe.session:
             pose = keyframe.odom_T_lidar
             covariance = keyframe.update.covariance if last is None else np.diag(_ANYWHERE**2)
             factors.add(gtsam.PriorFactorPose3(keyframe.key, pose, noise_model(covariance)))
         else:
-            motion, covariance = odometry_between(last, keyframe, self.config)
-            pose, noise = self.pose(last.index).compose(motion), noise_model(covariance)
-            factors.add(gtsam.BetweenFactorPose3(last.key, keyframe.key, motion, noise))
+            tie = self._tie(last, keyframe)
+            motion, noise = tie.base_T_lidar, noise_model(tie.covariance)
+            pose = self.pose(tie.base).compose(motion)
+            factors.add(gtsam.BetweenFactorPose3(pose_key(tie.base), keyframe.key, motion, noise))
         values.insert(keyframe.key, pose)
         self._graph.add(factors, values, settle=False)
         self.keyframes.append(keyframe)
+        self.visits.surplus = None
+        self.visits.last = None if tie is None else (tie, self._graph.factors.size())
+
+    def _place(self, newest: Keyframe) -> int | None:
+        """The first keyframe of the place at which the newest one surely is; None if it is new."""
+        config, pose = self.config, self.pose(newest.index)
+        near = [
+            (self.pose(other.index).range(pose), other.index)
+            for other in self.keyframes[:-1]
+            if self.visits.is_place(other.index)
+        ]
+        for away, index in sorted(near):
+            if away >= config.keyframe_distance:
+                break
+            motion = self.pose(index).between(pose)
+            if leads_to_keyframe(motion, config):
+                continue
+            covariance = self.relative(index, newest.index)[1]
+            rotation, position = (np.linalg.eigvalsh(part)[-1] for part in _blocks(covariance))
+            turned = np.radians(config.keyframe_angle_deg)
+            sure = 9.0 * position < config.keyframe_distance**2 and 9.0 * rotation < turned**2
+            return index if sure else None
+        return None
+
+    def _tie(self, last: Keyframe, new: Keyframe) -> Tie:
+        """What leads to a new keyframe: odometry from the last one, which may be forgotten now."""
+        motion, covariance = odometry_between(last, new, self.config)
+        way = new.travelled - last.travelled
+        own = [loop for loop in self.loops if loop.later == last.index]
+        if (
+            last.index != self.visits.surplus
+            or self.visits.last is None
+            or self._graph.factors.size() != self.visits.last[1]  # it has a factor of a user's own
+            or not all(self.active[len(self.loops) - len(own) :])  # it may be right some day
+        ):
+            return Tie(last.index, motion, covariance, way)
+        tie = self.visits.last[0]
+        if own:
+            tie = Tie(own[-1].earlier, own[-1].earlier_T_later, own[-1].covariance, 0.0)
+        self._forget(last, tie, len(own))
+        to_new = motion.inverse().AdjointMap()
+        covariance = covariance + to_new @ tie.covariance @ to_new.T
+        tie = Tie(tie.base, tie.base_T_lidar.compose(motion), covariance, tie.way + way)
+        self.visits.ties[new.index] = tie.base, tie.way
+        return tie
+
+    def _forget(self, last: Keyframe, tie: Tie, loops: int) -> None:
+        """Forget the newest keyframe and its loop closures; it was where ``tie`` says."""
+        there = last.stamp, last.odom_T_lidar, last.session
+        self.visits.journal.all.append(Forgotten(*there, tie.base, tie.base_T_lidar))
+        del self.visits.place_of[last.index]
+        self.visits.ties.pop(last.index, None)
+        self.keyframes.pop()
+        self._selection.forget(loops)
+        self._graph.forget(loops)
+
+
+def _blocks(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+    return covariance[:3, :3], covariance[3:, 3:]

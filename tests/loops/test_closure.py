@@ -223,11 +223,11 @@ def test_what_loops_have_tied_is_looked_for_less_far():
     for update in updates(straight):
         graph.add(update)
     last = graph.keyframes[-1]
-    distances = _odometry_distance(last, graph)
+    distances = _odometry_distance(last, graph.keyframes, graph)
     np.testing.assert_allclose(distances, 78.0 - 2.0 * np.arange(40), atol=1e-6)
     loop = LoopClosure(3, 35, graph.pose(3).between(graph.pose(35)), OWN)
     assert graph.add_loop(loop)
-    tied = _odometry_distance(last, graph)
+    tied = _odometry_distance(last, graph.keyframes, graph)
     assert tied[3] == pytest.approx(8.0)  # from the end of the loop to the last
     assert tied[0] == pytest.approx(8.0 + 6.0)
     assert tied[37] == pytest.approx(4.0)

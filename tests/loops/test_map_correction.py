@@ -17,6 +17,7 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.maps.map_file import corrected
 from loam_gtsam.pipeline import Pipeline, imu_buffer
 from loam_gtsam.registration.solvers import GtsamSolver
+from loam_gtsam.types import InputError
 
 UP = np.array([0.0, 0.0, 3.0])
 POSES = there_and_back(np.pi)
@@ -123,7 +124,8 @@ def test_only_keyframes_that_lie_elsewhere_move_their_points(metres, moves):
 def test_counts_and_ends_are_those_of_the_graph():
     _, loops, _ = driven(first=30)
     counts = loops.counts()
-    assert counts == {"keyframes": len(POSES), "loops": len(POSES) - 30, "on": len(POSES) - 30}
+    closed = len(POSES) - 30
+    assert counts == {"keyframes": len(POSES), "loops": closed, "on": closed, "forgotten": 0}
     ends, on = loops.loop_ends()
     assert ends.shape == (counts["loops"], 2, 3)
     assert on.all()
@@ -257,3 +259,86 @@ def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     assert off(left_open, 120) > 0.5
     assert off(closed, 120) < 0.5 * off(left_open, 120)
     assert max(jumps) < 0.2  # odom is continuous
+
+
+PLACES = [gtsam.Pose3(gtsam.Rot3.Yaw(t), 8.0 * np.array([np.sin(t), -np.cos(t), 0.0]))
+          for t in np.arange(12) * np.pi / 6]  # fmt: skip
+
+
+class Round:
+    """A loop closer that knows the truth of laps over PLACES, and closes with the first lap."""
+
+    def __init__(self, laps=99):
+        self.laps = laps
+
+    def detect(self, keyframe, history):
+        lap, place = divmod(keyframe.index, len(PLACES))
+        if not 0 < lap < self.laps:
+            return None
+        return LoopClosure(place, keyframe.index, gtsam.Pose3(), OWN)
+
+
+def driven_round(laps, closer=None, gps=(), **pose_graph):
+    mapper = Mapper(config := settings(**{"walk": 0.02, "turn_walk_deg": 0.1} | pose_graph))
+    loops = LoopMapping(mapper, config, closer or Round())
+    drives = updates(laps * PLACES, (0.0, 0.0, 1e-4, 0.0, 2e-3, 0.0))
+    for number, update in enumerate(drives):
+        loops.add(update, None)
+        if number in gps:
+            where = PLACES[number % len(PLACES)].translation()
+            loops.graph.add_position(number, where, 0.01 * np.eye(3))
+    found = loops.graph.trajectory(drives).map_T_lidar[:, :3, 3]
+    truth = np.array([pose.translation() for pose in laps * PLACES])
+    return mapper, loops, np.linalg.norm(found - truth, axis=1)
+
+
+def test_a_place_that_is_visited_again_and_again_takes_no_more_room():
+    """Keyframes beyond ``visits`` are forgotten, and the run is as right as with all of them."""
+    (_, some, error), (_, every, least) = (driven_round(12, visits=visits) for visits in (2, 99))
+    counts = some.counts()
+    assert counts["keyframes"] == 3 * len(PLACES) + 1  # the newest one is there until the next
+    assert counts["loops"] == counts["on"] == 2 * len(PLACES) + 1
+    assert counts["keyframes"] + counts["forgotten"] == every.counts()["keyframes"] == 144
+    assert error.max() < 1.5 * least.max() < 0.1
+    first, last = 3, some.graph.keyframes[-1].index
+    sigmas = [np.diag(loops.graph.relative(first, last)[1]) for loops in (some, every)]
+    assert (sigmas[0] > 0.9 * sigmas[1]).all()  # what is forgotten is not counted
+    assert (sigmas[0] < 5.0 * sigmas[1]).all()  # 3 passes, not 12
+    with pytest.raises(InputError, match="got 100, which was forgotten"):
+        some.graph.pose(100)
+    steps = len(some.graph._graph.__getstate__())
+    assert steps <= 4 * (counts["keyframes"] + counts["loops"]) + 101
+
+
+def test_points_seen_from_a_forgotten_keyframe_belong_to_its_place():
+    mapper, loops, _ = driven_round(4, visits=1)
+    assert loops.counts()["forgotten"] == 2 * len(PLACES) - 1
+    assert mapper.keyframe == len(PLACES) - 1
+    assert set(loops._placed) == set(range(2 * len(PLACES)))
+
+
+def test_a_keyframe_is_forgotten_only_where_it_surely_is_at_a_known_place():
+    _, lost, _ = driven_round(4, Round(laps=0), visits=1, walk=0.2)  # off by decimetres
+    assert lost.counts()["forgotten"] == 0
+    known = {"walk": 1e-3, "turn_walk_deg": 1e-3}
+    _, sure, _ = driven_round(4, Round(laps=0), visits=1, **known)  # needs no loop
+    assert sure.counts()["forgotten"] > len(PLACES)
+    _, marked, _ = driven_round(4, visits=1, gps=[30, 31])  # factors of a user's own
+    assert {30, 31} <= {keyframe.index for keyframe in marked.graph.keyframes}
+
+
+def test_a_graph_that_has_forgotten_keyframes_goes_on_to_the_last_bit():
+    drives = updates(9 * PLACES, (0.0, 0.0, 1e-4, 0.0, 2e-3, 0.0))
+    config = settings(walk=0.02, visits=1)
+    whole, other = (Pipeline(config.changed("loops.enabled=true"), loop_closer=Round())
+                    for _ in range(2))  # fmt: skip
+    for update in drives[:77]:
+        whole.loops.add(update, None)
+    thaw(freeze(*whole.state()), *other.state())
+    for update in drives[77:]:
+        for pipeline in (whole, other):
+            pipeline.loops.add(update, None)
+    np.testing.assert_array_equal(whole.loops.graph.poses(), other.loops.graph.poses())
+    one, two = (p.loops.graph.trajectory(drives).map_T_lidar for p in (whole, other))
+    np.testing.assert_array_equal(one, two)
+    assert whole.loops.counts()["forgotten"] > 50

@@ -15,6 +15,8 @@ _GYRO_RATE = 0.01
 """Error of a gyro's rate, rad/s: 0.6 degrees/s, a bias that was not learnt yet."""
 _LEAST = 1e-12  # (rad/s)^2 and (m/s)^2: keeps the velocity's covariance regular
 
+_LEAST_SHARE = 1e-15  # of the sum of all: a root is found to some 1e-16 of the largest variance
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlindStep:
@@ -91,7 +93,9 @@ class MotionError:
             passed_on[:3] = np.eye(6)[:3]
             noise[:3] = noise[:, :3] = 0.0
         before = positive_root(velocity)
-        self.velocity = symmetric(passed_on @ velocity @ passed_on.T + noise) + _LEAST * np.eye(6)
+        found = symmetric(passed_on @ velocity @ passed_on.T + noise)
+        least = max(_LEAST, _LEAST_SHARE * float(np.trace(found)))
+        self.velocity = found + least * np.eye(6)
         kept = np.linalg.solve(positive_root(self.velocity), passed_on @ before)
         left, values, right = np.linalg.svd(kept)
         # What is tied to the map by 1 - share is drawn back to the map by that in the next frame.

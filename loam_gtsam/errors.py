@@ -47,8 +47,9 @@ class PartError(LoamError):
 
     Attributes
     ----------
-    part : the name of the part: ``solver``, ``extra_factors``, ``loop_closer``, ``odometry``,
-        ``features``, ``observe``, ``on_frame``, or ``graph`` for factors in the pose graph
+    part : the name of the part: ``solver``, ``extra_factors``, ``priors`` of a sweep,
+        ``loop_closer``, ``odometry``, ``features``, ``observe``, ``on_frame``, or ``graph`` for
+        factors in the pose graph
     indeterminate : whether GTSAM found a linear system that does not determine its variables
     """
 

@@ -41,6 +41,7 @@ from loam_gtsam.registration.solvers.own_factors import (
     NamedSolver,
     PoseContext,
     own_factors,
+    own_priors,
 )
 from loam_gtsam.registration.start import Start
 from loam_gtsam.types import (
@@ -156,7 +157,7 @@ class Mapper:
             by the IMU
         twist : (6,) predicted body velocity during the sweep, rad/s and m/s; predicted if None
         priors : further factors on :data:`~loam_gtsam.registration.solvers.POSE_KEY`, the pose at
-            the middle of the sweep
+            the middle of the sweep; what they raise is a PartError like that of ``extra_factors``
 
         Returns
         -------
@@ -187,17 +188,19 @@ class Mapper:
             self._start = None
             update = self._insert(*placed, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
-            frame = self._frame(predicted, priors, clock)
-            frame, outcome = self._placed(frame, features)
-            clock.lap("solve")
-            if isinstance(outcome, Found) and outcome.solution.solved:
-                update = self._with_pose(frame, outcome, clock)
-            else:
-                self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
-                update = unplaced(frame, outcome, self.monitor)
-                if update.status is FrameStatus.FEW_MATCHES and self.config.map.insert_unmatched:
-                    self._start = None
-                    self._insert(*placed, update.status, update.message, clock)
+            with own_priors(priors):
+                frame = self._frame(predicted, priors, clock)
+                frame, outcome = self._placed(frame, features)
+                clock.lap("solve")
+                if isinstance(outcome, Found) and outcome.solution.solved:
+                    update = self._with_pose(frame, outcome, clock)
+                else:
+                    self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
+                    update = unplaced(frame, outcome, self.monitor)
+                    anyway = self.config.map.insert_unmatched
+                    if update.status is FrameStatus.FEW_MATCHES and anyway:
+                        self._start = None
+                        self._insert(*placed, update.status, update.message, clock)
         if not update.status.solved:
             self._errors.skipped(sweep)
         self.last = replace(update, timings=clock.seconds)

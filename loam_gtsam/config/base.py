@@ -18,9 +18,12 @@ from loam_gtsam.types import ConfigError
 
 _LONGEST = 200  # characters of a value in an error message
 _PAIR = "pair"
-_HIGHEST = {"m": 1e6, "degrees": 360.0, "m/s": 1e4, "rad/s": 1e4, "m/s^2": 1e4}
-"""Upper bounds by unit: 1000 km, where single precision still resolves 6 cm; one turn; and more
-than any vehicle does (a kilometre from sweep to sweep), where the guess is of no use."""
+_HIGHEST = {"m": 1e6, "degrees": 360.0, "m/s": 1e4, "rad/s": 1e4, "m/s^2": 1e4} | dict.fromkeys(
+    ("rad/s/sqrt(Hz)", "m/s^2/sqrt(Hz)", "rad/s^2/sqrt(Hz)", "m/s^3/sqrt(Hz)"), 1e3
+)
+"""Upper bounds by unit: 1000 km, where single precision still resolves 6 cm; one turn; more than
+any vehicle does (a kilometre from sweep to sweep); and noise beyond the range of any IMU, which
+says as little as twice as much. Variances this far apart still fit into one matrix."""
 _NO_LIMIT = 1_000_000_000
 """Upper bound of all else, which stands for "no limit": it fits into 32 bits as a count, into 63
 as nanoseconds of so many seconds, and its powers are far from infinity."""

@@ -444,8 +444,11 @@ class LoopConfig(Section):
     """The submap of a candidate has its features and those of so many keyframes on either side."""
     search: float = parameter(8.0, unit="m", low=1.0, high=100.0)
     """The keyframe is searched for within this radius about the candidate."""
-    min_share: float = parameter(0.5, low=0.0, high=1.0)
-    """At least this share of the features off level ground must have a match in the submap."""
+    min_share: float = parameter(
+        0.5, source="right loops have 0.55 or more, wrong ones at most 0.5", low=0.0, high=1.0
+    )
+    """At least this share of the features off level ground must have a match in the submap, as a
+    part of the share of all features that had one in the map of the run."""
     min_agreement: float = parameter(
         0.9, source="right loops have 0.97 or more, wrong ones at most 0.75", low=0.0, high=1.0
     )

@@ -15,7 +15,7 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
-from loam_gtsam.config import Config, as_config
+from loam_gtsam.config import Config, MatchingConfig, as_config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
@@ -151,13 +151,13 @@ class ScanLoopCloser:
             return associate(*features, pose, *maps, matching, keyframe.distinct)
 
         def fit(found: Solution) -> Fit:
-            most = matching.max_edges or np.inf, matching.max_planes or np.inf
-            offered = min(len(features[0]), most[0]) + min(len(features[1]), most[1])
-            return _standing_fit(found.matches, int(offered)) if found.solved else Fit(0.0, 0.0)
+            offered = _offered(len(features[0]), len(features[1]), matching)
+            return _standing_fit(found.matches, offered) if found.solved else Fit(0.0, 0.0)
 
         known = history.pose(candidate).between(history.pose(keyframe.index))
         solution = self._solver.solve(matches_at, known)
-        if self._judged(fit(solution)) is not None:
+        usual = _usual_share(keyframe, whole.matching)
+        if self._judged(fit(solution), usual) is not None:
             matching = trial_matching(whole.matching)
             # The ground is where it was: height zero, and the tilt that the graph says.
             matrix = known.rotation().matrix()
@@ -173,7 +173,7 @@ class ScanLoopCloser:
         if not solution.solved:
             return Rejection.FEW_MATCHES
         final = fit(solution)
-        if (rejection := self._judged(final)) is not None:
+        if (rejection := self._judged(final, usual)) is not None:
             return rejection
         covariance = self._covariance(solution, history.keyframe(candidate), keyframe)
         if covariance is None:
@@ -263,9 +263,9 @@ class ScanLoopCloser:
             cubes.insert(np.concatenate(parts), np.concatenate(origins))
         return maps
 
-    def _judged(self, fit: Fit) -> Rejection | None:
+    def _judged(self, fit: Fit, usual: float) -> Rejection | None:
         """The reason to reject a registration; None if it is believed."""
-        if fit.share < self.config.min_share:
+        if fit.share < self.config.min_share * usual:
             return Rejection.LITTLE_OVERLAP
         return Rejection.DISAGREES if fit.agreement < self.config.min_agreement else None
 
@@ -289,6 +289,23 @@ class ScanLoopCloser:
             if keyframe.update.uncertainty is not None:
                 covariance = covariance + moved @ keyframe.update.uncertainty.own @ moved.T
         return covariance
+
+
+def _offered(n_edges: int, n_planes: int, config: MatchingConfig) -> int:
+    """How many of so many features are matched at most."""
+    return min(n_edges, config.max_edges or n_edges) + min(n_planes, config.max_planes or n_planes)
+
+
+def _usual_share(keyframe: Keyframe, config: MatchingConfig) -> float:
+    """Share of the features that had a match when the mapper registered the keyframe; 1 if unknown.
+
+    How many features find a match is up to the sensor, the place and the tests of the matching; how
+    many fewer do in another map of the same place is not.
+    """
+    update = keyframe.update
+    offered = _offered(update.n_edges, update.n_planes, config)
+    matched = update.n_edge_matches + update.n_plane_matches
+    return min(matched / offered, 1.0) if offered and matched else 1.0
 
 
 def _standing_fit(matches: ScanMatches, offered: int) -> Fit:

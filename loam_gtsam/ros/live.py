@@ -25,7 +25,15 @@ from loam_gtsam.pipeline import Observer, Pipeline
 from loam_gtsam.registration.odometry import Odometry
 from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
-from loam_gtsam.ros.live_inputs import LiveImu, ReadySweep, SweepDecoder, checked_stamp, sample_rows
+from loam_gtsam.ros.live_inputs import (
+    LiveImu,
+    ReadySweep,
+    Row,
+    SweepDecoder,
+    check_stamp,
+    checked_stamp,
+    sample_rows,
+)
 from loam_gtsam.ros.live_report import LiveLog, LiveReport
 from loam_gtsam.types import DatasetError, ImuSamples, InputError, MapUpdate, Scan, Sweep
 
@@ -168,20 +176,28 @@ class LiveMapper:
             if isinstance(message, ImuSamples):
                 for row in sample_rows(message):
                     self._log.received["imu"] += 1
-                    self._imu.add(row)
+                    self._take_sample(row)
                 self._news.set()
                 return
             self._log.received["imu"] += 1
             try:
                 checked_stamp(message)
-                stamp, values = decode_imu(message)
-                if not np.isfinite(values).all():
-                    raise DatasetError("NaN or infinity")
+                row = decode_imu(message)
             except DatasetError as error:
                 self._log.fault(f"imu: {error}")
                 return
-            self._imu.add((stamp, values))
+            self._take_sample(row)
         self._news.set()
+
+    def _take_sample(self, row: Row) -> None:
+        assert self._imu is not None
+        try:
+            check_stamp(row[0])
+            if not np.isfinite(row[1]).all():
+                raise DatasetError("NaN or infinity")
+            self._imu.add(row)
+        except DatasetError as error:
+            self._log.fault(f"imu: {error}")
 
     def fault(self, reason: str) -> None:
         """Count a message that could not even be handed over."""

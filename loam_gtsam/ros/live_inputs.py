@@ -191,17 +191,21 @@ class LiveImu:
 
 
 def sample_rows(samples: ImuSamples) -> list[Row]:
-    """Finite samples one by one; without an orientation, their quaternion is none."""
+    """Samples one by one; without an orientation, their quaternion is none."""
     none = np.zeros((len(samples.stamps), 4))
     turns = none if samples.orientation is None else samples.orientation
     values = np.column_stack([turns, samples.gyro, samples.acceleration])
     pairs = zip(samples.stamps.tolist(), values, strict=True)
-    return [(stamp, tuple(row.tolist())) for stamp, row in pairs if np.isfinite(row).all()]
+    return [(stamp, tuple(row.tolist())) for stamp, row in pairs]
 
 
 def checked_stamp(message: Any) -> int:
-    """Header stamp, ns; DatasetError if there is none, or no message of ROS 2 could say it."""
-    stamp = message_stamp(message)
+    """Header stamp, ns; DatasetError if there is none or it is none, see :func:`check_stamp`."""
+    return check_stamp(message_stamp(message))
+
+
+def check_stamp(stamp: int) -> int:
+    """The stamp, ns; DatasetError if no message of ROS 2 could say it."""
     if not 0 <= stamp < 2**31 * 10**9:
         raise DatasetError(f"stamp of {stamp} ns: expected 0 to 2^31 s")
     return stamp

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -15,10 +16,11 @@ from loam_gtsam.factors import checked_factor
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.loops.closure import ScanLoopCloser
+from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
 from loam_gtsam.registration.odometry import ConstantVelocity
-from loam_gtsam.registration.solvers import make_solver
-from loam_gtsam.types import FrameStatus
+from loam_gtsam.registration.solvers import POSE_KEY, make_solver
+from loam_gtsam.types import FrameStatus, InputError
 
 DATA = open_dataset("sim:room?frames=6&columns=200&imu=mems&speed=3&start=moving")
 CONFIG = effective_config(Config().changed("pose_graph.keyframe_distance=0.02"), DATA)
@@ -132,6 +134,35 @@ def test_a_sweep_can_be_tried_again_after_a_fault_of_the_user(
     assert f"{named} of your own (Faulty" in str(error)
     for one, other in zip(found, undisturbed, strict=True):
         np.testing.assert_array_equal(one, other)
+
+
+def test_a_prior_that_fails_is_named_and_the_sweep_can_be_tried_again():
+    """Factors given to ``register``, alone and beside ``extra_factors``."""
+    features = [extract_features(sweep, CONFIG) for sweep in SWEEPS[:3]]
+    part, found = Faulty("residual"), []
+    for others in (None, lambda context: []):
+        mapper = Mapper(CONFIG, extra_factors=others)
+        for sweep in features[:2]:
+            mapper.register(sweep)
+        priors = part.factors(SimpleNamespace(key=POSE_KEY))
+        part.armed, part.passes = True, 0
+        with pytest.raises(PartError, match="raised FaultError") as caught:
+            mapper.register(features[2], priors=priors)
+        assert caught.value.part == ("priors" if others is None else "extra_factors")
+        notes = [] if others is None else ["or raised by one of the priors given to register"]
+        assert getattr(caught.value, "__notes__", []) == notes
+        found.append(mapper.register(features[2], priors=priors).map_T_lidar.matrix())
+        found.append(np.sort(mapper.map_points()[1], axis=0))
+    np.testing.assert_array_equal(found[0], found[2])
+    mapper = Mapper(CONFIG)
+    for sweep in features[:2]:
+        mapper.register(sweep)
+    for wrong in (1, [1], [gtsam.PriorFactorPose3(5, gtsam.Pose3(), NOISE)]):
+        with pytest.raises(InputError, match="factors on POSE_KEY"):
+            mapper.register(features[2], priors=wrong)
+    undisturbed = mapper.register(features[2], priors=priors)
+    np.testing.assert_array_equal(undisturbed.map_T_lidar.matrix(), found[0])
+    np.testing.assert_array_equal(np.sort(mapper.map_points()[1], axis=0), found[1])
 
 
 @pytest.mark.parametrize(

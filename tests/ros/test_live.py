@@ -613,6 +613,20 @@ def test_faulty_samples_are_counted_and_left_out(bag: Path, spoil: Any, reason: 
     assert live.report().received == {"imu": 2}
 
 
+def test_faulty_samples_that_are_no_messages_are_counted_alike() -> None:
+    samples = SimulatedWorld("room", frames=1, columns=90).imu
+    assert samples is not None
+    gyro, acceleration, stamps = (
+        part.copy() for part in (samples.gyro, samples.acceleration, samples.stamps)
+    )
+    gyro[3, 1], acceleration[5, 2], stamps[0] = math.nan, math.inf, -1
+    live = LiveMapper(imu=True)
+    live.add_imu(replace(samples, gyro=gyro, acceleration=acceleration, stamps=stamps))
+    wrong = "imu: stamp of -1 ns: expected 0 to 2^31 s"
+    assert live.report().faults == {"imu: NaN or infinity": 2, wrong: 1}
+    assert live.report().received == {"imu": len(stamps)}
+
+
 def test_reasons_stay_few_however_many_there_are() -> None:
     log = LiveLog()
     for number in range(100):

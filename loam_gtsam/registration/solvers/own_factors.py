@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.errors import is_own, own_code
+from loam_gtsam.errors import PartError, is_own, own_code
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.registration.solvers.base import (
     POSE_KEY,
@@ -80,6 +81,35 @@ def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.Nonline
                 f"{type(factor).__name__} on the keys {keys}"
             )
     return ready
+
+
+@contextmanager
+def own_priors(priors: object) -> Iterator[None]:
+    """A block in which factors that a user gave with a sweep are evaluated, under their name.
+
+    Raises
+    ------
+    PartError
+        What such a factor raises. Beside ``extra_factors`` or a solver of the user's own nobody
+        can tell whose exception it was: then the error has the name of that part, and a note.
+    InputError
+        If they are anything but a sequence of GTSAM factors on :data:`POSE_KEY`.
+    """
+    given: Sequence[object] = priors if isinstance(priors, Sequence) else [priors]
+    for factor in given:
+        if not isinstance(factor, gtsam.NonlinearFactor) or list(factor.keys()) != [POSE_KEY]:
+            raise InputError(
+                "priors: expected a list of GTSAM factors on POSE_KEY of "
+                f"loam_gtsam.registration.solvers alone, got {type(factor).__name__}"
+                + (f" on {factor.keys()}" if isinstance(factor, gtsam.NonlinearFactor) else "")
+            )
+    try:
+        with own_code("priors", "given to register" if given else None):
+            yield
+    except PartError as error:
+        if given and error.part != "priors":
+            error.add_note("or raised by one of the priors given to register")
+        raise
 
 
 @dataclass(frozen=True, slots=True, eq=False)

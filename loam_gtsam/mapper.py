@@ -152,9 +152,8 @@ class Mapper:
         Parameters
         ----------
         features : of the sweep
-        guess : predicted ``map_T_lidar`` at ``features.stamp``, where the solve starts; predicted
-            from the last motion and the IMU if None, and for the first sweep the origin, levelled
-            by the IMU
+        guess : ``map_T_lidar`` at ``features.stamp``, where the solve starts; if None, predicted by
+            the last motion and the IMU, and for the first sweep the origin, levelled by the IMU
         twist : (6,) predicted body velocity during the sweep, rad/s and m/s; predicted if None
         priors : further factors on :data:`~loam_gtsam.registration.solvers.POSE_KEY`, the pose at
             the middle of the sweep; what they raise is a PartError like that of ``extra_factors``
@@ -171,8 +170,7 @@ class Mapper:
             return refused
         if self.last is None and self.imu is not None:
             guess = self.imu.first_pose(features.stamp, guess)
-        gyro = None if self.imu is None else self.imu.trusted_gyro
-        sweep = MovingSweep(features, self.config, gyro)
+        sweep = MovingSweep(features, self.config, self.imu.trusted_gyro if self.imu else None)
         before = self.last, self._moment, self.imu
         predicted = predict(sweep, *before, self.config.solver, guess, twist)
         try:
@@ -197,8 +195,8 @@ class Mapper:
                 else:
                     self._moment = Moment(frame.sweep.stamp, frame.predicted.map_T_middle, False)
                     update = unplaced(frame, outcome, self.monitor)
-                    anyway = self.config.map.insert_unmatched
-                    if update.status is FrameStatus.FEW_MATCHES and anyway:
+                    few = update.status is FrameStatus.FEW_MATCHES
+                    if few and self.config.map.insert_unmatched:
                         self._start = None
                         self._insert(*placed, update.status, update.message, clock)
         if not update.status.solved:

@@ -405,9 +405,8 @@ class PoseGraphConfig(Section):
     believed_loops: int = parameter(6, low=2, high=1000)
     """At least this many loop closures that agree pairwise are used even against the odometry."""
     visits: int = parameter(4, low=0, high=10_000)
-    """So many keyframes that come back to a place stay in the graph; of one pass and so many more
-    visits, a further one would lower the standard deviations by less than a tenth, so it is
-    forgotten when the next keyframe comes."""
+    """This many keyframes that come back to a place stay in the graph; one more, which would lower
+    a standard deviation by less than a tenth, is forgotten when the next keyframe comes."""
     follow_distance: float = parameter(0.05, unit="m", low=0.0)
     """Map points follow their keyframe once a loop closure has moved it by more than this as seen
     from the newest keyframe; an error of follow_angle_deg in the newest one is allowed for."""
@@ -423,12 +422,11 @@ class LoopConfig(Section):
     min_way: float = parameter(30.0, unit="m", low=0.0)
     """Two keyframes form a loop closure only if at least this was travelled between them."""
     gate: float = parameter(10.0, unit="m", low=0.0)
-    """A candidate lies within a gate about the keyframe. The radius of the gate is the sum of three
-    parts, of which this is the constant one."""
+    """A candidate lies within a radius about the keyframe, of three parts; this one is constant."""
     gate_sigmas: float = parameter(3.0, low=0.0)
-    """The second part of the gate is this many standard deviations of the two positions."""
+    """The second part of that radius is this many standard deviations of the two positions."""
     gate_drift: float = parameter(0.02, low=0.0)
-    """The third part of the gate is this share of the distance travelled between the two keyframes,
+    """The third part of that radius is this share of the distance travelled between the keyframes,
     for drift that the covariances do not know."""
     rings: int = parameter(20, source="Scan Context", low=1, high=200)
     """The place descriptor has this many rings."""
@@ -444,11 +442,8 @@ class LoopConfig(Section):
     """The submap of a candidate has its features and those of so many keyframes on either side."""
     search: float = parameter(8.0, unit="m", low=1.0, high=100.0)
     """The keyframe is searched for within this radius about the candidate."""
-    min_share: float = parameter(
-        0.5, source="right loops have 0.55 or more, wrong ones at most 0.5", low=0.0, high=1.0
-    )
-    """At least this share of the features off level ground must have a match in the submap, as a
-    part of the share of all features that had one in the map of the run."""
+    min_share: float = parameter(0.5, low=0.0, high=1.0)
+    """Off level ground at least this part of the usual share of the features must have a match."""
     min_agreement: float = parameter(
         0.9, source="right loops have 0.97 or more, wrong ones at most 0.75", low=0.0, high=1.0
     )

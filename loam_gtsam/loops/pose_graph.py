@@ -109,17 +109,12 @@ class PoseGraph(FactorGraph):
     def visit(self) -> int | None:
         """Say that the newest keyframe has its loop closures; it is forgotten if its place is full.
 
-        A keyframe that comes back to a place, by position and heading and with three standard
-        deviations, is a variable of the graph as long as ``pose_graph.visits`` of them are not. One
-        more would say hardly anything new about other keyframes. So the next one takes its place,
-        and is tied to the keyframe with which it closed a loop.
-
-        Returns
-        -------
-        The number of the first keyframe of the place if the newest one will be forgotten, or None.
+        If ``pose_graph.visits`` keyframes have come back to a place, one more says hardly anything
+        new about others. The one after it takes its place, tied to that with which it closed a
+        loop. Returns the number of the first keyframe of the place if so, else None.
         """
         newest = self.keyframes[-1]
-        place = self._place(newest)
+        place = _place(self, newest)
         if place is None:
             return None
         self.visits.place_of.setdefault(place, place)
@@ -193,16 +188,7 @@ class PoseGraph(FactorGraph):
         updates : frames of the run that the keyframes are of; those with a bad stamp are left out
         session : number of the run, see :meth:`new_session`
         """
-        known = [
-            (k.stamp, self.pose(k.index).compose(k.odom_T_lidar.inverse()))
-            for k in self.keyframes
-            if k.session == session
-        ] + [
-            (f.stamp, self.pose(f.base).compose(f.base_T_lidar).compose(f.odom_T_lidar.inverse()))
-            for f in self.forgotten
-            if f.session == session
-        ]
-        known.sort(key=lambda one: one[0])
+        known = _corrections(self, session)
         good = [update for update in updates if update.status.has_pose]
         stamps = np.array([update.stamp for update in good], np.int64)
         starts = np.array([start for start, _ in known], np.int64)
@@ -286,27 +272,6 @@ class PoseGraph(FactorGraph):
         self.visits.surplus = None
         self.visits.last = None if tie is None else (tie, self._graph.factors.size())
 
-    def _place(self, newest: Keyframe) -> int | None:
-        """The first keyframe of the place at which the newest one surely is; None if it is new."""
-        config, pose = self.config, self.pose(newest.index)
-        near = [
-            (self.pose(other.index).range(pose), other.index)
-            for other in self.keyframes[:-1]
-            if self.visits.is_place(other.index)
-        ]
-        for away, index in sorted(near):
-            if away >= config.keyframe_distance:
-                break
-            motion = self.pose(index).between(pose)
-            if leads_to_keyframe(motion, config):
-                continue
-            covariance = self.relative(index, newest.index)[1]
-            rotation, position = (np.linalg.eigvalsh(part)[-1] for part in _blocks(covariance))
-            turned = np.radians(config.keyframe_angle_deg)
-            sure = 9.0 * position < config.keyframe_distance**2 and 9.0 * rotation < turned**2
-            return index if sure else None
-        return None
-
     def _tie(self, last: Keyframe, new: Keyframe) -> Tie:
         """What leads to a new keyframe: odometry from the last one, which may be forgotten now."""
         motion, covariance = odometry_between(last, new, self.config)
@@ -340,5 +305,39 @@ class PoseGraph(FactorGraph):
         self._graph.forget(loops)
 
 
-def _blocks(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    return covariance[:3, :3], covariance[3:, 3:]
+def _corrections(graph: PoseGraph, session: int) -> list[tuple[int, gtsam.Pose3]]:
+    """Stamps of the keyframes of a run, forgotten ones too, and ``map_T_odom`` at each."""
+    known = [
+        (k.stamp, graph.pose(k.index).compose(k.odom_T_lidar.inverse()))
+        for k in graph.keyframes
+        if k.session == session
+    ]
+    known += [
+        (f.stamp, graph.pose(f.base).compose(f.base_T_lidar).compose(f.odom_T_lidar.inverse()))
+        for f in graph.forgotten
+        if f.session == session
+    ]
+    return sorted(known, key=lambda one: one[0])
+
+
+def _place(graph: PoseGraph, newest: Keyframe) -> int | None:
+    """The first keyframe of the place at which the newest one surely is; None if it is new."""
+    config, pose = graph.config, graph.pose(newest.index)
+    near = [
+        (graph.pose(other.index).range(pose), other.index)
+        for other in graph.keyframes[:-1]
+        if graph.visits.is_place(other.index)
+    ]
+    for away, index in sorted(near):
+        if away >= config.keyframe_distance:
+            break
+        if leads_to_keyframe(graph.pose(index).between(pose), config):
+            continue
+        covariance = graph.relative(index, newest.index)[1]
+        turned, moved = (
+            3.0 * np.sqrt(np.linalg.eigvalsh(part)[-1])
+            for part in (covariance[:3, :3], covariance[3:, 3:])
+        )
+        sure = moved < config.keyframe_distance
+        return index if sure and turned < np.radians(config.keyframe_angle_deg) else None
+    return None

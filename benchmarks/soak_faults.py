@@ -112,16 +112,19 @@ class FaultyDrive:
     ----------
     world : as long as wanted
     seed : of the faults
+    kinds : of faults
 
     Attributes
     ----------
     expected : of the sweeps, complete when all were delivered; of the IMU, when it was asked for
     """
 
-    def __init__(self, world: SimulatedWorld, seed: int = 0) -> None:
+    def __init__(
+        self, world: SimulatedWorld, seed: int = 0, kinds: tuple[str, ...] = KINDS
+    ) -> None:
         self.world, self._seed = world, seed
         self.expected = Expected()
-        self._plan = list(_planned(len(world), np.random.default_rng([seed, 0])))
+        self._plan = list(_planned(len(world), np.random.default_rng([seed, 0]), kinds))
 
     def deliveries(self) -> Iterator[tuple[Sweep, int]]:
         """The sweeps as they arrive, each with its number in the world."""
@@ -243,11 +246,11 @@ def _imu_fault(
     return [here]
 
 
-def _planned(sweeps: int, rng: Rng) -> Iterator[tuple[int, str]]:
+def _planned(sweeps: int, rng: Rng, kinds: tuple[str, ...]) -> Iterator[tuple[int, str]]:
     """First sweep and kind of each fault; every kind once before any comes again."""
     at = SOUND
     while True:
-        for kind in rng.permutation(KINDS).tolist():
+        for kind in rng.permutation(kinds).tolist():
             if at + _sweeps(kind) + _BETWEEN[0] > sweeps:
                 return
             yield at, kind

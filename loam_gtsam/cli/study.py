@@ -15,7 +15,7 @@ from rich.text import Text
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import StudyOptions
-from loam_gtsam.io.atomic import file_name, make_folder
+from loam_gtsam.io.atomic import file_name, make_folder, used_alone
 from loam_gtsam.studies import trial_runner as runner
 from loam_gtsam.studies import trials
 from loam_gtsam.studies.trial_spec import Spec, load_spec
@@ -31,6 +31,12 @@ def execute(options: StudyOptions) -> int:
     spec = load_spec(options.spec)
     folder = options.output or Path("loam_gtsam_output") / f"{file_name(spec.name)}_study"
     make_folder(folder / trials.TRIALS_FOLDER)
+    with used_alone(folder):
+        return _run_missing(spec, folder, options)
+
+
+def _run_missing(spec: Spec, folder: Path, options: StudyOptions) -> int:
+    """Run the trials whose rows are not in the folder, and write the table of all."""
     store = trials.TrialStore(folder)
     missing = []
     # Each computation once: two names may stand for the same configuration.

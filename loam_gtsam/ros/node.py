@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
 from typing import Any
@@ -17,7 +18,7 @@ from loam_gtsam.config import Config, load_config, preset
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.decode.loam_messages import ODOMETRY as LOAM_ODOMETRY
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
-from loam_gtsam.io.atomic import make_folder
+from loam_gtsam.io.atomic import make_folder, used_alone
 from loam_gtsam.io.run_files import write_run
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.ros.live import LiveMapper
@@ -55,7 +56,7 @@ _log = logging.getLogger(__name__)
 class LiveNode:
     """A live run between the subscriptions and publishers of a ROS 2 node.
 
-    Raises LoamError if a parameter is wrong, or the output folder cannot be made.
+    Raises LoamError if a parameter is wrong, or the output folder cannot be made or is in use.
 
     The constructor declares the parameters of ``node``, an ``rclpy.node.Node``, subscribes and
     advertises; ``on_error`` is called when an error ends the thread that maps.
@@ -78,6 +79,9 @@ class LiveNode:
             observe=self._observe,
         )
         self._output = make_folder(values["output"]) if values["output"] else None
+        self._held = ExitStack()
+        if self._output is not None:
+            self._held.enter_context(used_alone(self._output))
         self._updates: list[MapUpdate] = []
         self._on_error = on_error
         self._error: Exception | None = None
@@ -103,9 +107,10 @@ class LiveNode:
         """
         self._stop.set()
         self._thread.join()
-        if self._output is not None and self._updates:
-            result = self.live.pipeline.result(self._updates, error=self._error)
-            write_run(result, self._output, dataset="live")
+        with self._held:
+            if self._output is not None and self._updates:
+                result = self.live.pipeline.result(self._updates, error=self._error)
+                write_run(result, self._output, dataset="live")
         if self._error is not None:
             raise self._error
 

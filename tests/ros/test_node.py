@@ -188,7 +188,12 @@ def test_the_files_of_the_run_are_written_when_the_node_ends(
     bag: Path, offline: RunResult, tmp_path: Path
 ) -> None:
     node = FakeNode(imu_topic=IMU, output=str(tmp_path / "run"))
-    play(node, LiveNode(node), raw_messages(bag), FRAMES)
+    live = LiveNode(node)
+    for _ in range(2):  # a node that was refused holds nothing
+        with pytest.raises(OutputError, match="another run uses this folder"):
+            LiveNode(FakeNode(output=str(tmp_path / "run")))
+    play(node, live, raw_messages(bag), FRAMES)
+    LiveNode(FakeNode(output=str(tmp_path / "run")))  # the first one has ended
     written = read_tum(tmp_path / "run" / "trajectory.tum")
     np.testing.assert_allclose(written.map_T_lidar, offline.trajectory.map_T_lidar, atol=1e-8)
 

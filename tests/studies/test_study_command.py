@@ -19,6 +19,7 @@ from typer.testing import Result
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.io.atomic import used_alone
 from loam_gtsam.studies import trial_runner
 from loam_gtsam.studies.trials import TABLE_FILE, Row, Trial, empty_row, read_table
 
@@ -70,6 +71,17 @@ def test_only_what_is_missing_or_has_changed_is_run_again(tmp_path, quick):
     rows, configs = read_table(Path("out") / TABLE_FILE)
     assert [row["ate_m"] for row in rows] == [10.0, 11.0, 12.0, 13.0]
     assert configs[rows[2]["config_hash"]]["solver"]["iterations"] == 3
+
+
+def test_a_second_study_in_the_folder_of_one_that_runs_is_refused(tmp_path, quick):
+    file = write_spec(tmp_path, SPEC)
+    (tmp_path / "out").mkdir()
+    with used_alone(tmp_path / "out"):
+        result = study(file, "--output", "out")
+        assert result.exit_code == 1
+        assert "out: another run uses this folder" in one_line(result)
+        assert not quick
+    assert study(file, "--output", "out").exit_code == 0
 
 
 def test_one_configuration_under_two_names_runs_once_and_has_two_rows(tmp_path, quick):

@@ -45,7 +45,7 @@ PLACES = dict.fromkeys(
 judged."""
 _USABLE = {"bridge": ("sixty points",)}
 """Faults that are left out, since there such a sweep may be good enough, or not."""
-_FRAMES_OF_A_PLACE = 240
+_FRAMES_OF_A_PLACE = 1_250
 _BOUNDED = "room"
 """The map of the block gets denser all the time, as noise fills further voxels."""
 _ATE = 0.05
@@ -195,7 +195,14 @@ def _errors(
 
 
 def write(folder: Path, results: Sequence[SoakResult]) -> list[Path]:
-    """``soak_SCENE.csv`` and, with matplotlib, ``.png`` of each run; ``soak.md``."""
+    """``soak_SCENE.csv`` and, with matplotlib, ``.png`` of each run; ``soak.md``.
+
+    Of the places there is one table, ``soak_places.md``.
+    """
+    if results[0].scene in PLACES:
+        text = "\n".join(_table_of_places(results)) + "\n"
+        (folder / "soak_places.md").write_text(text, encoding="utf-8")
+        return [folder / "soak_places.md"]
     paths = [path for result in results for path in _write_curves(folder, result)]
     paths.append(folder / "soak.md")
     paths[-1].write_text("\n".join(_markdown(results)) + "\n", encoding="utf-8")
@@ -237,10 +244,31 @@ def _markdown(results: Sequence[SoakResult]) -> Iterator[str]:
         "faults of its own, through one `Pipeline` each. Of each frame's report, which a run "
         "keeps, only pose and status are kept here. Memory is judged in the room, where the map is "
         "soon full. That of the block gets denser all the time, ever more slowly, as noise fills "
-        "further voxels ([long runs](growth.md)), and memory with it."
+        "further voxels ([long runs](growth.md)), and memory with it. "
+        "[Other places](soak_places.md) have a table."
     )
     for result in results:
         yield from _scene(result)
+
+
+def _table_of_places(results: Sequence[SoakResult]) -> Iterator[str]:
+    yield "# Soak of other places\n\nMade by `python -m benchmarks.soak --places`.\n"
+    yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
+    yield (
+        "As in the [room and the street](soak.md), with every fault there is (but sixty points on "
+        "the bridge, which may be enough there), once through each place. Judged are exceptions "
+        "and counts: where little is seen, a fault may cost more than its sweep.\n"
+    )
+    labels = list(results[0].verdicts())
+    yield f"| place | sweeps | faults | {' | '.join(labels)} | statuses |"
+    yield "|---" * (len(labels) + 4) + "|"
+    for result in results:
+        delivered, faults = len(result.columns["faults"]), result.expected.injected.total()
+        values = " | ".join(value for value, _ in result.verdicts().values())
+        statuses = ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
+        yield f"| {result.scene} | {delivered} | {faults} | {values} | {statuses} |"
+    total = sum(len(result.columns["faults"]) for result in results)
+    yield f"\n{total} sweeps in all."
 
 
 def _scene(result: SoakResult) -> Iterator[str]:

@@ -285,8 +285,8 @@ class PoseGraph(FactorGraph):
         ):
             return Tie(last.index, motion, covariance, way)
         tie = self.visits.last[0]
-        if own:
-            tie = Tie(own[-1].earlier, own[-1].earlier_T_later, own[-1].covariance, 0.0)
+        base, gone = (own[-1].earlier, 0.0) if own else (tie.base, tie.way)
+        tie = Tie(base, *self.relative(base, last.index), gone)
         self._forget(last, tie, len(own))
         to_new = motion.inverse().AdjointMap()
         covariance = covariance + to_new @ tie.covariance @ to_new.T

@@ -132,3 +132,18 @@ def test_between_frames_only_the_way_between_counts(blind_field):
         relative_covariance(updates[i], updates[k])[3, 3] ** 0.5 for i, k in ((1, 24), (19, 24))
     ]
     assert spread[1] == pytest.approx(spread[0] * 5 / 23, rel=0.3)
+
+
+def test_velocities_known_to_micrometres_beside_kilometres_stay_one_covariance():
+    """Starts at the bounds of the configuration, and a share of a pose along odd axes."""
+    for seed in range(300):
+        rng = np.random.default_rng(seed)
+        names = ("start_speed", "start_turn", "acceleration_sigma", "turn_sigma")
+        error = MotionError(CONFIG.changed(**{n: 10 ** rng.uniform(-6, 4) for n in names}))
+        error.coast(0, turned=False)
+        for number in range(1, 4):
+            axes, _ = np.linalg.qr(rng.normal(size=(6, 6)))
+            share = axes @ np.diag(rng.choice([0.0, 1.0, 0.5], 6)) @ axes.T
+            raw = 10 ** rng.uniform(-14, -4) * np.eye(6)
+            error.observe(number * FRAME, share, raw, turned=bool(rng.integers(2)))
+            assert np.isfinite(error.velocity).all()

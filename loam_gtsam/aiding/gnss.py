@@ -223,7 +223,7 @@ class _Fixes:
             at = _interpolated(placed, times, int(fixes.stamps[row]))
             move = keyframes[number].odom_T_lidar.between(at)
             moves.append(move)
-            poses.append(graph.pose(number).compose(move))
+            poses.append(graph.pose(keyframes[number].index).compose(move))
         walk = graph.config.walk**2 * np.array([np.linalg.norm(m.translation()) for m in moves])
         stamps = fixes.stamps[rows]
         origin = np.asarray(fixes.geodetic[rows[0]], np.float64)

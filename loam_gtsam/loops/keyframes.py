@@ -105,6 +105,11 @@ class Tie:
     covariance: FloatArray
     way: float
 
+    def factor(self, key: int) -> gtsam.BetweenFactorPose3:
+        """As a factor on the pose that has the key."""
+        noise = noise_model(self.covariance)
+        return gtsam.BetweenFactorPose3(pose_key(self.base), key, self.base_T_lidar, noise)
+
 
 @dataclass(slots=True, eq=False)
 class Visits:
@@ -130,9 +135,20 @@ class Visits:
         """Whether a keyframe is the first one of its place."""
         return self.place_of.get(index, index) == index
 
-    def count(self, place: int) -> int:
-        """How many keyframes have come back to a place."""
-        return sum(first == place for first in self.place_of.values()) - 1
+    def add(self, newest: int, place: int, most: int) -> bool:
+        """The newest keyframe is at a place; whether ``most`` came back to it before."""
+        self.place_of.setdefault(place, place)
+        back = sum(first == place for first in self.place_of.values()) - 1
+        self.place_of[newest] = place
+        self.surplus = newest if back >= most else None
+        return self.surplus is not None
+
+    def forget(self, last: Keyframe, tie: Tie) -> None:
+        """The newest keyframe is forgotten; it was where ``tie`` says."""
+        there = last.stamp, last.odom_T_lidar, last.session
+        self.journal.all.append(Forgotten(*there, tie.base, tie.base_T_lidar))
+        del self.place_of[last.index]
+        self.ties.pop(last.index, None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from loam_gtsam.config import Config, as_config
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.geometry import transform
-from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, ScanLoopCloser
+from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, NoLoops, ScanLoopCloser
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.mapper import Mapper
@@ -85,7 +85,8 @@ class LoopMapping:
         if is_closed:
             config = self._config.pose_graph
             self.correct_map(config.follow_distance, config.follow_angle_deg)
-        place = self.graph.visit()
+        # What ties a graph without loops, as a receiver does in the end, ties every visit anew.
+        place = None if isinstance(self.closer, NoLoops) else self.graph.visit()
         if place is not None:  # the points to come belong to a keyframe that stays
             self._mapper.keyframe = place
             del self._placed[keyframe.index]

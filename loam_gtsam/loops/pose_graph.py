@@ -28,7 +28,6 @@ from loam_gtsam.loops.keyframes import (
     noise_model,
     numbered,
     odometry_between,
-    pose_key,
 )
 from loam_gtsam.loops.loop_selection import LoopSelection
 from loam_gtsam.loops.own_factors import FactorGraph
@@ -109,19 +108,12 @@ class PoseGraph(FactorGraph):
     def visit(self) -> int | None:
         """Say that the newest keyframe has its loop closures; it is forgotten if its place is full.
 
-        If ``pose_graph.visits`` keyframes have come back to a place, one more says hardly anything
-        new about others. The one after it takes its place, tied to that with which it closed a
-        loop. Returns the number of the first keyframe of the place if so, else None.
+        If ``pose_graph.visits`` keyframes have come back to a place, the one after it hangs on that
+        with which it closed a loop. Returns the number of the first one there if so, else None.
         """
-        newest = self.keyframes[-1]
+        newest, most = self.keyframes[-1], self.config.visits
         place = _place(self, newest)
-        if place is None:
-            return None
-        self.visits.place_of.setdefault(place, place)
-        is_full = self.visits.count(place) >= self.config.visits
-        self.visits.place_of[newest.index] = place
-        self.visits.surplus = newest.index if is_full else None
-        return place if is_full else None
+        return place if place is not None and self.visits.add(newest.index, place, most) else None
 
     @property
     def forgotten(self) -> Sequence[Forgotten]:
@@ -193,15 +185,10 @@ class PoseGraph(FactorGraph):
         stamps = np.array([update.stamp for update in good], np.int64)
         starts = np.array([start for start, _ in known], np.int64)
         nexts = np.searchsorted(starts, stamps, side="right").tolist()
-        poses = []
-        for update, after in zip(good, nexts, strict=True):
-            pose, around = update.map_T_lidar, known[max(after - 1, 0) : after + 1]
-            found = [map_T_odom.compose(pose) for _, map_T_odom in around]
-            if len(found) == 2:
-                share = (update.stamp - around[0][0]) / (around[1][0] - around[0][0])
-                step = gtsam.Pose3.Logmap(found[0].between(found[1]))
-                found[0] = found[0].compose(gtsam.Pose3.Expmap(share * step))
-            poses.append(found[0] if found else pose)
+        poses = [
+            _corrected(update, known[max(after - 1, 0) : after + 1])
+            for update, after in zip(good, nexts, strict=True)
+        ]
         return Trajectory.from_poses(stamps, poses)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
@@ -263,9 +250,8 @@ class PoseGraph(FactorGraph):
             factors.add(gtsam.PriorFactorPose3(keyframe.key, pose, noise_model(covariance)))
         else:
             tie = self._tie(last, keyframe)
-            motion, noise = tie.base_T_lidar, noise_model(tie.covariance)
-            pose = self.pose(tie.base).compose(motion)
-            factors.add(gtsam.BetweenFactorPose3(pose_key(tie.base), keyframe.key, motion, noise))
+            pose = self.pose(tie.base).compose(tie.base_T_lidar)
+            factors.add(tie.factor(keyframe.key))
         values.insert(keyframe.key, pose)
         self._graph.add(factors, values, settle=False)
         self.keyframes.append(keyframe)
@@ -287,22 +273,15 @@ class PoseGraph(FactorGraph):
         tie = self.visits.last[0]
         base, gone = (own[-1].earlier, 0.0) if own else (tie.base, tie.way)
         tie = Tie(base, *self.relative(base, last.index), gone)
-        self._forget(last, tie, len(own))
+        self.visits.forget(last, tie)
+        self.keyframes.pop()
+        self._selection.forget(len(own))
+        self._graph.forget(len(own))
         to_new = motion.inverse().AdjointMap()
         covariance = covariance + to_new @ tie.covariance @ to_new.T
         tie = Tie(tie.base, tie.base_T_lidar.compose(motion), covariance, tie.way + way)
         self.visits.ties[new.index] = tie.base, tie.way
         return tie
-
-    def _forget(self, last: Keyframe, tie: Tie, loops: int) -> None:
-        """Forget the newest keyframe and its loop closures; it was where ``tie`` says."""
-        there = last.stamp, last.odom_T_lidar, last.session
-        self.visits.journal.all.append(Forgotten(*there, tie.base, tie.base_T_lidar))
-        del self.visits.place_of[last.index]
-        self.visits.ties.pop(last.index, None)
-        self.keyframes.pop()
-        self._selection.forget(loops)
-        self._graph.forget(loops)
 
 
 def _corrections(graph: PoseGraph, session: int) -> list[tuple[int, gtsam.Pose3]]:
@@ -318,6 +297,17 @@ def _corrections(graph: PoseGraph, session: int) -> list[tuple[int, gtsam.Pose3]
         if f.session == session
     ]
     return sorted(known, key=lambda one: one[0])
+
+
+def _corrected(update: MapUpdate, around: Sequence[tuple[int, gtsam.Pose3]]) -> gtsam.Pose3:
+    """The pose of a frame between two keyframes or beside one, ``map_T_odom`` of which is known."""
+    pose = update.map_T_lidar
+    found = [map_T_odom.compose(pose) for _, map_T_odom in around]
+    if len(found) < 2:
+        return found[0] if found else pose
+    share = (update.stamp - around[0][0]) / (around[1][0] - around[0][0])
+    step = gtsam.Pose3.Logmap(found[0].between(found[1]))
+    return found[0].compose(gtsam.Pose3.Expmap(share * step))
 
 
 def _place(graph: PoseGraph, newest: Keyframe) -> int | None:

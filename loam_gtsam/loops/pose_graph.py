@@ -64,7 +64,6 @@ class PoseGraph(FactorGraph):
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         self._session: int
-        self._added: int
         self.loops: list[LoopClosure]
         self.visits: Visits
         self._session, self.keyframes, self.loops, self._graph, self._added, self.visits = state

@@ -22,9 +22,6 @@ _STEADIEST = 1e-3  # rad/s, m/s and metres, far below what is measured: the leas
 _UNEVEN = 0.5
 """Error that the ranges of one side of a sweep have in common, over the noise of a single one. Data
 sheets state an accuracy of 2 to 3 cm as the bound of both."""
-_BY_NOISE = 2.0
-"""Information that the noise of ten independent normals makes is in one case of thirty more than
-this many times its mean."""
 _RANK = 1e-9  # of the largest eigenvalue, below which a scan has no information on a pose
 _NODES = 41  # of the path between the middle of the last sweep and the end of this one
 _BENT = 1.0  # longest time over which accelerations are integrated for that, seconds
@@ -261,7 +258,7 @@ def solved_twist(
     alone = np.linalg.pinv(information, rcond=_RANK, hermitian=True)
     step = alone @ (pull[6:] - followed @ pull[:6])
     noise = displacements(rows.points, (rows.scales * tilts * seconds) ** 2)
-    information = nearest_positive(information - _BY_NOISE * noise)
+    information = nearest_positive(information - noise)
     wrong = max(_UNEVEN * range_noise, _STEADIEST) / max(np.abs(seconds).max(), _SHORTEST)
     far = float(np.median(np.linalg.norm(rows.points, axis=1)))
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)

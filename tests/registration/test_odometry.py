@@ -426,7 +426,7 @@ def test_what_the_noise_of_the_normals_makes_is_no_information():
     """Ground alone: a turn moves its points along it, and only false normals see that."""
     rng = np.random.default_rng(0)
     points = np.column_stack([rng.uniform(-30.0, 30.0, (2000, 2)), np.full(2000, -1.5)])
-    seconds, tilts = rng.uniform(-0.05, 0.05, 2000), np.full(2000, 0.05)
+    seconds, tilts = rng.uniform(-0.05, 0.05, 2000), np.full(2000, 0.07)
     normals = np.column_stack([0.05 * rng.standard_normal((2000, 2)), np.ones(2000)])
     normals /= np.linalg.norm(normals, axis=1)[:, None]
     offsets = -np.einsum("ij,ij->i", normals, points) + 0.03 * rng.standard_normal(2000)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from loam_gtsam.geometry import cross_matrix
 from loam_gtsam.types import BoolArray, FloatArray
 
 _TRIED = 40  # fixes, evenly over the way, of which pairs are tried
@@ -86,7 +87,5 @@ def _turn(a: FloatArray, b: FloatArray) -> FloatArray:
     cross, cosine = np.cross(a, b), float(a @ b)
     if cosine < -1.0 + 1e-9:  # upside down: about the x axis
         return np.diag([1.0, -1.0, -1.0])
-    skew = np.array([
-        [0.0, -cross[2], cross[1]], [cross[2], 0.0, -cross[0]], [-cross[1], cross[0], 0.0]
-    ])  # fmt: skip
+    skew = cross_matrix(cross)
     return np.asarray(np.eye(3) + skew + skew @ skew / (1.0 + cosine))

@@ -20,6 +20,7 @@ from loam_gtsam.config import AidingConfig
 from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up
 from loam_gtsam.factors import checked_factor
+from loam_gtsam.geometry import cross_matrix
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.keyframes import noise_model
 from loam_gtsam.loops.pose_graph import PoseGraph
@@ -111,8 +112,8 @@ def fix_factor(
         seen = turned @ values.atPoint3(ANTENNA_KEY) + start
         place = there @ seen + pose.translation()
         whole = outer @ there
-        by_pose = np.hstack([-whole @ _skew(seen), whole])
-        by_earth = np.hstack([-outer @ _skew(place), outer])
+        by_pose = np.hstack([-whole @ cross_matrix(seen), whole])
+        by_earth = np.hstack([-outer @ cross_matrix(place), outer])
         error = outer @ place + earth.translation() - enu
         return error, [by_pose, by_earth, whole @ turned]
 
@@ -355,10 +356,6 @@ def _interpolated(placed: Sequence[MapUpdate], times: IntArray, stamp: int) -> g
     share = (stamp - before.stamp) / (later.stamp - before.stamp)
     step = gtsam.Pose3.Logmap(before.map_T_lidar.between(later.map_T_lidar))
     return before.map_T_lidar.compose(gtsam.Pose3.Expmap(share * step))
-
-
-def _skew(v: FloatArray) -> FloatArray:
-    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
 def write_enu(path: str | Path, trajectory: Trajectory, earth: GeoReference) -> None:

@@ -86,7 +86,7 @@ class DeskewConfig(Section):
     """Sweeps are de-skewed with the predicted motion, and again with the solution."""
     model: Literal["predicted", "constant", "linear"] = parameter("linear", source="LOAM predicts")
     """The motion within a sweep is the predicted one (and rest at the start), or leads from the
-    last pose to the solved one (constant), or is solved for with the pose (linear; without IMU).
+    last pose to the solved one (constant), or is solved for as well (linear, if no IMU tells it).
     Unless predicted, the first motion is searched for, and eight sweeps are registered together."""
     rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
     """The rotation within a sweep comes from the gyro of an IMU where that covers the sweep, else

@@ -214,7 +214,6 @@ def test_a_run_gets_better_and_its_covariances_are_right(room) -> None:
     assert after < before
     assert planes > 50
     assert last.entropy < first.entropy
-    assert last.entropy < first.entropy
     truth = {int(s): gtsam.Pose3(p) for s, p in
              zip(world.truth.stamps, world.truth.map_T_lidar, strict=True)}  # fmt: skip
     poses, squared = refined.trajectory, []

@@ -22,12 +22,16 @@ from loam_gtsam.registration.association import (
     rematched,
     trial_matching,
 )
+from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, joined
 from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
 from loam_gtsam.types import FloatArray, SweepMotion
 
+_PARTS = 6.0
+"""Times ``min_aligned`` matches in the weakest direction: then each sixth of a sweep would fix the
+pose, and what these parts differ by tells a velocity. Sparse terrain has half of that."""
 _FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
 _THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: some twenty sweeps
 _OPEN = 1.5
@@ -251,24 +255,39 @@ class FrameMatcher(Matcher):
         """The matcher of the sweep de-skewed with the motion that leads to a pose."""
         if not self.refine:
             return self
-        return replace(self, posed=self.posed.sweep.at(self.twist_to(map_T_lidar, matches)))
+        solved = self._solved_twist(map_T_lidar, matches)
+        if solved is None:
+            mean = self.twist_to(map_T_lidar)
+            return replace(self, posed=self.posed.sweep.at(mean), accelerations=None)
+        return replace(self, posed=self.posed.sweep.at(solved))
 
     def twist_to(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches | None = None) -> FloatArray:
         """(6,) body velocity that leads to a pose; ``matches`` have a say in it if it is free."""
-        posed, last = self.posed, self.last
-        mean = twist_to(posed.sweep, last, self.inertial, map_T_lidar, posed.twist)
-        search = None if matches is None else matches.search
-        if matches is None or search is None or not self.motion_is_free:
-            return mean
-        assert last is not None
+        solved = None if matches is None else self._solved_twist(map_T_lidar, matches)
+        if solved is not None:
+            return solved
+        posed = self.posed
+        return twist_to(posed.sweep, self.last, self.inertial, map_T_lidar, posed.twist)
+
+    def _solved_twist(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches) -> FloatArray | None:
+        """(6,) body velocity by the matches; None if it is not free, or if they do not tell it."""
+        config, search = self.config, matches.search
+        if search is None or not self.motion_is_free:
+            return None
+        if localizability(matches, map_T_lidar).aligned[0] < _PARTS * config.solver.min_aligned:
+            return None  # what leaves the pose open does not tell how fast it changes
+        assert self.last is not None
         assert self.accelerations is not None
-        config = self.config
+        sweep = self.posed.sweep
         rows = match_rows(matches, config.solver.kernel_width, config.solver.kernel)
-        edges, planes = posed.sweep.seconds(matches.edges.indices, matches.planes.indices)
+        edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
         seconds = np.concatenate([np.repeat(edges, 2), planes])
-        missed = 0.5 * last.seconds_to(posed.sweep.stamp) * np.sqrt(self.accelerations)
-        velocities = search.posed.twist, mean, missed
-        noise = config.features.range_noise
+        mean = self.twist_to(map_T_lidar)
+        # A jump of the pose is no acceleration to believe in.
+        most = np.repeat([config.solver.turn_sigma, config.solver.acceleration_sigma], 3)
+        usual = np.minimum(np.sqrt(self.accelerations), most)
+        missed = 0.5 * self.last.seconds_to(sweep.stamp) * usual
+        velocities, noise = (search.posed.twist, mean, missed), config.features.range_noise
         return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:

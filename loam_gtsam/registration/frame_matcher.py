@@ -22,7 +22,7 @@ from loam_gtsam.registration.association import (
     rematched,
     trial_matching,
 )
-from loam_gtsam.registration.degeneracy import localizability
+from loam_gtsam.registration.degeneracy import Localizability, localizability
 from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, joined
 from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
 from loam_gtsam.registration.report import Clock
@@ -194,6 +194,7 @@ class FrameMatcher(Matcher):
     refine: bool  # whether ``deskewed`` changes anything
     accelerations: FloatArray | None  # (6,) mean squares by which the velocity is not constant
     clock: Clock  # books the time of every call on the stage ``match``
+    told: bool = False  # whether the matches are known to tell the motion, if it is free
 
     @classmethod
     def of(
@@ -259,7 +260,7 @@ class FrameMatcher(Matcher):
         if solved is None:
             mean = self.twist_to(map_T_lidar)
             return replace(self, posed=self.posed.sweep.at(mean), accelerations=None)
-        return replace(self, posed=self.posed.sweep.at(solved))
+        return replace(self, posed=self.posed.sweep.at(solved), told=True)
 
     def twist_to(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches | None = None) -> FloatArray:
         """(6,) body velocity that leads to a pose; ``matches`` have a say in it if it is free."""
@@ -274,8 +275,8 @@ class FrameMatcher(Matcher):
         config, search = self.config, matches.search
         if search is None or not self.motion_is_free:
             return None
-        if localizability(matches, map_T_lidar).aligned[0] < _PARTS * config.solver.min_aligned:
-            return None  # what leaves the pose open does not tell how fast it changes
+        if not (self.told or self.tells_motion(localizability(matches, map_T_lidar))):
+            return None
         assert self.last is not None
         assert self.accelerations is not None
         sweep = self.posed.sweep
@@ -289,6 +290,10 @@ class FrameMatcher(Matcher):
         missed = 0.5 * self.last.seconds_to(sweep.stamp) * usual
         velocities, noise = (search.posed.twist, mean, missed), config.features.range_noise
         return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
+
+    def tells_motion(self, seen: Localizability) -> bool:
+        """Whether a sweep of some localizability tells how fast its pose changes."""
+        return bool(seen.aligned[0] >= _PARTS * self.config.solver.min_aligned)
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:
         """The matcher of the sweep de-skewed for a (6,) body velocity, and for no other."""
@@ -356,5 +361,9 @@ class Frame:
 
     def twist_of(self, solution: Solution) -> FloatArray:
         """(6,) body velocity that belongs to a solution."""
+        matcher, seen = self.matcher, solution.localizability
         matches = solution.matches if solution.solved else None
-        return self.matcher.twist_to(solution.map_T_lidar, matches)
+        if seen is not None and matcher.motion_is_free:  # saves looking again
+            matcher = replace(matcher, told=True)
+            matches = matches if matcher.tells_motion(seen) else None
+        return matcher.twist_to(solution.map_T_lidar, matches)

@@ -354,8 +354,7 @@ def _interpolated(placed: Sequence[MapUpdate], times: IntArray, stamp: int) -> g
     if later.stamp <= before.stamp:
         raise InputError("updates: expected the frames of a run in order of time")
     share = (stamp - before.stamp) / (later.stamp - before.stamp)
-    step = gtsam.Pose3.Logmap(before.map_T_lidar.between(later.map_T_lidar))
-    return before.map_T_lidar.compose(gtsam.Pose3.Expmap(share * step))
+    return before.map_T_lidar.slerp(share, later.map_T_lidar)
 
 
 def write_enu(path: str | Path, trajectory: Trajectory, earth: GeoReference) -> None:

@@ -128,9 +128,8 @@ class WheelOdometry(Odometry):
         if after in (0, len(times)) or times[after] - times[after - 1] > _GAP:
             return None
         share = (stamp - int(times[after - 1])) / int(times[after] - times[after - 1])
-        start = gtsam.Pose3(self._wheels.start_T_body[after - 1])
-        step = start.between(gtsam.Pose3(self._wheels.start_T_body[after]))
-        return start.compose(gtsam.Pose3.Expmap(share * gtsam.Pose3.Logmap(step)))
+        start, end = map(gtsam.Pose3, self._wheels.start_T_body[after - 1 : after + 1])
+        return start.slerp(share, end)
 
 
 def aided_odometry(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
@@ -196,7 +195,7 @@ def clean_run(options: CleanOptions) -> int:
     if (folder / "pose_graph.g2o").exists():
         where = corrected_trajectory(folder, updates).map_T_lidar
         poses[[update.status.has_pose for update in updates]] = where
-    draws = console.draws_pictures(options.plot)
+    draws, report = console.draws_pictures(options.plot), dict[str, dict[str, int]]()
     with SavedMap(folder / MAP_FILE) as saved:
 
         def write(target: Path) -> list[str]:
@@ -208,9 +207,8 @@ def clean_run(options: CleanOptions) -> int:
             if draws:
                 way = stack_poses(update.map_T_lidar for update in placed)
                 plot_cleaned(target / CLEANED_FILES[2], kept, gone, way[:, :3, 3])
-            report = {
-                layer: {"points": n, "removed": m} for layer, (n, m) in cleaned.counts.items()
-            }
+            for layer, (points, removed) in cleaned.counts.items():
+                report[layer] = {"points": points, "removed": removed}
             write_json(target / CLEANED_FILES[-1], report)
             return [name for name in CLEANED_FILES if (target / name).exists()]
 
@@ -219,7 +217,6 @@ def clean_run(options: CleanOptions) -> int:
         ) as target:
             files = console.write_results(target, CLEANED_FILES, CLEANED_FILES[-1], write)
     if not options.quiet:
-        report = json.loads((target / CLEANED_FILES[-1]).read_text(encoding="utf-8"))
         for layer, counts in report.items():
             if counts["points"]:
                 typer.echo(f"{layer}: {counts['removed']} of {counts['points']} points removed")

@@ -305,8 +305,7 @@ def _corrected(update: MapUpdate, around: Sequence[tuple[int, gtsam.Pose3]]) -> 
     if len(found) < 2:
         return found[0] if found else pose
     share = (update.stamp - around[0][0]) / (around[1][0] - around[0][0])
-    step = gtsam.Pose3.Logmap(found[0].between(found[1]))
-    return found[0].compose(gtsam.Pose3.Expmap(share * step))
+    return found[0].slerp(share, found[1])
 
 
 def _place(graph: PoseGraph, newest: Keyframe) -> int | None:

@@ -12,6 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
@@ -119,10 +120,7 @@ def _parts(
         rows = part == number
         if rows.any():
             moved = move_points(points[rows], twist, seconds[rows] - middle)
-            here = move_points(np.vstack([np.zeros(3), np.eye(3)]), twist, np.full(4, middle))
-            step = np.eye(4)
-            step[:3, :3], step[:3, 3] = (here[1:] - here[0]).T, here[0]
-            yield step, moved, rows
+            yield gtsam.Pose3.Expmap(twist * middle).matrix(), moved, rows
 
 
 def count_votes(points: FloatArray, sweeps: Iterable[View], config: Config) -> Votes:

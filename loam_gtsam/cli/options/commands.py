@@ -237,29 +237,30 @@ class OptimizeOptions(Options):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RefineOptions(SourceOptions):
-    """Options of ``refine``."""
+class FinishedRunOptions(SourceOptions):
+    """A finished run, whose data set is read once more."""
 
     run: Path = argument("RUN", "Folder with the results of loam-gtsam run PATH.")
-    rounds: int = option("Search for planes, and solve, at most so often.", default=5, min=1)
-    points: int = option("Points of a sweep at most.", default=3000, min=100)
     plot: bool | None = option(
         "Draw pictures [default: if matplotlib is installed].", "--plot/--no-plot"
     )
-    overwrite: bool = flag("Replace earlier results in RUN/refined.", "--overwrite")
     quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
 
 
 @dataclass(frozen=True, kw_only=True)
-class CleanOptions(SourceOptions):
+class RefineOptions(FinishedRunOptions):
+    """Options of ``refine``."""
+
+    rounds: int = option("Search for planes, and solve, at most so often.", default=5, min=1)
+    points: int = option("Points of a sweep at most.", default=3000, min=100)
+    overwrite: bool = flag("Replace earlier results in RUN/refined.", "--overwrite")
+
+
+@dataclass(frozen=True, kw_only=True)
+class CleanOptions(FinishedRunOptions):
     """Options of ``clean``."""
 
-    run: Path = argument("RUN", "Folder with the results of loam-gtsam run PATH.")
-    plot: bool | None = option(
-        "Draw a picture [default: if matplotlib is installed].", "--plot/--no-plot"
-    )
     overwrite: bool = flag("Replace earlier results in RUN/cleaned.", "--overwrite")
-    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -138,8 +138,14 @@ class Refined:
     def joint_covariance(self, numbers: Sequence[int]) -> FloatArray:
         """(6 K, 6 K) joint marginal of the poses of K sweeps at their reference times.
 
-        Tangent order of the package, perturbations on the right.
+        Tangent order of the package, perturbations on the right. A number that no sweep has is
+        an InputError.
         """
+        count = len(self.sweeps)
+        if not all(0 <= n < count for n in numbers):
+            raise InputError(
+                f"expected numbers of sweeps from 0 to {count - 1}, got {list(numbers)}"
+            )
         rows = np.concatenate([6 * n + np.arange(6) for n in numbers])
         units = np.zeros((self.information.shape[0], len(rows)))
         units[rows, np.arange(len(rows))] = 1.0

@@ -4,7 +4,18 @@ import json
 
 import numpy as np
 import pytest
-from support.bags import LATENCY, ROS1, START, cloud, header, odometry, store_of, sweeps, write_bag
+from support.bags import (
+    LATENCY,
+    ROS1,
+    START,
+    cloud,
+    fix,
+    odometry,
+    store_of,
+    sweeps,
+    twist,
+    write_bag,
+)
 from support.cli import loam
 
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
@@ -13,26 +24,6 @@ from loam_gtsam.maps import SavedMap
 from loam_gtsam.types import DatasetError
 
 ORIGIN = np.array([47.5, 8.5, 450.0])
-
-
-def fix(store, stamp, place, *, status=0, covariance=(0.04, 0.04, 0.16), known=2):
-    types = store.types
-    return types["sensor_msgs/msg/NavSatFix"](
-        header=header(store, stamp),
-        status=types["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
-        latitude=float(place[0]), longitude=float(place[1]), altitude=float(place[2]),
-        position_covariance=np.diag(covariance).ravel(),
-        position_covariance_type=known,
-    )  # fmt: skip
-
-
-def twist(store, stamp, ahead, turn):
-    types = store.types
-    vector = types["geometry_msgs/msg/Vector3"]
-    speed = types["geometry_msgs/msg/Twist"](
-        linear=vector(x=ahead, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=turn)
-    )
-    return types["geometry_msgs/msg/TwistStamped"](header=header(store, stamp), twist=speed)
 
 
 @pytest.mark.parametrize("kind", ["ros1", "mcap"])

@@ -6,31 +6,33 @@ import importlib
 import pydoc
 import re
 import shlex
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import typer
+from support import walk
 
 from loam_gtsam import Config
 from loam_gtsam.cli.app import app
 from loam_gtsam.cli.results import PLOT_FILES, TRUTH_FILE
 from loam_gtsam.io.run_files import RUN_FILES, stage_seconds, write_npz
 from loam_gtsam.types import FrameStatus
+from loam_gtsam.view import plots
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
-def blocks(page: Path, language: str) -> list[str]:
-    """The fenced blocks of one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text("utf-8"), re.M | re.S)
-
-
 def test_ci_runs_what_the_readme_says() -> None:
     script = (ROOT / ".ci/run").read_text("utf-8").replace("--quiet ", "")
-    commands = "".join(blocks(ROOT / "README.md", "bash")).replace("&&", "\n").splitlines()
+    commands = (
+        "".join(text for _, text in walk.blocks(ROOT / "README.md", "bash"))
+        .replace("&&", "\n")
+        .splitlines()
+    )
     wanted = [line.strip() for line in commands if line.startswith(("pip", "loam", "python -m"))]
     assert len(wanted) == 4
     assert [command for command in wanted if f"step {command}" not in script] == []
@@ -80,51 +82,49 @@ def test_what_the_documentation_imports_is_there_and_public(page: Path) -> None:
             assert hasattr(found, name) or importlib.import_module(f"{module}.{name}")
 
 
-EXECUTED = (
-    "README",
-    "quickstart",
-    "loops",
-    "own_factor",
-    "own_loop_closer",
-    "own_sensor",
-    "bags_out",
-)
-CODE = [
-    pytest.param(code, id=f"{page.stem}-{number}")
-    for page in PAGES
-    for number, code in enumerate(blocks(page, "python"))
-    if page.stem in EXECUTED
-]
+WALKED = [page for page in PAGES if any(block.runs for block in walk.blocks(page, *walk.RUN))]
 
 
-@pytest.mark.parametrize("code", CODE)
-def test_python_blocks_run(
-    code: str,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("data")
+    walk.write_drive(folder)
+    return folder
+
+
+@pytest.mark.parametrize("page", WALKED, ids=lambda page: page.stem)
+def test_pages_are_walked_from_top_to_bottom(
+    page: Path, data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    shutil.copytree(data, tmp_path, dirs_exist_ok=True)
     monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {"__name__": "block"}
-    exec(compile(code, "block", "exec"), names)
+    if page.stem != "quickstart":  # the time that pictures take
+        monkeypatch.setattr(plots, "available", lambda: False)
+    names = walk.walk(page, (ROOT / ".ci/run").read_text("utf-8").replace("--quiet ", ""))
     if "update" in names:
         assert names["update"].status == "ok"
     if "planes" in names:
         assert len(names["planes"]) > 1000
 
 
-SHELL = [
+def test_blocks_that_are_not_run_say_what_they_need() -> None:
+    languages = {block.language for page in PAGES for block in walk.blocks(page)}
+    assert languages <= {*walk.RUN, "text", "yaml"}
+    waiting = [b for page in PAGES for b in walk.blocks(page, *walk.RUN) if not b.runs]
+    assert len(waiting) < 0.3 * sum(len(walk.blocks(page, *walk.RUN)) for page in PAGES)
+
+
+NOT_RUN = [
     (page, line.strip())
     for page in PAGES
-    for language in ("console", "bash")
-    for block in blocks(page, language)
-    for line in block.splitlines()
-    if line.strip().startswith("loam-gtsam ")
+    for block in walk.blocks(page, "console")
+    for line in block.text.splitlines()
+    if not block.runs and line.startswith("loam-gtsam ")
 ]
 
 
-@pytest.mark.parametrize(("page", "line"), SHELL, ids=[line for _, line in SHELL])
-def test_commands_parse(page: Path, line: str) -> None:
+@pytest.mark.parametrize(("page", "line"), NOT_RUN, ids=[line for _, line in NOT_RUN])
+def test_commands_that_are_not_run_parse(page: Path, line: str) -> None:
     _, name, *words = shlex.split(line, comments=True)
     group: Any = typer.main.get_command(app)
     command = group.commands[name]  # an unknown command is a KeyError

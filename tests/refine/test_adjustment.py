@@ -224,6 +224,9 @@ def test_a_run_gets_better_and_its_covariances_are_right(room) -> None:
         covariance = refined.relative_covariance(k, k + 5)
         squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
     assert 0.25 < np.mean(squared) < 4.0
+    for absent in (-1, 25):
+        with pytest.raises(InputError, match="from 0 to 24"):
+            refined.relative_covariance(2, absent)
     assert len(refined.map_points(0.2)) > 1000
     assert refined.seen.all()
     # A sweep that did not see a direction: what the run told of it holds from there on.

@@ -95,6 +95,34 @@ def odometry(
     )
 
 
+def fix(
+    store: Any,
+    stamp: int,
+    place: Sequence[float],
+    *,
+    status: int = 0,
+    covariance: Sequence[float] = (0.04, 0.04, 0.16),
+    known: int = 2,
+) -> Any:
+    types = store.types
+    return types["sensor_msgs/msg/NavSatFix"](
+        header=header(store, stamp),
+        status=types["sensor_msgs/msg/NavSatStatus"](status=status, service=1),
+        latitude=float(place[0]), longitude=float(place[1]), altitude=float(place[2]),
+        position_covariance=np.diag(covariance).ravel(),
+        position_covariance_type=known,
+    )  # fmt: skip
+
+
+def twist(store: Any, stamp: int, ahead: float, turn: float) -> Any:
+    types = store.types
+    vector = types["geometry_msgs/msg/Vector3"]
+    speed = types["geometry_msgs/msg/Twist"](
+        linear=vector(x=ahead, y=0.0, z=0.0), angular=vector(x=0.0, y=0.0, z=turn)
+    )
+    return types["geometry_msgs/msg/TwistStamped"](header=header(store, stamp), twist=speed)
+
+
 def write_bag(path: Path, kind: str, recording: Recording) -> Path:
     """Write the messages as ``ros1``, ``sqlite3`` or ``mcap``; returns what a user would open."""
     store = ROS1 if kind == "ros1" else ROS2

@@ -423,7 +423,9 @@ def run(
     pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
     if parts.get("features") is not None:
         workers = 0
-    about = {"data set": dataset.name, "configuration": dump_config(config)}
+    about = {"data set": dataset.name}
+    if checkpoint is not None:  # for its comments, the text takes longer than a sweep
+        about["configuration"] = dump_config(config)
     progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
     interrupted, error = False, None

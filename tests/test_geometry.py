@@ -3,6 +3,7 @@
 import gtsam
 import numpy as np
 import pytest
+from scipy.integrate import cumulative_trapezoid
 
 from loam_gtsam.geometry import (
     as_points,
@@ -11,6 +12,7 @@ from loam_gtsam.geometry import (
     find_in_sorted,
     fit_lines,
     fit_planes,
+    integrated,
     inverse_pose,
     moments,
     move_points,
@@ -248,3 +250,11 @@ def test_keys_are_found_among_sorted_ones(held):
     positions, present = find_in_sorted(np.array(held, np.int64), np.array([9, 4, 3, 12, 0]))
     assert positions.tolist() == np.searchsorted(held, [9, 4, 3, 12, 0]).tolist()
     assert present.tolist() == [key in held for key in (9, 4, 3, 12, 0)]
+
+
+@pytest.mark.parametrize("count", [1, 2, 40])
+def test_integrals_are_those_of_scipy(count):
+    rng = np.random.default_rng(count)
+    times, values = np.sort(rng.random(count)), rng.normal(size=(count, 3))
+    expected = cumulative_trapezoid(values, times, axis=0, initial=0.0)
+    np.testing.assert_array_equal(integrated(values, times), expected)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.geometry import cross, interpolated
+from loam_gtsam.geometry import cross, integrated, interpolated
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import FloatArray
 
@@ -55,8 +54,8 @@ def bend(
     felt: FloatArray = interpolated(knots, times, samples.acceleration[needed]) - acceleration_bias
     acceleration = rotations.apply(felt) + gravity
     here = int(np.searchsorted(knots, 0.0))
-    velocity = cumulative_trapezoid(acceleration, knots, axis=0, initial=0.0)
-    path = cumulative_trapezoid(velocity - velocity[here], knots, axis=0, initial=0.0)
+    velocity = integrated(acceleration, knots)
+    path = integrated(velocity - velocity[here], knots)
     path -= path[here]
     # The IMU goes round the lidar.
     rate = interpolated(np.zeros(1), times, samples.gyro[needed] - buffer.gyro_bias)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtr
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.geometry import symmetric
@@ -23,7 +23,7 @@ _HARDEST = 1.0
 """Largest acceleration over a sweep, in multiples of gravity, with which the estimate may begin. If
 it seems larger, down is not where the orientation has it."""
 _FASTEST = 20.0  # m/s: standard deviation of a speed that nothing told
-_UNLIKELY = float(chi2.isf(2.0 * norm.sf(5.0), 6))
+_UNLIKELY = float(chdtri(6, 2.0 * ndtr(-5.0)))
 """Squared Mahalanobis distance from which a pose contradicts its prediction: as unlikely as five
 standard deviations."""
 _OUTWEIGHS = 5  # frames that agree and one that contradicts: the one after it knows no velocity

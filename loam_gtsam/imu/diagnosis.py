@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.integrate import cumulative_trapezoid
 
 from loam_gtsam.config import ImuConfig
+from loam_gtsam.geometry import integrated
 from loam_gtsam.imu.at_rest import RestWindow
 from loam_gtsam.imu.quaternions import inverse, logarithm, quaternion_product, rotate
 from loam_gtsam.types import FloatArray, ImuSamples, IntArray
@@ -170,7 +170,7 @@ def _in_time(
         return None
     origin = samples.stamps[0]
     times = (samples.stamps - origin) * 1e-9
-    turned = cumulative_trapezoid(samples.gyro, times, axis=0, initial=0.0)
+    turned = integrated(samples.gyro, times)
 
     def gyro(shift: float) -> FloatArray:
         ends = ((spans - origin) * 1e-9 + shift).T
@@ -256,7 +256,7 @@ def _orientation_problem(samples: ImuSamples, seconds: FloatArray, max_gap: floa
     if not known.any():
         return ""
     q, at = samples.orientation[known].T, seconds[known]
-    by_gyro = cumulative_trapezoid(samples.gyro, seconds, axis=0, initial=0.0)[known]
+    by_gyro = integrated(samples.gyro, seconds)[known]
     steps = logarithm(quaternion_product(inverse(q[:, :-1]), q[:, 1:]))
     steps = np.where(np.diff(at) > max_gap, np.nan, steps)
     ends = np.searchsorted(at, np.arange(at[0], at[-1], _WINDOW))

@@ -13,7 +13,7 @@ from typing import Literal
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
-from scipy.stats import chi2, norm
+from scipy.special import chdtri, ndtr
 
 from loam_gtsam.geometry import interpolated, inverse_pose, transform
 from loam_gtsam.registration.pose_errors import relative_covariance
@@ -26,7 +26,7 @@ _LENGTHS = 8  # path lengths of the relative error, as in KITTI; multiples of on
 _LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 FREEDOM = 6
 """Degrees of freedom of a pose."""
-FIVE_SIGMA = float(chi2.isf(2.0 * norm.sf(5.0), FREEDOM))
+FIVE_SIGMA = float(chdtri(FREEDOM, 2.0 * ndtr(-5.0)))
 """Squared Mahalanobis distance of a pose that is as unlikely as five standard deviations."""
 
 

@@ -6,12 +6,15 @@ at ``ring_starts[i]``; the last of these (R + 1,) entries is N. See docs/maths/f
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import FeatureConfig
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
+_Real = TypeVar("_Real", np.float32, np.float64)
 _LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
 """Residual sum of squares of a straight line through five even samples, from their second
 differences a, b, c: ``0.4 (a^2 + c^2) + 0.7 b^2 + 0.8 b (a + c) + 0.4 a c``, the quadratic form of
@@ -39,7 +42,7 @@ def curvature(xyz: NDArray[np.float32], half_window: int) -> NDArray[np.float32]
     for shift in range(width):
         total += xyz[:, shift : shift + inner]
     result = np.zeros(xyz.shape[1], dtype=np.float32)
-    result[half_window : half_window + inner] = _squared_norm(total)
+    result[half_window : half_window + inner] = squared_norm(total)
     return result
 
 
@@ -62,10 +65,11 @@ def prominence(xyz: NDArray[np.float32], half_window: int, chosen: IntArray) -> 
     (M,) metres: the distance along the beam, divided by ``sqrt(1 + (a^2 + b^2) / w)``, its standard
     deviation for unit range noise, with a and b = 1 - a the weights of the two sides
     """
-    window = xyz[:, chosen[:, None] + np.arange(-half_window, half_window + 1)].astype(np.float64)
-    inverse = 1.0 / np.sqrt((window * window).sum(axis=0))
+    rows = chosen[:, None] + np.arange(-half_window, half_window + 1)
+    window = xyz.take(rows, axis=1).astype(np.float64)
+    inverse = 1.0 / np.sqrt(squared_norm(window))
     beams = window * inverse
-    turned = np.sqrt(((beams - beams[:, :, half_window, None]) ** 2).sum(axis=0))
+    turned = np.sqrt(squared_norm(beams - beams[:, :, half_window, None]))
     before, after = slice(0, half_window), slice(half_window + 1, None)
     left, right = turned[:, before].mean(axis=1), turned[:, after].mean(axis=1)
     share = np.divide(right, left + right, out=np.full(len(chosen), 0.5), where=left + right > 0.0)
@@ -85,7 +89,7 @@ def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
     begin at a point the smoothest counts, so that points next to an edge are not rough. Returns
     (N,) metres, a standard deviation; infinite within two points of the ends.
     """
-    squared = _squared_norm(xyz)
+    squared = squared_norm(xyz)
     inverse = 1.0 / np.sqrt(squared)
     count = len(inverse)
     best = np.full(count, np.inf, dtype=np.float32)
@@ -107,7 +111,7 @@ def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
 def squared_gaps(xyz: NDArray[np.float32], ring_starts: IntArray) -> NDArray[np.float32]:
     """(N,) squared distance to the next point of the ring, square metres; infinite at its end."""
     gaps = np.empty(xyz.shape[1], dtype=np.float32)
-    gaps[:-1] = _squared_norm(xyz[:, 1:] - xyz[:, :-1])
+    gaps[:-1] = squared_norm(xyz[:, 1:] - xyz[:, :-1])
     gaps[ring_starts[1:] - 1] = np.inf
     return gaps
 
@@ -126,7 +130,7 @@ def unreliable_points(
     Where both gaps of a point are large for its range, the surface is seen at a grazing angle
     (figure 4a). ``gaps`` are those of :func:`squared_gaps`.
     """
-    squared = _squared_norm(xyz)
+    squared = squared_norm(xyz)
     limit = squared * np.float32(settings.grazing_ratio)
     out = np.zeros(len(squared), dtype=bool)
     out[1:] = (gaps[1:] > limit[1:]) & (gaps[:-1] > limit[1:])
@@ -148,7 +152,8 @@ def unreliable_points(
     return out
 
 
-def _squared_norm(xyz: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(N,) of (3, N); several times faster than a reduction along the short axis."""
-    squared: NDArray[np.float32] = xyz[0] * xyz[0] + xyz[1] * xyz[1] + xyz[2] * xyz[2]
+def squared_norm(xyz: NDArray[_Real]) -> NDArray[_Real]:
+    """(...,) of (3, ...); several times faster than a reduction along the short axis."""
+    x, y, z = xyz
+    squared: NDArray[_Real] = x * x + y * y + z * z
     return squared

@@ -407,8 +407,13 @@ def _firing_order(
         order = len(key) - 1 - np.argsort(key[::-1], kind="stable")
     else:
         order = np.argsort(key, kind="stable")
-    if not _in_order(number[order], clock[order]):
-        order = np.lexsort((clock, number))
+    key, sorted_clock = key[order], clock[order]
+    late = np.flatnonzero((key[1:] == key[:-1]) & (sorted_clock[1:] < sorted_clock[:-1]))
+    if len(late):  # some keys stand for several times: their points are sorted by time
+        several = np.zeros(65536, np.bool_)
+        several[key[late]] = True
+        rows = np.flatnonzero(several[key])
+        order[rows] = order[rows][np.lexsort((order[rows], sorted_clock[rows], key[rows]))]
     return order
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.frontend.curvature import squared_norm
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _LINKED_BEAMS = 2.5
@@ -72,17 +73,13 @@ def find_poles(
     if depth <= 0.0:
         nothing = np.zeros(0, np.int64)
         return Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
-    count = int(ring_starts[-1])
     own = ring_starts[1:] > ring_starts[:-1]
     heads, tails = ring_starts[:-1][own], ring_starts[1:][own] - 1
-    following = np.arange(1, count + 1)
-    following[tails] = heads  # a ring is closed
-    ranges = np.sqrt((xyz * xyz).sum(axis=0))
+    ranges = np.sqrt(squared_norm(xyz))
     beams = xyz / ranges
-    turn = beams[:, following] - beams
-    turn = np.sqrt((turn * turn).sum(axis=0))
+    turn = np.sqrt(squared_norm(_to_next(beams, heads, tails)))
     spacing = float(np.median(turn))
-    farther = ranges[following] - ranges
+    farther = _to_next(ranges, heads, tails)
     apart = turn > _LINKED_BEAMS * spacing
     # On a ring of a few points the last may lie beside the first, and still be a turn away.
     apart[tails[tails - heads < most]] = True
@@ -93,15 +90,16 @@ def find_poles(
     ends[tails] = True
     last = np.flatnonzero(ends)
     first = np.concatenate(([0], last[:-1] + 1))
-    gap_after = np.where(apart, np.inf, farther)
-    gap_before, start_cut = np.empty(count), np.empty(count, np.bool_)
-    gap_before[following] = np.where(apart, np.inf, -farther)
-    start_cut[following] = cut
+    before = first - 1
+    before[np.searchsorted(first, heads)] = tails
+    gap_before = np.where(apart[before], np.inf, -farther[before])
+    gap_after = np.where(apart[last], np.inf, farther[last])
     length = last - first + 1
-    depths = np.minimum(gap_before[first], gap_after[last])
-    chosen = (length <= most) & cut[last] & start_cut[first] & (depths > depth)
+    depths = np.minimum(gap_before, gap_after).astype(np.float64)
+    chosen = (length <= most) & cut[last] & cut[before] & (depths > depth)
     first, last, depths, length = first[chosen], last[chosen], depths[chosen], length[chosen]
-    sums = np.concatenate([np.zeros((3, 1)), np.cumsum(xyz, axis=1, dtype=np.float64)], axis=1)
+    sums = np.zeros((3, xyz.shape[1] + 1))
+    np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
     across = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) + spacing
@@ -109,3 +107,13 @@ def find_poles(
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
     return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])
+
+
+def _to_next(
+    values: NDArray[np.floating], heads: IntArray, tails: IntArray
+) -> NDArray[np.floating]:
+    """What (..., N) values change by from each point to the next of its ring; rings are closed."""
+    change = np.empty_like(values)
+    np.subtract(values[..., 1:], values[..., :-1], out=change[..., :-1])
+    change[..., tails] = values[..., heads] - values[..., tails]
+    return change

@@ -306,9 +306,11 @@ def test_a_few_nonsense_times_are_dropped_but_wrong_units_are_refused() -> None:
         organise(Scan(points, 0, rings=rings, times=1e9 * fraction), Config())
 
 
-@pytest.mark.parametrize("times", ["field", "none"])
-def test_order_is_ring_by_ring_in_firing_order(times: str) -> None:
+@pytest.mark.parametrize(("times", "power"), [("field", 1), ("field", 6), ("none", 1)])
+def test_order_is_ring_by_ring_in_firing_order(times: str, power: int) -> None:
+    """With the power, many points are measured within a thousandth of the sweep."""
     points, rings, fraction = firing(VLP16)
+    fraction = fraction**power
     shuffled = np.random.default_rng(2).permutation(len(points))
     reference = np.lexsort((fraction, rings))
     for order in (np.arange(len(points)), reference, reference[::-1], shuffled):

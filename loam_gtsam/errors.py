@@ -34,6 +34,14 @@ class OutputError(LoamError):
     """A file or a picture could not be written."""
 
 
+def check_kind(value: object, kind: type, name: str, how: str) -> None:
+    """InputError for a value that is not of a class; ``how`` says what makes one."""
+    if not isinstance(value, kind):
+        wanted = ("gtsam." if kind.__module__.startswith("gtsam.") else "") + kind.__name__
+        wanted = f"an {wanted}" if wanted[0] in "AEIOU" else f"a {wanted}"
+        raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
+
+
 def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:
     """The end of a message about an unknown name: which one may be meant, and all there are."""
     asked, names = name[:_LONGEST] if isinstance(name, str) else "", list(known)

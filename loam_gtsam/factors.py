@@ -212,10 +212,15 @@ def checked_factor(
     Raises
     ------
     InputError
-        From GTSAM's error and linearize calls, when ``residual`` returns something unusable.
+        For anything but a noise model, a list of keys and a function; and from GTSAM's error and
+        linearize calls, when ``residual`` returns something unusable.
     """
+    rows = _noise_dimension(noise)
+    if not isinstance(keys, Sequence):
+        raise InputError(f"keys: expected a list of keys, got {type(keys).__name__} {keys!r}")
+    if not callable(residual):
+        raise InputError(f"residual: expected a function, got {type(residual).__name__}")
     keys = list(keys)
-    rows = noise.dim()
 
     def call(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -408,6 +413,13 @@ def _unit(value: ArrayLike, name: str) -> FloatArray:
     return vector
 
 
-def _noise_dimension(noise: gtsam.noiseModel.Base, dimension: int) -> None:
-    if noise.dim() != dimension:
-        raise InputError(f"noise: expected dimension {dimension}, got {noise.dim()}")
+def _noise_dimension(noise: gtsam.noiseModel.Base, dimension: int | None = None) -> int:
+    if not isinstance(noise, gtsam.noiseModel.Base):
+        raise InputError(
+            f"noise: expected a noise model of GTSAM, got {type(noise).__name__}; "
+            "gtsam.noiseModel.Isotropic.Sigma(rows, sigma) makes one of a standard deviation"
+        )
+    rows: int = noise.dim()
+    if dimension not in (None, rows):
+        raise InputError(f"noise: expected dimension {dimension}, got {rows}")
+    return rows

@@ -5,10 +5,11 @@ Tangent order is ``[rotation, translation]`` (see :mod:`loam_gtsam.types`).
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
+from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array, check_kind
 
 _SMALL_ANGLE = 1e-9
 _GRID = 1 << 20
@@ -37,6 +38,12 @@ def as_points(value: ArrayLike, name: str) -> FloatArray:
 def as_vector(value: ArrayLike, name: str, size: int = 3) -> FloatArray:
     """(size,) finite float64, checked as by :func:`as_array`."""
     return as_array(value, name, (size,))
+
+
+def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
+    """The pose itself; InputError for anything else."""
+    check_kind(value, gtsam.Pose3, name, "gtsam.Pose3(matrix) makes one of a (4, 4) matrix")
+    return value
 
 
 def as_stamps(value: ArrayLike, name: str) -> IntArray:

@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 
 from loam_gtsam.config import Config, as_config
-from loam_gtsam.errors import own_code
+from loam_gtsam.errors import check_kind, own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -224,10 +224,10 @@ class Mapper:
 
     def _check(self, features: Features) -> MapUpdate | None:
         """The update of a sweep that cannot be used; None if it can."""
+        check_kind(features, Features, "features", "extract_features makes them of a Scan")
         if (refused := self._refused(features.stamp)) is not None:
             return refused
-        problem = problem_of(features)
-        return None if problem is None else self._unused(features.stamp, *problem)
+        return (problem := problem_of(features)) and self._unused(features.stamp, *problem)
 
     def _refused(self, stamp: int) -> MapUpdate | None:
         """The update of a sweep whose stamp cannot be used; None if it can."""

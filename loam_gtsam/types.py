@@ -28,6 +28,7 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
+from loam_gtsam.errors import check_kind as check_kind
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -98,7 +98,7 @@ def open_dataset(path: str | Path, **options: Any) -> Dataset:
     if not path.exists():
         raise DatasetError(f"{path}: no such file or folder; expected {_ACCEPTED}")
     if path.is_file() and path.suffix not in _BAG_FILES:
-        if path.suffix == ".bin":
+        if path.suffix in (".bin", ".pcd", ".ply", ".npy"):
             raise DatasetError(f"{path}: one sweep; give the folder that holds them: {path.parent}")
         kind = f"unknown kind of file {path.suffix!r}"
         raise DatasetError(f"{path}: {kind}; expected {_ACCEPTED}; {_OTHERS}")

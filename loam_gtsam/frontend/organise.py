@@ -11,7 +11,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, SensorConfig
+from loam_gtsam.config import Config, SensorConfig, as_config
 from loam_gtsam.frontend.rings import (
     MAX_RINGS,
     RingAssignment,
@@ -23,7 +23,15 @@ from loam_gtsam.frontend.rings import (
     rings_from_rows,
 )
 from loam_gtsam.geometry import run_starts
-from loam_gtsam.types import BoolArray, FloatArray, IntArray, Scan, SweepError, SweepFault
+from loam_gtsam.types import (
+    BoolArray,
+    FloatArray,
+    IntArray,
+    Scan,
+    SweepError,
+    SweepFault,
+    check_kind,
+)
 
 MIN_POINTS = 11
 """Points in one window of LOAM's curvature: a point and five neighbours on either side."""
@@ -365,7 +373,8 @@ def organise(scan: Scan, config: Config) -> OrganisedSweep:
 
     SweepError if too few points are usable, or rings or times cannot be found.
     """
-    columns = usable_columns(scan, config)
+    check_kind(scan, Scan, "scan", "Scan(points=..., stamp=...) makes one of an array")
+    columns = usable_columns(scan, as_config(config))
     rings = assign_rings(columns, config.sensor)
     timing = assign_times(columns, rings, config)
     order = _firing_order(columns, rings, timing)

@@ -31,7 +31,7 @@ from loam_gtsam.imu.quaternions import (
     rotation_steps,
     running_product,
 )
-from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_array
+from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_array, check_kind
 
 REST_AHEAD = 0.1
 """Seconds after the asked stamp that still count to its rest: one sweep."""
@@ -142,6 +142,8 @@ class ImuBuffer:
     """
 
     def __init__(self, config: ImuConfig, samples: ImuSamples | None = None) -> None:
+        how = 'the section "imu" of a Config is one'
+        check_kind(config, ImuConfig, "config of an ImuBuffer", how)
         self._config, self._gap = config, round(config.max_gap * 1e9)
         self.lidar_R_imu = gtsam.Rot3.RzRyRx(*np.deg2rad(config.lidar_R_imu_deg))
         self._bias = np.zeros(3)

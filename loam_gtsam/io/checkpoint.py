@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from loam_gtsam.io.atomic import atomic_file, lock_folder, make_folder, unlock_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.types import DatasetError, MapUpdate, OutputError, Sweep
+from loam_gtsam.types import DatasetError, MapUpdate, OutputError, Sweep, check_kind
 
 _HEADER = "header"
 _FILE = re.compile(r"(frames_\d+_\d+|state_\d+)\.npz")
@@ -207,6 +207,7 @@ class Progress:
         self.updates: list[MapUpdate] = []
         self._lock: int | None = None
         if checkpoint is not None:
+            check_kind(checkpoint, Checkpoint, "checkpoint", "Checkpoint(folder) makes one")
             with suppress(OSError):  # the log will say so
                 checkpoint.folder.mkdir(parents=True, exist_ok=True)
             self._lock = lock_folder(checkpoint.folder)

@@ -19,7 +19,7 @@ from loam_gtsam.config import PoseGraphConfig
 from loam_gtsam.loops.incremental import relative_pose
 from loam_gtsam.loops.keyframes import is_pose, pose_number
 from loam_gtsam.loops.loop_selection import chi_squared, loop_to_switch
-from loam_gtsam.types import BoolArray, FloatArray, InputError
+from loam_gtsam.types import BoolArray, FloatArray, InputError, check_kind
 
 _INLIER = 0.5  # weight of graduated non-convexity above which a loop closure is in the first choice
 _GNC_TOLERANCE = 1e-3  # relative change of the cost that ends a round of GNC
@@ -150,6 +150,7 @@ def optimize_graph(
 
 
 def _check(saved: SavedGraph) -> None:
+    check_kind(saved, SavedGraph, "graph", "read_graph(path) reads one")
     keys = sorted(saved.poses.keys())
     if not keys:
         raise InputError("graph: expected poses, got none")

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from loam_gtsam.config import Config, as_config
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import as_points, voxel_filter
+from loam_gtsam.geometry import as_points, checked_pose, voxel_filter
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
@@ -85,7 +85,7 @@ def align(
         if len(cloud) < least:
             raise InputError(f"{name}: expected at least {least} points, got {len(cloud)}")
     points = voxel_filter(source, config.map.plane_voxel)
-    pose = guess or gtsam.Pose3()
+    pose = gtsam.Pose3() if guess is None else checked_pose(guess, "guess")
     edges = CubeMap(config.map, config.map.edge_voxel)
     planes = CubeMap(config.map, config.map.plane_voxel)
     for cubes, cloud in ((edges, _NONE), (planes, target)):

@@ -11,6 +11,7 @@ import numpy as np
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.geometry import checked_pose
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.coupling import TightCoupling
 from loam_gtsam.imu.diagnosis import LATEST, scans_problems
@@ -28,7 +29,7 @@ from loam_gtsam.imu_prior import (
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.types import FloatArray, TiltPrior
+from loam_gtsam.types import FloatArray, TiltPrior, check_kind
 
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
@@ -78,6 +79,7 @@ class ImuTracker:
     """
 
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
+        check_kind(buffer, ImuBuffer, "imu", "ImuBuffer(config.imu, samples) makes one")
         self.config, self.buffer = config, buffer
         self._given_bias = buffer.gyro_bias
         self.reset()
@@ -128,7 +130,7 @@ class ImuTracker:
         if rest is not None:
             self.buffer.gyro_bias = rest.gyro
         levelled = self.config.level and given is None
-        pose = gtsam.Pose3() if given is None else given
+        pose = gtsam.Pose3() if given is None else checked_pose(given, "guess")
         self.level = find_level(self.buffer, self.config, stamp, pose, levelled=levelled)
         if self.level is None or not levelled:
             return pose

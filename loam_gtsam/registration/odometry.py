@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import OdometryConfig, SolverConfig
 from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
-from loam_gtsam.geometry import move_points, nearest_positive
+from loam_gtsam.geometry import as_vector, checked_pose, move_points, nearest_positive
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.solvers import MotionPrior
@@ -161,6 +161,8 @@ def predict(
     guess : ``map_T_lidar`` at the reference time, which replaces the predicted pose
     twist : (6,) body velocity at the reference time, which replaces the predicted velocity
     """
+    if guess is not None:
+        checked_pose(guess, "guess")
     steady = ConstantVelocity(imu).at(sweep.reference_stamp, last)
     inertial = None if last is None or imu is None else imu.predict(sweep.stamp)
     if imu is not None:
@@ -169,7 +171,7 @@ def predict(
     if twist is None and inertial is not None:
         velocity = inertial.map_T_lidar.rotation().matrix().T @ inertial.velocity
         twist = sweep.twist_at_reference(steady.twist[:3], velocity)
-    posed = sweep.at(steady.twist if twist is None else np.asarray(twist, np.float64))
+    posed = sweep.at(steady.twist if twist is None else as_vector(twist, "twist", 6))
     if guess is None and inertial is not None:
         guess = inertial.map_T_lidar.compose(posed.middle_T_reference)
     guess = steady.map_T_lidar if guess is None else guess

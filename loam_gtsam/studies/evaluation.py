@@ -17,7 +17,7 @@ from scipy.special import chdtri, ndtr
 
 from loam_gtsam.geometry import interpolated, inverse_pose, transform
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory
+from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory, check_kind
 
 _NO_SPREAD = 1e-9
 """Ratio of the second to the first singular value below which positions lie on a line (the ratio
@@ -370,6 +370,8 @@ def _common(
     caller: str, estimate: Trajectory, reference: Trajectory
 ) -> tuple[IntArray, FloatArray, FloatArray]:
     """Stamps and poses of the estimate inside the reference's time span, and reference poses."""
+    for trajectory in (estimate, reference):
+        check_kind(trajectory, Trajectory, caller, "a run and a data set have one")
     _check_stamps(caller, reference)
     inside = (estimate.stamps >= reference.stamps[0]) & (estimate.stamps <= reference.stamps[-1])
     if inside.sum() < 3:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.highlevel import AnyReader
+from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 
 from loam_gtsam.datasets.decode import aiding
@@ -198,4 +198,10 @@ def bag_kind(path: Path) -> str:
 
 
 def _reason(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
+    """What a reader stumbled over; its own sentences stand without the name of their class."""
+    text = str(error).rstrip(".")
+    if isinstance(error, UnicodeDecodeError):
+        text = "its first bytes are not those of a bag"
+    elif not isinstance(error, AnyReaderError):
+        text = f"{type(error).__name__}: {text}" if text else type(error).__name__
+    return text

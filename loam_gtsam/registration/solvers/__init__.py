@@ -12,6 +12,7 @@ from loam_gtsam.registration.solvers.base import Matcher as Matcher
 from loam_gtsam.registration.solvers.base import MotionPrior as MotionPrior
 from loam_gtsam.registration.solvers.base import ScanSolver as ScanSolver
 from loam_gtsam.registration.solvers.base import Solution as Solution
+from loam_gtsam.registration.solvers.base import check_settings as check_settings
 from loam_gtsam.registration.solvers.base import rematch as rematch
 from loam_gtsam.registration.solvers.classical import ALoamSolver as ALoamSolver
 from loam_gtsam.registration.solvers.classical import ClassicalSolver as ClassicalSolver
@@ -22,7 +23,8 @@ from loam_gtsam.registration.solvers.motion_error import MotionError as MotionEr
 
 
 def make_solver(config: SolverConfig) -> ScanSolver:
-    """Make the solver that ``config.method`` names."""
+    """Make the solver that ``config.method`` names; InputError for other than its settings."""
+    check_settings(config)
     if config.method == "gtsam":
         return GtsamSolver(config)
     return ClassicalSolver(config) if config.method == "loam" else ALoamSolver(config)

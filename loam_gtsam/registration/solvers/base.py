@@ -13,7 +13,7 @@ from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import MatchRows
 from loam_gtsam.registration.degeneracy import Localizability
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.types import BoolArray, FloatArray
+from loam_gtsam.types import BoolArray, FloatArray, check_kind
 
 POSE_KEY: int = gtsam.symbol("x", 0)
 """Key of the pose of a frame, ``map_T_lidar`` at the middle of the sweep, in the solver's graph."""
@@ -51,6 +51,12 @@ class Matcher:
         ``matches`` are the last ones, with which that pose was found.
         """
         return self
+
+
+def check_settings(config: object) -> None:
+    """InputError for anything but the settings of a solver."""
+    how = 'the section "solver" of a Config is one: preset("loam").solver'
+    check_kind(config, SolverConfig, "config of a solver", how)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -20,7 +20,13 @@ from loam_gtsam.factors import MatchRows, concatenate_rows, line_rows, plane_row
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.degeneracy import Localizability, localizability
 from loam_gtsam.registration.matches import ScanMatches
-from loam_gtsam.registration.solvers.base import Associate, MotionPrior, Solution, rematch
+from loam_gtsam.registration.solvers.base import (
+    Associate,
+    MotionPrior,
+    Solution,
+    check_settings,
+    rematch,
+)
 from loam_gtsam.types import FloatArray, InputError
 
 # LOAM's (rx, ry, rz) are (pitch, yaw, roll), and LOAM's (x, y, z) are (left, up, forward): the
@@ -45,6 +51,7 @@ class _SolverWithoutPriors(ABC):
     _stop = True
 
     def __init__(self, config: SolverConfig) -> None:
+        check_settings(config)
         self.config = config
 
     def solve(

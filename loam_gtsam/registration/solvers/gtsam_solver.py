@@ -32,6 +32,7 @@ from loam_gtsam.registration.solvers.base import (
     Matcher,
     MotionPrior,
     Solution,
+    check_settings,
     rematch,
 )
 from loam_gtsam.types import BoolArray, FloatArray
@@ -64,6 +65,7 @@ class GtsamSolver:
     """
 
     def __init__(self, config: SolverConfig) -> None:
+        check_settings(config)
         self.config = config
         params = gtsam.LevenbergMarquardtParams()
         params.setMaxIterations(config.inner_iterations)

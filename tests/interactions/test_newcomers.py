@@ -1,0 +1,86 @@
+"""What a newcomer hands over by mistake is answered by a sentence that says what was expected."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam import (
+    POSE_KEY,
+    Config,
+    GtsamSolver,
+    ImuBuffer,
+    InputError,
+    Mapper,
+    Pipeline,
+    SimulatedWorld,
+    absolute_error,
+    align,
+    checked_factor,
+    extract_features,
+    make_solver,
+    open_dataset,
+    optimize_graph,
+    point_to_line_factor,
+    run,
+)
+from loam_gtsam.types import DatasetError
+
+WORLD = SimulatedWorld("room", frames=2, columns=400)
+SWEEP = WORLD[0]
+ONE = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
+X = np.array([1.0, 0.0, 0.0])
+
+
+def row(_: gtsam.Values) -> tuple[np.ndarray, list[np.ndarray]]:
+    return np.zeros(1), [np.zeros((1, 6))]
+
+
+MISTAKES: list[tuple[Callable[[], object], str]] = [
+    (lambda: make_solver("loam"), r"a SolverConfig, got str; .* preset\(\"loam\"\).solver"),
+    (lambda: GtsamSolver(Config()), "expected a SolverConfig, got Config"),
+    (lambda: run(WORLD, solver=GtsamSolver), r"got the class; GtsamSolver\(config.solver\)"),
+    (lambda: run(WORLD, checkpoint="kept"), r"checkpoint: .* Checkpoint\(folder\) makes one"),
+    (lambda: extract_features(SWEEP, "loam"), "expected a Config, got str 'loam'"),
+    (lambda: extract_features(SWEEP.points, Config()), "scan: expected a Scan, got ndarray"),
+    (lambda: Mapper().register(SWEEP.points), "expected a Features, got ndarray; extract_features"),
+    (lambda: Pipeline(imu=WORLD.imu), "expected an ImuBuffer, got ImuSamples; ImuBuffer"),
+    (lambda: ImuBuffer(Config()), 'the section "imu" of a Config is one'),
+    (lambda: checked_factor(0.1, [POSE_KEY], row), "noise: .* got float; .*Isotropic.Sigma"),
+    (lambda: checked_factor(ONE, POSE_KEY, row), "keys: expected a list of keys, got int"),
+    (lambda: checked_factor(ONE, [POSE_KEY], 3.0), "residual: expected a function, got float"),
+    (lambda: point_to_line_factor(POSE_KEY, X, X, X, 0.1), "noise: .* got float"),
+    (lambda: align(SWEEP.points, SWEEP.points, guess=np.eye(4)), r"gtsam.Pose3\(matrix\) makes"),
+    (lambda: absolute_error(WORLD, WORLD.truth), "expected a Trajectory, got SimulatedWorld"),
+    (lambda: optimize_graph("run.g2o"), r"a SavedGraph, got str; read_graph\(path\)"),
+]
+
+
+@pytest.mark.parametrize(("mistake", "answer"), MISTAKES, ids=[answer for _, answer in MISTAKES])
+def test_a_mistake_is_an_input_error(mistake: Callable[[], object], answer: str) -> None:
+    with pytest.raises(InputError, match=answer):
+        mistake()
+
+
+@pytest.mark.parametrize(
+    ("guess", "twist", "answer"),
+    [(np.eye(4), None, "guess: expected a gtsam.Pose3"), (None, np.zeros(3), r"twist: .*\(6,\)")],
+)
+def test_guess_and_twist_of_a_sweep(guess: object, twist: object, answer: str) -> None:
+    mapper = Mapper()
+    features = extract_features(SWEEP, mapper.config)
+    with pytest.raises(InputError, match=answer):
+        mapper.register(features, guess, twist)
+    assert mapper.register(features, gtsam.Pose3(), np.zeros(6)).status == "first"
+
+
+@pytest.mark.parametrize(
+    ("name", "answer"),
+    [("drive.bag", "its first bytes are not those of a bag; if"), ("one.pcd", "one sweep; give")],
+)
+def test_files_of_junk(tmp_path: Path, name: str, answer: str) -> None:
+    (tmp_path / name).write_bytes(bytes(range(128, 256)) * 20)
+    with pytest.raises(DatasetError, match=answer):
+        open_dataset(tmp_path / name)

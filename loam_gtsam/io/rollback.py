@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from enum import Enum
-from functools import wraps
+from functools import partial, wraps
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import gtsam
@@ -115,8 +115,8 @@ def _factors(value: Any) -> tuple[_Restore, list[Any]]:
     return restore, []
 
 
-def _object(value: Any) -> tuple[_Restore, list[Any]]:
-    held = {name: getattr(value, name) for name in _slots(type(value)) if hasattr(value, name)}
+def _object(slots: list[str], value: Any) -> tuple[_Restore, list[Any]]:
+    held = {name: getattr(value, name) for name in slots if hasattr(value, name)}
     attributes = getattr(value, "__dict__", None)
     copied = None if attributes is None else dict(attributes)
 
@@ -160,7 +160,7 @@ def _choose(kind: type) -> _How | None:
     if hasattr(kind, "remember"):
         return _asked
     frozen: Any = getattr(kind, "__dataclass_params__", None) if is_dataclass(kind) else None
-    return None if frozen is not None and frozen.frozen else _object
+    return None if frozen is not None and frozen.frozen else partial(_object, _slots(kind))
 
 
 def _slots(kind: type) -> list[str]:

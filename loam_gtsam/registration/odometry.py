@@ -12,7 +12,13 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import OdometryConfig, SolverConfig
 from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
-from loam_gtsam.geometry import as_vector, checked_pose, move_points, nearest_positive
+from loam_gtsam.geometry import (
+    as_vector,
+    checked_pose,
+    move_points,
+    nearest_positive,
+    squared_lengths,
+)
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.solvers import MotionPrior
@@ -262,7 +268,7 @@ def solved_twist(
     noise = displacements(rows.points, (rows.scales * tilts * seconds) ** 2)
     information = nearest_positive(information - noise)
     wrong = max(_UNEVEN * range_noise, _STEADIEST) / max(np.abs(seconds).max(), _SHORTEST)
-    far = float(np.median(np.linalg.norm(rows.points, axis=1)))
+    far = float(np.median(np.sqrt(squared_lengths(rows.points))))
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
     # The inverse of information^-1 + limit^-1, without that of the information.
     seen = limit - limit @ np.linalg.inv(information + limit) @ limit

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -28,13 +30,21 @@ class KeyTable:
     """
 
     __slots__ = ("_merged", "_waiting")
+    _merged: Columns
+    _waiting: Columns
 
     def __init__(self, keys: IntArray, *columns: NDArray[Any]) -> None:
         self._put(keys, *columns)
 
     def _put(self, *rows: NDArray[Any]) -> None:
-        self._merged: Columns = rows
-        self._waiting: Columns = tuple(column[:0] for column in rows)
+        self._set(rows, tuple(column[:0] for column in rows))
+
+    def _set(self, merged: Columns, waiting: Columns) -> None:
+        self._merged, self._waiting = merged, waiting
+
+    def remember(self) -> Callable[[], None]:
+        """A function that brings the table back to what it is now: no array changes in place."""
+        return partial(self._set, self._merged, self._waiting)
 
     def __len__(self) -> int:
         return len(self._merged[0]) + len(self._waiting[0])

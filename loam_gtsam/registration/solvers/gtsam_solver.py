@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -279,6 +280,7 @@ def _kept(units: FloatArray, width: float, kernel: str) -> FloatArray:
     return scales
 
 
+@lru_cache(maxsize=1)  # asked for by the solver, then for the motion within the sweep
 def match_rows(
     matches: ScanMatches, kernel_width: float = np.inf, kernel: str = "huber"
 ) -> MatchRows:

@@ -144,10 +144,8 @@ class ImuTracker:
 
     def factors(self, stamp: int) -> Sequence[gtsam.NonlinearFactor]:
         """Factors on the pose of a moment for the solve itself: only with ``imu.prior: sigma``."""
-        measured = self._attitude(stamp)
-        if self.config.prior != "sigma" or measured is None:
-            return ()
-        return (self._gravity(measured),)
+        measured = self._attitude(stamp) if self.config.prior == "sigma" else None
+        return () if measured is None else (self._gravity(measured),)
 
     def add_tilt(
         self, stamp: int, solution: Solution, last: Moment | None = None

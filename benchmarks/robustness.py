@@ -2,8 +2,8 @@
 
 Passing objects, outliers, drop-outs, missing sweeps and a kidnapped lidar, each held against the
 undisturbed run, and KISS-ICP on the same sweeps if it is installed. The table goes to
-``robustness.csv`` and, as Markdown, into ``docs/robustness.md``. All numbers are the same on every
-run.
+``robustness.csv`` and, as Markdown, into ``docs/benchmarks/robustness.md``. All numbers are the
+same on every run.
 """
 
 from __future__ import annotations
@@ -340,15 +340,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a few coarse sweeps of the room")
     parser.add_argument("--data", type=Path, default=data_folder(),
                         help=f"folder with {TOWN}, which is skipped if it is absent")  # fmt: skip
-    parser.add_argument("--output", type=Path, help="folder for the tables; docs/benchmarks and "
-                        "docs/robustness.md, or benchmarks/results with --quick")  # fmt: skip
+    parser.add_argument("--output", type=Path, help="folder for the tables; docs/benchmarks, "
+                        "or benchmarks/results with --quick")  # fmt: skip
     options = parser.parse_args(arguments)
     places = [
         place for place in (QUICK if options.quick else PLACES)
         if place.scene != TOWN or (options.data / TOWN).is_dir()
     ]  # fmt: skip
     folder = options.output or ROOT / ("benchmarks/results" if options.quick else "docs/benchmarks")
-    page = None if options.quick or options.output else ROOT / "docs/robustness.md"
+    page = None if options.quick or options.output else ROOT / "docs/benchmarks/robustness.md"
     started = time.perf_counter()
     tasks = [(place, name) for place in places for name in place.disturbances]
     # Started afresh: KISS-ICP brings threads of its own, which a fork would not carry over.

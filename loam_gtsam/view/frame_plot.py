@@ -62,10 +62,9 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
         dots, ax=axes, location="bottom", extend="max", shrink=0.3, aspect=24, pad=0.01,
         anchor=(0.0, 1.0),
     )  # fmt: skip
-    bar.set_label(
-        f"residual [standard deviations]; lines and {_SIGMAS:g}-sigma ellipse: {_ENLARGED:g} x",
-        color=INK, loc="left",
-    )  # fmt: skip
+    scales = f"lines and {_SIGMAS:g}-sigma ellipse: {_ENLARGED:g} x"
+    scales += "; arrows not to scale" if unseen else ""
+    bar.set_label(f"residual [standard deviations]; {scales}", color=INK, loc="left")
     bar.ax.tick_params(colors=INK, length=0, labelsize=9)
     bar.outline.set_visible(False)
     reach = camera.reach

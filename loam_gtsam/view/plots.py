@@ -71,7 +71,7 @@ def plot_trajectory(
     loops : (L, 2, 3) ends of loops in the map and (L,) which are used; the others are dotted
     """
     lines = [] if truth is None else [("truth", truth, (TRUTH, "-"), 3.0)]
-    figure, top = _trajectory_figure(7.0, [*lines, ("estimate", trajectory, (PATH, "-"), 1.4)])
+    figure, top = _trajectory_figure([*lines, ("estimate", trajectory, (PATH, "-"), 1.4)])
     start = trajectory.map_T_lidar[:1, :3, 3]
     top.plot(start[:, 0], start[:, 1], "o", color=INK, ms=6, label="start")
     if loops is not None:
@@ -270,7 +270,7 @@ def plot_trajectories(
     lines = [] if truth is None else [("truth", truth, (TRUTH, "-"), 4.0)]
     named = zip(trajectories.items(), cycle(_RUN_LINES), strict=False)
     lines += [(name, trajectory, line, 1.3) for (name, trajectory), line in named]
-    figure, top = _trajectory_figure(7.5, lines)
+    figure, top = _trajectory_figure(lines)
     _legend_above(figure, *top.get_legend_handles_labels())
     save_figure(figure, path)
 
@@ -325,10 +325,15 @@ def plot_stages(path: str | Path, stages: Mapping[str, Mapping[str, float]]) -> 
 
 
 def _trajectory_figure(
-    height: float, lines: Sequence[tuple[str, Trajectory, tuple[str, str], float]]
+    lines: Sequence[tuple[str, Trajectory, tuple[str, str], float]],
 ) -> tuple[Any, Any]:
-    figure = empty_figure(9.0, height)
-    top, side = figure.subplots(2, 1, height_ratios=(4, 1))
+    """Paths from above over their heights; the figure is as high as the paths, within limits."""
+    places = np.concatenate([line[1].map_T_lidar[:, :2, 3] for line in lines])
+    places = places[np.isfinite(places).all(axis=1)]
+    width, depth = np.ptp(places, axis=0) if len(places) else (1.0, 1.0)
+    high = 8.2 * float(np.clip(1.2 * depth / max(width, 1e-6), 0.25, 0.6))  # inches
+    figure = empty_figure(9.0, high + 2.4)
+    top, side = figure.subplots(2, 1, height_ratios=(high, 1.3))
     for name, trajectory, (colour, style), width in lines:
         xyz = trajectory.map_T_lidar[:, :3, 3]
         top.plot(xyz[:, 0], xyz[:, 1], color=colour, ls=style, lw=width, label=name)

@@ -15,6 +15,8 @@ from loam_gtsam.cli.options.common import (
     SourceOptions,
     argument,
     flag,
+    known,
+    one_of,
     option,
 )
 
@@ -26,7 +28,11 @@ if TYPE_CHECKING:  # the help of a command needs neither GTSAM nor SciPy
 class DemoOptions(OutputOptions):
     """Options of ``demo``."""
 
-    scene: str = option("Built-in scene; a wrong name lists them.", default="street_loop")
+    scene: str = option(
+        "Built-in scene; a wrong name lists them.",
+        default="street_loop",
+        autocompletion=one_of("loam_gtsam.datasets.sim.world", "SCENES"),
+    )
     frames: int = option("Number of sweeps.", default=150, min=1)
     profile: bool = flag("Show the time per stage.", "--profile")
 
@@ -131,6 +137,7 @@ class CompareOptions(OutputOptions, SourceOptions):
         "repeatedly, as all of these [default, if nothing is chosen: gtsam, loam and aloam].",
         "--solver",
         metavar="NAME|PACKAGE.MODULE:FACTORY",
+        autocompletion=known("solver"),
     )
     front_ends: list[str] | None = option(
         "A front end of your own: only the features differ.",
@@ -138,7 +145,10 @@ class CompareOptions(OutputOptions, SourceOptions):
         metavar="PACKAGE.MODULE:FACTORY",
     )
     presets: list[str] | None = option(
-        "default, loam or aloam: the whole system differs.", "--preset", metavar="NAME"
+        "default, loam or aloam: the whole system differs.",
+        "--preset",
+        metavar="NAME",
+        autocompletion=known("preset"),
     )
     configs: list[Path] | None = option(
         "A configuration file (.yaml): the whole system differs.", "--config", metavar="FILE"
@@ -148,6 +158,7 @@ class CompareOptions(OutputOptions, SourceOptions):
         "settings as in 'kiss-icp?deskew=false&voxel=scene' (docs/compare.md).",
         "--peer",
         metavar="NAME",
+        autocompletion=one_of("loam_gtsam.studies.peers", "PEERS"),
     )
     base: str = option(
         "Preset or configuration file (.yaml) into which --solver and --features are put.",
@@ -267,6 +278,6 @@ class CleanOptions(FinishedRunOptions):
 class ConfigOptions(Options):
     """Options of ``config``."""
 
-    preset: str = option("Named configuration.", default="default")
+    preset: str = option("Named configuration.", default="default", autocompletion=known("preset"))
     output: Path | None = option("Write to a file instead of the screen.", metavar="FILE")
     overwrite: bool = flag("Replace an existing file.", "--overwrite")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import MISSING, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -29,6 +29,16 @@ def known(kind: Kind) -> Callable[[str], list[str]]:
     """The ``autocompletion`` of an option; imports nothing before it is asked."""
     module = "loam_gtsam.config.completion"
     return lambda incomplete: list(importlib.import_module(module).completions(kind, incomplete))
+
+
+def one_of(module: str, table: str) -> Callable[[str], list[str]]:
+    """The same for the names in a table of a module."""
+
+    def names(incomplete: str) -> list[str]:
+        every: Iterable[str] = getattr(importlib.import_module(module), table)
+        return [name for name in every if name.startswith(incomplete)]
+
+    return names
 
 
 def flag(help: str, *names: str) -> Any:

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 from support import layout_writers as write
 
 from loam_gtsam.studies.evaluation import absolute_error
@@ -16,7 +17,7 @@ from loam_gtsam.types import ConfigError, InputError, SweepMotion, Trajectory
 
 pytest.importorskip("evalio")
 
-from evalio import pipelines, stats
+from evalio import datasets, pipelines, stats
 from evalio import types as ty
 from evalio._cpp.types import VisOption
 from support import evalio_room
@@ -138,6 +139,18 @@ def test_evalio_s_own_checks_of_parameters_accept_and_refuse() -> None:
     assert [params["imu.weight"] for _, _, params in configs] == [0.01, 0.02]
     wrong = pipelines.parse_config({"pipeline": "loam_gtsam", "imu.weigth": 0.1})
     assert isinstance(wrong, pipelines.PipelineConfigError)
+
+
+def test_the_experiments_of_the_documentation_name_what_evalio_has() -> None:
+    page = Path(__file__).resolve().parents[2] / "docs/study/evalio.yaml"
+    experiments = YAML(typ="safe").load(page)
+    sequences = datasets.parse_config(experiments["datasets"])
+    assert isinstance(sequences, list)
+    assert len(sequences) > 60
+    systems = pipelines.parse_config(experiments["pipelines"])
+    assert isinstance(systems, list)
+    assert [name for name, _, _ in systems][:2] == ["loam_gtsam", "lidar_only"]
+    assert [params.get("imu.coupling") for _, _, params in systems][:2] == ["tight", "off"]
 
 
 def test_features_and_map_are_shown_only_when_asked_for() -> None:

@@ -14,7 +14,7 @@ import gtsam
 from loam_gtsam.aiding.gnss import TiedFixes, tie
 from loam_gtsam.aiding.imu_summary import ImuSummary, imu_summary
 from loam_gtsam.aiding.wheels import aided_odometry
-from loam_gtsam.config import Config, Section, as_config, dump_config, with_implied
+from loam_gtsam.config import Config, Section, as_config, with_implied
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
 from loam_gtsam.datasets.decode.geodesy import GeoReference
@@ -423,9 +423,7 @@ def run(
     pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
     if parts.get("features") is not None:
         workers = 0
-    about = {"data set": dataset.name}
-    if checkpoint is not None:  # for its comments, the text takes longer than a sweep
-        about["configuration"] = dump_config(config)
+    about = {"data set": dataset.name, "configuration": config.model_dump_json()}
     progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
     interrupted, error = False, None

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from benchmarks import ouster, report
+from benchmarks import history, ouster, report
 from benchmarks.cases import CASES, QUICK, ROOT, Case, CaseResult, open_case, run_case
 from loam_gtsam.datasets.kitti.folder import KittiDataset
 from loam_gtsam.pipeline import run
@@ -98,6 +98,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     report.show(console, results)
     paths = report.write(options.output, results)
+    if not options.quick:
+        paths += history.add(options.output, results)
     console.print(f"Written: {', '.join(map(str, paths))}", markup=False, soft_wrap=True)
     return int(any(result.failed for result in results))
 

@@ -104,7 +104,7 @@ def show(console: Console, results: Sequence[CaseResult]) -> None:
         console.print(table)
 
 
-def write(folder: Path, results: Sequence[CaseResult]) -> tuple[Path, Path]:
+def write(folder: Path, results: Sequence[CaseResult]) -> tuple[Path, ...]:
     """Write ``benchmarks.csv`` (one row a case) and ``benchmarks.md``; their paths."""
     folder.mkdir(parents=True, exist_ok=True)
     rows = [_csv_row(result) for result in results]

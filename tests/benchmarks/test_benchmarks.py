@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import re
 from collections import Counter
 from concurrent.futures import Future
 from dataclasses import replace
@@ -17,6 +19,7 @@ from benchmarks import __main__ as tool
 from benchmarks import (
     cases,
     growth,
+    history,
     loops,
     ouster,
     peers,
@@ -34,6 +37,7 @@ from loam_gtsam.types import FloatArray, FrameStatus, InputError, MapUpdate, Swe
 
 ROOM = Case("room", "sim:room?frames=6&columns=360", ate_limit=1.0, rivals=("KISS-ICP",))
 ABSENT = Path("no such folder")
+KINDS = "jsonl", "md", "png"
 
 
 class InProcess:
@@ -82,6 +86,11 @@ def test_cases_are_measured_beside_their_targets(tmp_path: Path, here: pytest.Mo
     assert "| room | 6 |" in (tmp_path / "benchmarks.md").read_text("utf-8")
     assert tool.main([*only, "--output", str(tmp_path)]) == 0
     assert table(tmp_path / "benchmarks.csv")[0]["problem"] == "skipped: no data"
+    # Each whole run is a line of the history.
+    (run,) = map(json.loads, (tmp_path / "history.jsonl").read_text("utf-8").splitlines())
+    assert list(run["cases"]) == ["room"]
+    assert history.draw(tmp_path) == tuple(tmp_path / f"history.{end}" for end in KINDS)
+    assert re.search(r"\| 1: .* \| \d", (tmp_path / "history.md").read_text("utf-8"))
     here.setattr(tool, "CASES", (ROOM,))
     assert "tottime" in tool.profile("room", tmp_path)[1]
 

@@ -1,0 +1,100 @@
+"""Accuracy and time over the versions: one JSON line a run of the benchmarks, a page, a picture."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.cases import CaseResult
+from benchmarks.report import machine
+from loam_gtsam.io.version import installed_version
+from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.view.plots import available, plot_curves
+
+FILE = "history.jsonl"
+_PANELS = {"ate_m": "ATE [mm]", "ms": "ms a frame", "x_kiss_icp": "times of KISS-ICP"}
+_SCALES = {"ate_m": 1000.0}
+_EXPLANATION = """# Accuracy and time over the versions
+
+Each run of `python -m benchmarks` adds a line to [history.jsonl](history.jsonl), from which this
+page is made; what is measured, and how, is on the page of the [last run](benchmarks.md).
+Milliseconds are medians, and those of two runs compare only on the same machine, equally busy; the
+ratio to KISS-ICP, which runs in between, compares better.
+
+![Accuracy and time over the runs](history.png)
+"""
+
+
+def add(folder: Path, results: Sequence[CaseResult]) -> tuple[Path, ...]:
+    """Add a run to the history in a folder, and make page and picture anew; returns their paths."""
+    line = {
+        "date": datetime.now(UTC).date().isoformat(),
+        "version": installed_version(),
+        "machine": dict(machine()),
+        "cases": {result.name: _measured(result) for result in results if not result.problem},
+    }
+    with (folder / FILE).open("a", encoding="utf-8") as file:
+        file.write(json.dumps(line) + "\n")
+    return draw(folder)
+
+
+def draw(folder: Path) -> tuple[Path, ...]:
+    """Make the page, and the picture if matplotlib is there, from the lines of a folder."""
+    text = (folder / FILE).read_text(encoding="utf-8")
+    runs = [json.loads(line) for line in text.splitlines()]
+    page, picture = folder / "history.md", folder / "history.png"
+    page.write_text("\n".join(_page(runs)) + "\n", encoding="utf-8")
+    if not available():
+        return folder / FILE, page
+    numbers = np.arange(1, len(runs) + 1)
+    panels: dict[str, dict[str, tuple[IntArray, FloatArray]]] = {}
+    for key, label in _PANELS.items():
+        curves = {name: [_value(run, name, key) for run in runs] for name in _names(runs)}
+        panels[label] = {
+            name: (numbers[known], np.array(values)[known])
+            for name, values in curves.items()
+            for known in [np.isfinite(values)]
+        }
+    plot_curves(picture, panels, "run", log=True)
+    return folder / FILE, page, picture
+
+
+def _measured(result: CaseResult) -> dict[str, float | None]:
+    values = {
+        "ate_m": result.ate,
+        "ms": result.stages["wall"][0] if "wall" in result.stages else math.nan,
+        "x_kiss_icp": result.ratio,
+    }
+    return {key: value if math.isfinite(value) else None for key, value in values.items()}
+
+
+def _names(runs: Sequence[dict[str, Any]]) -> list[str]:
+    """The cases with an ATE in any of the runs, those of the last run first."""
+    found = [(name, case) for run in reversed(runs) for name, case in run["cases"].items()]
+    return list(dict.fromkeys(name for name, case in found if case["ate_m"] is not None))
+
+
+def _value(run: dict[str, Any], name: str, key: str) -> float:
+    value = run["cases"].get(name, {}).get(key)
+    return math.nan if value is None else _SCALES.get(key, 1.0) * value
+
+
+def _page(runs: Sequence[dict[str, Any]]) -> Iterator[str]:
+    yield _EXPLANATION
+    names = _names(runs)
+    for key, label in _PANELS.items():
+        yield f"**{label}**\n"
+        yield f"| run | {' | '.join(names)} |"
+        yield "|---" * (len(names) + 1) + "|"
+        for number, run in enumerate(runs, 1):
+            values = (_value(run, name, key) for name in names)
+            cells = ("-" if math.isnan(value) else f"{value:.3g}" for value in values)
+            about = ", ".join((run["version"], run["date"], run["machine"]["CPU"]))
+            yield f"| {number}: {about} | {' | '.join(cells)} |"
+        yield ""

@@ -125,7 +125,7 @@ def cross_matrix(vector: FloatArray) -> FloatArray:
 
 def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     """Cross products (3, N) of vectors (3, N), of which one may be (3,); faster than numpy's."""
-    product: FloatArray = np.stack(
+    product: FloatArray = np.array(
         [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
     )
     return product
@@ -145,7 +145,7 @@ def moments(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
     means: FloatArray = axes.sum(axis=1) / count
     x, y, z = axes - means[:, None]
     pairs = ((x, x), (y, y), (z, z), (x, y), (y, z), (x, z))
-    covariance = np.stack([(a * b).sum(axis=0) for a, b in pairs]) / count
+    covariance: FloatArray = np.array([(a * b).sum(axis=0) for a, b in pairs]) / count
     return means, covariance
 
 
@@ -165,7 +165,7 @@ def symmetric_eigenvalues(matrices: FloatArray) -> FloatArray:
     phi = np.arccos(np.clip(ratio, -1.0, 1.0)) / 3.0
     largest = mean + 2.0 * p * np.cos(phi)
     smallest = mean + 2.0 * p * np.cos(phi + 2.0 * np.pi / 3.0)
-    return np.stack([smallest, 3.0 * mean - largest - smallest, largest])
+    return np.array([smallest, 3.0 * mean - largest - smallest, largest])
 
 
 def nearest_positive(matrix: FloatArray) -> FloatArray:
@@ -265,7 +265,9 @@ def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
 
 
 def _voxel_cells(points: NDArray[np.floating], size: float) -> IntArray:
-    cells: IntArray = np.floor(points[:, :3] / size).astype(np.int64) + _GRID
+    """(3, N) from (N, 3) or more columns."""
+    axes = np.ascontiguousarray(points[:, :3].T)
+    cells: IntArray = np.floor(axes / size).astype(np.int64) + _GRID
     return cells
 
 
@@ -274,7 +276,8 @@ def _within_grid(cells: IntArray) -> bool:
 
 
 def _packed_cells(cells: IntArray) -> IntArray:
-    keys: IntArray = (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
+    x, y, z = cells
+    keys: IntArray = (x << 42) | (y << 21) | z
     return keys
 
 
@@ -293,11 +296,12 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     if _within_grid(cells):
         keys = _packed_cells(cells)
     else:  # slower, but for any extent, and in the same order
-        keys = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+        keys = np.unique(cells.T, axis=0, return_inverse=True)[1].reshape(-1)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     first = np.flatnonzero(np.concatenate(([True], keys[1:] != keys[:-1])))
-    sums = np.add.reduceat(points[order].astype(np.float64, copy=False), first, axis=0)
+    rows = points.take(order, axis=0)
+    sums = np.add.reduceat(rows.astype(np.float64, copy=False), first, axis=0)
     counts = np.diff(np.append(first, len(keys)))
     centroids: FloatArray = sums / counts[:, None]
     return centroids

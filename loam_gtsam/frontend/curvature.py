@@ -142,7 +142,8 @@ def unreliable_points(
     near = np.where(near_is_second, second, first)
     far = np.where(near_is_second, first, second)
     range_near, range_far = np.sqrt(squared[near]), np.sqrt(squared[far])
-    apart = np.linalg.norm(xyz[:, near] - xyz[:, far] * (range_near / range_far), axis=0)
+    drawn_in = xyz.take(far, axis=1) * (range_near / range_far)
+    apart = np.linalg.norm(xyz.take(near, axis=1) - drawn_in, axis=0)
     one_ray = apart < settings.occlusion_ratio * range_near
     far, away = far[one_ray], np.where(near_is_second, -1, 1)[one_ray]
     hidden = far[:, None] + away[:, None] * np.arange(settings.half_window + 1)

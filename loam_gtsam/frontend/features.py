@@ -239,7 +239,7 @@ def _assemble(
     ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
 
     def positions(chosen: IntArray) -> FloatArray:
-        return scan.points[sweep.index[chosen]].astype(np.float64)
+        return scan.points.take(sweep.index[chosen], axis=0).astype(np.float64)
 
     reach = _reach(sweep.xyz)
     size = scale_of(reach, config.map) * config.features.plane_voxel

@@ -388,4 +388,4 @@ def _rotation_vectors(
 
 def _interpolate(times: FloatArray, seconds: FloatArray, rates: FloatArray) -> FloatArray:
     """(3, N) rates at ``times``; before the first and after the last they are held."""
-    return np.stack([np.interp(times, seconds, rate) for rate in rates])
+    return np.array([np.interp(times, seconds, rate) for rate in rates])

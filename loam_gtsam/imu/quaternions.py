@@ -19,7 +19,7 @@ def quaternion_product(a: FloatArray, b: FloatArray) -> FloatArray:
     """(4, N) of the rotations ``a_k b_k``; either may be (4, 1)."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
-    return np.stack(
+    return np.array(
         [
             aw * bx + ax * bw + ay * bz - az * by,
             aw * by - ax * bz + ay * bw + az * bx,

@@ -290,7 +290,9 @@ def match_lines(
     fit = eigenvalues[1], eigenvalues[2], leverage
     sigmas, tilts = _deviations(*fit, 2, neighbours.shape[1], config)
     columns = (part[keep] for part in (distances, sigmas, weights, near, tilts))
-    return EdgeMatches(points[near[keep]], centres.T[keep], directions.T[keep], *columns)
+    return EdgeMatches(
+        points.take(near[keep], axis=0), centres.T[keep], directions.T[keep], *columns
+    )
 
 
 def match_planes(
@@ -376,7 +378,7 @@ def _matched_planes(
     if config.fit_uncertainty:
         sigmas = np.hypot(sigmas, _misfit(fits, config.point_sigma))
     return PlaneMatches(
-        points[rows[keep]],
+        points.take(rows[keep], axis=0),
         normals.T[keep],
         offsets[keep],
         distances[keep],

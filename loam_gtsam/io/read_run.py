@@ -8,11 +8,18 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from loam_gtsam.types import DatasetError, FrameStatus, MapUpdate, Uncertainty
+from loam_gtsam.types import (
+    DatasetError,
+    FrameStatus,
+    MapUpdate,
+    SweepMotion,
+    TiltPrior,
+    Uncertainty,
+)
 
 
 def read_updates(path: str | Path) -> list[MapUpdate]:
-    """Stamps, poses, statuses, twists, covariances and their parts of the frames of a run.
+    """The frames of a run, but for their faults and counts of points that are not finite.
 
     Raises
     ------
@@ -23,6 +30,7 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
     try:
         with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in _NEEDED}
+            stages = file["stage_names"].tolist()
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
         raise DatasetError(f"{path}: expected the run.npz of a finished run: {error}") from error
     updates = []
@@ -47,21 +55,36 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
                 int(at["stamps"]),
                 gtsam.Pose3(at["map_T_lidar"]),
                 status,
+                str(at["messages"]),
                 covariance=at["covariances"],
                 twist=at["twists"],
                 uncertainty=uncertainty,
                 map_T_middle=gtsam.Pose3(at["map_T_middle"]) if at["middle_stamps"] else None,
                 middle_stamp=int(at["middle_stamps"]),
-                localizability=at["localizability"],
-                directions=at["directions"],
+                sweep_motion=SweepMotion(str(at["sweep_motions"])),
+                tilt_prior=TiltPrior(str(at["tilt_priors"])),
+                timings={
+                    stage: seconds
+                    for stage, seconds in zip(stages, at["stage_seconds"].tolist(), strict=True)
+                    if np.isfinite(seconds)
+                },
+                **{name: at[name] for name in _ARRAYS},
+                **{name: at[name].item() for name in _NUMBERS},
             )
         )
     return updates
 
 
+_ARRAYS = (
+    "information", "localizability", "directions", "direction_information", "axis_localizability",
+)  # fmt: skip
+_NUMBERS = (
+    "n_edges", "n_planes", "n_edge_matches", "n_plane_matches", "iterations", "solver_iterations",
+    "error_before", "error_after",
+)  # fmt: skip
 _NEEDED = (
-    "stamps", "map_T_lidar", "status", "covariances", "twists", "own_covariances",
+    "stamps", "map_T_lidar", "status", "messages", "covariances", "twists", "own_covariances",
     "shared_covariances", "drift_covariances", "follows", "residual_variances",
-    "effective_matches", "blind_drifts", "forgotten", "localizability", "directions",
-    "map_T_middle", "middle_stamps",
+    "effective_matches", "blind_drifts", "forgotten", "map_T_middle", "middle_stamps",
+    "sweep_motions", "tilt_priors", "stage_seconds", *_ARRAYS, *_NUMBERS,
 )  # fmt: skip

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import gtsam
@@ -15,6 +15,7 @@ from loam_gtsam.config import load_config
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io import run_files
+from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies.evaluation import absolute_error
@@ -104,6 +105,21 @@ def test_npz_holds_every_frame_without_pickle(result, tmp_path):
     not_run = last.timings.keys() - first.timings.keys()
     assert not_run
     assert np.isnan([stages[name][0] for name in not_run]).all()
+
+
+def test_the_frames_of_a_saved_run_are_those_of_the_run(result, tmp_path):
+    run_files.write_npz(tmp_path / "run.npz", result.updates)
+    for here, there in zip(result.updates, read_updates(tmp_path / "run.npz"), strict=True):
+        poses = ("map_T_lidar", "map_T_middle")
+        for name in {item.name for item in fields(MapUpdate)} - {"uncertainty", "timings", *poses}:
+            if name not in ("fault", "n_not_finite"):  # the file does not have them
+                np.testing.assert_array_equal(getattr(there, name), getattr(here, name), name)
+        for name in poses:
+            one, other = (getattr(u, name) or u.map_T_lidar for u in (here, there))
+            np.testing.assert_array_equal(one.matrix(), other.matrix())
+        assert (there.uncertainty is None) == (here.uncertainty is None)
+        assert there.timings == here.timings
+    assert there.n_plane_matches > 100
 
 
 def test_covariances_stand_beside_the_poses(result, tmp_path):

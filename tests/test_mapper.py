@@ -396,8 +396,9 @@ def test_the_imu_moves_roll_and_pitch_of_a_frame_by_its_weight(rng):
 def test_a_frame_that_is_not_solved_has_no_prior(rng):
     mapper = Mapper(imu=imu_of(gtsam.Rot3()))
     first = mapper.register(room_features(gtsam.Pose3(), 0, rng))
+    mapper.register(room_features(gtsam.Pose3(), SECOND // 10, rng))
     far = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.array([30.0, 10.0, 0.0]))
-    lost = mapper.register(room_features(gtsam.Pose3(), SECOND // 10, rng), guess=far)
+    lost = mapper.register(room_features(gtsam.Pose3(), SECOND // 5, rng), guess=far)
     assert lost.status is not FrameStatus.OK
     assert first.tilt_prior is lost.tilt_prior is TiltPrior.NONE
 

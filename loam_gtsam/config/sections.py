@@ -204,12 +204,12 @@ class MatchingConfig(Section):
     max_distance: float = parameter(1.0, unit="m", source="LOAM", low=0.01)
     """A feature is matched only if its nearest map points are all within this distance."""
     wide_search: float = parameter(4.0, source="LOAM has no such search", low=1.0, high=100.0)
-    """While the map is thin, and fewer than half of the plane features have planes near by, the
-    others are matched with planes within this times max_distance, among voxels enlarged by this
-    factor: at the start the rings of a sweep are too far apart. 1 turns the search off."""
+    """While the map is thin, and planes near by are few or leave a translation open, other features
+    are matched with planes within this times max_distance, among voxels enlarged by this factor:
+    at the start the rings of a sweep are too far apart. 1 turns the search off."""
     wide_below: float = parameter(8.0, low=0.0)
-    """Lines are searched for within wide_search times max_distance, too, if fewer planes than this
-    fix a translation, counted as if they lay across it."""
+    """A translation is open if fewer planes than this fix it, counted as if they lay across it.
+    Lines, and planes while the map is thin, are then searched for more widely, too."""
     line_ratio: float = parameter(10.0, source="LOAM uses 3", low=1.0)
     """A line needs its largest eigenvalue above this times the second one."""
     plane_fit: Literal["centroid", "unit_offset"] = parameter(

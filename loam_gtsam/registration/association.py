@@ -100,7 +100,8 @@ def match_features(
         alone = distinct.copy()
         alone[lines.indices] = False
         left = np.flatnonzero(alone)
-        if config.wide_search > 1.0 and len(left) and _fixed_by(surfaces) < config.wide_below:
+        wanted = config.wide_search > 1.0 and len(left) > 0
+        if wanted and translations_fixed(surfaces)[0] < config.wide_below:
             # A pole that few beams met has no five points within max_distance.
             far = config.wide_search * limit
             near_edges = edge_map.nearest(edges_map[left], k, far, around)
@@ -182,13 +183,18 @@ def _on_this_side(
     return fits._replace(planar=fits.planar & known & explained.all(axis=0)), known
 
 
-def _fixed_by(planes: PlaneMatches) -> float:
-    """The least eigenvalue of ``sum n n^T - s^2 I``, s being the standard deviation of a normal."""
+def translations_fixed(planes: PlaneMatches) -> FloatArray:
+    """(3,) how many planes fix each of three translations, the one that they fix least first.
+
+    They are counted as if they lay across it: the eigenvalues of ``sum n n^T - s^2 I``, s being the
+    standard deviation of a normal.
+    """
     # Planes that fix three translations face three ways, and then they fix the rotation as well.
     tilts = planes.tilts
     assert tilts is not None  # match_planes sets the tilts
     across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
-    return float(np.linalg.eigvalsh(across)[0])
+    fixed: FloatArray = np.linalg.eigvalsh(across).astype(np.float64)
+    return fixed
 
 
 def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntArray:

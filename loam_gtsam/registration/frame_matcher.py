@@ -20,6 +20,7 @@ from loam_gtsam.registration.association import (
     match_features,
     match_surfaces,
     rematched,
+    translations_fixed,
     trial_matching,
 )
 from loam_gtsam.registration.degeneracy import Localizability, localizability
@@ -317,8 +318,7 @@ class FrameMatcher(Matcher):
         features = *self.posed.rows(self.rows.edges, self.rows.planes), map_T_lidar
         maps, config = (self.maps.edges, self.maps.planes), self.matching
         matches = match_features(*features, *maps, config, self.rows)
-        few = len(matches.planes) < _FEW * len(self.rows.planes)
-        if few and config.wide_search > 1.0 and maps[1].count() < _THIN:
+        if config.wide_search > 1.0 and self.maps.planes.count() < _THIN:
             matches = self._with_wide_planes(matches, map_T_lidar)
         return replace(matches, search=Search(map_T_lidar, self.posed, matches))
 
@@ -326,15 +326,22 @@ class FrameMatcher(Matcher):
         """The matches, and wider planes for the plane features that have none near by.
 
         In a map of a few sweeps the five points nearest to a point of the ground lie on one ring,
-        and make no plane. Seen more coarsely, there are others among them.
+        and make no plane. Seen more coarsely, there are others among them. They are of use where
+        planes near by are few, or where they tell of a translation that these leave open.
         """
-        config, coarse = self.matching, self.maps.thinned(self.matching.wide_search)
-        left = np.setdiff1d(self.rows.planes, matches.planes.indices, assume_unique=True)
+        config, near, limit = self.matching, matches.planes, self.matching.max_distance
+        few, fixed = len(near) < _FEW * len(self.rows.planes), translations_fixed(near)
+        if not few and (fixed >= config.wide_below).all():
+            return matches
+        left = np.setdiff1d(self.rows.planes, near.indices, assume_unique=True)
         _, points = self.posed.rows(self.rows.edges[:0], left)
-        reach = config.wide_search * config.max_distance
-        wide, _ = match_surfaces(points, map_T_lidar.matrix(), coarse, config, reach)
-        wide = replace(wide, indices=left[wide.indices])
-        return replace(matches, planes=joined(matches.planes, wide))
+        coarse, reach = self.maps.thinned(config.wide_search), config.wide_search * limit
+        # Five points across a corner may lie in a plane by accident; seven seldom do.
+        more = config.model_copy(update={"neighbours": config.neighbours + config.neighbours // 2})
+        wide, _ = match_surfaces(points, map_T_lidar.matrix(), coarse, more, reach)
+        both = joined(near, replace(wide, indices=left[wide.indices]))
+        closed = (translations_fixed(both) >= config.wide_below) > (fixed >= config.wide_below)
+        return replace(matches, planes=both) if few or closed.any() else matches
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:

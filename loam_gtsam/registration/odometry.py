@@ -185,7 +185,7 @@ def predict(
     motion = MotionPrior(middle, np.zeros((6, 6)))
     if inertial is not None:
         information = np.linalg.inv(inertial.covariance).astype(np.float64)
-        motion = MotionPrior(inertial.map_T_lidar, information)
+        motion = MotionPrior(inertial.map_T_lidar, information, measured=True)
     elif moment is not None:
         seconds = moment.seconds_to(sweep.stamp)
         sigmas = np.repeat([config.turn_sigma, config.acceleration_sigma], 3)

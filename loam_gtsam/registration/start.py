@@ -19,6 +19,7 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
+    APART,
     CLEARLY,
     Fit,
     Found,
@@ -51,14 +52,14 @@ class EarlySweep:
     posed : the sweep, de-skewed
     map_T_middle : pose at the middle of the sweep
     held : whether further factors decided on the pose, which is then left as it is
-    leeway : (6, 6) information of the expected motion, for directions that the scan does not fix
+    expected : the expected motion, for directions that the scan does not fix
     keyframe : number of the keyframe to which the points belong
     """
 
     posed: PosedSweep
     map_T_middle: gtsam.Pose3
     held: bool
-    leeway: FloatArray
+    expected: MotionPrior
     keyframe: int
 
     @property
@@ -80,8 +81,7 @@ class Start:
 
     def __init__(self, first: Prediction, keyframe: int) -> None:
         self._map_T_first = first.map_T_lidar
-        middle, leeway = first.map_T_middle, first.motion.information
-        self._sweeps = [EarlySweep(first.posed, middle, True, leeway, keyframe)]
+        self._sweeps = [EarlySweep(first.posed, first.map_T_middle, True, first.motion, keyframe)]
 
     @classmethod
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
@@ -105,10 +105,13 @@ class Start:
             return expected
         first, middle = self._sweeps[0], frame.predicted.map_T_middle
         seconds = first.moment.seconds_to(frame.sweep.stamp)
+        around = [middle]
+        if middle.range(first.map_T_middle) > APART[0]:  # a guess, and it may be wrong
+            around.append(first.map_T_middle)
         places = likely_poses(
             sample_features(*frame.matcher.posed.points),
             np.concatenate(_in_map(first)),
-            [middle],
+            around,
             min(_FASTEST * seconds, _FARTHEST),
             _PLACES,
             most_turn=_TURNING * seconds,
@@ -140,7 +143,7 @@ class Start:
             frame.sweep.at(found.twist),
             found.solution.map_T_lidar,
             bool(frame.priors),
-            frame.predicted.motion.information,
+            frame.predicted.motion,
             keyframe,
         )
         sweeps = [*self._sweeps, new]
@@ -184,9 +187,9 @@ class Start:
 
     def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> _Tried:
         """The first two sweeps, the second near a pose, registered by few matches."""
-        first, leeway = self._sweeps[0], frame.predicted.motion.information
+        first = self._sweeps[0]
         moved = first.map_T_middle.between(map_T_middle)
-        second = EarlySweep(frame.matcher.posed, map_T_middle, False, leeway, 0)
+        second = EarlySweep(frame.matcher.posed, map_T_middle, False, frame.predicted.motion, 0)
         first, second = self._with_motion([first, second])
         second = replace(second, map_T_middle=first.map_T_middle.compose(moved))
         return self._registered(frame, [first, second], solver, quickly=True)
@@ -225,7 +228,7 @@ class Start:
         )
         if quickly:
             matcher = matcher.with_few_matches()
-        expected = MotionPrior(one.map_T_middle, one.leeway)
+        expected = replace(one.expected, map_T_lidar=one.map_T_middle)
         priors = frame.priors if one.posed.sweep is frame.sweep else ()
         return solver.solve(matcher, one.map_T_middle, priors, expected)
 

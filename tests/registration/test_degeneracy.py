@@ -243,6 +243,25 @@ def test_few_matches_are_believed_if_they_bring_a_displaced_pose_back(count, fol
     assert np.abs(np.delete(error, 3)).max() < 0.02
 
 
+@pytest.mark.parametrize(
+    ("count", "sigma", "measured", "believed"),
+    [
+        (14, 0.05, True, False),
+        (14, 0.3, True, True),
+        (14, 0.05, False, True),
+        (60, 0.05, True, True),
+    ],
+)
+def test_few_matches_are_not_believed_against_the_imu(count, sigma, measured, believed):
+    """The IMU is 0.5 m off along the corridor; an end wall of few points contradicts it."""
+    expected = MotionPrior(GUESS, np.diag(np.repeat([1e4, sigma**-2], 3)), measured=measured)
+    associate = corridor_with_end(count, follows=False)
+    solution = GtsamSolver(SolverConfig()).solve(associate, GUESS, (), expected)
+    assert solution.n_weak == (not believed)
+    along = GUESS if not believed else POSE
+    assert along.localCoordinates(solution.map_T_lidar)[3] == pytest.approx(0.0, abs=0.05)
+
+
 def test_planes_are_believed_where_lines_see_too_little():
     planes = surfaces(*whole_room())
     seen = found(planes, poles(6, True))

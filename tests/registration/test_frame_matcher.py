@@ -14,7 +14,8 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as Inertial
 from loam_gtsam.registration import frame_matcher
-from loam_gtsam.registration.association import match_planes
+from loam_gtsam.registration.association import match_planes, translations_fixed
+from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.frame_matcher import FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.report import Clock
@@ -156,7 +157,7 @@ def test_with_few_planes_the_search_is_wide_and_equals_brute_force():
     points = second.at(TWIST).points[1]
     there = transform(HERE.matrix(), points)
     distances = cdist(there, known)
-    nearest = np.argsort(distances, axis=1)[:, : config.neighbours]
+    nearest = np.argsort(distances, axis=1)[:, : config.neighbours + config.neighbours // 2]
     squared = np.take_along_axis(distances, nearest, axis=1) ** 2
     arguments = points, there, known[nearest], squared, HERE.matrix(), config, reach
     expected = match_planes(*arguments)
@@ -188,6 +189,37 @@ def test_in_a_map_that_has_enough_planes_none_is_searched_for_widely(matcher, mo
     np.testing.assert_array_equal(wider.planes.normals[near], found.planes.normals)
     monkeypatch.setattr(frame_matcher, "_THIN", 10)
     assert same(matcher(HERE), found)
+
+
+def on_true_poses(scene):
+    """The matcher of the fifth sweep in the map of those before it, and its pose."""
+    world = SimulatedWorld(scene, frames=6, seed=1, columns=450)
+    poses = [gtsam.Pose3(pose) for pose in world.truth.map_T_lidar]
+    maps, parts = MapPair(CONFIG), []
+    for scan, pose, after in zip(world, poses, poses[1:], strict=False):
+        if parts:
+            maps.insert(*parts[-1], 0)
+        sweep = MovingSweep(extract_features(scan, CONFIG), CONFIG)
+        posed = sweep.at(10.0 * gtsam.Pose3.Logmap(pose.between(after)))
+        parts.append((posed, pose.slerp(0.5, after)))
+    (before, there), (now, here) = parts[-2:]
+    last = Moment(before.sweep.stamp, there, True)
+    return FrameMatcher.of(now, maps, CONFIG, last, Clock()), here
+
+
+@pytest.mark.parametrize(
+    ("scene", "closes"), [("tunnel_pilasters", True), ("sparse_terrain", False)]
+)
+def test_wide_planes_count_where_they_close_an_open_translation(scene, closes, monkeypatch):
+    """Rings on floor and ceiling of a tunnel tell the height; between poles nothing tells x, y."""
+    monkeypatch.setattr(frame_matcher, "_FEW", 0.0)
+    matcher, pose = on_true_poses(scene)
+    narrow = replace(matcher, matching=CONFIG.matching.changed(wide_search=1.0))
+    assert translations_fixed(narrow(pose).planes)[0] < CONFIG.matching.wide_below
+    assert (len(matcher(pose).planes) > len(narrow(pose).planes)) == closes
+    if closes:
+        height = [localizability(one(pose), pose).axes()[5] for one in (narrow, matcher)]
+        assert height[0] < CONFIG.solver.min_aligned < height[1] / 5
 
 
 LIMIT = CONFIG.map.small_below

@@ -18,6 +18,11 @@ from loam_gtsam.types import BoolArray, FloatArray, check_kind
 POSE_KEY: int = gtsam.symbol("x", 0)
 """Key of the pose of a frame, ``map_T_lidar`` at the middle of the sweep, in the solver's graph."""
 
+SCAN_VARIANCE = 4.0
+"""Variance of a scan's error over that of its raw covariance, where the scatter of the residuals
+does not tell it: where some direction is not seen, the map was made by the same guesses as the
+scan, and agrees with them."""
+
 Associate = Callable[[gtsam.Pose3], ScanMatches]
 """Gives the matches of a sweep at a pose ``map_T_lidar``: a pure function."""
 
@@ -126,11 +131,17 @@ class Solution:
 class MotionPrior:
     """The expected pose, which is used along the directions that a scan does not fix.
 
-    Its information is (6, 6), in the tangent order of the package.
+    Attributes
+    ----------
+    map_T_lidar : the pose
+    information : (6, 6), in the tangent order of the package
+    measured : whether gyro and accelerometer tell it, so that the information holds all that is
+        not known of it. That of a constant velocity leaves out the error of the velocity.
     """
 
     map_T_lidar: gtsam.Pose3
     information: FloatArray
+    measured: bool = False
 
     def along(self, directions: FloatArray) -> MotionPrior:
         """The expected pose along directions alone, given by their (6, 6) projector."""

@@ -29,6 +29,7 @@ from loam_gtsam.registration.degeneracy import (
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers.base import (
     POSE_KEY,
+    SCAN_VARIANCE,
     Associate,
     Matcher,
     MotionPrior,
@@ -55,6 +56,7 @@ _PUSH = 0.2  # metres (root mean square of the points) by which the pose is disp
 _COMES_BACK = 0.25
 """Least share of the displacement that one more association must undo. It is the share of true
 information: below, that of noise is three times as much."""
+_SURE = 3.0  # standard deviations beyond which a doubted direction contradicts the IMU
 _CERTAIN = 1e10  # information that outweighs every other factor: 0.01 mrad and 0.01 mm
 
 
@@ -98,6 +100,10 @@ class GtsamSolver:
         doubted = sight.doubted(found, self.config.min_aligned)
         if doubted is None:
             return found
+        lost = _contradicted(found, doubted, motion)
+        if lost.any():
+            sight = sight.without(lost, self.config.min_aligned)
+            return rematch(associate, guess, self.config, optimise)
         lost = self._returns(associate, found, doubted, sight, expected) < _COMES_BACK
         if not lost.any():
             return found
@@ -162,6 +168,17 @@ class GtsamSolver:
         small = within_tolerance(pose.localCoordinates(moved), information, config)
         sights = sight.scan, blind, without, beacons, rows, added
         return Solution(moved, True, small, matches, 1, steps, before, after, information, *sights)
+
+
+def _contradicted(found: Solution, doubted: Directions, expected: MotionPrior | None) -> BoolArray:
+    """(W,) directions along which the pose is not where the IMU, by its covariance, allows it."""
+    if expected is None or not expected.measured:
+        return np.zeros(len(doubted), np.bool_)
+    away = doubted.shares @ expected.map_T_lidar.localCoordinates(found.map_T_lidar)
+    of_both = np.linalg.inv(expected.information) + SCAN_VARIANCE * np.linalg.inv(found.information)
+    variances = np.einsum("ki,ij,kj->k", doubted.shares, of_both, doubted.shares)
+    contradicted: BoolArray = away**2 > _SURE**2 * variances
+    return contradicted
 
 
 @dataclass(frozen=True, slots=True, eq=False)

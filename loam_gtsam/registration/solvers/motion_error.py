@@ -8,7 +8,7 @@ import numpy as np
 
 from loam_gtsam.config import SolverConfig
 from loam_gtsam.geometry import positive_root, symmetric
-from loam_gtsam.registration.solvers.scan_error import SCAN_VARIANCE
+from loam_gtsam.registration.solvers.base import SCAN_VARIANCE
 from loam_gtsam.types import FloatArray
 
 _GYRO_RATE = 0.01

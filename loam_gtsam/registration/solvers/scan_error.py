@@ -10,7 +10,7 @@ import numpy as np
 
 from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.geometry import nearest_positive, symmetric, transform, voxel_keys
-from loam_gtsam.registration.solvers.base import POSE_KEY, Solution
+from loam_gtsam.registration.solvers.base import POSE_KEY, SCAN_VARIANCE, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.key_table import KeyTable
@@ -20,10 +20,6 @@ _PRIOR_CELLS = 6.0
 cells the scores alone do not span the six directions."""
 _LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
-SCAN_VARIANCE = 4.0
-"""Variance of a scan's error over that of its raw covariance, where the scatter of the residuals
-does not tell it: where some direction is not seen, the map was made by the same guesses as the
-scan, and agrees with them."""
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 

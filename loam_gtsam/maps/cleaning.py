@@ -265,14 +265,17 @@ class _Image:
         self, points: FloatArray, normals: FloatArray, flat: BoolArray, along: float, aside: float
     ) -> tuple[BoolArray, BoolArray]:
         """Which points (N, 3) the sweep saw through, and which it saw."""
-        x, y, z = points.T
-        ranges = np.sqrt(x * x + y * y + z * z)[:, None]
         rings, columns = self.ranges.shape
+        x, y, z = points.T
         above = np.searchsorted(self.elevations, np.arctan2(z, np.hypot(x, y)))
-        inside = (above > 0) & (above < rings)
-        above = np.clip(above, 1, rings - 1)
-        column = (_column(np.arctan2(y, x), columns)[:, None] + np.array([-1, 0, 1])) % columns
-        cells = [(row[:, None], column) for row in (above - 1, above)]
+        column = _column(np.arctan2(y, x), columns)
+        hit = np.isfinite(self.ranges).any(axis=0)
+        looked = hit | np.roll(hit, 1) | np.roll(hit, -1)
+        asked = np.flatnonzero((above > 0) & (above < rings) & looked[column])
+        points, normals, flat = (part.take(asked, axis=0) for part in (points, normals, flat))
+        ranges = np.sqrt((points**2).sum(axis=1))[:, None]
+        beside = (column[asked][:, None] + np.array([-1, 0, 1])) % columns
+        cells = [(row[:, None], beside) for row in (above[asked] - 1, above[asked])]
         low, high = (self.ranges[cell] for cell in cells)
         around = np.concatenate([low, high], axis=1)
         met = np.concatenate([self.points[cell] for cell in cells], axis=1)
@@ -281,9 +284,11 @@ class _Image:
         same = there & flat[:, None] & (away < aside)
         beyond = ~there | ((around > ranges + along) & ~same)
         both = np.isfinite(low).any(axis=1) & np.isfinite(high).any(axis=1)
-        through = inside & both & beyond.all(axis=1)
         close = there & (np.abs(around - ranges) <= along)
-        return through, inside & ~through & (close | same).any(axis=1)
+        through, seen = np.zeros((2, len(x)), np.bool_)
+        through[asked] = both & beyond.all(axis=1)
+        seen[asked] = (close | same).any(axis=1)
+        return through, seen & ~through
 
 
 def _column(azimuth: FloatArray, columns: int) -> IntArray:

@@ -272,7 +272,7 @@ class _Image:
         hit = np.isfinite(self.ranges).any(axis=0)
         looked = hit | np.roll(hit, 1) | np.roll(hit, -1)
         asked = np.flatnonzero((above > 0) & (above < rings) & looked[column])
-        points, normals, flat = (part.take(asked, axis=0) for part in (points, normals, flat))
+        points, normals, flat = points[asked], normals[asked], flat[asked]
         ranges = np.sqrt((points**2).sum(axis=1))[:, None]
         beside = (column[asked][:, None] + np.array([-1, 0, 1])) % columns
         cells = [(row[:, None], beside) for row in (above[asked] - 1, above[asked])]

@@ -23,8 +23,6 @@ from loam_gtsam.io.atomic import used_alone
 from loam_gtsam.studies import trial_runner
 from loam_gtsam.studies.trials import TABLE_FILE, Row, Trial, empty_row, read_table
 
-PAGE = Path(__file__).resolve().parents[2] / "docs" / "parameter_studies.md"
-
 
 def study(*arguments: object) -> Result:
     return loam("study", *arguments)
@@ -160,14 +158,6 @@ def test_a_signal_keeps_what_is_finished_and_the_next_call_goes_on(tmp_path, mon
     assert study(file, "--output", "out").exit_code == 0
     assert [entry["seed"] for entry in opened] == [0, 1, 1, 0, 1]
     assert len(read_table(Path("out") / TABLE_FILE)[0]) == 4
-
-
-def test_the_pandas_of_the_page_works(tmp_path, quick, capsys):
-    pytest.importorskip("pandas")
-    study(write_spec(tmp_path, SPEC), "--output", "results")
-    code = re.search(r"^```python\n(.*?)^```", PAGE.read_text("utf-8"), re.M | re.S)
-    exec(compile(code[1], "block", "exec"), {})
-    assert "gtsam" in capsys.readouterr().out
 
 
 def test_what_takes_long_to_import_is_imported_only_where_it_is_needed():

@@ -20,7 +20,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 
-from benchmarks.tables import write_csv
+from benchmarks.tables import markdown_table, write_csv
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
@@ -348,14 +348,14 @@ def _outcome(world: str, policy: str, rows: Sequence[tuple[float, ...]]) -> Outc
 def table(rows: Sequence[Detection] | Sequence[Outcome]) -> str:
     """Rows of one kind in Markdown."""
     names = [item.name for item in fields(rows[0])]
-    lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
-    for row in rows:
-        cells = [
-            ("-" if np.isnan(value) else f"{value:.3g}") if isinstance(value, float) else str(value)
+    cells = (
+        [
+            ("-" if np.isnan(value) else f"{value:.3g}") if isinstance(value, float) else value
             for value in astuple(row)
         ]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
+        for row in rows
+    )
+    return "\n".join(markdown_table(names, cells)) + "\n"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

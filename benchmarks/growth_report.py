@@ -13,7 +13,7 @@ from benchmarks import recorded
 from benchmarks.cases import EvidenceTable, Verdict
 from benchmarks.recorded import RivalResult
 from benchmarks.report import machine
-from benchmarks.tables import write_csv
+from benchmarks.tables import markdown_table, write_csv
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.view.plots import available, plot_curves
 
@@ -221,10 +221,7 @@ def _markdown(results: Sequence[GrowthResult], rivals: Sequence[RivalResult] = (
         tables.append(recorded.table(rivals))
     for table in tables:
         yield f"\n**{table.title}**\n"
-        yield f"| {' | '.join(table.header)} |"
-        yield "|---" * len(table.header) + "|"
-        for row in table.rows:
-            yield f"| {' | '.join(row)} |"
+        yield from markdown_table(table.header, table.rows)
     for result in results:
         name = f"growth_{result.name}"
         yield f"\n**{result.name}** ([CSV]({name}.csv))"

@@ -13,6 +13,7 @@ import numpy as np
 
 from benchmarks.cases import CaseResult
 from benchmarks.report import machine
+from benchmarks.tables import markdown_table
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.view.plots import available, plot_curves
@@ -90,11 +91,11 @@ def _page(runs: Sequence[dict[str, Any]]) -> Iterator[str]:
     names = _names(runs)
     for key, label in _PANELS.items():
         yield f"**{label}**\n"
-        yield f"| run | {' | '.join(names)} |"
-        yield "|---" * (len(names) + 1) + "|"
+        rows = []
         for number, run in enumerate(runs, 1):
             values = (_value(run, name, key) for name in names)
             cells = ("-" if math.isnan(value) else f"{value:.3g}" for value in values)
             about = ", ".join((run["version"], run["date"], run["machine"]["CPU"]))
-            yield f"| {number}: {about} | {' | '.join(cells)} |"
+            rows.append((f"{number}: {about}", *cells))
+        yield from markdown_table(["run", *names], rows)
         yield ""

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from benchmarks.cases import CaseResult, EvidenceTable
 from benchmarks.peers import load
+from benchmarks.tables import markdown_table
 from loam_gtsam.io.version import installed_version
 
 STAGES = ("features", "odometry", "prepare", "match", "solve", "insert", "covariance", "wall")
@@ -146,10 +147,8 @@ def _markdown(results: Sequence[CaseResult]) -> Iterator[str]:
         yield f"\n{paragraph}"
     for table in tables(results):
         yield f"\n**{table.title}**\n"
-        yield f"| {' | '.join(table.header)} |"
-        yield "|---" * len(table.header) + "|"
-        for row in table.rows:
-            yield f"| {' | '.join(cell.replace('|', '/') for cell in row)} |"
+        rows = ([cell.replace("|", "/") for cell in row] for row in table.rows)
+        yield from markdown_table(table.header, rows)
     yield "\n**Notes**\n"
     for result in results:
         if result.note:

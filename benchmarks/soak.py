@@ -26,7 +26,7 @@ from benchmarks.cases import ROOT, Verdict
 from benchmarks.process import memory
 from benchmarks.report import machine
 from benchmarks.soak_faults import KINDS, Expected, FaultyDrive
-from benchmarks.tables import write_csv
+from benchmarks.tables import markdown_table, write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.io.run_files import summarise
@@ -254,6 +254,10 @@ def _markdown(results: Sequence[SoakResult]) -> Iterator[str]:
         yield from _scene(result)
 
 
+def _statuses(result: SoakResult) -> str:
+    return ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
+
+
 def _table_of_places(results: Sequence[SoakResult]) -> Iterator[str]:
     yield "# Soak of other places\n\nMade by `python -m benchmarks.soak --places`.\n"
     yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
@@ -262,14 +266,13 @@ def _table_of_places(results: Sequence[SoakResult]) -> Iterator[str]:
         "the bridge, which may be enough there), once through each place. Judged are exceptions "
         "and counts: where little is seen, a fault may cost more than its sweep.\n"
     )
-    labels = list(results[0].verdicts())
-    yield f"| place | sweeps | faults | {' | '.join(labels)} | statuses |"
-    yield "|---" * (len(labels) + 4) + "|"
+    rows = []
     for result in results:
         delivered, faults = len(result.columns["faults"]), result.expected.injected.total()
-        values = " | ".join(value for value, _ in result.verdicts().values())
-        statuses = ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
-        yield f"| {result.scene} | {delivered} | {faults} | {values} | {statuses} |"
+        values = [value for value, _ in result.verdicts().values()]
+        rows.append((result.scene, delivered, faults, *values, _statuses(result)))
+    names = ["place", "sweeps", "faults", *results[0].verdicts(), "statuses"]
+    yield from markdown_table(names, rows)
     total = sum(len(result.columns["faults"]) for result in results)
     yield f"\n{total} sweeps in all."
 
@@ -285,16 +288,17 @@ def _scene(result: SoakResult) -> Iterator[str]:
         f"From the second to the last fifth of them memory grew by {growth} MB per 1,000 sweeps; "
         f"map points: {points[len(points) // 5]:.0f} after a fifth, {points[-1]:.0f} in the end.\n"
     )
-    yield "| what | value | target |\n|---|---|---|"
-    for label, (value, verdict) in result.verdicts().items():
-        yield f"| {label} | {value} | {verdict if verdict.target != '-' else ''} |"
-    yield "\n**What was done to the sweeps**\n\n| fault | times |\n|---|---|"
-    yield from (f"| {kind} | {times} |" for kind, times in sorted(injected.items()))
+    verdicts = (
+        (label, value, verdict if verdict.target != "-" else "")
+        for label, (value, verdict) in result.verdicts().items()
+    )
+    yield from markdown_table(("what", "value", "target"), verdicts)
+    yield "\n**What was done to the sweeps**\n"
+    yield from markdown_table(("fault", "times"), sorted(injected.items()))
     yield "\n**What the report counts** (`faults`, `sweep_gaps`, `not_finite_points` and `imu` in"
-    yield "`summary.json`)\n\n| what | injected | counted |\n|---|---|---|"
-    yield from (f"| {' | '.join(map(str, row))} |" for row in result.counts())
-    statuses = ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
-    yield f"\nStatuses: {statuses}. ([CSV]({name}.csv))"
+    yield "`summary.json`)\n"
+    yield from markdown_table(("what", "injected", "counted"), result.counts())
+    yield f"\nStatuses: {_statuses(result)}. ([CSV]({name}.csv))"
     if available():
         yield f"\n![Memory, error and faults over the sweeps of {result.scene}]({name}.png)"
 

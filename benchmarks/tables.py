@@ -1,9 +1,9 @@
-"""Tables as CSV files."""
+"""Tables as CSV files, and in Markdown."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 
@@ -17,3 +17,11 @@ def write_csv(
         writer.writerow(names)
         for row in rows:
             writer.writerow([f"{v:.{digits}g}" if isinstance(v, float) else v for v in row])
+
+
+def markdown_table(names: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:
+    """The lines of a table in Markdown."""
+    yield f"| {' | '.join(names)} |"
+    yield "|---" * len(names) + "|"
+    for row in rows:
+        yield f"| {' | '.join(map(str, row))} |"

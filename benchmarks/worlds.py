@@ -23,6 +23,7 @@ import numpy as np
 
 from benchmarks.cases import ROOT, data_folder
 from benchmarks.process import processor_clock
+from benchmarks.tables import markdown_table
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.base import PartOf
@@ -352,15 +353,15 @@ def table(rows: Sequence[Row], before: Sequence[Row] = ()) -> str:
     """In Markdown; the last column is the ATE over that of an earlier table."""
     known = {(row.world, row.mode, row.seed): row for row in before}
     titles = TITLES + (("ATE, x before",) if before else ())
-    lines = ["| " + " | ".join(titles) + " |", "|" + "---|" * len(titles)]
-    ratios = []
+    cells, ratios = [], []
     for line in lines_of(rows):
         pairs = [known.get((row.world, row.mode, row.seed)) for row in line.rows]
         same = [row for row in pairs if row is not None]
         older = Line(line.world, line.mode, same) if len(same) == len(line.rows) else None
         if older is not None:
             ratios.append(line.ate / older.ate)
-        lines.append("| " + " | ".join(line.cells(older)) + " |")
+        cells.append(line.cells(older))
+    lines = list(markdown_table(titles, cells))
     if ratios:
         mean, worst = _geometric(ratios), max(ratios)
         lines += ["", f"ATE over that before: geometric mean {mean:.3f}, worst {worst:.2f}."]

@@ -5,12 +5,15 @@ Tangent order is ``[rotation, translation]`` (see :mod:`loam_gtsam.types`).
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array, check_kind
 
+_Real = TypeVar("_Real", np.float32, np.float64)
 _SMALL_ANGLE = 1e-9
 _GRID = 1 << 20
 """Voxels on either side of the origin that the keys of voxels tell apart."""
@@ -131,10 +134,10 @@ def cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return product
 
 
-def squared_lengths(vectors: FloatArray) -> FloatArray:
-    """(N,) of (N, 3); a sixth of the time of numpy's sum along an axis of three, and its bits."""
-    x, y, z = vectors.T
-    squared: FloatArray = x * x + y * y + z * z
+def squared_norm(xyz: NDArray[_Real]) -> NDArray[_Real]:
+    """(...,) of (3, ...), with the bits of numpy's sum along the axis of three; much faster."""
+    x, y, z = xyz
+    squared: NDArray[_Real] = x * x + y * y + z * z
     return squared
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 
 from loam_gtsam.geometry import cross_matrix
@@ -46,11 +47,10 @@ def align(
     best: tuple[int, float, int] | None = None
     inliers = np.zeros(len(way), np.bool_)
     heading = np.arctan2(there[:, 1], there[:, 0]) - np.arctan2(here[:, 1], here[:, 0])
-    found = np.eye(3), np.zeros(3)
+    found = np.eye(3)
     for number in np.flatnonzero(clear).tolist():
         a, b = first[number], second[number]
-        cosine, sine = np.cos(heading[number]), np.sin(heading[number])
-        turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ level
+        turn = gtsam.Rot3.Yaw(heading[number]).matrix() @ level
         shift = 0.5 * ((fixes[a] + fixes[b]) - turn @ (way[a] + way[b]))
         away = np.linalg.norm(way @ turn.T + shift - fixes, axis=1)
         near = np.minimum(*(np.linalg.norm(way - way[index], axis=1) for index in (a, b)))
@@ -58,7 +58,7 @@ def align(
         good = away < allowed
         score = int(good.sum()), -float(away[good].sum()), -number
         if best is None or score > best:
-            best, inliers, found = score, good, (turn, shift)
+            best, inliers, found = score, good, turn
     if not inliers.any():
         return np.eye(4), inliers
     turn, shift = _fit(way[inliers], fixes[inliers], found)
@@ -67,18 +67,14 @@ def align(
     return pose, inliers
 
 
-def _fit(
-    way: FloatArray, fixes: FloatArray, start: tuple[FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray]:
-    """The heading and shift that fit all of them, tilt as at the start (least squares)."""
-    turn, _ = start
+def _fit(way: FloatArray, fixes: FloatArray, turn: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """The rotation and shift that fit all of them, tilt as that of ``turn`` (least squares)."""
     middle, target = way.mean(axis=0), fixes.mean(axis=0)
     here, there = (way - middle) @ turn.T, fixes - target
     cross = (here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]).sum()
     along = (here[:, 0] * there[:, 0] + here[:, 1] * there[:, 1]).sum()
     angle = np.arctan2(cross, along)
-    cosine, sine = np.cos(angle), np.sin(angle)
-    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]) @ turn
+    turn = gtsam.Rot3.Yaw(angle).matrix() @ turn
     return turn, target - turn @ middle
 
 

@@ -272,7 +272,7 @@ class _Solver:
         self._fixes = fixes
         self.rest = graph.active_factors()
         self._values = graph.values
-        self._antenna = config
+        self._antenna_sigma = config.antenna_sigma
         self._up, self._leaning = gtsam.Unit3(up), leaning
 
     def factors(self, spread: FloatArray, used: BoolArray) -> gtsam.NonlinearFactorGraph:
@@ -284,7 +284,7 @@ class _Solver:
             graph.add(fix_factor(key, fixes.enu[row], noise, fixes.moves[row]))
         level = gtsam.noiseModel.Isotropic.Sigma(2, self._leaning)
         graph.add(gtsam.AttitudeFactorPose3(MAP_KEY, gtsam.Unit3(0.0, 0.0, 1.0), level, self._up))
-        known = gtsam.noiseModel.Isotropic.Sigma(3, self._antenna.antenna_sigma)
+        known = gtsam.noiseModel.Isotropic.Sigma(3, self._antenna_sigma)
         graph.add(gtsam.PriorFactorPoint3(ANTENNA_KEY, fixes.antenna, known))
         return graph
 

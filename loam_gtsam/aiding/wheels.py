@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import AidingConfig, Config
 from loam_gtsam.datasets.decode.aiding import WheelSamples
@@ -55,8 +54,8 @@ class WheelOdometry(Odometry):
     def __init__(
         self, config: AidingConfig, wheels: WheelSamples, imu: Turns | None = None
     ) -> None:
-        turn = Rotation.from_euler("xyz", config.lidar_R_wheels_deg, degrees=True).as_matrix()
-        self._lidar_T_body = gtsam.Pose3(gtsam.Rot3(turn), np.array(config.lidar_t_wheels))
+        turn = gtsam.Rot3.RzRyRx(*np.deg2rad(config.lidar_R_wheels_deg))
+        self._lidar_T_body = gtsam.Pose3(turn, np.array(config.lidar_t_wheels))
         self._wheels, self._steady = wheels, ConstantVelocity(imu)
         self.reset()
 

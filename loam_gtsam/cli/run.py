@@ -34,8 +34,11 @@ def execute(dataset: Dataset, config: Config, options: RunOptions) -> int:
 
     An error that ends the run early is raised after the results up to there were written.
     """
-    asked = {"loops.enabled": options.loops, "aiding.gnss": options.gnss}
-    asked["aiding.wheels"] = options.wheels
+    asked = {
+        "loops.enabled": options.loops,
+        "aiding.gnss": options.gnss,
+        "aiding.wheels": options.wheels,
+    }
     config = config.changed({key: True for key, on in asked.items() if on})
     plot = console.draws_pictures(options.plot)
     wanted = options.output or Path("loam_gtsam_output") / file_name(dataset.name)

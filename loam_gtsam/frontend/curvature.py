@@ -6,15 +6,13 @@ at ``ring_starts[i]``; the last of these (R + 1,) entries is N. See docs/maths/f
 
 from __future__ import annotations
 
-from typing import TypeVar
-
 import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import FeatureConfig
+from loam_gtsam.geometry import squared_norm
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
-_Real = TypeVar("_Real", np.float32, np.float64)
 _LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
 """Residual sum of squares of a straight line through five even samples, from their second
 differences a, b, c: ``0.4 (a^2 + c^2) + 0.7 b^2 + 0.8 b (a + c) + 0.4 a c``, the quadratic form of
@@ -151,10 +149,3 @@ def unreliable_points(
     same_ring = (hidden >= ring_starts[ring - 1]) & (hidden < ring_starts[ring])
     out[hidden[same_ring]] = True
     return out
-
-
-def squared_norm(xyz: NDArray[_Real]) -> NDArray[_Real]:
-    """(...,) of (3, ...); several times faster than a reduction along the short axis."""
-    x, y, z = xyz
-    squared: NDArray[_Real] = x * x + y * y + z * z
-    return squared

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.frontend.curvature import squared_norm
+from loam_gtsam.geometry import squared_norm
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _LINKED_BEAMS = 2.5

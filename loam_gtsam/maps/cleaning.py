@@ -20,7 +20,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.errors import SweepError
 from loam_gtsam.frontend.organise import organise
-from loam_gtsam.geometry import as_points, move_points
+from loam_gtsam.geometry import as_points, move_points, squared_norm
 from loam_gtsam.maps.map_file import SavedMap
 from loam_gtsam.types import BoolArray, DatasetError, FloatArray, IntArray, MapUpdate, Scan
 from loam_gtsam.voxels.grid import CubeIndex
@@ -144,9 +144,9 @@ def count_votes(points: FloatArray, sweeps: Iterable[View], config: Config) -> V
         image = _Image.of(view)
         if image is None:
             continue
-        near = np.linalg.norm(points - view.map_T_lidar[:3, 3], axis=1) < REACH
-        rows = np.flatnonzero(near)
-        local = (points[rows] - view.map_T_lidar[:3, 3]) @ view.map_T_lidar[:3, :3]
+        away = points - view.map_T_lidar[:3, 3]
+        rows = np.flatnonzero(np.sqrt(squared_norm(away.T)) < REACH)
+        local = away[rows] @ view.map_T_lidar[:3, :3]
         faces = normals[rows] @ view.map_T_lidar[:3, :3]
         through, met = image.ask(local, faces, flat[rows], along, off_plane)
         free[rows[through]] += 1
@@ -238,7 +238,7 @@ class _Image:
     def of(cls, view: View) -> _Image | None:
         """The image of a sweep; None if it has less than two rings."""
         x, y, z = view.points.T
-        ranges = np.sqrt(x * x + y * y + z * z)
+        ranges = np.sqrt(squared_norm(view.points.T))
         elevation = np.arctan2(z, np.hypot(x, y))
         numbers, ring = np.unique(view.rings, return_inverse=True)
         if len(numbers) < 2:
@@ -273,7 +273,7 @@ class _Image:
         looked = hit | np.roll(hit, 1) | np.roll(hit, -1)
         asked = np.flatnonzero((above > 0) & (above < rings) & looked[column])
         points, normals, flat = points[asked], normals[asked], flat[asked]
-        ranges = np.sqrt((points**2).sum(axis=1))[:, None]
+        ranges = np.sqrt(squared_norm(points.T))[:, None]
         beside = (column[asked][:, None] + np.array([-1, 0, 1])) % columns
         cells = [(row[:, None], beside) for row in (above[asked] - 1, above[asked])]
         low, high = (self.ranges[cell] for cell in cells)

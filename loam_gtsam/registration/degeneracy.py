@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.factors import complement_basis
-from loam_gtsam.geometry import cross, cross_matrix, squared_lengths
+from loam_gtsam.geometry import cross, cross_matrix, squared_norm
 from loam_gtsam.registration.matches import EdgeMatches, ScanMatches, subset
 from loam_gtsam.types import FloatArray
 
@@ -278,8 +278,8 @@ def _sight(
     turn, shift = directions[:, :3], directions[:, 3:]
     seen = cross(points.T, normals.T).T @ turn.T + normals @ shift.T
     # |shift + turn x p|^2 for all points and directions, as products of small matrices
-    moved = np.outer(squared_lengths(points), squared_lengths(turn)) - (points @ turn.T) ** 2
-    moved += 2.0 * points @ cross(shift.T, turn.T) + squared_lengths(shift)
+    moved = np.outer(squared_norm(points.T), squared_norm(turn.T)) - (points @ turn.T) ** 2
+    moved += 2.0 * points @ cross(shift.T, turn.T) + squared_norm(shift.T)
     moved = np.maximum(moved, _MOVED**2)
     squared = seen**2 / moved
     return np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0)

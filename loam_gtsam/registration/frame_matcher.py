@@ -329,13 +329,14 @@ class FrameMatcher(Matcher):
         and make no plane. Seen more coarsely, there are others among them. They are of use where
         planes near by are few, or where they tell of a translation that these leave open.
         """
-        config, near, limit = self.matching, matches.planes, self.matching.max_distance
+        config, near = self.matching, matches.planes
         few, fixed = len(near) < _FEW * len(self.rows.planes), translations_fixed(near)
         if not few and (fixed >= config.wide_below).all():
             return matches
         left = np.setdiff1d(self.rows.planes, near.indices, assume_unique=True)
         _, points = self.posed.rows(self.rows.edges[:0], left)
-        coarse, reach = self.maps.thinned(config.wide_search), config.wide_search * limit
+        coarse = self.maps.thinned(config.wide_search)
+        reach = config.wide_search * config.max_distance
         # Five points across a corner may lie in a plane by accident; seven seldom do.
         more = config.model_copy(update={"neighbours": config.neighbours + config.neighbours // 2})
         wide, _ = match_surfaces(points, map_T_lidar.matrix(), coarse, more, reach)

@@ -17,7 +17,7 @@ from loam_gtsam.geometry import (
     checked_pose,
     move_points,
     nearest_positive,
-    squared_lengths,
+    squared_norm,
 )
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
@@ -268,7 +268,7 @@ def solved_twist(
     noise = displacements(rows.points, (rows.scales * tilts * seconds) ** 2)
     information = nearest_positive(information - noise)
     wrong = max(_UNEVEN * range_noise, _STEADIEST) / max(np.abs(seconds).max(), _SHORTEST)
-    far = float(np.median(np.sqrt(squared_lengths(rows.points))))
+    far = float(np.median(np.sqrt(squared_norm(rows.points.T))))
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
     # The inverse of information^-1 + limit^-1, without that of the information.
     seen = limit - limit @ np.linalg.inv(information + limit) @ limit

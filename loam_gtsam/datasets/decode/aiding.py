@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
+from loam_gtsam.datasets.decode.tables import rows_in_time
 from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray
 
@@ -174,11 +175,11 @@ def _ascending(stamps: IntArray, topic: str, problems: list[str]) -> IntArray:
     """Rows in order of time, each stamp once."""
     if (np.diff(stamps) < 0).any():
         problems.append(f"{topic}: stamps out of order, sorted")
-    order = np.argsort(stamps, kind="stable")
-    first = np.diff(stamps[order], prepend=-1) > 0 if len(stamps) else np.empty(0, np.bool_)
-    if dropped := len(stamps) - int(first.sum()):
+    order = rows_in_time(stamps)
+    order = order[stamps[order] >= 0]
+    if dropped := len(stamps) - len(order):
         problems.append(f"{topic}: {dropped} messages with a repeated stamp left out")
-    return np.asarray(order[first])
+    return order
 
 
 def describe_fixes(fixes: GnssFixes | None, topic: str) -> str:

@@ -14,7 +14,6 @@ import numpy as np
 
 from loam_gtsam.types import (
     MAX_STAMP,
-    BoolArray,
     DatasetError,
     FloatArray,
     ImuSamples,
@@ -186,17 +185,19 @@ def sorted_trajectory(
     stamps: IntArray, poses: FloatArray, source: str, problems: list[str]
 ) -> Trajectory:
     """Reference poses by time, each time once; what had to be put right goes to ``problems``."""
-    order = np.argsort(stamps, kind="stable")
+    rows = rows_in_time(stamps)
     if (np.diff(stamps) < 0).any():
         problems.append(f"{source}: poses out of order, sorted")
-    first = _later_than_before(stamps[order])
-    if dropped := len(stamps) - int(first.sum()):
+    if dropped := len(stamps) - len(rows):
         problems.append(f"{source}: {dropped} poses with a repeated stamp left out")
-    return Trajectory(stamps[order[first]], poses[order[first]])
+    return Trajectory(stamps[rows], poses[rows])
 
 
-def _later_than_before(stamps: IntArray) -> BoolArray:
-    return np.asarray(np.diff(stamps, prepend=np.iinfo(np.int64).min // 2) > 0)
+def rows_in_time(stamps: IntArray) -> IntArray:
+    """Rows of stamps (N,) in order of time, the first one of each stamp."""
+    order = np.argsort(stamps, kind="stable")
+    later = np.diff(stamps[order], prepend=np.iinfo(np.int64).min // 2) > 0
+    return np.asarray(order[later])
 
 
 def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:
@@ -205,14 +206,12 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     ``values`` (N, 10) are quaternion x y z w (zero where unknown), rad/s, m/s^2.
     """
     keep = np.flatnonzero((np.abs(values) < _ABSURD).all(axis=1))  # NaN compares false
-    order = keep[np.argsort(stamps[keep], kind="stable")]
-    later = _later_than_before(stamps[order])
-    if dropped := len(stamps) - int(later.sum()):
+    order = keep[rows_in_time(stamps[keep])]
+    if dropped := len(stamps) - len(order):
         what = "with NaN, absurd values or a repeated stamp"
         problems.append(f"IMU: {dropped} samples {what} left out")
     if (np.diff(stamps) < 0).any():
         problems.append("IMU: stamps out of order, sorted")
-    order = order[later]
     if len(order) == 0:
         problems.append("IMU: no usable samples")
         return None

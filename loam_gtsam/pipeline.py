@@ -151,7 +151,7 @@ class Pipeline:
     odometry : predicts them; None leaves it to the mapper (constant velocity, IMU)
     faults : what is done about exceptions in parts of a user's own
     loops : keyframes and loops; None if none are looked for
-    places : where the map can be recognised, once it is saved
+    places : where the map can be recognised, once it is saved; keyframes are, if there are any
     earth : where the map is on the earth, by GNSS; None if unknown
     """
 
@@ -267,9 +267,13 @@ class Pipeline:
         return self._with_loops(update, sweep.features)
 
     def _with_loops(self, update: MapUpdate, features: Features) -> MapUpdate:
-        """Show the frame to the places, and to the pose graph, if there is one."""
-        self.places.add(update, self.mapper.registered)
-        if self.loops is None or not update.status.solved:
+        """Show the frame to the pose graph, or to the places if there is none."""
+        if self.loops is None:
+            place = self.places.add(update, self.mapper.registered)
+            if place is not None:
+                self.mapper.keyframe = place
+            return update
+        if not update.status.solved:
             return update
         started = time.perf_counter()
         self.loops.add(update, features)

@@ -171,8 +171,8 @@ def _write(
     write_covariances(folder / LOCALISED_FILES[1], found.solved)
     write_npz(folder / LOCALISED_FILES[2], found.updates)
     write_text(folder / LOCALISED_FILES[3], dump_config(found.config))
-    if saved.earth is not None:
-        write_enu(folder / ENU_FILE, found.trajectory, saved.earth)
+    if saved.frame.earth is not None:
+        write_enu(folder / ENU_FILE, found.trajectory, saved.frame.earth)
     if draws:
         plots.plot_map(folder / "localised.png", *saved.points(), found.trajectory)
     write_json(folder / "summary.json", summary)

@@ -27,7 +27,7 @@ from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
 from loam_gtsam.registration.solvers import GtsamSolver, Solution
 from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full
 _NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
@@ -89,6 +89,108 @@ class LoopStatistics:
     rejected: Counter[Rejection] = field(default_factory=Counter)
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Verified:
+    """A registration that is believed.
+
+    Attributes
+    ----------
+    pose : of the features in the frame of the map they were registered with
+    covariance : (6, 6) of the scan's own error in it
+    fit : of the features off level ground
+    """
+
+    pose: gtsam.Pose3
+    covariance: FloatArray
+    fit: Fit
+
+
+class Verifier:
+    """Registers the features of one place with those of another, and judges what comes of it.
+
+    Parameters
+    ----------
+    config : ``loops``; ``map``, ``matching``, ``solver`` and ``covariance`` for the registration
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._whole, self.config = config, config.loops
+        self._solver = GtsamSolver(config.solver)
+        # A trial only has to come near: a full registration follows the best one.
+        near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
+        self._rough_solver = GtsamSolver(config.solver.changed(**near))
+
+    def verify(
+        self,
+        edges: FloatArray,
+        planes: FloatArray,
+        maps: tuple[CubeMap, CubeMap],
+        known: gtsam.Pose3,
+        *,
+        turn: float = 0.0,
+        usual: float = 1.0,
+        distinct: BoolArray | None = None,
+    ) -> Verified | Rejection:
+        """Register features (E, 3) and (P, 3) in the edge and the plane map of a place.
+
+        Parameters
+        ----------
+        known : pose of the features in the frame of the place, as far as known
+        turn : rad about z by which they are turned against it, to be tried if that does not fit
+        usual : share of such features that has a match where they belong
+        distinct : (E,) see :func:`~loam_gtsam.registration.association.associate`
+        """
+        matching = self._whole.matching
+
+        def matches_at(pose: gtsam.Pose3) -> ScanMatches:
+            return associate(edges, planes, pose, *maps, matching, distinct)
+
+        def fit(found: Solution) -> Fit:
+            offered = _offered(len(edges), len(planes), matching)
+            return _standing_fit(found.matches, offered) if found.solved else Fit(0.0, 0.0)
+
+        solution = self._solver.solve(matches_at, known)
+        if self._judged(fit(solution), usual) is not None:
+            matching = trial_matching(self._whole.matching)
+            # The ground is where it was: height zero, and the tilt that the graph says.
+            matrix = known.rotation().matrix()
+            missing = turn - float(np.arctan2(matrix[1, 0], matrix[0, 0]))
+            turned = gtsam.Rot3.Yaw(missing).compose(known.rotation())
+            start = gtsam.Pose3(turned, np.zeros(3))
+            held = np.concatenate([cubes.points() for cubes in maps])
+            sample = sample_features(edges, planes)
+            around = likely_poses(sample, held, [start], self.config.search, _STARTS)
+            trials = [self._rough_solver.solve(matches_at, pose) for pose in (start, *around)]
+            best = max(trials, key=lambda tried: fit(tried).total)
+            matching = self._whole.matching
+            solution = self._solver.solve(matches_at, best.map_T_lidar)
+        if not solution.solved:
+            return Rejection.FEW_MATCHES
+        final = fit(solution)
+        if (rejection := self._judged(final, usual)) is not None:
+            return rejection
+        covariance = self._covariance(solution)
+        if covariance is None:
+            return Rejection.DEGENERATE
+        return Verified(solution.map_T_lidar, covariance, final)
+
+    def _judged(self, fit: Fit, usual: float) -> Rejection | None:
+        """The reason to reject a registration; None if it is believed."""
+        if fit.share < self.config.min_share * usual:
+            return Rejection.LITTLE_OVERLAP
+        return Rejection.DISAGREES if fit.agreement < self.config.min_agreement else None
+
+    def _covariance(self, solution: Solution) -> FloatArray | None:
+        """(6, 6) of the scan's own error; None if the registration leaves a direction free."""
+        seen = localizability(solution.matches, solution.map_T_lidar)
+        if seen.aligned[0] < self.config.min_aligned:
+            return None
+        config, solver = self._whole.covariance, self._whole.solver
+        ground = SeenGround(config.ground_cell)
+        error = scan_error(solution, solver.kernel_width, ground, config, kernel=solver.kernel)
+        return None if error is None else error.covariance
+
+
 class ScanLoopCloser:
     """Finds loop closures of one pose graph by position, descriptor and registration.
 
@@ -100,10 +202,7 @@ class ScanLoopCloser:
     def __init__(self, config: Config | None = None) -> None:
         self._whole = as_config(config)
         self.config = self._whole.loops
-        self._solver = GtsamSolver(self._whole.solver)
-        # A trial only has to come near: a full registration follows the best one.
-        near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
-        self._rough_solver = GtsamSolver(self._whole.solver.changed(**near))
+        self._verifier = Verifier(self._whole)
         self.reset()
 
     def reset(self) -> None:
@@ -143,43 +242,25 @@ class ScanLoopCloser:
         ``turn`` is the rad about z by which the lidar is turned against the candidate, as far as
         known. Returns the loop closure, or the reason why the registration is not believed.
         """
-        whole, config = self._whole, self.config
-        maps = self._submap(keyframe, candidate, history)
-        features, matching = (keyframe.edges, keyframe.planes), whole.matching
-
-        def matches_at(pose: gtsam.Pose3) -> ScanMatches:
-            return associate(*features, pose, *maps, matching, keyframe.distinct)
-
-        def fit(found: Solution) -> Fit:
-            offered = _offered(len(features[0]), len(features[1]), matching)
-            return _standing_fit(found.matches, offered) if found.solved else Fit(0.0, 0.0)
-
-        known = history.pose(candidate).between(history.pose(keyframe.index))
-        solution = self._solver.solve(matches_at, known)
-        usual = _usual_share(keyframe, whole.matching)
-        if self._judged(fit(solution), usual) is not None:
-            matching = trial_matching(whole.matching)
-            # The ground is where it was: height zero, and the tilt that the graph says.
-            matrix = known.rotation().matrix()
-            missing = turn - float(np.arctan2(matrix[1, 0], matrix[0, 0]))
-            turned = gtsam.Rot3.Yaw(missing).compose(known.rotation())
-            start = gtsam.Pose3(turned, np.zeros(3))
-            held = np.concatenate([cubes.points() for cubes in maps])
-            around = likely_poses(sample_features(*features), held, [start], config.search, _STARTS)
-            trials = [self._rough_solver.solve(matches_at, pose) for pose in (start, *around)]
-            best = max(trials, key=lambda tried: fit(tried).total)
-            matching = whole.matching
-            solution = self._solver.solve(matches_at, best.map_T_lidar)
-        if not solution.solved:
-            return Rejection.FEW_MATCHES
-        final = fit(solution)
-        if (rejection := self._judged(final, usual)) is not None:
-            return rejection
-        covariance = self._covariance(solution, history.keyframe(candidate), keyframe)
-        if covariance is None:
-            return Rejection.DEGENERATE
-        pose = solution.map_T_lidar
-        return LoopClosure(candidate, keyframe.index, pose, covariance, *astuple(final))
+        found = self._verifier.verify(
+            keyframe.edges,
+            keyframe.planes,
+            self._submap(keyframe, candidate, history),
+            history.pose(candidate).between(history.pose(keyframe.index)),
+            turn=turn,
+            usual=_usual_share(keyframe, self._whole.matching),
+            distinct=keyframe.distinct,
+        )
+        if isinstance(found, Rejection):
+            return found
+        covariance = found.covariance
+        # The own error of the candidate displaces the submap, that of the new keyframe comes from
+        # de-skewing its features.
+        earlier, to_later = history.keyframe(candidate), found.pose.inverse().AdjointMap()
+        for one, moved in ((earlier, to_later), (keyframe, np.eye(6))):
+            if one.update.uncertainty is not None:
+                covariance = covariance + moved @ one.update.uncertainty.own @ moved.T
+        return LoopClosure(candidate, keyframe.index, found.pose, covariance, *astuple(found.fit))
 
     def _describe(self, history: PoseGraph) -> None:
         """Compute descriptor and standard deviation of the position of new keyframes."""
@@ -262,33 +343,6 @@ class ScanLoopCloser:
             origins = [np.tile(p[:3, 3], (len(q), 1)) for p, q in zip(poses, parts, strict=True)]
             cubes.insert(np.concatenate(parts), np.concatenate(origins))
         return maps
-
-    def _judged(self, fit: Fit, usual: float) -> Rejection | None:
-        """The reason to reject a registration; None if it is believed."""
-        if fit.share < self.config.min_share * usual:
-            return Rejection.LITTLE_OVERLAP
-        return Rejection.DISAGREES if fit.agreement < self.config.min_agreement else None
-
-    def _covariance(
-        self, solution: Solution, earlier: Keyframe, later: Keyframe
-    ) -> FloatArray | None:
-        """(6, 6) covariance of a loop closure; None if the registration leaves a direction free."""
-        seen = localizability(solution.matches, solution.map_T_lidar)
-        if seen.aligned[0] < self.config.min_aligned:
-            return None
-        config, solver = self._whole.covariance, self._whole.solver
-        ground = SeenGround(config.ground_cell)
-        error = scan_error(solution, solver.kernel_width, ground, config, kernel=solver.kernel)
-        if error is None:
-            return None
-        covariance = error.covariance
-        to_later = solution.map_T_lidar.inverse().AdjointMap()
-        # The own error of the candidate displaces the submap, that of the new keyframe comes from
-        # de-skewing its features.
-        for keyframe, moved in ((earlier, to_later), (later, np.eye(6))):
-            if keyframe.update.uncertainty is not None:
-                covariance = covariance + moved @ keyframe.update.uncertainty.own @ moved.T
-        return covariance
 
 
 def _offered(n_edges: int, n_planes: int, config: MatchingConfig) -> int:

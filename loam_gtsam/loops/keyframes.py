@@ -263,8 +263,13 @@ def odometry_between(
     else:
         back = motion.inverse().AdjointMap()
         covariance = back @ relative_covariance(two.update, one.update) @ back.T
-    walk = np.repeat([np.radians(config.turn_walk_deg), config.walk], 3)
-    return motion, covariance + np.diag(walk**2 * abs(two.travelled - one.travelled))
+    return motion, covariance + walk(abs(two.travelled - one.travelled), config)
+
+
+def walk(way: float, config: PoseGraphConfig) -> FloatArray:
+    """(6, 6) covariance of what the odometry drifts in metres of way and does not know of."""
+    sigmas = np.repeat([np.radians(config.turn_walk_deg), config.walk], 3)
+    return np.diag(sigmas**2 * way)
 
 
 def noise_model(covariance: FloatArray, size: int = 6) -> gtsam.noiseModel.Gaussian:

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config
 from loam_gtsam.geometry import nearest_positive
-from loam_gtsam.loops.keyframes import leads_to_keyframe
+from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe, walk
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.mapper import Registered
+from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import FloatArray, MapUpdate
 
 Descriptor = NDArray[np.float16]
@@ -46,6 +47,8 @@ class Places:
     Attributes
     ----------
     all : the places, in the order in which they were visited
+    links : the motion to each place but the first, from the one before it; where places in between
+        were not kept, from the one there was at the last of them
     """
 
     def __init__(self, config: Config) -> None:
@@ -55,27 +58,48 @@ class Places:
     def reset(self) -> None:
         """Forget all places."""
         self.all: list[Place] = []
-        self._last: gtsam.Pose3 | None = None
+        self.links: list[LoopClosure] = []
+        self._last: tuple[int, MapUpdate, gtsam.Pose3] | None = None
         self._positions = np.empty((0, 3))
 
-    def add(self, update: MapUpdate, registered: Registered | None) -> None:
-        """Add the place of a sweep, if it was solved and is far enough from the last place."""
+    def add(self, update: MapUpdate, registered: Registered | None) -> int | None:
+        """Add the place of a sweep, if it was solved and is far enough from the last place.
+
+        Returns the number of the place at which the lidar has come; None if it has come to none.
+        """
         uncertainty = update.uncertainty
         if uncertainty is None or registered is None or not update.status.solved:
-            return
-        pose = registered.map_T_middle
+            return None
+        pose, last = registered.map_T_middle, self._last
         config = self._config.pose_graph
-        if self._last is not None and not leads_to_keyframe(self._last.between(pose), config):
-            return
-        self._last = pose
+        if last is not None and not leads_to_keyframe(last[2].between(pose), config):
+            return None
         away = np.linalg.norm(self._positions - pose.translation(), axis=1)
-        near = [self.all[i] for i in np.flatnonzero(away < config.keyframe_distance).tolist()]
-        motions = [place.map_T_middle.between(pose) for place in near]
-        if sum(not leads_to_keyframe(motion, config) for motion in motions) > config.visits:
-            return
-        self._positions = np.vstack([self._positions, pose.translation()])
-        points = np.concatenate([registered.edges, registered.planes])
-        descriptor = scan_context(points, self._config.loops).astype(np.float16)
-        to_map = update.map_T_lidar.AdjointMap()
-        of_map = nearest_positive(to_map @ (update.covariance - uncertainty.own) @ to_map.T)
-        self.all.append(Place(update.stamp, pose, of_map, descriptor))
+        there = [
+            number
+            for number in np.flatnonzero(away < config.keyframe_distance).tolist()
+            if not leads_to_keyframe(self.all[number].map_T_middle.between(pose), config)
+        ]
+        if len(there) > config.visits:
+            number = int(min(there, key=away.__getitem__))
+        else:
+            number = len(self.all)
+            self._positions = np.vstack([self._positions, pose.translation()])
+            points = np.concatenate([registered.edges, registered.planes])
+            descriptor = scan_context(points, self._config.loops).astype(np.float16)
+            to_map = update.map_T_lidar.AdjointMap()
+            of_map = nearest_positive(to_map @ (update.covariance - uncertainty.own) @ to_map.T)
+            self.all.append(Place(update.stamp, pose, of_map, descriptor))
+            if last is not None:
+                self.links.append(self._link(last[0], last[1], number, update))
+        self._last = number, update, pose
+        return number
+
+    def _link(self, one: int, before: MapUpdate, two: int, update: MapUpdate) -> LoopClosure:
+        """The motion between two places, at both of which the lidar was."""
+        pose = self.all[two].map_T_middle
+        motion = self.all[one].map_T_middle.between(pose)
+        to_middle = pose.between(update.map_T_lidar).AdjointMap()
+        covariance = to_middle @ relative_covariance(before, update) @ to_middle.T
+        way = before.map_T_lidar.range(update.map_T_lidar)
+        return LoopClosure(one, two, motion, covariance + walk(way, self._config.pose_graph))

@@ -24,9 +24,11 @@ from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
+from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
 from loam_gtsam.maps.map_file import SavedMap, write_map
+from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.pose_errors import relative_covariance
@@ -99,7 +101,7 @@ class Localizer:
     def reset(self) -> None:
         """Forget where the lidar is, and what was added to the map."""
         self._maps = SavedMaps(self.config, self._saved, keep=self._extend)
-        self._places = list(self._saved.places)
+        self._places, self._links = list(self._saved.places), list(self._saved.graph.links)
         self._search()
         self._last: MapUpdate | None = None  # that was solved
         self._seen: MapUpdate | None = None  # the last of some that saw all directions
@@ -137,9 +139,10 @@ class Localizer:
             extraction = extract(sweep, self.config, self._parts.get("features"))
         if self._fixed:
             update = self._tracking.process(sweep, extraction)
+            if self._extend:
+                self._add_places()
             if not self._given_up(update):
                 return self._told(update)
-            self._add_places()
             self._search()
         features = sweep.features if isinstance(sweep, FeatureSweep) else None
         if extraction is not None:
@@ -163,6 +166,7 @@ class Localizer:
     def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:
         """Track from a fix on."""
         self._maps.grows = self._extend
+        self._maps.owners = [self._nearest(fix.map_T_lidar)[0]]
         self._tracking.reset()
         self._tracking.mapper.maps = self._maps
         self._tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
@@ -195,20 +199,30 @@ class Localizer:
 
     def _add_places(self) -> None:
         """Take over places of new ground; the error of the map before is in theirs, too."""
-        if not (self._fixed and self._extend):
-            return
-        least = self.config.pose_graph.keyframe_distance
-        for place in self._tracking.places.all:
+        tracked, owners = self._tracking.places, self._maps.owners
+        for number in range(len(owners), len(tracked.all)):
+            place = tracked.all[number]
             pose = place.map_T_middle
-            if all(pose.range(other.map_T_middle) >= least for other in self._places):
+            near, motion = self._nearest(pose)
+            new = np.linalg.norm(motion.translation()) >= self.config.pose_graph.keyframe_distance
+            owners.append(len(self._places) if new else near)
+            if new:
+                drift = tracked.links[number - 1].covariance
+                self._links.append(LoopClosure(near, owners[-1], motion, drift))
                 covariance = place.covariance + self.map_covariance(pose)
                 self._places.append(replace(place, covariance=covariance))
 
+    def _nearest(self, pose: gtsam.Pose3) -> tuple[int, gtsam.Pose3]:
+        """The nearest place to a pose, with those that were added, and the motion from there."""
+        poses = [place.map_T_middle for place in self._places]
+        near = min(range(len(poses)), key=lambda number: poses[number].range(pose))
+        return near, poses[near].between(pose)
+
     def save(self, path: str | Path) -> None:
         """Write the map with what was added to it; see :func:`~loam_gtsam.maps.save_map`."""
-        self._add_places()
         saved = self._saved
-        write_map(path, self._maps, self._places, saved.config, saved.up, saved.earth)
+        graph = MapGraph(self._places, self._links, saved.graph.loops)
+        write_map(path, self._maps, graph, saved.config, saved.frame)
 
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6, 6) of the saved map's own error at a pose, along its axes, about its origin."""

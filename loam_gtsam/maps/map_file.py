@@ -13,10 +13,10 @@ import json
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,25 +26,44 @@ from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import ConfigError
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
+from loam_gtsam.maps.map_graph import (
+    MapGraph,
+    array_shapes,
+    graph_arrays,
+    graph_of,
+    graph_of_arrays,
+)
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.registration.frame_matcher import MapPair
-from loam_gtsam.types import BoolArray, DatasetError, FloatArray, IntArray, stack_poses
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex
 
 SUFFIX = ".lgmap"
-VERSION = 1
+VERSION = 2
 LAYERS = "edges", "planes", "small_edges", "small_planes"
 _FORMAT = "loam_gtsam map"
-_PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _HEADER = "map.json"
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same map makes the same file
 _POINT = np.dtype([("xyz", "<f8", 3), ("owner", "<i4"), ("view", "i1", 4)])
-"""A map point: metres, the number of its keyframe, from where it was seen (voxels/tags.py)."""
+"""A map point: metres, the number of its place, from where it was seen (voxels/tags.py)."""
 _DAMAGED = (OSError, EOFError, ValueError, KeyError, TypeError, IndexError, MemoryError,
             NotImplementedError, zipfile.BadZipFile, zlib.error)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapFrame:
+    """What is known of the frame of a map.
+
+    Attributes
+    ----------
+    up : (3,) up in the map; None if the run had no IMU that knew
+    earth : where the map is on the earth; None if the run had no GNSS receiver
+    """
+
+    up: FloatArray | None = None
+    earth: GeoReference | None = None
 
 
 def save_map(path: str | Path, pipeline: Pipeline) -> None:
@@ -60,31 +79,42 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
     OutputError
         If the file cannot be written; an old one is then as it was.
     """
-    loops, places = pipeline.loops, pipeline.places.all
-    maps = pipeline.mapper.maps if loops is None else loops.corrected_maps()
-    if loops is not None:
-        places = corrected(places, loops)
     aid = pipeline.mapper.imu
     level = None if aid is None else aid.level
-    up = None if level is None else level.map_up
-    write_map(path, maps, places, pipeline.config, up, pipeline.earth)
+    frame = MapFrame(None if level is None else level.map_up, pipeline.earth)
+    if pipeline.loops is not None:
+        maps, graph = pipeline.loops.corrected_maps(), graph_of(pipeline.loops, pipeline.config)
+        numbers = [keyframe.index for keyframe in pipeline.loops.graph.keyframes]
+        write_map(path, maps, graph, pipeline.config, frame, numbers)
+    else:
+        graph = MapGraph(pipeline.places.all, pipeline.places.links, [])
+        write_map(path, pipeline.mapper.maps, graph, pipeline.config, frame)
 
 
 def write_map(
     path: str | Path,
     maps: MapPair,
-    places: Sequence[Place],
+    graph: MapGraph,
     config: Config,
-    up: FloatArray | None,
-    earth: GeoReference | None = None,
+    frame: MapFrame,
+    numbers: Sequence[int] | None = None,
 ) -> None:
-    """Write maps and places; ``config`` is that of the maps, ``up`` (3,) is up in them, if known.
+    """Write maps and places.
 
-    ``earth`` is where they are on the earth, if that is known.
+    Parameters
+    ----------
+    maps, graph : the points, whose owners are the numbers of the places
+    config : of the maps
+    frame : of both
+    numbers : the owners, in the order of the places, if they are others
 
-    Raises OutputError as :func:`save_map`.
+    Raises
+    ------
+    OutputError
+        As :func:`save_map`.
     """
     contents = {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
+    up, earth = frame.up, frame.earth
     header = {
         "format": _FORMAT,
         "version": VERSION,
@@ -95,7 +125,9 @@ def write_map(
             "enu": None if earth is None else earth.as_dict(),
         },
         "config": dump_config(config),
-        "places": len(places),
+        "places": len(graph.places),
+        "links": len(graph.links),
+        "loops": len(graph.loops),
         "layers": {
             name: [[*index, len(cube.points)] for index, cube in cubes.items()]
             for name, cubes in contents.items()
@@ -103,11 +135,15 @@ def write_map(
     }
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
         _add(archive, _HEADER, json.dumps(header, indent=1).encode())
-        for name, array in _place_arrays(places).items():
-            _add(archive, f"places/{name}.npy", _bytes_of(array))
+        for name, array in graph_arrays(graph).items():
+            _add(archive, f"{name}.npy", _bytes_of(array))
         for name, cubes in contents.items():
             for index, cube in cubes.items():
-                _add(archive, _cube_name(name, index), _bytes_of(_rows(cube)))
+                rows = _rows(cube)
+                if numbers is not None and len(numbers):
+                    at = np.searchsorted(numbers, rows["owner"], "right") - 1
+                    rows["owner"] = np.maximum(at, 0)
+                _add(archive, _cube_name(name, index), _bytes_of(rows))
 
 
 class SavedMap:
@@ -120,10 +156,9 @@ class SavedMap:
     Attributes
     ----------
     config : of the run that made the map
-    places : where the map can be recognised
+    graph : places where the map can be recognised, the motions between them, and loops
     layers : numbers of points by cube, by kind of map (:data:`LAYERS`)
-    up : (3,) up in the map; None if the run had no IMU that knew
-    earth : where the map is on the earth; None if the run had no GNSS receiver
+    frame : what is known of its frame
 
     Raises
     ------
@@ -170,11 +205,15 @@ class SavedMap:
                 }
                 for name in LAYERS
             }
-            up = header["frame"]["up"]
-            self.up = None if up is None else np.array(up, np.float64).reshape(3)
-            enu = header["frame"].get("enu")
-            self.earth = None if enu is None else GeoReference.of_dict(enu)
-            self.places = self._places(int(header["places"]))
+            up, enu = header["frame"]["up"], header["frame"].get("enu")
+            self.frame = MapFrame(
+                None if up is None else np.array(up, np.float64).reshape(3),
+                None if enu is None else GeoReference.of_dict(enu),
+            )
+            sizes = {name: int(header[name]) for name in ("places", "links", "loops")}
+            shapes = array_shapes(sizes, self.config.loops)
+            arrays = {name: self._array(f"{name}.npy", *how) for name, how in shapes.items()}
+            self.graph = graph_of_arrays(arrays)
         except (*_DAMAGED, ConfigError) as error:
             raise self._damaged(_HEADER, error) from error
         names = set(self._archive.namelist())
@@ -196,6 +235,11 @@ class SavedMap:
     def __len__(self) -> int:
         """Number of points, those of small places counted once more."""
         return sum(sum(cubes.values()) for cubes in self.layers.values())
+
+    @property
+    def places(self) -> Sequence[Place]:
+        """Where the map can be recognised."""
+        return self.graph.places
 
     def cube(self, layer: str, index: CubeIndex) -> CubePoints:
         """Read a cube.
@@ -248,27 +292,13 @@ class SavedMap:
         }
         with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
             _add(archive, _HEADER, json.dumps(header, indent=1).encode())
-            for name in _PLACES:
-                _add(archive, f"places/{name}.npy", self._read(f"places/{name}.npy"))
+            for name in graph_arrays(self.graph):
+                _add(archive, f"{name}.npy", self._read(f"{name}.npy"))
             for layer, cubes in header["layers"].items():
                 for *cube, _ in cubes:
                     index = (cube[0], cube[1], cube[2])
                     rows = _rows(self.cube(layer, index).chosen(keep[layer][index]))
                     _add(archive, _cube_name(layer, index), _bytes_of(rows))
-
-    def _places(self, count: int) -> list[Place]:
-        rings, sectors = self.config.loops.rings, self.config.loops.sectors
-        shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
-            "stamps": (np.dtype("<i8"), (count,)),
-            "map_T_middle": (np.dtype("<f8"), (count, 4, 4)),
-            "covariances": (np.dtype("<f8"), (count, 6, 6)),
-            "descriptors": (np.dtype("<f2"), (count, rings, sectors)),
-        }
-        columns = [self._array(f"places/{name}.npy", *how) for name, how in shapes.items()]
-        return [
-            Place(int(stamp), gtsam.Pose3(pose), covariance, descriptor)
-            for stamp, pose, covariance, descriptor in zip(*columns, strict=True)
-        ]
 
     def _array(self, name: str, kind: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         array = np.load(io.BytesIO(self._read(name)), allow_pickle=False)
@@ -288,35 +318,6 @@ class SavedMap:
             f"{self.path}: the map is damaged: {name}: {told[:200]}; copy the file again, or run "
             "the data again"
         )
-
-
-def corrected(places: list[Place], loops: LoopMapping) -> list[Place]:
-    """The places that are keyframes, where the graph has them, with its covariances."""
-    of_stamp = {place.stamp: place for place in places}
-    found = []
-    for keyframe in loops.graph.keyframes:
-        place = of_stamp.get(keyframe.stamp)
-        if place is None:
-            continue
-        pose = loops.graph.pose(keyframe.index)
-        moved = pose.compose(keyframe.odom_T_lidar.inverse())
-        to_map = pose.AdjointMap()
-        covariance = to_map @ loops.graph.covariance(keyframe.index) @ to_map.T
-        middle = moved.compose(place.map_T_middle)
-        found.append(Place(place.stamp, middle, covariance, place.descriptor))
-    return found
-
-
-def _place_arrays(places: Sequence[Place]) -> dict[str, NDArray[Any]]:
-    poses = stack_poses(place.map_T_middle for place in places)
-    stamps: IntArray = np.array([place.stamp for place in places], np.int64)
-    covariances: FloatArray = np.array([p.covariance for p in places], np.float64)
-    return {
-        "stamps": stamps,
-        "map_T_middle": poses,
-        "covariances": covariances.reshape(-1, 6, 6),
-        "descriptors": np.array([place.descriptor for place in places], np.float16),
-    }
 
 
 def _rows(cube: CubePoints) -> NDArray[Any]:

@@ -78,6 +78,7 @@ class SavedMaps(MapPair):
     Attributes
     ----------
     grows : whether sweeps go into the maps now; off until it is set
+    owners : numbers of the places of the map at which those of the drive are
     """
 
     given = True
@@ -85,6 +86,7 @@ class SavedMaps(MapPair):
     def __init__(self, config: Config, saved: SavedMap, *, keep: bool = False) -> None:
         self._saved, self._keep = saved, keep
         self.grows = False
+        self.owners = [0]
         super().__init__(config)
 
     def clear(self) -> None:
@@ -107,7 +109,7 @@ class SavedMaps(MapPair):
     ) -> None:
         """Add a sweep, if the map grows."""
         if self.grows:
-            super().insert(posed, map_T_middle, keyframe, matches)
+            super().insert(posed, map_T_middle, self.owners[keyframe], matches)
 
     def move(self, *_: object) -> int:
         """Nothing: the map stays where it is."""

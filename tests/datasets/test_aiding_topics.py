@@ -91,10 +91,10 @@ def test_a_run_with_gnss_places_its_map_on_the_earth(tmp_path):
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     enu = summary["gnss"]["enu"]
     with SavedMap(tmp_path / "out" / "map.lgmap") as saved:
-        assert saved.earth is not None
-        assert saved.earth.as_dict() == enu
+        assert saved.frame.earth is not None
+        assert saved.frame.earth.as_dict() == enu
         # x of the map is north there.
-        assert saved.earth.heading_deg == pytest.approx(90.0, abs=2.0)
+        assert saved.frame.earth.heading_deg == pytest.approx(90.0, abs=2.0)
     first = (tmp_path / "out" / "trajectory_enu.tum").read_text().splitlines()[0]
     assert first.startswith(f"# origin: latitude {enu['latitude_deg']:.9f}")
     plain = loam("run", path, "--wheels", "--output", tmp_path / "no", "--frames", 2)

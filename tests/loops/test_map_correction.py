@@ -12,9 +12,8 @@ from loam_gtsam.datasets import open_dataset
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.map_correction import LoopMapping
-from loam_gtsam.loops.places import Place
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.maps.map_file import corrected
+from loam_gtsam.maps.map_graph import graph_arrays, graph_of, graph_of_arrays
 from loam_gtsam.pipeline import Pipeline, imu_buffer
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import InputError
@@ -87,18 +86,25 @@ def test_the_map_follows_its_keyframes():
     assert after < 0.5 * before
 
 
-def test_saved_places_are_where_the_graph_has_them():
+def test_places_and_motions_of_a_saved_map_are_those_of_the_graph():
     _, loops, _ = driven(first=30)
-    descriptor = np.zeros((2, 3), np.float16)
-    chosen = loops.graph.keyframes[::5]
-    places = [Place(k.stamp, k.odom_T_lidar, np.eye(6), descriptor) for k in chosen]
-    unknown = Place(-1, chosen[0].odom_T_lidar, np.eye(6), descriptor)  # no keyframe
-    for place, keyframe in zip(corrected([unknown, *places], loops), chosen, strict=True):
+    saved = graph_of(loops, Config())
+    for place, keyframe in zip(saved.places, loops.graph.keyframes, strict=True):
         pose = loops.graph.pose(keyframe.index)
         np.testing.assert_allclose(place.map_T_middle.matrix(), pose.matrix(), atol=1e-9)
         back = pose.inverse().AdjointMap()
         told = back @ place.covariance @ back.T
         np.testing.assert_allclose(told, loops.graph.covariance(keyframe.index), atol=1e-9)
+    assert [(link.earlier, link.later) for link in saved.links] == [
+        (number, number + 1) for number in range(len(POSES) - 1)
+    ]
+    assert [(one.earlier, one.later) for one in saved.loops] == [
+        (one.earlier, one.later) for one in loops.graph.loops
+    ]
+    again = graph_of_arrays(graph_arrays(saved))
+    for one, other in zip([*saved.links, *saved.loops], [*again.links, *again.loops], strict=True):
+        np.testing.assert_array_equal(one.covariance, other.covariance)
+        assert one.earlier_T_later.equals(other.earlier_T_later, 1e-12)
 
 
 def test_the_newest_keyframe_and_its_points_stay():

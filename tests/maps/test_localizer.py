@@ -21,6 +21,7 @@ from loam_gtsam.maps.first_fix import Candidate
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, Hypothesis
 from loam_gtsam.maps.localizer import Localizer, localise
 from loam_gtsam.maps.map_file import SavedMap, save_map
+from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.types import BadSweep, ConfigError, FrameStatus, InputError, MapUpdate
@@ -203,6 +204,15 @@ def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path):
                     assert old <= new  # no point is moved or lost
             assert len(larger.places) > len(saved.places)
             added = larger.places[len(saved.places) :]
+            ends = [link.later for link in larger.graph.links]
+            assert ends == list(range(1, len(larger.places)))  # each hangs on an earlier one
+            owners = {
+                int(owner)
+                for layer, cubes in larger.layers.items()
+                for index in cubes
+                for owner in np.unique(larger.cube(layer, index).tags[:, 0])
+            }
+            assert max(owners) in range(len(saved.places), len(larger.places))
             for place in added:
                 here = place.map_T_middle.inverse().AdjointMap()
                 errors_of = [here @ p.covariance @ here.T for p in (saved.places[-1], place)]
@@ -231,7 +241,7 @@ def test_parts_that_do_not_go_together_are_refused_at_once(mapped, saved):
 
 
 def test_a_map_without_places_is_refused(saved):
-    saved.places = []
+    saved.graph = MapGraph([], [], [])
     with pytest.raises(InputError, match="no places"):
         Localizer(saved)
 

@@ -35,8 +35,15 @@ def test_all_of_a_map_comes_back(mapped, saved):
         np.testing.assert_allclose(read.map_T_middle.matrix(), place.map_T_middle.matrix())
         np.testing.assert_array_equal(read.covariance, place.covariance)
         np.testing.assert_array_equal(read.descriptor, place.descriptor)
-    assert saved.up is not None
-    assert abs(np.linalg.norm(saved.up) - 1.0) < 1e-9
+    assert len(saved.graph.links) == len(saved.places) - 1
+    for read, link in zip(saved.graph.links, pipeline.places.links, strict=True):
+        assert (read.earlier, read.later) == (link.earlier, link.later)
+        np.testing.assert_allclose(read.earlier_T_later.matrix(), link.earlier_T_later.matrix())
+        np.testing.assert_array_equal(read.covariance, link.covariance)
+        assert np.linalg.eigvalsh(read.covariance)[0] > 0.0
+    assert saved.graph.loops == []
+    assert saved.frame.up is not None
+    assert abs(np.linalg.norm(saved.frame.up) - 1.0) < 1e-9
     assert len(saved) > 1000
 
 
@@ -126,6 +133,7 @@ WRONG = {
     "places/stamps": without("places/stamps"),
     "missing": without("cubes/planes"),
     "got (3,)": array_of("places/stamps.npy", np.zeros(3, np.int64)),
+    "numbers of the": array_of("links/ends.npy", np.full((3, 2), 99)),
     "places/covariances": array_of("places/covariances.npy", np.zeros((2, 6, 6), np.float32)),
     "pickle": array_of("places/stamps.npy", np.array([{}, {}], object)),
     "there is no 'edges'": header_with(layers={}),

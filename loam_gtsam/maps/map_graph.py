@@ -1,0 +1,158 @@
+"""The pose graph of a saved map: its places, the motions between them, and loop closures.
+
+In a file the motions are arrays. Other factors than motions, as the fixes of a GNSS receiver, are
+not in it; what they did to the poses is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from loam_gtsam.config import Config, LoopConfig
+from loam_gtsam.geometry import symmetric, transform
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_number
+from loam_gtsam.loops.map_correction import LoopMapping
+from loam_gtsam.loops.places import Place
+from loam_gtsam.loops.scan_context import scan_context
+from loam_gtsam.types import FloatArray, stack_poses
+
+_PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
+_MOTIONS = "ends", "motions", "covariances"
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MapGraph:
+    """Places of a map, by their numbers, and what leads from one to another.
+
+    Attributes
+    ----------
+    places : where the map can be recognised
+    links : motions along the runs, from place to place; one that no link leads to begins a run
+    loops : loop closures that were used
+    """
+
+    places: Sequence[Place]
+    links: Sequence[LoopClosure]
+    loops: Sequence[LoopClosure]
+
+
+def graph_of(mapping: LoopMapping, config: Config) -> MapGraph:
+    """The keyframes of a run with loops as places, where its graph has them."""
+    graph = mapping.graph
+    places, moves = [], {}
+    for number, keyframe in enumerate(graph.keyframes):
+        pose = graph.pose(keyframe.index)
+        move = _to_middle(keyframe)
+        to_map = pose.AdjointMap()
+        covariance = symmetric(to_map @ graph.covariance(keyframe.index) @ to_map.T)
+        points = np.concatenate([keyframe.edges, keyframe.planes])
+        seen = transform(move.inverse().matrix(), points)
+        descriptor = scan_context(seen, config.loops).astype(np.float16)
+        places.append(Place(keyframe.stamp, pose.compose(move), covariance, descriptor))
+        moves[keyframe.index] = number, move
+    factors = graph.saved().factors
+    links = []
+    for place in range(factors.size() - len(graph.loops)):
+        factor: Any = factors.at(place)
+        if not isinstance(factor, gtsam.BetweenFactorPose3):
+            continue
+        (one, two), noise = map(pose_number, factor.keys()), factor.noiseModel()
+        if one in moves and two in moves and isinstance(noise, gtsam.noiseModel.Gaussian):
+            motion = LoopClosure(one, two, factor.measured(), noise.covariance())
+            links.append(_between_middles(motion, moves))
+    active = zip(graph.loops, graph.active, strict=True)
+    loops = [_between_middles(loop, moves) for loop, on in active if on]
+    return MapGraph(places, links, loops)
+
+
+def _to_middle(keyframe: Keyframe) -> gtsam.Pose3:
+    """The middle of the sweep of a keyframe, seen from its reference time."""
+    middle = keyframe.update.map_T_middle
+    return gtsam.Pose3() if middle is None else keyframe.odom_T_lidar.between(middle)
+
+
+def _between_middles(
+    motion: LoopClosure, moves: Mapping[int, tuple[int, gtsam.Pose3]]
+) -> LoopClosure:
+    """A motion between keyframes as one between the middles of their sweeps."""
+    (one, first), (two, second) = moves[motion.earlier], moves[motion.later]
+    moved = first.between(motion.earlier_T_later).compose(second)
+    back = second.inverse().AdjointMap()
+    covariance = symmetric(back @ motion.covariance @ back.T)
+    return LoopClosure(one, two, moved, covariance, motion.share, motion.agreement)
+
+
+def array_shapes(
+    sizes: Mapping[str, int], config: LoopConfig
+) -> dict[str, tuple[np.dtype[Any], tuple[int, ...]]]:
+    """Types and shapes of the arrays of a graph, by name, from the numbers of its parts."""
+    whole, real = np.dtype("<i8"), np.dtype("<f8")
+    places = sizes["places"]
+    shapes: dict[str, tuple[np.dtype[Any], tuple[int, ...]]] = {
+        "places/stamps": (whole, (places,)),
+        "places/map_T_middle": (real, (places, 4, 4)),
+        "places/covariances": (real, (places, 6, 6)),
+        "places/descriptors": (np.dtype("<f2"), (places, config.rings, config.sectors)),
+    }
+    for kind, count in sizes.items():
+        if kind == "places":
+            continue
+        shapes |= {
+            f"{kind}/ends": (whole, (count, 2)),
+            f"{kind}/motions": (real, (count, 4, 4)),
+            f"{kind}/covariances": (real, (count, 6, 6)),
+        }
+    return shapes
+
+
+def graph_arrays(graph: MapGraph) -> dict[str, NDArray[Any]]:
+    """A graph as arrays, by name; see :func:`array_shapes`."""
+    places = graph.places
+    arrays: dict[str, NDArray[Any]] = {
+        "places/stamps": np.array([place.stamp for place in places], np.int64),
+        "places/map_T_middle": stack_poses(place.map_T_middle for place in places),
+        "places/covariances": _matrices([place.covariance for place in places]),
+        "places/descriptors": np.array([place.descriptor for place in places], np.float16),
+    }
+    for kind, motions in (("links", graph.links), ("loops", graph.loops)):
+        ends = np.array([(one.earlier, one.later) for one in motions], np.int64)
+        arrays |= {
+            f"{kind}/ends": ends.reshape(-1, 2),
+            f"{kind}/motions": stack_poses(one.earlier_T_later for one in motions),
+            f"{kind}/covariances": _matrices([one.covariance for one in motions]),
+        }
+    return arrays
+
+
+def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
+    """The graph of arrays.
+
+    Raises
+    ------
+    ValueError
+        If a motion is between places that there are not.
+    """
+    columns = (arrays[f"places/{name}"] for name in _PLACES)
+    places = [
+        Place(int(stamp), gtsam.Pose3(pose), covariance, descriptor)
+        for stamp, pose, covariance, descriptor in zip(*columns, strict=True)
+    ]
+    found = []
+    for kind in ("links", "loops"):
+        ends, motions, covariances = (arrays[f"{kind}/{name}"] for name in _MOTIONS)
+        if ((ends < 0) | (ends >= len(places))).any():
+            raise ValueError(f"{kind}/ends.npy: expected numbers of the {len(places)} places")
+        rows = zip(*ends.T.tolist(), map(gtsam.Pose3, motions), covariances, strict=True)
+        found.append([LoopClosure(*row) for row in rows])
+    links, loops = found
+    return MapGraph(places, links, loops)
+
+
+def _matrices(given: Sequence[FloatArray]) -> FloatArray:
+    return np.array(given, np.float64).reshape(-1, 6, 6)

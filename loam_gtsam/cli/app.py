@@ -18,6 +18,7 @@ from loam_gtsam.cli.options import (
     DemoOptions,
     InspectOptions,
     LocaliseOptions,
+    MergeOptions,
     OptimizeOptions,
     RefineOptions,
     RunOptions,
@@ -156,6 +157,19 @@ def localise(options: LocaliseOptions) -> int:
     from loam_gtsam.cli.saved import localise_in_map
 
     return localise_in_map(options)
+
+
+@app.command(short_help="Join the maps of several runs.")
+@command
+def merge(options: MergeOptions) -> int:
+    """Join the maps of several runs that have places in common: one frame, one pose graph, one map.
+
+    No data are read again. The frame is that of the first. Exits with 1, and writes nothing, if a
+    map has no place in common with the others.
+    """
+    from loam_gtsam.cli.merge import execute
+
+    return execute(options)
 
 
 @app.command(short_help="Adjust planes and poses of a finished run.")

@@ -174,6 +174,12 @@ class Verifier:
             return Rejection.DEGENERATE
         return Verified(solution.map_T_lidar, covariance, final)
 
+    def share(self, edges: FloatArray, planes: FloatArray, maps: tuple[CubeMap, CubeMap]) -> float:
+        """Share of features off level ground that have a match in the maps as they are."""
+        matches = associate(edges, planes, gtsam.Pose3(), *maps, self._whole.matching)
+        offered = _offered(len(edges), len(planes), self._whole.matching)
+        return _standing_fit(matches, offered).share
+
     def _judged(self, fit: Fit, usual: float) -> Rejection | None:
         """The reason to reject a registration; None if it is believed."""
         if fit.share < self.config.min_share * usual:

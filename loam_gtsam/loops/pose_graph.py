@@ -179,16 +179,7 @@ class PoseGraph(FactorGraph):
         updates : frames of the run that the keyframes are of; those with a bad stamp are left out
         session : number of the run, see :meth:`new_session`
         """
-        known = _corrections(self, session)
-        good = [update for update in updates if update.status.has_pose]
-        stamps = np.array([update.stamp for update in good], np.int64)
-        starts = np.array([start for start, _ in known], np.int64)
-        nexts = np.searchsorted(starts, stamps, side="right").tolist()
-        poses = [
-            _corrected(update, known[max(after - 1, 0) : after + 1])
-            for update, after in zip(good, nexts, strict=True)
-        ]
-        return Trajectory.from_poses(stamps, poses)
+        return corrected_trajectory(updates, _corrections(self, session))
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane features of all keyframes in the map, (E, 3) and (P, 3) metres."""
@@ -296,6 +287,21 @@ def _corrections(graph: PoseGraph, session: int) -> list[tuple[int, gtsam.Pose3]
         if f.session == session
     ]
     return sorted(known, key=lambda one: one[0])
+
+
+def corrected_trajectory(
+    updates: Sequence[MapUpdate], known: Sequence[tuple[int, gtsam.Pose3]]
+) -> Trajectory:
+    """The frames of a run where ``known`` has them: stamps in order, and ``map_T_odom`` at each."""
+    good = [update for update in updates if update.status.has_pose]
+    stamps = np.array([update.stamp for update in good], np.int64)
+    starts = np.array([start for start, _ in known], np.int64)
+    nexts = np.searchsorted(starts, stamps, side="right").tolist()
+    poses = [
+        _corrected(update, known[max(after - 1, 0) : after + 1])
+        for update, after in zip(good, nexts, strict=True)
+    ]
+    return Trajectory.from_poses(stamps, poses)
 
 
 def _corrected(update: MapUpdate, around: Sequence[tuple[int, gtsam.Pose3]]) -> gtsam.Pose3:

@@ -7,3 +7,5 @@ from loam_gtsam.maps.localizer import localise as localise
 from loam_gtsam.maps.localizer import own_settings as own_settings
 from loam_gtsam.maps.map_file import SavedMap as SavedMap
 from loam_gtsam.maps.map_file import save_map as save_map
+from loam_gtsam.maps.merging import MergedMaps as MergedMaps
+from loam_gtsam.maps.merging import merge_maps as merge_maps

@@ -27,7 +27,7 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
-from loam_gtsam.maps.map_file import SavedMap, write_map
+from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
@@ -222,7 +222,7 @@ class Localizer:
         """Write the map with what was added to it; see :func:`~loam_gtsam.maps.save_map`."""
         saved = self._saved
         graph = MapGraph(self._places, self._links, saved.graph.loops)
-        write_map(path, self._maps, graph, saved.config, saved.frame)
+        write_map(path, whole(self._maps), graph, saved.config, saved.frame)
 
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6, 6) of the saved map's own error at a pose, along its axes, about its origin."""

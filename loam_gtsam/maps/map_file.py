@@ -20,8 +20,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, dump_config
+from loam_gtsam.config import Config, MapConfig, dump_config
 from loam_gtsam.config.tree import parse_config
+from loam_gtsam.cubemap import Contents
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import ConfigError
 from loam_gtsam.io.atomic import atomic_file
@@ -38,7 +39,7 @@ from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.types import BoolArray, DatasetError, FloatArray
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
-from loam_gtsam.voxels.grid import CubeIndex
+from loam_gtsam.voxels.grid import CubeIndex, Grid
 
 SUFFIX = ".lgmap"
 VERSION = 2
@@ -83,27 +84,44 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
     level = None if aid is None else aid.level
     frame = MapFrame(None if level is None else level.map_up, pipeline.earth)
     if pipeline.loops is not None:
-        maps, graph = pipeline.loops.corrected_maps(), graph_of(pipeline.loops, pipeline.config)
+        points = whole(pipeline.loops.corrected_maps())
+        graph = graph_of(pipeline.loops, pipeline.config)
         numbers = [keyframe.index for keyframe in pipeline.loops.graph.keyframes]
-        write_map(path, maps, graph, pipeline.config, frame, numbers)
+        write_map(path, points, graph, pipeline.config, frame, numbers)
     else:
         graph = MapGraph(pipeline.places.all, pipeline.places.links, [])
-        write_map(path, pipeline.mapper.maps, graph, pipeline.config, frame)
+        write_map(path, whole(pipeline.mapper.maps), graph, pipeline.config, frame)
+
+
+def grids(config: Config) -> dict[str, Grid]:
+    """Cubes and voxels of the maps, by layer."""
+    sizes = [grid for place in (config, config.of_small_places()) for grid in _grids(place.map)]
+    return dict(zip(LAYERS, sizes, strict=True))
+
+
+def _grids(config: MapConfig) -> tuple[Grid, Grid]:
+    return Grid(config.cube_size, config.edge_voxel), Grid(config.cube_size, config.plane_voxel)
+
+
+def whole(maps: MapPair) -> dict[str, Contents]:
+    """All points of maps, by layer and cube."""
+    return {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
 
 
 def write_map(
     path: str | Path,
-    maps: MapPair,
+    contents: Mapping[str, Contents],
     graph: MapGraph,
     config: Config,
     frame: MapFrame,
     numbers: Sequence[int] | None = None,
 ) -> None:
-    """Write maps and places.
+    """Write points and places.
 
     Parameters
     ----------
-    maps, graph : the points, whose owners are the numbers of the places
+    contents : points by layer (:data:`LAYERS`) and cube, whose owners are numbers of places
+    graph : the places
     config : of the maps
     frame : of both
     numbers : the owners, in the order of the places, if they are others
@@ -113,7 +131,6 @@ def write_map(
     OutputError
         As :func:`save_map`.
     """
-    contents = {name: cubes.contents(archived=True) for name, cubes in maps.layers().items()}
     up, earth = frame.up, frame.earth
     header = {
         "format": _FORMAT,

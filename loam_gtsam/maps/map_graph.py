@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, LoopConfig
 from loam_gtsam.geometry import symmetric, transform
-from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_number
+from loam_gtsam.loops.batch import SavedGraph
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key, pose_number
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import scan_context
@@ -40,6 +41,16 @@ class MapGraph:
     places: Sequence[Place]
     links: Sequence[LoopClosure]
     loops: Sequence[LoopClosure]
+
+    def saved(self) -> SavedGraph:
+        """As it is written to other files, and optimised: links, then loops."""
+        factors, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        for motion in (*self.links, *self.loops):
+            factors.add(motion.factor())
+        for number, place in enumerate(self.places):
+            poses.insert(pose_key(number), place.map_T_middle)
+        stamps = {pose_key(number): place.stamp for number, place in enumerate(self.places)}
+        return SavedGraph(factors, poses, stamps)
 
 
 def graph_of(mapping: LoopMapping, config: Config) -> MapGraph:

@@ -7,7 +7,7 @@ import gtsam
 from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import PosedSweep
-from loam_gtsam.maps.map_file import LAYERS, SavedMap
+from loam_gtsam.maps.map_file import SavedMap, grids
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.voxels.archive import Archive
@@ -92,11 +92,10 @@ class SavedMaps(MapPair):
     def clear(self) -> None:
         """Read anew what is needed."""
         maps = []
-        for layer, config in zip(LAYERS, [c for c in self._configs for _ in "ep"], strict=True):
-            size = config.map.edge_voxel if layer.endswith("edges") else config.map.plane_voxel
-            grid = Grid(config.map.cube_size, size)
+        for number, (layer, grid) in enumerate(grids(self._configs[0]).items()):
             archive = SavedCubes(grid, self._saved, layer, keep=self._keep)
-            maps.append(CubeMap(config.map, size, archive if len(archive) else None))
+            config = self._configs[number // 2].map
+            maps.append(CubeMap(config, grid.voxel_size, archive if len(archive) else None))
         self._open, self._small = (maps[0], maps[1]), (maps[2], maps[3])
         self._thinned = None
 

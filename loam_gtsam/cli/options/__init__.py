@@ -5,6 +5,7 @@ from loam_gtsam.cli.options.commands import CompareOptions as CompareOptions
 from loam_gtsam.cli.options.commands import ConfigOptions as ConfigOptions
 from loam_gtsam.cli.options.commands import DemoOptions as DemoOptions
 from loam_gtsam.cli.options.commands import LocaliseOptions as LocaliseOptions
+from loam_gtsam.cli.options.commands import MergeOptions as MergeOptions
 from loam_gtsam.cli.options.commands import OptimizeOptions as OptimizeOptions
 from loam_gtsam.cli.options.commands import RefineOptions as RefineOptions
 from loam_gtsam.cli.options.commands import RunOptions as RunOptions

@@ -128,6 +128,15 @@ class LocaliseOptions(OutputOptions, PartOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class MergeOptions(OutputOptions):
+    """Options of ``merge``."""
+
+    maps: list[Path] = argument(
+        "MAP...", "Two or more folders with the results of runs, or maps (.lgmap) alone."
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
 class CompareOptions(OutputOptions, SourceOptions):
     """Options of ``compare``."""
 

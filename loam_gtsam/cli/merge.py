@@ -1,0 +1,104 @@
+"""The command ``merge``: maps of finished runs become one."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from loam_gtsam.cli import console
+from loam_gtsam.cli.options import MergeOptions
+from loam_gtsam.cli.results import MAP_FILE
+from loam_gtsam.io.atomic import write_json
+from loam_gtsam.io.read_run import read_updates
+from loam_gtsam.io.run_files import write_ply
+from loam_gtsam.io.trajectories import write_tum
+from loam_gtsam.loops.files import write_graph
+from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.maps.merging import MergedMaps, merge_maps
+from loam_gtsam.types import MapUpdate, Trajectory
+from loam_gtsam.view import plots
+
+GRAPH_FILE, PLOT_FILE = "pose_graph.g2o", "merged.png"
+
+
+def execute(options: MergeOptions) -> int:
+    """Merge maps; returns the exit code."""
+    paths = [path / MAP_FILE if path.is_dir() else path for path in options.maps]
+    names = [f"trajectory_{number}.tum" for number in range(1, len(paths) + 1)]
+    known = (MAP_FILE, "map.ply", *names, GRAPH_FILE, PLOT_FILE, "summary.json")
+    draws, started = console.draws_pictures(options.plot), time.perf_counter()
+    wanted = options.output or Path("loam_gtsam_output") / "merged"
+    with ExitStack() as stack:
+        maps = [stack.enter_context(SavedMap(path)) for path in paths]
+        updates = [_frames(path, saved) for path, saved in zip(paths, maps, strict=True)]
+        report: dict[str, Any] = {}
+
+        def write(target: Path) -> list[str]:
+            merged = _merge(maps, target / MAP_FILE, quiet=options.quiet)
+            ways = [merged.trajectory(*numbered) for numbered in enumerate(updates)]
+            for name, way in zip(names, ways, strict=True):
+                write_tum(target / name, way, comments={"frame": f"of {paths[0]}"})
+            write_graph(target / GRAPH_FILE, merged.graph.saved())
+            with SavedMap(target / MAP_FILE) as whole:
+                write_ply(target / "map.ply", *whole.points())
+            if draws:
+                labels = [f"{number}: {path}" for number, path in enumerate(options.maps, 1)]
+                plots.plot_trajectories(target / PLOT_FILE, dict(zip(labels, ways, strict=True)))
+            report.update(_summary(paths, merged, ways, time.perf_counter() - started))
+            write_json(target / "summary.json", report)
+            return [name for name in known if (target / name).exists()]
+
+        with console.output_folder(wanted, known, overwrite=options.overwrite) as folder:
+            files = console.write_results(folder, known, "summary.json", write)
+    if not options.quiet:
+        Console().print(_table(report))
+        typer.echo(f"Written to {folder}: {', '.join(files)}")
+    return 0
+
+
+def _frames(path: Path, saved: SavedMap) -> list[MapUpdate] | None:
+    """Frames of the run that made a map, if they are beside it and the map is of one run."""
+    beside = path.with_name("run.npz")
+    one_run = len(saved.graph.links) == len(saved.places) - 1
+    updates = read_updates(beside) if one_run and beside.exists() else []
+    stamps = {update.stamp for update in updates}
+    return updates if any(place.stamp in stamps for place in saved.places) else None
+
+
+def _merge(maps: Sequence[SavedMap], path: Path, *, quiet: bool) -> MergedMaps:
+    total = sum(len(saved.places) for saved in maps)
+    with console.progress_bar("places", total, quiet=quiet) as show:
+        return merge_maps(maps, path, on_place=lambda done, of: show(done * total // of, ""))
+
+
+def _summary(
+    paths: Sequence[Path], merged: MergedMaps, ways: Sequence[Trajectory], seconds: float
+) -> dict[str, Any]:
+    maps = []
+    for number, (path, way) in enumerate(zip(paths, ways, strict=True)):
+        loops = {str(paths[sum(pair) - number]): count
+                 for pair, count in merged.ties.items() if number in pair}  # fmt: skip
+        places = len(merged.places(number))
+        maps.append({"map": str(path), "places": places, "path_length_m": way.path_length,
+                     "loops": loops})  # fmt: skip
+    return {
+        "maps": maps,
+        "loops_between_maps": sum(merged.ties.values()),
+        "loops_not_used": merged.unused,
+        "seconds": seconds,
+    }
+
+
+def _table(report: dict[str, Any]) -> Table:
+    table = Table("map", "places", "way", "loops with the others", box=None)
+    for row in report["maps"]:
+        loops = ", ".join(f"{count} with {path}" for path, count in row["loops"].items())
+        table.add_row(row["map"], str(row["places"]), f"{row['path_length_m']:.0f} m", loops)
+    return table

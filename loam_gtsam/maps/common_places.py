@@ -1,0 +1,240 @@
+"""Common places of saved maps: what is seen from a place of one, found in the others.
+
+No sweeps are read: what a lidar would see at a place is cut out of the map around it, and
+registered with what is around a place of another map that looks alike.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import astuple
+from functools import lru_cache
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+from scipy.spatial import cKDTree
+
+from loam_gtsam.config import Config
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.geometry import inverse_pose, nearest_positive, squared_norm, symmetric, transform
+from loam_gtsam.loops.closure import Rejection, Verifier
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, walk
+from loam_gtsam.loops.loop_selection import consistent, consistent_set
+from loam_gtsam.loops.places import Place
+from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key
+from loam_gtsam.maps.map_file import LAYERS, SavedMap
+from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate, Uncertainty
+from loam_gtsam.voxels.cubes import CubePoints, joined
+from loam_gtsam.voxels.tags import views
+
+LEAST = 3
+"""Loop closures that agree with each other, below which two maps have no place in common."""
+_RIVAL = 0.5
+"""Share of these that loop closures which lead elsewhere may reach."""
+_APART = 3.0  # keyframe distances between the places that are looked for
+_ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
+_SIGHT = 0.5  # of the reach of the descriptors: what is looked for around a place
+_SAME_SIDE = 0.5  # cosine between the views of a point from where it was seen and from a place
+_CUBES, _SUBMAPS = 64, 32  # that are kept
+
+
+class Sight(NamedTuple):
+    """Edges (E, 3) and planes (P, 3) of a map around a place, seen from it, in its frame."""
+
+    edges: FloatArray
+    planes: FloatArray
+    seen_from: FloatArray  # (P, 3) in the direction from which the planes were seen
+
+
+class Surroundings:
+    """What is around the places of a saved map."""
+
+    def __init__(self, saved: SavedMap) -> None:
+        self._saved = saved
+        self._cube = lru_cache(_CUBES)(saved.cube)
+
+    def around(self, place: Place, radius: float) -> Sight:
+        """The points of the map within metres of a place."""
+        pose = place.map_T_middle.matrix()
+        local = inverse_pose(pose)
+        edges, planes = (self._near(layer, pose[:3, 3], radius) for layer in LAYERS[:2])
+        seen = views(planes.tags)[:, :3] / 127.0
+        away = pose[:3, 3] - planes.points
+        along = np.einsum("ni,ni->n", seen, away)
+        sizes = np.sqrt(squared_norm(seen.T) * squared_norm(away.T))
+        shown = along >= _SAME_SIDE * sizes
+        points = transform(local, planes.points[shown])
+        return Sight(transform(local, edges.points), points, points + seen[shown] @ local[:3, :3].T)
+
+    def _near(self, layer: str, position: FloatArray, radius: float) -> CubePoints:
+        size = self._saved.config.map.cube_size
+        reach = radius + 0.5 * size
+        near = [
+            self._cube(layer, index)
+            for index in self._saved.layers[layer]
+            if (np.abs(np.array(index) * size - position) <= reach).all()
+        ]
+        content = joined(near)
+        return content.chosen(squared_norm((content.points - position).T) < radius**2)
+
+
+class CommonPlaces:
+    """Looks for the places of some maps in each other; places are numbered through all maps.
+
+    Parameters
+    ----------
+    maps : must stay open, and have descriptors of one shape
+    config : for the registration
+
+    Attributes
+    ----------
+    places : of all maps
+    map_of : (N,) number of the map of each place
+    rejected : candidates, by the reason
+    """
+
+    def __init__(self, maps: Sequence[SavedMap], config: Config) -> None:
+        self._config, self._verifier = config, Verifier(config)
+        self.places = [place for saved in maps for place in saved.places]
+        self.map_of: IntArray = np.repeat(np.arange(len(maps)), [len(m.places) for m in maps])
+        self.rejected: Counter[Rejection] = Counter()
+        self._surroundings = [Surroundings(saved) for saved in maps]
+        self._descriptors = [place.descriptor.astype(np.float64) for place in self.places]
+        self._keys = np.array([heading_free_key(one) for one in self._descriptors])
+        self._submap = lru_cache(_SUBMAPS)(self._make_submap)
+        self._keyframes = _keyframes(maps)
+        self._own = [error for saved in maps for error in _own_errors(saved)]
+
+    def looked_for(self) -> list[int]:
+        """Places of all maps but the first, some keyframe distances apart."""
+        chosen: list[int] = []
+        least = _APART * self._config.pose_graph.keyframe_distance
+        last: tuple[int, gtsam.Pose3] | None = None
+        for number, place in enumerate(self.places):
+            own, pose = int(self.map_of[number]), place.map_T_middle
+            if own and (last is None or last[0] != own or last[1].range(pose) >= least):
+                chosen.append(number)
+                last = own, pose
+        return chosen
+
+    def find(self, number: int) -> list[LoopClosure]:
+        """Where in the maps before its own a place is, as far as its surroundings tell."""
+        others = np.flatnonzero(self.map_of < self.map_of[number])
+        _, near = cKDTree(self._keys[others]).query(self._keys[number], k=min(_ALIKE, len(others)))
+        own = self._descriptors[number]
+        compared = [
+            (*compare_descriptors(self._descriptors[other], own), other)
+            for other in others[np.sort(np.atleast_1d(near))].tolist()
+        ]
+        loops = self._config.loops
+        tried: list[int] = []
+        found = []
+        for unlike, turn, other in sorted(compared):
+            if unlike > loops.max_unlike or len(tried) == loops.tries:
+                break
+            if any(self._near_by(other, taken) for taken in tried):
+                continue
+            tried.append(other)
+            start = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.zeros(3))
+            loop = self.register(number, other, start, turn)
+            found += [] if loop is None else [loop]
+        return found
+
+    def register(
+        self, number: int, other: int, other_T_place: gtsam.Pose3, turn: float
+    ) -> LoopClosure | None:
+        """The motion from one place to another, if what is around them fits."""
+        radius = _SIGHT * self._config.loops.reach
+        place, home = self.places[number], self._surroundings[self.map_of[number]]
+        sight = home.around(place, radius)
+        usual = self._verifier.share(sight.edges, sight.planes, self._submap(number))
+        found = self._verifier.verify(
+            sight.edges, sight.planes, self._submap(other), other_T_place, turn=turn, usual=usual
+        )
+        if isinstance(found, Rejection):
+            self.rejected[found] += 1
+            return None
+        to_own = found.pose.inverse().AdjointMap()
+        covariance = found.covariance + self._own[number] + to_own @ self._own[other] @ to_own.T
+        return LoopClosure(other, number, found.pose, symmetric(covariance), *astuple(found.fit))
+
+    def agreeing(self, loops: Sequence[LoopClosure]) -> tuple[list[LoopClosure], int]:
+        """Of loop closures between two maps most that agree, and how many agree otherwise."""
+        config = self._config.pose_graph.changed(walk=0.0, turn_walk_deg=0.0)  # links have it
+
+        def agree(one: int, two: int) -> bool:
+            return consistent(loops[one], loops[two], self._keyframes, config)
+
+        def best(numbers: Sequence[int]) -> set[int]:
+            of = {n: {m for m in numbers if m != n and agree(n, m)} for n in numbers}
+            return max((consistent_set(n, of.__getitem__) for n in numbers), key=len, default=set())
+
+        most = best(range(len(loops)))
+        others = [
+            n for n in range(len(loops)) if n not in most and not all(agree(n, m) for m in most)
+        ]
+        return [loops[n] for n in sorted(most)], len(best(others))
+
+    def _near_by(self, one: int, two: int) -> bool:
+        if self.map_of[one] != self.map_of[two]:
+            return False
+        poses = self.places[one].map_T_middle, self.places[two].map_T_middle
+        return bool(poses[0].range(poses[1]) < self._config.loops.search)
+
+    def _make_submap(self, number: int) -> tuple[CubeMap, CubeMap]:
+        """Edge and plane map around a place, in its frame."""
+        home, place = self._surroundings[self.map_of[number]], self.places[number]
+        sight = home.around(place, self._config.loops.reach)
+        config = self._config.map.changed(archive_dir=None, insertion="settled")
+        maps = CubeMap(config, config.edge_voxel), CubeMap(config, config.plane_voxel)
+        maps[0].insert(sight.edges)
+        maps[1].insert(sight.planes, sight.seen_from)
+        return maps
+
+
+def are_tied(agreeing: int, otherwise: int) -> bool:
+    """Whether loop closures between two maps are believed, from how many agree on what."""
+    return agreeing >= LEAST and otherwise <= _RIVAL * agreeing
+
+
+def _own_errors(saved: SavedMap) -> list[FloatArray]:
+    """(6, 6) by which the sweep of each place lies off the map around it, in its axes.
+
+    A motion has the errors of both ends in its covariance, and the walk that the run was told of.
+    """
+    places = saved.places
+    found = [np.zeros((6, 6)) for _ in places]
+    for link in reversed(saved.graph.links):
+        way = places[link.earlier].map_T_middle.range(places[link.later].map_T_middle)
+        own = 0.5 * nearest_positive(link.covariance - walk(way, saved.config.pose_graph))
+        found[link.later] = own
+        if not found[link.earlier].any():
+            found[link.earlier] = own
+    return found
+
+
+def _keyframes(maps: Sequence[SavedMap]) -> list[Keyframe]:
+    """The places as keyframes between which the links have drifted."""
+    found: list[Keyframe] = []
+    nothing = np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.bool_)
+    for session, saved in enumerate(maps):
+        poses = [place.map_T_middle for place in saved.places]
+        drifts = [np.zeros((6, 6))]
+        link_to = {link.later: link for link in saved.graph.links}
+        for number in range(1, len(poses)):
+            drift, link = drifts[-1], link_to.get(number)
+            if link is None:  # of another run, which loops tie
+                drift = drift + saved.places[number].covariance
+            else:
+                to_map = poses[number].AdjointMap()
+                back = drift - drifts[link.earlier] if link.earlier < number else 0.0
+                drift = drift + back + to_map @ link.covariance @ to_map.T
+            drifts.append(drift)
+        for pose, drift in zip(poses, drifts, strict=True):
+            number = len(found)
+            error = Uncertainty(np.zeros((6, 6)), np.zeros((6, 6)), None, drift, 1.0, np.inf)
+            update = MapUpdate(number, pose, FrameStatus.OK, uncertainty=error)
+            found.append(Keyframe(number, update, 0.0, *nothing, session))
+    return found

@@ -1,0 +1,313 @@
+"""Saved maps become one: one frame, one pose graph, one file.
+
+The maps are tied by places that they have in common (:mod:`.common_places`), then all motions and
+loop closures are solved at once, and the points follow their places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import gtsam
+import numpy as np
+from scipy.spatial import cKDTree
+
+from loam_gtsam.config import Config
+from loam_gtsam.geometry import symmetric
+from loam_gtsam.loops.batch import OptimizedGraph, optimize_graph
+from loam_gtsam.loops.keyframes import LoopClosure, noise_model, pose_key
+from loam_gtsam.loops.places import Place
+from loam_gtsam.loops.pose_graph import corrected_trajectory
+from loam_gtsam.maps.common_places import CommonPlaces, are_tied
+from loam_gtsam.maps.map_file import SavedMap, grids, write_map
+from loam_gtsam.maps.map_graph import MapGraph
+from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory
+from loam_gtsam.voxels.archive import Archive
+from loam_gtsam.voxels.cubes import CubePoints, joined
+from loam_gtsam.voxels.grid import CubeIndex
+from loam_gtsam.voxels.tags import views
+
+Pair = tuple[int, int]
+"""Numbers of two maps, the lower one first."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MergedMaps:
+    """Maps in one frame, that of the first of them.
+
+    Attributes
+    ----------
+    graph : places of all maps, one map after the other, where all motions have them
+    starts : number of the first place of each map
+    before : the places as they were in their maps
+    ties : loop closures between the maps, by pair
+    unused : of these, how many contradicted the others
+    """
+
+    graph: MapGraph
+    starts: tuple[int, ...]
+    before: Sequence[Place]
+    ties: Mapping[Pair, int]
+    unused: int
+
+    def places(self, number: int) -> Sequence[Place]:
+        """Places of a map."""
+        return self.graph.places[self._rows(number)]
+
+    def trajectory(self, number: int, updates: Sequence[MapUpdate] | None = None) -> Trajectory:
+        """The way of the run that made a map, corrected.
+
+        Parameters
+        ----------
+        number : of the map
+        updates : frames of that run; without them the poses are those of the places
+        """
+        places = self.places(number)
+        if updates is None:
+            return Trajectory.from_poses(
+                [p.stamp for p in places], [p.map_T_middle for p in places]
+            )
+        then = {update.stamp: update for update in updates if update.map_T_middle is not None}
+        known = []
+        for place in places:
+            middle = then[place.stamp].map_T_middle if place.stamp in then else None
+            if middle is not None:
+                known.append((place.stamp, place.map_T_middle.compose(middle.inverse())))
+        if not known:
+            raise InputError(f"updates: expected the frames of the run of map {number}, got others")
+        return corrected_trajectory(updates, known)
+
+    def _rows(self, number: int) -> slice:
+        return slice(*(*self.starts, len(self.graph.places))[number : number + 2])
+
+
+def merge_maps(
+    maps: Sequence[SavedMap],
+    path: str | Path,
+    config: Config | None = None,
+    on_place: Callable[[int, int], None] | None = None,
+) -> MergedMaps:
+    """Join maps that have places in common, and write them as one.
+
+    Parameters
+    ----------
+    maps : two or more; the frame and the configuration of the first are those of the whole
+    path : of the new file
+    config : of the registration; that of the first map if None
+    on_place : called with how many places were looked for, and of how many
+
+    Raises
+    ------
+    InputError
+        If there are less than two maps.
+    DatasetError
+        If a map has no place in common with the others, or its descriptors are of another shape.
+    OutputError
+        If the file cannot be written.
+    """
+    if len(maps) < 2:
+        raise InputError(f"merge: expected two maps or more, got {len(maps)}")
+    config = config or maps[0].config
+    _check(maps)
+    common = CommonPlaces(maps, config)
+    ties = _tied(maps, common, on_place or (lambda done, total: None))
+    starts = np.cumsum([0, *(len(saved.places) for saved in maps[:-1])]).tolist()
+    whole = _Whole(maps, starts, common, config)
+    first = whole.solve([loop for loops in ties.values() for loop in loops])
+    loops = [loop for pair, held in ties.items() for loop in whole.more(pair, held, first)]
+    solved = whole.solve(loops)
+    used = [report.active for report in solved.loops[-len(loops) :]]
+    merged = whole.merged(solved, [loop for loop, on in zip(loops, used, strict=True) if on])
+    _connected(maps, list(merged.ties))
+    contents = _moved(maps, merged)
+    write_map(path, contents, merged.graph, maps[0].config, maps[0].frame)
+    return replace(merged, unused=len(used) - sum(used))
+
+
+def _check(maps: Sequence[SavedMap]) -> None:
+    shapes = [(own.rings, own.sectors, own.reach) for own in (m.config.loops for m in maps)]
+    for saved, shape in zip(maps, shapes, strict=True):
+        if shape != shapes[0]:
+            raise DatasetError(
+                f"{saved.path}: expected place descriptors as those of {maps[0].path}, with "
+                f"loops.rings, sectors and reach {shapes[0]}, got {shape}; map one of the two again"
+            )
+        if not saved.places:
+            raise DatasetError(f"{saved.path}: the map has no places; map more of the ground")
+
+
+def _tied(
+    maps: Sequence[SavedMap], common: CommonPlaces, on_place: Callable[[int, int], None]
+) -> dict[Pair, list[LoopClosure]]:
+    """Loop closures between the maps, by pair, of pairs that have common places for sure."""
+    found: dict[Pair, list[LoopClosure]] = {}
+    wanted = common.looked_for()
+    for done, number in enumerate(wanted, 1):
+        for loop in common.find(number):
+            pair = int(common.map_of[loop.earlier]), int(common.map_of[number])
+            found.setdefault(pair, []).append(loop)
+        on_place(done, len(wanted))
+    ties, doubtful = {}, {}
+    for pair, loops in sorted(found.items()):
+        most, otherwise = common.agreeing(loops)
+        doubtful[pair] = len(most), otherwise
+        if are_tied(*doubtful[pair]):
+            ties[pair] = most
+    _connected(maps, list(ties), doubtful)
+    return ties
+
+
+def _connected(
+    maps: Sequence[SavedMap], pairs: Sequence[Pair], found: Mapping[Pair, Pair] | None = None
+) -> None:
+    """Raise a DatasetError if some map is not tied to the first one, by way of others or not."""
+    reached = _order(pairs)
+    for number in range(len(maps)):
+        if number in reached:
+            continue
+        tried = [
+            f"{maps[sum(pair) - number].path}: {most} loops agree, {others} lead elsewhere"
+            for pair, (most, others) in (found or {}).items()
+            if number in pair
+        ]
+        raise DatasetError(
+            f"{maps[number].path}: no place of it is for sure in the other maps"
+            + (f" ({'; '.join(tried)})" if tried else "")
+            + "; the drives must have a stretch in common, of some ten metres or more"
+        )
+
+
+def _order(pairs: Sequence[Pair]) -> dict[int, Pair | None]:
+    """Maps in an order in which each is tied to one before it, by which pair."""
+    reached: dict[int, Pair | None] = {0: None}
+    for _ in pairs:
+        for pair in pairs:
+            for one, two in (pair, pair[::-1]):
+                if one in reached and two not in reached:
+                    reached[two] = pair
+    return reached
+
+
+class _Whole:
+    """The pose graphs of all maps as one."""
+
+    def __init__(
+        self, maps: Sequence[SavedMap], starts: Sequence[int], common: CommonPlaces, config: Config
+    ) -> None:
+        self._maps, self._starts, self._common, self._config = maps, starts, common, config
+        of_map = zip(maps, starts, strict=True)
+        found = [
+            ([_numbered(link, start) for link in saved.graph.links],
+             [_numbered(loop, start) for loop in saved.graph.loops])
+            for saved, start in of_map
+        ]  # fmt: skip
+        self._links = [link for links, _ in found for link in links]
+        self._loops = [loop for _, loops in found for loop in loops]
+        self._before = common.places
+
+    def solve(self, ties: Sequence[LoopClosure]) -> OptimizedGraph:
+        """All places where links, loop closures of the maps, and those between them have them."""
+        aligned = zip(self._before, self._aligned(ties), strict=True)
+        places = [replace(place, map_T_middle=pose) for place, pose in aligned]
+        graph = MapGraph(places, self._links, [*self._loops, *ties]).saved()
+        loops = range(len(self._links), graph.factors.size())
+        first = places[0]
+        to_place = first.map_T_middle.inverse().AdjointMap()
+        noise = noise_model(symmetric(to_place @ first.covariance @ to_place.T))
+        graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), first.map_T_middle, noise))
+        most = self._config.pose_graph.max_chi2
+        return optimize_graph(graph, max_chi2=most, loops=loops)
+
+    def _aligned(self, ties: Sequence[LoopClosure]) -> list[gtsam.Pose3]:
+        """Places of all maps in the frame of the first, by one tie for each of the others."""
+        map_of, before = self._common.map_of, self._before
+        by_pair: dict[Pair, LoopClosure] = {}
+        for tie in ties:
+            by_pair.setdefault((int(map_of[tie.earlier]), int(map_of[tie.later])), tie)
+        frames = {0: gtsam.Pose3()}
+        for number, pair in _order(list(by_pair)).items():
+            if pair is None:
+                continue
+            tie = by_pair[pair]
+            one, two = before[tie.earlier].map_T_middle, before[tie.later].map_T_middle
+            motion = one.compose(tie.earlier_T_later).compose(two.inverse())
+            known = pair[0] if number == pair[1] else pair[1]
+            motion = motion if number == pair[1] else motion.inverse()
+            frames[number] = frames[known].compose(motion)
+        return [
+            frames[int(of)].compose(place.map_T_middle)
+            for of, place in zip(map_of, before, strict=True)
+        ]
+
+    def more(
+        self, pair: Pair, held: Sequence[LoopClosure], solved: OptimizedGraph
+    ) -> list[LoopClosure]:
+        """Loop closures of all places that two maps have in common, now that it is known where."""
+        rows = [np.flatnonzero(self._common.map_of == number).tolist() for number in pair]
+        poses = [[solved.poses.atPose3(pose_key(n)) for n in numbers] for numbers in rows]
+        tree = cKDTree([pose.translation() for pose in poses[0]])
+        loops, tied = list(held), {loop.later for loop in held}
+        for number, pose in zip(rows[1], poses[1], strict=True):
+            away, at = tree.query(pose.translation())
+            if number in tied or away > self._config.loops.search:
+                continue
+            motion = poses[0][int(at)].between(pose)
+            loop = self._common.register(
+                number, rows[0][int(at)], motion, float(motion.rotation().yaw())
+            )
+            loops += [] if loop is None else [loop]
+        return loops
+
+    def merged(self, solved: OptimizedGraph, ties: Sequence[LoopClosure]) -> MergedMaps:
+        """The places where they were solved to be, and the ties that were used."""
+        marginals = gtsam.Marginals(solved.factors, solved.poses)
+        places = []
+        for number, place in enumerate(self._before):
+            pose = solved.poses.atPose3(pose_key(number))
+            to_map = pose.AdjointMap()
+            covariance = to_map @ marginals.marginalCovariance(pose_key(number)) @ to_map.T
+            placed = replace(place, map_T_middle=pose, covariance=symmetric(covariance))
+            places.append(placed)
+        active = [report.active for report in solved.loops[: len(self._loops)]]
+        own = [loop for loop, on in zip(self._loops, active, strict=True) if on]
+        map_of = self._common.map_of
+        counts: dict[Pair, int] = {}
+        for tie in ties:
+            pair = int(map_of[tie.earlier]), int(map_of[tie.later])
+            counts[pair] = counts.get(pair, 0) + 1
+        graph = MapGraph(places, self._links, [*own, *ties])
+        return MergedMaps(graph, tuple(self._starts), self._before, counts, 0)
+
+
+def _numbered(motion: LoopClosure, start: int) -> LoopClosure:
+    return replace(motion, earlier=motion.earlier + start, later=motion.later + start)
+
+
+def _moved(maps: Sequence[SavedMap], merged: MergedMaps) -> dict[str, dict[CubeIndex, CubePoints]]:
+    """Points of all maps, which follow their places; a voxel keeps the point of an earlier map."""
+    after = [place.map_T_middle for place in merged.graph.places]
+    before = [place.map_T_middle for place in merged.before]
+    pairs = zip(after, before, strict=True)
+    moves = np.array([to.compose(at.inverse()).matrix() for to, at in pairs])
+    contents = {}
+    for layer, grid in grids(maps[0].config).items():
+        archive = Archive(grid, np.inf, None)
+        for saved, start in zip(maps, merged.starts, strict=True):
+            content = joined([saved.cube(layer, index) for index in saved.layers[layer]])
+            content.tags[:, 0] += start
+            order = np.argsort(content.tags[:, 0], kind="stable")
+            archive.settle(_carried(content.chosen(order), moves))
+        contents[layer] = dict(sorted(archive.contents()))
+    return contents
+
+
+def _carried(content: CubePoints, moves: np.ndarray) -> CubePoints:
+    """Points where the moves (N, 4, 4) of their owners bring them."""
+    move = moves[content.tags[:, 0]]
+    points = np.einsum("nij,nj->ni", move[:, :3, :3], content.points) + move[:, :3, 3]
+    tags = content.tags.copy()
+    seen = views(tags)
+    seen[:, :3] = np.rint(np.einsum("nij,nj->ni", move[:, :3, :3], seen[:, :3].astype(np.float64)))
+    return CubePoints(points, tags)

@@ -107,14 +107,14 @@ class FrameMessages:
 
         A frame with a bad stamp has none. One whose messages are not all asked for does not count.
         ``cloud`` and ``surround`` give the points that ``BagWriter.write`` takes; each is called
-        when its message is due. ``map_T_odom`` is the correction by the loops, for an odometry
-        frame; None is none. Raises OutputError if a message cannot say the stamp; InputError if
-        a cloud is not (N, 4).
+        when its message is due. ``map_T_odom`` is where an odometry frame is in the map; None is
+        unknown, and not published. Raises OutputError if a message cannot say the stamp; InputError
+        if a cloud is not (N, 4).
         """
         if not update.status.has_pose:
             return
         config = self._config
-        yield TF, self._transforms(update, map_T_odom or gtsam.Pose3())
+        yield TF, self._transforms(update, map_T_odom)
         yield ODOMETRY, self._odometry(update)
         points = cloud() if cloud is not None and config.registered else None
         if points is not None:
@@ -145,9 +145,9 @@ class FrameMessages:
             twist=self._geometry("TwistWithCovariance", twist=twist, covariance=_UNKNOWN),
         )
 
-    def _transforms(self, update: MapUpdate, map_T_odom: gtsam.Pose3) -> bytes:
+    def _transforms(self, update: MapUpdate, map_T_odom: gtsam.Pose3 | None) -> bytes:
         made = [self._transform(update.map_T_lidar, update.stamp, self._config.lidar_frame)]
-        if self._odom:
+        if self._odom and map_T_odom is not None:
             made.append(
                 self._transform(map_T_odom, update.stamp, self._odom, self._config.map_frame)
             )

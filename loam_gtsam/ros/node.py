@@ -14,6 +14,8 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
+import gtsam
+
 from loam_gtsam.config import Config, load_config, preset
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
 from loam_gtsam.datasets.decode.loam_messages import ODOMETRY as LOAM_ODOMETRY
@@ -21,6 +23,7 @@ from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
 from loam_gtsam.io.atomic import make_folder, used_alone
 from loam_gtsam.io.run_files import write_run
 from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.ros.in_map import InMap
 from loam_gtsam.ros.live import LiveMapper
 from loam_gtsam.ros.messages import ODOMETRY, REGISTERED, TYPES, FrameMessages
 from loam_gtsam.types import ConfigError, MapUpdate, OutputError, Sweep
@@ -41,6 +44,7 @@ PARAMETERS: dict[str, Any] = {
     "time_field": "",
     "time_unit": "",
     "stamp_is": "",
+    "map": "",
     "output": "",
     "report_every": 10.0,
 }
@@ -65,7 +69,8 @@ class LiveNode:
     def __init__(self, node: Any, on_error: Callable[[], object] = lambda: None) -> None:
         values = {key: node.declare_parameter(key, v).value for key, v in PARAMETERS.items()}
         config = config_of(values)
-        self._messages = FrameMessages(config.bag, odom_frame=values["odom_frame"])
+        odom = values["odom_frame"] or ("odom" if values["map"] else "")
+        self._messages = FrameMessages(config.bag, odom_frame=odom)
         self._read = self._messages.store.deserialize_cdr
         self._features: tuple[str, ...] = ()
         if values["loam_topics"]:
@@ -82,6 +87,9 @@ class LiveNode:
         self._held = ExitStack()
         if self._output is not None:
             self._held.enter_context(used_alone(self._output))
+        self._in_map = InMap(values["map"], config) if values["map"] else None
+        if self._in_map is not None:
+            self._held.callback(self._in_map.close)
         self._updates: list[MapUpdate] = []
         self._on_error = on_error
         self._error: Exception | None = None
@@ -152,12 +160,16 @@ class LiveNode:
     def _observe(self, sweep: Sweep, update: MapUpdate, pipeline: Pipeline) -> None:
         if self._output is not None:
             self._updates.append(update)
-        loops = pipeline.loops
+        map_T_odom: gtsam.Pose3 | None = gtsam.Pose3()
+        if self._in_map is not None:
+            map_T_odom = self._in_map.map_T_odom
+        elif pipeline.loops is not None:
+            map_T_odom = pipeline.loops.map_T_odom
         frame = self._messages.frame(
             update,
             lambda: registered_cloud(sweep, update, pipeline.mapper),
             lambda: surrounding_cloud(update, pipeline.mapper),
-            None if loops is None else loops.map_T_odom,
+            map_T_odom,
         )
         try:
             for topic, message in frame:
@@ -165,6 +177,8 @@ class LiveNode:
                 self._publishers[topic].publish(message + bytes(-len(message) % 4))
         except OutputError as error:
             _log.warning("not published: %s", error)
+        if self._in_map is not None:  # after the pose has gone out, for the next one
+            self._in_map.add(sweep, update)
 
 
 def config_of(values: Mapping[str, Any]) -> Config:

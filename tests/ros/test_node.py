@@ -22,6 +22,7 @@ from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.loops.map_correction import LoopMapping
+from loam_gtsam.maps import save_map
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.ros.live_report import LiveReport
 from loam_gtsam.ros.messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, TYPES
@@ -219,6 +220,36 @@ def test_frames_by_rep_105(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert {m.header.frame_id for topic, m in read if topic != TF} == {"odom"}
     with pytest.raises(ConfigError, match="odom_frame"):
         LiveNode(FakeNode(odom_frame="map", map_frame="map"))
+
+
+def test_a_node_with_a_map_says_where_the_odometry_is_in_it(
+    bag: Path, offline: RunResult, tmp_path: Path
+) -> None:
+    """Played from the fourth sweep on: there the frame of the odometry begins."""
+    assert offline.pipeline is not None
+    save_map(tmp_path / "map.lgmap", offline.pipeline)
+    node = FakeNode(map=str(tmp_path), map_frame="map", lidar_frame="lidar")
+    first = offline.updates[3].stamp
+    messages = [
+        (topic, raw)
+        for topic, raw in raw_messages(bag)
+        if topic == POINTS and stamp_of(ROS2.deserialize_cdr(raw, TYPES[REGISTERED])) >= first
+    ]
+    play(node, LiveNode(node), messages, FRAMES - 3)
+    read = [ROS2.deserialize_cdr(raw, TYPES[TF]) for topic, raw in node.published if topic == TF]
+    assert [len(message.transforms) for message in read] == [1] * 4 + [2] * (FRAMES - 7)
+    for message in read[4:]:
+        there = message.transforms[1]
+        assert (there.header.frame_id, there.child_frame_id) == ("map", "odom")
+        at = there.transform.translation
+        began = offline.updates[3].map_T_lidar.translation()
+        assert np.linalg.norm(np.array([at.x, at.y, at.z]) - began) < 0.05
+    with pytest.raises(DatasetError, match="there is no such file"):
+        LiveNode(FakeNode(map=str(tmp_path / "none.lgmap")))
+
+
+def stamp_of(message: Any) -> int:
+    return int(message.header.stamp.sec * 10**9 + message.header.stamp.nanosec)
 
 
 def test_topics_of_loam_need_no_imu(tmp_path: Path) -> None:

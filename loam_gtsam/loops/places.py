@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config
 from loam_gtsam.geometry import nearest_positive
-from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe, walk
+from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.mapper import Registered
 from loam_gtsam.registration.pose_errors import relative_covariance
@@ -101,5 +101,4 @@ class Places:
         motion = self.all[one].map_T_middle.between(pose)
         to_middle = pose.between(update.map_T_lidar).AdjointMap()
         covariance = to_middle @ relative_covariance(before, update) @ to_middle.T
-        way = before.map_T_lidar.range(update.map_T_lidar)
-        return LoopClosure(one, two, motion, covariance + walk(way, self._config.pose_graph))
+        return LoopClosure(one, two, motion, covariance)

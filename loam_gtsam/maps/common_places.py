@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import astuple, replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -18,12 +18,13 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import inverse_pose, nearest_positive, squared_norm, symmetric, transform
+from loam_gtsam.geometry import inverse_pose, squared_norm, symmetric, transform
 from loam_gtsam.loops.closure import Rejection, Verifier
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, walk
 from loam_gtsam.loops.loop_selection import consistent, consistent_set
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key
+from loam_gtsam.maps.first_fix import same
 from loam_gtsam.maps.map_file import LAYERS, SavedMap
 from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate, Uncertainty
 from loam_gtsam.voxels.cubes import CubePoints, joined
@@ -35,6 +36,7 @@ _RIVAL = 0.5
 """Share of these that loop closures which lead elsewhere may reach."""
 _APART = 3.0  # keyframe distances between the places that are looked for
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
+_CHANGED = 0.75  # share of the matches that agree at a place that is known, and may have changed
 _SIGHT = 0.5  # of the reach of the descriptors: what is looked for around a place
 _SAME_SIDE = 0.5  # cosine between the views of a point from where it was seen and from a place
 _CUBES, _SUBMAPS = 64, 32  # that are kept
@@ -97,6 +99,8 @@ class CommonPlaces:
 
     def __init__(self, maps: Sequence[SavedMap], config: Config) -> None:
         self._config, self._verifier = config, Verifier(config)
+        least = min(config.loops.min_agreement, _CHANGED)
+        self._known = Verifier(config.changed(loops=config.loops.changed(min_agreement=least)))
         self.places = [place for saved in maps for place in saved.places]
         self.map_of: IntArray = np.repeat(np.arange(len(maps)), [len(m.places) for m in maps])
         self.rejected: Counter[Rejection] = Counter()
@@ -138,21 +142,25 @@ class CommonPlaces:
                 continue
             tried.append(other)
             start = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.zeros(3))
-            loop = self.register(number, other, start, turn)
+            loop = self._register(self._verifier, number, other, start, turn)
             found += [] if loop is None else [loop]
         return found
 
-    def register(
-        self, number: int, other: int, other_T_place: gtsam.Pose3, turn: float
+    def register(self, number: int, other: int, other_T_place: gtsam.Pose3) -> LoopClosure | None:
+        """The motion from one place to another, of which it is known about where it is."""
+        turn = float(other_T_place.rotation().yaw())
+        loop = self._register(self._known, number, other, other_T_place, turn)
+        return loop if loop is not None and same(loop.earlier_T_later, other_T_place) else None
+
+    def _register(
+        self, verifier: Verifier, number: int, other: int, start: gtsam.Pose3, turn: float
     ) -> LoopClosure | None:
-        """The motion from one place to another, if what is around them fits."""
         radius = _SIGHT * self._config.loops.reach
         place, home = self.places[number], self._surroundings[self.map_of[number]]
         sight = home.around(place, radius)
-        usual = self._verifier.share(sight.edges, sight.planes, self._submap(number))
-        found = self._verifier.verify(
-            sight.edges, sight.planes, self._submap(other), other_T_place, turn=turn, usual=usual
-        )
+        usual = verifier.share(sight.edges, sight.planes, self._submap(number))
+        maps = self._submap(other)
+        found = verifier.verify(sight.edges, sight.planes, maps, start, turn=turn, usual=usual)
         if isinstance(found, Rejection):
             self.rejected[found] += 1
             return None
@@ -199,19 +207,26 @@ def are_tied(agreeing: int, otherwise: int) -> bool:
     return agreeing >= LEAST and otherwise <= _RIVAL * agreeing
 
 
+def walked(saved: SavedMap) -> list[LoopClosure]:
+    """The links of a map, which may have drifted by more than the run measured."""
+    poses, config = [place.map_T_middle for place in saved.places], saved.config.pose_graph
+    ways = [poses[link.earlier].range(poses[link.later]) for link in saved.graph.links]
+    return [
+        replace(link, covariance=link.covariance + walk(way, config))
+        for link, way in zip(saved.graph.links, ways, strict=True)
+    ]
+
+
 def _own_errors(saved: SavedMap) -> list[FloatArray]:
     """(6, 6) by which the sweep of each place lies off the map around it, in its axes.
 
-    A motion has the errors of both ends in its covariance, and the walk that the run was told of.
+    A motion has the errors of both ends in its covariance.
     """
-    places = saved.places
-    found = [np.zeros((6, 6)) for _ in places]
+    found = [np.zeros((6, 6)) for _ in saved.places]
     for link in reversed(saved.graph.links):
-        way = places[link.earlier].map_T_middle.range(places[link.later].map_T_middle)
-        own = 0.5 * nearest_positive(link.covariance - walk(way, saved.config.pose_graph))
-        found[link.later] = own
+        found[link.later] = 0.5 * link.covariance
         if not found[link.earlier].any():
-            found[link.earlier] = own
+            found[link.earlier] = found[link.later]
     return found
 
 
@@ -222,7 +237,7 @@ def _keyframes(maps: Sequence[SavedMap]) -> list[Keyframe]:
     for session, saved in enumerate(maps):
         poses = [place.map_T_middle for place in saved.places]
         drifts = [np.zeros((6, 6))]
-        link_to = {link.later: link for link in saved.graph.links}
+        link_to = {link.later: link for link in walked(saved)}
         for number in range(1, len(poses)):
             drift, link = drifts[-1], link_to.get(number)
             if link is None:  # of another run, which loops tie

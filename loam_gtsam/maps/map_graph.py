@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, LoopConfig
-from loam_gtsam.geometry import symmetric, transform
+from loam_gtsam.geometry import nearest_positive, symmetric, transform
 from loam_gtsam.loops.batch import SavedGraph
-from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key, pose_number
+from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key, pose_number, walk
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import scan_context
@@ -34,7 +34,8 @@ class MapGraph:
     Attributes
     ----------
     places : where the map can be recognised
-    links : motions along the runs, from place to place; one that no link leads to begins a run
+    links : motions along the runs, from place to place, without the walk of ``pose_graph`` in their
+        covariances; a place that none leads to begins a run
     loops : loop closures that were used
     """
 
@@ -75,7 +76,10 @@ def graph_of(mapping: LoopMapping, config: Config) -> MapGraph:
             continue
         (one, two), noise = map(pose_number, factor.keys()), factor.noiseModel()
         if one in moves and two in moves and isinstance(noise, gtsam.noiseModel.Gaussian):
-            motion = LoopClosure(one, two, factor.measured(), noise.covariance())
+            first, second = graph.keyframe(one), graph.keyframe(two)
+            told = walk(abs(second.travelled - first.travelled), config.pose_graph)
+            measured = nearest_positive(noise.covariance() - told)
+            motion = LoopClosure(one, two, factor.measured(), measured)
             links.append(_between_middles(motion, moves))
     active = zip(graph.loops, graph.active, strict=True)
     loops = [_between_middles(loop, moves) for loop, on in active if on]

@@ -20,7 +20,7 @@ from loam_gtsam.loops.batch import OptimizedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import LoopClosure, noise_model, pose_key
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.pose_graph import corrected_trajectory
-from loam_gtsam.maps.common_places import CommonPlaces, are_tied
+from loam_gtsam.maps.common_places import CommonPlaces, are_tied, walked
 from loam_gtsam.maps.map_file import SavedMap, grids, write_map
 from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory
@@ -28,6 +28,10 @@ from loam_gtsam.voxels.archive import Archive
 from loam_gtsam.voxels.cubes import CubePoints, joined
 from loam_gtsam.voxels.grid import CubeIndex
 from loam_gtsam.voxels.tags import views
+
+_LIKELY = 12.0
+"""Mean squared Mahalanobis distance of the loops from all other motions, up to which the runs have
+drifted as their covariances say: twice the six freedoms."""
 
 Pair = tuple[int, int]
 """Numbers of two maps, the lower one first."""
@@ -117,7 +121,9 @@ def merge_maps(
     whole = _Whole(maps, starts, common, config)
     first = whole.solve([loop for loops in ties.values() for loop in loops])
     loops = [loop for pair, held in ties.items() for loop in whole.more(pair, held, first)]
-    solved = whole.solve(loops)
+    solved = whole.solve(loops, walk=False)
+    if not _agree(solved):
+        solved = whole.solve(loops)
     used = [report.active for report in solved.loops[-len(loops) :]]
     merged = whole.merged(solved, [loop for loop, on in zip(loops, used, strict=True) if on])
     _connected(maps, list(merged.ties))
@@ -157,6 +163,12 @@ def _tied(
             ties[pair] = most
     _connected(maps, list(ties), doubtful)
     return ties
+
+
+def _agree(solved: OptimizedGraph) -> bool:
+    """Whether all loops agree, and are off by no more than their covariances say."""
+    distances = [report.chi_squared for report in solved.loops]
+    return all(report.active for report in solved.loops) and float(np.mean(distances)) <= _LIKELY
 
 
 def _connected(
@@ -200,19 +212,25 @@ class _Whole:
         of_map = zip(maps, starts, strict=True)
         found = [
             ([_numbered(link, start) for link in saved.graph.links],
+             [_numbered(link, start) for link in walked(saved)],
              [_numbered(loop, start) for loop in saved.graph.loops])
             for saved, start in of_map
         ]  # fmt: skip
-        self._links = [link for links, _ in found for link in links]
-        self._loops = [loop for _, loops in found for loop in loops]
+        self._links, self._walked, self._loops = (
+            [one for motions in kind for one in motions] for kind in zip(*found, strict=True)
+        )
         self._before = common.places
 
-    def solve(self, ties: Sequence[LoopClosure]) -> OptimizedGraph:
-        """All places where links, loop closures of the maps, and those between them have them."""
+    def solve(self, ties: Sequence[LoopClosure], *, walk: bool = True) -> OptimizedGraph:
+        """All places where links, loop closures of the maps, and those between them have them.
+
+        ``walk`` allows for drift that the runs did not know of.
+        """
+        links = self._walked if walk else self._links
         aligned = zip(self._before, self._aligned(ties), strict=True)
         places = [replace(place, map_T_middle=pose) for place, pose in aligned]
-        graph = MapGraph(places, self._links, [*self._loops, *ties]).saved()
-        loops = range(len(self._links), graph.factors.size())
+        graph = MapGraph(places, links, [*self._loops, *ties]).saved()
+        loops = range(len(links), graph.factors.size())
         first = places[0]
         to_place = first.map_T_middle.inverse().AdjointMap()
         noise = noise_model(symmetric(to_place @ first.covariance @ to_place.T))
@@ -254,9 +272,7 @@ class _Whole:
             if number in tied or away > self._config.loops.search:
                 continue
             motion = poses[0][int(at)].between(pose)
-            loop = self._common.register(
-                number, rows[0][int(at)], motion, float(motion.rotation().yaw())
-            )
+            loop = self._common.register(number, rows[0][int(at)], motion)
             loops += [] if loop is None else [loop]
         return loops
 

@@ -136,6 +136,16 @@ def test_wrong_loops_do_not_bend_the_map(halves, merged, tmp_path, monkeypatch):
     assert not (tmp_path / "none.lgmap").exists()
 
 
+def test_where_loops_are_off_by_more_than_they_may_the_runs_have_walked(
+    halves, merged, tmp_path, monkeypatch
+):
+    monkeypatch.setattr("loam_gtsam.maps.merging._LIKELY", 0.0)
+    found = merge_maps(halves.maps(), tmp_path / "walked.lgmap")
+    told = [np.trace(of.places(1)[-1].covariance[3:, 3:]) for of in (merged[0], found)]
+    assert told[1] > 2.0 * told[0]
+    assert ate(halves, found) < 2.0 * ate(halves, merged[0])
+
+
 @pytest.mark.parametrize(
     ("agreeing", "otherwise", "tied"), [(3, 0, True), (2, 0, False), (6, 3, True), (6, 4, False)]
 )

@@ -15,6 +15,7 @@ from loam_gtsam.cli.options import (
     CleanOptions,
     CompareOptions,
     ConfigOptions,
+    ConvertOptions,
     DemoOptions,
     InspectOptions,
     LocaliseOptions,
@@ -170,6 +171,15 @@ def merge(options: MergeOptions) -> int:
     from loam_gtsam.cli.merge import execute
 
     return execute(options)
+
+
+@app.command(short_help="Make a map of a point cloud, or a point cloud of a map.")
+@command
+def convert(options: ConvertOptions) -> int:
+    """Make a map of a foreign point cloud, in which drives are localised; or export a map."""
+    from loam_gtsam.cli.merge import convert_map
+
+    return convert_map(options)
 
 
 @app.command(short_help="Adjust planes and poses of a finished run.")

@@ -1,4 +1,4 @@
-"""The command ``merge``: maps of finished runs become one."""
+"""The commands that make maps of maps: ``merge``, and ``convert`` for those of other systems."""
 
 from __future__ import annotations
 
@@ -13,16 +13,17 @@ from rich.console import Console
 from rich.table import Table
 
 from loam_gtsam.cli import console
-from loam_gtsam.cli.options import MergeOptions
+from loam_gtsam.cli.options import ConvertOptions, MergeOptions
 from loam_gtsam.cli.results import MAP_FILE
 from loam_gtsam.io.atomic import write_json
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_ply
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
-from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.maps.clouds import import_cloud, read_cloud, write_cloud
+from loam_gtsam.maps.map_file import SUFFIX, SavedMap
 from loam_gtsam.maps.merging import MergedMaps, merge_maps
-from loam_gtsam.types import MapUpdate, Trajectory
+from loam_gtsam.types import MapUpdate, OutputError, Trajectory
 from loam_gtsam.view import plots
 
 GRAPH_FILE, PLOT_FILE = "pose_graph.g2o", "merged.png"
@@ -102,3 +103,26 @@ def _table(report: dict[str, Any]) -> Table:
         loops = ", ".join(f"{count} with {path}" for path, count in row["loops"].items())
         table.add_row(row["map"], str(row["places"]), f"{row['path_length_m']:.0f} m", loops)
     return table
+
+
+def convert_map(options: ConvertOptions) -> int:
+    """Make a map of a cloud, or a cloud of a map; returns the exit code."""
+    source, target = options.source, options.target
+    if target.exists() and not options.overwrite:
+        raise OutputError(f"{target}: the file exists; add --overwrite or choose another name")
+    if target.suffix == SUFFIX:
+        opening = options.lowest, options.highest
+        made = import_cloud(
+            read_cloud(source), target, height=options.height, sigma=options.sigma, opening=opening
+        )
+        said = f"{made.edges} edges, {made.planes} points on planes, {made.places} places"
+        if made.shift.any():
+            said += f"; its origin is at {', '.join(f'{value:.0f}' for value in made.shift)}"
+    else:
+        with SavedMap(source / MAP_FILE if source.is_dir() else source) as saved:
+            edges, planes = saved.points()
+        write_cloud(target, edges, planes)
+        said = f"{len(edges) + len(planes)} points"
+    if not options.quiet:
+        typer.echo(f"Written to {target}: {said}")
+    return 0

@@ -138,7 +138,7 @@ def count_votes(points: FloatArray, sweeps: Iterable[View], config: Config) -> V
     # A point of the map is the mean of a voxel of one ring, and the sweep has noise as well.
     off_plane = 3.0 * np.sqrt(2.0) * sigma
     along = off_plane + config.features.plane_voxel / np.sqrt(12.0)
-    normals, flat = _surfaces(points, off_plane / 3.0)
+    normals, flat = surfaces(points, off_plane / 3.0)
     free, seen = np.zeros((2, len(points)), np.int64)
     for view in sweeps:
         image = _Image.of(view)
@@ -204,8 +204,11 @@ def clean_map(
     return CleanedMap(points, moved, counts)
 
 
-def _surfaces(points: FloatArray, thick: float) -> tuple[FloatArray, BoolArray]:
-    """Normals (N, 3) at the points of a map, and (N,) whether they lie on something flat."""
+def surfaces(points: FloatArray, thick: float) -> tuple[FloatArray, BoolArray]:
+    """Normals (N, 3) at the points of a map, and (N,) whether they lie on something flat.
+
+    ``thick`` is a standard deviation of the points across a surface, metres.
+    """
     if len(points) < _NEAREST:
         return np.zeros_like(points), np.zeros(len(points), np.bool_)
     _, near = cKDTree(points).query(points, k=_NEAREST)

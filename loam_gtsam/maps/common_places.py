@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import astuple, replace
 from functools import lru_cache
+from itertools import combinations
 from typing import NamedTuple
 
 import gtsam
@@ -170,20 +171,20 @@ class CommonPlaces:
 
     def agreeing(self, loops: Sequence[LoopClosure]) -> tuple[list[LoopClosure], int]:
         """Of loop closures between two maps most that agree, and how many agree otherwise."""
-        config = self._config.pose_graph.changed(walk=0.0, turn_walk_deg=0.0)  # links have it
+        config = self._config.pose_graph.changed(walk=0.0, turn_walk_deg=0.0)  # which drifts have
+        of: dict[int, set[int]] = {number: set() for number in range(len(loops))}
+        for one, two in combinations(of, 2):
+            if consistent(loops[one], loops[two], self._keyframes, config):
+                of[one].add(two)
+                of[two].add(one)
 
-        def agree(one: int, two: int) -> bool:
-            return consistent(loops[one], loops[two], self._keyframes, config)
+        def largest(numbers: set[int]) -> set[int]:
+            sets = (consistent_set(one, lambda n: of[n] & numbers) for one in sorted(numbers))
+            return max(sets, key=len, default=set())
 
-        def best(numbers: Sequence[int]) -> set[int]:
-            of = {n: {m for m in numbers if m != n and agree(n, m)} for n in numbers}
-            return max((consistent_set(n, of.__getitem__) for n in numbers), key=len, default=set())
-
-        most = best(range(len(loops)))
-        others = [
-            n for n in range(len(loops)) if n not in most and not all(agree(n, m) for m in most)
-        ]
-        return [loops[n] for n in sorted(most)], len(best(others))
+        most = largest(set(of))
+        others = {number for number in set(of) - most if not most <= of[number]}
+        return [loops[number] for number in sorted(most)], len(largest(others))
 
     def _near_by(self, one: int, two: int) -> bool:
         if self.map_of[one] != self.map_of[two]:

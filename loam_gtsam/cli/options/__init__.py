@@ -3,6 +3,7 @@
 from loam_gtsam.cli.options.commands import CleanOptions as CleanOptions
 from loam_gtsam.cli.options.commands import CompareOptions as CompareOptions
 from loam_gtsam.cli.options.commands import ConfigOptions as ConfigOptions
+from loam_gtsam.cli.options.commands import ConvertOptions as ConvertOptions
 from loam_gtsam.cli.options.commands import DemoOptions as DemoOptions
 from loam_gtsam.cli.options.commands import LocaliseOptions as LocaliseOptions
 from loam_gtsam.cli.options.commands import MergeOptions as MergeOptions

@@ -137,6 +137,20 @@ class MergeOptions(OutputOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
+class ConvertOptions(Options):
+    """Options of ``convert``."""
+
+    source: Path = argument("FROM", "A point cloud (.ply, .pcd, .las, .laz), or a map.")
+    target: Path = argument("TO", "A map (.lgmap) of a cloud, or the other way round.")
+    height: float = option("Of the lidar above the ground, metres.", default=1.7, min=0.1)
+    lowest: float = option("Lowest beam of the lidar, degrees.", default=-15.0, min=-90.0)
+    highest: float = option("Highest beam of the lidar, degrees.", default=15.0, max=90.0)
+    sigma: float = option("Error of the cloud, metres.", default=0.02, min=0.0)
+    overwrite: bool = flag("Replace an existing file.", "--overwrite")
+    quiet: bool = flag("Print nothing but errors.", "--quiet", "-q")
+
+
+@dataclass(frozen=True, kw_only=True)
 class CompareOptions(OutputOptions, SourceOptions):
     """Options of ``compare``."""
 

@@ -24,6 +24,7 @@ ODOMETRY = "/aft_mapped_to_init"
 REGISTERED = "/velodyne_cloud_registered"
 SURROUND = "/laser_cloud_surround"
 PATH = "/aft_mapped_path"
+IN_MAP = "/pose_in_map"
 TYPES = {
     TF: "tf2_msgs/msg/TFMessage",
     ODOMETRY: "nav_msgs/msg/Odometry",
@@ -32,6 +33,9 @@ TYPES = {
     PATH: "nav_msgs/msg/Path",
 }
 """Topic -> type of its messages; docs/bags_out.md says when each is due."""
+
+IN_MAP_TYPES = {IN_MAP: "geometry_msgs/msg/PoseWithCovarianceStamped"}
+"""The same of a node that localises in a saved map."""
 
 _PATH_STEP = 10
 """Poses by which the path grows at least before it is written again; later a tenth of its length,
@@ -132,6 +136,20 @@ class FrameMessages:
             self._path_length = len(self._poses)
             yield PATH, self._path()
 
+    def in_map(self, update: MapUpdate) -> Iterator[tuple[str, bytes]]:
+        """A pose in a saved map with its covariance there, if it was found."""
+        if update.status.solved:
+            pose = self._pose(update.map_T_lidar)
+            covariance = ros_covariance(update.covariance, update.map_T_lidar)
+            yield (
+                IN_MAP,
+                self._serialised(
+                    IN_MAP,
+                    header=self._header(update.stamp, self._config.map_frame),
+                    pose=self._geometry("PoseWithCovariance", pose=pose, covariance=covariance),
+                ),
+            )
+
     def _odometry(self, update: MapUpdate) -> bytes:
         pose, (turn, velocity) = update.map_T_lidar, np.split(update.twist, 2)
         linear, angular = self._xyz("Vector3", velocity), self._xyz("Vector3", turn)
@@ -194,7 +212,7 @@ class FrameMessages:
         return self._make(f"geometry_msgs/msg/{name}", **values)
 
     def _serialised(self, topic: str, **values: Any) -> bytes:
-        name = TYPES[topic]
+        name = (TYPES | IN_MAP_TYPES)[topic]
         serialise = self.store.serialize_ros1 if self._ros1 else self.store.serialize_cdr
         return bytes(serialise(self._make(name, **values), name))
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import ExitStack
 from functools import partial
 from importlib import import_module
@@ -25,7 +25,13 @@ from loam_gtsam.io.run_files import write_run
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.ros.in_map import InMap
 from loam_gtsam.ros.live import LiveMapper
-from loam_gtsam.ros.messages import ODOMETRY, REGISTERED, TYPES, FrameMessages
+from loam_gtsam.ros.messages import (
+    IN_MAP_TYPES,
+    ODOMETRY,
+    REGISTERED,
+    TYPES,
+    FrameMessages,
+)
 from loam_gtsam.types import ConfigError, MapUpdate, OutputError, Sweep
 from loam_gtsam.view.observers import registered_cloud, surrounding_cloud
 
@@ -97,7 +103,7 @@ class LiveNode:
         self._thread = threading.Thread(target=self._work, name="loam_gtsam", daemon=True)
         self._publishers = {
             topic: node.create_publisher(_message_class(kind), topic, _DEPTH)
-            for topic, kind in TYPES.items()
+            for topic, kind in (TYPES | (IN_MAP_TYPES if values["map"] else {})).items()
         }
         self._subscribe(node, values["cloud_topic"], values["imu_topic"], config.live.queue)
         if values["report_every"] > 0.0:
@@ -171,14 +177,17 @@ class LiveNode:
             lambda: surrounding_cloud(update, pipeline.mapper),
             map_T_odom,
         )
+        self._publish(frame)
+        if self._in_map is not None:  # after the pose has gone out, for the next one
+            self._publish(self._messages.in_map(self._in_map.add(sweep, update)))
+
+    def _publish(self, messages: Iterable[tuple[str, bytes]]) -> None:
         try:
-            for topic, message in frame:
+            for topic, message in messages:
                 # RTPS pads to words of four bytes, which not every middleware does for bytes.
                 self._publishers[topic].publish(message + bytes(-len(message) % 4))
         except OutputError as error:
             _log.warning("not published: %s", error)
-        if self._in_map is not None:  # after the pose has gone out, for the next one
-            self._in_map.add(sweep, update)
 
 
 def config_of(values: Mapping[str, Any]) -> Config:

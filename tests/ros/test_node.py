@@ -25,7 +25,16 @@ from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.maps import save_map
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.ros.live_report import LiveReport
-from loam_gtsam.ros.messages import ODOMETRY, PATH, REGISTERED, SURROUND, TF, TYPES
+from loam_gtsam.ros.messages import (
+    IN_MAP,
+    IN_MAP_TYPES,
+    ODOMETRY,
+    PATH,
+    REGISTERED,
+    SURROUND,
+    TF,
+    TYPES,
+)
 from loam_gtsam.ros.node import PARAMETERS, LiveNode, config_of, main
 from loam_gtsam.types import ConfigError, DatasetError, OutputError
 
@@ -74,7 +83,7 @@ class FakeNode:
         return SimpleNamespace(value=self.parameters.get(name, default))
 
     def create_publisher(self, kind: type, topic: str, depth: int) -> Any:
-        assert kind.__name__ == TYPES[topic].rpartition("/")[2]
+        assert kind.__name__ == (TYPES | IN_MAP_TYPES)[topic].rpartition("/")[2]
         return SimpleNamespace(publish=lambda message: self.publish(topic, message))
 
     def publish(self, topic: str, message: bytes) -> None:
@@ -119,6 +128,7 @@ def rclpy(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         module("rclpy.qos", QoSProfile=SimpleNamespace, ReliabilityPolicy=reliability),
     ]
     kinds = {"sensor_msgs": "PointCloud2 Imu", "nav_msgs": "Odometry Path", "tf2_msgs": "TFMessage"}
+    kinds["geometry_msgs"] = "PoseWithCovarianceStamped"
     for package, names in kinds.items():
         content = {name: type(name, (), {}) for name in names.split()}
         modules += [module(package), module(f"{package}.msg", **content)]
@@ -244,6 +254,19 @@ def test_a_node_with_a_map_says_where_the_odometry_is_in_it(
         at = there.transform.translation
         began = offline.updates[3].map_T_lidar.translation()
         assert np.linalg.norm(np.array([at.x, at.y, at.z]) - began) < 0.05
+    poses = [
+        ROS2.deserialize_cdr(raw, IN_MAP_TYPES[IN_MAP])
+        for topic, raw in node.published
+        if topic == IN_MAP
+    ]
+    assert len(poses) == FRAMES - 6  # from the fix on, which the transform follows a sweep later
+    for message, update in zip(poses, offline.updates[6:], strict=True):
+        assert (message.header.frame_id, stamp_of(message)) == ("map", update.stamp)
+        at, sigmas = message.pose.pose.position, np.sqrt(message.pose.covariance[[0, 7, 14]])
+        away = np.array([at.x, at.y, at.z]) - update.map_T_lidar.translation()
+        assert np.linalg.norm(away) < 0.05
+        assert (sigmas > 0.0).all()
+        assert (sigmas < 0.1).all()
     with pytest.raises(DatasetError, match="there is no such file"):
         LiveNode(FakeNode(map=str(tmp_path / "none.lgmap")))
 

@@ -31,13 +31,14 @@ from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate, Uncer
 from loam_gtsam.voxels.cubes import CubePoints, joined
 from loam_gtsam.voxels.tags import views
 
-LEAST = 3
+LEAST = 4
 """Loop closures that agree with each other, below which two maps have no place in common."""
 _RIVAL = 0.5
 """Share of these that loop closures which lead elsewhere may reach."""
 _APART = 3.0  # keyframe distances between the places that are looked for
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
 _CHANGED = 0.75  # share of the matches that agree at a place that is known, and may have changed
+_TWINS = 4  # places of its own map at which a place is tried, which must not fit there
 _SIGHT = 0.5  # of the reach of the descriptors: what is looked for around a place
 _SAME_SIDE = 0.5  # cosine between the views of a point from where it was seen and from a place
 _CUBES, _SUBMAPS = 64, 32  # that are kept
@@ -125,19 +126,38 @@ class CommonPlaces:
         return chosen
 
     def find(self, number: int) -> list[LoopClosure]:
-        """Where in the maps before its own a place is, as far as its surroundings tell."""
-        others = np.flatnonzero(self.map_of < self.map_of[number])
+        """Where in the maps before its own a place is, as far as its surroundings tell.
+
+        Nowhere if they fit elsewhere in its own map as well: then they tell nothing.
+        """
+        tries = self._config.loops.tries
+        before = np.flatnonzero(self.map_of < self.map_of[number])
+        found = self._alike(number, before, tries)
+        if not found:
+            return []
+        pose = self.places[number].map_T_middle
+        own = np.flatnonzero(self.map_of == self.map_of[number])
+        least = 2.0 * self._config.loops.search
+        far = [n for n in own.tolist() if pose.range(self.places[n].map_T_middle) > least]
+        for twin in self._alike(number, np.array(far, np.int64), _TWINS):
+            if not same(twin.earlier_T_later, self.places[twin.earlier].map_T_middle.between(pose)):
+                return []
+        return found
+
+    def _alike(self, number: int, others: IntArray, tries: int) -> list[LoopClosure]:
+        """Where a place fits at those of some others that look most alike."""
+        if not len(others):
+            return []
         _, near = cKDTree(self._keys[others]).query(self._keys[number], k=min(_ALIKE, len(others)))
         own = self._descriptors[number]
         compared = [
             (*compare_descriptors(self._descriptors[other], own), other)
             for other in others[np.sort(np.atleast_1d(near))].tolist()
         ]
-        loops = self._config.loops
         tried: list[int] = []
         found = []
         for unlike, turn, other in sorted(compared):
-            if unlike > loops.max_unlike or len(tried) == loops.tries:
+            if unlike > self._config.loops.max_unlike or len(tried) == tries:
                 break
             if any(self._near_by(other, taken) for taken in tried):
                 continue

@@ -15,6 +15,7 @@ from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io.run_files import write_npz
 from loam_gtsam.loops.files import read_graph
+from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.common_places import CommonPlaces, are_tied
 from loam_gtsam.maps.localizer import Localizer
 from loam_gtsam.maps.map_file import SavedMap, save_map
@@ -146,8 +147,25 @@ def test_where_loops_are_off_by_more_than_they_may_the_runs_have_walked(
     assert ate(halves, found) < 2.0 * ate(halves, merged[0])
 
 
+def test_a_place_that_has_a_twin_in_its_own_map_tells_nothing(halves, monkeypatch):
+    common = CommonPlaces(halves.maps(), halves.runs[0].config)
+    number = next(number for number in common.looked_for() if common.find(number))
+    whole = CommonPlaces._alike
+
+    def with_twin(self, place, others, tries):
+        found = whole(self, place, others, tries)
+        if len(others) and (self.map_of[others] < self.map_of[place]).all():
+            return found
+        loop = LoopClosure(int(number) + 1, place, gtsam.Pose3(), np.eye(6))
+        aside = gtsam.Pose3(gtsam.Rot3(), np.array([20.0, 0.0, 0.0]))
+        return [replace(loop, earlier_T_later=aside)]
+
+    monkeypatch.setattr(CommonPlaces, "_alike", with_twin)
+    assert common.find(number) == []
+
+
 @pytest.mark.parametrize(
-    ("agreeing", "otherwise", "tied"), [(3, 0, True), (2, 0, False), (6, 3, True), (6, 4, False)]
+    ("agreeing", "otherwise", "tied"), [(4, 0, True), (3, 0, False), (6, 3, True), (6, 4, False)]
 )
 def test_maps_are_tied_by_loops_that_agree(agreeing, otherwise, tied):
     assert are_tied(agreeing, otherwise) is tied

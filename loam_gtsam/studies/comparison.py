@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import islice
 from typing import Any, cast
@@ -24,6 +24,7 @@ from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies import evaluation
 from loam_gtsam.studies.contenders import (
     Contender,
+    MapSample,
     PeerRunner,
     PipelineRunner,
     SharedFeatures,
@@ -50,6 +51,7 @@ class Comparison:
     notes : sentences that a reader of the numbers must know
     interrupted, error : whether the user, or which error, ended the comparison early
     shared_guess : whether all solvers of this package had the guesses of the first of them
+    sample : points of the sweeps, by which maps are judged; None judges none
     """
 
     name: str
@@ -59,6 +61,7 @@ class Comparison:
     interrupted: bool = False
     error: Exception | None = None
     shared_guess: bool = False
+    sample: MapSample | None = None
 
     @property
     def frames(self) -> int:
@@ -89,6 +92,8 @@ class Scores:
     matches : number of matches of the last association, median of the solved frames
     ms_median, ms_95 : milliseconds per frame without reading, the first frame left out
     map_points : points of the whole map
+    thickness_mm, planar_share, entropy : sharpness of the map that the poses make of the same
+        points, see :class:`~loam_gtsam.refine.map_quality.MapQuality`; NaN without a plane
     lengths : metres, the path lengths of the relative error
     problem : why an error is missing
     """
@@ -112,6 +117,9 @@ class Scores:
     ms_median: float = np.nan
     ms_95: float = np.nan
     map_points: int = 0
+    thickness_mm: float = np.nan
+    planar_share: float = np.nan
+    entropy: float = np.nan
     lengths: tuple[float, ...] = ()
     problem: str = ""
 
@@ -144,12 +152,15 @@ def compare_solvers(
     contenders = sorted(contenders, key=lambda entry: groups.index(entry.group))
     ended: BaseException | None = None
     done = 0
+    first = next((entry.config for entry in contenders if entry.config is not None), Config())
+    sample = MapSample(effective_config(first, dataset))
     with ExitStack() as stack:
         runners, notes = _make_runners(contenders, dataset, shared_guess, stack)
         try:
             for sweep in islice(dataset, max_frames):
                 for runner in runners:
                     runner.register(sweep)
+                sample.add(sweep)
                 done += 1
                 if on_frame is not None:
                     on_frame(done - 1, runners[0].updates[-1])
@@ -170,6 +181,7 @@ def compare_solvers(
         interrupted=isinstance(ended, KeyboardInterrupt),
         error=ended if isinstance(ended, Exception) else None,
         shared_guess=shared_guess,
+        sample=sample,
     )
 
 
@@ -227,10 +239,26 @@ def score_all(comparison: Comparison) -> tuple[Scores, ...]:
     pairs = list(zip(comparison.runs, [comparison.truth, *references[1:]], strict=True))
     scores = tuple(score(run, reference, exact=exact) for run, reference in pairs)
     found = {entry.lengths for entry in scores if entry.lengths}
-    if len(found) < 2:
+    if len(found) > 1:
+        # Some runs have poses over a part of the path only: the lengths must fit the shortest part.
+        scores = tuple(score(run, reference, min(found), exact=exact) for run, reference in pairs)
+    if comparison.sample is None:
         return scores
-    # Some runs have poses over a part of the path only: the lengths must fit the shortest part.
-    return tuple(score(run, reference, min(found), exact=exact) for run, reference in pairs)
+    maps = [_sharpness(run, comparison.sample) for run in comparison.runs]
+    return tuple(replace(entry, **values) for entry, values in zip(scores, maps, strict=True))
+
+
+def _sharpness(run: SolverRun, sample: MapSample) -> dict[str, Any]:
+    try:
+        quality = sample.quality(run)
+    except InputError:  # poses of a peer that are not finite, or whose stamps do not increase
+        return {}
+    share = quality.planar_share if quality.planes else np.nan
+    return {
+        "thickness_mm": 1e3 * quality.thickness,
+        "planar_share": share,
+        "entropy": quality.entropy,
+    }
 
 
 def score(

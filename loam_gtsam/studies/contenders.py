@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from pathlib import Path
@@ -19,7 +20,9 @@ from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_colu
 from loam_gtsam.frontend.workers import Extraction, extract
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import Parts, Pipeline, RunResult
+from loam_gtsam.refine.map_quality import MapQuality, map_quality
 from loam_gtsam.registration.odometry import Guess, Odometry
+from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.studies.factories import is_factory, make_parts
 from loam_gtsam.studies.peers import Inertial, Peer, TimedPoints, make_peer
 from loam_gtsam.types import (
@@ -27,8 +30,10 @@ from loam_gtsam.types import (
     ConfigError,
     Features,
     FeatureSweep,
+    FloatArray,
     FrameStatus,
     InputError,
+    IntArray,
     MapUpdate,
     Scan,
     Sweep,
@@ -36,6 +41,8 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
+_SAMPLE, _MAP_SAMPLE = 2000, 200_000
+"""Points of a sweep, and of a whole drive, that maps are judged by."""
 METHODS: tuple[str, ...] = get_args(SolverConfig.model_fields["method"].annotation)
 """Solvers of this package by the name of their ``solver.method``."""
 
@@ -218,6 +225,58 @@ def timed_points(scan: Scan, config: Config) -> TimedPoints:
     timing = assign_times(columns, assign_rings(columns, config.sensor), config)
     points = np.ascontiguousarray(columns.xyz.T, dtype=np.float64)
     return TimedPoints(points, np.asarray(timing.times, np.float64), timing.span)
+
+
+class MapSample:
+    """Some points of every sweep, to judge how sharp a map the poses of each contender make.
+
+    The points are the same for all, 2000 of a sweep at most, as they were measured; each is put
+    where the trajectory was at its time, linear in position between poses, whatever moment of a
+    sweep a contender's poses belong to and however it de-skews.
+
+    Parameters
+    ----------
+    config : decides which points of a sweep are used, and their times
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._sweeps: list[tuple[FloatArray, IntArray]] = []
+
+    def add(self, sweep: Sweep) -> None:
+        """Keep points of the next sweep; none of one that is unusable or has features only."""
+        found = np.empty((0, 3)), np.empty(0, np.int64)
+        if isinstance(sweep, Scan):
+            with suppress(SweepError):
+                timed = timed_points(sweep, self._config)
+                rows = _evenly(len(timed.points), _SAMPLE)
+                stamps = sweep.stamp + np.round(timed.times[rows] * 1e9).astype(np.int64)
+                found = timed.points[rows], stamps
+        self._sweeps.append(found)
+
+    def quality(self, run: SolverRun) -> MapQuality:
+        """Sharpness of the map by the poses of a run, of at most 200,000 points.
+
+        Points measured before its first pose and after its last are left out.
+        """
+        trajectory = run.trajectory
+        if len(trajectory) < 2:
+            return map_quality(np.empty((0, 3)))
+        kept = [self._sweeps[number] for number in run.used]
+        points, stamps = (np.concatenate(column) for column in zip(*kept, strict=True))
+        numbers = np.repeat(np.arange(len(kept)), [len(part) for part, _ in kept])
+        inside = (stamps >= trajectory.stamps[0]) & (stamps <= trajectory.stamps[-1])
+        rows = np.flatnonzero(inside)
+        rows = rows[_evenly(len(rows), _MAP_SAMPLE)]
+        map_T_lidar = interpolate(trajectory, stamps[rows]).map_T_lidar
+        placed = np.einsum("nij,nj->ni", map_T_lidar[:, :3, :3], points[rows])
+        return map_quality(placed + map_T_lidar[:, :3, 3], numbers[rows])
+
+
+def _evenly(count: int, most: int) -> IntArray:
+    """At most so many of ``count`` rows, evenly spread."""
+    rows: IntArray = np.linspace(0, count - 1, min(most, count)).astype(np.int64)
+    return rows
 
 
 class SharedGuess:

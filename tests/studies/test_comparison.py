@@ -22,8 +22,15 @@ from loam_gtsam.studies.comparison import (
     score,
     score_all,
 )
-from loam_gtsam.studies.contenders import METHODS, Contender, Group, SolverRun, make_contender
-from loam_gtsam.studies.evaluation import absolute_error
+from loam_gtsam.studies.contenders import (
+    METHODS,
+    Contender,
+    Group,
+    MapSample,
+    SolverRun,
+    make_contender,
+)
+from loam_gtsam.studies.evaluation import absolute_error, interpolate
 from loam_gtsam.studies.peers import PEERS
 from loam_gtsam.types import (
     BadSweep,
@@ -308,3 +315,41 @@ def test_what_is_off_by_more_than_is_told_is_counted(dataset):
     assert bad.nees > 100.0
     assert bad.start_m > 1.5 * bad.ate_m
     assert (bad.statuses, bad.solved) == ({"first": 1, "ok": FRAMES - 1}, 1.0)
+
+
+def test_maps_are_judged_by_the_same_points_at_the_poses_of_each(world, sweeps):
+    """Truth makes the sharpest map, whatever moment of the sweeps its poses belong to."""
+    sample = MapSample(Config())
+    for sweep in sweeps:
+        sample.add(sweep)
+    sample.add(BadSweep(sweeps[-1].stamp + 1, "not read"))
+    rng = np.random.default_rng(0)
+
+    def quality(shift, noise):
+        stamps = np.array([sweep.stamp + shift for sweep in sweeps], np.int64)
+        stamps = np.clip(stamps, world.truth.stamps[0], world.truth.stamps[-1])
+        exact = interpolate(world.truth, stamps).map_T_lidar
+        updates = []
+        for stamp, pose in zip(stamps.tolist(), exact, strict=True):
+            moved = gtsam.Pose3(pose).compose(gtsam.Pose3(gtsam.Rot3(), noise * rng.normal(size=3)))
+            updates.append(MapUpdate(stamp, moved, FrameStatus.OK))
+        return sample.quality(SolverRun("any", "1", None, tuple(updates), 0))
+
+    start, end, bad = quality(0, 0.0), quality(50_000_000, 0.0), quality(0, 0.03)
+    assert start.planes > 20
+    assert end.thickness == pytest.approx(start.thickness, rel=0.15)
+    assert bad.thickness > 1.2 * start.thickness
+    assert bad.entropy > start.entropy + 0.1
+
+
+def test_poses_that_make_no_map_have_no_numbers_of_one(dataset, fake):
+    comparison = compare_solvers(dataset, [find_contender("gtsam"), find_contender("fake")])
+    ours, drifts = score_all(comparison)
+    assert 0.0 < ours.thickness_mm < 30.0
+    assert 0.0 < ours.planar_share <= 1.0
+    assert drifts.entropy > ours.entropy
+    first, *_ = comparison.runs[1].updates
+    for lost in ((first,), (first,) * FRAMES):  # one pose, and stamps that do not increase
+        runs = comparison.runs[0], replace(comparison.runs[1], updates=lost)
+        found = score_all(replace(comparison, runs=runs))[1]
+        assert np.isnan([found.thickness_mm, found.planar_share, found.entropy]).all()

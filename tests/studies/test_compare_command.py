@@ -74,8 +74,8 @@ def test_report_is_one_file_with_everything_escaped(command, fake):
     assert 'src="http' not in page
     assert "href" not in page
     assert page.count("data:image/png;base64,") == (4 if PLOTS else 0)
-    assert len(re.findall("<tr>", page)) == 3 * 3  # three tables of two contenders
-    assert len(re.findall('<tr class="group">', page)) == 3 * 2
+    assert len(re.findall("<tr>", page)) == 4 * 3  # four tables of two contenders
+    assert len(re.findall('<tr class="group">', page)) == 4 * 2
     assert "Only the solver differs" in page
     assert 'class="best"' in page
 

@@ -64,13 +64,18 @@ class CubeMapStats:
     outside: int
 
 
+def grid_of(config: MapConfig, voxel_size: float) -> Grid:
+    """Cubes and voxels of a map: LOAM's voxels lie along its axes, ``settled`` ones obliquely."""
+    return Grid(config.cube_size, float(voxel_size), oblique=config.insertion == "settled")
+
+
 class CubeMap:
     """Map points of one feature class, at most one per voxel, searchable around the sensor.
 
     Parameters
     ----------
     config : cubes, window, neighbourhood, insertion policy and archive
-    voxel_size : metres; the voxel grid is anchored at the map origin
+    voxel_size : metres; the voxel grid is anchored at the map origin, and oblique if ``settled``
     archive : cubes outside the window, those of a saved map for example; an empty one if None
 
     Attributes
@@ -87,7 +92,7 @@ class CubeMap:
         if not 0.0 < voxel_size < np.inf:
             raise ConfigError(f"voxel_size: expected metres above 0, got {voxel_size!r}")
         self._config = config
-        self._grid = Grid(config.cube_size, float(voxel_size))
+        self._grid = grid_of(config, voxel_size)
         self._window = Window.around((0, 0, 0), config.window)
         self._trees = TreeCache()
         self._archive = archive or Archive(self._grid, config.archive_megabytes, config.archive_dir)
@@ -304,7 +309,7 @@ class CubeMap:
         """A map of the points of the window, with voxels ``factor`` times as large."""
         config = self._config.changed(insertion="centroid", archive_dir=None)
         thin = CubeMap(config, factor * self._grid.voxel_size)
-        thin._window = self._window
+        thin._window, thin._grid = self._window, thin._grid._replace(oblique=self._grid.oblique)
         thin.insert(self.points())
         return thin
 

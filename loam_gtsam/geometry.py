@@ -251,13 +251,18 @@ def integrated(values: FloatArray, times: FloatArray) -> FloatArray:
     return whole
 
 
-def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
+def voxel_keys(points: NDArray[np.floating], size: float, *, oblique: bool = False) -> IntArray:
     """One integer per voxel of edge length ``size``, metres; keys sort by x, then y, then z.
+
+    The voxels of an ``oblique`` grid have their edges along (2, -1, 2), (2, 2, -1) and (-1, 2, 2).
+    What is built is upright and mostly along the axes of the map. Where a wall runs along a border
+    of voxels, noise brings some of its points over that border, and as each voxel counts once,
+    they pull the whole wall towards it. A border of an oblique grid runs along nothing.
 
     InputError if a point of (N, 3) or more columns is outside the grid of 2^20 voxels on either
     side of the origin, whose keys are distinct.
     """
-    cells = _voxel_cells(points, size)
+    cells = _voxel_cells(points, size, oblique)
     if not _within_grid(cells):
         farthest = np.abs(points[:, :3]).max()
         raise InputError(
@@ -267,9 +272,12 @@ def voxel_keys(points: NDArray[np.floating], size: float) -> IntArray:
     return _packed_cells(cells)
 
 
-def _voxel_cells(points: NDArray[np.floating], size: float) -> IntArray:
+def _voxel_cells(points: NDArray[np.floating], size: float, oblique: bool) -> IntArray:
     """(3, N) from (N, 3) or more columns."""
     axes = np.ascontiguousarray(points[:, :3].T)
+    if oblique:  # by component: a matrix product may round a point otherwise among others
+        x, y, z = axes * np.array(1.0 / 3.0, axes.dtype)
+        axes = np.stack((2.0 * (x + z) - y, 2.0 * (x + y) - z, 2.0 * (y + z) - x))
     cells: IntArray = np.floor(axes / size).astype(np.int64) + _GRID
     return cells
 
@@ -284,7 +292,7 @@ def _packed_cells(cells: IntArray) -> IntArray:
     return keys
 
 
-def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
+def voxel_filter(points: NDArray[np.floating], size: float, *, oblique: bool = False) -> FloatArray:
     """Centroids (M, C) of the points in each voxel, ordered by voxel.
 
     Parameters
@@ -292,10 +300,11 @@ def voxel_filter(points: NDArray[np.floating], size: float) -> FloatArray:
     points : (N, C) with C >= 3: metres in the first three columns, anything that can be averaged
         (e.g. times) in the others
     size : edge length of a voxel, metres; 0 returns the points as they are
+    oblique : see :func:`voxel_keys`
     """
     if size <= 0.0 or len(points) == 0:
         return np.asarray(points, dtype=np.float64)
-    cells = _voxel_cells(points, size)
+    cells = _voxel_cells(points, size, oblique)
     if _within_grid(cells):
         keys = _packed_cells(cells)
     else:  # slower, but for any extent, and in the same order

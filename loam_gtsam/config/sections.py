@@ -76,7 +76,9 @@ class FeatureConfig(Section):
     grazing_ratio: float = parameter(0.0002, source="LOAM", low=0.0)
     """A beam grazes if both squared gaps beside its point exceed this times its squared range."""
     plane_voxel: float = parameter(0.2, unit="m", source="LOAM", low=0.0)
-    """The plane points of one ring are thinned to one per voxel of this size."""
+    """The plane points of one ring are averaged over runs, or voxels, of this length."""
+    thinning: Literal["runs", "voxels"] = parameter("runs", source="LOAM has voxels")
+    """Plane points are averaged so; where a run ends does not depend on range noise."""
 
 
 class DeskewConfig(Section):
@@ -189,11 +191,9 @@ class MatchingConfig(Section):
     """The association of features with lines and planes of the map."""
 
     max_edges: int = parameter(500, source="LOAM matches all", low=0)
-    """At most this many edge features of a sweep are matched, evenly spread over it; 0 matches all.
-    All features enter the map."""
+    """At most this many edges are matched, evenly spread; 0 matches all. All enter the map."""
     max_planes: int = parameter(2000, source="LOAM matches all", low=0)
-    """At most this many plane features of a sweep are matched, evenly spread over it; 0 matches
-    all. All features enter the map."""
+    """At most this many plane points are matched, evenly spread; 0 matches all. All are mapped."""
     trial_edges: int = parameter(150, low=1)
     """At most this many edge features are matched where many poses are tried, in the search for a
     lost sweep and for a loop closure."""

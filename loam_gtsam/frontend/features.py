@@ -12,8 +12,9 @@ the published code:
   foliage five neighbours make a plane only by chance, and matches with such planes pull the pose
   towards the pose from which the map was first seen.
 * Poles, which are too thin for the curvature, are edges (:mod:`loam_gtsam.frontend.poles`).
-* Flat picks stand in ``Features.planes`` as they were measured, before the rest, which is
-  voxel-filtered; the published code puts them into the filter too.
+* Plane points are averaged over runs along a ring (:func:`averaged_along_rings`). The published
+  code averages those in a voxel, ``features.thinning: voxels``, where flat picks stand in
+  ``Features.planes`` as they were measured, before the rest; the published code has them twice.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from loam_gtsam.frontend.curvature import (
 )
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.frontend.poles import Poles, find_poles
-from loam_gtsam.geometry import run_starts, voxel_filter
+from loam_gtsam.geometry import run_starts, squared_norm, voxel_filter
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError, SweepFault
 
 _ROUGH = 4.0
@@ -100,9 +101,10 @@ def extract_features(scan: Scan, config: Config) -> Features:
     if settings.range_noise > 0.0:
         rest &= roughness(xyz) < _ROUGH * settings.range_noise
     rest[edges] = False
-    rest[flat] = False
+    rest[flat] &= settings.thinning == "runs"
     n_sharp = int(np.count_nonzero(rank < settings.sharp_per_sector))
-    return _assemble(scan, config, sweep, edges, n_sharp, flat, np.flatnonzero(rest), poles)
+    rows = edges, flat, np.flatnonzero(rest)
+    return _assemble(scan, config, sweep, rows, n_sharp, gaps, poles)
 
 
 def thinned(features: Features, config: MapConfig) -> Features:
@@ -127,7 +129,11 @@ def thinned(features: Features, config: MapConfig) -> Features:
         stands_out = np.full(len(features.edges), np.inf)
     edges = np.column_stack([features.edges, features.edge_times, stands_out])
     planes = np.column_stack([features.planes, features.plane_times])
-    edges, planes = map(voxel_filter, (edges, planes), sizes)
+    oblique = config.insertion == "settled"
+    edges, planes = (
+        voxel_filter(points, size, oblique=oblique)
+        for points, size in zip((edges, planes), sizes, strict=True)
+    )
     return replace(
         features,
         edges=edges[:, :3].copy(),
@@ -228,8 +234,8 @@ def pick_by_sector(
 
 
 def _assemble(
-    scan: Scan, config: Config, sweep: OrganisedSweep, edges: IntArray, n_sharp: int,
-    flat: IntArray, rest: IntArray, poles: Poles,
+    scan: Scan, config: Config, sweep: OrganisedSweep, rows: tuple[IntArray, IntArray, IntArray],
+    n_sharp: int, gaps: NDArray[np.float32], poles: Poles,
 ) -> Features:  # fmt: skip
     """Gather positions, times from the reference time, and rings; poles are the last edges."""
     span = sweep.span
@@ -238,28 +244,40 @@ def _assemble(
     times = sweep.times - reference
     ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
 
-    def positions(chosen: IntArray) -> FloatArray:
-        return scan.points.take(sweep.index[chosen], axis=0).astype(np.float64)
+    def measured(chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
+        points = scan.points.take(sweep.index[chosen], axis=0).astype(np.float64)
+        return points, times[chosen], ring[chosen]
 
-    reach = _reach(sweep.xyz)
-    size = scale_of(reach, config.map) * config.features.plane_voxel
-    if size > 0.0 and len(rest):
-        rest_of = voxel_filter_by_ring(sweep.xyz.take(rest, axis=1), times[rest], ring[rest], size)
+    edges, flat, rest = rows
+    settings, reach = config.features, _reach(sweep.xyz)
+    size = scale_of(reach, config.map) * settings.plane_voxel
+    if size <= 0.0 or len(rest) == 0:
+        rest = np.union1d(flat, rest)
+        planes, flat = measured(rest), np.searchsorted(rest, flat)
+    elif settings.thinning == "runs":
+        starts = cut_into_runs(sweep.xyz, gaps, rest, size, settings.half_window)
+        planes = averaged_along_rings(sweep.xyz, times, ring, rest, starts)
+        smooth = np.intersect1d(flat, rest, assume_unique=True)
+        places = np.searchsorted(rest, smooth)
+        flat = np.unique(np.searchsorted(starts, places, side="right") - 1)
     else:
-        rest_of = positions(rest), times[rest], ring[rest]
-    rest_points, rest_times, rest_rings = rest_of
-    stands_out = prominence(sweep.xyz, config.features.half_window, edges)
+        filtered = voxel_filter_by_ring(sweep.xyz[:, rest], times[rest], ring[rest], size)
+        (a, b, c), (x, y, z) = measured(flat), filtered
+        planes = np.concatenate((a, x)), np.concatenate((b, y)), np.concatenate((c, z))
+        flat = np.arange(len(flat))
+    points, plane_times, plane_rings = planes
+    stands_out = prominence(sweep.xyz, settings.half_window, edges)
     with_poles = np.concatenate((edges, poles.middles))
     return Features(
         stamp=scan.stamp + round(reference * 1e9),
-        edges=np.concatenate((positions(edges), poles.points)),
-        planes=np.concatenate((positions(flat), rest_points)),
+        edges=np.concatenate((measured(edges)[0], poles.points)),
+        planes=points,
         edge_times=times[with_poles],
-        plane_times=np.concatenate((times[flat], rest_times)),
+        plane_times=plane_times,
         edge_rings=ring[with_poles],
-        plane_rings=np.concatenate((ring[flat], rest_rings)),
+        plane_rings=plane_rings,
         sharp=np.arange(n_sharp),
-        flat=np.arange(len(flat)),
+        flat=flat,
         span=(span[0] - reference, span[1] - reference),
         edge_prominence=np.concatenate((stands_out, poles.depths)),
         not_finite=sweep.not_finite,
@@ -278,6 +296,62 @@ def _reach(xyz: NDArray[np.float32]) -> float:
     squared = x * x + y * y + z * z
     rank = int(_REACH * len(squared))
     return float(np.sqrt(np.partition(squared, rank)[rank]))
+
+
+def cut_into_runs(
+    xyz: NDArray[np.float32],
+    gaps: NDArray[np.float32],
+    chosen: IntArray,
+    length: float,
+    half_window: int,
+) -> IntArray:
+    """Where runs of points of a ring begin that are about as long as a length.
+
+    The way along a ring is that of the means over windows, so that it hardly depends on range
+    noise, and where a run ends does not depend on the side of its surface on which a point lies.
+    In a voxel filter it does: the few points that noise brings over a border are a voxel of their
+    own, count as much as the many on the other side, and pull the surface towards the border.
+
+    Parameters
+    ----------
+    xyz : (3, N) metres, ring after ring
+    gaps : (N,) squared distances to the next point, square metres; infinite at the end of a ring
+    chosen : (M,) the points to be cut, ascending, M > 0
+    length : metres; a gap that is wider ends a run as well
+    half_window : points on either side of the one at the middle of a window
+
+    Returns
+    -------
+    (R,) rows of ``chosen``.
+    """
+    count = xyz.shape[1]
+    sums = np.zeros((3, count + 1))
+    np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
+    rows = np.arange(count)
+    first = np.maximum(rows - half_window, 0)
+    end = np.minimum(rows + half_window + 1, count)
+    means = (sums.take(end, axis=1) - sums.take(first, axis=1)) / (end - first)
+    steps = squared_norm(np.diff(means, prepend=means[:, :1]))
+    steps[1:] = np.minimum(steps[1:], gaps[:-1])  # a gap near by is no step of this one
+    way = np.cumsum(np.sqrt(steps))
+    number = np.floor(way / length)
+    number[1:] += np.cumsum(gaps[:-1] > length * length)
+    number = number[chosen]
+    return run_starts(number[1:] != number[:-1])
+
+
+def averaged_along_rings(
+    xyz: NDArray[np.float32], times: FloatArray, rings: IntArray, chosen: IntArray, starts: IntArray
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Centroids (R, 3), mean times (R,) and rings (R,) of runs; see :func:`cut_into_runs`."""
+    counts = np.diff(np.append(starts, len(chosen)))
+
+    def mean(values: NDArray[np.floating]) -> FloatArray:
+        sums: FloatArray = np.add.reduceat(values.take(chosen).astype(np.float64), starts)
+        return sums / counts
+
+    points = np.stack([mean(axis) for axis in xyz], axis=1)
+    return points, mean(times), rings[chosen[starts]]
 
 
 def voxel_filter_by_ring(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config, MapConfig, dump_config
 from loam_gtsam.config.tree import parse_config
-from loam_gtsam.cubemap import Contents
+from loam_gtsam.cubemap import Contents, grid_of
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import ConfigError
 from loam_gtsam.io.atomic import atomic_file
@@ -100,7 +100,7 @@ def grids(config: Config) -> dict[str, Grid]:
 
 
 def _grids(config: MapConfig) -> tuple[Grid, Grid]:
-    return Grid(config.cube_size, config.edge_voxel), Grid(config.cube_size, config.plane_voxel)
+    return grid_of(config, config.edge_voxel), grid_of(config, config.plane_voxel)
 
 
 def whole(maps: MapPair) -> dict[str, Contents]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loam_gtsam.geometry import find_in_sorted, run_starts, transform, voxel_keys
+from loam_gtsam.geometry import find_in_sorted, run_starts, transform
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
 from loam_gtsam.voxels.key_table import Columns, KeyTable
@@ -50,7 +50,7 @@ class CubePoints(NamedTuple):
 
     def keys(self, grid: Grid) -> IntArray:
         """(N,) under which cubes hold the points."""
-        keys = voxel_keys(self.points, grid.voxel_size)
+        keys = grid.keys(self.points)
         keys[second(self.tags)] |= _SECOND
         return keys
 
@@ -166,7 +166,7 @@ def mark_second(
     near = grid.reaches(content.points[faces.rows].T)
     rows, normals, least = faces.rows[near], faces.normals[near], faces.least[near]
     points = content.points[rows]
-    cells, keys = grid.cells(points), voxel_keys(points, grid.voxel_size)
+    cells, keys = grid.cells(points), grid.keys(points)
     held = tags_of(len(rows), 0)
     for cell in set(map(tuple, cells.tolist())):
         cube = cubes.get(cube_index(np.array(cell)))

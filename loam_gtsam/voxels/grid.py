@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from loam_gtsam.geometry import as_vector
-from loam_gtsam.types import BoolArray, FloatArray, InputError
+from loam_gtsam.geometry import as_vector, voxel_keys
+from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray
 
 CubeIndex = tuple[int, int, int]
 
@@ -24,16 +24,23 @@ _MOST_VOXELS = (1 << 20) - 1
 class Grid(NamedTuple):
     """Cubes, of which (0, 0, 0) is centred on the map origin, and voxels, anchored there.
 
-    ``cube_size`` and ``voxel_size`` are edge lengths, metres.
+    ``cube_size`` and ``voxel_size`` are edge lengths, metres. The voxels, not the cubes, may be
+    ``oblique``: see :func:`loam_gtsam.geometry.voxel_keys`.
     """
 
     cube_size: float
     voxel_size: float
+    oblique: bool = False
 
     @property
     def limit(self) -> float:
-        """Metres from the origin along an axis at which the voxel grid ends."""
-        return _MOST_VOXELS * self.voxel_size
+        """Metres from the origin along an axis up to which there are voxels whatever the others."""
+        most = _MOST_VOXELS * self.voxel_size
+        return 0.6 * most if self.oblique else most  # (2, 2, -1) / 3 times (1, 1, -1) is 5 / 3
+
+    def keys(self, points: FloatArray) -> IntArray:
+        """(N,) keys of the voxels of points (N, 3)."""
+        return voxel_keys(points, self.voxel_size, oblique=self.oblique)
 
     def cells(self, points: FloatArray) -> FloatArray:
         """Indices of the cubes of points, as floats: far or infinite points must not overflow."""

@@ -11,6 +11,8 @@ from loam_gtsam.config import Config, DeskewConfig, FeatureConfig, SensorConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.curvature import curvature, squared_gaps, unreliable_points, window_fits
 from loam_gtsam.frontend.features import (
+    averaged_along_rings,
+    cut_into_runs,
     extract_features,
     pick_by_sector,
     sector_bounds,
@@ -155,6 +157,7 @@ class Picked:
     """Where, in organised order, the edge, sharp and flat points of a scan are."""
 
     def __init__(self, scan: Scan, config: Config) -> None:
+        config = config.changed("features.thinning=voxels")  # which leaves flat points as measured
         self.sweep = organise(scan, config)
         self.features = extract_features(scan, config)
         where = {tuple(point): i for i, point in enumerate(scan.points[self.sweep.index])}
@@ -264,6 +267,66 @@ def test_voxels_two_hundred_thousand_apart_are_not_taken_for_one() -> None:
     assert (times.tolist(), rings.tolist()) == ([0.0, 1.0], [0, 0])
 
 
+def test_runs_end_at_their_length_at_gaps_and_with_the_ring() -> None:
+    y = np.concatenate([0.01 * np.arange(100), 2.0 + 0.01 * np.arange(50), np.zeros(30)])
+    xyz = np.stack([np.full(180, 10.0), y, np.zeros(180)]).astype(np.float32)
+    gaps = squared_gaps(xyz, np.array([0, 150, 180]))
+    chosen = np.setdiff1d(np.arange(180), [3, 60])
+    starts = cut_into_runs(xyz, gaps, chosen, 0.25, 5)
+    parts = np.split(chosen, starts[1:])
+    assert {100, 150} <= {part[0] for part in parts}
+    assert max(np.ptp(y[part]) for part in parts) < 0.3
+    assert np.median([len(part) for part in parts]) > 10
+    points, times, rings = averaged_along_rings(
+        xyz, np.arange(180.0), np.repeat([4, 7], [150, 30]), chosen, starts
+    )
+    assert points[:, 1] == pytest.approx([y[part].mean() for part in parts], abs=1e-6)
+    assert times == pytest.approx([part.mean() for part in parts])
+    assert rings.tolist() == [4 if part[0] < 150 else 7 for part in parts]
+
+
+def wall(tilt: float, seed: int) -> Scan:
+    """A noisy wall 4 m ahead, where voxels of 0.2 m have a border, that leans forward."""
+    rng = np.random.default_rng(seed)
+    azimuth = np.deg2rad(np.arange(-50.0, 50.0, 0.1))
+    rays = np.stack(
+        [
+            np.stack([np.cos(azimuth), np.sin(azimuth), np.full(len(azimuth), np.tan(lift))], 1)
+            for lift in np.deg2rad(ELEVATIONS["vlp16"])
+        ]
+    )
+    reach = 4.0 / (rays[..., 0] - tilt * rays[..., 2])
+    lengths = np.linalg.norm(rays, axis=-1)
+    reach += 0.02 * rng.standard_normal(reach.shape) / lengths
+    points = (reach[..., None] * rays).reshape(-1, 3).astype(np.float32)
+    times = np.tile(np.linspace(0.0, 0.1, len(azimuth)), 16)
+    return Scan(points, 0, times=times, rings=np.repeat(np.arange(16), len(azimuth)))
+
+
+@pytest.mark.parametrize(
+    ("thinning", "lowest", "highest"), [("runs", 0.9, 1.1), ("voxels", 0, 0.7)]
+)
+def test_runs_keep_the_lean_of_a_wall_that_voxels_take_away(
+    thinning: str, lowest: float, highest: float
+) -> None:
+    tilt, slopes = np.deg2rad(0.5), []
+    for seed in range(4):
+        config = Config().changed("map.small_below=0", f"features.thinning={thinning}")
+        planes = extract_features(wall(tilt, seed), config).planes
+        slopes.append(np.polyfit(planes[:, 2], planes[:, 0], 1)[0])
+    assert lowest < np.mean(slopes) / tilt < highest
+
+
+def test_flat_runs_are_those_with_flat_points() -> None:
+    scan = noisy_scan(2)
+    found, features = Picked(scan, Config()), extract_features(scan, Config())
+    runs = features.planes[features.flat]
+    measured = found.features.planes[found.features.flat]
+    nearest = np.linalg.norm(runs[:, None] - measured, axis=2).min(axis=1)
+    assert 20 < len(runs) <= len(measured)
+    assert nearest.max() < 0.2
+
+
 @pytest.mark.parametrize("bound", [0.1, 1e-3])
 def test_flat_points_are_below_the_bound(bound: float) -> None:
     settings = FeatureConfig(plane_curvature=bound, flat_per_sector=100)
@@ -364,7 +427,7 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
     raw = replace(raw, edge_times=times, plane_times=times[:300], span=(0.0, 0.1), not_finite=3)
     if known:
         raw = replace(raw, edge_prominence=times + 1.0)
-    config = Config().map.changed(edge_voxel=0.5, plane_voxel=1.0)
+    config = Config().map.changed(edge_voxel=0.5, plane_voxel=1.0, insertion="centroid")
     thin = thinned(raw, config)
     for size, held, moments, all_points in (
         (0.5, thin.edges, thin.edge_times, points),

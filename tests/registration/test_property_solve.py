@@ -184,7 +184,7 @@ def features() -> tuple[Features, ...]:
 
 
 def driven(first: gtsam.Pose3) -> list[gtsam.Pose3]:
-    mapper = Mapper(ALL)
+    mapper = Mapper(ALL.changed("map.insertion=centroid"))  # voxels along the axes of the map
     updates = [mapper.register(features()[0], first)]
     updates += [mapper.register(part) for part in features()[1:]]
     assert all(update.status.solved for update in updates[1:])

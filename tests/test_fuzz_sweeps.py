@@ -125,7 +125,7 @@ def test_a_guess_outside_the_grid_is_a_status_and_the_map_stays(metres: float) -
     assert mapper.register(features[2]).status.solved
 
 
-@pytest.mark.parametrize("metres", [400.0, -5000.0, 90_000.0])
+@pytest.mark.parametrize("metres", [400.0, -5000.0, 60_000.0])
 def test_a_map_may_start_far_from_its_origin(metres: float) -> None:
     mapper = Pipeline(Config()).mapper
     start = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 0.0, metres]))

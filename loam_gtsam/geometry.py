@@ -70,6 +70,13 @@ def transform(a_T_b: FloatArray, points: NDArray[np.floating]) -> FloatArray:
     return moved
 
 
+def transform_each(a_T_b: FloatArray, points: FloatArray) -> FloatArray:
+    """Apply a rigid transform of its own, of (N, 4, 4), to each of (N, 3) points."""
+    moved: FloatArray = np.einsum("nij,nj->ni", a_T_b[:, :3, :3], points)
+    moved += a_T_b[:, :3, 3]
+    return moved
+
+
 def inverse_pose(a_T_b: FloatArray) -> FloatArray:
     """``b_T_a`` of one rigid transform (4, 4), or of each of (N, 4, 4)."""
     inverse = np.zeros_like(a_T_b)

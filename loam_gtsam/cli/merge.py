@@ -14,14 +14,13 @@ from rich.table import Table
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import ConvertOptions, MergeOptions
-from loam_gtsam.cli.results import MAP_FILE
 from loam_gtsam.io.atomic import write_json
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_ply
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.maps.clouds import import_cloud, read_cloud, write_cloud
-from loam_gtsam.maps.map_file import SUFFIX, SavedMap
+from loam_gtsam.maps.map_file import MAP_FILE, SUFFIX, SavedMap, map_of_run
 from loam_gtsam.maps.merging import MergedMaps, merge_maps
 from loam_gtsam.types import MapUpdate, OutputError, Trajectory
 from loam_gtsam.view import plots
@@ -31,7 +30,7 @@ GRAPH_FILE, PLOT_FILE = "pose_graph.g2o", "merged.png"
 
 def execute(options: MergeOptions) -> int:
     """Merge maps; returns the exit code."""
-    paths = [path / MAP_FILE if path.is_dir() else path for path in options.maps]
+    paths = [map_of_run(path) for path in options.maps]
     names = [f"trajectory_{number}.tum" for number in range(1, len(paths) + 1)]
     known = (MAP_FILE, "map.ply", *names, GRAPH_FILE, PLOT_FILE, "summary.json")
     draws, started = console.draws_pictures(options.plot), time.perf_counter()
@@ -119,7 +118,7 @@ def convert_map(options: ConvertOptions) -> int:
         if made.shift.any():
             said += f"; its origin is at {', '.join(f'{value:.0f}' for value in made.shift)}"
     else:
-        with SavedMap(source / MAP_FILE if source.is_dir() else source) as saved:
+        with SavedMap(map_of_run(source)) as saved:
             edges, planes = saved.points()
         write_cloud(target, edges, planes)
         said = f"{len(edges) + len(planes)} points"

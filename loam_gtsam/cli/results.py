@@ -17,7 +17,7 @@ from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
-from loam_gtsam.maps.map_file import SUFFIX, save_map
+from loam_gtsam.maps.map_file import MAP_FILE, save_map
 from loam_gtsam.pipeline import RunResult, effective_config
 from loam_gtsam.studies import evaluation
 from loam_gtsam.types import (
@@ -36,7 +36,6 @@ PLOT_FILES = ("trajectory.png", "map.png", "frame.png", "timings.png")
 ERROR_PLOT = "errors.png"
 TRUTH_FILE, MATCHED_FILE = "truth.tum", "truth_matched.tum"
 LOOP_FILES = ("odometry.tum", "pose_graph.g2o")
-MAP_FILE = f"map{SUFFIX}"
 ENU_FILE = "trajectory_enu.tum"
 BASE_FILES = (*RUN_FILES, MAP_FILE)
 """What every run writes."""

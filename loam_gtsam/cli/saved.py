@@ -17,7 +17,7 @@ from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import CleanOptions, LocaliseOptions, OptimizeOptions
 from loam_gtsam.cli.refine import corrected_trajectory
-from loam_gtsam.cli.results import ENU_FILE, MAP_FILE
+from loam_gtsam.cli.results import ENU_FILE
 from loam_gtsam.cli.run import worker_count
 from loam_gtsam.config import Config, dump_config, load_config
 from loam_gtsam.datasets.base import Dataset
@@ -29,7 +29,7 @@ from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
 from loam_gtsam.maps.cleaning import View, clean_map, views
 from loam_gtsam.maps.localizer import Localisation, localise, own_settings
-from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.maps.map_file import MAP_FILE, SavedMap, map_of_run
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
     DatasetError,
@@ -103,7 +103,7 @@ def _table(saved: SavedGraph, result: OptimizedGraph, keys: list[int]) -> Table:
 
 def localise_in_map(options: LocaliseOptions) -> int:
     """Localise a data set in a saved map, write what was found; returns the exit code."""
-    path = options.map / MAP_FILE if options.map.is_dir() else options.map
+    path = map_of_run(options.map)
     plot = console.draws_pictures(options.plot)
     dataset = options.dataset()
     total = len(dataset) if options.frames is None else min(len(dataset), options.frames)

@@ -101,7 +101,8 @@ def extract_features(scan: Scan, config: Config) -> Features:
     if settings.range_noise > 0.0:
         rest &= roughness(xyz) < _ROUGH * settings.range_noise
     rest[edges] = False
-    rest[flat] &= settings.thinning == "runs"
+    if settings.thinning == "voxels":
+        rest[flat] = False
     n_sharp = int(np.count_nonzero(rank < settings.sharp_per_sector))
     rows = edges, flat, np.flatnonzero(rest)
     return _assemble(scan, config, sweep, rows, n_sharp, gaps, poles)
@@ -262,8 +263,12 @@ def _assemble(
         flat = np.unique(np.searchsorted(starts, places, side="right") - 1)
     else:
         filtered = voxel_filter_by_ring(sweep.xyz[:, rest], times[rest], ring[rest], size)
-        (a, b, c), (x, y, z) = measured(flat), filtered
-        planes = np.concatenate((a, x)), np.concatenate((b, y)), np.concatenate((c, z))
+        (points, seconds, rings), others = measured(flat), filtered
+        planes = (
+            np.concatenate((points, others[0])),
+            np.concatenate((seconds, others[1])),
+            np.concatenate((rings, others[2])),
+        )
         flat = np.arange(len(flat))
     points, plane_times, plane_rings = planes
     stands_out = prominence(sweep.xyz, settings.half_window, edges)

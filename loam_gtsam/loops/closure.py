@@ -330,8 +330,7 @@ class ScanLoopCloser:
         self, keyframe: Keyframe, candidate: int, history: PoseGraph
     ) -> tuple[CubeMap, CubeMap]:
         """Edge and plane map of the keyframes around the candidate, in its frame."""
-        config = self._whole.map.changed(archive_dir=None, insertion="settled")
-        maps = CubeMap(config, config.edge_voxel), CubeMap(config, config.plane_voxel)
+        maps = empty_submap(self._whole)
         beside = self.config.neighbours
         middle = history.keyframes.index(history.keyframe(candidate))
         around = history.keyframes[max(middle - beside, 0) : middle + beside + 1]
@@ -349,6 +348,12 @@ class ScanLoopCloser:
             origins = [np.tile(p[:3, 3], (len(q), 1)) for p, q in zip(poses, parts, strict=True)]
             cubes.insert(np.concatenate(parts), np.concatenate(origins))
         return maps
+
+
+def empty_submap(config: Config) -> tuple[CubeMap, CubeMap]:
+    """Edge and plane map for what is around a place; the first point of a voxel stays."""
+    settled = config.map.changed(archive_dir=None, insertion="settled")
+    return CubeMap(settled, settled.edge_voxel), CubeMap(settled, settled.plane_voxel)
 
 
 def _offered(n_edges: int, n_planes: int, config: MatchingConfig) -> int:

@@ -17,8 +17,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config, as_config
-from loam_gtsam.datasets.decode.packed_points import PackedCloud, read_pcd, read_ply
-from loam_gtsam.geometry import as_points, squared_norm, voxel_keys
+from loam_gtsam.datasets.decode.packed_points import read_pcd, read_ply
+from loam_gtsam.datasets.decode.pointcloud2 import read_positions
+from loam_gtsam.geometry import as_points, squared_norm, voxel_filter
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.run_files import write_ply
 from loam_gtsam.loops.keyframes import LoopClosure
@@ -99,19 +100,6 @@ DATA binary
 """
 
 
-def _positions(cloud: PackedCloud) -> FloatArray:
-    kinds = {7: "<f4", 8: "<f8"}
-    fields = {field.name: field for field in cloud.fields}
-    found = []
-    for axis in "xyz":
-        if axis not in fields or fields[axis].datatype not in kinds:
-            raise DatasetError(f"cloud: expected fields x, y, z of floats, got {', '.join(fields)}")
-        kind, start = kinds[fields[axis].datatype], fields[axis].offset
-        count = cloud.width * cloud.height
-        found.append(np.ndarray((count,), kind, cloud.data.data, start, (cloud.point_step,)))
-    return np.column_stack(found).astype(np.float64)
-
-
 def _laspy(path: Path) -> Any:
     try:
         import laspy
@@ -141,8 +129,8 @@ def _write_las(path: Path, points: FloatArray) -> None:
 
 
 _READERS: dict[str, Callable[[Path], FloatArray]] = {
-    ".ply": lambda path: _positions(read_ply(path, 0)),
-    ".pcd": lambda path: _positions(read_pcd(path, 0)),
+    ".ply": lambda path: read_positions(read_ply(path, 0)).astype(np.float64),
+    ".pcd": lambda path: read_positions(read_pcd(path, 0)).astype(np.float64),
     ".las": _read_las,
     ".laz": _read_las,
 }
@@ -231,17 +219,9 @@ def features_of(points: FloatArray, config: Config) -> tuple[FloatArray, FloatAr
 
     All that is not flat may be an edge: the matching takes those that lie on a line.
     """
-    even = _means(points, _THIN * config.map.plane_voxel)
+    even = voxel_filter(points, _THIN * config.map.plane_voxel)
     normals, flat = surfaces(even, np.sqrt(2.0) * config.matching.point_sigma)
     return even[~flat], even[flat], normals[flat]
-
-
-def _means(points: FloatArray, size: float) -> FloatArray:
-    """The mean of the points of each voxel."""
-    _, rows, counts = np.unique(voxel_keys(points, size), return_inverse=True, return_counts=True)
-    sums = [np.bincount(rows, column, len(counts)) for column in points.T]
-    means: FloatArray = np.column_stack(sums) / counts[:, None]
-    return means
 
 
 def stands(

@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import inverse_pose, squared_norm, symmetric, transform
-from loam_gtsam.loops.closure import Rejection, Verifier
+from loam_gtsam.loops.closure import Rejection, Verifier, empty_submap
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, walk
 from loam_gtsam.loops.loop_selection import consistent, consistent_set
 from loam_gtsam.loops.places import Place
@@ -216,8 +216,7 @@ class CommonPlaces:
         """Edge and plane map around a place, in its frame."""
         home, place = self._surroundings[self.map_of[number]], self.places[number]
         sight = home.around(place, self._config.loops.reach)
-        config = self._config.map.changed(archive_dir=None, insertion="settled")
-        maps = CubeMap(config, config.edge_voxel), CubeMap(config, config.plane_voxel)
+        maps = empty_submap(self._config)
         maps[0].insert(sight.edges)
         maps[1].insert(sight.planes, sight.seen_from)
         return maps

@@ -42,6 +42,7 @@ from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex, Grid
 
 SUFFIX = ".lgmap"
+MAP_FILE = f"map{SUFFIX}"
 VERSION = 2
 LAYERS = "edges", "planes", "small_edges", "small_planes"
 _FORMAT = "loam_gtsam map"
@@ -65,6 +66,12 @@ class MapFrame:
 
     up: FloatArray | None = None
     earth: GeoReference | None = None
+
+
+def map_of_run(path: str | Path) -> Path:
+    """The file of the map in the folder of a run, or a file as it is."""
+    path = Path(path)
+    return path / MAP_FILE if path.is_dir() else path
 
 
 def save_map(path: str | Path, pipeline: Pipeline) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
-from loam_gtsam.geometry import symmetric
+from loam_gtsam.geometry import symmetric, transform_each
 from loam_gtsam.loops.batch import OptimizedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import LoopClosure, noise_model, pose_key
 from loam_gtsam.loops.places import Place
@@ -27,7 +27,7 @@ from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory
 from loam_gtsam.voxels.archive import Archive
 from loam_gtsam.voxels.cubes import CubePoints, joined
 from loam_gtsam.voxels.grid import CubeIndex
-from loam_gtsam.voxels.tags import views
+from loam_gtsam.voxels.tags import turn
 
 _LIKELY = 12.0
 """Mean squared Mahalanobis distance of the loops from all other motions, up to which the runs have
@@ -322,8 +322,6 @@ def _moved(maps: Sequence[SavedMap], merged: MergedMaps) -> dict[str, dict[CubeI
 def _carried(content: CubePoints, moves: np.ndarray) -> CubePoints:
     """Points where the moves (N, 4, 4) of their owners bring them."""
     move = moves[content.tags[:, 0]]
-    points = np.einsum("nij,nj->ni", move[:, :3, :3], content.points) + move[:, :3, 3]
     tags = content.tags.copy()
-    seen = views(tags)
-    seen[:, :3] = np.rint(np.einsum("nij,nj->ni", move[:, :3, :3], seen[:, :3].astype(np.float64)))
-    return CubePoints(points, tags)
+    turn(tags, move[:, :3, :3])
+    return CubePoints(transform_each(move, content.points), tags)

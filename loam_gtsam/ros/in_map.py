@@ -15,6 +15,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.maps import Localizer, SavedMap
+from loam_gtsam.maps.map_file import map_of_run
 from loam_gtsam.registration.odometry import Guess, Odometry, advance
 from loam_gtsam.types import Features, MapUpdate, Sweep
 
@@ -41,8 +42,7 @@ class InMap(Odometry):
     """
 
     def __init__(self, path: str | Path, config: Config) -> None:
-        path = Path(path)
-        self._saved = SavedMap(path / "map.lgmap" if path.is_dir() else path)
+        self._saved = SavedMap(map_of_run(path))
         self._localizer = Localizer(self._saved, config, odometry=self)
         self._past: deque[MapUpdate] = deque(maxlen=_KEPT)
         self.map_T_odom: gtsam.Pose3 | None = None

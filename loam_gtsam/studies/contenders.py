@@ -18,9 +18,11 @@ from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.errors import nearest
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.frontend.workers import Extraction, extract
+from loam_gtsam.geometry import transform_each
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import Parts, Pipeline, RunResult
 from loam_gtsam.refine.map_quality import MapQuality, map_quality
+from loam_gtsam.registration.association import spread_rows
 from loam_gtsam.registration.odometry import Guess, Odometry
 from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.studies.factories import is_factory, make_parts
@@ -249,7 +251,7 @@ class MapSample:
         if isinstance(sweep, Scan):
             with suppress(SweepError):
                 timed = timed_points(sweep, self._config)
-                rows = _evenly(len(timed.points), _SAMPLE)
+                rows = spread_rows(len(timed.points), _SAMPLE)
                 stamps = sweep.stamp + np.round(timed.times[rows] * 1e9).astype(np.int64)
                 found = timed.points[rows], stamps
         self._sweeps.append(found)
@@ -267,16 +269,9 @@ class MapSample:
         numbers = np.repeat(np.arange(len(kept)), [len(part) for part, _ in kept])
         inside = (stamps >= trajectory.stamps[0]) & (stamps <= trajectory.stamps[-1])
         rows = np.flatnonzero(inside)
-        rows = rows[_evenly(len(rows), _MAP_SAMPLE)]
+        rows = rows[spread_rows(len(rows), _MAP_SAMPLE)]
         map_T_lidar = interpolate(trajectory, stamps[rows]).map_T_lidar
-        placed = np.einsum("nij,nj->ni", map_T_lidar[:, :3, :3], points[rows])
-        return map_quality(placed + map_T_lidar[:, :3, 3], numbers[rows])
-
-
-def _evenly(count: int, most: int) -> IntArray:
-    """At most so many of ``count`` rows, evenly spread."""
-    rows: IntArray = np.linspace(0, count - 1, min(most, count)).astype(np.int64)
-    return rows
+        return map_quality(transform_each(map_T_lidar, points[rows]), numbers[rows])
 
 
 class SharedGuess:

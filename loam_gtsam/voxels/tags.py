@@ -70,9 +70,10 @@ def look(tags: Tags, points: FloatArray, seen_from: NDArray[np.floating]) -> Non
 
 
 def turn(tags: Tags, rotation: FloatArray) -> None:
-    """Turn the views in tags (N, 2) with a rotation (3, 3) of their points."""
+    """Turn the views in tags (N, 2) with the rotation (3, 3) of all points, or each (N, 3, 3)."""
     seen = views(tags)
-    seen[:, :3] = np.rint(seen[:, :3] @ rotation.T)
+    turned = np.einsum("...ij,...j->...i", rotation, seen[:, :3].astype(np.float64))
+    seen[:, :3] = np.rint(turned)
 
 
 def sines(seen: Views, normals: FloatArray) -> FloatArray:

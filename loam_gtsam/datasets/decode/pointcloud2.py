@@ -249,6 +249,14 @@ class _Layout:
         return view.astype(dtype.newbyteorder("=")).reshape(-1)
 
 
+def read_positions(msg: Any) -> NDArray[Any]:
+    """(N, 3) x, y and z of a PointCloud2 as they are in it, those that are not finite too.
+
+    Raises DatasetError if the layout or a field cannot be understood.
+    """
+    return _points(_Layout(msg))
+
+
 def _points(layout: _Layout) -> NDArray[Any]:
     if missing := [name for name in "xyz" if name not in layout.fields]:
         there = f"the message has: {', '.join(layout.fields) or 'no fields'}"

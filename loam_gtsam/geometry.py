@@ -17,6 +17,9 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 _SMALL_ANGLE = 1e-9
 _GRID = 1 << 20
 """Voxels on either side of the origin that the keys of voxels tell apart."""
+OBLIQUE_EDGE = float(np.sqrt(5.0 / 3.0))
+"""Edges of oblique voxels over the size asked for: a plane along two axes of the map crosses 5 / 3
+times as many voxels of an oblique grid as of one along the axes, so these are as much larger."""
 
 
 def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:
@@ -261,7 +264,8 @@ def integrated(values: FloatArray, times: FloatArray) -> FloatArray:
 def voxel_keys(points: NDArray[np.floating], size: float, *, oblique: bool = False) -> IntArray:
     """One integer per voxel of edge length ``size``, metres; keys sort by x, then y, then z.
 
-    The voxels of an ``oblique`` grid have their edges along (2, -1, 2), (2, 2, -1) and (-1, 2, 2).
+    The voxels of an ``oblique`` grid have their edges along (2, -1, 2), (2, 2, -1) and (-1, 2, 2),
+    sqrt(5 / 3) times as long: walls along the axes have as many voxels as in the other grid.
     What is built is upright and mostly along the axes of the map. Where a wall runs along a border
     of voxels, noise brings some of its points over that border, and as each voxel counts once,
     they pull the whole wall towards it. A border of an oblique grid runs along nothing.
@@ -283,7 +287,7 @@ def _voxel_cells(points: NDArray[np.floating], size: float, oblique: bool) -> In
     """(3, N) from (N, 3) or more columns."""
     axes = np.ascontiguousarray(points[:, :3].T)
     if oblique:  # by component: a matrix product may round a point otherwise among others
-        x, y, z = axes * np.array(1.0 / 3.0, axes.dtype)
+        x, y, z = axes * np.array(1.0 / (3.0 * OBLIQUE_EDGE), axes.dtype)
         axes = np.stack((2.0 * (x + z) - y, 2.0 * (x + y) - z, 2.0 * (y + z) - x))
     cells: IntArray = np.floor(axes / size).astype(np.int64) + _GRID
     return cells

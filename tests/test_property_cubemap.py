@@ -14,7 +14,7 @@ from support.strategies import FEW, generators
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import transform
+from loam_gtsam.geometry import OBLIQUE_EDGE, transform
 
 Cell = tuple[int, int, int]
 Point = tuple[float, float, float]
@@ -22,6 +22,11 @@ Point = tuple[float, float, float]
 CUBE, VOXEL = 4.0, 0.5
 EDGES = np.array([[2.0, -1.0, 2.0], [2.0, 2.0, -1.0], [-1.0, 2.0, 2.0]])
 """Of oblique voxels, three times as long."""
+
+
+def voxel_size(config: MapConfig) -> float:
+    """That of voxels with edges of VOXEL."""
+    return VOXEL / OBLIQUE_EDGE if config.insertion == "settled" else VOXEL
 
 
 class Reference:
@@ -136,7 +141,7 @@ def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
         field_of_view=True,
     )  # fmt: skip
     rng = np.random.default_rng(steps + int(megabytes))
-    cubes, reference = CubeMap(config, VOXEL), Reference(config)
+    cubes, reference = CubeMap(config, voxel_size(config)), Reference(config)
     position, around = np.zeros(3), ()
     pose = np.eye(4)
     seen: Counter[str] = Counter()
@@ -194,7 +199,7 @@ def test_ten_thousand_random_operations_in_all_are_those_of_a_dictionary(
 def test_moved_points_are_those_of_a_dictionary(rng: np.random.Generator, insertion: str) -> None:
     """Whole voxels, and turns that leave the voxels: no point comes to lie in that of another."""
     config = SMALL.changed(insertion=insertion)
-    cubes, reference = CubeMap(config, VOXEL), Reference(config)
+    cubes, reference = CubeMap(config, voxel_size(config)), Reference(config)
     for _ in range(10):
         position = rng.normal(0.0, 6.0, 3)
         cubes.recenter(position)

@@ -1,8 +1,8 @@
 """A point cloud of another system becomes a map, and a map a point cloud.
 
-Of a foreign cloud it is not known from where its points were seen. What is flat around a point is a
-plane, all else may be an edge, and places are put all over the ground, where a lidar may stand;
-what it would see there is told by a picture of ranges.
+Of a foreign cloud it is not known from where its points were seen. Any point may lie on a plane,
+what is not flat on an edge, and places are put all over the ground, where a lidar may stand; what
+it would see there is told by a picture of ranges.
 """
 
 from __future__ import annotations
@@ -196,7 +196,7 @@ def import_cloud(
     contents = {}
     tree = cKDTree(seats)
     for (layer, grid), found in zip(
-        grids(config).items(), (edges, planes, edges[:0], planes[:0]), strict=True
+        grids(config).items(), (edges, seen, seen[:0], seen[:0]), strict=True
     ):
         tags = tags_of(len(found), 0)
         tags[:, 0] = tree.query(found)[1] if len(found) else 0
@@ -217,7 +217,7 @@ def import_cloud(
 def features_of(points: FloatArray, config: Config) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Edges (E, 3), points on planes (P, 3), and their normals (P, 3), of a cloud (N, 3).
 
-    All that is not flat may be an edge: the matching takes those that lie on a line.
+    All that is not flat may be an edge, and lie on a plane too: the matching takes those that do.
     """
     even = voxel_filter(points, _THIN * config.map.plane_voxel)
     normals, flat = surfaces(even, np.sqrt(2.0) * config.matching.point_sigma)

@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from support.matches import make_matches
 from support.strategies import FEW, generators
 
-from loam_gtsam.config import Config, MatchingConfig, SolverConfig, preset
+from loam_gtsam.config import Config, MapConfig, MatchingConfig, SolverConfig, preset
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.geometry import OBLIQUE_EDGE
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.registration.matches import ScanMatches, subset
@@ -169,8 +170,12 @@ def test_a_mirrored_scene_has_the_mirrored_pose(name: str, problem: Any) -> None
 
 # -- the mapper ------------------------------------------------------------------------------------
 
-ALL = Config().changed(matching=MatchingConfig(max_edges=0, max_planes=0))
-"""Every feature is matched: which ones are left out depends on the order of the voxels."""
+ALL = Config().changed(
+    matching=MatchingConfig(max_edges=0, max_planes=0),
+    map=MapConfig(edge_voxel=0.2 / OBLIQUE_EDGE, plane_voxel=0.4 / OBLIQUE_EDGE),
+)
+"""Every feature is matched: which ones are left out depends on the order of the voxels. The edges
+of the voxels are 0.2 and 0.4 m long."""
 
 
 @cache

@@ -10,6 +10,7 @@ import pytest
 from loam_gtsam.config import Config, MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.geometry import OBLIQUE_EDGE
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
@@ -138,7 +139,7 @@ def test_views_do_not_break_a_plane_that_is_no_wall() -> None:
 
 
 def test_the_second_face_enters_voxels_that_the_first_one_holds() -> None:
-    planes, first_only = (wall((0.1, FRONT), voxel=0.4) for _ in range(2))
+    planes, first_only = (wall((0.1, FRONT), voxel=0.4 / OBLIQUE_EDGE) for _ in range(2))
     held = planes.count()
     behind = face(0.1 + THICKNESS)
     first_only.insert(behind, BACK)

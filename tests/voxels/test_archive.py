@@ -11,7 +11,7 @@ from support.cubes import SMALL, moved_by
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import voxel_keys
+from loam_gtsam.geometry import OBLIQUE_EDGE, voxel_keys
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ConfigError
 
@@ -68,8 +68,8 @@ def test_two_maps_share_an_archive_folder(tmp_path: Path) -> None:
 
 def test_budget_drops_the_oldest_counts_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
     """Each stop leaves one cube of 7 points, 224 bytes; two of them fit into 500 bytes."""
-    cube_map = CubeMap(SMALL.changed(archive_megabytes=500e-6), 0.5)
-    heap = np.arange(-1.5, 1.6, 0.5)[:, None] * np.ones(3)
+    cube_map = CubeMap(SMALL.changed(archive_megabytes=500e-6), 0.5 / OBLIQUE_EDGE)
+    heap = np.arange(-1.4, 1.7, 0.5)[:, None] * np.ones(3)
     with caplog.at_level(logging.WARNING, logger="loam_gtsam.cubemap"):
         for stop in range(5):
             position = np.array([100.0 * stop, 0.0, 0.0])
@@ -139,14 +139,16 @@ def test_bad_archive_dir(tmp_path: Path) -> None:
 @pytest.mark.parametrize("megabytes", [100.0, 0.0])
 def test_moved_points_join_those_of_a_cube_in_the_archive(small, megabytes):
     """Of the moved ones too a voxel keeps one, and those that were there stay."""
-    cubes = CubeMap(small.changed(archive_megabytes=megabytes), 0.5)
+    cubes = CubeMap(small.changed(archive_megabytes=megabytes), 0.5 / OBLIQUE_EDGE)
     there = np.array([[100.1, 0.1, 0.1], [100.6, 0.1, 0.1], [101.1, 0.1, 0.1]])
     cubes.recenter(there[0])
     cubes.insert(there)
     cubes.recenter(np.zeros(3))
     cubes.owner = 1
     # The last two come to lie in one voxel, the second in that of a point that was there.
-    arrived = np.array([[100.1, 0.4, 0.5], [100.6, 0.0, 0.2], [101.4, 0.2, 0.5], [101.4, 0.3, 0.2]])
+    arrived = np.array(
+        [[100.1, 0.4, 0.5], [100.6, 0.05, 0.2], [101.4, 0.2, 0.5], [101.4, 0.3, 0.2]]
+    )
     turned = moved_by(100.0)
     turned[2, 2], turned[1, 1] = -1.0, -1.0
     turned[1:3, 3] = 0.7, 0.65
@@ -155,7 +157,7 @@ def test_moved_points_join_those_of_a_cube_in_the_archive(small, megabytes):
     assert cubes.move({1: turned}) == 4
     assert cubes.count() == 0
     union = np.concatenate([there, arrived])
-    _, first = np.unique(voxel_keys(union, 0.5, oblique=True), return_index=True)
+    _, first = np.unique(voxel_keys(union, 0.5 / OBLIQUE_EDGE, oblique=True), return_index=True)
     assert sorted(first) == [0, 1, 2, 3, 5]
     np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=1e-12)
     cubes.recenter(np.array([100.0, 0.0, 0.0]))

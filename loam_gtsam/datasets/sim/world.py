@@ -215,7 +215,7 @@ class SimulatedWorld(Loader):
             name = self.scene.name
             raise InputError(f"stamps: the path of {name!r} ends at {end}, got {stamps.max()}")
         poses = inverse_pose(self.world_T_start) @ self._motion.world_T_lidar(_seconds(stamps))
-        if len(stamps) and stamps[0] == _EPOCH:
+        if len(stamps) and stamps[0] == _EPOCH and np.allclose(poses[0], np.eye(4)):
             poses[0] = np.eye(4)  # not only up to rounding
         return Trajectory(stamps=stamps, map_T_lidar=poses)
 

@@ -244,21 +244,8 @@ def score_all(comparison: Comparison) -> tuple[Scores, ...]:
         scores = tuple(score(run, reference, min(found), exact=exact) for run, reference in pairs)
     if comparison.sample is None:
         return scores
-    maps = [_sharpness(run, comparison.sample) for run in comparison.runs]
+    maps = [comparison.sample.sharpness(run) for run in comparison.runs]
     return tuple(replace(entry, **values) for entry, values in zip(scores, maps, strict=True))
-
-
-def _sharpness(run: SolverRun, sample: MapSample) -> dict[str, Any]:
-    try:
-        quality = sample.quality(run)
-    except InputError:  # poses of a peer that are not finite, or whose stamps do not increase
-        return {}
-    share = quality.planar_share if quality.planes else np.nan
-    return {
-        "thickness_mm": 1e3 * quality.thickness,
-        "planar_share": share,
-        "entropy": quality.entropy,
-    }
 
 
 def score(

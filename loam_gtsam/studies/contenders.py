@@ -273,6 +273,19 @@ class MapSample:
         map_T_lidar = interpolate(trajectory, stamps[rows]).map_T_lidar
         return map_quality(transform_each(map_T_lidar, points[rows]), numbers[rows])
 
+    def sharpness(self, run: SolverRun) -> dict[str, Any]:
+        """The columns of :meth:`quality` in tables; none if the poses make no map."""
+        try:
+            quality = self.quality(run)
+        except InputError:  # poses of a peer that are not finite, or whose stamps do not increase
+            return {}
+        share = quality.planar_share if quality.planes else np.nan
+        return {
+            "thickness_mm": 1e3 * quality.thickness,
+            "planar_share": share,
+            "entropy": quality.entropy,
+        }
+
 
 class SharedGuess:
     """An odometry for several pipelines: the first one predicts, the others take the same step.

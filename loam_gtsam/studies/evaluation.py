@@ -379,8 +379,14 @@ def _common(
             f"{caller}: expected 3 or more poses inside the reference's time span "
             f"{reference.stamps[0]} to {reference.stamps[-1]} ns, got {int(inside.sum())}"
         )
-    stamps = estimate.stamps[inside]
-    return stamps, estimate.map_T_lidar[inside], interpolate(reference, stamps).map_T_lidar
+    stamps, poses = estimate.stamps[inside], estimate.map_T_lidar[inside]
+    unknown = ~np.isfinite(poses).all(axis=(1, 2))
+    if unknown.any():
+        raise InputError(
+            f"{caller}: expected poses of finite numbers, got {int(unknown.sum())} of {len(poses)} "
+            "that are not; leave them out"
+        )
+    return stamps, poses, interpolate(reference, stamps).map_T_lidar
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ import traceback
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -28,7 +28,7 @@ from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import OnFrame, effective_config, run
 from loam_gtsam.studies.comparison import score
-from loam_gtsam.studies.contenders import PeerRunner, SolverRun
+from loam_gtsam.studies.contenders import MapSample, PeerRunner, SolverRun
 from loam_gtsam.studies.evaluation import pose_differences
 from loam_gtsam.studies.factories import make_parts
 from loam_gtsam.types import FrameStatus, LoamError, OutputError, Trajectory
@@ -40,6 +40,7 @@ VERSIONS = ("loam_gtsam", "gtsam", "numpy")
 METRICS = (
     "ate_m", "ate_max_m", "start_m", "rotation_deg", "rpe_percent", "rpe_deg_per_m",
     "drift_percent", "solved", "beyond", "nees", "nees_step",
+    "thickness_mm", "planar_share", "entropy",
     "iterations", "solver_iterations", "matches", "ms_median", "ms_95",
 )  # fmt: skip
 """Columns to compare solvers by; see ``docs/compare.md`` and ``docs/parameter_studies.md``."""
@@ -124,8 +125,9 @@ def run_trial(trial: Trial, on_frame: OnFrame | None = None) -> Row:
     started = time.perf_counter()
     try:
         dataset = datasets.open_dataset(trial.path, **trial.dataset_options)
-        finished = _run_solver(trial, dataset, on_frame)
-        row |= _numbers(finished, dataset.truth)
+        sample = MapSample(effective_config(trial.config, dataset))
+        finished = _run_solver(trial, dataset, sample, on_frame)
+        row |= _numbers(finished, sample, dataset.truth)
         row["error"] = _unusable(dataset.name, finished)
     except LoamError as error:
         row["error"] = f"{type(error).__name__}: {error}"
@@ -151,11 +153,18 @@ def empty_row(trial: Trial) -> Row:
     return dict.fromkeys(COLUMNS) | dict(versions()) | known
 
 
-def _run_solver(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> SolverRun:
+def _run_solver(
+    trial: Trial, dataset: Dataset, sample: MapSample, on_frame: OnFrame | None
+) -> SolverRun:
     if trial.peer is None:
-        parts = make_parts(trial.parts, trial.config)
-        frames = trial.frames
-        result = run(dataset, trial.config, max_frames=frames, on_frame=on_frame, **parts)
+        result = run(
+            dataset,
+            trial.config,
+            max_frames=trial.frames,
+            on_frame=on_frame,
+            observe=lambda sweep, *_: sample.add(sweep),
+            **make_parts(trial.parts, trial.config),
+        )
         if result.interrupted:
             raise KeyboardInterrupt
         return SolverRun.of_result(trial.config_name, result)
@@ -163,13 +172,14 @@ def _run_solver(trial: Trial, dataset: Dataset, on_frame: OnFrame | None) -> Sol
     with closing(runner):
         for number, sweep in enumerate(islice(dataset, trial.frames)):
             runner.register(sweep)
+            sample.add(sweep)
             if on_frame is not None:
                 on_frame(number, runner.updates[-1])
         return runner.result(len(runner.updates))
 
 
-def _numbers(finished: SolverRun, truth: Trajectory | None) -> Row:
-    scores = score(finished, truth)
+def _numbers(finished: SolverRun, sample: MapSample, truth: Trajectory | None) -> Row:
+    scores = replace(score(finished, truth), **sample.sharpness(finished))
     counts = Counter(update.status for update in finished.updates)
     row: Row = {
         "frames": len(finished.updates),

@@ -296,3 +296,12 @@ def test_relative_errors_are_those_of_evo():
             rpe.process_data((reference, other))
             assert len(rpe.error) == found.pairs[0]
             assert ours == pytest.approx(float(np.mean(rpe.error)), rel=1e-6)
+
+
+def test_poses_that_are_no_numbers_have_no_error():
+    truth = winding()
+    poses = truth.map_T_lidar.copy()
+    poses[1] = np.nan
+    for error in (absolute_error, relative_error):
+        with pytest.raises(InputError, match="expected poses of finite numbers, got 1 of"):
+            error(changed(truth, poses), truth)

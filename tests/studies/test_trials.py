@@ -56,6 +56,9 @@ def test_a_row_has_the_numbers_of_the_run():
     assert (row["ate_m"], row["rotation_deg"]) == (absolute.rmse, absolute.rotation_rmse_deg)
     assert row["rpe_percent"] == relative.translation_percent
     assert row["rpe_shortest_m"] == relative.lengths[0]
+    assert 0.0 < row["thickness_mm"] < 40.0
+    assert 0.0 < row["planar_share"] <= 1.0
+    assert row["entropy"] < 0.0
     apart = pose_differences(found, truth)[1][-1]
     assert row["drift_percent"] == pytest.approx(100.0 * apart / truth.path_length, rel=1e-9)
     assert row["frames"] == 24

@@ -343,9 +343,9 @@ class Uncertainty:
         along the axes of the map, about its origin. It never shrinks.
     residual_variance : of the whitened residuals; 1 if their standard deviations are right
     effective_matches : independent rows that would know as much as the correlated ones do
-    blind : (6, 6) further drift, along directions that no scan saw, by an error of the velocity
-        that persists: ``blind @ u`` with u of unit covariance
-    forgotten : (6,) what was passed on of each u from frame to frame since the start, as the
+    blind : (6, 9) further drift, along directions that no scan saw, by errors of the velocity and
+        the linear acceleration that persist: ``blind @ u`` with u of unit covariance
+    forgotten : (9,) what was passed on of each u from frame to frame since the start, as the
         negative logarithm of the correlation
     """
 
@@ -355,8 +355,8 @@ class Uncertainty:
     drift: FloatArray
     residual_variance: float
     effective_matches: float
-    blind: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
-    forgotten: FloatArray = field(default_factory=lambda: np.zeros(6))
+    blind: FloatArray = field(default_factory=lambda: np.zeros((6, 9)))
+    forgotten: FloatArray = field(default_factory=lambda: np.zeros(9))
 
 
 class Timings(Mapping[str, float]):

@@ -113,7 +113,7 @@ class PoseErrors:
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionError(config.solver)
-        self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 6)), np.zeros(6)
+        self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
@@ -212,7 +212,7 @@ class PoseErrors:
             moved = step.by_velocity @ step.by_velocity.T + step.by_chance
             by_chance = by_chance + rows * seen.wander(moved)
         blind = self._blind + to_map @ step.by_velocity
-        faded = nearest_positive(np.eye(6) - step.kept.T @ step.kept)
+        faded = nearest_positive(np.eye(9) - step.kept.T @ step.kept)
         self._drift = self._drift + symmetric(
             to_map @ by_chance @ to_map.T + blind @ faded @ blind.T
         )

@@ -43,8 +43,7 @@ def test_a_seen_velocity_is_the_difference_of_two_poses():
 
 def test_a_velocity_that_was_never_seen_is_that_of_the_start():
     velocity, start = after([True] * 3)[0].velocity, CONFIG.start_speed**2
-    grown = 3.0 * (CONFIG.acceleration_sigma * SECONDS) ** 2
-    assert velocity[3, 3] == pytest.approx(start + grown, rel=1e-3)
+    assert start < velocity[3, 3] < start + (3.0 * CONFIG.acceleration_sigma * SECONDS) ** 2
 
 
 @pytest.mark.parametrize("blind", [True, False])
@@ -53,7 +52,7 @@ def test_along_what_nothing_sees_the_errors_of_steps_add_up(blind):
     changes = {"acceleration_sigma": 1e-6}
     error, steps = after([False] * 5 + [blind] * 50, **changes)
     before = after([False] * 5, **changes)[0].velocity[3, 3]
-    total, kept = np.zeros((6, 6)), np.eye(6)
+    total, kept = np.zeros((6, 9)), np.eye(9)
     for step in steps[5:]:
         total, kept = (total + step.by_velocity) @ step.kept.T, step.kept @ kept
     assert np.sqrt(total[3] @ total[3]) == pytest.approx(blind * 5.0 * before**0.5, rel=1e-3)
@@ -62,18 +61,24 @@ def test_along_what_nothing_sees_the_errors_of_steps_add_up(blind):
 
 
 def test_steps_are_as_large_as_those_of_a_sampled_velocity():
-    """Monte Carlo: a velocity known to 0.3 m/s at first, accelerations of 2 m/s^2, 40 blind."""
+    """Monte Carlo: a velocity known to 0.3 m/s at first, accelerations of 2 m/s^2, 40 blind.
+
+    An acceleration lasts for two seconds, as that of a vehicle that starts does.
+    """
     rng = np.random.default_rng(0)
     speed = rng.normal(0.0, after([False] * 5)[0].velocity[3, 3] ** 0.5, 20_000)
-    way = np.zeros(20_000)
+    way, sigma, stays = np.zeros(20_000), CONFIG.acceleration_sigma, np.exp(-SECONDS / 2.0)
+    acceleration = rng.normal(0.0, sigma, len(way))
     for _ in range(40):
-        jerk = rng.normal(0.0, CONFIG.acceleration_sigma * SECONDS, len(way))
-        way, speed = way + SECONDS * (speed + jerk), speed + jerk
+        speed = speed + SECONDS * acceleration
+        way = way + SECONDS * speed
+        new = rng.normal(0.0, sigma * np.sqrt(1.0 - stays**2), len(way))
+        acceleration = stays * acceleration + new
     _, steps = after([False] * 5 + [True] * 40)
-    total, rest = np.zeros((6, 6)), np.zeros((6, 6))
+    total, rest = np.zeros((6, 9)), np.zeros((6, 6))
     for step in steps[5:]:
         moved = total + step.by_velocity
-        rest += step.by_chance + moved @ (np.eye(6) - step.kept.T @ step.kept) @ moved.T
+        rest += step.by_chance + moved @ (np.eye(9) - step.kept.T @ step.kept) @ moved.T
         total = moved @ step.kept.T
     told = (total @ total.T + rest)[3, 3] ** 0.5
     assert told == pytest.approx(way.std(), rel=0.1)

@@ -13,7 +13,11 @@ from loam_gtsam.types import FloatArray
 
 _GYRO_RATE = 0.01
 """Error of a gyro's rate, rad/s: 0.6 degrees/s, a bias that was not learnt yet."""
-_LEAST = 1e-12  # (rad/s)^2 and (m/s)^2: keeps the velocity's covariance regular
+_LASTS = 2.0
+"""Seconds for which a vehicle goes on to gather speed: the time constant of an exponential
+correlation (Singer, Estimating optimal tracking filter performance for manned maneuvering targets,
+IEEE Transactions on Aerospace and Electronic Systems 6, 1970)."""
+_LEAST = 1e-12  # (rad/s)^2 and (m/s)^2: keeps the covariance of the state regular
 
 _LEAST_SHARE = 1e-15  # of the sum of all: a root is found to some 1e-16 of the largest variance
 
@@ -22,13 +26,13 @@ _LEAST_SHARE = 1e-15  # of the sum of all: a root is found to some 1e-16 of the 
 class BlindStep:
     """What a frame adds to the error that the expected motion alone leaves; axes of the lidar.
 
-    The error of the velocity is ``root @ u``, with u of unit covariance.
+    The error of velocity and acceleration is ``root @ u``, with u (9,) of unit covariance.
 
     Attributes
     ----------
-    by_velocity : (6, 6) displacement by the u of the last frame, rad and m
+    by_velocity : (6, 9) displacement by the u of the last frame, rad and m
     by_chance : (6, 6) covariance of a displacement that has nothing to do with others
-    kept : (6, 6) correlation of this frame's u (rows) with the last frame's (columns)
+    kept : (9, 9) correlation of this frame's u (rows) with the last frame's (columns)
     """
 
     by_velocity: FloatArray
@@ -45,18 +49,25 @@ class MotionError:
         pose: W (velocity * seconds + n) + s,  velocity: the change of that error over the seconds.
 
     So along what a scan sees the velocity's error is new with every frame, and along what no scan
-    sees it is the one before. Covariances are (6, 6), right perturbations.
+    sees it is the one before. An angular acceleration lasts for a frame, a linear one for seconds:
+    a vehicle that starts unseen gathers speed. The state is the velocity and that acceleration.
+    Covariances are of right perturbations.
     """
 
     def __init__(self, config: SolverConfig) -> None:
-        turn, speed = config.turn_sigma, config.acceleration_sigma
-        self._missed = np.repeat([turn, speed], 3) ** 2
-        self.velocity = np.diag(np.repeat([config.start_turn, config.start_speed], 3) ** 2.0)
+        self._turn, self._acceleration = config.turn_sigma**2, config.acceleration_sigma**2
+        start = [config.start_turn**2, config.start_speed**2, self._acceleration]
+        self._state = np.diag(np.repeat(start, 3))
         self._scan = np.zeros((6, 6))  # of the last solved pose in the map around it
         self._pose = np.zeros((6, 6))  # of the last pose in the map around it
         self._solved: int | None = None  # stamp of the last solved pose, nanoseconds
         self._last: int | None = None  # stamp of the last pose
         self._turned = False
+
+    @property
+    def velocity(self) -> FloatArray:
+        """(6, 6) covariance."""
+        return self._state[:6, :6]
 
     def cut(self) -> None:
         """The next frame is on another clock than the frames before."""
@@ -65,8 +76,9 @@ class MotionError:
     def of_expected(self, stamp: int, *, turned: bool) -> FloatArray:
         """Covariance of the pose expected at a stamp; ``turned`` if a gyro knows the rotation."""
         seconds = self._seconds(stamp, self._solved)
-        velocity = seconds**2 * self._known(turned=turned)
-        return self._scan + velocity + self._by_acceleration(seconds, turned=turned)
+        moved = _moved(seconds)
+        by_state = moved @ self._known(turned=turned) @ moved.T
+        return self._scan + by_state + self._by_turning(seconds, turned=turned)
 
     def coast(self, stamp: int, *, turned: bool) -> None:
         """The pose at a stamp is the expected one; the first pose is exact."""
@@ -84,25 +96,30 @@ class MotionError:
         """
         since, seconds = self._seconds(stamp, self._solved), self._seconds(stamp, self._last)
         scan = SCAN_VARIANCE * raw
-        velocity, missed = self._known(turned=turned), self._by_acceleration(since, turned=turned)
+        state, by_turning = self._known(turned=turned), self._by_turning(since, turned=turned)
         tied = share - np.eye(6)
-        noise = tied @ self._pose @ tied.T + scan
-        noise = noise / seconds**2 + share @ missed @ share.T / since**2
-        passed_on = share.copy()
+        noise = np.zeros((9, 9))
+        noise[:6, :6] = tied @ self._pose @ tied.T + scan
+        noise[:6, :6] = noise[:6, :6] / seconds**2 + share @ by_turning @ share.T / since**2
+        passed_on = np.zeros((9, 9))
+        passed_on[:6] = share @ _moved(since) / since
         if turned:  # the scan has no say in the velocity
-            passed_on[:3] = np.eye(6)[:3]
+            passed_on[:3] = np.eye(9)[:3]
             noise[:3] = noise[:, :3] = 0.0
-        before = positive_root(velocity)
-        found = symmetric(passed_on @ velocity @ passed_on.T + noise)
+        stays = np.exp(-since / _LASTS)
+        passed_on[6:, 6:] = stays * np.eye(3)
+        noise[6:, 6:] = (1.0 - stays**2) * self._acceleration * np.eye(3)
+        before = positive_root(state)
+        found = symmetric(passed_on @ state @ passed_on.T + noise)
         least = max(_LEAST, _LEAST_SHARE * float(np.trace(found)))
-        self.velocity = found + least * np.eye(6)
-        kept = np.linalg.solve(positive_root(self.velocity), passed_on @ before)
+        self._state = found + least * np.eye(9)
+        kept = np.linalg.solve(positive_root(self._state), passed_on @ before)
         left, values, right = np.linalg.svd(kept)
         # What is tied to the map by 1 - share is drawn back to the map by that in the next frame.
         lasting = share @ share
         step = BlindStep(
-            since * lasting @ before,
-            lasting @ (self._scan + missed) @ lasting.T,
+            lasting @ _moved(since) @ before,
+            lasting @ (self._scan + by_turning) @ lasting.T,
             (left * np.minimum(values, 1.0)) @ right,
         )
         self._scan = self._pose = scan
@@ -111,21 +128,23 @@ class MotionError:
         return step
 
     def _known(self, *, turned: bool) -> FloatArray:
-        """Covariance of the velocity with which the next pose is predicted."""
+        """Covariance of the state with which the next pose is predicted."""
         if not turned or self._turned:
-            return self.velocity
-        velocity = self.velocity.copy()
-        velocity[:3] = velocity[:, :3] = 0.0
-        velocity[:3, :3] = _GYRO_RATE**2 * np.eye(3)
-        return velocity
+            return self._state
+        state = self._state.copy()
+        state[:3] = state[:, :3] = 0.0
+        state[:3, :3] = _GYRO_RATE**2 * np.eye(3)
+        return state
 
-    def _by_acceleration(self, seconds: float, *, turned: bool) -> FloatArray:
-        """What the acceleration since the last pose does to the expected one."""
-        missed = seconds**4 * self._missed
-        if turned:
-            missed[:3] = 0.0
-        return np.diag(missed)
+    def _by_turning(self, seconds: float, *, turned: bool) -> FloatArray:
+        """What the angular acceleration since the last pose does to the expected one."""
+        return np.diag(np.repeat([0.0 if turned else seconds**4 * self._turn, 0.0], 3))
 
     @staticmethod
     def _seconds(stamp: int, since: int | None) -> float:
         return 0.1 if since is None else max((stamp - since) * 1e-9, 1e-3)
+
+
+def _moved(seconds: float) -> FloatArray:
+    """(6, 9) displacement over some seconds by the state."""
+    return np.hstack([seconds * np.eye(6), seconds**2 * np.eye(6, 3, k=-3)])

@@ -16,7 +16,7 @@ from support.list_dataset import ListDataset
 from loam_gtsam.config import preset
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.pipeline import run
-from loam_gtsam.types import Features, FeatureSweep
+from loam_gtsam.types import Features, FeatureSweep, ImuSamples
 
 EXTRACT = Path(__file__).parent / "data" / "fidelity.npz"
 GRID = 1.0 / 512.0
@@ -58,7 +58,8 @@ def extract():
             kept["stamps"], *clouds, odometry, strict=True
         )
     ]
-    return ListDataset(sweeps), {name: as_matrices(kept[name]) for name in ("aloam", "loam")}
+    names = "aloam", "loam", "loam_imu"
+    return ListDataset(sweeps), {name: as_matrices(kept[name]) for name in names}
 
 
 @pytest.mark.parametrize(
@@ -74,6 +75,22 @@ def test_the_presets_follow_the_cpp_systems(extract, name, median, largest, degr
     assert rotation.max() < degrees
     other = preset(name).changed("matching.line_ratio=5")
     assert np.median(differences(other, sweeps, theirs[name])[0]) > largest
+
+
+def test_the_tilt_is_blended_as_laser_mapping_does(extract):
+    sweeps, theirs = extract
+    first, last = sweeps.items[0].stamp, sweeps.items[-1].stamp
+    stamps = np.arange(first, last + 1, 5_000_000)
+    leaning = np.clip((stamps - first) * 1e-9 - 1.0, 0.0, 1.0)  # from level, within a second
+    angles = np.outer(leaning, [0.3, -0.2, 0.0])
+    still, up = np.zeros((len(stamps), 3)), np.tile([0.0, 0.0, 9.81], (len(stamps), 1))
+    with_imu = ListDataset(sweeps.items)
+    with_imu.imu = ImuSamples(stamps, Rotation.from_euler("xyz", angles).as_quat(), still, up)
+    position, rotation, _ = differences(preset("loam"), with_imu, theirs["loam_imu"])
+    assert np.median(position) < 0.002
+    assert rotation.max() < 0.02
+    unblended = np.linalg.inv(theirs["loam"]) @ theirs["loam_imu"]
+    assert np.degrees(Rotation.from_matrix(unblended[-1, :3, :3]).magnitude()) > 0.1
 
 
 @pytest.mark.parametrize(

@@ -29,12 +29,12 @@ had_one: list[int] = []
 
 def gps(context: PoseContext) -> Sequence[gtsam.NonlinearFactor]:
     """The position at that moment, between two fixes; no factor where they are too far apart."""
-    after = int(np.searchsorted(stamps, context.stamp))
+    after = int(np.searchsorted(stamps, context.middle_stamp))
     if after in (0, len(stamps)) or stamps[after] - stamps[after - 1] > LONGEST:
         return []
-    seconds = (stamps - context.stamp) * 1e-9
+    seconds = (stamps - context.middle_stamp) * 1e-9
     position = np.array([np.interp(0.0, seconds, column) for column in positions.T])
-    had_one.append(int(np.searchsorted(world.truth.stamps, context.stamp)) - 1)
+    had_one.append(int(np.searchsorted(world.truth.stamps, context.middle_stamp)) - 1)
     return [gtsam.GPSFactor(context.key, position, gtsam.noiseModel.Isotropic.Sigma(3, SIGMA))]
 
 

@@ -40,7 +40,7 @@ def floor(context: PoseContext) -> gtsam.NonlinearFactor:
 def wheels(context: PoseContext) -> gtsam.NonlinearFactor:
     """What the wheels have turned since the last sweep; they slip by 1 %."""
     stamp, _ = context.last
-    a, b = world.truth_at(np.array([stamp, context.stamp])).map_T_lidar
+    a, b = world.truth_at(np.array([stamp, context.middle_stamp])).map_T_lidar
     step = gtsam.Pose3(np.linalg.inv(a) @ b)
     step = gtsam.Pose3(step.rotation(), 1.01 * step.translation())
     noise = gtsam.noiseModel.Diagonal.Sigmas(WHEELS)

@@ -406,21 +406,27 @@ def test_own_factors_are_asked_for_once_a_frame_and_act(shaken, sweeps):
 
     def extra(context):
         asked.append(context)
-        return [tight(context.guess.translation() + np.array([0.0, 0.0, 0.02]))]
+        return [tight(context.map_T_middle.translation() + np.array([0.0, 0.0, 0.02]))]
 
     result = run(data_of(shaken, sweeps[:5]), extra_factors=extra)
     assert [context.key for context in asked] == [POSE_KEY] * 4
     half = 50_000_000  # the middle of a sweep
-    assert [context.stamp for context in asked] == [scan.stamp + half for scan in sweeps[1:5]]
+    assert [context.middle_stamp for context in asked] == [
+        scan.stamp + half for scan in sweeps[1:5]
+    ]
     assert [context.last[0] for context in asked] == [scan.stamp + half for scan in sweeps[:4]]
+    with pytest.deprecated_call(match="middle_stamp"):
+        assert asked[0].stamp == asked[0].middle_stamp
+    with pytest.deprecated_call(match="map_T_middle"):
+        assert asked[0].guess is asked[0].map_T_middle
     for context, before in zip(asked[1:], result.updates[1:], strict=False):
         # The middle of the last sweep is half a sweep on from its reported pose.
         there = before.map_T_lidar.between(context.last[1])
         assert np.linalg.norm(there.translation()) < 0.05
-        assert np.linalg.norm(context.last[1].localCoordinates(context.guess)) < 0.3
+        assert np.linalg.norm(context.last[1].localCoordinates(context.map_T_middle)) < 0.3
         # The pose of the last frame is where the factor on it wanted it.
     for context, after in pairwise(asked):
-        moved = after.last[1].translation() - context.guess.translation()
+        moved = after.last[1].translation() - context.map_T_middle.translation()
         np.testing.assert_allclose(moved, [0.0, 0.0, 0.02], atol=1e-3)
 
 

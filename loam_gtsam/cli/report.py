@@ -15,16 +15,17 @@ from rich.text import Text
 from loam_gtsam.aiding.imu_summary import ImuSummary
 from loam_gtsam.cli.console import number_table
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.base import Dataset, PartOf
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.io.run_files import stage_seconds
-from loam_gtsam.pipeline import RunResult, effective_config, imu_buffer
+from loam_gtsam.pipeline import RunResult, effective_config, imu_buffer, run
 from loam_gtsam.refine.map_quality import map_quality
 from loam_gtsam.types import (
     TANGENT,
     BadSweep,
     FeatureSweep,
+    FloatArray,
     FrameStatus,
     MapUpdate,
     Sweep,
@@ -44,6 +45,8 @@ _ADVICE = {
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _MESSAGES, _TRIED_SWEEPS = 3, 5
+_MAPPED = 50  # sweeps from which the turns of the scans are told; a word needs 20
+_SOUGHT, _STEP = 30.0, 1.0  # seconds in which a start for them is sought, and between such starts
 _VOXELS = 4  # of the map along the edge of a cell in which a plane is looked for
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
@@ -214,7 +217,7 @@ def profile_table(updates: Sequence[MapUpdate]) -> Table:
 
 def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     """What was understood of a data set, and whether it can be run."""
-    config = effective_config(config, dataset)
+    asked, config = config, effective_config(config, dataset)
     info = dataset.info()
     rows = {"path": info.path, **info.facts}
     problems = list(info.problems)
@@ -233,7 +236,8 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     if imu is not None:
         used = f"{imu.report.samples} samples at {imu.report.rate:.0f} Hz"
         rows["IMU, used"] = f"{used}, orientation {_ORIENTATIONS[imu.report.orientation]}"
-        problems += imu.report.problems
+        rows["IMU, by the scans"], found = _by_scans(dataset, asked) if facts else ("", [])
+        problems += found or imu.report.problems
     tables = [_table(info.kind, rows), *([_table("First usable sweep", facts)] if facts else [])]
     notes = [Text(f"problem: {problem}", style="yellow") for problem in problems]
     verdict = "can be run" if facts else "cannot be run: no usable sweep among the first few"
@@ -253,6 +257,39 @@ def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:
         f"IMU: its samples are from {first * 1e-9:.3f} to {last * 1e-9:.3f} s, the sweep shown is "
         f"at {stamp * 1e-9:.3f} s; if they never meet, the clocks differ, and the IMU is not used"
     ]
+
+
+def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
+    """What a short run says of an IMU: how much was mapped, and problems with the IMU.
+
+    The sweeps are the first, of the first half minute, over which the gyro's rates vary at least
+    half as much as over any: where nothing turns, clock and mounting cannot be told.
+    """
+    first = next(iter(dataset)).stamp
+    imu = dataset.imu
+    begin = 0.0
+    if imu is not None and len(imu.stamps):
+        order = np.argsort(imu.stamps, kind="stable")
+        seconds = (imu.stamps[order] - first).astype(np.float64) * 1e-9 + config.imu.time_offset
+        begin = where_it_turns(seconds, imu.gyro[order], config.sensor.period * len(dataset))
+    part = PartOf(dataset, 0, 1, begin)
+    result = run(part, config, max_frames=_MAPPED, keep_partial=True)
+    if result.imu is None:
+        return "", []
+    said = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
+    return said, _imu_problems(result.imu)
+
+
+def where_it_turns(seconds: FloatArray, gyro: FloatArray, duration: float) -> float:
+    """Seconds, within ``_SOUGHT``, from which on the rates vary much over the mapped sweeps.
+
+    ``seconds`` of the rates (N, 3) count from the first sweep, and ``duration`` is that of all.
+    """
+    length = 0.1 * _MAPPED
+    starts = np.arange(0.0, np.clip(duration - length, _STEP, _SOUGHT), _STEP)
+    windows = [gyro[slice(*np.searchsorted(seconds, [t, t + length]))] for t in starts]
+    varied = np.array([w.var(axis=0).sum() * len(w) if len(w) else 0.0 for w in windows])
+    return float(starts[np.argmax(varied >= 0.5 * varied.max())])
 
 
 def _sweep_facts(sweep: Sweep, config: Config) -> dict[str, str]:

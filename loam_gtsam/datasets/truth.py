@@ -64,7 +64,7 @@ def read_truth(
     elif topic is not None:
         raise DatasetError(f"{path}: a topic belongs to a bag, and this is none")
     else:
-        found, poses = _of_text(path, stamps)
+        found, poses = _of_text(path, stamps, problems)
     if not len(found):
         raise DatasetError(f"{path}: no poses")
     truth = tables.sorted_trajectory(found, poses, path.name, problems)
@@ -102,7 +102,9 @@ def extrinsic(text: str) -> FloatArray:
         ) from error
 
 
-def _of_text(path: Path, stamps: IntArray | None) -> tuple[IntArray, FloatArray]:
+def _of_text(
+    path: Path, stamps: IntArray | None, problems: list[str]
+) -> tuple[IntArray, FloatArray]:
     lines = [line.strip() for line in tables.read_lines(path)]
     rows = [line for line in lines if line and line[0] in "+-.0123456789"]
     if not rows:
@@ -112,7 +114,7 @@ def _of_text(path: Path, stamps: IntArray | None) -> tuple[IntArray, FloatArray]
     first = rows[0].split(separator)[0].strip()
     nanoseconds = first.isdigit() and len(first) > _SECONDS_DIGITS
     if width == 12 and separator is None:
-        return _without_stamps(path, rows, stamps)
+        return _without_stamps(path, rows, stamps, problems)
     if separator == "," and nanoseconds and width >= 8:  # EuRoC: the real part comes first
         return _table(path, rows, separator, nanoseconds, (0, 1, 2, 4, 5, 6, 3))
     if width == 9 and separator == ",":
@@ -153,7 +155,7 @@ def _pose(numbers: Sequence[float]) -> FloatArray:
 
 
 def _without_stamps(
-    path: Path, rows: list[str], stamps: IntArray | None
+    path: Path, rows: list[str], stamps: IntArray | None, problems: list[str]
 ) -> tuple[IntArray, FloatArray]:
     if stamps is None or len(rows) != len(stamps):
         known = "unknown" if stamps is None else str(len(stamps))
@@ -167,6 +169,11 @@ def _without_stamps(
         raise DatasetError(
             f"{path}: expected 12 numbers of a rigid transform in every line: {str(error)[:80]}"
         ) from error
+    problems.append(
+        f"{path.name}: without stamps, so its poses are taken to be those at the stamps of the "
+        "sweeps; if they are of another moment of the sweep (ours: deskew.reference), the motion "
+        "in between passes for error"
+    )
     return stamps, inverse_pose(whole[0]) @ np.array(whole)
 
 

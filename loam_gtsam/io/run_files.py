@@ -189,6 +189,8 @@ def write_run(
     folder = make_folder(directory)
     trajectory = result.trajectory
     records = {"made by": f"loam_gtsam {installed_version()}", "data set": dataset}
+    moment = result.config.deskew.reference
+    records["poses"] = f"at the {moment} of each sweep (deskew.reference), as their stamps"
     if result.interrupted or result.error:
         records["incomplete"] = "the run ended early"
     write_tum(folder / "trajectory.tum", trajectory, comments=records)
@@ -210,6 +212,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "loam_gtsam": installed_version(),
         "frames": len(result.updates),
         "poses": len(trajectory),
+        "pose_moment": result.config.deskew.reference,
         "interrupted": result.interrupted,
         "error": None if result.error is None else f"{type(result.error).__name__}: {result.error}",
         "status_counts": result.status_counts,

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam.cli import run as run_command
 from loam_gtsam.cli.console import stop_requests
+from loam_gtsam.cli.report import where_it_turns
 from loam_gtsam.cli.results import BASE_FILES, ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import DatasetInfo
@@ -399,12 +401,34 @@ def test_run_says_that_the_imu_is_mounted_otherwise():
     assert re.search(r"fit those of the scans better by (179|180) degrees", text)
 
 
+def test_inspect_names_an_imu_that_is_late(monkeypatch):
+    """With the offset that is named there is nothing to say."""
+    imu = SimulatedWorld("shaken", frames=60, columns=900).imu
+    late = replace(imu, stamps=imu.stamps + 100_000_000)
+    monkeypatch.setattr(SimulatedWorld, "imu", late)
+    text = said("inspect", "sim:shaken?columns=900&frames=30")
+    assert re.search(r"its clock is (9[5-9]|10[0-5]) ms late", text)
+    assert "30 sweeps mapped, from 0 s on" in text
+    offset = ["--set", "imu.time_offset=-0.1"]
+    assert "problem" not in said("inspect", "sim:shaken?columns=900&frames=30", *offset)
+
+
+def test_inspect_maps_where_the_lidar_turns():
+    seconds = np.arange(-2.0, 60.0, 0.01)
+    gyro = np.zeros((len(seconds), 3))
+    assert where_it_turns(seconds, gyro, 60.0) == 0.0
+    gyro[(seconds > 14.0) & (seconds < 17.0)] = np.sin(np.arange(300.0))[:, None]
+    assert 9.0 <= where_it_turns(seconds, gyro, 60.0) <= 14.0
+    assert where_it_turns(seconds + 100.0, gyro, 60.0) == 0.0  # it has no samples there
+    assert where_it_turns(seconds, gyro, 12.0) <= 7.0  # nor sweeps
+
+
 def test_inspect_shows_what_was_understood_of_sweeps_and_imu(opens, scans, monkeypatch):
-    text = said("inspect", "sim:room")
+    text = said("inspect", "sim:room?frames=3")
     for part in ("simulated world", "16 rings from the ring field", "per-point times",
                  "samples at 200 Hz, orientation its own", "can be run"):  # fmt: skip
         assert part in text
-    assert "IMU, used" not in said("inspect", "sim:room", "--set", "imu.coupling=off")
+    assert "IMU, used" not in said("inspect", "sim:room?frames=3", "--set", "imu.coupling=off")
     opens(scans[:1])
     assert "IMU, used" not in said("inspect", "x")
     imu = SimulatedWorld("room", frames=2).imu

@@ -22,13 +22,13 @@ CLOSE = ("loops.enabled=true", "pose_graph.keyframe_distance=0.2", "loops.min_wa
 def gps(context):
     """A position at the prediction, as a receiver would measure it."""
     noise = gtsam.noiseModel.Isotropic.Sigma(3, 0.5)
-    return [gtsam.GPSFactor(context.key, context.guess.translation(), noise)]
+    return [gtsam.GPSFactor(context.key, context.map_T_middle.translation(), noise)]
 
 
 def wheels(context):
     """A motion since the last sweep, as an odometer would measure it."""
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.2)
-    moved = context.last[1].between(context.guess)
+    moved = context.last[1].between(context.map_T_middle)
     return [gtsam.BetweenFactorPose3(context.last_key, context.key, moved, noise)]
 
 

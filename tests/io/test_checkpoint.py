@@ -245,7 +245,7 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
     frames = []
 
     def interrupting(context):
-        frames.append(context.stamp)
+        frames.append(context.middle_stamp)
         if len(frames) == 3:
             raise KeyboardInterrupt
         return []

@@ -53,6 +53,7 @@ def test_evo_finds_the_same_ate_in_the_files_of_a_run(result, tmp_path):
     write_kitti(tmp_path / "truth.txt", reference)
     expected = absolute_error(result.trajectory, reference).rmse
     assert 1.0 < expected < 5.0
+    assert "# poses: at the start of each sweep" in (tmp_path / "trajectory.tum").read_text()
     tum = file_interface.read_tum_trajectory_file
     kitti = file_interface.read_kitti_poses_file
     pairs = (

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -31,17 +32,35 @@ class PoseContext:
     Attributes
     ----------
     key : of the unknown pose ``map_T_lidar`` at the middle of the sweep
-    stamp, guess : nanoseconds and predicted ``map_T_lidar`` of the middle of the sweep
+    middle_stamp, map_T_middle : nanoseconds, and the predicted pose; for a measurement of another
+        moment, as the start of the sweep, ask for it at this one
     last : stamp, nanoseconds, and pose of the middle of the last sweep
     last_key : key of the pose in ``last``, for factors between the two sweeps; that pose is known
         and does not change
     """
 
     key: int
-    stamp: int
-    guess: gtsam.Pose3
+    middle_stamp: int
+    map_T_middle: gtsam.Pose3
     last: tuple[int, gtsam.Pose3]
     last_key: int = LAST_KEY
+
+    @property
+    def stamp(self) -> int:
+        """Deprecated name of ``middle_stamp``."""
+        _renamed("stamp", "middle_stamp")
+        return self.middle_stamp
+
+    @property
+    def guess(self) -> gtsam.Pose3:
+        """Deprecated name of ``map_T_middle``."""
+        _renamed("guess", "map_T_middle")
+        return self.map_T_middle
+
+
+def _renamed(old: str, new: str) -> None:
+    what = f"PoseContext.{old} is now {new}, and gone in 0.3"
+    warnings.warn(what, DeprecationWarning, stacklevel=3)
 
 
 ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]

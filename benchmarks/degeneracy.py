@@ -378,10 +378,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, rows in (("detectors", detections), ("policies", outcomes)):
         columns_of = [item.name for item in fields(rows[0])]
         write_csv(options.output / f"{name}.csv", columns_of, map(astuple, rows), digits=4)
-    head = "# Unseen motions\n\nWritten by `python -m benchmarks.degeneracy`."
-    text = "\n\n".join((head, table(detections), table(outcomes)))
-    (options.output / "degeneracy.md").write_text(text, encoding="utf-8")
-    print(text)
+    print(table(detections), table(outcomes), sep="\n\n")
     return 0
 
 

@@ -27,18 +27,21 @@ if TYPE_CHECKING:
     from loam_gtsam.datasets.bags.loam_topics import LoamTopicsDataset as LoamTopicsDataset
     from loam_gtsam.datasets.decode.pointcloud2 import decode_pointcloud2 as decode_pointcloud2
     from loam_gtsam.datasets.kitti.folder import KittiDataset as KittiDataset
+    from loam_gtsam.datasets.known.boreas import BoreasDataset as BoreasDataset
     from loam_gtsam.datasets.known.helipr import HeLiPRDataset as HeLiPRDataset
     from loam_gtsam.datasets.known.mulran import MulRanDataset as MulRanDataset
     from loam_gtsam.datasets.known.newer_college import NewerCollegeBags as NewerCollegeBags
     from loam_gtsam.datasets.known.newer_college import NewerCollegeClouds as NewerCollegeClouds
     from loam_gtsam.datasets.known.oxford_spires import OxfordSpiresBags as OxfordSpiresBags
     from loam_gtsam.datasets.known.oxford_spires import OxfordSpiresClouds as OxfordSpiresClouds
+    from loam_gtsam.datasets.known.rigs import RigBag as RigBag
     from loam_gtsam.datasets.sim.streets import build_city as build_city
     from loam_gtsam.datasets.sim.world import SimulatedWorld as SimulatedWorld
 
 _LAZY = {
     "ArrayDataset": "arrays",
     "BagDataset": "bags.bag",
+    "BoreasDataset": "known.boreas",
     "HeLiPRDataset": "known.helipr",
     "KittiDataset": "kitti.folder",
     "LoamTopicsDataset": "bags.loam_topics",
@@ -47,6 +50,7 @@ _LAZY = {
     "NewerCollegeClouds": "known.newer_college",
     "OxfordSpiresBags": "known.oxford_spires",
     "OxfordSpiresClouds": "known.oxford_spires",
+    "RigBag": "known.rigs",
     "SimulatedWorld": "sim.world",
     "build_city": "sim.streets",
     "decode_pointcloud2": "decode.pointcloud2",
@@ -57,8 +61,8 @@ _BAG_FILES = (".bag", ".mcap", ".db3")
 _ACCEPTED = (
     "a folder with .bin, .pcd, .ply or .npy sweeps (also in velodyne/, scans/ or "
     "velodyne_points/data/), a ROS 1 .bag, a ROS 2 bag folder (with metadata.yaml), an .mcap or "
-    ".db3 file, a sequence of Newer College, MulRan, HeLiPR or Oxford Spires, or a built-in world "
-    "such as sim:street_loop or 'sim:room?frames=50&seed=3'"
+    ".db3 file, a sequence of Newer College, MulRan, HeLiPR, Boreas or Oxford Spires, or a "
+    "built-in world such as sim:street_loop or 'sim:room?frames=50&seed=3'"
 )
 _OTHERS = "sweeps of any other format: docs/own_sensor.md"
 _LOOKED_AT = 500  # folders searched for a better path to suggest
@@ -144,12 +148,15 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
     from loam_gtsam.datasets.bags.bag_reader import open_bag
     from loam_gtsam.datasets.bags.loam_topics import LoamTopicsDataset
     from loam_gtsam.datasets.decode.loam_messages import REQUIRED
+    from loam_gtsam.datasets.known.rigs import RigBag, rig_of
 
     with closing(open_bag(path)) as reader:
-        loam = reader.topics.keys() >= set(REQUIRED)
+        loam, rig = reader.topics.keys() >= set(REQUIRED), rig_of(reader.topics.keys())
     plain = (BagOptions.__annotations__.keys() - {"imu_topic"}) & options.keys()
     own = "axes" in options or (loam and not plain)
-    return _construct(LoamTopicsDataset if own else BagDataset, path, options)
+    known = rig is not None and options.get("topic") in (None, rig.topic)
+    plain_bag = RigBag if known else BagDataset
+    return _construct(LoamTopicsDataset if own else plain_bag, path, options)
 
 
 def _open_world(text: str, options: dict[str, Any]) -> Dataset:

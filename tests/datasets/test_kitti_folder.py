@@ -150,6 +150,14 @@ def test_reference_poses_and_imu_of_a_folder(tmp_path: Path) -> None:
     np.testing.assert_allclose(dataset.truth.map_T_lidar[0], expected, atol=1e-12)
     assert dataset.imu.stamps.tolist() == [5_000_000]
     np.testing.assert_allclose(dataset.imu.acceleration, [[0, 0, 9.81]])
+    (folder / "imu.csv").unlink()  # EuRoC's table has no orientation
+    (folder / "imu0").mkdir()
+    text = "#timestamp [ns],w_RS_S_x [rad s^-1],...\n5000000,0.1,0.2,0.3,0,0,9.81\n"
+    (folder / "imu0" / "data.csv").write_text(text)
+    euroc = KittiDataset(folder).imu
+    assert euroc.stamps.tolist() == [5_000_000]
+    assert euroc.orientation is None
+    np.testing.assert_allclose(euroc.gyro, [[0.1, 0.2, 0.3]])
 
 
 @pytest.mark.parametrize(

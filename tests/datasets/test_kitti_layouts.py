@@ -258,3 +258,33 @@ def test_the_odometry_benchmark_s_poses_must_fit_the_sweeps(tmp_path: Path) -> N
     dataset = open_dataset(sequence)
     assert dataset.sensor["stamp"] == "middle"  # nothing says that it is of the benchmark
     assert isinstance(next(iter(dataset)), Scan)
+
+
+def test_a_drive_of_kitti_360_has_its_poses(tmp_path: Path) -> None:
+    """Frame numbers and poses of a camera; rays are left as they are."""
+    name = "2013_05_28_drive_0000_sync"
+    root = tmp_path / "data_3d_raw" / name
+    stamps = write_sweeps(root / "velodyne_points" / "data")
+    write_dates(root / "velodyne_points" / "timestamps.txt", stamps)
+    assert open_dataset(root).truth is None
+    lidar_T_camera = np.linalg.inv(CAMERA_T_LIDAR)
+    true = write.room(**WORLD).truth_at(np.array(stamps[1:])).map_T_lidar
+    poses = tmp_path / "data_poses" / name / "cam0_to_world.txt"
+    rows = (true @ lidar_T_camera).reshape(-1, 16)
+    poses.parent.mkdir(parents=True)
+    lines = [f"{k} {' '.join(map(repr, row.tolist()))}" for k, row in enumerate(rows, start=1)]
+    poses.write_text("\n".join(lines) + "\n")
+    dataset = open_dataset(root)
+    assert dataset.truth is None
+    assert "calib_cam_to_velo.txt says where the scanner is" in " ".join(dataset.info().problems)
+    (tmp_path / "calibration").mkdir()
+    calibration = tmp_path / "calibration" / "calib_cam_to_velo.txt"
+    calibration.write_text(" ".join(map(repr, lidar_T_camera[:3].ravel().tolist())) + "\n")
+    dataset = open_dataset(root)
+    assert dataset.truth.stamps.tolist() == stamps[1:]
+    np.testing.assert_allclose(dataset.truth.map_T_lidar, true, atol=1e-7)
+    assert "elevation raised by" not in dataset.info().facts
+    assert dataset.sensor["stamp"] == "middle"
+    poses.write_text(f"{len(stamps)} {' '.join(['0'] * 16)}\n")
+    with pytest.raises(DatasetError, match=r"cam0_to_world.txt:1: expected a frame number"):
+        _ = open_dataset(root).truth

@@ -200,6 +200,15 @@ def rows_in_time(stamps: IntArray) -> IntArray:
     return np.asarray(order[later])
 
 
+def read_imu(path: Path, problems: list[str]) -> ImuSamples | None:
+    """Samples of ``t qx qy qz qw wx wy wz ax ay az``, or of EuRoC's ``ns wx wy wz ax ay az``."""
+    first = next((line for line in read_lines(path) if not line.startswith("#")), "")
+    if first.count(",") != 6:
+        return clean_imu(*read_table(path, "t qx qy qz qw wx wy wz ax ay az", ","), problems)
+    stamps, values = read_table(path, "ns wx wy wz ax ay az", ",")
+    return clean_imu(stamps, np.hstack([np.zeros((len(values), 4)), values]), problems)
+
+
 def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuSamples | None:
     """IMU samples in order of time, in SI units; what had to be put right goes to ``problems``.
 

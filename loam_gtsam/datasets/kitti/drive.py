@@ -22,6 +22,7 @@ from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import DatasetError, FloatArray, ImuSamples, IntArray, Trajectory
 
 _RAW = "velodyne_points"
+_KITTI_360 = re.compile(r"2013_05_28_drive_\d{4}_(sync|extract)")
 _EARTH_RADIUS = 6378137.0  # metres, as in the development kit
 _LATITUDE, _LONGITUDE, _ALTITUDE = 0, 1, 2
 _ANGLES = slice(3, 6)  # roll, pitch, yaw: radians; yaw 0 is east
@@ -199,6 +200,43 @@ def odometry_truth(root: Path, stamps: IntArray, camera_T_lidar: FloatArray) -> 
         raise DatasetError(f"{path}: {len(poses)} poses for {len(stamps)} sweeps")
     moved = inverse_pose(camera_T_lidar) @ np.reshape(poses, (-1, 4, 4)) @ camera_T_lidar
     return Trajectory(stamps, moved)
+
+
+def is_kitti_360(root: Path) -> bool:
+    """Whether a folder has the name of a drive of KITTI-360."""
+    return _KITTI_360.fullmatch(root.resolve().name) is not None
+
+
+def kitti_360_truth(root: Path, problems: list[str]) -> Trajectory | None:
+    """Poses of the scanner from ``cam0_to_world.txt``: frame numbers and matrices, row by row.
+
+    Liao, Xie and Geiger, KITTI-360, PAMI 45(3), 2023; ``loadCalibration.py`` of its scripts.
+    """
+    above, name = root.resolve().parent.parent, root.resolve().name
+    path = first_existing(above, [f"data_poses/{name}/cam0_to_world.txt"])
+    if path is None:
+        return None
+    calibration = above / "calibration" / "calib_cam_to_velo.txt"
+    if not calibration.is_file():
+        problems.append(f"{path.name} left out: no {calibration} says where the scanner is")
+        return None
+    dates = read_dates(root / _RAW / "timestamps.txt")
+
+    def frame(line: str) -> tuple[int, FloatArray]:
+        number, *words = line.split()
+        if len(words) != 16 or not 0 <= (at := tables.whole_number(number)) < len(dates):
+            raise ValueError(f"{len(words)} numbers, of {len(dates)} frames")
+        return int(dates[at]), tables.rigid_matrix([float(word) for word in words[:12]])
+
+    def rigid(line: str) -> FloatArray:
+        return tables.rigid_matrix([float(word) for word in line.split()])
+
+    expected = "12 numbers of a rigid transform"
+    lidar_T_camera = tables.convert_lines(calibration, rigid, expected)[0]
+    rows = tables.convert_lines(path, frame, "a frame number and the 16 of a rigid transform")
+    stamps = np.array([stamp for stamp, _ in rows], np.int64)
+    poses = np.reshape([pose for _, pose in rows], (-1, 4, 4)) @ inverse_pose(lidar_T_camera)
+    return tables.sorted_trajectory(stamps, poses, path.name, problems)
 
 
 def _calibration(path: Path) -> dict[str, list[float]]:

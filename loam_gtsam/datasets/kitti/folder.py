@@ -25,6 +25,7 @@ from loam_gtsam.datasets.decode.packed_points import (
 from loam_gtsam.datasets.decode.point_times import TimeDecision, apply_times, decide_times
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
 from loam_gtsam.datasets.kitti import drive
+from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
 
 KITTI_SENSOR: Mapping[str, Any] = {
@@ -70,12 +71,15 @@ class KittiDataset(SweepFiles):
     -----
     Next to the sweeps it reads, where present: ``times.txt`` (seconds, one per sweep) or KITTI's
     ``velodyne_points/timestamps.txt``; ``t_ns/*.u64`` (uint64 nanoseconds per point);
-    ``gt.tum`` (reference poses); ``imu.csv`` (s, quaternion x y z w, rad/s, m/s^2).
+    ``gt.tum`` (reference poses); ``imu.csv`` (s, quaternion x y z w, rad/s, m/s^2) or EuRoC's
+    ``imu0/data.csv`` (ns, rad/s, m/s^2; ``imu.csv`` may have these columns, too).
 
     Of KITTI's raw drives also ``timestamps_start.txt`` and ``timestamps_end.txt`` (the duration of
     a turn), and ``oxts/`` with ``calib_imu_to_velo.txt`` as IMU and as reference poses. A sequence
     of its odometry benchmark, known by ``Tr`` in ``calib.txt``, has sweeps that are already freed
-    of the motion; its reference poses are ``../../poses/NN.txt``.
+    of the motion; its reference poses are ``../../poses/NN.txt``. Those of a drive of KITTI-360,
+    known by its name, are ``../../data_poses/DRIVE/cam0_to_world.txt``, with
+    ``../../calibration/calib_cam_to_velo.txt``.
 
     Raises
     ------
@@ -102,6 +106,7 @@ class KittiDataset(SweepFiles):
         if suffix == ".bin" and (columns or _columns_of(self._files)) == 5:
             self._record = XYZI_RING
         self._times_folder = self._root / "t_ns"
+        self._imu_file = first_existing(self._root, ["imu.csv", "imu0/data.csv"])
         self._problems: list[str] = []
         self.stamps = drive.sweep_stamps(self._root, self._files, self._problems)
         self._camera_T_lidar = drive.camera_T_lidar_of(self._root)
@@ -115,7 +120,8 @@ class KittiDataset(SweepFiles):
         self.sensor: Mapping[str, Any] = self._implied(folder)
         self._default_offset = vertical_angle_offset_deg is None
         if vertical_angle_offset_deg is None:
-            kitti = suffix == ".bin" and self.sensor.get("stamp") == KITTI_SENSOR["stamp"]
+            kitti = not drive.is_kitti_360(self._root) and suffix == ".bin"
+            kitti = kitti and self.sensor.get("stamp") == KITTI_SENSOR["stamp"]
             vertical_angle_offset_deg = ELEVATION_DEG if kitti else 0.0
         self._offset = float(np.radians(vertical_angle_offset_deg))
         if not np.isfinite(self._offset):
@@ -127,10 +133,8 @@ class KittiDataset(SweepFiles):
     @cached_property
     def imu(self) -> ImuSamples | None:
         """The IMU of ``imu.csv`` or ``oxts/``, or None."""
-        path = self._root / "imu.csv"
-        if path.is_file():
-            table = tables.read_table(path, "t qx qy qz qw wx wy wz ax ay az", ",")
-            return tables.clean_imu(*table, self._problems)
+        if self._imu_file is not None:
+            return tables.read_imu(self._imu_file, self._problems)
         if self._oxts is None or self._lidar_T_imu is None:
             return None
         return drive.oxts_imu(*self._oxts, self._problems)
@@ -141,6 +145,8 @@ class KittiDataset(SweepFiles):
         path = self._root / "gt.tum"
         if path.is_file():
             return tables.read_tum(path)
+        if drive.is_kitti_360(self._root):
+            return drive.kitti_360_truth(self._root, self._problems)
         if self._camera_T_lidar is not None:
             return drive.odometry_truth(self._root, self.stamps, self._camera_T_lidar)
         if self._oxts is None or self._lidar_T_imu is None:
@@ -184,7 +190,7 @@ class KittiDataset(SweepFiles):
         elif folder.name == "velodyne" or folder.parent.name == "velodyne_points":
             period = drive.turn_seconds(self._root, self._files, self.stamps, self._problems)
             sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
-        if self._lidar_T_imu is not None and not (self._root / "imu.csv").is_file():
+        if self._lidar_T_imu is not None and self._imu_file is None:
             sensor.update(extrinsic_settings(self._lidar_T_imu))
         return sensor
 

@@ -33,6 +33,8 @@ def known_loader(path: Path) -> str | None:
         return "OxfordSpiresClouds"
     if spires_truth(path) is not None and spires_bags(path):
         return "OxfordSpiresBags"
+    if (path / "lidar").is_dir() and (path / "applanix").is_dir():
+        return "BoreasDataset"
     lidars = (*HELIPR_LIDARS, *HELIPR_OTHERS)
     if any((path / "LiDAR" / lidar).is_dir() or helipr_truth(path, lidar) for lidar in lidars):
         return "HeLiPRDataset"

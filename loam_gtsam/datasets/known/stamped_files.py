@@ -28,6 +28,7 @@ from loam_gtsam.types import (
 )
 
 _NAMES = {
+    "MICROSECONDS": r"(-?\d+)",
     "NANOSECONDS": r"(-?\d+)",
     "SECONDS.NANOSECONDS": r"(?:cloud_)?(\d+)[._](\d{9})",
     "cloud_SECONDS_NANOSECONDS": r"cloud_(\d+)_(\d{1,9})",
@@ -51,8 +52,8 @@ class StampedFiles(SweepFiles):
     path, rig : as the user gave it; of the data set
     folder, pattern : of the files
     read : makes the cloud of a file with its stamp
-    name : of a file, without suffix: ``NANOSECONDS``, ``SECONDS.NANOSECONDS`` or
-        ``cloud_SECONDS_NANOSECONDS``
+    name : of a file, without suffix: ``MICROSECONDS``, ``NANOSECONDS``, ``SECONDS.NANOSECONDS``
+        or ``cloud_SECONDS_NANOSECONDS``
     imu, truth : files of the IMU (``xsens_imu.csv``, unless a subclass reads another one) and of
         the reference poses, or None
     in_order : whether sweeps without times of points are complete ones of an OS1-64, firing by
@@ -174,7 +175,7 @@ def _stamp(file: Path, name: str) -> int:
     reason = f"{file.stem} is not {name}"
     if match is not None:
         *seconds, nanoseconds = map(int, match.groups())
-        stamp = sum(seconds) * 10**9 + nanoseconds
+        stamp = sum(seconds) * 10**9 + nanoseconds * (1000 if name == "MICROSECONDS" else 1)
         if abs(stamp) <= MAX_STAMP:
             return stamp
         reason = "out of range"

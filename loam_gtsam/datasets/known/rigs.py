@@ -1,0 +1,72 @@
+"""Known rigs whose bags are told by their topics: NTU VIRAL, Hilti 2022 and 2023."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from contextlib import closing
+from pathlib import Path
+from typing import Unpack
+
+import numpy as np
+
+from loam_gtsam.datasets.bags import bag_reader
+from loam_gtsam.datasets.bags.bag import BagSequence
+from loam_gtsam.datasets.base import BagOptions
+from loam_gtsam.datasets.decode.extrinsics import Rig
+from loam_gtsam.datasets.decode.tables import pose_matrix
+from loam_gtsam.datasets.known.layouts import first_existing
+from loam_gtsam.geometry import inverse_pose
+from loam_gtsam.types import DatasetError
+
+_HILTI_IMU_T_LIDAR = pose_matrix([-0.001, -0.00855, 0.055, 0.7071068, -0.7071068, 0.0, 0.0])
+HILTI = Rig(
+    kind="Hilti 2022 or 2023, hand-held",
+    topic="/hesai/pandar",
+    imu_topic="/alphasense/imu",
+    body_T_lidar=_HILTI_IMU_T_LIDAR,
+    lidar_T_imu=inverse_pose(_HILTI_IMU_T_LIDAR),
+    source="the challenge's calibration, as evalio quotes it",
+)
+"""A Hesai XT32 and an Alphasense. Reference poses, ``BAG_imu.txt``, are those of the IMU."""
+NTU_VIRAL = Rig(
+    kind="NTU VIRAL",
+    topic="/os1_cloud_node1/points",
+    imu_topic="/imu/imu",
+    body_T_lidar=np.eye(4),
+    lidar_T_imu=inverse_pose(pose_matrix([-0.05, 0.0, 0.055, 0.0, 0.0, 0.0, 1.0])),
+    source="the data set's calibration, as FAST-LIVO quotes it",
+)
+"""The horizontal OS1-16 of a drone, and its VN100. Reference positions are those of a prism."""
+
+
+def rig_of(topics: Collection[str]) -> Rig | None:
+    """The rig whose topics, of sweeps and of the IMU, are both among these."""
+    return next(
+        (rig for rig in (HILTI, NTU_VIRAL) if {rig.topic, rig.imu_topic} <= {*topics}), None
+    )
+
+
+class RigBag(BagSequence):
+    """A bag of a known rig, with the extrinsics of its IMU.
+
+    Parameters
+    ----------
+    path : one bag. Reference poses are those of ``BAG_imu.txt`` beside it, as Hilti has them
+    options : see :class:`~loam_gtsam.datasets.base.BagOptions`
+
+    Raises
+    ------
+    DatasetError
+        If its topics are those of no known rig.
+    """
+
+    def __init__(self, path: str | Path, **options: Unpack[BagOptions]) -> None:
+        bag = Path(path)
+        with closing(bag_reader.open_bag(bag)) as reader:
+            topics = sorted(reader.topics)
+        rig = rig_of(topics)
+        if rig is None:
+            known = ", ".join(f"{r.topic} and {r.imu_topic}" for r in (HILTI, NTU_VIRAL))
+            raise DatasetError(f"{bag}: no known rig: expected {known}; got {', '.join(topics)}")
+        names = [f"{bag.stem}_imu.txt", f"exp_{bag.stem.removeprefix('exp')}_imu.txt"]
+        super().__init__(bag, [bag], rig, first_existing(bag.parent, names), **options)

@@ -6,7 +6,8 @@ RUN pip wheel --no-cache-dir --no-deps --wheel-dir /wheels /source
 FROM python:3.12-slim
 COPY --from=build /wheels /wheels
 RUN pip install --no-cache-dir "$(ls /wheels/*.whl)[plot]" && rm -r /wheels
-RUN useradd --create-home mapper
+RUN useradd --create-home mapper && install --directory --owner mapper /data
+ENV MPLCONFIGDIR=/tmp/matplotlib
 USER mapper
 WORKDIR /data
 ENTRYPOINT ["loam-gtsam"]

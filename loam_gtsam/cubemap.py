@@ -31,7 +31,7 @@ from loam_gtsam.voxels.cubes import (
     mark_second,
 )
 from loam_gtsam.voxels.grid import CubeIndex, Grid, Window, cubes_in_view
-from loam_gtsam.voxels.tags import Faces, look, tags_of
+from loam_gtsam.voxels.tags import Faces, look, tags_of, views
 from loam_gtsam.voxels.trees import Neighbours, TreeCache
 
 Chosen = Iterable[CubeIndex] | None
@@ -210,8 +210,10 @@ class CubeMap:
 
     def fill(self, other: CubeMap, *, archived: bool = False) -> None:
         """Add the points of another map, archived ones if asked, to free voxels: none is moved."""
-        held = other.contents(archived=archived)
-        self._put(joined([*held.values()]), archive=archived, settle=True)
+        held = joined([*other.contents(archived=archived).values()])
+        tags = held.tags.copy()
+        views(tags)[..., 3] = 0  # a second one in a voxel there is none in a voxel here
+        self._put(CubePoints(held.points, tags), archive=archived, settle=True)
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points of the window and of the archive, after a loop closure; return how many.

@@ -17,9 +17,9 @@ _Real = TypeVar("_Real", np.float32, np.float64)
 _SMALL_ANGLE = 1e-9
 _GRID = 1 << 20
 """Voxels on either side of the origin that the keys of voxels tell apart."""
-OBLIQUE_EDGE = float(np.sqrt(5.0 / 3.0))
-"""Edges of oblique voxels over the size asked for: a plane along two axes of the map crosses 5 / 3
-times as many voxels of an oblique grid as of one along the axes, so these are as much larger."""
+OBLIQUE_EDGE = float(np.sqrt(1.5))
+"""Edges of oblique voxels over the size asked for. In the mean over all attitudes a plane crosses
+1.5 times as many voxels as one along their borders does, so oblique ones are as much larger."""
 
 
 def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:
@@ -265,7 +265,7 @@ def voxel_keys(points: NDArray[np.floating], size: float, *, oblique: bool = Fal
     """One integer per voxel of edge length ``size``, metres; keys sort by x, then y, then z.
 
     The voxels of an ``oblique`` grid have their edges along (2, -1, 2), (2, 2, -1) and (-1, 2, 2),
-    sqrt(5 / 3) times as long: walls along the axes have as many voxels as in the other grid.
+    sqrt(1.5) times as long: walls have about as many voxels as in the other grid.
     What is built is upright and mostly along the axes of the map. Where a wall runs along a border
     of voxels, noise brings some of its points over that border, and as each voxel counts once,
     they pull the whole wall towards it. A border of an oblique grid runs along nothing.

@@ -36,8 +36,8 @@ class Grid(NamedTuple):
     def limit(self) -> float:
         """Metres from the origin along an axis up to which there are voxels whatever the others."""
         most = _MOST_VOXELS * self.voxel_size
-        # (2, 2, -1) / 3 times (1, 1, -1) is 5 / 3, over the edge its square root.
-        return most / OBLIQUE_EDGE if self.oblique else most
+        # (2, 2, -1) / 3 times (1, 1, -1) is 5 / 3.
+        return 0.6 * OBLIQUE_EDGE * most if self.oblique else most
 
     def keys(self, points: FloatArray) -> IntArray:
         """(N,) keys of the voxels of points (N, 3)."""

@@ -233,3 +233,20 @@ def test_a_walk_through_rooms_keeps_its_way() -> None:
     world = SimulatedWorld("rooms", frames=120, columns=450)
     result = run(world, Config().changed("imu.coupling=off"))
     assert absolute_error(result.trajectory, world.truth).rmse < 0.022
+
+
+def test_what_fills_a_map_is_second_in_no_voxel_of_it() -> None:
+    """A second point of large voxels has a small one for itself, or there is one already."""
+    large = wall((0.1, FRONT), voxel=0.4 / OBLIQUE_EDGE)
+    behind = face(0.1 + THICKNESS)
+    large.insert(behind, BACK, matched(large, behind, BACK).faces)
+    small = CubeMap(MAP, 0.1)
+    small.insert(behind, BACK)
+    held = small.count()
+    small.fill(large)
+    assert second(large.contents()[0, 0, 0].tags).any()
+    assert held < small.count() <= held + len(face(0.1))
+    assert not any(second(cube.tags).any() for cube in small.contents().values())
+    before = small.count()
+    small.fill(large)
+    assert small.count() == before

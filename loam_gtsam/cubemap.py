@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.geometry import as_array, as_points
+from loam_gtsam.geometry import OBLIQUE_EDGE, as_array, as_points
 from loam_gtsam.types import ConfigError, FloatArray, InputError
 from loam_gtsam.voxels.archive import Archive
 from loam_gtsam.voxels.cubes import (
@@ -31,7 +31,7 @@ from loam_gtsam.voxels.cubes import (
     mark_second,
 )
 from loam_gtsam.voxels.grid import CubeIndex, Grid, Window, cubes_in_view
-from loam_gtsam.voxels.tags import Faces, look, tags_of, views
+from loam_gtsam.voxels.tags import Faces, look, tags_of
 from loam_gtsam.voxels.trees import Neighbours, TreeCache
 
 Chosen = Iterable[CubeIndex] | None
@@ -211,9 +211,7 @@ class CubeMap:
     def fill(self, other: CubeMap, *, archived: bool = False) -> None:
         """Add the points of another map, archived ones if asked, to free voxels: none is moved."""
         held = joined([*other.contents(archived=archived).values()])
-        tags = held.tags.copy()
-        views(tags)[..., 3] = 0  # a second one in a voxel there is none in a voxel here
-        self._put(CubePoints(held.points, tags), archive=archived, settle=True)
+        self._put(held.without_seconds(), archive=archived, settle=True)
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points of the window and of the archive, after a loop closure; return how many.
@@ -308,9 +306,10 @@ class CubeMap:
         return dict(sorted(held.items()))
 
     def thinned(self, factor: float) -> CubeMap:
-        """A map of the points of the window, with voxels ``factor`` times as large."""
+        """A map of the points of the window, with voxels of ``factor`` times the size."""
         config = self._config.changed(insertion="centroid", archive_dir=None)
-        thin = CubeMap(config, factor * self._grid.voxel_size)
+        edge = OBLIQUE_EDGE if self._grid.oblique else 1.0  # few points are left to a plane anyway
+        thin = CubeMap(config, factor * self._grid.voxel_size / edge)
         thin._window, thin._grid = self._window, thin._grid._replace(oblique=self._grid.oblique)
         thin.insert(self.points())
         return thin

@@ -8,7 +8,7 @@ from support.cubes import SMALL, moved_by
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.geometry import OBLIQUE_EDGE, voxel_filter, voxel_keys
+from loam_gtsam.geometry import voxel_filter, voxel_keys
 from loam_gtsam.types import ConfigError, InputError
 
 ALL_AROUND = MapConfig(field_of_view=False)
@@ -283,7 +283,7 @@ def test_a_thinned_map_is_that_of_the_window_in_larger_voxels(tmp_path):
     points = np.array([[98.1, 0.1, 0.1], [100.1, 0.1, 0.1], [101.7, 0.1, 0.1]])
     cubes.insert(points)
     folders = list(tmp_path.iterdir())
-    thin = cubes.thinned(4.0 / OBLIQUE_EDGE)  # edges of 2 m: from 98 to 100 and from 100 to 102
+    thin = cubes.thinned(4.0)  # edges of 2 m: from 98 to 100 and from 100 to 102
     np.testing.assert_allclose(thin.points(archived=True), [points[0], [100.9, 0.1, 0.1]])
     assert thin.window == cubes.window
     assert list(tmp_path.iterdir()) == folders

@@ -48,6 +48,12 @@ class CubePoints(NamedTuple):
         turn(tags, move[:3, :3])
         return CubePoints(transform(move, self.points), tags)
 
+    def without_seconds(self) -> CubePoints:
+        """The points for other voxels, where none of them is known to be second."""
+        tags = self.tags.copy()
+        views(tags)[..., 3] = 0
+        return CubePoints(self.points, tags)
+
     def keys(self, grid: Grid) -> IntArray:
         """(N,) under which cubes hold the points."""
         keys = grid.keys(self.points)

@@ -99,8 +99,8 @@ class MotionError:
         state, by_turning = self._known(turned=turned), self._by_turning(since, turned=turned)
         tied = share - np.eye(6)
         noise = np.zeros((9, 9))
-        noise[:6, :6] = tied @ self._pose @ tied.T + scan
-        noise[:6, :6] = noise[:6, :6] / seconds**2 + share @ by_turning @ share.T / since**2
+        by_pose = tied @ self._pose @ tied.T + scan
+        noise[:6, :6] = by_pose / seconds**2 + share @ by_turning @ share.T / since**2
         passed_on = np.zeros((9, 9))
         passed_on[:6] = share @ _moved(since) / since
         if turned:  # the scan has no say in the velocity

@@ -172,7 +172,8 @@ class Mapper:
             guess = self.imu.first_pose(features.stamp, guess)
         sweep = MovingSweep(features, self.config, self.imu.trusted_gyro if self.imu else None)
         before = self.last, self._moment, self.imu
-        predicted = predict(sweep, *before, self.config.solver, guess, twist)
+        expected = self._errors.expected(sweep.stamp, *before[1:]) if guess is None else None
+        predicted = predict(sweep, *before, self.config.solver, guess, twist, expected)
         try:
             self.maps.recenter(predicted.map_T_middle, features.reach)
         except InputError as error:
@@ -299,7 +300,8 @@ class Mapper:
             posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
-        update = self._errors.calibrated(update, frame.sweep, solution, scan, fused)
+        last = None if found.message else frame.matcher.last
+        update = self._errors.calibrated(update, frame.sweep, solution, scan, last, fused)
         clock.lap("covariance")
         return update
 

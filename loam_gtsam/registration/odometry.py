@@ -156,6 +156,7 @@ def predict(
     config: SolverConfig,
     guess: gtsam.Pose3 | None = None,
     twist: FloatArray | None = None,
+    expected: gtsam.Pose3 | None = None,
 ) -> Prediction:
     """Predict the pose of a sweep: by gyro and accelerometer if known, else by constant velocity.
 
@@ -166,6 +167,8 @@ def predict(
     config : ``turn_sigma`` and ``acceleration_sigma`` are the uncertainty of a constant velocity
     guess : ``map_T_lidar`` at the reference time, which replaces the predicted pose
     twist : (6,) body velocity at the reference time, which replaces the predicted velocity
+    expected : pose at the middle by the velocity of all sweeps before, for directions that the
+        scan does not fix; the predicted pose if None
     """
     if guess is not None:
         checked_pose(guess, "guess")
@@ -189,7 +192,7 @@ def predict(
     elif moment is not None:
         seconds = moment.seconds_to(sweep.stamp)
         sigmas = np.repeat([config.turn_sigma, config.acceleration_sigma], 3)
-        motion = MotionPrior(middle, np.diag((0.5 * seconds**2 * sigmas) ** -2.0))
+        motion = MotionPrior(expected or middle, np.diag((0.5 * seconds**2 * sigmas) ** -2.0))
     return Prediction(posed, guess, middle, motion, inertial)
 
 

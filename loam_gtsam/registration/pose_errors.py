@@ -15,7 +15,8 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
-from loam_gtsam.registration.solvers import MotionError, Solution
+from loam_gtsam.registration.odometry import Moment, Turns
+from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 from loam_gtsam.types import (
     FloatArray,
@@ -112,7 +113,7 @@ class PoseErrors:
         self._gyro_noise = config.imu.gyro_noise
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
-        self._expected = MotionError(config.solver)
+        self._expected = MotionFilter(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
         self._first: MovingSweep | None = None
         self._origin = _Origin()
@@ -147,12 +148,14 @@ class PoseErrors:
         sweep: MovingSweep,
         solution: Solution,
         scan: ScanError | None,
+        last: Moment | None,
         fused: Fused | None = None,
     ) -> MapUpdate:
         """The update of a solved frame with its covariance; to be called after :meth:`of_scan`.
 
-        The sweep has the motion of the solution, which is at its middle; ``fused`` is that pose by
-        scan and IMU together.
+        The sweep has the motion of the solution, which is at its middle; ``last`` is the middle of
+        the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
+        and IMU together.
         """
         first = self._scans == 1
         if scan is None:
@@ -163,7 +166,7 @@ class PoseErrors:
         to_map = middle.AdjointMap()
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
-        self._add_drift(sweep, solution, scan, factor * scan.renewed)
+        self._add_drift(sweep, solution, scan, last, factor * scan.renewed)
         if fused is None or solution.weak is not None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
         else:
@@ -191,14 +194,29 @@ class PoseErrors:
         covariance = symmetric(own + drifted @ total @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
+    def expected(self, stamp: int, last: Moment | None, imu: Turns | None) -> gtsam.Pose3 | None:
+        """The pose at a stamp, by the velocity of all frames before; None after unsolved ones.
+
+        ``last`` is the middle of the last sweep; ``imu`` tells the rotation since, if it can.
+        """
+        if last is None or not self._follows(last):
+            return None
+        turned = None if imu is None else imu.rotation_between(last.stamp, stamp)
+        return self._expected.expected(stamp, last.map_T_lidar, turned)
+
+    def _follows(self, last: Moment | None) -> bool:
+        """Whether the velocity is that at the middle of the last sweep."""
+        return last is not None and last.solved and last.stamp == self._expected.stamp
+
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""
         self._last = None
         self._expected.cut()
 
     def _add_drift(
-        self, sweep: MovingSweep, solution: Solution, scan: ScanError, renewed: FloatArray
-    ) -> None:
+        self, sweep: MovingSweep, solution: Solution, scan: ScanError, last: Moment | None,
+        renewed: FloatArray,
+    ) -> None:  # fmt: skip
         """What new ground adds to the map's error, and the expected motion where it is alone."""
         to_map, share, seen = solution.map_T_lidar.AdjointMap(), scan.expected, None
         if solution.weak is not None and share.any():
@@ -206,7 +224,9 @@ class PoseErrors:
         if seen is not None:
             rows = len(solution.matches) / max(scan.effective_matches, 1.0)
             share = seen.without_noise(share, rows)
-        step = self._expected.observe(sweep.stamp, share, scan.raw, turned=_turned(sweep))
+        before = last.map_T_lidar if last is not None and self._follows(last) else None
+        found = before, solution.map_T_lidar, share, scan.raw
+        step = self._expected.observe(sweep.stamp, *found, turned=_turned(sweep))
         by_chance = renewed + step.by_chance
         if seen is not None:
             moved = step.by_velocity @ step.by_velocity.T + step.by_chance
@@ -223,7 +243,7 @@ class PoseErrors:
         """Account for a sweep whose pose is the expected one; the very first begins the map."""
         if self._first is None and not self._scans:
             self._first = sweep
-        self._expected.coast(sweep.stamp, turned=_turned(sweep))
+            self._expected.begin(sweep.stamp)
 
     def _own_of(
         self, update: MapUpdate, sweep: MovingSweep, middle: gtsam.Pose3,

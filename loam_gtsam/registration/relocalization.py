@@ -271,7 +271,9 @@ def _place(
     trial = replace(matcher, refine=False).with_few_matches()
     best: tuple[float, gtsam.Pose3] | None = None
     for start in starts:
-        tried = solver.solve(trial, start, frame.priors)
+        # Few matches leave directions open: along these a place stays where it is.
+        here = MotionPrior(start, frame.predicted.motion.information)
+        tried = solver.solve(trial, start, frame.priors, here)
         total = Fit.of(tried.matches, trial.offered).total
         if tried.solved and (best is None or total > best[0]):
             best = total, tried.map_T_lidar

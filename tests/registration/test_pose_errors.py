@@ -255,7 +255,7 @@ def calibrated(errors, number):
     update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
     solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
-    return errors.calibrated(update, sweep, solution, errors.of_scan(solution))
+    return errors.calibrated(update, sweep, solution, errors.of_scan(solution), None)
 
 
 def test_ground_that_replaces_none_counts_half(monkeypatch):
@@ -288,7 +288,7 @@ def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
         solution = replace(Solution.unsolved(gtsam.Pose3(), None, 1, 1), matches=matches)
         update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
         sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
-        errors.calibrated(update, sweep, solution, errors.of_scan(solution, small=small))
+        errors.calibrated(update, sweep, solution, errors.of_scan(solution, small=small), None)
     assert fresh == [1, 0, 0, 2, 0, 1]  # cells of 0.8 m, and of 0.4 m in small places
 
 

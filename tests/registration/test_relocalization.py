@@ -254,6 +254,26 @@ def test_a_search_finds_a_sweep_that_was_carried_away_and_changes_nothing(before
     assert all(map(np.array_equal, before.maps.points(), points))
 
 
+class _Watched(GtsamSolver):
+    """A solver that notes how far from its start each pose is expected, metres; inf for nowhere."""
+
+    def __init__(self, config):
+        super().__init__(config)
+        self.away = []
+
+    def solve(self, associate, guess, priors=(), motion=None):
+        self.away.append(np.inf if motion is None else motion.map_T_lidar.range(guess))
+        return super().solve(associate, guess, priors, motion)
+
+
+def test_along_what_a_sweep_does_not_show_a_tried_place_stays_where_it_is(before, kidnapped):
+    before = copy(before)
+    before.solver = _Watched(before.config.solver)
+    search_in(before, list(kidnapped)[AT], before.monitor)
+    assert len(before.solver.away) > 5
+    assert max(before.solver.away) == 0.0
+
+
 def test_a_search_of_too_small_a_radius_says_that_the_sweep_is_lost(before, kidnapped):
     monitor = deepcopy(before.monitor)
     monitor.config = monitor.config.changed(radius=1.0, max_radius=1.0)

@@ -19,7 +19,7 @@ from loam_gtsam.registration.solvers.classical import ClassicalSolver as Classic
 from loam_gtsam.registration.solvers.gtsam_solver import GtsamSolver as GtsamSolver
 from loam_gtsam.registration.solvers.gtsam_solver import fuse as fuse
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows as match_rows
-from loam_gtsam.registration.solvers.motion_error import MotionError as MotionError
+from loam_gtsam.registration.solvers.motion_filter import MotionFilter as MotionFilter
 
 
 def make_solver(config: SolverConfig) -> ScanSolver:

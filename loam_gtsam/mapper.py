@@ -226,9 +226,8 @@ class Mapper:
     def _check(self, features: Features) -> MapUpdate | None:
         """The update of a sweep that cannot be used; None if it can."""
         check_kind(features, Features, "features", "extract_features makes them of a Scan")
-        if (refused := self._refused(features.stamp)) is not None:
-            return refused
-        return (problem := problem_of(features)) and self._unused(features.stamp, *problem)
+        problem = problem_of(features)
+        return self._refused(features.stamp) or (problem and self._unused(features.stamp, *problem))
 
     def _refused(self, stamp: int) -> MapUpdate | None:
         """The update of a sweep whose stamp cannot be used; None if it can."""
@@ -248,8 +247,7 @@ class Mapper:
         """The update of a sweep that says nothing: the pose is predicted."""
         guess, bad = ConstantVelocity(self.imu).at(stamp, self.last), FrameStatus.UNUSABLE_SCAN
         update = MapUpdate(stamp, guess.map_T_lidar, bad, message, twist=guess.twist, fault=fault)
-        if self.last is not None:
-            self.last = update
+        self.last = None if self.last is None else update
         return update
 
     def _frame(

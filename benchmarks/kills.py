@@ -15,7 +15,11 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from benchmarks.cases import ROOT
+from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.datasets.decode.geodesy import geodetic_of
 from loam_gtsam.io.run_files import RUN_FILES
 
 _BYTES = ("trajectory.tum", "trajectory_kitti.txt", "trajectory_covariance.csv", "map.ply")
@@ -37,8 +41,10 @@ MODES: dict[str, tuple[str, tuple[str, ...]]] = {
                         "--set", "map.window_margin=1", "--set", "map.neighbourhood=[3, 3, 3]",
                         "--set", "map.archive_megabytes=0.01",
                         "--set", "map.archive_dir={scratch}/cubes")),
+    "receiver and wheels": ("{scratch}/aided.bag", ("--set", "aiding.gnss=true",
+                            "--set", "aiding.wheels=true", "--set", "imu.coupling=off")),
 }  # fmt: skip
-"""World and options of the runs that are gone on with."""
+"""World, or a bag of :func:`write_aided`, and options of the runs that are gone on with."""
 
 
 def main() -> None:
@@ -53,6 +59,7 @@ def main() -> None:
     each, more = divmod(options.kills - replaced, len(MODES))
     faults: list[str] = []
     with tempfile.TemporaryDirectory() as scratch:
+        write_aided(Path(scratch) / "aided.bag", options.frames)
         for number, mode in enumerate(MODES):
             kills = each + (number < more)
             found = _resumed(Path(scratch), mode, options.frames, kills, chance)
@@ -64,6 +71,26 @@ def main() -> None:
     print(f"{options.kills} kills, {len(faults)} faults")
     if faults:
         raise SystemExit(1)
+
+
+def write_aided(path: Path, frames: int) -> None:
+    """A bag with sweeps of the block, fixes of a receiver and poses of wheels."""
+    sys.path.append(str(ROOT / "tests"))
+    from support import bags
+
+    world, store = SimulatedWorld("street_loop", frames=frames, columns=450), bags.ROS1
+    truth, recording = world.truth, []
+    places = geodetic_of(truth.map_T_lidar[:, :3, 3], np.array([47.5, 8.5, 450.0]))
+    turns = Rotation.from_matrix(truth.map_T_lidar[:, :3, :3]).as_quat()
+    for scan, pose, place, turn in zip(world, truth.map_T_lidar, places, turns, strict=True):
+        assert scan.times is not None
+        assert scan.rings is not None
+        rings, times = scan.rings.astype("<u2"), scan.times.astype("<f4")
+        cloud = bags.cloud(store, scan.stamp, scan.points, ring=rings, time=times)
+        wheels = bags.odometry(store, scan.stamp, pose[:3, 3], turn)
+        recording += [("/points", scan.stamp, cloud), ("/wheels", scan.stamp, wheels)]
+        recording.append(("/fix", scan.stamp, bags.fix(store, scan.stamp, place)))
+    bags.write_bag(path, "ros1", recording)
 
 
 def _resumed(scratch: Path, mode: str, frames: int, kills: int, chance: random.Random) -> list[str]:
@@ -113,9 +140,11 @@ def _replaced(scratch: Path, kills: int, chance: random.Random) -> list[str]:
 
 def _command(folder: Path, frames: int, mode: str = "without IMU", *options: str) -> list[str]:
     world, settings = MODES[mode]
-    run = [sys.executable, "-m", "loam_gtsam.cli", "run", f"{world}&frames={frames}"]
+    scratch = folder.parent.parent
+    path = f"{world}&frames={frames}" if world.startswith("sim:") else world.format(scratch=scratch)
+    run = [sys.executable, "-m", "loam_gtsam.cli", "run", path]
     run += ["--output", str(folder), "--quiet", "--no-plot"]
-    run += [setting.format(scratch=folder.parent.parent) for setting in settings]
+    run += [setting.format(scratch=scratch) for setting in settings]
     return [*run, *(() if "--workers" in settings else ("--workers", "0")), *options]
 
 

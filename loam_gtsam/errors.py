@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import difflib
 import logging
+import struct
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 
 _log = logging.getLogger(__name__)
+DAMAGED: tuple[type[Exception], ...] = (
+    OSError, EOFError, ValueError, LookupError, TypeError, ArithmeticError, MemoryError,
+    RuntimeError, SyntaxError, struct.error, tokenize.TokenError, zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
+"""What numpy and zipfile raise at a file of arrays that is damaged, or holds something else."""
 _LONGEST = 80  # characters of a name that is looked for among others
 _INDETERMINATE = "Indeterminate linear system"  # how a RuntimeError of GTSAM begins
 

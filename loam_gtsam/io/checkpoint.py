@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.errors import DAMAGED
 from loam_gtsam.io.atomic import atomic_file, lock_folder, make_folder, unlock_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
@@ -112,7 +113,7 @@ class Checkpoint:
                 frames.stamps += part.stamps
                 frames.updates += part.updates
             thaw(state, roots, shared)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except DAMAGED as error:
             problem = f"{newest}: the checkpoint cannot be read: {str(error)[:200]}"
             raise OutputError(f"{problem}; start again without resuming") from error
         self._written = time.monotonic()
@@ -258,7 +259,7 @@ class Progress:
 
 def _is_ours(path: Path) -> bool:
     """Whether a file is one that a checkpoint wrote."""
-    with suppress(OSError, zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+    with suppress(*DAMAGED), zipfile.ZipFile(path) as archive:
         return {f"{_HEADER}.npy", f"{STRUCTURE}.npy"} <= set(archive.namelist())
     return False
 

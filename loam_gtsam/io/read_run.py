@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import zipfile
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
 
+from loam_gtsam.errors import DAMAGED
 from loam_gtsam.types import (
     DatasetError,
     FrameStatus,
@@ -31,48 +33,50 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
         with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in _NEEDED}
             stages = file["stage_names"].tolist()
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as error:
+        return [
+            _update({name: column[row] for name, column in columns.items()}, stages)
+            for row in range(len(columns["stamps"]))
+        ]
+    except DAMAGED as error:
         raise DatasetError(f"{path}: expected the run.npz of a finished run: {error}") from error
-    updates = []
-    for row in range(len(columns["stamps"])):
-        at = {name: column[row] for name, column in columns.items()}
-        status = FrameStatus(str(at["status"]))
-        uncertainty = None
-        if status.solved and np.isfinite(at["own_covariances"]).all():
-            follows = int(at["follows"])
-            uncertainty = Uncertainty(
-                own=at["own_covariances"],
-                shared=at["shared_covariances"],
-                follows=None if follows < 0 else follows,
-                drift=at["drift_covariances"],
-                residual_variance=float(at["residual_variances"]),
-                effective_matches=float(at["effective_matches"]),
-                blind=at["blind_drifts"],
-                forgotten=at["forgotten"],
-            )
-        updates.append(
-            MapUpdate(
-                int(at["stamps"]),
-                gtsam.Pose3(at["map_T_lidar"]),
-                status,
-                str(at["messages"]),
-                covariance=at["covariances"],
-                twist=at["twists"],
-                uncertainty=uncertainty,
-                map_T_middle=gtsam.Pose3(at["map_T_middle"]) if at["middle_stamps"] else None,
-                middle_stamp=int(at["middle_stamps"]),
-                sweep_motion=SweepMotion(str(at["sweep_motions"])),
-                tilt_prior=TiltPrior(str(at["tilt_priors"])),
-                timings={
-                    stage: seconds
-                    for stage, seconds in zip(stages, at["stage_seconds"].tolist(), strict=True)
-                    if np.isfinite(seconds)
-                },
-                **{name: at[name] for name in _ARRAYS},
-                **{name: at[name].item() for name in _NUMBERS},
-            )
+
+
+def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:
+    """A frame, of its rows in all columns."""
+    status = FrameStatus(str(at["status"]))
+    uncertainty = None
+    if status.solved and np.isfinite(at["own_covariances"]).all():
+        follows = int(at["follows"])
+        uncertainty = Uncertainty(
+            own=at["own_covariances"],
+            shared=at["shared_covariances"],
+            follows=None if follows < 0 else follows,
+            drift=at["drift_covariances"],
+            residual_variance=float(at["residual_variances"]),
+            effective_matches=float(at["effective_matches"]),
+            blind=at["blind_drifts"],
+            forgotten=at["forgotten"],
         )
-    return updates
+    return MapUpdate(
+        int(at["stamps"]),
+        gtsam.Pose3(at["map_T_lidar"]),
+        status,
+        str(at["messages"]),
+        covariance=at["covariances"],
+        twist=at["twists"],
+        uncertainty=uncertainty,
+        map_T_middle=gtsam.Pose3(at["map_T_middle"]) if at["middle_stamps"] else None,
+        middle_stamp=int(at["middle_stamps"]),
+        sweep_motion=SweepMotion(str(at["sweep_motions"])),
+        tilt_prior=TiltPrior(str(at["tilt_priors"])),
+        timings={
+            stage: seconds
+            for stage, seconds in zip(stages, at["stage_seconds"].tolist(), strict=True)
+            if np.isfinite(seconds)
+        },
+        **{name: at[name] for name in _ARRAYS},
+        **{name: at[name].item() for name in _NUMBERS},
+    )
 
 
 _ARRAYS = (

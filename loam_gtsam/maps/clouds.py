@@ -7,6 +7,7 @@ it would see there is told by a picture of ranges.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,9 +35,12 @@ from loam_gtsam.voxels.cubes import CubePoints
 from loam_gtsam.voxels.tags import tags_of
 
 _FAR = 10_000.0  # metres from the origin from which on a cloud is brought near it
+_WIDEST = 1e6
+"""Metres, beyond all maps: what spans more has stray points in it, or other units."""
 _THIN = 0.5  # share of the voxels of planes with which a cloud is made even first
 _GROUND = 0.95  # cosine between up and the normals of the ground
 _CELL = 1.0  # metres, in which the lowest level point is the ground
+_LAS_POINTS = 96  # byte of a LAS file at which the offset of its points stands
 _FREE = 0.5  # metres around a lidar in which there is nothing
 _BINS = np.radians(1.0)  # of a picture of what is seen
 _RIGID = np.repeat([1e-5, 1e-3], 3)  # rad and m: between places of a cloud nothing has drifted
@@ -113,9 +117,28 @@ def _laspy(path: Path) -> Any:
 def _read_las(path: Path) -> FloatArray:
     laspy = _laspy(path)
     try:
+        _check_chunks(path)
         return np.asarray(laspy.read(path).xyz, np.float64)
     except Exception as error:  # of laspy, or of whatever a damaged file makes it stumble over
         raise DatasetError(f"{path}: the file cannot be read: {error}") from error
+
+
+def _check_chunks(path: Path) -> None:
+    """A ValueError if a LAZ file claims more chunks than it has bytes: the decoder would abort.
+
+    The table of the chunks begins with its version and their number; where it is stands before the
+    points, or in the last eight bytes (Isenburg, LASzip, PE&RS 79(2), 2013).
+    """
+    if path.suffix.lower() != ".laz":
+        return
+    data: Any = np.memmap(path, np.uint8, "r")
+    (points,) = struct.unpack_from("<I", data, _LAS_POINTS)
+    (table,) = struct.unpack_from("<q", data, points)
+    if table == -1:
+        (table,) = struct.unpack_from("<q", data, len(data) - 8)
+    (chunks,) = struct.unpack_from("<I", data, max(table, 0) + 4)
+    if chunks > len(data):
+        raise ValueError(f"expected at most {len(data)} chunks, got {chunks}")
 
 
 def _write_las(path: Path, points: FloatArray) -> None:
@@ -181,8 +204,14 @@ def import_cloud(
     """
     config = as_config(config)
     points = as_points(points, "points")
+    low, high = points.min(axis=0, initial=np.inf), points.max(axis=0, initial=-np.inf)
+    if not len(points) or not (0.5 * high - 0.5 * low < 0.5 * _WIDEST).all():
+        raise DatasetError(
+            f"cloud: expected points within {_WIDEST:g} m of each other, got {len(points)}, from "
+            f"{low} to {high} m; take out those that are far off"
+        )
     far = bool(np.abs(points).max() > _FAR)
-    shift = np.round(0.5 * (points.min(axis=0) + points.max(axis=0))) * far
+    shift = np.round(0.5 * low + 0.5 * high) * far
     edges, planes, normals = features_of(points - shift, config)
     seen = np.concatenate([edges, planes])
     seats = stands(planes, normals, seen, height, config)

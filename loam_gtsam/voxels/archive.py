@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from loam_gtsam.errors import DAMAGED
 from loam_gtsam.types import ConfigError
 from loam_gtsam.voxels.cubes import Cube, CubePoints, SortedPoints
 from loam_gtsam.voxels.grid import CubeIndex, Grid
@@ -120,7 +121,7 @@ class Archive:
             expected = (count, _COLUMNS)
             if rows.shape != expected or rows.dtype != np.float64:
                 raise ValueError(f"expected {expected} float64, got {rows.shape} {rows.dtype}")
-        except (OSError, ValueError) as error:
+        except DAMAGED as error:
             del self._disk[index]
             self._drop(count, f"cannot read {path}: {error}")
             return None

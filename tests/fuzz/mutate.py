@@ -62,15 +62,18 @@ def damage(content: bytes, chance: random.Random) -> bytes:
     return mutated(content, steps)
 
 
-def read_mutant(specimen: Specimen, chance: random.Random) -> None:
-    """Write the files, one of them damaged, and read them."""
-    victim = chance.choice(sorted(specimen.files))
+def read_mutant(specimen: Specimen, chance: random.Random | None) -> None:
+    """Write the files, one of them damaged unless there is no chance of it, and read them."""
+    files = dict(specimen.files)
+    if chance is not None:
+        victim = chance.choice(sorted(files))
+        files[victim] = damage(files[victim], chance)
     folder = Path(tempfile.mkdtemp(prefix="mutant_"))
     try:
-        for name, content in specimen.files.items():
+        for name, content in files.items():
             path = folder / name
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(damage(content, chance) if name == victim else content)
+            path.write_bytes(content)
         specimen.read(folder)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
@@ -112,8 +115,10 @@ def run_with(values: list[str]) -> None:
 WORLD = SimulatedWorld("room", frames=5, columns=60, imu="mems", start="moving", speed=3.0)
 
 
-def try_value(chance: random.Random) -> None:
-    """One to three parameters at once."""
+def try_value(chance: random.Random | None) -> None:
+    """One to three parameters at once, or none."""
+    if chance is None:
+        return run_with([])
     names = chance.sample(parameters(), chance.choice([1, 1, 2, 3]))
     values = [f"{name}={value(field, chance)}" for name, field in names]
     try:
@@ -157,6 +162,7 @@ def batch(
     signal.signal(signal.SIGALRM, _ring)
     warnings.simplefilter("ignore")
     warnings.simplefilter("error", RuntimeWarning)
+    target(None)  # mutants of what is refused anyway would show nothing
     for number in numbers:
         done.value = number
         problem = attempt(name, number, seed, target)
@@ -177,7 +183,7 @@ def all_of(name: str, target: Any, numbers: range, seed: int) -> int:
         seen[place] += 1
 
     while len(numbers):
-        done, found = context.Value("q", numbers.start), context.SimpleQueue()
+        done, found = context.Value("q", -1), context.SimpleQueue()
         process = context.Process(
             target=batch, args=(name, target, numbers, seed, done, found), daemon=True
         )
@@ -190,6 +196,8 @@ def all_of(name: str, target: Any, numbers: range, seed: int) -> int:
             take(*found.get())
         if done.value >= numbers.stop:
             break
+        if done.value < 0:
+            raise SystemExit(f"{name}: refused though nothing is damaged")
         take(done.value, f"the process died: exit code {process.exitcode}")
         numbers = range(done.value + 1, numbers.stop)
     return seen.total()

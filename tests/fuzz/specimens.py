@@ -16,6 +16,7 @@ from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from specimens_maps import maps
 from support import bags
 from support.layout_writers import write_pcd
 
@@ -57,6 +58,9 @@ def read_all(path: Path, **options: Any) -> int:
             with suppress(LoamError):
                 extract_features(sweep, Config())
     assert dataset.imu is None or len(dataset.imu.stamps)
+    for kind in ("gnss", "wheels"):
+        samples = getattr(dataset, kind, None)
+        assert samples is None or len(samples)
     assert dataset.truth is None or len(dataset.truth) >= 0
     return count
 
@@ -221,9 +225,16 @@ def kitti() -> dict[str, Specimen]:
     sequence["sequences/00/times.txt"] = b"0.0\n0.1\n0.2\n"
     sequence["sequences/00/calib.txt"] = f"P0: {IDENTITY}\nTr: {IDENTITY}\n".encode()
     sequence["poses/00.txt"] = f"{IDENTITY}\n".encode() * 3
+    name = "2013_05_28_drive_0000_sync"
+    later = f"data_3d_raw/{name}/velodyne_points"
+    kitti_360 = {f"{later}/data/{i:010d}.bin": columns() for i in range(3)}
+    kitti_360[f"{later}/timestamps.txt"] = dates()
+    kitti_360[f"data_poses/{name}/cam0_to_world.txt"] = rows([0, 2], IDENTITY, "0 0 0 1")
+    kitti_360["calibration/calib_cam_to_velo.txt"] = f"{IDENTITY}\n".encode()
     return {
         "KITTI raw": Specimen(raw, at(drive)),
         "KITTI odometry": Specimen(sequence, at("sequences/00")),
+        "KITTI-360": Specimen(kitti_360, at(f"data_3d_raw/{name}")),
     }
 
 
@@ -281,6 +292,41 @@ def known() -> dict[str, Specimen]:
     } | helipr
 
 
+def rigs() -> dict[str, Specimen]:
+    """Boreas, Hilti, NTU VIRAL, and a bag with a receiver and wheels."""
+    pose = [1, 2, 3, 0, 0, 0, 0.1, 0.2, 0.3, 0, 0, 0]
+    points = records(intensity=("<f4", 7.0), laser=("<f4", RINGS), time=("<f4", TIMES - 0.05))
+    boreas = {f"lidar/{stamp // 1000}.bin": points.tobytes() for stamp in STAMPS}
+    boreas["applanix/lidar_poses.csv"] = b"GPSTime,easting,northing\n" + rows(
+        [stamp // 1000 for stamp in STAMPS], *pose, separator=","
+    )
+    hesai = recording("ros1", "/hesai/pandar", "/alphasense/imu", "timestamp")
+    hilti = made(bag("ros1", hesai, "exp04"))
+    hilti["exp04_imu.txt"] = rows([f"{s * 1e-9:.9f}" for s in STAMPS], "1 2 3 0 0 0.6 0.8")
+    viral = recording("ros1", "/os1_cloud_node1/points", "/imu/imu", "t")
+    store = bags.ROS1
+    aided = recording("ros1")
+    for stamp in STAMPS:
+        aided.append(("/fix", stamp, bags.fix(store, stamp, (49.0, 8.4, 112.0))))
+        aided.append(("/twist", stamp, bags.twist(store, stamp, 1.0, 0.1)))
+        aided.append(("/odom", stamp, bags.odometry(store, stamp, (1.0, 2.0, 3.0))))
+    imu = b"#timestamp [ns],w,a\n" + rows(
+        [START + i * 10_000_000 for i in range(40)], 0.1, 0, 0, 0, 0, 9.81, separator=","
+    )
+    beside = {f"velodyne/{i}.bin": columns() for i in range(3)} | {"imu0/data.csv": imu}
+    beside["times.txt"] = "".join(f"{stamp * 1e-9:.9f}\n" for stamp in STAMPS).encode()
+    return {
+        "Boreas": Specimen(boreas, at()),
+        "Hilti": Specimen(hilti, at("exp04.bag")),
+        "NTU VIRAL": Specimen(made(bag("ros1", viral, "eee_01")), at("eee_01.bag")),
+        "receiver and wheels": Specimen(made(bag("ros1", aided)), at("run.bag")),
+        "wheels' poses": Specimen(
+            made(bag("ros1", aided)), at("run.bag", wheels_topic="/odom", gnss_topic="/fix")
+        ),
+        "EuRoC IMU": Specimen(beside, at()),
+    }
+
+
 def recordings() -> dict[str, Specimen]:
     """Bags with every compression, and LOAM's topics."""
     modes = {
@@ -297,7 +343,7 @@ def recordings() -> dict[str, Specimen]:
             name = f"{kind} {getattr(mode, 'name', 'plain').lower()}"
             found[name] = Specimen(files, at("run" if "/" in alone else alone))
             if mode is None and kind != "ros1":
-                found[f"{kind} file"] = Specimen({alone: files[alone]}, at(alone))
+                found[f"{kind} alone"] = Specimen({alone: files[alone]}, at(alone))
     loam = made(bag("ros1", bags.loam_recording(count=2)))
     found["LOAM topics"] = Specimen(loam, at("run.bag", axes="lidar"))
     return found
@@ -326,7 +372,8 @@ def poses() -> dict[str, Specimen]:
 
 def own() -> dict[str, Specimen]:
     """What the package writes and reads again: configuration, graph, checkpoint, study."""
-    settings = config.dump_config(Config())[:4000].rpartition("\n")[0].encode()
+    lines = config.dump_config(Config()).splitlines()
+    settings = "\n".join(line for line in lines if not line.lstrip().startswith("#")).encode()
     world = SimulatedWorld("room", frames=3, columns=60)
     turned = Config().changed("loops.enabled=true", "pose_graph.keyframe_distance=0.001")
 
@@ -341,8 +388,8 @@ def own() -> dict[str, Specimen]:
     study = b"""sequences:
   room: {path: "sim:room?frames=40"}
 configs:
-  base: []
-  more: [solver.iterations=40]
+  base: {}
+  more: {set: {solver.iterations: 40}}
 seeds: [0, 1]
 frames: 20
 """
@@ -359,4 +406,5 @@ frames: 20
 
 def all_specimens() -> dict[str, Specimen]:
     """By the name of the format."""
-    return folders() | kitti() | known() | recordings() | poses() | own()
+    saved = {name: Specimen(*parts) for name, parts in maps(made).items()}
+    return folders() | kitti() | known() | rigs() | recordings() | poses() | own() | saved

@@ -232,7 +232,10 @@ def kitti_360_truth(root: Path, problems: list[str]) -> Trajectory | None:
         return tables.rigid_matrix([float(word) for word in line.split()])
 
     expected = "12 numbers of a rigid transform"
-    lidar_T_camera = tables.convert_lines(calibration, rigid, expected)[0]
+    found = tables.convert_lines(calibration, rigid, expected)
+    if not found:
+        raise DatasetError(f"{calibration}: expected {expected}, got an empty file")
+    lidar_T_camera = found[0]
     rows = tables.convert_lines(path, frame, "a frame number and the 16 of a rigid transform")
     stamps = np.array([stamp for stamp, _ in rows], np.int64)
     poses = np.reshape([pose for _, pose in rows], (-1, 4, 4)) @ inverse_pose(lidar_T_camera)

@@ -288,3 +288,6 @@ def test_a_drive_of_kitti_360_has_its_poses(tmp_path: Path) -> None:
     poses.write_text(f"{len(stamps)} {' '.join(['0'] * 16)}\n")
     with pytest.raises(DatasetError, match=r"cam0_to_world.txt:1: expected a frame number"):
         _ = open_dataset(root).truth
+    calibration.write_text("")
+    with pytest.raises(DatasetError, match=r"calib_cam_to_velo.txt: .*got an empty file"):
+        _ = open_dataset(root).truth

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from contextlib import suppress
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -19,7 +20,7 @@ from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies.evaluation import absolute_error
-from loam_gtsam.types import FrameStatus, InputError, MapUpdate, Trajectory
+from loam_gtsam.types import DatasetError, FrameStatus, InputError, MapUpdate, Trajectory
 
 FRAMES = 8
 WORLD = SimulatedWorld("room", frames=FRAMES, columns=450)
@@ -106,6 +107,26 @@ def test_npz_holds_every_frame_without_pickle(result, tmp_path):
     not_run = last.timings.keys() - first.timings.keys()
     assert not_run
     assert np.isnan([stages[name][0] for name in not_run]).all()
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [("status", np.array(["fine"])), ("twists", np.zeros(0)), ("map_T_lidar", np.zeros((1, 3)))],
+)
+def test_a_damaged_run_is_refused(result, tmp_path, column, value):
+    path = tmp_path / "run.npz"
+    run_files.write_npz(path, result.updates)
+    whole = path.read_bytes()
+    with np.load(path) as file:
+        columns = {name: file[name] for name in file.files}
+    np.savez(path, **{**columns, column: value})
+    with pytest.raises(DatasetError, match=r"run\.npz: expected the run\.npz of a finished run"):
+        read_updates(path)
+    rng = np.random.default_rng(0)
+    for at in rng.integers(0, len(whole), 40).tolist():
+        path.write_bytes(whole[:at] + rng.bytes(8) + whole[at + 8 :])
+        with suppress(DatasetError):
+            read_updates(path)
 
 
 def test_the_frames_of_a_saved_run_are_those_of_the_run(result, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -41,10 +42,35 @@ def test_what_is_no_cloud_is_refused(tmp_path):
     write_cloud(tmp_path / "none.pcd", np.full((3, 3), np.nan), np.empty((0, 3)))
     with pytest.raises(DatasetError, match="expected points"):
         read_cloud(tmp_path / "none.pcd")
+    for stray in (np.zeros((0, 3)), np.array([[0.0, 0.0, 0.0], [1e30, 0.0, 0.0]])):
+        with pytest.raises(DatasetError, match="points within 1e\\+06 m of each other"):
+            import_cloud(stray, tmp_path / "stray.lgmap")
     blob = np.random.default_rng(0).normal(size=(500, 3))
     with pytest.raises(DatasetError, match="expected level ground"):
         import_cloud(blob, tmp_path / "blob.lgmap")
     assert not (tmp_path / "blob.lgmap").exists()
+
+
+@pytest.mark.parametrize("streamed", [False, True])
+def test_a_laz_file_that_claims_too_many_chunks_is_refused(tmp_path, streamed):
+    """The decoder would ask for 64 GB, and end the process."""
+    pytest.importorskip("laspy")
+    path = tmp_path / "cloud.laz"
+    points = np.random.default_rng(3).uniform(-9.0, 9.0, (100, 3))
+    write_cloud(path, points[:50], points[50:])
+    data = bytearray(path.read_bytes())
+    (start,) = struct.unpack_from("<I", data, 96)
+    (table,) = struct.unpack_from("<q", data, start)
+    assert struct.unpack_from("<I", data, table + 4) == (1,)
+    if streamed:  # then the place of the table is at the end
+        struct.pack_into("<q", data, start, -1)
+        data += struct.pack("<q", table)
+    path.write_bytes(data)
+    assert len(read_cloud(path)) == 100
+    struct.pack_into("<I", data, table + 4, 2**32 - 1)
+    path.write_bytes(data)
+    with pytest.raises(DatasetError, match="chunks, got 4294967295"):
+        read_cloud(path)
 
 
 def test_flat_points_are_planes_and_corners_may_be_edges():

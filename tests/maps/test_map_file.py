@@ -126,6 +126,13 @@ def array_of(name: str, array: np.ndarray) -> Callable[[dict[str, bytes]], None]
     return edit
 
 
+def header_of_array(name: str, header: bytes) -> Callable[[dict[str, bytes]], None]:
+    def edit(members: dict[str, bytes]) -> None:
+        members[name] = b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header
+
+    return edit
+
+
 WRONG = {
     "version 99": header_with(version=99),
     "got a picture": header_with(format="a picture"),
@@ -135,6 +142,10 @@ WRONG = {
     "got (3,)": array_of("places/stamps.npy", np.zeros(3, np.int64)),
     "numbers of the": array_of("links/ends.npy", np.full((3, 2), 99)),
     "places/covariances": array_of("places/covariances.npy", np.zeros((2, 6, 6), np.float32)),
+    "places/map_T_middle.npy: expected finite numbers below": array_of(
+        "places/map_T_middle.npy", np.full((4, 4, 4), 1e200)
+    ),
+    "multi-line": header_of_array("places/stamps.npy", b"{'descr': 3L,\n"),
     "pickle": array_of("places/stamps.npy", np.array([{}, {}], object)),
     "there is no 'edges'": header_with(layers={}),
     "damaged": header_with(config="map: {cube_size: -1}"),

@@ -38,7 +38,8 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
             for row in range(len(columns["stamps"]))
         ]
     except DAMAGED as error:
-        raise DatasetError(f"{path}: expected the run.npz of a finished run: {error}") from error
+        told = str(error)[:200]
+        raise DatasetError(f"{path}: expected the run.npz of a finished run: {told}") from error
 
 
 def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:

@@ -265,13 +265,15 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
     The sweeps are the first, of the first half minute, over which the gyro's rates vary at least
     half as much as over any: where nothing turns, clock and mounting cannot be told.
     """
-    first = next(iter(dataset)).stamp
+    stamps = [sweep.stamp for sweep in itertools.islice(dataset, _TRIED_SWEEPS + 1)]
+    period = float(np.median(np.diff(stamps))) * 1e-9 if len(stamps) > 1 else 0.0
+    period = period if period > 0.0 else config.sensor.period
     imu = dataset.imu
     begin = 0.0
     if imu is not None and len(imu.stamps):
         order = np.argsort(imu.stamps, kind="stable")
-        seconds = (imu.stamps[order] - first).astype(np.float64) * 1e-9 + config.imu.time_offset
-        begin = where_it_turns(seconds, imu.gyro[order], config.sensor.period * len(dataset))
+        seconds = (imu.stamps[order] - stamps[0]).astype(np.float64) * 1e-9 + config.imu.time_offset
+        begin = where_it_turns(seconds, imu.gyro[order], _MAPPED * period, len(dataset) * period)
     part = PartOf(dataset, 0, 1, begin)
     result = run(part, config, max_frames=_MAPPED, keep_partial=True)
     if result.imu is None:
@@ -280,12 +282,12 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
     return said, _imu_problems(result.imu)
 
 
-def where_it_turns(seconds: FloatArray, gyro: FloatArray, duration: float) -> float:
+def where_it_turns(seconds: FloatArray, gyro: FloatArray, length: float, duration: float) -> float:
     """Seconds, within ``_SOUGHT``, from which on the rates vary much over the mapped sweeps.
 
-    ``seconds`` of the rates (N, 3) count from the first sweep, and ``duration`` is that of all.
+    ``seconds`` of the rates (N, 3) count from the first sweep; ``length`` is the time that the
+    mapped sweeps take, and ``duration`` that of all sweeps.
     """
-    length = 0.1 * _MAPPED
     starts = np.arange(0.0, np.clip(duration - length, _STEP, _SOUGHT), _STEP)
     windows = [gyro[slice(*np.searchsorted(seconds, [t, t + length]))] for t in starts]
     varied = np.array([w.var(axis=0).sum() * len(w) if len(w) else 0.0 for w in windows])

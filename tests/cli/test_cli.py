@@ -18,6 +18,7 @@ import pytest
 from support.cli import loam
 from support.list_dataset import ListDataset
 
+from loam_gtsam.cli import report
 from loam_gtsam.cli import run as run_command
 from loam_gtsam.cli.console import stop_requests
 from loam_gtsam.cli.report import where_it_turns
@@ -416,11 +417,23 @@ def test_inspect_names_an_imu_that_is_late(monkeypatch):
 def test_inspect_maps_where_the_lidar_turns():
     seconds = np.arange(-2.0, 60.0, 0.01)
     gyro = np.zeros((len(seconds), 3))
-    assert where_it_turns(seconds, gyro, 60.0) == 0.0
+    assert where_it_turns(seconds, gyro, 5.0, 60.0) == 0.0
     gyro[(seconds > 14.0) & (seconds < 17.0)] = np.sin(np.arange(300.0))[:, None]
-    assert 9.0 <= where_it_turns(seconds, gyro, 60.0) <= 14.0
-    assert where_it_turns(seconds + 100.0, gyro, 60.0) == 0.0  # it has no samples there
-    assert where_it_turns(seconds, gyro, 12.0) <= 7.0  # nor sweeps
+    assert 10.0 <= where_it_turns(seconds, gyro, 5.0, 60.0) <= 14.0
+    assert 12.0 <= where_it_turns(seconds, gyro, 2.5, 60.0) <= 14.0  # a lidar of 20 Hz
+    assert where_it_turns(seconds + 100.0, gyro, 5.0, 60.0) == 0.0  # it has no samples there
+    assert where_it_turns(seconds, gyro, 5.0, 12.0) <= 7.0  # nor sweeps
+
+
+def test_inspect_takes_the_rate_of_the_recording(monkeypatch):
+    """At 5 Hz 50 sweeps are ten seconds: what turns in the ninth is reached from the start."""
+    asked = []
+    monkeypatch.setattr(
+        report, "where_it_turns", lambda *a: asked.append(a[2:]) or where_it_turns(*a)
+    )
+    text = said("inspect", "sim:shaken?columns=600&frames=30", "--every", 2)
+    assert asked == [(pytest.approx(10.0), pytest.approx(3.0))]
+    assert "15 sweeps mapped, from 0 s on" in text
 
 
 def test_inspect_shows_what_was_understood_of_sweeps_and_imu(opens, scans, monkeypatch):

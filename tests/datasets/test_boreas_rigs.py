@@ -12,11 +12,13 @@ from support.bags import Recording, cloud, imu, store_of, write_bag
 
 from loam_gtsam.datasets import BagDataset, BoreasDataset, RigBag, open_dataset
 from loam_gtsam.datasets.decode.tables import pose_matrix
+from loam_gtsam.datasets.known.rigs import HILTI_2021
 from loam_gtsam.types import DatasetError
 
 MIDDLE = 50_000_000
 IMU_T_XT32 = pose_matrix([-0.001, -0.00855, 0.055, 0.7071068, -0.7071068, 0.0, 0.0])
 HESAI = "/hesai/pandar", "/alphasense/imu"
+OS0 = "/os_cloud_node/points", "/alphasense/imu"
 VIRAL = "/os1_cloud_node1/points", "/imu/imu"
 
 
@@ -95,6 +97,27 @@ def test_a_hilti_bag_is_told_by_its_topics_and_has_its_extrinsics(tmp_path: Path
     result = write.expect_mapped(dataset)
     turned = Rotation.from_euler("xyz", result.config.imu.lidar_R_imu_deg, degrees=True)
     np.testing.assert_allclose(turned.as_matrix(), lidar_R_imu, atol=1e-6)
+
+
+def test_hilti_2021_is_another_lidar_above_the_same_imu(tmp_path: Path) -> None:
+    """The pose of the case in the IMU's frame is the one that FAST-LIO-MULTI has in digits."""
+    imu_T_case = np.eye(4)
+    imu_T_case[:3] = [
+        [0.9999757, 0.0024556, -0.0065197, 0.0102543784],
+        [0.0024579, -0.9999969, 0.0003309, -0.0066573859],
+        [-0.0065188, -0.0003470, -0.9999787, 0.130729657],
+    ]
+    np.testing.assert_allclose(HILTI_2021.body_T_lidar, imu_T_case, atol=1e-6)
+    bag = write_rig(tmp_path / "Basement_1.bag", OS0, imu_T_case[:3, :3].T)
+    truth = write.body_truth(HILTI_2021.body_T_lidar)
+    seconds = [f"{stamp // 10**9}.{stamp % 10**9:09d}" for stamp in truth.stamps]
+    write.write_rows(tmp_path / "Basement_1_imu.txt", seconds, write.quaternion_rows(truth), " ")
+    dataset = open_dataset(bag)
+    assert isinstance(dataset, RigBag)
+    write.expect_truth(dataset)
+    position = -imu_T_case[:3, :3].T @ imu_T_case[:3, 3]
+    np.testing.assert_allclose(dataset.sensor["imu.lidar_t_imu"], position, atol=1e-5)
+    write.expect_mapped(dataset)
 
 
 def test_ntu_viral_has_its_extrinsics_unless_another_lidar_is_asked_for(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Known rigs whose bags are told by their topics: NTU VIRAL, Hilti 2022 and 2023."""
+"""Known rigs whose bags are told by their topics: NTU VIRAL, Hilti 2021, 2022 and 2023."""
 
 from __future__ import annotations
 
@@ -28,6 +28,20 @@ HILTI = Rig(
     source="the challenge's calibration, as evalio quotes it",
 )
 """A Hesai XT32 and an Alphasense. Reference poses, ``BAG_imu.txt``, are those of the IMU."""
+_IMU_T_OS_LIDAR = pose_matrix(
+    [0.01001967, -0.00664547, 0.09473042, 0.99999392, 0.00122838, -0.00325965, -0.00016948]
+)
+_OS_LIDAR_T_OS_SENSOR = pose_matrix([0.0, 0.0, -0.036, 0.0, 0.0, 0.0, 1.0])
+HILTI_2021 = Rig(
+    kind="Hilti 2021, on a pole",
+    topic="/os_cloud_node/points",
+    imu_topic="/alphasense/imu",
+    body_T_lidar=_IMU_T_OS_LIDAR @ _OS_LIDAR_T_OS_SENSOR,
+    lidar_T_imu=inverse_pose(_IMU_T_OS_LIDAR @ _OS_LIDAR_T_OS_SENSOR),
+    source="the challenge's calibration, as CT-ICP and FAST-LIO-MULTI quote it",
+)
+"""An OS0-64, whose points are in the frame of its case (``os_sensor``), and the IMU of an
+Alphasense, z down. Reference poses, ``BAG_imu.txt``, are those of the IMU."""
 NTU_VIRAL = Rig(
     kind="NTU VIRAL",
     topic="/os1_cloud_node1/points",
@@ -38,12 +52,12 @@ NTU_VIRAL = Rig(
 )
 """The horizontal OS1-16 of a drone, and its VN100. Reference positions are those of a prism."""
 
+_RIGS = (HILTI, HILTI_2021, NTU_VIRAL)
+
 
 def rig_of(topics: Collection[str]) -> Rig | None:
     """The rig whose topics, of sweeps and of the IMU, are both among these."""
-    return next(
-        (rig for rig in (HILTI, NTU_VIRAL) if {rig.topic, rig.imu_topic} <= {*topics}), None
-    )
+    return next((rig for rig in _RIGS if {rig.topic, rig.imu_topic} <= {*topics}), None)
 
 
 class RigBag(BagSequence):
@@ -66,7 +80,7 @@ class RigBag(BagSequence):
             topics = sorted(reader.topics)
         rig = rig_of(topics)
         if rig is None:
-            known = ", ".join(f"{r.topic} and {r.imu_topic}" for r in (HILTI, NTU_VIRAL))
+            known = ", ".join(f"{r.topic} and {r.imu_topic}" for r in _RIGS)
             raise DatasetError(f"{bag}: no known rig: expected {known}; got {', '.join(topics)}")
         names = [f"{bag.stem}_imu.txt", f"exp_{bag.stem.removeprefix('exp')}_imu.txt"]
         super().__init__(bag, [bag], rig, first_existing(bag.parent, names), **options)

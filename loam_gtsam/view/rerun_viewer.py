@@ -28,8 +28,19 @@ _SIGMAS = 3.0
 _SWEEP, _MAP_EDGE, _MAP_PLANE = (220, 226, 232), (150, 160, 172), (96, 106, 118)
 _EDGE, _PLANE, _PATH = (228, 87, 46), (63, 143, 166), (228, 87, 46)
 _LOOP_ON, _LOOP_OFF, _ELLIPSOID = (46, 158, 107), (194, 34, 47), (238, 202, 59)
-_AXIS_COLOURS = {"x": (214, 64, 69), "y": (46, 158, 107), "z": (63, 108, 201)}
+_CURVES = {
+    "matches/edges": _EDGE,
+    "matches/planes": _PLANE,
+    "residual/median": _SWEEP,
+    "sigma_mm/x": (214, 64, 69),
+    "sigma_mm/y": (46, 158, 107),
+    "sigma_mm/z": (63, 108, 201),
+    "milliseconds/frame": _SWEEP,
+}
+"""Entities below ``frame`` and their colours: those of the features, of the axes, or none."""
+_LIDAR = "map/lidar"
 _AXES = 0.5  # metres, of the origin of the lidar
+_EYE = (-13.0, -8.0, 10.0)  # metres from the lidar at the start, behind, to the right and above
 _MOST_PATH = 2_000  # points of the trajectory that are drawn at most
 _FINE = (FrameStatus.OK, FrameStatus.FIRST)
 
@@ -82,10 +93,11 @@ class RerunViewer(ClosingWriter):
             self._file.opened()
             self._streams.append(stream)
         self._log("map", self._rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        self._log("map/lidar", self._rr.TransformAxes3D(_AXES), static=True)
-        for axis, colour in _AXIS_COLOURS.items():
-            line = self._rr.SeriesLines(colors=[colour], names=[axis], widths=[2.0])
-            self._log(f"frame/sigma_mm/{axis}", line, static=True)
+        self._log(_LIDAR, self._rr.TransformAxes3D(_AXES), static=True)
+        for curve, colour in _CURVES.items():
+            name = curve.rpartition("/")[2]
+            line = self._rr.SeriesLines(colors=[colour], names=[name], widths=[2.0])
+            self._log(f"frame/{curve}", line, static=True)
 
     def show(self, frame: FrameView, around: Callable[[], MapView]) -> None:
         """Draw a frame; every tenth with the map, which ``around`` makes.
@@ -124,7 +136,7 @@ class RerunViewer(ClosingWriter):
 
     def _draw_frame(self, frame: FrameView) -> None:
         rr, pose = self._rr, frame.map_T_lidar
-        self._log("map/lidar", rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
+        self._log(_LIDAR, rr.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3]))
         self._log("map/covariance", self._ellipsoid(pose[:3, 3], frame.position_covariance))
         self._draw("map/sweep", rr.Points3D, _thinned(frame.sweep, self._most_sweep), _SWEEP, 0.75)
         self._draw("map/features/edges", rr.Points3D, frame.edges, _EDGE, 1.0)
@@ -240,10 +252,22 @@ def _blueprint() -> Any:
         "sigma_mm": "Sigma of the position [mm]",
         "milliseconds": "Time of the frame [ms]",
     }
-    plots = [bp.TimeSeriesView(origin=f"frame/{name}", name=titles[name]) for name in titles]
-    eye = bp.EyeControls3D(tracking_entity="map/lidar")
+    plots = [
+        bp.TimeSeriesView(
+            origin=f"frame/{name}",
+            name=title,
+            plot_legend=bp.PlotLegend(
+                corner=bp.Corner2D.LeftTop,
+                visible=sum(curve.startswith(name) for curve in _CURVES) > 1,
+            ),
+        )
+        for name, title in titles.items()
+    ]
+    eye = bp.EyeControls3D(
+        position=_EYE, look_target=(0.0, 0.0, 0.0), eye_up=(0.0, 0.0, 1.0), tracking_entity=_LIDAR
+    )
     scene = bp.Spatial3DView(origin="map", name="Map", eye_controls=eye)
-    panel = bp.Vertical(*plots, bp.TextLogView(origin="frame/messages"))
+    panel = bp.Vertical(*plots, bp.TextLogView(origin="frame/messages", name="Messages"))
     return bp.Blueprint(
         bp.Horizontal(scene, panel, column_shares=[3, 1]),
         bp.TimePanel(timeline="frame", state="collapsed"),

@@ -123,6 +123,38 @@ def test_a_run_is_recorded_frame_by_frame(tmp_path, chunks):
     assert check.returncode == 0, check.stderr
 
 
+def test_the_first_view_is_from_behind_and_curves_of_a_plot_differ(tmp_path, chunks):
+    """How it looks was judged by eye, with the viewer's own screenshots."""
+    with RerunViewer(tmp_path / "run.rrd") as viewer:
+        viewer.show(frame(0), around)
+    _, found, _ = chunks(tmp_path / "run.rrd")
+    colours = {}
+    for chunk in found:
+        batch = chunk.to_record_batch()
+        if "SeriesLines:colors" in batch.schema.names:
+            plot, _, curve = chunk.entity_path.removeprefix("/frame/").partition("/")
+            colours.setdefault(plot, {})[curve] = batch.column("SeriesLines:colors")[0].as_py()[0]
+    assert {plot: len(curves) for plot, curves in colours.items()} == {
+        "matches": 2, "residual": 1, "sigma_mm": 3, "milliseconds": 1
+    }  # fmt: skip
+    for curves in colours.values():
+        assert len({*curves.values()}) == len(curves)
+
+    from rerun.chunk import RrdReader
+
+    reader, seen = RrdReader(tmp_path / "run.rrd"), {}
+    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
+        batch = chunk.to_record_batch()
+        for name in batch.schema.names:
+            if name.startswith("EyeControls3D:"):
+                seen[name.partition(":")[2]] = batch.column(name)[0].as_py()[0]
+    x, y, z = seen["position"]
+    assert x < 0.0 and z > 5.0 and 10.0 < np.hypot(x, y) < 20.0  # noqa: PT018
+    assert seen["look_target"] == [0.0, 0.0, 0.0]
+    assert seen["eye_up"] == [0.0, 0.0, 1.0]
+    assert seen["tracking_entity"].strip("/") == "map/lidar"
+
+
 def test_stamps_are_exact_and_numbers_are_those_of_the_frames(tmp_path, chunks):
     with RerunViewer(tmp_path / "run.rrd") as viewer:
         for number in (3, 4):

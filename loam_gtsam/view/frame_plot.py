@@ -30,7 +30,7 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     """
     figure = empty_figure(9.0, 6.0)
     from matplotlib.collections import LineCollection
-    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.colors import LinearSegmentedColormap, to_rgb
 
     axes = figure.subplots()
     camera = _Camera(frame)
@@ -54,7 +54,7 @@ def plot_frame(path: str | Path, frame: FrameView, around: MapView) -> None:
     axes.plot(*path_seen, color="white", lw=3.5)
     axes.plot(*path_seen, color=PATH, lw=2.0)
     ellipse, unseen = camera.uncertainty(frame.position_covariance)
-    axes.fill(*ellipse.T, color=INK, lw=0)
+    axes.fill(*ellipse.T, fc=(*to_rgb(INK), 0.2), ec=INK, lw=1.5)
     for end, sigma in unseen:
         _draw_unseen(axes, end, sigma)
     axes.plot(0.0, 0.0, "o", color=PATH, mec="white", ms=8)

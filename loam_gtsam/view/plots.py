@@ -252,7 +252,7 @@ def plot_timings(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         labels = [f"{name}  {median:.1f} ms" for name, median in medians]
         axes.stackplot(np.arange(len(updates)), milliseconds.T, labels=labels, colors=colours, lw=0)
         # A rare slow frame (start-up, a busy machine) would flatten everything else.
-        axes.set_ylim(0.0, 1.3 * float(np.percentile(milliseconds.sum(axis=1), 98)) + 1e-9)
+        axes.set_ylim(0.0, 1.5 * float(np.percentile(milliseconds.sum(axis=1), 95)) + 1e-9)
         axes.set_xlim(0, max(len(updates) - 1, 1))
         handles, texts = axes.get_legend_handles_labels()
         axes.legend(

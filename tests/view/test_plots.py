@@ -16,6 +16,7 @@ from loam_gtsam.view.frame_view import RESIDUAL_COLOURS, FrameView, MapView
 
 gtsam = pytest.importorskip("gtsam")
 image = pytest.importorskip("matplotlib.image")
+colors = pytest.importorskip("matplotlib.colors")
 
 
 def circle(count: int = 100) -> Trajectory:
@@ -135,10 +136,12 @@ def test_a_frame_shows_its_matches_by_their_residuals(tmp_path):
         plot_frame(tmp_path / f"{name}.png", seen(residuals), NO_MAP)
         shown[name] = [has_colour(tmp_path / f"{name}.png", colour, 600) for colour in colours]
     assert shown == {"good": [True, False], "bad": [False, True]}
-    assert has_colour(tmp_path / "bad.png", visualization.INK, 4000)  # the ellipse
+    # See-through, over white.
+    ellipse = colors.to_hex(0.2 * np.array(colors.to_rgb(visualization.INK)) + 0.8)
+    assert has_colour(tmp_path / "bad.png", ellipse, 2000)
     bare = seen(np.zeros(0), sweep=np.zeros((0, 3)), position_covariance=np.full((3, 3), np.nan))
     plot_frame(tmp_path / "bare.png", bare, NO_MAP)
-    assert not has_colour(tmp_path / "bare.png", visualization.INK, 4000)
+    assert not has_colour(tmp_path / "bare.png", ellipse, 2000)
 
 
 def test_a_direction_that_is_not_seen_hides_nothing(tmp_path):

@@ -236,11 +236,14 @@ class Trajectory:
     Attributes
     ----------
     stamps : (N,) int64 nanoseconds
-    map_T_lidar : (N, 4, 4) float64
+    map_T_lidar : (N, 4, 4) float64; NaN as orientations where positions alone are known
+    point : (3,) metres along the axes of the lidar: the point, such as a prism, whose positions a
+        reference has; None if they are the lidar's
     """
 
     stamps: IntArray
     map_T_lidar: FloatArray
+    point: FloatArray | None = None
 
     def __post_init__(self) -> None:
         check_array(self.map_T_lidar, "Trajectory.map_T_lidar", (len(self.stamps), 4, 4), "numbers")

@@ -80,6 +80,8 @@ class Results:
         there = evaluation.interpolate(truth, error.stamps)
         inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
         here = trajectory.map_T_lidar[inside]
+        if len(here) != len(error.stamps):  # a sparse reference
+            here = evaluation.interpolate(trajectory, error.stamps).map_T_lidar
         turn = None
         if np.isfinite(there.map_T_lidar).all():
             turn = evaluation.align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])

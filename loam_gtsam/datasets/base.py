@@ -12,6 +12,7 @@ from typing import Any, Protocol, cast, runtime_checkable
 import numpy as np
 
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
+from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.pointcloud2 import TimeOptions
 from loam_gtsam.types import (
     BadSweep,
@@ -236,7 +237,7 @@ class WithTruth(ChangedDataset):
         """
         if isinstance(truth, Trajectory):
             if body_T_lidar is not None:
-                truth = Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
+                truth = moved_to_lidar(truth, body_T_lidar)
             return cls(dataset, truth, "given")
         # By name, as the loaders: what reads bags is itself made of what is here.
         reader = importlib.import_module("loam_gtsam.datasets.truth")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from loam_gtsam.datasets.decode import tables
+from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.geometry import inverse_pose
@@ -41,7 +42,8 @@ def read_truth(
 ) -> Trajectory:
     """Read reference poses of the lidar.
 
-    Positions alone (a file of ``t x y z``, GPS) have NaN as their orientation.
+    Positions alone (a file of ``t x y z``, GPS) have NaN as their orientation, and with
+    ``body_T_lidar`` they are those of a :attr:`~loam_gtsam.Trajectory.point` beside the lidar.
 
     Parameters
     ----------
@@ -55,8 +57,7 @@ def read_truth(
     Raises
     ------
     DatasetError
-        If the file cannot be read, is of no known format, has no poses, or has positions alone and
-        ``body_T_lidar`` moves them.
+        If the file cannot be read, is of no known format, or has no poses.
     """
     path, problems = Path(path), [] if problems is None else problems
     if path.suffix in _BAGS or (path / "metadata.yaml").is_file():
@@ -68,14 +69,7 @@ def read_truth(
     if not len(found):
         raise DatasetError(f"{path}: no poses")
     truth = tables.sorted_trajectory(found, poses, path.name, problems)
-    if body_T_lidar is None:
-        return truth
-    if np.isnan(truth.map_T_lidar).any() and np.any(body_T_lidar[:3, 3]):
-        raise DatasetError(
-            f"{path}: has positions alone, which an extrinsic cannot move to the lidar without "
-            "orientations; leave the extrinsic out, and the lever arm stays in the error"
-        )
-    return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
+    return truth if body_T_lidar is None else moved_to_lidar(truth, body_T_lidar)
 
 
 def extrinsic(text: str) -> FloatArray:

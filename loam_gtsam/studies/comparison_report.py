@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -333,7 +333,7 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
     if aligned and truth is not None:
         stamps = np.concatenate([trajectory.stamps for trajectory in aligned.values()])
         inside = (truth.stamps >= stamps.min()) & (truth.stamps <= stamps.max())
-        truth = Trajectory(truth.stamps[inside], truth.map_T_lidar[inside])
+        truth = replace(truth, stamps=truth.stamps[inside], map_T_lidar=truth.map_T_lidar[inside])
     if aligned:
         plots.plot_trajectories(path("trajectories.png"), aligned, truth)
     if errors and truth is not None:

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 from scipy.special import chdtri, ndtr
 
+from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.geometry import interpolated, inverse_pose, transform
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory, check_kind
@@ -24,6 +25,7 @@ _NO_SPREAD = 1e-9
 of the spreads is its root: 3 cm across a line of a kilometre)."""
 _LENGTHS = 8  # path lengths of the relative error, as in KITTI; multiples of one of these metres:
 _LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+_SPARSE_NS = 1_000_000_000  # between the poses of a reference that is not interpolated
 FREEDOM = 6
 """Degrees of freedom of a pose."""
 FIVE_SIGMA = float(chdtri(FREEDOM, 2.0 * ndtr(-5.0)))
@@ -114,7 +116,7 @@ def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
     else:  # positions alone
         poses[:, :3, :3] = np.nan
     poses[:, :3, 3] = interpolated(queries, times, trajectory.map_T_lidar[:, :3, 3])
-    return Trajectory(np.asarray(stamps, np.int64), poses)
+    return Trajectory(np.asarray(stamps, np.int64), poses, trajectory.point)
 
 
 def matched_truth(trajectory: Trajectory, reference: Trajectory) -> Trajectory:
@@ -369,24 +371,38 @@ def distance_travelled(positions: FloatArray) -> FloatArray:
 def _common(
     caller: str, estimate: Trajectory, reference: Trajectory
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Stamps and poses of the estimate inside the reference's time span, and reference poses."""
+    """Stamps, poses of the estimate where the reference has any, and those of the reference.
+
+    The stamps are those of the estimate inside the reference's time span. A sparse reference, as of
+    surveyed points at which the lidar stands, is not interpolated: then they are its own.
+    """
     for trajectory in (estimate, reference):
         check_kind(trajectory, Trajectory, caller, "a run and a data set have one")
     _check_stamps(caller, reference)
-    inside = (estimate.stamps >= reference.stamps[0]) & (estimate.stamps <= reference.stamps[-1])
+    if len(reference) > 1 and np.median(np.diff(reference.stamps)) > _SPARSE_NS:
+        fine, coarse, which = estimate, reference, "points of the sparse reference, inside the run"
+    else:
+        fine, coarse, which = reference, estimate, "poses inside the reference"
+    inside = (coarse.stamps >= fine.stamps[0]) & (coarse.stamps <= fine.stamps[-1])
     if inside.sum() < 3:
         raise InputError(
-            f"{caller}: expected 3 or more poses inside the reference's time span "
-            f"{reference.stamps[0]} to {reference.stamps[-1]} ns, got {int(inside.sum())}"
+            f"{caller}: expected 3 or more {which}'s time span {fine.stamps[0]} to "
+            f"{fine.stamps[-1]} ns, got {int(inside.sum())}"
         )
-    stamps, poses = estimate.stamps[inside], estimate.map_T_lidar[inside]
-    unknown = ~np.isfinite(poses).all(axis=(1, 2))
+    compared = estimate.map_T_lidar[inside] if coarse is estimate else estimate.map_T_lidar
+    unknown = ~np.isfinite(compared).all(axis=(1, 2))
     if unknown.any():
         raise InputError(
-            f"{caller}: expected poses of finite numbers, got {int(unknown.sum())} of {len(poses)} "
-            "that are not; leave them out"
+            f"{caller}: expected poses of finite numbers, got {int(unknown.sum())} of "
+            f"{len(compared)} that are not; leave them out"
         )
-    return stamps, poses, interpolate(reference, stamps).map_T_lidar
+    stamps = coarse.stamps[inside]
+    poses, truth = compared, interpolate(fine, stamps).map_T_lidar
+    if coarse is reference:
+        poses, truth = truth, reference.map_T_lidar[inside]
+    if reference.point is not None:
+        poses = poses @ rigid_transform(Rotation.identity(), reference.point)
+    return stamps, poses, truth
 
 
 def _angles_deg(rotations: FloatArray) -> FloatArray:

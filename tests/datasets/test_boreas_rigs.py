@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import layout_writers as write
-from support.bags import Recording, cloud, imu, store_of, write_bag
+from support.bags import Recording, cloud, imu, odometry, store_of, write_bag
 
+from loam_gtsam import absolute_error
 from loam_gtsam.datasets import BagDataset, BoreasDataset, RigBag, open_dataset
 from loam_gtsam.datasets.decode.tables import pose_matrix
 from loam_gtsam.datasets.known.rigs import HILTI_2021
@@ -18,6 +19,7 @@ from loam_gtsam.types import DatasetError
 MIDDLE = 50_000_000
 IMU_T_XT32 = pose_matrix([-0.001, -0.00855, 0.055, 0.7071068, -0.7071068, 0.0, 0.0])
 HESAI = "/hesai/pandar", "/alphasense/imu"
+POINTS = {"pole": (-0.00938425, -0.0148401), "prism": (-0.00594496, -0.00721288)}
 OS0 = "/os_cloud_node/points", "/alphasense/imu"
 VIRAL = "/os1_cloud_node1/points", "/imu/imu"
 
@@ -65,9 +67,11 @@ def test_what_is_wrong_with_boreas_is_told(tmp_path: Path) -> None:
         open_dataset(root)
 
 
-def write_rig(path: Path, topics: tuple[str, str], lidar_R_imu: np.ndarray) -> Path:
+def write_rig(
+    path: Path, topics: tuple[str, str], lidar_R_imu: np.ndarray, more: Recording | None = None
+) -> Path:
     store = store_of("ros1")
-    entries: Recording = []
+    entries: Recording = list(more or [])
     for sweep in write.sweeps():
         rings = np.asarray(sweep.rings).astype("<u2")
         times = sweep.stamp * 1e-9 + sweep.times
@@ -118,6 +122,42 @@ def test_hilti_2021_is_another_lidar_above_the_same_imu(tmp_path: Path) -> None:
     position = -imu_T_case[:3, :3].T @ imu_T_case[:3, 3]
     np.testing.assert_allclose(dataset.sensor["imu.lidar_t_imu"], position, atol=1e-5)
     write.expect_mapped(dataset)
+
+
+@pytest.mark.parametrize("point", ["pole", "prism"])
+def test_positions_of_the_pole_are_compared_at_the_pole(tmp_path: Path, point: str) -> None:
+    imu_T_lidar = HILTI_2021.body_T_lidar
+    bag = write_rig(tmp_path / "IC_Office_1.bag", OS0, imu_T_lidar[:3, :3].T)
+    truth = write.body_truth(imu_T_lidar)
+    offset = {"pole": 1.66722, "prism": 0.272943}[point]
+    beside = truth.map_T_lidar @ np.array([*POINTS[point], offset, 1.0])
+    lines = [
+        f"{stamp * 1e-9:.9f} {x:.9f} {y:.9f} {z:.9f} 0 0 0 1"
+        for stamp, (x, y, z, _) in zip(truth.stamps, beside, strict=True)
+    ]
+    (tmp_path / f"IC_Office_1_{point}.txt").write_text("\n".join(lines))
+    dataset = open_dataset(bag)
+    assert np.isnan(dataset.truth.map_T_lidar[:, :3, :3]).all()
+    exact = write.lidar_truth()
+    assert absolute_error(exact, dataset.truth).rmse < 1e-5
+    assert f"IC_Office_1_{point}.txt" in dataset.info().facts["reference poses"]
+
+
+def test_ntu_viral_brings_the_positions_of_its_prism(tmp_path: Path) -> None:
+    exact = write.lidar_truth()
+    # Prism and lidar in the frame of the IMU, by the calibration files of the data set.
+    prism = np.array([-0.293656, -0.012288, -0.273095]) - np.array([-0.05, 0.0, 0.055])
+    places = exact.map_T_lidar[:, :3, :3] @ prism + exact.map_T_lidar[:, :3, 3]
+    store = store_of("ros1")
+    entries = []
+    for stamp, place in zip(exact.stamps.tolist(), places, strict=True):
+        message = odometry(store, stamp, place)
+        make = store.types["geometry_msgs/msg/PoseStamped"]
+        entry = make(header=message.header, pose=message.pose.pose)
+        entries.append(("/leica/pose/relative", stamp, entry))
+    dataset = open_dataset(write_rig(tmp_path / "eee_01.bag", VIRAL, np.eye(3), entries))
+    assert absolute_error(exact, dataset.truth).rmse < 1e-6
+    assert "positions of a prism" in dataset.info().facts["reference poses"]
 
 
 def test_ntu_viral_has_its_extrinsics_unless_another_lidar_is_asked_for(tmp_path: Path) -> None:

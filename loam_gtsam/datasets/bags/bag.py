@@ -203,6 +203,7 @@ class BagSequence(BagDataset):
             options["imu_topic"] = rig.imu_topic
         super().__init__(path, parts=parts, **options)
         self._rig, self._truth_file = rig, truth
+        self._truth_source = "" if truth is None else truth.name
         self.name = path.resolve().name if path.is_dir() else path.stem
         if self.imu_topic == rig.imu_topic:
             self.sensor: Mapping[str, Any] = extrinsics.extrinsic_settings(rig.lidar_T_imu)
@@ -231,8 +232,8 @@ class BagSequence(BagDataset):
             where = extrinsics.describe_extrinsics(self.sensor, self._rig.source)
             info.facts["IMU to lidar"] = where
         info.facts["reference poses"] = "none"
-        if truth is not None and self._truth_file is not None:
-            info.facts["reference poses"] = f"{len(truth)} ({self._truth_file.name})"
+        if truth is not None:
+            info.facts["reference poses"] = f"{len(truth)} ({self._truth_source})"
         return info
 
 

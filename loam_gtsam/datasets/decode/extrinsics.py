@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.types import FloatArray, Trajectory
 
 
@@ -41,8 +42,13 @@ def rigid_transform(rotation: Rotation, translation: Sequence[float] | FloatArra
 
 
 def moved_to_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
-    """Poses of the lidar, from those of another frame of the same body."""
-    return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
+    """Poses of the lidar, from those of another frame of the same body.
+
+    Positions alone stay where they are, and are told to be of the origin of that frame.
+    """
+    if np.isfinite(truth.map_T_lidar).all():
+        return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
+    return Trajectory(truth.stamps, truth.map_T_lidar, inverse_pose(body_T_lidar)[:3, 3])
 
 
 def extrinsic_settings(lidar_T_imu: FloatArray) -> Mapping[str, Any]:

@@ -10,16 +10,17 @@ from pathlib import Path
 
 import typer
 from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import StudyOptions
-from loam_gtsam.io.atomic import file_name, make_folder, used_alone
+from loam_gtsam.io.atomic import file_name, make_folder, used_alone, write_text
 from loam_gtsam.studies import trial_runner as runner
 from loam_gtsam.studies import trials
+from loam_gtsam.studies.report_html import TextTable, page, table_html
 from loam_gtsam.studies.trial_spec import Spec, load_spec
 
+REPORT_FILE = "report.html"
 _SHOWN_ERRORS = 3
 
 
@@ -58,11 +59,15 @@ def _run_missing(spec: Spec, folder: Path, options: StudyOptions) -> int:
         finally:  # also after an error: the finished trials are worth a table
             found = [row for row in map(store.load, spec.trials) if row is not None]
             trials.write_table(folder / trials.TABLE_FILE, found, spec.text, spec.trials)
+            _write_page(folder / REPORT_FILE, spec, found)
     failed = [row for row in found if row["error"]]
     if not options.quiet:
         typer.echo("Medians over the seeds")
         for metric in spec.metrics:
-            Console().print(_summary(spec, found, metric))
+            shown = console.number_table("sequence", metric, spec.config_names)
+            for name, *cells in _medians(spec, found, metric).rows:
+                shown.add_row(Text(name), *map(Text, cells))
+            Console().print(shown)
         for row in failed[:_SHOWN_ERRORS]:
             typer.echo(f"  {_label(row)} failed: {row['error'].strip().splitlines()[-1]}")
         if len(failed) > _SHOWN_ERRORS:
@@ -70,7 +75,7 @@ def _run_missing(spec: Spec, folder: Path, options: StudyOptions) -> int:
         typer.echo(f"{len(found)} of {len(spec.trials)} trials done, {len(failed)} of them failed")
         if len(found) < len(spec.trials):
             typer.echo("Stopped; the same command goes on from here.")
-        typer.echo(f"Written to {folder / trials.TABLE_FILE}")
+        typer.echo(f"Written to {folder}: {trials.TABLE_FILE}, {REPORT_FILE}")
     if stop.signum is not None:
         return 128 + stop.signum
     return 1 if failed else 0
@@ -99,18 +104,31 @@ def _progress(name: str, total: int, quiet: bool) -> Iterator[Callable[[trials.R
         yield count
 
 
-def _summary(spec: Spec, rows: Sequence[trials.Row], metric: str) -> Table:
-    configs = list(dict.fromkeys(trial.config_name for trial in spec.trials))
-    table = console.number_table("sequence", metric, configs)
+def _medians(spec: Spec, rows: Sequence[trials.Row], metric: str) -> TextTable:
+    """A row for each sequence, a column for each configuration."""
+    table = []
     for sequence in dict.fromkeys(trial.sequence for trial in spec.trials):
         cells = []
-        for config in configs:
+        for config in spec.config_names:
             wanted = (sequence, config, None)
             own = (r for r in rows if (r["sequence"], r["config"], r["error"]) == wanted)
             values = [row[metric] for row in own if row[metric] is not None]
-            cells.append(Text(f"{statistics.median(values):.4g}" if values else "-"))
-        table.add_row(Text(sequence), *cells)
-    return table
+            cells.append(f"{statistics.median(values):.4g}" if values else "-")
+        table.append([sequence, *cells])
+    return TextTable(["sequence", *spec.config_names], table)
+
+
+def _write_page(path: Path, spec: Spec, rows: Sequence[trials.Row]) -> None:
+    """All metrics as tables, and what failed."""
+    sections = {metric: table_html(_medians(spec, rows, metric)) for metric in spec.metrics}
+    failed = [[_label(row), row["error"].strip().splitlines()[-1]] for row in rows if row["error"]]
+    if failed:
+        sections["Failed"] = table_html(TextTable(["trial", "error"], failed))
+    known = ", ".join(
+        f"{name.removesuffix('_version')} {version}" for name, version in trials.versions().items()
+    )
+    intro = [f"{len(rows)} of {len(spec.trials)} trials; medians over the seeds.", known]
+    write_text(path, page(f"Study {spec.name}", intro, sections))
 
 
 def _label(row: trials.Row) -> str:

@@ -37,6 +37,11 @@ class Spec:
     trials: tuple[Trial, ...]
     metrics: tuple[str, ...]
 
+    @property
+    def config_names(self) -> list[str]:
+        """Names of the configurations, in their order."""
+        return list(dict.fromkeys(trial.config_name for trial in self.trials))
+
 
 @dataclass(frozen=True, slots=True)
 class _System:

@@ -21,7 +21,8 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io.atomic import used_alone
 from loam_gtsam.studies import trial_runner
-from loam_gtsam.studies.trials import TABLE_FILE, Row, Trial, empty_row, read_table
+from loam_gtsam.studies.trial_spec import load_spec
+from loam_gtsam.studies.trials import TABLE_FILE, Row, Trial, empty_row, read_table, run_trial
 
 
 def study(*arguments: object) -> Result:
@@ -110,7 +111,13 @@ def test_the_table_at_the_end_shows_medians_of_what_did_not_fail(tmp_path, quick
     result = study(write_spec(tmp_path, text))
     assert re.search(r"ate_m\s+sequence\s+gtsam\s+few\s+room\s+3\s+7\s", result.output)
     assert re.search(r"rpe_percent\s+sequence\s+gtsam\s+few\s+room\s+-\s+-\s", result.output)
-    assert "Written to loam_gtsam_output/spec_study/results.parquet" in one_line(result)
+    written = "Written to loam_gtsam_output/spec_study: results.parquet, report.html"
+    assert written in one_line(result)
+    page = Path("loam_gtsam_output/spec_study/report.html").read_text("utf-8")
+    assert "<tr><td>room</td><td>3</td><td>7</td></tr>" in page
+    assert "<h2>rpe_percent</h2>" in page
+    assert "room x gtsam, seed 13" in page
+    assert "on [red]purpose[/red]" in page
     assert study("spec.yaml", "--quiet").output == ""
 
 
@@ -169,3 +176,16 @@ print([name for name in slow if name in sys.modules])
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_recordings_of_the_documentation_are_a_study(tmp_path, monkeypatch):
+    """The 27 of the usual comparison, KITTI, MulRan and HeLiPR; nothing of it is there."""
+    monkeypatch.setenv("LOAM_GTSAM_DATA", str(tmp_path))
+    spec = load_spec(Path(__file__).resolve().parents[2] / "docs/study/recordings.yaml")
+    names = list(dict.fromkeys(trial.sequence for trial in spec.trials))
+    usual = [n for n in names if n.startswith(("NC20", "NC21", "Spires", "Hilti", "NTU"))]
+    assert len(usual) == 27
+    assert len([n for n in names if n.startswith("KITTI")]) == 11
+    assert {n.split()[0] for n in names[38:]} == {"MulRan", "HeLiPR"}
+    assert {Path(trial.path).is_relative_to(tmp_path) for trial in spec.trials} == {True}
+    assert "no such" in run_trial(spec.trials[0])["error"]

@@ -17,7 +17,7 @@ SPIRES_CLOUDS = "raw/lidar-clouds"
 _ROOSTER = re.compile(r"rooster_[\d-]+_(?P<part>\d+)")
 _COLLECTION = re.compile(
     r"\d{4}(-\d\d){5}(_(?P<part>\d+))?-"
-    r"(?P<name>(quad|math)-(easy|medium|hard)|stairs|cloister|park)"
+    r"(?P<name>(quad|math|underground|mine)-(easy|medium|hard)|stairs|cloister|park)"
 )
 
 

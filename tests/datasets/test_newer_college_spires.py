@@ -15,6 +15,7 @@ from support.bags import Recording, cloud, imu, store_of, write_bag
 from loam_gtsam import datasets
 from loam_gtsam.datasets.decode.packed_points import read_pcd
 from loam_gtsam.datasets.decode.tables import pose_matrix
+from loam_gtsam.datasets.known import layouts
 from loam_gtsam.types import DatasetError, Scan
 
 WORLD = {"sensor": "os1-64", "columns": 512}
@@ -303,3 +304,10 @@ def test_tables_beside_the_sweeps_name_the_line_that_does_not_fit(tmp_path: Path
     (root / "raw" / "lidar-clouds" / "first.pcd").write_bytes(b"")
     with pytest.raises(DatasetError, match=r"first is not SECONDS.NANOSECONDS"):
         datasets.open_dataset(root)
+
+
+@pytest.mark.parametrize("place", ["quad", "math", "underground", "mine"])
+def test_sequences_are_told_by_their_names(place: str) -> None:
+    bag = Path(f"2021-07-01-10-37-38_1-{place}-hard.bag")
+    assert layouts.newer_college_sequence(bag) == (f"{place}-hard", 1)
+    assert layouts.newer_college_sequence(Path(f"2021-07-01-10-37-38-{place}.bag")) is None

@@ -212,7 +212,8 @@ _EXPLANATION = (
 
 
 def _markdown(results: Sequence[GrowthResult], rivals: Sequence[RivalResult] = ()) -> Iterator[str]:
-    yield "# Long runs\n\nMade by `python -m benchmarks.growth`.\n"
+    yield "# Long runs\n\nAfter this page you know what time and memory a long run takes."
+    yield "Made by `python -m benchmarks.growth`.\n"
     yield "; ".join(f"{name} {value}" for name, value in machine()) + "."
     for paragraph in _EXPLANATION:
         yield f"\n{paragraph}"

@@ -23,6 +23,7 @@ _PANELS = {"ate_m": "ATE [mm]", "ms": "ms a frame", "x_kiss_icp": "times of KISS
 _SCALES = {"ate_m": 1000.0}
 _EXPLANATION = """# Accuracy and time over the versions
 
+After this page you know what became of accuracy and time.
 Each run of `python -m benchmarks` adds a line to [history.jsonl](history.jsonl), from which this
 page is made; what is measured, and how, is on the page of the [last run](benchmarks.md).
 Milliseconds are medians, and those of two runs compare only on the same machine, equally busy; the

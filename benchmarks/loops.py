@@ -44,7 +44,8 @@ FALSE_LOOPS = 50
 _RESULTS = Path("benchmarks/results/loops")
 _HEAD = """# Loops, measured
 
-Made by `python -m benchmarks.loops`; also as [CSV](loops.csv). One kilometre round a street block
+After this page you know how many loops are found, and what they bring. Made by
+`python -m benchmarks.loops`; also as [CSV](loops.csv). One kilometre round a street block
 (20 m/s, VLP-16 with 600 columns), twenty towns. The odometry is made to go astray by a share of the
 way: to one side, always the same, and in heading (0.006 degrees a metre for 1 %). *Recall*:
 keyframes with an old one within 5 m that closed a loop. *Wrong*: off by more than 0.5 m or 3

@@ -141,7 +141,8 @@ def _csv_row(result: CaseResult) -> dict[str, str]:
 
 
 def _markdown(results: Sequence[CaseResult]) -> Iterator[str]:
-    yield "# Benchmarks\n\nMade by `python -m benchmarks`; also as [CSV](benchmarks.csv).\n"
+    yield "# Benchmarks\n\nAfter this page you know how accurate and how fast every case is."
+    yield "Made by `python -m benchmarks`; also as [CSV](benchmarks.csv).\n"
     yield "; ".join(f"{name} {value}" for name, value in machine()) + "."
     for paragraph in _EXPLANATION:
         yield f"\n{paragraph}"

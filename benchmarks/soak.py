@@ -240,7 +240,8 @@ def _write_curves(folder: Path, result: SoakResult) -> list[Path]:
 
 
 def _markdown(results: Sequence[SoakResult]) -> Iterator[str]:
-    yield "# Soak\n\nMade by `python -m benchmarks.soak`.\n"
+    yield "# Soak\n\nAfter this page you know what faults cost in long runs."
+    yield "Made by `python -m benchmarks.soak`.\n"
     yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
     yield (
         "Laps of built-in scenes with every fault there is, again and again, and an IMU with "
@@ -259,7 +260,8 @@ def _statuses(result: SoakResult) -> str:
 
 
 def _table_of_places(results: Sequence[SoakResult]) -> Iterator[str]:
-    yield "# Soak of other places\n\nMade by `python -m benchmarks.soak --places`.\n"
+    yield "# Soak of other places\n\nAfter this page you know what faults cost in other places."
+    yield "Made by `python -m benchmarks.soak --places`.\n"
     yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
     yield (
         "As in the [room and the street](soak.md), with every fault there is (but sixty points on "

@@ -10,6 +10,7 @@ numbers but the milliseconds are the same on every run.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import sys
 from collections import Counter
@@ -433,6 +434,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(text)
     options.output.mkdir(parents=True, exist_ok=True)
     (options.output / "worlds.md").write_text(text, encoding="utf-8")
+    with open(options.output / "worlds.csv", "w", encoding="utf-8", newline="") as file:
+        cells = [[cell.strip("*") for cell in line.cells(None)] for line in lines_of(rows)]
+        csv.writer(file, lineterminator="\n").writerows([TITLES, *cells])
     found = json.dumps([asdict(row) for row in rows], indent=1)
     (options.output / "worlds.json").write_text(found, encoding="utf-8")
     for row in rows:

@@ -105,6 +105,10 @@ def test_worlds_are_judged_the_same_by_any_number_of_workers(tmp_path: Path) -> 
     assert [row.seed for row in one] == [0, 1]
     assert all(0.0 < row.ate < 0.05 and row.broken == row.beyond == 0 for row in one)
     assert "geometric mean 1.000, worst 1.00" in (tmp_path / "2" / "worlds.md").read_text("utf-8")
+    (row,) = table(tmp_path / "2" / "worlds.csv")
+    assert (row["mode"], row["broken"]) == ("lidar", "0")
+    assert float(row["ATE mm"]) == pytest.approx(1e3 * np.sqrt(one[0].ate * one[1].ate), abs=0.06)
+    assert float(row["NEES/6 1"]) > 0.0
 
 
 def test_long_drives_leave_cubes_behind_and_keep_them(

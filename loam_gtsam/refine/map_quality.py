@@ -88,7 +88,7 @@ def map_quality(
     thick = spread[flat, 0]
     return MapQuality(
         thickness=float(thick.mean()) if len(thick) else np.nan,
-        planar_share=float(flat.sum() / max(enough.sum(), 1)),
+        planar_share=float(flat.sum() / max(int(enough.sum()), 1)),
         planes=int(flat.sum()),
         entropy=_entropy(p, radius),
         thicknesses=thick,

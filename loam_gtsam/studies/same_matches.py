@@ -8,7 +8,7 @@ expected motion, so that nothing but the solve differs.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
@@ -388,7 +388,9 @@ def table_of(results: SameMatches) -> TextTable:
             values = values[np.isfinite(values)]
             value = (np.mean if key in _MEANS else np.median)(values) if len(values) else np.nan
             row.append(f"{unit * float(value):.{digits}f}" if len(values) else "-")
-        shares = np.mean([solve.returned for solve in solves], axis=0) if solves else []
+        shares: Iterable[float] = ()
+        if solves:
+            shares = np.mean([solve.returned for solve in solves], axis=0)
         rows.append([*row, *(f"{100.0 * share:.0f}" for share in shares)])
     away = [f"back from {m:g} m, {deg:g} deg [%]" for m, deg in results.disturbances]
     return TextTable(["solver", *(title for title, *_ in _SHOWN.values()), *away], rows)

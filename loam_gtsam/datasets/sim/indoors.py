@@ -214,7 +214,7 @@ def _furniture(
     """A desk or shelves at the back of every room, and something beside its door."""
     rows = []
     for left, right in pairwise(edges):
-        out, top = rng.uniform(0.35, 0.8), rng.choice([0.75, 1.2, 2.0])
+        out, top = rng.uniform(0.35, 0.8), float(rng.choice([0.75, 1.2, 2.0]))
         begin = left + rng.uniform(0.4, 1.2)
         stop = begin + rng.uniform(0.8, 1.8)
         rows.append(streets.box(begin, stop, side * (far - out), side * far, 0.0, top))

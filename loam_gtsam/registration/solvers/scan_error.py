@@ -127,7 +127,7 @@ def scan_error(
     by_ground, new = seen.cells(points)
     fresh = _sums(scores, by_ground, len(new))[new]
     _, by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)
-    cells = by_cell.max(initial=-1) + 1
+    cells = int(by_cell.max(initial=-1)) + 1
     scatter = _sums(scores, by_cell, cells)
     information: FloatArray = jacobian.T @ jacobian
     variance = max(float(residuals @ residuals) / max(len(residuals) - 6, 1), _LEAST_VARIANCE)

@@ -112,7 +112,10 @@ def test_a_run_is_recorded_frame_by_frame(tmp_path, chunks):
     some = ("trajectory", "surroundings/edges", "surroundings/planes", "loops/used")
     # Frames 0 and 4, and the end.
     assert [rows[f"/map/{name}"] for name in some] == [3] * len(some)
-    assert (rows["/frame/matches/planes"], rows["/frame/messages"]) == (6, 1)
+    assert (rows["/frame/matches/planes"], rows["/frame/messages"]) == (
+        7,
+        1,
+    )  # its style is for all times
     assert blueprints == 1
     matches = column(found, "/map/matches/points", "Points3D:positions")
     expected = [u.n_edge_matches + u.n_plane_matches for u in outcome.updates]

@@ -71,6 +71,34 @@ def test_what_no_scan_sees_goes_on_as_it_was():
     np.testing.assert_allclose(follow(ways, 1e-3, blind=30)[10:], 0.5, atol=0.01)
 
 
+def test_a_step_back_after_a_blind_way_is_no_velocity_but_tells_one():
+    """Slower by 0.05 m a frame for ten blind ones: the next scan finds the pose 0.5 m back."""
+    motion, sigma = MotionFilter(CONFIG), 1e-3
+    motion.begin(0)
+    for number in range(1, 22):
+        share, raw = solved(10 < number < 21, sigma)
+        way = 0.5 if number < 21 else 0.45 - 0.5
+        found = moved(motion.expected(number * FRAME, moved(0)).x() if share.any() else way)
+        before = motion.covariance[3, 3]
+        motion.observe(number * FRAME, moved(0), found, share, raw, turned=False)
+    assert 0.3 < motion.expected(22 * FRAME, moved(0)).x() < 0.48
+    # The scan may have seen what was mapped on the way: then it tells little of the velocity.
+    assert motion.covariance[3, 3] > 0.5 * before
+
+
+def test_a_share_that_a_users_factor_has_a_say_in_tells_the_velocity():
+    """Positions of a receiver, known to 0.02 m, beside an expected pose of 0.01 m."""
+    motion, share, raw = MotionFilter(CONFIG), 0.8 * np.outer(X, X), 0.08**2 / 4.0 * np.eye(6)
+    motion.begin(0)
+    at = found = 0.0
+    for number in range(1, 60):
+        at += 0.5
+        expected = found + motion.expected(number * FRAME, moved(0)).x()
+        before, found = found, 0.8 * expected + 0.2 * at
+        motion.observe(number * FRAME, moved(0), moved(found - before), share, raw, turned=False)
+    assert found == pytest.approx(at, abs=0.02)
+
+
 def test_a_way_that_is_not_known_says_nothing_of_the_velocity():
     motion, (share, raw) = MotionFilter(CONFIG), solved(False)
     motion.begin(0)

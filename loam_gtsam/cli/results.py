@@ -168,10 +168,10 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
         written = (folder / "config.yaml").read_text(encoding="utf-8")
     except (OSError, ValueError):
         return False
-    if summary.get("interrupted") or summary.get("error"):
+    if not isinstance(summary, dict) or summary.get("interrupted") or summary.get("error"):
         return False
     now = _described(_input_info(dataset)), dump_config(effective_config(config, dataset))
-    frames, same = summary.get("frames"), (summary.get("dataset"), written) == now
+    frames, same = summary.get("frames", 0), (summary.get("dataset"), written) == now
     if same and frames < total and not summary.get("whole", True):
         return False
     if not same or not (frames == total or (summary.get("whole") and frames < total)):

@@ -495,6 +495,15 @@ def test_resume_does_not_take_another_run_for_its_own(opens, scans, change):
     assert "out: holds the results of another run" in mapped("--resume", *change, code=1)
 
 
+def test_resume_does_over_what_has_a_damaged_summary(opens, scans):
+    opens(scans[:3])
+    mapped()
+    for damaged in ("[]", "{", "null"):
+        Path("out/summary.json").write_text(damaged, encoding="utf-8")
+        mapped("--resume")
+        assert summary_in(Path("out"))["frames"] == 3
+
+
 def test_a_checkpoint_is_not_run_over(opens, scans):
     opens([*scans[:2], DatasetError("the disk was pulled out")])
     mapped(code=1)

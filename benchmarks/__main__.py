@@ -73,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=NAMES, default=NAMES,
                         help=f"cases to run: {', '.join(NAMES)}")  # fmt: skip
     parser.add_argument("--output", type=Path, default=ROOT / "benchmarks" / "results",
-                        help="folder for benchmarks.csv and benchmarks.md")  # fmt: skip
+                        help="folder for the tables, as CSV files, and the history")  # fmt: skip
     parser.add_argument("--no-peers", action="store_true", help="without KISS-ICP and small_gicp")
     parser.add_argument("--profile", metavar="CASE", choices=NAMES,
                         help="profile one case instead")  # fmt: skip
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         peers=not options.no_peers,
         announce=lambda name: console.print(f"{name} ..."),
     )
-    report.show(console, results)
+    report.show(console, report.tables(results))
     paths = report.write(options.output, results)
     if not options.quick:
         paths += history.add(options.output, results)

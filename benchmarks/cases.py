@@ -166,8 +166,9 @@ class PeerResult:
 
 @dataclass(frozen=True, slots=True)
 class EvidenceTable:
-    """Any further evidence of a case."""
+    """Numbers to show, and to write as a CSV file of this name."""
 
+    name: str
     title: str
     header: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]

@@ -3,7 +3,7 @@
 Two drives through the built-in world: round and round a block (``street_loop``, 3,000 sweeps), and
 10 km over ground that is always new (``avenue``). Each is mapped in a process of its own, with its
 IMU, as ``loam-gtsam run`` does it. Besides, the mapping stage is held against what the C++ systems
-recorded on the same sweeps. ``growth.md`` has the tables, ``growth_*.csv`` and ``.png`` the curves.
+recorded on the same sweeps. Tables and curves are CSV files.
 """
 
 from __future__ import annotations
@@ -19,11 +19,13 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
+from rich.console import Console
 
 from benchmarks import recorded
 from benchmarks.cases import ROOT, data_folder
-from benchmarks.growth_report import GrowthResult, write
+from benchmarks.growth_report import GrowthResult, size_table, time_table, write
 from benchmarks.process import memory, processor_clock
+from benchmarks.report import show, write_tables
 from loam_gtsam.config import Config, MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import SimulatedWorld
@@ -187,15 +189,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         part = False
     folder = options.output or ROOT / ("benchmarks/results" if part else "docs/benchmarks")
-    results = []
+    results, paths = [], []
     for drive in drives:
         print(f"{drive.scene} ...", flush=True)
         # Its own process, started afresh: the memory of one drive is not that of the other.
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
             results.append(pool.submit(measure, drive).result())
-        write(folder, results)  # kept, should the next one be stopped
-    rivals = [] if options.quick else recorded.measure_all(data_folder())
-    paths = write(folder, results, rivals)
+        paths += write(folder, results[-1])  # kept, should the next one be stopped
+    tables = [time_table(results), size_table(results)]
+    if not options.quick:
+        tables.append(recorded.table(recorded.measure_all(data_folder())))
+    show(Console(width=200), tables)
+    paths += write_tables(folder, tables)
     print(f"Written: {', '.join(map(str, paths))}")
     return 0
 

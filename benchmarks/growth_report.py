@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks import recorded
 from benchmarks.cases import EvidenceTable, Verdict
-from benchmarks.recorded import RivalResult
 from benchmarks.report import machine
-from benchmarks.tables import markdown_table, write_csv
+from benchmarks.tables import write_csv
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.view.plots import available, plot_curves
 
@@ -97,24 +95,16 @@ def thinned(result: GrowthResult) -> dict[str, FloatArray]:
     return rows
 
 
-def write(
-    folder: Path, results: Sequence[GrowthResult], rivals: Sequence[RivalResult] = ()
-) -> list[Path]:
-    """``growth_SCENE.csv`` and, with matplotlib, ``.png`` of each drive; ``growth.md``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    paths = []
-    for result in results:
-        rows = thinned(result)
-        path = folder / f"growth_{result.name}.csv"
-        columns = [np.asarray(values, np.float64).tolist() for values in rows.values()]
-        write_csv(path, list(rows), zip(*columns, strict=True))
-        paths.append(path)
-        if available():
-            paths.append(path.with_suffix(".png"))
-            _draw(paths[-1], rows)
-    path = folder / "growth.md"
-    path.write_text("\n".join(_markdown(results, rivals)) + "\n", encoding="utf-8")
-    return [*paths, path]
+def write(folder: Path, result: GrowthResult) -> list[Path]:
+    """``growth_SCENE.csv`` and, with matplotlib, ``.png`` of a drive; the paths."""
+    rows = thinned(result)
+    path = folder / f"growth_{result.name}.csv"
+    columns = [np.asarray(values, np.float64).tolist() for values in rows.values()]
+    write_csv(path, list(rows), zip(*columns, strict=True))
+    if not available():
+        return [path]
+    _draw(path.with_suffix(".png"), rows)
+    return [path, path.with_suffix(".png")]
 
 
 def _draw(path: Path, rows: Mapping[str, FloatArray]) -> None:
@@ -162,14 +152,14 @@ def time_table(results: Sequence[GrowthResult]) -> EvidenceTable:
             verdict = str(result.verdict) if column == "cpu_ms" else ""
             rows.append((result.name, label, *numbers, verdict))
     title = "Median processor time a frame in each tenth of the run [ms]"
-    return EvidenceTable(title, header, tuple(rows))
+    return EvidenceTable("growth_times", title, header, tuple(rows))
 
 
 def size_table(results: Sequence[GrowthResult]) -> EvidenceTable:
     """What was driven, and what it left in memory."""
     header = ("run", "sweeps", "path [m]", "ATE [m]", "status", "whole map [points]",
               "most in the window", "cubes evicted / lost", "archive [MB]", "reports [MB]",
-              "process [MB]", "peak [MB]", "peak with the whole map [MB]")  # fmt: skip
+              "process [MB]", "peak [MB]", "peak with the whole map [MB]", "CPU")  # fmt: skip
     rows = []
     for result in results:
         columns = result.columns
@@ -188,43 +178,7 @@ def size_table(results: Sequence[GrowthResult]) -> EvidenceTable:
                 f"{columns['process_mb'][-1]:.0f}",
                 f"{result.peak_mb:.0f}",
                 f"{result.peak_with_map_mb:.0f}",
+                dict(machine())["CPU"],
             )
         )
-    return EvidenceTable("Runs", header, tuple(rows))
-
-
-_EXPLANATION = (
-    "`street_loop` goes round and round a block, on ground that is mapped already from the second "
-    "lap on. Its map still gets denser, ever more slowly, as noise fills further voxels. `avenue` "
-    "leads through streets of a town and never comes back: what is left behind goes into the "
-    "archive. Default configuration, with the IMU of the built-in world.",
-    "Times are processor time, to which the work of others on the machine does not add; their "
-    "share of its caches and clock does, and shows in the time of making the sweeps, which is the "
-    "same work all along and no part of the pipeline. The target is for the growth of the pipeline "
-    "over the growth of that, the last but one column.",
-    "The window counts both maps; a point there takes 36 bytes, in the archive 28. The archive may "
-    "grow to `map.archive_megabytes` for each of the two; beyond it cubes go to `map.archive_dir`, "
-    "or are lost and counted. A run also keeps the report of every frame (`MapUpdate`).",
-    "Beside the recorded C++ systems: their milliseconds are those on the wall that they wrote "
-    "themselves, on a machine of this kind; ours is `prepare`, `match`, `solve` and `insert`, in "
-    "processor time, from raw sweeps or from the very features that they mapped. No IMU there.",
-)
-
-
-def _markdown(results: Sequence[GrowthResult], rivals: Sequence[RivalResult] = ()) -> Iterator[str]:
-    yield "# Long runs\n\nAfter this page you know what time and memory a long run takes."
-    yield "Made by `python -m benchmarks.growth`.\n"
-    yield "; ".join(f"{name} {value}" for name, value in machine()) + "."
-    for paragraph in _EXPLANATION:
-        yield f"\n{paragraph}"
-    tables = [time_table(results), size_table(results)]
-    if rivals:
-        tables.append(recorded.table(rivals))
-    for table in tables:
-        yield f"\n**{table.title}**\n"
-        yield from markdown_table(table.header, table.rows)
-    for result in results:
-        name = f"growth_{result.name}"
-        yield f"\n**{result.name}** ([CSV]({name}.csv))"
-        if available():
-            yield f"\n![Time, map points and memory over the frames of {result.name}]({name}.png)"
+    return EvidenceTable("growth", "Runs", header, tuple(rows))

@@ -1,10 +1,10 @@
-"""Accuracy and time over the versions: one JSON line a run of the benchmarks, a page, a picture."""
+"""Accuracy and time over the versions: one JSON line a run of the benchmarks, and a picture."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,6 @@ import numpy as np
 
 from benchmarks.cases import CaseResult
 from benchmarks.report import machine
-from benchmarks.tables import markdown_table
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.view.plots import available, plot_curves
@@ -21,20 +20,10 @@ from loam_gtsam.view.plots import available, plot_curves
 FILE = "history.jsonl"
 _PANELS = {"ate_m": "ATE [mm]", "ms": "ms a frame", "x_kiss_icp": "times of KISS-ICP"}
 _SCALES = {"ate_m": 1000.0}
-_EXPLANATION = """# Accuracy and time over the versions
-
-After this page you know what became of accuracy and time.
-Each run of `python -m benchmarks` adds a line to [history.jsonl](history.jsonl), from which this
-page is made; what is measured, and how, is on the page of the [last run](benchmarks.md).
-Milliseconds are medians, and those of two runs compare only on the same machine, equally busy; the
-ratio to KISS-ICP, which runs in between, compares better.
-
-![Accuracy and time over the runs](history.png)
-"""
 
 
 def add(folder: Path, results: Sequence[CaseResult]) -> tuple[Path, ...]:
-    """Add a run to the history in a folder, and make page and picture anew; returns their paths."""
+    """Add a run to the history in a folder, and draw it; returns the paths."""
     line = {
         "date": datetime.now(UTC).date().isoformat(),
         "version": installed_version(),
@@ -47,13 +36,12 @@ def add(folder: Path, results: Sequence[CaseResult]) -> tuple[Path, ...]:
 
 
 def draw(folder: Path) -> tuple[Path, ...]:
-    """Make the page, and the picture if matplotlib is there, from the lines of a folder."""
+    """Make the picture, if matplotlib is there, from the lines of a folder."""
     text = (folder / FILE).read_text(encoding="utf-8")
     runs = [json.loads(line) for line in text.splitlines()]
-    page, picture = folder / "history.md", folder / "history.png"
-    page.write_text("\n".join(_page(runs)) + "\n", encoding="utf-8")
+    picture = folder / "history.png"
     if not available():
-        return folder / FILE, page
+        return (folder / FILE,)
     numbers = np.arange(1, len(runs) + 1)
     panels: dict[str, dict[str, tuple[IntArray, FloatArray]]] = {}
     for key, label in _PANELS.items():
@@ -64,7 +52,7 @@ def draw(folder: Path) -> tuple[Path, ...]:
             for known in [np.isfinite(values)]
         }
     plot_curves(picture, panels, "run", log=True)
-    return folder / FILE, page, picture
+    return folder / FILE, picture
 
 
 def _measured(result: CaseResult) -> dict[str, float | None]:
@@ -85,18 +73,3 @@ def _names(runs: Sequence[dict[str, Any]]) -> list[str]:
 def _value(run: dict[str, Any], name: str, key: str) -> float:
     value = run["cases"].get(name, {}).get(key)
     return math.nan if value is None else _SCALES.get(key, 1.0) * value
-
-
-def _page(runs: Sequence[dict[str, Any]]) -> Iterator[str]:
-    yield _EXPLANATION
-    names = _names(runs)
-    for key, label in _PANELS.items():
-        yield f"**{label}**\n"
-        rows = []
-        for number, run in enumerate(runs, 1):
-            values = (_value(run, name, key) for name in names)
-            cells = ("-" if math.isnan(value) else f"{value:.3g}" for value in values)
-            about = ", ".join((run["version"], run["date"], run["machine"]["CPU"]))
-            rows.append((f"{number}: {about}", *cells))
-        yield from markdown_table(["run", *names], rows)
-        yield ""

@@ -150,6 +150,7 @@ def _step_table(estimates: list[Estimate]) -> EvidenceTable:
         ]
         rows.append((entry.label, *vectors, *away))
     return EvidenceTable(
+        "ouster_steps",
         "Steps between the sweeps, x y z [m] in the frame of the earlier sweep",
         ("method", *pairs, "from the reference [mm]", "from ours at mid-sweep [mm]"),
         tuple(rows),
@@ -169,6 +170,7 @@ def _residual_table(sweeps: list[Scan], estimates: list[Estimate]) -> EvidenceTa
         for estimate in chosen
     )
     return EvidenceTable(
+        "ouster_planes",
         "Mean distance of the later sweep's points from planes of the earlier one [mm], each step "
         "with the de-skew that belongs to it",
         ("method", *(f"{a} to {b}" for a, b in _PAIRS[:2])),

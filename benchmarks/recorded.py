@@ -121,4 +121,4 @@ def table(results: Sequence[RivalResult]) -> EvidenceTable:
                 *whole,
             )
         )
-    return EvidenceTable("Beside the recorded C++ systems", header, tuple(rows))
+    return EvidenceTable("growth_recorded", "Beside the recorded C++ systems", header, tuple(rows))

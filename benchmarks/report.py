@@ -1,11 +1,10 @@
-"""Results as tables: on the terminal, and as CSV and Markdown files."""
+"""Results as tables: on the terminal, and as CSV files."""
 
 from __future__ import annotations
 
-import csv
 import os
 import platform
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from rich.console import Console
@@ -14,23 +13,12 @@ from rich.text import Text
 
 from benchmarks.cases import CaseResult, EvidenceTable
 from benchmarks.peers import load
-from benchmarks.tables import markdown_table
+from benchmarks.tables import write_csv
 from loam_gtsam.io.version import installed_version
 
 STAGES = ("features", "odometry", "prepare", "match", "solve", "insert", "covariance", "wall")
 _PACKAGES = ("loam_gtsam", "gtsam", "numpy", "scipy", "kiss-icp", "small_gicp")
 _KISS = "KISS-ICP"
-
-_EXPLANATION = (
-    "ATE: root mean square of the positions after a rigid (SE(3), Umeyama) alignment, against the "
-    "truth at the moment each system's pose belongs to: ours at the start of the sweep, KISS-ICP's "
-    "at its last point (version 1.3 de-skews to there), without de-skew at its middle.",
-    "Times: median (95 %) milliseconds a frame, without reading or making the sweeps. The wall "
-    "time is that of the whole pipeline, with one process that extracts features ahead "
-    "(`run(..., workers=1)`), so it is less than the sum of the stages. No IMU is used. KISS-ICP "
-    "gets the same sweeps with the same point times, in blocks of 50 after ours, with its default "
-    "settings (voxel 1 m, all cores); the ratio is our median over its median.",
-)
 
 
 def machine() -> list[tuple[str, str]]:
@@ -54,7 +42,8 @@ def summary_table(results: Sequence[CaseResult]) -> EvidenceTable:
     """One row a case: accuracy, targets, peers, speed, size, statuses."""
     header = ("case", "sweeps", "path [m]", "ATE [m]", "targets", "other systems' ATE [m]",
               "ms a frame", "x KISS-ICP", "map points", "status")  # fmt: skip
-    return EvidenceTable("Summary", header, tuple(_summary_row(result) for result in results))
+    rows = tuple(_summary_row(result) for result in results)
+    return EvidenceTable("summary", "Summary", header, rows)
 
 
 def _summary_row(result: CaseResult) -> tuple[str, ...]:
@@ -84,7 +73,8 @@ def stage_table(results: Sequence[CaseResult]) -> EvidenceTable:
         for result in results
         if not result.problem
     )
-    return EvidenceTable("Median (95 %) milliseconds a frame, by stage", ("case", *STAGES), rows)
+    title = "Median (95 %) milliseconds a frame, by stage"
+    return EvidenceTable("stages", title, ("case", *STAGES), rows)
 
 
 def tables(results: Sequence[CaseResult]) -> list[EvidenceTable]:
@@ -93,9 +83,9 @@ def tables(results: Sequence[CaseResult]) -> list[EvidenceTable]:
     return [summary_table(results), stage_table(results), *own]
 
 
-def show(console: Console, results: Sequence[CaseResult]) -> None:
-    """Print the tables."""
-    for content in tables(results):
+def show(console: Console, tables: Iterable[EvidenceTable]) -> None:
+    """Print tables."""
+    for content in tables:
         # Text: brackets are units, not markup.
         table = Table(title=Text(content.title), title_justify="left")
         for column in content.header:
@@ -105,55 +95,43 @@ def show(console: Console, results: Sequence[CaseResult]) -> None:
         console.print(table)
 
 
+def write_tables(folder: Path, tables: Iterable[EvidenceTable]) -> tuple[Path, ...]:
+    """Write a CSV file of each table; their paths."""
+    paths = []
+    for content in tables:
+        paths.append(folder / f"{content.name}.csv")
+        write_csv(paths[-1], content.header, content.rows)
+    return tuple(paths)
+
+
 def write(folder: Path, results: Sequence[CaseResult]) -> tuple[Path, ...]:
-    """Write ``benchmarks.csv`` (one row a case) and ``benchmarks.md``; their paths."""
-    folder.mkdir(parents=True, exist_ok=True)
+    """Write ``benchmarks.csv``, a row a case, and the further evidence; the paths."""
     rows = [_csv_row(result) for result in results]
     names = list(dict.fromkeys(name for row in rows for name in row))
-    csv_path, markdown_path = folder / "benchmarks.csv", folder / "benchmarks.md"
-    with csv_path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, names)
-        writer.writeheader()
-        writer.writerows(rows)
-    markdown_path.write_text("\n".join(_markdown(results)) + "\n", encoding="utf-8")
-    return csv_path, markdown_path
+    path = folder / "benchmarks.csv"
+    write_csv(path, names, ([row.get(name, "") for name in names] for row in rows))
+    return path, *write_tables(folder, (table for result in results for table in result.tables))
 
 
-def _csv_row(result: CaseResult) -> dict[str, str]:
-    row = {"case": result.name, "problem": result.problem, "note": result.note}
+def _csv_row(result: CaseResult) -> dict[str, object]:
+    row: dict[str, object] = {"case": result.name, "problem": result.problem, "note": result.note}
     if result.problem:
         return row
     row |= {
-        "sweeps": str(result.sweeps),
-        "path_m": repr(result.path),
-        "ate_m": repr(result.ate),
+        "sweeps": result.sweeps,
+        "path_m": result.path,
+        "ate_m": result.ate,
         "targets": "; ".join(map(str, result.verdicts)),
-        "ratio_to_kiss_icp": repr(result.ratio),
-        "edge_points": str(result.map_points[0]),
-        "plane_points": str(result.map_points[1]),
+        "ratio_to_kiss_icp": result.ratio,
+        "edge_points": result.map_points[0],
+        "plane_points": result.map_points[1],
     }
-    row |= {f"frames_{status}": str(count) for status, count in result.statuses.items()}
+    row |= {f"frames_{status}": count for status, count in result.statuses.items()}
     for stage, (median, tail) in result.stages.items():
-        row |= {f"{stage}_ms_median": repr(median), f"{stage}_ms_95": repr(tail)}
+        row |= {f"{stage}_ms_median": median, f"{stage}_ms_95": tail}
     for peer in result.peers:
-        row |= {f"ate_m {peer.label}": repr(peer.ate), f"ms_median {peer.label}": repr(peer.ms)}
+        row |= {f"ate_m {peer.label}": peer.ate, f"ms_median {peer.label}": peer.ms}
     return row
-
-
-def _markdown(results: Sequence[CaseResult]) -> Iterator[str]:
-    yield "# Benchmarks\n\nAfter this page you know how accurate and how fast every case is."
-    yield "Made by `python -m benchmarks`; also as [CSV](benchmarks.csv).\n"
-    yield "; ".join(f"{name} {value}" for name, value in machine()) + "."
-    for paragraph in _EXPLANATION:
-        yield f"\n{paragraph}"
-    for table in tables(results):
-        yield f"\n**{table.title}**\n"
-        rows = ([cell.replace("|", "/") for cell in row] for row in table.rows)
-        yield from markdown_table(table.header, rows)
-    yield "\n**Notes**\n"
-    for result in results:
-        if result.note:
-            yield f"- {result.name}: {result.note}."
 
 
 def _times(result: CaseResult, stage: str) -> str:

@@ -2,8 +2,7 @@
 
 Passing objects, outliers, drop-outs, missing sweeps and a kidnapped lidar, each held against the
 undisturbed run, and KISS-ICP on the same sweeps if it is installed. The table goes to
-``robustness.csv`` and, as Markdown, into ``docs/benchmarks/robustness.md``. All numbers are the
-same on every run.
+``robustness.csv``. All numbers are the same on every run.
 """
 
 from __future__ import annotations
@@ -12,7 +11,7 @@ import argparse
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import cache, partial
@@ -47,7 +46,6 @@ _BACK = 0.1
 """Metres by which the error may exceed that of the undisturbed run to count as recovered."""
 _STAYS = 5
 """Sweeps for which it must be."""
-_BEGIN, _END = "<!-- begin table -->", "<!-- end table -->"
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,40 +296,12 @@ def _from_the_start(trajectory: Trajectory, truth: Trajectory) -> FloatArray:
     return errors
 
 
-def markdown(rows: Sequence[Row]) -> Iterator[str]:
-    """A line for each place and disturbance, the two systems side by side."""
-    yield (
-        "| place | disturbance | ATE [m] | largest [m] | recovery [sweeps] | other statuses "
-        "| KISS-ICP: ATE [m] | largest [m] | recovery [sweeps] |"
-    )
-    yield "|---" * 9 + "|"
-    peers = {(row.place, row.disturbance): row for row in rows if row.system == KISS}
-    for row in rows:
-        if row.system != OURS:
-            continue
-        cells = [row.place, row.disturbance, *_numbers(row), row.statuses]
-        peer = peers.get((row.place, row.disturbance))
-        yield f"| {' | '.join([*cells, *(_numbers(peer) if peer else ('',) * 3)])} |"
-
-
-def _numbers(row: Row) -> tuple[str, str, str]:
-    return f"{row.ate_m:.4f}", f"{row.max_m:.3f}", row.recovery
-
-
-def write(folder: Path, rows: Sequence[Row], page: Path | None = None) -> list[Path]:
-    """``robustness.csv``, and the table in a page between its marks if there is one."""
+def write(folder: Path, rows: Sequence[Row]) -> Path:
+    """``robustness.csv``; its path."""
     path = folder / "robustness.csv"
     names = [item.name for item in fields(Row)]
     write_csv(path, names, ([getattr(row, name) for name in names] for row in rows))
-    table = "\n".join(markdown(rows))
-    if page is None:
-        page = folder / "robustness.md"
-        page.write_text(table + "\n", encoding="utf-8")
-        return [path, page]
-    before, rest = page.read_text("utf-8").split(_BEGIN)
-    after = rest.split(_END)[1]
-    page.write_text(f"{before}{_BEGIN}\n{table}\n{_END}{after}", encoding="utf-8")
-    return [path, page]
+    return path
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -348,16 +318,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if place.scene != TOWN or (options.data / TOWN).is_dir()
     ]  # fmt: skip
     folder = options.output or ROOT / ("benchmarks/results" if options.quick else "docs/benchmarks")
-    page = None if options.quick or options.output else ROOT / "docs/benchmarks/robustness.md"
     started = time.perf_counter()
     tasks = [(place, name) for place in places for name in place.disturbances]
     # Started afresh: KISS-ICP brings threads of its own, which a fork would not carry over.
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         found = list(pool.map(partial(measure, data=options.data), tasks))
     rows = finished([measured for own in found for measured in own])
-    paths = write(folder, rows, page)
-    seconds = time.perf_counter() - started
-    print(f"{len(rows)} rows in {seconds:.0f} s: {', '.join(map(str, paths))}")
+    path = write(folder, rows)
+    print(f"{len(rows)} rows in {time.perf_counter() - started:.0f} s: {path}")
     return 0
 
 

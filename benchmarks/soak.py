@@ -4,7 +4,7 @@ Drives round and round a room and a block of the built-in world, or with ``--pla
 places once, whose sweeps, stamps and IMU samples are spoilt as :mod:`benchmarks.soak_faults` says.
 No exception may leave the pipeline, its memory must not grow, the good frames must stay accurate,
 and the report of the run must count every fault that was injected, no more and no less; else the
-exit code is 1. ``soak.md`` has the tables, ``soak_*.csv`` and ``.png`` the curves.
+exit code is 1. Tables and curves are CSV files.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from benchmarks.cases import ROOT, Verdict
 from benchmarks.process import memory
 from benchmarks.report import machine
 from benchmarks.soak_faults import KINDS, Expected, FaultyDrive
-from benchmarks.tables import markdown_table, write_csv
+from benchmarks.tables import write_csv
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.io.run_files import summarise
@@ -198,18 +198,24 @@ def _errors(
 
 
 def write(folder: Path, results: Sequence[SoakResult]) -> list[Path]:
-    """``soak_SCENE.csv`` and, with matplotlib, ``.png`` of each run; ``soak.md``.
+    """``soak.csv``, ``soak_counts.csv``, and the curves of each run; or ``soak_places.csv``."""
+    places = results[0].scene in PLACES
+    paths = [folder / ("soak_places.csv" if places else "soak.csv")]
+    header = ("place", "sweeps", "faults", *results[0].verdicts(), "statuses", "CPU")
+    write_csv(paths[0], header, map(_row, results))
+    if places:
+        return paths
+    counts = [(result.scene, *row) for result in results for row in result.counts()]
+    paths.append(folder / "soak_counts.csv")
+    write_csv(paths[-1], ("place", "what", "injected", "counted"), counts)
+    return paths + [path for result in results for path in _write_curves(folder, result)]
 
-    Of the places there is one table, ``soak_places.md``.
-    """
-    if results[0].scene in PLACES:
-        text = "\n".join(_table_of_places(results)) + "\n"
-        (folder / "soak_places.md").write_text(text, encoding="utf-8")
-        return [folder / "soak_places.md"]
-    paths = [path for result in results for path in _write_curves(folder, result)]
-    paths.append(folder / "soak.md")
-    paths[-1].write_text("\n".join(_markdown(results)) + "\n", encoding="utf-8")
-    return paths
+
+def _row(result: SoakResult) -> tuple[object, ...]:
+    delivered, faults = len(result.columns["faults"]), result.expected.injected.total()
+    values = [value for value, _ in result.verdicts().values()]
+    statuses = ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
+    return result.scene, delivered, faults, *values, statuses, dict(machine())["CPU"]
 
 
 def _write_curves(folder: Path, result: SoakResult) -> list[Path]:
@@ -237,72 +243,6 @@ def _write_curves(folder: Path, result: SoakResult) -> list[Path]:
         }
         plot_curves(paths[-1], panels, "sweep")
     return paths
-
-
-def _markdown(results: Sequence[SoakResult]) -> Iterator[str]:
-    yield "# Soak\n\nAfter this page you know what faults cost in long runs."
-    yield "Made by `python -m benchmarks.soak`.\n"
-    yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
-    yield (
-        "Laps of built-in scenes with every fault there is, again and again, and an IMU with "
-        "faults of its own, through one `Pipeline` each. Of each frame's report, which a run "
-        "keeps, only pose and status are kept here. Memory is judged in the room, where the map is "
-        "soon full. That of the block gets denser all the time, ever more slowly, as noise fills "
-        "further voxels ([long runs](growth.md)), and memory with it. "
-        "[Other places](soak_places.md) have a table."
-    )
-    for result in results:
-        yield from _scene(result)
-
-
-def _statuses(result: SoakResult) -> str:
-    return ", ".join(f"{n} {name}" for name, n in result.summary["status_counts"].items())
-
-
-def _table_of_places(results: Sequence[SoakResult]) -> Iterator[str]:
-    yield "# Soak of other places\n\nAfter this page you know what faults cost in other places."
-    yield "Made by `python -m benchmarks.soak --places`.\n"
-    yield "; ".join(f"{name} {value}" for name, value in machine()) + ".\n"
-    yield (
-        "As in the [room and the street](soak.md), with every fault there is (but sixty points on "
-        "the bridge, which may be enough there), once through each place. Judged are exceptions "
-        "and counts: where little is seen, a fault may cost more than its sweep.\n"
-    )
-    rows = []
-    for result in results:
-        delivered, faults = len(result.columns["faults"]), result.expected.injected.total()
-        values = [value for value, _ in result.verdicts().values()]
-        rows.append((result.scene, delivered, faults, *values, _statuses(result)))
-    names = ["place", "sweeps", "faults", *results[0].verdicts(), "statuses"]
-    yield from markdown_table(names, rows)
-    total = sum(len(result.columns["faults"]) for result in results)
-    yield f"\n{total} sweeps in all."
-
-
-def _scene(result: SoakResult) -> Iterator[str]:
-    injected, name = result.expected.injected, f"soak_{result.scene}"
-    points = result.columns["map_points"]
-    growth = ", ".join(f"{result.slope(k / 5, (k + 1) / 5):.1f}" for k in range(1, 5))
-    yield f"\n## {result.scene}\n"
-    firings = (SCENES | PLACES)[result.scene]
-    yield (
-        f"{len(points)} sweeps of {firings} firings delivered, {injected.total()} faults. "
-        f"From the second to the last fifth of them memory grew by {growth} MB per 1,000 sweeps; "
-        f"map points: {points[len(points) // 5]:.0f} after a fifth, {points[-1]:.0f} in the end.\n"
-    )
-    verdicts = (
-        (label, value, verdict if verdict.target != "-" else "")
-        for label, (value, verdict) in result.verdicts().items()
-    )
-    yield from markdown_table(("what", "value", "target"), verdicts)
-    yield "\n**What was done to the sweeps**\n"
-    yield from markdown_table(("fault", "times"), sorted(injected.items()))
-    yield "\n**What the report counts** (`faults`, `sweep_gaps`, `not_finite_points` and `imu` in"
-    yield "`summary.json`)\n"
-    yield from markdown_table(("what", "injected", "counted"), result.counts())
-    yield f"\nStatuses: {_statuses(result)}. ([CSV]({name}.csv))"
-    if available():
-        yield f"\n![Memory, error and faults over the sweeps of {result.scene}]({name}.png)"
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -41,6 +41,9 @@ _THIN = 0.5  # share of the voxels of planes with which a cloud is made even fir
 _GROUND = 0.95  # cosine between up and the normals of the ground
 _CELL = 1.0  # metres, in which the lowest level point is the ground
 _LAS_POINTS = 96  # byte of a LAS file at which the offset of its points stands
+_LAS_RECORDS = ((100, 54), (243, 60))
+"""Bytes at which the numbers of its records before and (LAS 1.4) after the points stand, and the
+least bytes of a record."""
 _FREE = 0.5  # metres around a lidar in which there is nothing
 _BINS = np.radians(1.0)  # of a picture of what is seen
 _RIGID = np.repeat([1e-5, 1e-3], 3)  # rad and m: between places of a cloud nothing has drifted
@@ -117,22 +120,27 @@ def _laspy(path: Path) -> Any:
 def _read_las(path: Path) -> FloatArray:
     laspy = _laspy(path)
     try:
-        _check_chunks(path)
+        _check_counts(path)
         return np.asarray(laspy.read(path).xyz, np.float64)
     except Exception as error:  # of laspy, or of whatever a damaged file makes it stumble over
         raise DatasetError(f"{path}: the file cannot be read: {error}") from error
 
 
-def _check_chunks(path: Path) -> None:
-    """A ValueError if a LAZ file claims more chunks than it has bytes: the decoder would abort.
+def _check_counts(path: Path) -> None:
+    """A ValueError if a file claims more records or chunks of points than it has room for.
 
-    The table of the chunks begins with its version and their number; where it is stands before the
+    A reader would look for each of the records, and a decoder of LAZ would abort the process. The
+    table of the chunks begins with its version and their number; where it is stands before the
     points, or in the last eight bytes (Isenburg, LASzip, PE&RS 79(2), 2013).
     """
-    if path.suffix.lower() != ".laz":
-        return
     data: Any = np.memmap(path, np.uint8, "r")
     (points,) = struct.unpack_from("<I", data, _LAS_POINTS)
+    for place, least in _LAS_RECORDS[: 1 + (data[25] >= 4)]:  # byte 25: the minor version
+        (records,) = struct.unpack_from("<I", data, place)
+        if records * least > len(data):
+            raise ValueError(f"expected at most {len(data) // least} records, got {records}")
+    if path.suffix.lower() != ".laz":
+        return
     (table,) = struct.unpack_from("<q", data, points)
     if table == -1:
         (table,) = struct.unpack_from("<q", data, len(data) - 8)

@@ -176,7 +176,8 @@ class PoseErrors:
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         from_map = update.map_T_lidar.inverse().AdjointMap()
-        by_scan = to_reference @ (np.eye(6) - scan.user) @ np.linalg.inv(to_reference)
+        to_middle = middle.between(update.map_T_lidar).AdjointMap()
+        by_scan = to_reference @ (np.eye(6) - scan.user) @ to_middle
         drifted = by_scan @ from_map
         uncertainty = Uncertainty(
             own=own,

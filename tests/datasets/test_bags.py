@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -142,6 +143,15 @@ def test_truncated_bags_cannot_be_opened(tmp_path: Path) -> None:
         path.write_bytes(data[:size])
         with pytest.raises(DatasetError, match=r"run.bag: cannot open the bag.*reindex"):
             open_dataset(path)
+
+
+def test_what_a_reader_says_of_a_damaged_bag_is_cut(tmp_path: Path) -> None:
+    bag = write_bag(tmp_path / "run", "sqlite3", sweeps("sqlite3"))
+    metadata = bag / "metadata.yaml"
+    metadata.write_text(re.sub(r"RIHS01_\w+", "x" * 20_000, metadata.read_text()))
+    with pytest.raises(DatasetError, match="cannot open the bag") as caught:
+        open_dataset(bag)
+    assert len(str(caught.value)) < 1_000
 
 
 def test_damage_inside_keeps_what_came_before(tmp_path: Path) -> None:

@@ -73,6 +73,20 @@ def test_a_laz_file_that_claims_too_many_chunks_is_refused(tmp_path, streamed):
         read_cloud(path)
 
 
+@pytest.mark.parametrize("kind", [".las", ".laz"])
+def test_a_las_file_that_claims_too_many_records_is_refused(tmp_path, kind):
+    """A reader would look for four billion of them."""
+    pytest.importorskip("laspy")
+    path = tmp_path / f"cloud{kind}"
+    points = np.random.default_rng(3).uniform(-9.0, 9.0, (100, 3))
+    write_cloud(path, points[:50], points[50:])
+    data = bytearray(path.read_bytes())
+    struct.pack_into("<I", data, 100, 2**32 - 1)
+    path.write_bytes(data)
+    with pytest.raises(DatasetError, match="records, got 4294967295"):
+        read_cloud(path)
+
+
 def test_flat_points_are_planes_and_corners_may_be_edges():
     rng = np.random.default_rng(1)
     across, along = rng.uniform(0.0, 6.0, (2, 30_000))

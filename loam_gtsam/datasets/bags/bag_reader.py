@@ -22,6 +22,7 @@ MAPPED = ("/laser_cloud_map", "/laser_cloud_surround", "/velodyne_cloud_register
 """Topics on which LOAM and A-LOAM publish clouds in the map."""
 _MOST = 2**63 - 1
 """Neither a length nor nanoseconds are larger; a bag without messages starts there."""
+_LONGEST = 500  # letters of what a reader says of a damaged bag, parts of which it may quote
 
 
 _OPTIONS = {
@@ -204,4 +205,4 @@ def _reason(error: Exception) -> str:
         text = "its first bytes are not those of a bag"
     elif not isinstance(error, AnyReaderError):
         text = f"{type(error).__name__}: {text}" if text else type(error).__name__
-    return text
+    return text[:_LONGEST]

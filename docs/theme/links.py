@@ -3,12 +3,14 @@
 The pages link to files of the repository by relative paths, which work wherever the repository is
 shown. On the site every such file gets a page of its own, and a link whose text is the name of a
 class, function or constant of that file leads to its line: ``[`matching.associate`](../../x.py)``.
-A title after the path narrows it down to the first line there that has those words.
+A title after the path narrows it down to the first line there that has those words. A link to a CSV
+file, alone on its line and with the title "table", becomes that table.
 """
 
 from __future__ import annotations
 
 import ast
+import csv
 import html
 import logging
 import posixpath
@@ -27,6 +29,7 @@ SYMBOL = re.compile(
     r"<code>(?P<name>\w+(?:\.(?!py<)\w+)+)</code></a>"
 )
 NOTEBOOK_LINK = re.compile(r'href="([\w./]+\.(?:md|ipynb))')
+TABLE = re.compile(r'^\[[^\]]*\]\((?P<path>[^)\s]+\.csv) "table"\)$', re.M)
 BLOCK = re.compile(r"(^```.*?^```)", re.M | re.S)
 _LANGUAGES = {".py": "python", ".yml": "yaml", ".cff": "yaml", ".toml": "toml"}
 
@@ -85,9 +88,21 @@ def page_of(path: str) -> str:
 
 def _targets(path: str) -> set[str]:
     """Files of the repository, outside docs/, that a page links to."""
-    text = BLOCK.sub("", (ROOT / path).read_text("utf-8"))
+    text = with_tables(BLOCK.sub("", (ROOT / path).read_text("utf-8")), path)
     found = {_joined(path, match["path"]) for match in LINK.finditer(text) if _local(match["path"])}
     return {target for target in found if not target.startswith("docs/")}
+
+
+def with_tables(markdown: str, path: str) -> str:
+    """The text of a page with its tables in it."""
+
+    def table(match: re.Match[str]) -> str:
+        with (ROOT / _joined(path, match["path"])).open(encoding="utf-8", newline="") as file:
+            header, *rows = csv.reader(file)
+        lines = [header, ["---"] * len(header), *rows]
+        return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+
+    return TABLE.sub(table, markdown)
 
 
 def _local(target: str) -> bool:
@@ -134,7 +149,7 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Any) -> st
         link = posixpath.relpath(page_of(target), posixpath.dirname(uri) or ".")
         return f"{match['text']}{link}{match['rest']}"
 
-    parts = BLOCK.split(markdown)
+    parts = BLOCK.split(with_tables(markdown, path))
     parts[::2] = [LINK.sub(moved, part) for part in parts[::2]]
     return "".join(parts)
 

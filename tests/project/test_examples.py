@@ -125,6 +125,11 @@ def refined_run(names: Names, output: str) -> None:
     assert names["graph"].size() == 2
 
 
+def own_solver(names: Names, output: str) -> None:
+    assert names["update"].status == "ok"
+    assert 0.0 < names["apart"] < 0.003
+
+
 CHECKS: dict[str, Callable[[Names, str], None]] = {
     "01_map_a_built_in_scene.py": built_in_scene,
     "02_numpy_arrays.py": numpy_arrays,
@@ -139,6 +144,7 @@ CHECKS: dict[str, Callable[[Names, str], None]] = {
     "11_optimise_a_saved_graph.py": saved_graph,
     "12_merge_maps.py": merged_maps,
     "13_refine_a_run.py": refined_run,
+    "14_own_solver.py": own_solver,
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import importlib
 import importlib.util
 import re
@@ -19,11 +20,10 @@ LINK = re.compile(r'\[`([\w.]+)`\]\((\S+\.py)(?: "([^"]+)")?\)')
 SECTIONS = set(Config.__annotations__)
 
 
-def rows(heading: str) -> list[list[str]]:
-    """The cells of the table under a heading."""
-    text = PAGE.read_text("utf-8").split(f"## {heading}\n")[1].split("\n## ")[0]
-    lines = [line for line in text.splitlines() if line.startswith("|")]
-    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
+def rows(table: str) -> list[list[str]]:
+    """The cells of a table beside the page."""
+    with (PAGE.with_suffix("") / f"{table}.csv").open(encoding="utf-8", newline="") as file:
+        return list(csv.reader(file))[1:]
 
 
 def shown(value: Any) -> str:
@@ -57,7 +57,8 @@ def line_of() -> Callable[..., int]:
     return found
 
 
-LINKS = LINK.findall(PAGE.read_text("utf-8"))
+CONSTANTS, ADDITIONS = rows("constants"), rows("additions")
+LINKS = LINK.findall("\n".join([PAGE.read_text("utf-8"), *(row[5] for row in CONSTANTS)]))
 
 
 @pytest.mark.parametrize(("name", "path", "words"), sorted(set(LINKS)))
@@ -80,7 +81,7 @@ def test_a_line_that_is_not_there_is_an_error(line_of: Callable[..., int]) -> No
             line_of(source, name, words)
 
 
-@pytest.mark.parametrize("row", rows("Constants"), ids=lambda row: row[3].strip("`"))
+@pytest.mark.parametrize("row", CONSTANTS, ids=lambda row: row[3].strip("`"))
 def test_every_constant_has_this_value_by_default_and_in_the_presets(row: list[str]) -> None:
     name = row[3].strip("`")
     assert row[4] == shown(value_of(name, Config()))
@@ -92,20 +93,20 @@ def test_every_constant_has_this_value_by_default_and_in_the_presets(row: list[s
             assert value == ours, system
 
 
-@pytest.mark.parametrize("row", rows("Constants"), ids=lambda row: row[3].strip("`"))
+@pytest.mark.parametrize("row", CONSTANTS, ids=lambda row: row[3].strip("`"))
 def test_the_line_of_a_constant_is_where_it_is_used(row: list[str]) -> None:
     name, _, words = LINK.findall(row[5])[0]
     assert words.endswith(row[3].strip("`").rpartition(".")[2]) or name == "solvers.make_solver"
 
 
-@pytest.mark.parametrize("row", rows("What neither of them has"), ids=lambda row: row[1])
+@pytest.mark.parametrize("row", ADDITIONS, ids=lambda row: row[1])
 def test_every_addition_has_these_values(row: list[str]) -> None:
     configs = (Config(), preset("loam"), preset("aloam"))
     assert row[2:] == [shown(value_of(row[1].strip("`"), config)) for config in configs]
 
 
 def test_no_parameter_is_missing_that_comes_from_the_originals_or_differs_in_a_preset() -> None:
-    page = PAGE.read_text("utf-8")
+    named = {row[3] for row in CONSTANTS} | {row[1] for row in ADDITIONS}
     missing = []
     for section in SECTIONS:
         default = getattr(Config(), section)
@@ -116,6 +117,6 @@ def test_no_parameter_is_missing_that_comes_from_the_originals_or_differs_in_a_p
             concerns = "LOAM" in field.json_schema_extra["source"] or any(
                 value != own for value in theirs
             )
-            if concerns and f"| `{key}` |" not in page:
+            if concerns and f"`{key}`" not in named:
                 missing.append(key)
     assert missing == []

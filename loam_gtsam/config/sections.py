@@ -57,8 +57,8 @@ class FeatureConfig(Section):
     post_depth: float = parameter(0.5, unit="m", source="LOAM has no such search", low=0.0)
     """A pole, a run of a ring too short for the curvature, is an edge where it stands in front of
     what is on both sides of it by more than this; 0 turns the search for poles off."""
-    post_width: float = parameter(0.5, unit="m", low=0.0)
-    """A run of a ring counts as a pole only if it is narrower than this."""
+    post_width: float = parameter(2.0, unit="m", source="twice matching.max_distance", low=0.0)
+    """A run of a ring is a pole only if it is narrower: all of it is within reach of its middle."""
     plane_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """A plane point has at most this curvature."""
     sharp_per_sector: int = parameter(2, source="LOAM", low=0)

@@ -45,6 +45,7 @@ class MovingSweep:
     duration : seconds of the sweep; 0 without de-skewing
     n_edges, n_planes : numbers of features
     distinct : (E,) whether an edge stands out of its ring by more than range noise
+    alone : (E,) whether it is a pole, which stands before all that is beside it; None if unknown
     motion : source of the rotation within the sweep
     not_finite : number of points of the sweep that were NaN or infinite
     """
@@ -65,6 +66,8 @@ class MovingSweep:
         self.distinct: BoolArray = (
             np.ones(len(features.edges), np.bool_) if prominence is None else prominence > least
         )
+        depth = config.features.post_depth or np.inf
+        self.alone: BoolArray | None = None if prominence is None else prominence > depth
         self._points = features.edges, features.planes
         times = features.edge_times, features.plane_times
         self._seconds = times[0] - self.middle, times[1] - self.middle

@@ -1,7 +1,8 @@
-"""Pole features: poles, trunks and table legs, which are thin and stand alone.
+"""Pole features: what stands alone and has few points, near and thin or wide and far away.
 
 A pole of ten centimetres has too few points for LOAM's windows, and most of them count as grazed or
-occluded. On open ground poles are nevertheless all that fixes the pose.
+occluded; so has a car at fifty metres. On open ground they are nevertheless all that fixes the
+pose.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _LINKED_BEAMS = 2.5
 """Beam spacings between two neighbours of a run at most: one lost beam is bridged."""
+_EMPTY_BEAMS = 5.5
+"""Beam spacings without a point at least, for there to be nothing: four beams in a row are lost by
+chance where one in four returns nothing, as on dark ground."""
 _LINKED = 0.2
 """Metres between two neighbours of a run that are always allowed."""
 _ROUND = 0.25 * np.pi
@@ -25,7 +29,7 @@ the mean of ``sqrt(1 - x^2)`` over the width."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Poles:
-    """Poles of a sweep, one for each ring that meets a pole.
+    """Poles of a sweep, one for each ring that meets one.
 
     Attributes
     ----------
@@ -82,7 +86,10 @@ def find_poles(
     farther = _to_next(ranges, heads, tails)
     apart = turn > _LINKED_BEAMS * spacing
     # On a ring of a few points the last may lie beside the first, and still be a turn away.
-    apart[tails[tails - heads < most]] = True
+    short = tails[tails - heads < most]
+    apart[short] = True
+    empty = turn > _EMPTY_BEAMS * spacing
+    empty[short] = True
     reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
     cut = apart | (np.hypot(farther, turn * ranges) > reach)
     # A run does not go on from the end of a ring to its start: it is cut there.
@@ -92,8 +99,8 @@ def find_poles(
     first = np.concatenate(([0], last[:-1] + 1))
     before = first - 1
     before[np.searchsorted(first, heads)] = tails
-    gap_before = np.where(apart[before], np.inf, -farther[before])
-    gap_after = np.where(apart[last], np.inf, farther[last])
+    gap_before = np.where(empty[before], np.inf, -farther[before])
+    gap_after = np.where(empty[last], np.inf, farther[last])
     length = last - first + 1
     depths = np.minimum(gap_before, gap_after).astype(np.float64)
     chosen = (length <= most) & cut[last] & cut[before] & (depths > depth)

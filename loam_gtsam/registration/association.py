@@ -16,6 +16,7 @@ from loam_gtsam.registration.matches import (
     EdgeMatches,
     PlaneMatches,
     ScanMatches,
+    chosen_rows,
     joined,
     subset,
 )
@@ -29,6 +30,8 @@ _MORE = 2
 _ROUGH, _WRONG = 2.0, 4.0
 """A plane is rough if a neighbour lies farther off than twice the median of the sweep's planes, as
 less than one in ten of flat ones do by noise. It is wrong by four times what is beyond that."""
+_LEAN = 0.1
+"""Standard deviation, rad, of the angle between the axis of the rings and what stands upright."""
 _SURE = 2.0
 """Standard deviations beyond which a difference is none of noise (95 %)."""
 
@@ -51,23 +54,13 @@ def associate(
     ----------
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
     distinct : (E,) mask of :class:`EdgeMatches`; None if all edges are distinct. Distinct edges are
-        matched before other edges. A distinct edge without a line near by is searched for more
-        widely (``wide_search``) if the planes leave a translation open.
+        matched before other edges. If the planes leave a translation open, a distinct edge without
+        a line near by is searched for more widely (``wide_search``), and then, without a line, it
+        is matched with the map points near by.
     """
     rows = chosen_rows(len(edges), len(planes), config, distinct)
     chosen = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
     return match_features(*chosen, map_T_lidar, edge_map, plane_map, config, rows)
-
-
-def chosen_rows(
-    edges: int, planes: int, config: MatchingConfig, distinct: BoolArray | None = None
-) -> ChosenRows:
-    """Choose the features that are matched, from their numbers; see :func:`associate`."""
-    if distinct is not None and distinct.all():
-        distinct = None
-    edge_rows = spread_rows(edges, config.max_edges, distinct)
-    known = None if distinct is None else distinct[edge_rows]
-    return ChosenRows(edge_rows, spread_rows(planes, config.max_planes), known)
 
 
 def match_features(
@@ -97,16 +90,20 @@ def match_features(
     lines = match_lines(edges, edges_map, *near_edges[:2], pose, config, limit)
     surfaces, faces = match_surfaces(planes, pose, plane_map, config, limit)
     if distinct is not None:
-        alone = distinct.copy()
-        alone[lines.indices] = False
-        left = np.flatnonzero(alone)
-        wanted = config.wide_search > 1.0 and len(left) > 0
-        if wanted and translations_fixed(surfaces)[0] < config.wide_below:
-            # A pole that few beams met has no five points within max_distance.
-            far = config.wide_search * limit
-            near_edges = edge_map.nearest(edges_map[left], k, far, around)
-            more = match_lines(edges[left], edges_map[left], *near_edges[:2], pose, config, far)
-            lines = joined(lines, replace(more, indices=left[more.indices]))
+        left = distinct.copy()
+        left[lines.indices] = False
+        searched = config.wide_search > 1.0 and left.any()
+        if searched and translations_fixed(surfaces)[0] < config.wide_below:
+            # A pole that few beams met has no five points within max_distance, or only these.
+            poles = np.zeros_like(left) if rows.alone is None else rows.alone
+            ways = (match_lines, True, config.wide_search * limit), (match_uprights, poles, limit)
+            for match, among, far in ways:
+                chosen = np.flatnonzero(left & among)
+                near = edge_map.nearest(edges_map[chosen], k, far, around)
+                features = edges[chosen], edges_map[chosen], *near[:2]
+                more = match(*features, pose, config, far)
+                lines = joined(lines, replace(more, indices=chosen[more.indices]))
+                left[lines.indices] = False
         lines = replace(lines, distinct=distinct[lines.indices])
     return ScanMatches(
         replace(lines, indices=rows.edges[lines.indices]),
@@ -195,19 +192,6 @@ def translations_fixed(planes: PlaneMatches) -> FloatArray:
     across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
     fixed: FloatArray = np.linalg.eigvalsh(across).astype(np.float64)
     return fixed
-
-
-def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
-    """At most ``limit`` of ``count`` rows, evenly spread; those of ``first`` before others."""
-    if not 0 < limit < count:
-        return np.arange(count)
-    if first is None:
-        return np.arange(limit) * count // limit
-    before, after = np.flatnonzero(first), np.flatnonzero(~first)
-    before = before[spread_rows(len(before), limit)]
-    if len(before) == limit:
-        return before
-    return np.sort(np.concatenate([before, after[spread_rows(len(after), limit - len(before))]]))
 
 
 def trial_matching(config: MatchingConfig) -> MatchingConfig:
@@ -299,6 +283,39 @@ def match_lines(
     return EdgeMatches(
         points.take(near[keep], axis=0), centres.T[keep], directions.T[keep], *columns
     )
+
+
+def match_uprights(
+    points: FloatArray,
+    points_map: FloatArray,
+    neighbours: FloatArray,
+    squared_distances: FloatArray,
+    map_T_lidar: FloatArray,
+    config: MatchingConfig,
+    reach: float,
+) -> EdgeMatches:
+    """Lines across the rings through the few neighbours of what stands alone.
+
+    A car or a rock far away has one point on each of few rings: no five of them make a line. It is
+    known to be within ``reach`` of them, evenly in a disc; that is a standard deviation of half of
+    ``reach`` to either side, of the point as of each neighbour. How high it is stays open.
+    Parameters are those of :func:`match_lines`.
+    """
+    found = squared_distances < reach**2
+    rows = np.flatnonzero(found.any(axis=1))
+    found = found.take(rows, axis=0)
+    count = np.count_nonzero(found, axis=1)
+    near = np.where(found[:, :, None], neighbours.take(rows, axis=0), 0.0)
+    centres = near.sum(axis=1) / count[:, None]
+    up = map_T_lidar[:3, 2]
+    away = points_map.take(rows, axis=0) - centres
+    distances = np.linalg.norm(away - (away @ up)[:, None] * up, axis=1)
+    weights = _line_weights(distances, config)
+    sigmas = 0.5 * reach * np.sqrt(1.0 + 1.0 / count)
+    lines = centres, np.broadcast_to(up, centres.shape), distances, sigmas, weights
+    tilts = np.full(len(rows), _LEAN)
+    matches = EdgeMatches(points.take(rows, axis=0), *lines, rows, tilts)
+    return subset(matches, weights > config.min_weight)
 
 
 def match_planes(

@@ -16,7 +16,6 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.association import (
-    chosen_rows,
     match_features,
     match_surfaces,
     rematched,
@@ -24,7 +23,7 @@ from loam_gtsam.registration.association import (
     trial_matching,
 )
 from loam_gtsam.registration.degeneracy import Localizability, localizability
-from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, joined
+from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, chosen_rows, joined
 from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
@@ -346,7 +345,7 @@ class FrameMatcher(Matcher):
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
-    return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct)
+    return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct, sweep.alone)
 
 
 @dataclass(frozen=True, eq=False)

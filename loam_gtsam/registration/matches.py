@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import gtsam
 import numpy as np
 
+from loam_gtsam.config import MatchingConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.tags import Faces
@@ -109,9 +110,35 @@ class ChosenRows:
     edges: IntArray  # rows among the edges of the sweep
     planes: IntArray  # rows among its planes
     distinct: BoolArray | None  # mask of ``edges``; None if all are distinct
+    alone: BoolArray | None = None  # mask of those that are poles; None if none is known to be
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
+
+
+def chosen_rows(
+    edges: int, planes: int, config: MatchingConfig,
+    distinct: BoolArray | None = None, alone: BoolArray | None = None,
+) -> ChosenRows:  # fmt: skip
+    """Choose the features that are matched, evenly spread: those that stand out first."""
+    if distinct is not None and alone is None and distinct.all():
+        distinct = None
+    edge_rows = spread_rows(edges, config.max_edges, distinct)
+    known = [None if mask is None else mask[edge_rows] for mask in (distinct, alone)]
+    return ChosenRows(edge_rows, spread_rows(planes, config.max_planes), *known)
+
+
+def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntArray:
+    """At most ``limit`` of ``count`` rows, evenly spread; those of ``first`` before others."""
+    if not 0 < limit < count:
+        return np.arange(count)
+    if first is None:
+        return np.arange(limit) * count // limit
+    before, after = np.flatnonzero(first), np.flatnonzero(~first)
+    before = before[spread_rows(len(before), limit)]
+    if len(before) == limit:
+        return before
+    return np.sort(np.concatenate([before, after[spread_rows(len(after), limit - len(before))]]))
 
 
 _Matches = TypeVar("_Matches", EdgeMatches, PlaneMatches)

@@ -15,9 +15,8 @@ import numpy as np
 from scipy.ndimage import maximum_filter
 
 from loam_gtsam.config import RelocalizationConfig
-from loam_gtsam.registration.association import spread_rows
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
-from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.matches import ScanMatches, spread_rows
 from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution

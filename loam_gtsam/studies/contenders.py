@@ -22,7 +22,7 @@ from loam_gtsam.geometry import transform_each
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.pipeline import Parts, Pipeline, RunResult
 from loam_gtsam.refine.map_quality import MapQuality, map_quality
-from loam_gtsam.registration.association import spread_rows
+from loam_gtsam.registration.matches import spread_rows
 from loam_gtsam.registration.odometry import Guess, Odometry
 from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.studies.factories import is_factory, make_parts

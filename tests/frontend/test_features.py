@@ -190,7 +190,8 @@ def counts_by_sector(rows: list[int], sweep_starts: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("points_per_ring", [22, 60, 800])
 def test_counts_and_spacing(points_per_ring: int) -> None:
     # Suppression never stops early, and nothing but spacing and counts rejects.
-    settings = FeatureConfig(max_gap=1e9, occlusion_gap=1e9, grazing_ratio=1e9)
+    loose = {"max_gap": 1e9, "occlusion_gap": 1e9, "grazing_ratio": 1e9, "post_depth": 0.0}
+    settings = FeatureConfig(**loose)
     found = Picked(noisy_scan(1, points_per_ring), Config(features=settings))
     edges, flat = found.edges, found.flat
     for rows, most in ((edges, 20), (found.sharp, 2), (flat, 4)):

@@ -87,6 +87,16 @@ def test_one_lost_beam_does_not_cut_a_wall_and_two_only_with_depth():
     assert len(found(ring(lost))) == 0  # twelve metres on either side of every gap
 
 
+@pytest.mark.parametrize(("lost", "count"), [(1, 0), (4, 0), (5, 1)])
+def test_a_point_between_a_few_lost_beams_is_no_pole(lost, count):
+    """By dropout, points of flat ground are alone; they are no thing that tells the motion."""
+    ranges = wall()
+    ranges[100 - lost : 100] = ranges[101 : 101 + lost] = np.nan
+    assert len(found(ring(ranges))) == count
+    ranges[100] = 8.0  # before the wall beyond the gap
+    assert len(found(ring(ranges))) == 1
+
+
 def test_rings_do_not_touch():
     ranges = wall()
     ranges[-3:] = 8.0

@@ -11,13 +11,13 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.association import (
     associate,
+    match_features,
     match_lines,
     match_planes,
     rematched,
-    spread_rows,
     trial_matching,
 )
-from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.matches import ScanMatches, chosen_rows, spread_rows
 
 CONFIG = MatchingConfig(plane_tolerance=0.2)  # groups may be rough
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -413,6 +413,43 @@ def test_a_distinct_edge_without_a_line_near_is_searched_for_more_widely():
     np.testing.assert_array_equal(match(CONFIG, None).indices, [1, 3])
     assert match(CONFIG, None).distinct is None
     np.testing.assert_array_equal(match(CONFIG, np.full(5, True)).indices, [1, 3])
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_what_stands_alone_is_matched_with_the_few_points_near_by(count):
+    stands = np.array([5.0, 8.0, 0.0]) + np.outer(np.arange(count), [0.0, 0.1, 0.3])
+    held = map_of(np.concatenate([stands, [[20.0, 8.0, 0.0]]]))
+    pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.2, -0.1, 0.7), np.array([1.0, 2.0, 0.5]))
+    things = np.array([[5.2, 8.1, 0.1], [20.9, 8.5, 0.0], [-9.0, 0.0, 0.0], [5.0, 8.2, 0.2]])
+    features = pose.transformTo(things.T).T
+    alone = np.array([True, True, True, False])
+    none = np.empty((0, 3))
+
+    def near_by(config, alone):
+        rows = chosen_rows(4, 0, config, np.full(4, True), alone)
+        return match_features(features, none, pose, held, held, config, rows).edges
+
+    edges = near_by(CONFIG, alone)
+    # The second is 1.03 m from the nearest point, the fourth is no pole.
+    np.testing.assert_array_equal(edges.indices, [0])
+    np.testing.assert_allclose(edges.centres, [stands.mean(axis=0)], atol=1e-9)
+    up = pose.rotation().matrix()[:, 2]
+    np.testing.assert_allclose(edges.directions, [up], atol=1e-12)
+    away = np.linalg.norm(np.cross(things[0] - stands.mean(axis=0), up))
+    np.testing.assert_allclose(edges.distances, [away], atol=1e-9)
+    # Even in a disc of 1 m, both the point and the mean of its neighbours.
+    np.testing.assert_allclose(edges.sigmas, [0.5 * np.sqrt(1.0 + 1.0 / count)])
+    assert len(near_by(changed(wide_search=1.0), alone)) == 0
+    assert len(near_by(CONFIG, None)) == 0
+    walls, on_walls = zip(*(wall(across, 10) for across in (X, Y, Z)), strict=True)
+    held_planes, config = map_of(np.concatenate(walls)), changed(max_planes=0)
+    rows = chosen_rows(4, 30, config, np.full(4, True), alone)
+    for planes, count in ((on_walls, 0), (on_walls[:2], 1)):  # these leave the height open
+        rows = chosen_rows(4, 10 * len(planes), config, np.full(4, True), alone)
+        there = pose.transformTo(np.concatenate(planes).T).T
+        found = match_features(features, there, pose, held, held_planes, config, rows)
+        assert len(found.planes) == 10 * len(planes)
+        assert len(found.edges) == count
 
 
 def wall(across, count):

@@ -13,7 +13,8 @@ from support.strategies import generators
 
 from loam_gtsam.config import MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.registration.association import associate, rematched, spread_rows
+from loam_gtsam.registration.association import associate, rematched
+from loam_gtsam.registration.matches import spread_rows
 
 MAP = MapConfig(field_of_view=False)
 EXACT = MatchingConfig(

@@ -80,7 +80,7 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
 
 
 def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch):
-    _, features = features_of("square", 2, speed=20.0, start="moving")
+    _, features = features_of("square", 2, speed=24.0, start="moving")
     found, closer = [], []
     for share in (0.0, start._HOPEFUL, 1.0):
         monkeypatch.setattr(start, "_HOPEFUL", share)

@@ -125,10 +125,8 @@ def thinned(features: Features, config: MapConfig) -> Features:
     sizes = scale * config.edge_voxel, scale * config.plane_voxel
     if features.voxel_sizes == sizes:
         return features
-    stands_out = features.edge_prominence
-    if stands_out is None:
-        stands_out = np.full(len(features.edges), np.inf)
-    edges = np.column_stack([features.edges, features.edge_times, stands_out])
+    stands_out = () if features.edge_prominence is None else (features.edge_prominence,)
+    edges = np.column_stack([features.edges, features.edge_times, *stands_out])
     planes = np.column_stack([features.planes, features.plane_times])
     oblique = config.insertion == "settled"
     edges, planes = (
@@ -145,7 +143,7 @@ def thinned(features: Features, config: MapConfig) -> Features:
         plane_rings=np.zeros(len(planes), np.int64),
         sharp=np.empty(0, np.int64),
         flat=np.empty(0, np.int64),
-        edge_prominence=edges[:, 4].copy(),
+        edge_prominence=edges[:, 4].copy() if stands_out else None,
         voxel_sizes=sizes,
     )
 

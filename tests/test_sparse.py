@@ -52,12 +52,15 @@ def things_far_apart():
     return Scene("things", solids, way, False, 8.0, 1.5, sway, frames=60)
 
 
-@pytest.mark.parametrize(("width", "held"), [(2.0, True), (0.0, False)])
-def test_things_that_stand_alone_far_away_hold_a_drive(width, held):
-    world = SimulatedWorld(things_far_apart(), columns=360, max_range=60.0, start="moving")
-    result = run(world, alone().changed({"features.post_width": width}))
+@pytest.mark.parametrize(
+    ("speed", "width", "held"), [(8, 2.0, True), (20, 2.0, True), (8, 0, False)]
+)
+def test_things_that_stand_alone_far_away_hold_a_drive_that_starts_at_speed(speed, width, held):
+    given = {"columns": 360, "max_range": 60.0, "start": "moving", "frames": 40}
+    world = SimulatedWorld(things_far_apart(), speed=speed, **given)
+    result = run(world, alone().changed({"features.post_width": float(width)}))
     found, true = result.trajectory.map_T_lidar, world.truth.map_T_lidar
     off = np.linalg.norm((found - true)[:, :3, 3], axis=1)
     assert (off.max() < 0.02 * world.truth.path_length) == held
     told = [update.status is FrameStatus.OK for update in result.updates]
-    assert (sum(told) > 50) == held
+    assert (sum(told) > 30) == held

@@ -22,7 +22,7 @@ from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate
 
-_AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
+AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
 _CELL = 0.5  # metres: half the reach of a match, which is then the neighbouring cell
 _SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
 _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than a cell
@@ -47,8 +47,8 @@ class Fit:
         if not len(matches):
             return cls(0.0, 0.0)
         e, p = matches.edges, matches.planes
-        agree = np.count_nonzero(e.distances < _AGREE * e.sigmas)
-        agree += np.count_nonzero(np.abs(p.distances) < _AGREE * p.sigmas)
+        agree = np.count_nonzero(e.distances < AGREE * e.sigmas)
+        agree += np.count_nonzero(np.abs(p.distances) < AGREE * p.sigmas)
         return cls(len(matches) / max(offered, 1), agree / len(matches))
 
     @property

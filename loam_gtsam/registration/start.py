@@ -19,6 +19,7 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
+    AGREE,
     APART,
     CLEARLY,
     Fit,
@@ -38,6 +39,7 @@ _AGAINST = 3.0
 Between the rings of the first sweep more of the ground finds planes than on them, at any place."""
 _HOPEFUL = 0.5
 """Share of the best place's score, by few matches, below which a place is not looked at closer."""
+_CHANCE = 3.0  # standard deviations beyond which a difference of counts is no chance
 _FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
 _FARTHEST = 30.0  # metres: largest distance between the first two sweeps
 _TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical axis
@@ -72,6 +74,7 @@ class _Tried(NamedTuple):
     """A first motion that was tried."""
 
     total: float  # share of the features that agree, less that of those that contradict
+    lines: int  # distinct edges that agree
     sweeps: list[EarlySweep]
     solution: Solution
 
@@ -99,7 +102,8 @@ class Start:
 
         The places where the second sweep may have been taken are tried, each with both sweeps
         de-skewed for the motion that leads there. Another place than the expected one is chosen if
-        more features agree there, and if the scan tells the two places apart.
+        more features agree there, and if the scan tells the two places apart. Open ground agrees
+        everywhere: among places at which as many agree, what stands on it decides.
         """
         if len(self._sweeps) > 1:
             return expected
@@ -126,7 +130,7 @@ class Start:
             if number == 0 or tried.total >= enough
         )
         for tried in others:
-            if tried.total > CLEARLY * best.total and _told_apart(tried, best):
+            if _better(tried, best):
                 best = tried
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
@@ -208,7 +212,10 @@ class Start:
         fit = Fit.of(solution.matches, matcher.offered)
         total = fit.total - _AGAINST * (fit.share - fit.total) if solution.solved else 0.0
         second = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
-        return _Tried(max(total, 0.0), [sweeps[0], second], solution)
+        edges = solution.matches.edges
+        agree = edges.distances < AGREE * edges.sigmas
+        lines = np.count_nonzero(agree if edges.distinct is None else agree & edges.distinct)
+        return _Tried(max(total, 0.0), int(lines), [sweeps[0], second], solution)
 
     def _solved(
         self,
@@ -245,6 +252,14 @@ def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
     pose = sweep.map_T_middle.matrix()
     edges, planes = sweep.posed.points
     return transform(pose, edges), transform(pose, planes)
+
+
+def _better(tried: _Tried, best: _Tried) -> bool:
+    """Whether one place is clearly better than another; a count of lines varies by its root."""
+    if tried.total > CLEARLY * best.total and _told_apart(tried, best):
+        return True
+    chance = _CHANCE * np.sqrt(tried.lines + best.lines)
+    return CLEARLY * tried.total >= best.total and bool(tried.lines - best.lines > chance)
 
 
 def _told_apart(tried: _Tried, best: _Tried) -> bool:

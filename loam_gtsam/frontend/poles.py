@@ -83,13 +83,10 @@ def find_poles(
     beams = xyz / ranges
     turn = np.sqrt(squared_norm(_to_next(beams, heads, tails)))
     spacing = float(np.median(turn))
-    farther = _to_next(ranges, heads, tails)
-    apart = turn > _LINKED_BEAMS * spacing
     # On a ring of a few points the last may lie beside the first, and still be a turn away.
-    short = tails[tails - heads < most]
-    apart[short] = True
-    empty = turn > _EMPTY_BEAMS * spacing
-    empty[short] = True
+    turn[tails[tails - heads < most]] = np.inf
+    farther = _to_next(ranges, heads, tails)
+    apart, empty = turn > _LINKED_BEAMS * spacing, turn > _EMPTY_BEAMS * spacing
     reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
     cut = apart | (np.hypot(farther, turn * ranges) > reach)
     # A run does not go on from the end of a ring to its start: it is cut there.

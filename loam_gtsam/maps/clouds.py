@@ -134,13 +134,13 @@ def _check_counts(path: Path) -> None:
     points, or in the last eight bytes (Isenburg, LASzip, PE&RS 79(2), 2013).
     """
     data: Any = np.memmap(path, np.uint8, "r")
-    (points,) = struct.unpack_from("<I", data, _LAS_POINTS)
     for place, least in _LAS_RECORDS[: 1 + (data[25] >= 4)]:  # byte 25: the minor version
         (records,) = struct.unpack_from("<I", data, place)
         if records * least > len(data):
             raise ValueError(f"expected at most {len(data) // least} records, got {records}")
     if path.suffix.lower() != ".laz":
         return
+    (points,) = struct.unpack_from("<I", data, _LAS_POINTS)
     (table,) = struct.unpack_from("<q", data, points)
     if table == -1:
         (table,) = struct.unpack_from("<q", data, len(data) - 8)

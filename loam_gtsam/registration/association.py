@@ -55,8 +55,7 @@ def associate(
     edges, planes : (E, 3) and (P, 3) metres, lidar frame
     distinct : (E,) mask of :class:`EdgeMatches`; None if all edges are distinct. Distinct edges are
         matched before other edges. If the planes leave a translation open, a distinct edge without
-        a line near by is searched for more widely (``wide_search``), and then, without a line, it
-        is matched with the map points near by.
+        a line near by is searched for more widely (``wide_search``).
     """
     rows = chosen_rows(len(edges), len(planes), config, distinct)
     chosen = edges.take(rows.edges, axis=0), planes.take(rows.planes, axis=0)
@@ -78,7 +77,8 @@ def match_features(
     Parameters
     ----------
     edges, planes : the chosen features, (E, 3) and (P, 3) metres, lidar frame
-    rows : rows of these features in the sweep
+    rows : rows of these features in the sweep. Those that stand ``alone``, if the planes leave a
+        translation open and they have no line, are matched with the map points near by.
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
     pose = map_T_lidar.matrix()
@@ -95,10 +95,12 @@ def match_features(
         searched = config.wide_search > 1.0 and left.any()
         if searched and translations_fixed(surfaces)[0] < config.wide_below:
             # A pole that few beams met has no five points within max_distance, or only these.
-            poles = np.zeros_like(left) if rows.alone is None else rows.alone
+            poles = rows.alone is not None and rows.alone
             ways = (match_lines, True, config.wide_search * limit), (match_uprights, poles, limit)
             for match, among, far in ways:
                 chosen = np.flatnonzero(left & among)
+                if not len(chosen):
+                    continue
                 near = edge_map.nearest(edges_map[chosen], k, far, around)
                 features = edges[chosen], edges_map[chosen], *near[:2]
                 more = match(*features, pose, config, far)
@@ -274,15 +276,13 @@ def match_lines(
     along = _dot(away, directions)
     distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))
     weights = _line_weights(distances, config)
-    keep = is_line & (weights > config.min_weight)
     # A line in space has four parameters, two for each of the directions across it.
     leverage = along**2 / np.maximum(eigenvalues[2], _TINY)
     fit = eigenvalues[1], eigenvalues[2], leverage
     sigmas, tilts = _deviations(*fit, 2, neighbours.shape[1], config)
-    columns = (part[keep] for part in (distances, sigmas, weights, near, tilts))
-    return EdgeMatches(
-        points.take(near[keep], axis=0), centres.T[keep], directions.T[keep], *columns
-    )
+    columns = centres.T, directions.T, distances, sigmas, weights, near, tilts
+    matches = EdgeMatches(points.take(near, axis=0), *columns)
+    return subset(matches, is_line & (weights > config.min_weight))
 
 
 def match_uprights(

@@ -19,12 +19,12 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
-    AGREE,
     APART,
     CLEARLY,
     Fit,
     Found,
     likely_poses,
+    lines_that_agree,
     sample_features,
 )
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
@@ -212,9 +212,8 @@ class Start:
         fit = Fit.of(solution.matches, matcher.offered)
         total = fit.total - _AGAINST * (fit.share - fit.total) if solution.solved else 0.0
         second = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
-        edges = solution.matches.edges
-        agree = edges.distances < AGREE * edges.sigmas
-        lines = np.count_nonzero(agree if edges.distinct is None else agree & edges.distinct)
+        agree, distinct = lines_that_agree(solution.matches), solution.matches.edges.distinct
+        lines = np.count_nonzero(agree if distinct is None else agree & distinct)
         return _Tried(max(total, 0.0), int(lines), [sweeps[0], second], solution)
 
     def _solved(

@@ -443,7 +443,6 @@ def test_what_stands_alone_is_matched_with_the_few_points_near_by(count):
     assert len(near_by(CONFIG, None)) == 0
     walls, on_walls = zip(*(wall(across, 10) for across in (X, Y, Z)), strict=True)
     held_planes, config = map_of(np.concatenate(walls)), changed(max_planes=0)
-    rows = chosen_rows(4, 30, config, np.full(4, True), alone)
     for planes, count in ((on_walls, 0), (on_walls[:2], 1)):  # these leave the height open
         rows = chosen_rows(4, 10 * len(planes), config, np.full(4, True), alone)
         there = pose.transformTo(np.concatenate(planes).T).T

@@ -250,9 +250,9 @@ def test_a_gyro_leaves_its_noise():
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
 
 
-def calibrated(errors, number):
+def calibrated(errors, number, map_T_lidar=gtsam.Pose3()):  # noqa: B008
     """A frame at rest, whatever its matches are."""
-    update = MapUpdate(number * FRAME, gtsam.Pose3(), FrameStatus.OK)
+    update = MapUpdate(number * FRAME, map_T_lidar, FrameStatus.OK)
     solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
     return errors.calibrated(update, sweep, solution, errors.of_scan(solution), None)
@@ -290,6 +290,16 @@ def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
         sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
         errors.calibrated(update, sweep, solution, errors.of_scan(solution, small=small), None)
     assert fresh == [1, 0, 0, 2, 0, 1]  # cells of 0.8 m, and of 0.4 m in small places
+
+
+def test_a_pose_so_far_off_that_its_adjoint_is_singular(monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    far = gtsam.Pose3(gtsam.Rot3(), np.array([-3e16, -2e16, -3e16]))
+    assert np.linalg.matrix_rank(far.between(gtsam.Pose3()).AdjointMap()) < 6
+    errors = PoseErrors(Config())
+    for number in range(2):
+        assert np.isfinite(calibrated(errors, number, far).covariance).all()
 
 
 def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatch):

@@ -21,8 +21,8 @@ from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_covariances, write_ply
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.loops.files import read_graph
-from loam_gtsam.refine.adjustment import Round, Settings
 from loam_gtsam.refine.map_quality import MapQuality, common_thickness, map_quality
+from loam_gtsam.refine.rounds import Round, Settings
 from loam_gtsam.refine.runs import RefinedRun, refine_run, run_points
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
@@ -82,6 +82,7 @@ def refine_folder(
         found = refine_run(
             points, updates, trajectory=trajectory, graph=graph, settings=settings,
             min_aligned=config.solver.min_aligned, on_round=on_round,
+            on_window=lambda done, of: show(0, f"window {done} of {of}"),
         )  # fmt: skip
     before, after = (map_quality(*found.held_out(refined=on)) for on in (False, True))
     report = _report(found, before, after, dataset)

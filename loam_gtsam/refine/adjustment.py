@@ -1,8 +1,8 @@
-"""The adjustment: planes of the map and poses of the sweeps together, by Levenberg-Marquardt.
+"""The adjustment: planes of the map and poses of the sweeps together.
 
-Each round de-skews the sweeps along the adjusted path, finds the planes anew, and solves for the
-poses, the planes eliminated (:mod:`loam_gtsam.refine.elimination`) and all other factors as GTSAM
-linearises them.
+Sweeps are de-skewed along the adjusted path, anew in each round
+(:mod:`loam_gtsam.refine.rounds`). A long drive is adjusted in windows, and then as a whole
+(:mod:`loam_gtsam.refine.windows`).
 """
 
 from __future__ import annotations
@@ -10,91 +10,26 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
 
 import gtsam
 import numpy as np
-from scipy.sparse import coo_array, csc_array, diags_array
-from scipy.sparse.csgraph import connected_components
-from scipy.sparse.linalg import splu
+from scipy.sparse import csc_array
 
-from loam_gtsam.geometry import as_array, symmetric, transform
+from loam_gtsam.geometry import as_array, symmetric
 from loam_gtsam.refine.elimination import (
+    PlaneTies,
     Sightings,
     about_planes,
-    eliminated,
-    refitted,
-    seen_directions,
-    sightings,
     transformed_moments,
 )
-from loam_gtsam.refine.surfaces import Planes, find_planes, voxel_sizes
+from loam_gtsam.refine.rounds import OtherFactors, Round, Settings, adjusted, equations, factorised
+from loam_gtsam.refine.surfaces import Planes
 from loam_gtsam.refine.sweeps import Path, SweepPoints, stacked
+from loam_gtsam.refine.windows import in_windows
 from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
 
-_GOLDEN: FloatArray = np.array([0.8191725, 0.6710436, 0.5497005])
-"""Steps of the grid from round to round, as shares of the largest voxel: never the same again."""
-_ANCHOR = 1e-4
-"""Radians and metres: standard deviation of the first pose if no factor holds any."""
-_DAMPING = 1e-6, 1e-12, 1e6
-"""Levenberg-Marquardt: first, least and largest share of the diagonal."""
-_SLACK = 1e-4
-"""Share by which the cost may rise in a step, where directions that are not seen were left out."""
 _TOGETHER = 20
 """Poses of which covariances are found in one solve."""
-_LEAST_PIVOT = 1e-13
-"""Pivot over its diagonal entry below which a direction counts as free."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """How the adjustment goes.
-
-    Attributes
-    ----------
-    rounds : times that planes are searched for
-    steps : steps of Levenberg-Marquardt at most in each
-    sigma : metres, that a point may have across a surface (``matching.point_sigma``)
-    largest, least : metres, edge lengths of the voxels of the first and the last level
-    enough : metres and radians; a round that moves no pose by more is the last
-    """
-
-    rounds: int = 5
-    steps: int = 3
-    sigma: float = 0.03
-    largest: float = 3.2
-    least: float = 0.4
-    enough: float = 2e-4
-
-    def __post_init__(self) -> None:
-        voxel_sizes(self.largest, self.least)
-        if self.rounds < 1 or self.steps < 1 or not 0.0 < self.sigma < np.inf:
-            raise InputError(
-                f"Settings: expected rounds and steps of 1 or more and a positive sigma, got {self}"
-            )
-
-
-@dataclass(frozen=True, slots=True)
-class Round:
-    """What one round did.
-
-    Attributes
-    ----------
-    planes, pairs, points : planes, pairs of a sweep and a plane, and points on planes
-    scatter : metres, weighted root mean square of the points across their planes
-    shared : metres, see :class:`~loam_gtsam.refine.elimination.Sightings`
-    moved : metres, largest step of a pose
-    cost_before, cost_after : with the planes of this round
-    """
-
-    planes: int
-    pairs: int
-    points: int
-    scatter: float
-    shared: float
-    moved: float
-    cost_before: float
-    cost_after: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +61,7 @@ class Refined:
 
     @cached_property
     def _solver(self) -> Callable[[FloatArray], FloatArray]:
-        solver: Callable[[FloatArray], FloatArray] = _factorised(self.information).solve
+        solver: Callable[[FloatArray], FloatArray] = factorised(self.information).solve
         return solver
 
     @cached_property
@@ -204,6 +139,7 @@ def refine(
     keep: FloatArray | None = None,
     for_covariances: gtsam.NonlinearFactorGraph | None = None,
     on_round: Callable[[Round], None] | None = None,
+    on_window: Callable[[int, int], None] | None = None,
 ) -> Refined:
     """Adjust the poses of sweeps so that the planes that they see become thin.
 
@@ -219,7 +155,8 @@ def refine(
         (:func:`~loam_gtsam.refine.elimination.seen_directions`)
     for_covariances : factors that stand for ``factors`` in the covariances, if those are less
         sure than they are given weight
-    on_round : called after each round, to show progress
+    on_round : called after each round of the whole, to show progress
+    on_window : called after each window of a long drive with the number of those done, and of all
 
     Raises
     ------
@@ -231,195 +168,27 @@ def refine(
     poses = as_array(map_T_middle, "map_T_middle", (len(sweeps), 4, 4)).copy()
     if len(sweeps) < 3:
         raise InputError(f"refine: expected 3 or more sweeps, got {len(sweeps)}")
-    others = _OtherFactors(factors, poses)
+    others = OtherFactors(factors, poses)
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
-    sizes = voxel_sizes(settings.largest, settings.least)
-    asked = np.eye(6) if keep is None else as_array(keep, "keep", (len(sweeps), 6, 6))
-    rounds: list[Round] = []
-    for number in range(settings.rounds):
-        points, numbers = stacked(Path.through(stamps, poses), sweeps)
-        shift = settings.largest * np.modf(number * _GOLDEN)[0]
-        in_map = _placed(points, numbers, poses)
-        planes = find_planes(in_map, numbers, settings.sigma, sizes, shift)
-        seen = sightings(points, numbers, planes)
-        _check_ties(seen, others, len(sweeps))
-        clear = seen_directions(poses, planes, seen) @ asked
-        before, poses_before = None, poses
-        damping = _DAMPING[0]
-        for _ in range(settings.steps):
-            poses, planes, costs, damping = _step(poses, planes, seen, clear, others, damping)
-            before = costs[0] if before is None else before
-            if costs[0] - costs[1] <= 1e-4 * costs[0]:
-                break
-        weights = np.maximum(planes.weights, 1e-12)
-        scatter = float(np.sqrt(np.average(planes.residuals**2, weights=weights)))
-        moved = float(np.linalg.norm(poses[:, :3, 3] - poses_before[:, :3, 3], axis=1).max())
-        counts = len(planes), len(seen.sweeps), len(planes.rows)
-        assert before is not None
-        rounds.append(Round(*counts, scatter, seen.shared, moved, before, costs[1]))
-        if on_round is not None:
-            on_round(rounds[-1])
-        if moved < settings.enough:
-            break
+    asked = np.tile(np.eye(6), (len(sweeps), 1, 1))
+    if keep is not None:
+        asked = as_array(keep, "keep", (len(sweeps), 6, 6))
+
+    def points_at(poses: FloatArray) -> tuple[FloatArray, IntArray]:
+        return stacked(Path.through(stamps, poses), sweeps)
+
+    known: tuple[PlaneTies, ...] = ()
+    views = 3
+    if len(sweeps) > settings.whole:
+        views = 2  # of stretches, each of which saw a plane from many places
+        windows = in_windows(sweeps, poses, others, asked, settings, on_window)
+        poses, known, points_at = windows.map_T_middle, windows.ties, windows.points_at
+        others = OtherFactors(factors, poses, known=known)
+    found = adjusted(points_at, poses, others, asked, settings, on_round, views)
+    poses = found.map_T_middle
     if for_covariances is not None:
-        others = _OtherFactors(for_covariances, poses)
-    hessian, _ = _equations(poses, planes, seen, clear, others)
-    _factorised(hessian)
+        others = OtherFactors(for_covariances, poses, known=known)
+    information, _ = equations(poses, found.planes, found.seen, found.clear, others)
+    factorised(information)
     path = Path.through(stamps, poses)
-    return Refined(path, tuple(sweeps), planes, seen, hessian, tuple(rounds))
-
-
-def _placed(points: FloatArray, numbers: IntArray, poses: FloatArray) -> FloatArray:
-    """Points of all sweeps in the map."""
-    placed = np.empty_like(points)
-    bounds = np.searchsorted(numbers, np.arange(len(poses) + 1))
-    for pose, begin, end in zip(poses, bounds[:-1], bounds[1:], strict=True):
-        placed[begin:end] = transform(pose, points[begin:end])
-    return placed
-
-
-class _OtherFactors:
-    """Factors of GTSAM on the poses, and the anchor that they may need."""
-
-    def __init__(self, factors: gtsam.NonlinearFactorGraph | None, poses: FloatArray) -> None:
-        self.graph = gtsam.NonlinearFactorGraph() if factors is None else factors
-        self._count = len(poses)
-        self.ties: list[list[int]] = []
-        held: list[int] = []
-        for place in range(self.graph.size()):
-            keys: list[int] = self.graph.at(place).keys()
-            numbers = [gtsam.symbolIndex(key) for key in keys]
-            known = [gtsam.symbol("x", number) for number in numbers if number < len(poses)]
-            if known != keys:
-                raise InputError(
-                    f"factors: factor {place} has a key that is not x0 to x{len(poses) - 1}, the "
-                    "poses of the sweeps"
-                )
-            self.ties.append(numbers)
-            held += numbers if len(numbers) == 1 else []
-        self.held = held or [0]
-        self._anchor = None if held else gtsam.Pose3(poses[0])
-
-    def _values(self, poses: FloatArray) -> gtsam.Values:
-        values = gtsam.Values()
-        for number, pose in enumerate(poses):
-            values.insert(gtsam.symbol("x", number), gtsam.Pose3(pose))
-        return values
-
-    def error(self, poses: FloatArray) -> float:
-        """Cost of the factors."""
-        total = 0.0 if not self.graph.size() else float(self.graph.error(self._values(poses)))
-        if self._anchor is not None:
-            off = gtsam.Pose3.Logmap(self._anchor.between(gtsam.Pose3(poses[0])))
-            total += 0.5 * float(off @ off) / _ANCHOR**2
-        return total
-
-    def equations(self, poses: FloatArray) -> tuple[csc_array, FloatArray]:
-        """Information (6 N, 6 N) and gradient (6 N,)."""
-        rows, columns, entries = [], [], []
-        gradient = np.zeros((self._count, 6))
-        values = self._values(poses)
-        for place in range(self.graph.size()):
-            linear: Any = self.graph.at(place).linearize(values)
-            if linear is None:
-                continue
-            numbers = [gtsam.symbolIndex(key) for key in linear.keys()]  # noqa: SIM118
-            block = linear.augmentedInformation()
-            at = np.concatenate([6 * n + np.arange(6) for n in numbers])
-            rows.append(np.repeat(at, len(at)))
-            columns.append(np.tile(at, len(at)))
-            entries.append(block[:-1, :-1].ravel())
-            gradient[numbers] -= block[:-1, -1].reshape(-1, 6)
-        if self._anchor is not None:
-            off = gtsam.Pose3.Logmap(self._anchor.between(gtsam.Pose3(poses[0])))
-            gradient[0] += off / _ANCHOR**2
-            rows.append(np.arange(6))
-            columns.append(np.arange(6))
-            entries.append(np.full(6, _ANCHOR**-2))
-        where = np.concatenate(rows), np.concatenate(columns)
-        size = 6 * self._count
-        matrix = coo_array((np.concatenate(entries), where), shape=(size, size))
-        return csc_array(matrix), gradient.ravel()
-
-
-def _check_ties(seen: Sightings, others: _OtherFactors, count: int) -> None:
-    """InputError unless every pose is tied to one that is held."""
-    if not len(seen.sweeps):
-        raise InputError(
-            "refine: no plane is seen by three sweeps; are the poses those of the sweeps, and does "
-            "Settings.sigma allow for their errors?"
-        )
-    one = [number for tie in others.ties for number in tie[:-1]]
-    two = [number for tie in others.ties for number in tie[1:]]
-    planes = int(seen.planes.max()) + 1
-    ends = np.append(seen.sweeps, one), np.append(count + seen.planes, two)
-    links = coo_array((np.ones(len(ends[0])), ends), shape=(count + planes,) * 2)
-    group = connected_components(links, directed=False)[1]
-    loose = np.flatnonzero(~np.isin(group[:count], group[others.held]))
-    if len(loose):
-        raise InputError(
-            f"refine: {len(loose)} sweeps, number {loose[0]} the first, share no plane and no "
-            "factor with those that are held; leave them out, or give factors that tie them"
-        )
-
-
-def _equations(
-    poses: FloatArray, planes: Planes, seen: Sightings, keep: FloatArray, others: _OtherFactors
-) -> tuple[csc_array, FloatArray]:
-    reduced = eliminated(poses, planes, seen, keep)
-    information, gradient = others.equations(poses)
-    return csc_array(reduced.hessian + information), reduced.gradient + gradient
-
-
-def _step(
-    poses: FloatArray,
-    planes: Planes,
-    seen: Sightings,
-    keep: FloatArray,
-    others: _OtherFactors,
-    damping: float,
-) -> tuple[FloatArray, Planes, tuple[float, float], float]:
-    """One step of Levenberg-Marquardt: poses, planes, cost before and after, damping."""
-    planes, before = refitted(poses, planes, seen)
-    before += others.error(poses)
-    hessian, gradient = _equations(poses, planes, seen, keep, others)
-    slack = 1.0 + (0.0 if (keep == np.eye(6)).all() else _SLACK)
-    diagonal = hessian.diagonal()
-    while damping <= _DAMPING[2]:
-        solver = splu(csc_array(hessian + diags_array(damping * diagonal)), **_SYMMETRIC)
-        step = solver.solve(-gradient).reshape(-1, 6)
-        moved = np.array(
-            [
-                gtsam.Pose3(pose).retract(delta).matrix()
-                for pose, delta in zip(poses, step, strict=True)
-            ]
-        )
-        fitted, after = refitted(moved, planes, seen)
-        after += others.error(moved)
-        if np.isfinite(after) and after <= slack * before:
-            return moved, fitted, (before, after), max(0.1 * damping, _DAMPING[1])
-        damping = max(10.0 * damping, 1e-9)
-    return poses, planes, (before, before), damping
-
-
-_SYMMETRIC: dict[str, Any] = {
-    "permc_spec": "MMD_AT_PLUS_A",
-    "diag_pivot_thresh": 0.0,
-    "options": {"SymmetricMode": True},
-}
-
-
-def _factorised(information: csc_array) -> Any:
-    """Sparse factors of the information; InputError if it leaves a direction free."""
-    diagonal = information.diagonal()
-    try:
-        factors = splu(information, **_SYMMETRIC)
-        smallest = float((factors.U.diagonal()[factors.perm_c] / diagonal).min())
-    except RuntimeError:
-        smallest = 0.0
-    if not smallest > _LEAST_PIVOT:
-        raise InputError(
-            "refine: planes and factors leave a direction of the poses free; give factors that fix "
-            "it, as the odometry does"
-        )
-    return factors
+    return Refined(path, tuple(sweeps), found.planes, found.seen, information, found.rounds)

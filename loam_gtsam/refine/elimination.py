@@ -11,8 +11,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
+import gtsam
 import numpy as np
-from scipy.sparse import bsr_array, csc_array
+from scipy.sparse import bsr_array, csc_array, csr_array
 
 from loam_gtsam.refine.surfaces import Planes, weighted_moments
 from loam_gtsam.types import FloatArray, IntArray
@@ -106,6 +107,49 @@ class Reduced:
     gradient: FloatArray
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneTies:
+    """What planes that were eliminated tell of the poses that saw them.
+
+    It is known about poses at which the planes were found, up to a motion of all together: a
+    quadratic form of where the others are, seen from one of them.
+
+    Attributes
+    ----------
+    numbers : (K,) of the sweeps
+    map_T_middle : (K, 4, 4) the poses there
+    base : row of the pose from which the others are seen
+    hessian : (6 K, 6 K)
+    gradient : (6 K,)
+    """
+
+    numbers: IntArray
+    map_T_middle: FloatArray
+    base: int
+    hessian: FloatArray
+    gradient: FloatArray
+
+    def _moved(self, poses: FloatArray) -> FloatArray:
+        """(6 K,) tangents from where the poses were to where they are among all N."""
+        base, now = self.map_T_middle[self.base], poses[self.numbers]
+        to_base = gtsam.Pose3(base).compose(gtsam.Pose3(now[self.base]).inverse())
+        then = (gtsam.Pose3(pose) for pose in self.map_T_middle)
+        moved = [
+            a.localCoordinates(to_base.compose(gtsam.Pose3(b)))
+            for a, b in zip(then, now, strict=True)
+        ]
+        return np.concatenate(moved)
+
+    def cost(self, poses: FloatArray) -> float:
+        """Cost at poses (N, 4, 4) of all sweeps, above that where the planes were found."""
+        moved = self._moved(poses)
+        return float((self.gradient + 0.5 * self.hessian @ moved) @ moved)
+
+    def equations(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information (6 K, 6 K) and gradient (6 K,) at poses (N, 4, 4) of all sweeps."""
+        return self.hessian, self.gradient + self.hessian @ self._moved(poses)
+
+
 def refitted(map_T_middle: FloatArray, planes: Planes, seen: Sightings) -> tuple[Planes, float]:
     """Each plane where it fits the poses best, the weights kept, and the cost.
 
@@ -139,17 +183,16 @@ def seen_directions(map_T_middle: FloatArray, planes: Planes, seen: Sightings) -
     count = len(map_T_middle)
     relative = about_planes(map_T_middle, planes, seen)
     spread = transformed_moments(relative, planes, seen)
-    whole, noise = np.zeros((2, count, 6, 6))
+    parts = []
     for column in range(3):
         axis = planes.axes[:, :, column]
         by_pose = _by_pose(relative, axis[seen.planes])
         own = by_pose @ seen.moments @ np.swapaxes(by_pose, 1, 2)
-        if column == 0:
-            np.add.at(whole, seen.sweeps, own)
-            continue
-        known = np.einsum("ni,nij,nj->n", axis, spread[:, :3, :3], axis)
-        variance = 1.0 / np.maximum(known, 1e-12)
-        np.add.at(noise, seen.sweeps, variance[seen.planes, None, None] * own)
+        if column > 0:
+            known = np.einsum("ni,nij,nj->n", axis, spread[:, :3, :3], axis)
+            own *= (1.0 / np.maximum(known, 1e-12))[seen.planes, None, None]
+        parts.append(summed(own, seen.sweeps, count))
+    whole, noise = parts[0], parts[1] + parts[2]
     values, vectors = np.linalg.eigh(whole)
     least = 1e-12 * np.maximum(values[:, -1:], 1e-12)
     root = vectors / np.sqrt(np.maximum(values, least))[:, None, :]
@@ -175,9 +218,17 @@ def _by_pose(relative: FloatArray, normals: FloatArray) -> FloatArray:
 
 def transformed_moments(relative: FloatArray, planes: Planes, seen: Sightings) -> FloatArray:
     """(L, 4, 4) sums of the moments of each plane, about its centre, in the axes of the map."""
-    total = np.zeros((len(planes), 4, 4))
-    np.add.at(total, seen.planes, relative @ seen.moments @ np.swapaxes(relative, 1, 2))
-    return total
+    moments = relative @ seen.moments @ np.swapaxes(relative, 1, 2)
+    return summed(moments, seen.planes, len(planes))
+
+
+def summed(values: FloatArray, groups: IntArray, count: int) -> FloatArray:
+    """Sums (count, ...) of the values (M, ...) of each group."""
+    rows = np.ones(len(groups)), groups, np.arange(len(groups) + 1)
+    shape = values.shape[1:]
+    flat = values.reshape(len(groups), int(np.prod(shape)))
+    sums: FloatArray = csr_array(rows, shape=(len(groups), count)).T @ flat
+    return sums.reshape(count, *shape)
 
 
 def eliminated(
@@ -210,10 +261,8 @@ def eliminated(
     across = weighted @ by_plane
     pull = np.einsum("nij,nj->ni", weighted, plane)
     on_plane = seen.moments @ by_plane
-    of_planes = np.zeros((len(planes), 3, 3))
-    np.add.at(of_planes, seen.planes, np.swapaxes(by_plane, 1, 2) @ on_plane)
-    their_pull = np.zeros((len(planes), 3))
-    np.add.at(their_pull, seen.planes, np.einsum("nji,nj->ni", on_plane, plane))
+    of_planes = summed(np.swapaxes(by_plane, 1, 2) @ on_plane, seen.planes, len(planes))
+    their_pull = summed(np.einsum("nji,nj->ni", on_plane, plane), seen.planes, len(planes))
     diagonal = np.arange(3)
     of_planes[:, diagonal, diagonal] *= 1.0 + _RIDGE
     of_planes[:, diagonal, diagonal] += 1e-12
@@ -221,12 +270,9 @@ def eliminated(
     across = across @ np.swapaxes(root, 1, 2)[seen.planes]
     their_pull = np.einsum("nij,nj->ni", root, their_pull)
 
-    gradient = np.zeros((count, 6))
-    np.add.at(
-        gradient, seen.sweeps, pull - np.einsum("nij,nj->ni", across, their_pull[seen.planes])
-    )
-    blocks = np.zeros((count, 6, 6))
-    np.add.at(blocks, seen.sweeps, own)
+    pull -= np.einsum("nij,nj->ni", across, their_pull[seen.planes])
+    gradient = summed(pull, seen.sweeps, count)
+    blocks = summed(own, seen.sweeps, count)
     hessian = bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count,) * 2)
     hessian = hessian - _outer_products(across, seen, count, len(planes))
     return Reduced(csc_array(hessian), gradient.ravel())

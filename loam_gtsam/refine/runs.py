@@ -12,13 +12,14 @@ from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
-from loam_gtsam.refine.adjustment import Refined, Round, Settings, refine
+from loam_gtsam.refine.adjustment import Refined, refine
 from loam_gtsam.refine.motion_factors import (
     long_motion_factors,
     loop_factors,
     odometry_factors,
     told_directions,
 )
+from loam_gtsam.refine.rounds import Round, Settings
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import (
@@ -191,6 +192,7 @@ def refine_run(
     settings: Settings | None = None,
     min_aligned: float = SolverConfig().min_aligned,
     on_round: Callable[[Round], None] | None = None,
+    on_window: Callable[[int, int], None] | None = None,
 ) -> RefinedRun:
     """Adjust the poses of a run, its odometry and its loops staying in the graph.
 
@@ -205,6 +207,7 @@ def refine_run(
         that of frame ``points.frames[n]``
     min_aligned : matches that must fix a direction (``solver.min_aligned``); sweeps of which one
         is not fixed stay as the run had them
+    on_round, on_window : see :func:`~loam_gtsam.refine.adjustment.refine`
 
     Raises
     ------
@@ -244,7 +247,7 @@ def refine_run(
     asked = keep * whole[:, None, None]
     found = refine(
         points.used, before.map_T_middle, every, settings,
-        keep=asked, for_covariances=told, on_round=on_round,
+        keep=asked, for_covariances=told, on_round=on_round, on_window=on_window,
     )  # fmt: skip
     seen: BoolArray = whole.copy()
     seen &= np.array([update.status.solved or update.status in _SEEN for update in frames])

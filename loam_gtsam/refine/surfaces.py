@@ -15,7 +15,7 @@ import numpy as np
 from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.types import FloatArray, InputError, IntArray
 
-_LEAST_POINTS, _LEAST_SWEEPS = 12, 3
+_LEAST_POINTS = 12
 _FLAT = 16.0
 """Variance along a plane's narrow extent over that across it: a patch of four times its scatter."""
 _STRUCTURE = 0.1
@@ -74,8 +74,9 @@ def find_planes(
     sigma: float,
     sizes: tuple[float, ...],
     shift: FloatArray | None = None,
+    views: int = 3,
 ) -> Planes:
-    """Planes of an adaptive voxel tree that at least three sweeps see.
+    """Planes of an adaptive voxel tree.
 
     Parameters
     ----------
@@ -85,6 +86,7 @@ def find_planes(
     sizes : edge lengths of the levels, see :func:`voxel_sizes`
     shift : (3,) metres by which the grid is moved. A surface that a border of the grid cuts along
         its face is pinned to where it is, so each round of an adjustment takes another grid.
+    views : sweeps that must see a plane at least
     """
     labels = np.full(len(points), -1, np.int64)
     active, found = np.arange(len(points)), 0
@@ -97,9 +99,9 @@ def find_planes(
         )
         here, count = points[active], len(first)
         seen = np.unique(voxel * (int(sweeps.max()) + 1) + sweeps[active])
-        views = np.bincount(seen // (int(sweeps.max()) + 1), minlength=count)
+        seen_by = np.bincount(seen // (int(sweeps.max()) + 1), minlength=count)
         fit = principal_axes(here, np.ones(len(here)), voxel, count, here[first])
-        enough = (fit.counts >= _LEAST_POINTS) & (views >= _LEAST_SWEEPS)
+        enough = (fit.counts >= _LEAST_POINTS) & (seen_by >= views)
         flat = fit.values[:, 1] > _FLAT * np.maximum(fit.values[:, 0], (0.5 * sigma) ** 2)
         good = enough & flat & (fit.values[:, 0] < sigma**2)
         good &= _structure(here, voxel, fit, sigma) < _STRUCTURE + 6.0 / np.maximum(fit.counts, 1.0)
@@ -198,8 +200,8 @@ def _structure(points: FloatArray, groups: IntArray, fit: Axes, sigma: float) ->
 def _scatters(residuals: FloatArray, labels: IntArray, count: int, sigma: float) -> FloatArray:
     """Robust standard deviation of each group's residuals, from their median."""
     size = np.abs(residuals)
-    order = np.lexsort((size, labels))
-    bounds = np.searchsorted(labels[order], np.arange(count + 1))
-    middle = np.minimum((bounds[:-1] + bounds[1:]) // 2, max(len(size) - 1, 0))
+    order = np.argsort(labels + size / (2.0 * size.max(initial=1e-9)))  # by group, then by size
+    ends = np.cumsum(np.bincount(labels, minlength=count))
+    middle = np.minimum(ends - (np.diff(ends, prepend=0) + 1) // 2, max(len(size) - 1, 0))
     medians = size[order][middle] if len(size) else np.zeros(count)
     return np.clip(1.4826 * medians, _THIN * sigma, sigma)

@@ -8,10 +8,11 @@ import pytest
 from support.jacobians import numerical
 
 from loam_gtsam import Config, SimulatedWorld, absolute_error, run
-from loam_gtsam.refine.adjustment import Settings, refine
+from loam_gtsam.refine.adjustment import refine
 from loam_gtsam.refine.elimination import eliminated, refitted, sightings
 from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.refine.motion_factors import told_directions
+from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.surfaces import find_planes, voxel_sizes
 from loam_gtsam.refine.sweeps import Path, SweepPoints

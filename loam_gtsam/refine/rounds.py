@@ -60,7 +60,7 @@ class Settings:
     largest: float = 3.2
     least: float = 0.4
     enough: float = 2e-4
-    whole: int = 200
+    whole: int = 700
 
     def __post_init__(self) -> None:
         voxel_sizes(self.largest, self.least)

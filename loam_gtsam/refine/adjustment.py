@@ -138,6 +138,7 @@ def refine(
     *,
     keep: FloatArray | None = None,
     for_covariances: gtsam.NonlinearFactorGraph | None = None,
+    starts: Sequence[int] = (0,),
     on_round: Callable[[Round], None] | None = None,
     on_window: Callable[[int, int], None] | None = None,
 ) -> Refined:
@@ -145,7 +146,7 @@ def refine(
 
     Parameters
     ----------
-    sweeps : in the order of their stamps
+    sweeps : in the order of their stamps, run after run
     map_T_middle : (N, 4, 4) poses of the middles of the sweeps, where the search starts: planes
         that sweeps see farther apart than about ``settings.sigma`` tie nothing
     factors : further factors on the poses, whose keys are ``gtsam.symbol("x", n)``: odometry,
@@ -155,6 +156,7 @@ def refine(
         (:func:`~loam_gtsam.refine.elimination.seen_directions`)
     for_covariances : factors that stand for ``factors`` in the covariances, if those are less
         sure than they are given weight
+    starts : numbers of the first sweeps of the runs, if there are several
     on_round : called after each round of the whole, to show progress
     on_window : called after each window of a long drive with the number of those done, and of all
 
@@ -175,13 +177,13 @@ def refine(
         asked = as_array(keep, "keep", (len(sweeps), 6, 6))
 
     def points_at(poses: FloatArray) -> tuple[FloatArray, IntArray]:
-        return stacked(Path.through(stamps, poses), sweeps)
+        return stacked(Path.through(stamps, poses, starts), sweeps)
 
     known: tuple[PlaneTies, ...] = ()
     views = 3
     if len(sweeps) > settings.whole:
         views = 2  # of stretches, each of which saw a plane from many places
-        windows = in_windows(sweeps, poses, others, asked, settings, on_window)
+        windows = in_windows(sweeps, poses, others, asked, settings, starts, on_window)
         poses, known, points_at = windows.map_T_middle, windows.ties, windows.points_at
         others = OtherFactors(factors, poses, known=known)
     found = adjusted(points_at, poses, others, asked, settings, on_round, views)
@@ -190,5 +192,5 @@ def refine(
         others = OtherFactors(for_covariances, poses, known=known)
     information, _ = equations(poses, found.planes, found.seen, found.clear, others)
     factorised(information)
-    path = Path.through(stamps, poses)
+    path = Path.through(stamps, poses, starts)
     return Refined(path, tuple(sweeps), found.planes, found.seen, information, found.rounds)

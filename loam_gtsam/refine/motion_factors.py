@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from bisect import bisect_right
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -10,8 +11,8 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.geometry import symmetric
-from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph
-from loam_gtsam.loops.keyframes import noise_model
+from loam_gtsam.loops.batch import SavedGraph, optimize_graph
+from loam_gtsam.loops.keyframes import noise_model, pose_number
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate
 
@@ -39,7 +40,11 @@ def told_directions(updates: Sequence[MapUpdate], least: float) -> FloatArray:
 
 
 def odometry_factors(
-    updates: Sequence[MapUpdate], map_T_middle: FloatArray, keep: FloatArray | None = None
+    updates: Sequence[MapUpdate],
+    map_T_middle: FloatArray,
+    keep: FloatArray | None = None,
+    *,
+    start: int = 0,
 ) -> gtsam.NonlinearFactorGraph:
     """Between factors of consecutive sweeps, with the covariances that the run calibrated.
 
@@ -53,6 +58,7 @@ def odometry_factors(
     keep : (N, 6, 6) of :func:`told_directions`. Along what is left out, an error of the velocity
         persists: over n sweeps it grows with n and not with its root, so that each variance along
         it is taken n times.
+    start : number of the first of them among the sweeps of all runs
     """
     keep = np.tile(np.eye(6), (len(updates), 1, 1)) if keep is None else keep
     blind = np.eye(6) - keep
@@ -65,13 +71,13 @@ def odometry_factors(
         extra = max(length[number + 1] - 1, 0) * left_out @ covariance @ left_out.T
         covariance = symmetric(covariance + extra)
         motion = gtsam.Pose3(map_T_middle[number]).between(gtsam.Pose3(map_T_middle[number + 1]))
-        keys = gtsam.symbol("x", number), gtsam.symbol("x", number + 1)
+        keys = gtsam.symbol("x", start + number), gtsam.symbol("x", start + number + 1)
         graph.add(gtsam.BetweenFactorPose3(*keys, motion, noise_model(covariance)))
     return graph
 
 
 def long_motion_factors(
-    updates: Sequence[MapUpdate], map_T_middle: FloatArray, span: int = 50
+    updates: Sequence[MapUpdate], map_T_middle: FloatArray, span: int = 50, *, start: int = 0
 ) -> gtsam.NonlinearFactorGraph:
     """Between factors over ``span`` sweeps, each beginning half of that after the one before.
 
@@ -87,7 +93,7 @@ def long_motion_factors(
             continue
         noise = noise_model(relative_covariance(updates[first], updates[last]))
         motion = gtsam.Pose3(map_T_middle[first]).between(gtsam.Pose3(map_T_middle[last]))
-        keys = gtsam.symbol("x", first), gtsam.symbol("x", last)
+        keys = gtsam.symbol("x", start + first), gtsam.symbol("x", start + last)
         graph.add(gtsam.BetweenFactorPose3(*keys, motion, noise))
     return graph
 
@@ -104,31 +110,37 @@ def _stretches(mask: BoolArray) -> IntArray:
 
 def loop_factors(
     graph: SavedGraph,
-    solved: OptimizedGraph,
-    stamps: IntArray,
+    frames: Mapping[int, int],
     to_middle: Sequence[gtsam.Pose3],
+    starts: Sequence[int] = (0,),
 ) -> gtsam.NonlinearFactorGraph:
-    """The loop closures of a run that agree with the others, between the middles of the sweeps.
+    """The loop closures that agree with the others, between the middles of the sweeps.
 
     Parameters
     ----------
-    graph, solved : pose graph of the run with its stamps, and its solution
-    stamps : (N,) nanoseconds of the poses of all frames
-    to_middle : N poses of the middle of each sweep, seen from its reference time
+    graph : pose graph of a run, or of several, which loops alone tie
+    frames : numbers of the sweeps by the keys of the graph; loops on other keys are left out
+    to_middle : pose of the middle of each sweep, seen from where the graph has its pose
+    starts : numbers of the first poses of the runs in the graph
     """
+    run = {key: bisect_right(starts, pose_number(key)) for key in graph.keys}
+    loops = set(graph.loops)
+    for place in range(graph.factors.size()):
+        ends = [run[key] for key in graph.factors.at(place).keys() if key in run]  # noqa: SIM118
+        loops |= {place} if len(set(ends)) > 1 else set()
+    solved = optimize_graph(graph, loops=sorted(loops))
     found = gtsam.NonlinearFactorGraph()
-    frame = {int(stamp): number for number, stamp in enumerate(stamps)}
-    for place, report in zip(graph.loops, solved.loops, strict=True):
+    for place, report in zip(sorted(loops), solved.loops, strict=True):
         factor: Any = graph.factors.at(place)
-        ends = [frame.get(graph.stamps.get(key, -1)) for key in factor.keys()]  # noqa: SIM118
-        if not report.active or ends[0] is None or ends[1] is None:
+        first, second = (frames.get(key) for key in factor.keys())  # noqa: SIM118
+        if not report.active or first is None or second is None:
             continue
-        one, two = to_middle[ends[0]], to_middle[ends[1]]
+        one, two = to_middle[first], to_middle[second]
         motion = one.inverse().compose(factor.measured()).compose(two)
         turn = two.inverse().AdjointMap()
         noise = noise_model(symmetric(turn @ factor.noiseModel().covariance() @ turn.T))
         kernel = gtsam.noiseModel.mEstimator.Huber.Create(_LOOP_KERNEL)
-        keys = gtsam.symbol("x", ends[0]), gtsam.symbol("x", ends[1])
+        keys = gtsam.symbol("x", first), gtsam.symbol("x", second)
         robust = gtsam.noiseModel.Robust.Create(kernel, noise)
         found.add(gtsam.BetweenFactorPose3(*keys, motion, robust))
     return found

@@ -1,8 +1,9 @@
-"""A finished run, refined: its data set is read once more, for the points of every sweep."""
+"""Finished runs, refined: their data sets are read once more, for the points of every sweep."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from bisect import bisect_right
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import gtsam
@@ -11,7 +12,8 @@ import numpy as np
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.geometry import transform, voxel_filter
-from loam_gtsam.loops.batch import SavedGraph, optimize_graph
+from loam_gtsam.loops.batch import SavedGraph
+from loam_gtsam.loops.keyframes import pose_number
 from loam_gtsam.refine.adjustment import Refined, refine
 from loam_gtsam.refine.motion_factors import (
     long_motion_factors,
@@ -35,6 +37,8 @@ from loam_gtsam.types import (
 
 _SEEN = (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
 """Statuses of frames that were not solved and are in the map all the same."""
+_AT_REST = 0.03
+"""Metres and radians: what the second sweep may tell of the first one's half before that moved."""
 _HELD = 5
 """Of so many points of a sweep one is held out, to judge the map by."""
 
@@ -116,10 +120,11 @@ class RefinedRun:
     Attributes
     ----------
     points : of the frames
-    before : path of the run, with which the adjustment began
-    refined : the adjustment
+    before : path with which the adjustment began, of all runs that were adjusted together
+    refined : the adjustment, of all of them
     updates : N frames of the run that have a pose
     seen : (N,) whether the run saw all directions of each
+    first : number of its first sweep in ``before`` and ``refined``
     """
 
     points: RunPoints
@@ -127,23 +132,30 @@ class RefinedRun:
     refined: Refined
     updates: tuple[MapUpdate, ...]
     seen: BoolArray
+    first: int = 0
 
     @property
     def trajectory(self) -> Trajectory:
-        """One pose per frame that has one, at the stamps of the run."""
-        return self.refined.trajectory
+        """One pose per frame that has one, at the stamps of the run, in the frame of the first."""
+        every = self.refined.trajectory
+        return Trajectory(every.stamps[self._rows], every.map_T_lidar[self._rows])
 
     @property
     def covariances(self) -> FloatArray:
-        """(N, 6, 6) of the poses, the first one being exact.
+        """(N, 6, 6) of the poses, the first one of the first run being exact.
 
         From the first sweep on of which the run did not see all directions they are those of the
-        run, or NaN if it has none: where nothing tells, planes know no better, and a chain of
-        motions forgets that an error of the velocity persists.
+        run, on top of that of its first pose, or NaN if it has none: where nothing tells, planes
+        know no better, and a chain of motions forgets that an error of the velocity persists.
         """
         clear = np.logical_and.accumulate(self.seen)[:, None, None]
+        found = self.refined.covariances[self._rows]
         told = np.array([update.covariance for update in self.updates])
-        return np.where(clear, self.refined.covariances, told)
+        if self.first:
+            start = self.updates[0].map_T_lidar
+            back = np.array([u.map_T_lidar.between(start).AdjointMap() for u in self.updates])
+            told += back @ found[0] @ np.swapaxes(back, 1, 2)
+        return np.where(clear, found, told)
 
     def relative_covariance(self, earlier: int, later: int) -> FloatArray:
         """(6, 6) of the motion between two poses, perturbation on the right of the later one.
@@ -151,35 +163,39 @@ class RefinedRun:
         It is that of the run if there is a sweep between of which the run did not see all
         directions.
         """
+        count = len(self.updates)
+        if not (0 <= earlier < count and 0 <= later < count):
+            raise InputError(
+                f"expected numbers of sweeps from 0 to {count - 1}, got {earlier} and {later}"
+            )
         if self.seen[earlier : later + 1].all():
-            return self.refined.relative_covariance(earlier, later)
+            return self.refined.relative_covariance(self.first + earlier, self.first + later)
         return relative_covariance(self.updates[earlier], self.updates[later])
 
     def held_out(self, *, refined: bool = True) -> tuple[FloatArray, IntArray]:
         """Points that took no part, (M, 3) metres in the refined or the first map; their sweeps."""
-        return _in_map(self.refined.path if refined else self.before, self.points.held)
+        return self._in_map(self.refined.path if refined else self.before, self.points.held)
 
     def map_points(self, size: float) -> FloatArray:
         """The map, rebuilt from the points of all sweeps: one centroid per voxel of that size."""
-        every = [
-            _in_map(self.refined.path, part)[0] for part in (self.points.used, self.points.held)
+        return voxel_filter(np.concatenate(self.all_points()), size)
+
+    def all_points(self) -> tuple[FloatArray, FloatArray]:
+        """Points of all sweeps, metres in the refined map: used and held out."""
+        path, points = self.refined.path, self.points
+        return self._in_map(path, points.used)[0], self._in_map(path, points.held)[0]
+
+    @property
+    def _rows(self) -> slice:
+        return slice(self.first, self.first + len(self.updates))
+
+    def _in_map(self, path: Path, sweeps: Sequence[SweepPoints]) -> tuple[FloatArray, IntArray]:
+        numbers = np.arange(self.first, self.first + len(sweeps))
+        parts = [
+            transform(path.map_T_middle[number], path.deskewed(number, sweep))
+            for number, sweep in zip(numbers.tolist(), sweeps, strict=True)
         ]
-        return voxel_filter(np.concatenate(every), size)
-
-
-def _in_map(path: Path, sweeps: Sequence[SweepPoints]) -> tuple[FloatArray, IntArray]:
-    parts = [
-        transform(path.map_T_middle[number], path.deskewed(number, sweep))
-        for number, sweep in enumerate(sweeps)
-    ]
-    return np.concatenate(parts), np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-
-
-def _to_middle(update: MapUpdate, sweep: SweepPoints) -> gtsam.Pose3:
-    """Pose of the middle of a sweep, seen from its reference time, as the run had it."""
-    if update.map_T_middle is not None and update.middle_stamp == sweep.stamp:
-        return update.map_T_lidar.between(update.map_T_middle)
-    return gtsam.Pose3.Expmap(update.twist * -sweep.reference)
+        return np.concatenate(parts), np.repeat(numbers, [len(part) for part in parts])
 
 
 def refine_run(
@@ -214,41 +230,170 @@ def refine_run(
     InputError
         As :func:`~loam_gtsam.refine.adjustment.refine` does, or if the trajectory has other stamps.
     """
-    frames = [updates[number] for number in points.frames]
-    stamps = np.array([update.stamp for update in frames], np.int64)
-    poses = np.array([update.map_T_lidar.matrix() for update in frames])
-    if trajectory is not None:
-        if not np.array_equal(trajectory.stamps, stamps):
-            raise InputError("trajectory: expected the stamps of the run's poses, got others")
-        poses = trajectory.map_T_lidar
-    middles = np.array([sweep.stamp for sweep in points.used], np.int64)
-    to_middle = [_to_middle(*pair) for pair in zip(frames, points.used, strict=True)]
-    first = [pose @ step.matrix() for pose, step in zip(poses, to_middle, strict=True)]
-    odometry = [
-        u.map_T_lidar.compose(step).matrix() for u, step in zip(frames, to_middle, strict=True)
-    ]
-    keep = told_directions(frames, min_aligned)
-    every = odometry_factors(frames, np.array(odometry))
-    told = odometry_factors(frames, np.array(odometry), keep)
-    far = long_motion_factors(frames, np.array(odometry))
-    every.push_back(far)
-    told.push_back(far)
+    run = _Run.of(points, updates, trajectory, "trajectory")
+    further = gtsam.NonlinearFactorGraph()
     if graph is not None:
-        solved = optimize_graph(graph)
-        loops = loop_factors(graph, solved, stamps, to_middle)
-        every.push_back(loops)
-        told.push_back(loops)
+        frames = {key: run.frame[s] for key, s in graph.stamps.items() if s in run.frame}
+        further.push_back(loop_factors(graph, frames, run.to_middle))
     if factors is not None:
-        every.push_back(factors)
-        told.push_back(factors)
-    before = Path.through(middles, np.array(first))
+        further.push_back(factors)
+    return _adjusted([run], further, settings, min_aligned, on_round, on_window)[0]
+
+
+def refine_runs(
+    points: Sequence[RunPoints],
+    updates: Sequence[Sequence[MapUpdate]],
+    trajectories: Sequence[Trajectory],
+    *,
+    graph: SavedGraph | None = None,
+    starts: Sequence[int] = (0,),
+    factors: gtsam.NonlinearFactorGraph | None = None,
+    settings: Settings | None = None,
+    min_aligned: float = SolverConfig().min_aligned,
+    on_round: Callable[[Round], None] | None = None,
+    on_window: Callable[[int, int], None] | None = None,
+) -> tuple[RefinedRun, ...]:
+    """Adjust the poses of several runs together, in one frame.
+
+    Runs may overlap in time, or have clocks of their own. Nothing leads from one to another but
+    the planes that both see, and loop closures. The first pose of the first run is held.
+
+    Parameters
+    ----------
+    points, updates : of each run, as of :func:`refine_run`
+    trajectories : of each, in one frame: ``MergedMaps.trajectory(number, updates)``
+    graph : places of the runs, at the middles of sweeps, one run after the other, with the motions
+        between them: ``MergedMaps.graph.saved()``. Loop closures are used unless they contradict
+        the others.
+    starts : number of the first place of each run: ``MergedMaps.starts``
+    factors, settings, min_aligned, on_round, on_window : as of :func:`refine_run`; factors count
+        the frames of one run after those of another
+
+    Raises
+    ------
+    InputError
+        As :func:`refine_run` does; if there are not as many of each; or if a run has nothing in
+        common with the others.
+    """
+    counts = [len(points), len(updates), len(trajectories)]
+    counts += [] if graph is None else [len(starts)]
+    if not points or len(set(counts)) > 1:
+        raise InputError(
+            "refine_runs: expected points, updates, a trajectory and a start for each run, got "
+            f"{', '.join(map(str, counts))} of them"
+        )
+    given = zip(points, updates, trajectories, strict=True)
+    runs = [_Run.of(*one, f"trajectories[{n}]") for n, one in enumerate(given)]
+    further = gtsam.NonlinearFactorGraph()
+    if graph is not None:
+        first = _starts(runs)
+        frames = {}
+        for key, stamp in graph.stamps.items():
+            number = bisect_right(starts, pose_number(key)) - 1
+            if stamp in runs[number].frame:
+                frames[key] = first[number] + runs[number].frame[stamp]
+        to_middle = [step for run in runs for step in run.from_places()]
+        further.push_back(loop_factors(graph, frames, to_middle, starts))
+    if factors is not None:
+        further.push_back(factors)
+    return _adjusted(runs, further, settings, min_aligned, on_round, on_window)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Run:
+    """A run as it goes into the adjustment."""
+
+    points: RunPoints
+    updates: tuple[MapUpdate, ...]  # N frames that have a pose
+    frame: Mapping[int, int]  # number of the frame by its stamp
+    to_middle: Sequence[gtsam.Pose3]  # of its sweep, seen from the frame
+    map_T_middle: FloatArray  # (N, 4, 4) where the adjustment begins
+    odometry: FloatArray  # (N, 4, 4) the same as the run had it
+
+    @staticmethod
+    def of(
+        points: RunPoints, updates: Sequence[MapUpdate], trajectory: Trajectory | None, name: str
+    ) -> _Run:
+        frames = tuple(updates[number] for number in points.frames)
+        stamps = np.array([update.stamp for update in frames], np.int64)
+        poses = np.array([update.map_T_lidar.matrix() for update in frames])
+        if trajectory is not None:
+            if not np.array_equal(trajectory.stamps, stamps):
+                raise InputError(f"{name}: expected the stamps of the run's poses, got others")
+            poses = trajectory.map_T_lidar
+        steps = _to_middles(frames, points.used)
+        first = [pose @ step.matrix() for pose, step in zip(poses, steps, strict=True)]
+        odometry = [
+            u.map_T_lidar.compose(step).matrix() for u, step in zip(frames, steps, strict=True)
+        ]
+        number = {int(stamp): place for place, stamp in enumerate(stamps)}
+        return _Run(points, frames, number, steps, np.array(first), np.array(odometry))
+
+    def from_places(self) -> list[gtsam.Pose3]:
+        """Poses of the middles of the sweeps, seen from where the map of the run has its places."""
+        return [
+            (u.map_T_middle or u.map_T_lidar).between(u.map_T_lidar.compose(step))
+            for u, step in zip(self.updates, self.to_middle, strict=True)
+        ]
+
+
+def _to_middles(updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints]) -> list[gtsam.Pose3]:
+    """Poses of the middles of the sweeps, seen from their reference times, as the run had them.
+
+    A run that begins on the way did not know so in its first sweep; the next one tells.
+    """
+    steps = []
+    for update, sweep in zip(updates, sweeps, strict=True):
+        step = gtsam.Pose3.Expmap(update.twist * -sweep.reference)
+        if update.map_T_middle is not None and update.middle_stamp == sweep.stamp:
+            step = update.map_T_lidar.between(update.map_T_middle)
+        steps.append(step)
+    if len(updates) > 1 and updates[0].status is FrameStatus.FIRST and updates[1].status.solved:
+        moved = gtsam.Pose3.Expmap(updates[1].twist * -sweeps[0].reference)
+        if np.linalg.norm(gtsam.Pose3.Logmap(steps[0].between(moved))) > _AT_REST:
+            steps[0] = moved
+    return steps
+
+
+def _starts(runs: Sequence[_Run]) -> list[int]:
+    """Numbers of the first frames of the runs."""
+    counted: list[int] = np.cumsum([0, *(len(run.updates) for run in runs[:-1])]).tolist()
+    return counted
+
+
+def _adjusted(
+    runs: Sequence[_Run], further: gtsam.NonlinearFactorGraph, settings: Settings | None,
+    min_aligned: float, on_round: Callable[[Round], None] | None,
+    on_window: Callable[[int, int], None] | None,
+) -> tuple[RefinedRun, ...]:  # fmt: skip
+    """Runs adjusted with their odometry and further factors."""
+    starts = _starts(runs)
+    every, told = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
+    keeps = [told_directions(run.updates, min_aligned) for run in runs]
+    for start, run, keep in zip(starts, runs, keeps, strict=True):
+        own = run.updates, run.odometry
+        far = long_motion_factors(*own, start=start)
+        for graph, chosen in ((every, None), (told, keep)):
+            graph.push_back(odometry_factors(*own, chosen, start=start))
+            graph.push_back(far)
+    every.push_back(further)
+    told.push_back(further)
+    sweeps = [sweep for run in runs for sweep in run.points.used]
+    middles = np.array([sweep.stamp for sweep in sweeps], np.int64)
+    first = np.concatenate([run.map_T_middle for run in runs])
+    before = Path.through(middles, first, starts)
     # A sweep that the run did not see whole stays as the run had it, relative to its neighbours.
-    whole = (keep == np.eye(6)).all(axis=(1, 2))
-    asked = keep * whole[:, None, None]
+    wholes = [(keep == np.eye(6)).all(axis=(1, 2)) for keep in keeps]
+    asked = np.concatenate([
+        keep * whole[:, None, None] for keep, whole in zip(keeps, wholes, strict=True)
+    ])  # fmt: skip
     found = refine(
-        points.used, before.map_T_middle, every, settings,
-        keep=asked, for_covariances=told, on_round=on_round, on_window=on_window,
+        sweeps, before.map_T_middle, every, settings,
+        keep=asked, for_covariances=told, starts=starts, on_round=on_round, on_window=on_window,
     )  # fmt: skip
-    seen: BoolArray = whole.copy()
-    seen &= np.array([update.status.solved or update.status in _SEEN for update in frames])
-    return RefinedRun(points, before, found, tuple(frames), seen)
+    refined = []
+    for start, run, whole in zip(starts, runs, wholes, strict=True):
+        solved = [update.status.solved or update.status in _SEEN for update in run.updates]
+        seen: BoolArray = whole & np.array(solved)
+        refined.append(RefinedRun(run.points, before, found, run.updates, seen, start))
+    return tuple(refined)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import gtsam
 import numpy as np
@@ -100,42 +101,35 @@ class Path:
     powers : (N, 4, 6) coefficients of t, t^2, t^3, t^4, with t the seconds from the middle: the
         lidar is at ``map_T_middle Exp(xi(t))``, tangent order of the package
     coarse : (N, 4, 6) the same through the two nearest neighbours alone
+    starts : numbers of the first sweeps of the runs, which have clocks of their own
     """
 
     map_T_middle: FloatArray
     powers: FloatArray
     coarse: FloatArray
+    starts: tuple[int, ...] = (0,)
 
     @classmethod
-    def through(cls, stamps: IntArray, map_T_middle: FloatArray) -> Path:
-        """Through the pose of each sweep and up to two neighbours on either side.
+    def through(
+        cls, stamps: IntArray, map_T_middle: FloatArray, starts: Sequence[int] = (0,)
+    ) -> Path:
+        """Through the pose of each sweep and up to two neighbours of its run on either side.
 
         A sweep in the middle of others has a polynomial of degree four through five poses; at a gap
         in time, where the neighbours of one side are missing, the degree is at most two. A sweep
         without neighbours is at rest.
+
+        Parameters
+        ----------
+        stamps : (N,) nanoseconds, increasing in each run
+        map_T_middle : (N, 4, 4) run after run
+        starts : numbers of the first sweeps of the runs
         """
         poses = as_array(map_T_middle, "map_T_middle", (len(stamps), 4, 4))
-        count = len(poses)
-        seconds = (stamps - stamps[:1]) * 1e-9
-        steps = np.diff(seconds)
-        if not (steps > 0.0).all():
-            raise InputError("stamps: expected increasing nanoseconds, got others; sort the sweeps")
-        linked = steps <= _GAP * np.median(steps) if count > 1 else np.zeros(0, np.bool_)
-        stretch = np.concatenate([[0], np.cumsum(~linked)])
-        frames = [gtsam.Pose3(pose) for pose in poses]
-        powers, coarse = np.zeros((2, count, 4, 6))
-        for k in range(count):
-            near = [n for n in range(max(k - 2, 0), min(k + 3, count)) if stretch[n] == stretch[k]]
-            near.remove(k)
-            near = [near[n] for n in np.argsort(np.abs(np.array(near) - k), kind="stable")]
-            times = seconds[near] - seconds[k]
-            away = np.array([gtsam.Pose3.Logmap(frames[k].between(frames[n])) for n in near])
-            for found, most in ((powers, len(near) if len(near) == 4 else 2), (coarse, 2)):
-                degrees = np.arange(1, min(most, len(near)) + 1)
-                if len(degrees):
-                    matrix = times[: len(degrees), None] ** degrees
-                    found[k, : len(degrees)] = np.linalg.solve(matrix, away[: len(degrees)])
-        return cls(poses, powers, coarse)
+        rows = _rows(starts, len(poses))
+        found = [_polynomials(stamps[some], poses[some]) for some in rows]
+        powers, coarse = (np.concatenate(parts) for parts in zip(*found, strict=True))
+        return cls(poses, powers, coarse, tuple(starts))
 
     def errors(self, seconds: FloatArray) -> FloatArray:
         """(N, 6) variances of the motion from the middles to times (N,) beside them.
@@ -143,18 +137,10 @@ class Path:
         A polynomial of degree two misses what the motion has of higher degrees, and one of degree
         four some share of it. What the two differ by is averaged over the sweeps near by.
         """
-        times = seconds[:, None, None] ** np.arange(1, 5)[:, None]
-        missed = ((self.powers - self.coarse) * times).sum(axis=1) ** 2
-        whole = np.abs(self.powers[:, 2:]).max(axis=(1, 2)) > 0.0
-        numbers = np.flatnonzero(whole)
-        if not len(numbers):
-            return np.zeros_like(missed)
-        window = np.ones(2 * _NEAR + 1)
-        sums = [np.convolve(column, window, "same") for column in (missed * whole[:, None]).T]
-        mean = np.stack(sums, axis=1) / np.maximum(np.convolve(whole, window, "same"), 1.0)[:, None]
-        nearest = numbers[np.abs(np.arange(len(whole))[:, None] - numbers).argmin(axis=1)]
-        variances: FloatArray = np.where(whole[:, None], _MISSED**2, _AT_END**2) * mean[nearest]
-        return variances
+        rows = _rows(self.starts, len(self.powers))
+        return np.concatenate(
+            [_missed(self.powers[some], self.coarse[some], seconds[some]) for some in rows]
+        )
 
     def motion(self, number: int, seconds: FloatArray) -> FloatArray:
         """``xi`` (M, 6) at times (M,) from the middle of a sweep."""
@@ -171,6 +157,57 @@ class Path:
         """``map_T_lidar`` so many seconds from the middle of a sweep."""
         step = self.motion(number, np.array([seconds]))[0]
         return gtsam.Pose3(self.map_T_middle[number]).compose(gtsam.Pose3.Expmap(step))
+
+
+def _rows(starts: Sequence[int], count: int) -> list[slice]:
+    """The sweeps of each run."""
+    bounds = [*starts, count]
+    if bounds[0] != 0 or (np.diff(bounds[:-1]) <= 0).any() or bounds[-2] > count:
+        raise InputError(
+            f"starts: expected 0 and then increasing numbers of the {count} sweeps, got {starts}"
+        )
+    return [slice(*pair) for pair in pairwise(bounds)]
+
+
+def _polynomials(stamps: IntArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """``powers`` and ``coarse`` of one run."""
+    count = len(poses)
+    seconds = (stamps - stamps[:1]) * 1e-9
+    steps = np.diff(seconds)
+    if not (steps > 0.0).all():
+        raise InputError("stamps: expected increasing nanoseconds, got others; sort the sweeps")
+    linked = steps <= _GAP * np.median(steps) if count > 1 else np.zeros(0, np.bool_)
+    stretch = np.concatenate([[0], np.cumsum(~linked)])
+    frames = [gtsam.Pose3(pose) for pose in poses]
+    powers, coarse = np.zeros((2, count, 4, 6))
+    for k in range(count):
+        near = [n for n in range(max(k - 2, 0), min(k + 3, count)) if stretch[n] == stretch[k]]
+        near.remove(k)
+        near = [near[n] for n in np.argsort(np.abs(np.array(near) - k), kind="stable")]
+        times = seconds[near] - seconds[k]
+        away = np.array([gtsam.Pose3.Logmap(frames[k].between(frames[n])) for n in near])
+        for found, most in ((powers, len(near) if len(near) == 4 else 2), (coarse, 2)):
+            degrees = np.arange(1, min(most, len(near)) + 1)
+            if len(degrees):
+                matrix = times[: len(degrees), None] ** degrees
+                found[k, : len(degrees)] = np.linalg.solve(matrix, away[: len(degrees)])
+    return powers, coarse
+
+
+def _missed(powers: FloatArray, coarse: FloatArray, seconds: FloatArray) -> FloatArray:
+    """Variances (N, 6) of one run, see :meth:`Path.errors`."""
+    times = seconds[:, None, None] ** np.arange(1, 5)[:, None]
+    missed = ((powers - coarse) * times).sum(axis=1) ** 2
+    whole = np.abs(powers[:, 2:]).max(axis=(1, 2)) > 0.0
+    numbers = np.flatnonzero(whole)
+    if not len(numbers):
+        return np.zeros_like(missed)
+    window = np.ones(2 * _NEAR + 1)
+    sums = [np.convolve(column, window, "same") for column in (missed * whole[:, None]).T]
+    mean = np.stack(sums, axis=1) / np.maximum(np.convolve(whole, window, "same"), 1.0)[:, None]
+    nearest = numbers[np.abs(np.arange(len(whole))[:, None] - numbers).argmin(axis=1)]
+    variances: FloatArray = np.where(whole[:, None], _MISSED**2, _AT_END**2) * mean[nearest]
+    return variances
 
 
 def _moved(points: FloatArray, motions: FloatArray) -> FloatArray:

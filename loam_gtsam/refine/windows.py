@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -58,6 +59,7 @@ def in_windows(
     others: OtherFactors,
     asked: FloatArray,
     settings: Settings,
+    starts: Sequence[int] = (0,),
     on_window: Callable[[int, int], None] | None = None,
 ) -> Windows:
     """Adjust the windows of a drive, one after the other.
@@ -65,16 +67,14 @@ def in_windows(
     Parameters
     ----------
     asked : (N, 6, 6) projectors of the poses onto the directions about which planes are asked
+    starts : numbers of the first sweeps of the runs; a window is of one
     on_window : called after each window with the number of those that are done, and of all
     """
-    count, half = len(sweeps), _STRETCH // 2
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
-    poses, starts = map_T_middle.copy(), range(0, count, _STRETCH)
+    poses, stretches = map_T_middle.copy(), _stretches(starts, len(sweeps))
     ties: list[PlaneTies] = []
     points, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)]
-    for done, start in enumerate(starts, 1):
-        stretch = range(start, min(start + _STRETCH, count))
-        window = slice(max(start - half, 0), stretch.stop + half)
+    for done, (stretch, window) in enumerate(stretches, 1):
         base = _base(stretch, asked)
         one = _Window(stamps[window], sweeps[window], window.start)
         now = map_T_middle[window]
@@ -83,14 +83,27 @@ def in_windows(
             ties.append(one.ties(found, base))
             now = found.map_T_middle
         base_T_middle = np.linalg.inv(now[base - window.start]) @ now
-        inside = slice(start - window.start, stretch.stop - window.start)
-        poses[start : stretch.stop] = map_T_middle[base] @ base_T_middle[inside]
+        inside = slice(stretch.start - window.start, stretch.stop - window.start)
+        poses[stretch.start : stretch.stop] = map_T_middle[base] @ base_T_middle[inside]
         seen = [n - window.start for n in stretch if asked[n].any()]
         points.append(one.points(base_T_middle, seen))
         numbers.append(np.full(len(points[-1]), base))
         if on_window is not None:
-            on_window(done, len(starts))
+            on_window(done, len(stretches))
     return Windows(poses, tuple(ties), np.concatenate(points), np.concatenate(numbers))
+
+
+def _stretches(starts: Sequence[int], count: int) -> list[tuple[range, slice]]:
+    """The stretches of all runs, and the windows around them."""
+    half = _STRETCH // 2
+    return [
+        (
+            range(first, min(first + _STRETCH, end)),
+            slice(max(first - half, begin), min(first + _STRETCH + half, end)),
+        )
+        for begin, end in pairwise([*starts, count])
+        for first in range(begin, end, _STRETCH)
+    ]
 
 
 def _base(stretch: range, asked: FloatArray) -> int:

@@ -14,6 +14,8 @@ from rich.table import Table
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import ConvertOptions, MergeOptions
+from loam_gtsam.cli.refine import FinishedRun, refine_merged
+from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.atomic import write_json
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_ply
@@ -22,7 +24,7 @@ from loam_gtsam.loops.files import write_graph
 from loam_gtsam.maps.clouds import import_cloud, read_cloud, write_cloud
 from loam_gtsam.maps.map_file import MAP_FILE, SUFFIX, SavedMap, map_of_run
 from loam_gtsam.maps.merging import MergedMaps, merge_maps
-from loam_gtsam.types import MapUpdate, OutputError, Trajectory
+from loam_gtsam.types import DatasetError, MapUpdate, OutputError, Trajectory
 from loam_gtsam.view import plots
 
 GRAPH_FILE, PLOT_FILE = "pose_graph.g2o", "merged.png"
@@ -33,15 +35,19 @@ def execute(options: MergeOptions) -> int:
     paths = [map_of_run(path) for path in options.maps]
     names = [f"trajectory_{number}.tum" for number in range(1, len(paths) + 1)]
     known = (MAP_FILE, "map.ply", *names, GRAPH_FILE, PLOT_FILE, "summary.json")
+    datasets = options.datasets()
     draws, started = console.draws_pictures(options.plot), time.perf_counter()
     wanted = options.output or Path("loam_gtsam_output") / "merged"
     with ExitStack() as stack:
         maps = [stack.enter_context(SavedMap(path)) for path in paths]
         updates = [_frames(path, saved) for path, saved in zip(paths, maps, strict=True)]
+        runs = _runs(paths, updates, datasets)
         report: dict[str, Any] = {}
+        done: list[MergedMaps] = []
 
         def write(target: Path) -> list[str]:
             merged = _merge(maps, target / MAP_FILE, quiet=options.quiet)
+            done.append(merged)
             ways = [merged.trajectory(*numbered) for numbered in enumerate(updates)]
             for name, way in zip(names, ways, strict=True):
                 write_tum(target / name, way, comments={"frame": f"of {paths[0]}"})
@@ -60,7 +66,26 @@ def execute(options: MergeOptions) -> int:
     if not options.quiet:
         Console().print(_table(report))
         typer.echo(f"Written to {folder}: {', '.join(files)}")
+    if runs:
+        return refine_merged(folder, runs, done[-1], plot=options.plot, quiet=options.quiet)
     return 0
+
+
+def _runs(
+    paths: Sequence[Path],
+    updates: Sequence[list[MapUpdate] | None],
+    datasets: Sequence[Dataset],
+) -> list[FinishedRun]:
+    """The runs that are to be refined together; none without data sets."""
+    found = []
+    for path, frames, dataset in zip(paths, updates, datasets, strict=False):
+        if frames is None:
+            raise DatasetError(
+                f"{path}: --refine expects the map of one run, with its run.npz and config.yaml "
+                "beside it; give the folder of the run, or leave out --refine"
+            )
+        found.append(FinishedRun.read(path.parent, dataset))
+    return found
 
 
 def _frames(path: Path, saved: SavedMap) -> list[MapUpdate] | None:

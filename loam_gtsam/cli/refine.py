@@ -1,7 +1,10 @@
-"""The command ``refine``: adjust planes and poses of a finished run, write what became of it."""
+"""The command ``refine``: adjust planes and poses of finished runs, write what became of them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,33 +16,32 @@ from rich.table import Table
 
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RefineOptions
-from loam_gtsam.config import load_config
+from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.truth import read_truth
+from loam_gtsam.geometry import voxel_filter
 from loam_gtsam.io.atomic import write_json
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_covariances, write_ply
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.loops.files import read_graph
+from loam_gtsam.maps.merging import MergedMaps
 from loam_gtsam.refine.map_quality import MapQuality, common_thickness, map_quality
 from loam_gtsam.refine.rounds import Round, Settings
-from loam_gtsam.refine.runs import RefinedRun, refine_run, run_points
+from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
     DatasetError,
     FloatArray,
     FrameStatus,
     InputError,
+    IntArray,
     MapUpdate,
     Trajectory,
 )
 from loam_gtsam.view.sections import plot_section
 
 FOLDER = "refined"
-FILES = (
-    "trajectory.tum", "trajectory_kitti.txt", "trajectory_covariance.csv", "map.ply",
-    "section.png", "report.json",
-)  # fmt: skip
 
 
 def execute(options: RefineOptions) -> int:
@@ -55,23 +57,78 @@ def refine_folder(
     plot: bool | None = None, overwrite: bool = False, quiet: bool = False,
 ) -> int:  # fmt: skip
     """Refine the run in a folder, whose data set is read once more; into ``folder/refined``."""
-    if not (folder / "run.npz").exists():
-        raise DatasetError(
-            f"{folder}: expected the folder of a finished run, with run.npz and config.yaml; make "
-            "one with loam-gtsam run PATH --output FOLDER"
-        )
     draws = console.draws_pictures(plot)
-    updates = read_updates(folder / "run.npz")
-    config = load_config(folder / "config.yaml")
+    run = FinishedRun.read(folder, dataset)
     graph, trajectory = None, None
     if (folder / "pose_graph.g2o").exists():
         graph = read_graph(folder / "pose_graph.g2o")
-        trajectory = corrected_trajectory(folder, updates)
-    settings = Settings(rounds=rounds, sigma=config.matching.point_sigma)
-    with console.progress_bar("points", len(updates), quiet=quiet) as show:
-        points = run_points(
-            dataset, updates, config, most=most, on_sweep=lambda number: show(number + 1, "")
-        )
+        trajectory = corrected_trajectory(folder, run.updates)
+    points = run.points(most, quiet=quiet)
+    settings = Settings(rounds=rounds, sigma=run.config.matching.point_sigma)
+    with _progress(settings, quiet=quiet) as shown:
+        found = refine_run(
+            points, run.updates, trajectory=trajectory, graph=graph, settings=settings,
+            min_aligned=run.config.solver.min_aligned, on_round=shown[0], on_window=shown[1],
+        )  # fmt: skip
+    return _write_all(folder, [run], [found], draws=draws, overwrite=overwrite, quiet=quiet)
+
+
+def refine_merged(
+    folder: Path, runs: Sequence[FinishedRun], merged: MergedMaps, *,
+    plot: bool | None = None, quiet: bool = False,
+) -> int:  # fmt: skip
+    """Refine runs whose maps were merged, together; into ``folder/refined``."""
+    draws = console.draws_pictures(plot)
+    points = [run.points(3000, quiet=quiet) for run in runs]
+    updates = [run.updates for run in runs]
+    ways = [merged.trajectory(*numbered) for numbered in enumerate(updates)]
+    config = runs[0].config
+    settings = Settings(sigma=config.matching.point_sigma)
+    with _progress(settings, quiet=quiet) as shown:
+        found = refine_runs(
+            points, updates, ways, graph=merged.graph.saved(), starts=merged.starts,
+            settings=settings, min_aligned=config.solver.min_aligned,
+            on_round=shown[0], on_window=shown[1],
+        )  # fmt: skip
+    return _write_all(folder, runs, found, draws=draws, overwrite=True, quiet=quiet)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FinishedRun:
+    """The results of a run, and its data set."""
+
+    folder: Path
+    dataset: Dataset
+    updates: list[MapUpdate]
+    config: Config
+
+    @staticmethod
+    def read(folder: Path, dataset: Dataset) -> FinishedRun:
+        """Read the folder of a run; a DatasetError if it is none."""
+        if not (folder / "run.npz").exists() or not (folder / "config.yaml").exists():
+            raise DatasetError(
+                f"{folder}: expected the folder of a finished run, with run.npz and config.yaml; "
+                "make one with loam-gtsam run PATH --output FOLDER"
+            )
+        updates, config = read_updates(folder / "run.npz"), load_config(folder / "config.yaml")
+        return FinishedRun(folder, dataset, updates, config)
+
+    def points(self, most: int, *, quiet: bool) -> RunPoints:
+        """The points of the data set; an InputError that names the folder if it is of another."""
+        with console.progress_bar("points", len(self.updates), quiet=quiet) as show:
+            try:
+                return run_points(
+                    self.dataset, self.updates, self.config, most=most,
+                    on_sweep=lambda number: show(number + 1, ""),
+                )  # fmt: skip
+            except InputError as error:
+                raise InputError(f"{self.folder} and {self.dataset.name}: {error}") from error
+
+
+@contextmanager
+def _progress(
+    settings: Settings, *, quiet: bool
+) -> Iterator[tuple[Callable[[Round], None], Callable[[int, int], None]]]:
     done: list[Round] = []
     with console.progress_bar("rounds", settings.rounds, quiet=quiet) as show:
 
@@ -79,24 +136,52 @@ def refine_folder(
             done.append(last)
             show(len(done), f"moved by {1e3 * last.moved:.1f} mm")
 
-        found = refine_run(
-            points, updates, trajectory=trajectory, graph=graph, settings=settings,
-            min_aligned=config.solver.min_aligned, on_round=on_round,
-            on_window=lambda done, of: show(0, f"window {done} of {of}"),
-        )  # fmt: skip
-    before, after = (map_quality(*found.held_out(refined=on)) for on in (False, True))
-    report = _report(found, before, after, dataset)
-    with console.output_folder(folder / FOLDER, FILES, overwrite=overwrite) as target:
-        files = console.write_results(
-            target,
-            FILES,
-            "report.json",
-            lambda new: _write(new, found, (before, after), report, draws=draws, config=config),
-        )
+        yield on_round, lambda number, of: show(0, f"window {number} of {of}")
+
+
+def _write_all(
+    folder: Path, runs: Sequence[FinishedRun], found: Sequence[RefinedRun], *,
+    draws: bool, overwrite: bool, quiet: bool,
+) -> int:  # fmt: skip
+    clouds = _held_out(found, refined=False), _held_out(found, refined=True)
+    qualities = map_quality(*clouds[0]), map_quality(*clouds[1])
+    report = _report(found, *qualities, runs)
+    known = _names(len(runs))
+
+    def write(target: Path) -> list[str]:
+        for refined, *names in zip(found, known[::3], known[1::3], known[2::3], strict=False):
+            _write_trajectory(target, refined, names)
+        every = [part for refined in found for part in refined.all_points()]
+        points = voxel_filter(np.concatenate(every), runs[0].config.map.edge_voxel)
+        write_ply(target / known[-3], np.empty((0, 3)), points)
+        files = list(known[:-2])
+        if draws and qualities[0].planes and qualities[1].planes:
+            planes = _most_improved(*qualities)
+            plot_section(target / known[-2], clouds[0][0], clouds[1][0], *planes)
+            files.append(known[-2])
+        write_json(target / known[-1], report)
+        return [*files, known[-1]]
+
+    with console.output_folder(folder / FOLDER, known, overwrite=overwrite) as target:
+        files = console.write_results(target, known, known[-1], write)
     if not quiet:
         Console().print(_table(report))
         typer.echo(f"Written to {target}: {', '.join(files)}")
     return 0
+
+
+def _names(runs: int) -> tuple[str, ...]:
+    """Files of a refinement: three of each run, and three of all."""
+    numbers = [""] if runs == 1 else [f"_{number}" for number in range(1, runs + 1)]
+    ends = ".tum", "_kitti.txt", "_covariance.csv"
+    of_runs = [f"trajectory{number}{end}" for number in numbers for end in ends]
+    return *of_runs, "map.ply", "section.png", "report.json"
+
+
+def _held_out(found: Sequence[RefinedRun], *, refined: bool) -> tuple[FloatArray, IntArray]:
+    parts = [run.held_out(refined=refined) for run in found]
+    points, sweeps = zip(*parts, strict=True)
+    return np.concatenate(points), np.concatenate(sweeps)
 
 
 def corrected_trajectory(folder: Path, updates: list[MapUpdate]) -> Trajectory:
@@ -108,24 +193,13 @@ def corrected_trajectory(folder: Path, updates: list[MapUpdate]) -> Trajectory:
     return Trajectory(stamps, read.map_T_lidar)
 
 
-def _write(
-    folder: Path, found: RefinedRun, qualities: tuple[MapQuality, MapQuality],
-    report: dict[str, Any], *, draws: bool, config: Any,
-) -> list[str]:  # fmt: skip
+def _write_trajectory(folder: Path, found: RefinedRun, names: Sequence[str]) -> None:
     trajectory = found.trajectory
-    write_tum(folder / FILES[0], trajectory, comments={"refined": "planes and poses adjusted"})
-    write_kitti(folder / FILES[1], trajectory)
+    write_tum(folder / names[0], trajectory, comments={"refined": "planes and poses adjusted"})
+    write_kitti(folder / names[1], trajectory)
     told = zip(trajectory.stamps, trajectory.map_T_lidar, found.covariances, strict=True)
     poses = [MapUpdate(int(s), gtsam.Pose3(p), FrameStatus.OK, covariance=c) for s, p, c in told]
-    write_covariances(folder / FILES[2], poses)
-    write_ply(folder / FILES[3], np.empty((0, 3)), found.map_points(config.map.edge_voxel))
-    files = list(FILES[:4])
-    if draws and qualities[0].planes and qualities[1].planes:
-        clouds = found.held_out(refined=False)[0], found.held_out()[0]
-        plot_section(folder / FILES[4], *clouds, *_most_improved(*qualities))
-        files.append(FILES[4])
-    write_json(folder / FILES[5], report)
-    return [*files, FILES[5]]
+    write_covariances(folder / names[2], poses)
 
 
 def _most_improved(before: MapQuality, after: MapQuality) -> tuple[FloatArray, FloatArray]:
@@ -138,20 +212,23 @@ def _most_improved(before: MapQuality, after: MapQuality) -> tuple[FloatArray, F
 
 
 def _report(
-    found: RefinedRun, before: MapQuality, after: MapQuality, dataset: Dataset
-) -> dict[str, Any]:
+    found: Sequence[RefinedRun], before: MapQuality, after: MapQuality,
+    runs: Sequence[FinishedRun],
+) -> dict[str, Any]:  # fmt: skip
     common = common_thickness(before, after)
-    first = found.before.map_T_middle[:, :3, 3]
-    moved = np.linalg.norm(found.refined.path.map_T_middle[:, :3, 3] - first, axis=1)
+    all_of = found[0]
+    first = all_of.before.map_T_middle[:, :3, 3]
+    moved = np.linalg.norm(all_of.refined.path.map_T_middle[:, :3, 3] - first, axis=1)
+    frames = np.concatenate([run.points.frames for run in found])
     edges = [0.0, 2.0, 5.0, 10.0, 15.0, 20.0, 30.0, 50.0, 1e9]
     report: dict[str, Any] = {
         "frames": len(moved),
         "moved_mean_m": float(moved.mean()),
         "moved_max_m": float(moved.max()),
-        "moved_most_frame": int(found.points.frames[moved.argmax()]),
+        "moved_most_frame": int(frames[moved.argmax()]),
         "common_planes": common[2],
         "rounds": [{name: getattr(done, name) for name in Round.__slots__}
-                   for done in found.refined.rounds],
+                   for done in all_of.refined.rounds],
         "thickness_bins_mm": edges[:-1],
     }  # fmt: skip
     for name, quality, thickness in (
@@ -166,12 +243,18 @@ def _report(
             "entropy": quality.entropy,
             "planes_by_thickness": counts.tolist(),
         }
-    if dataset.truth is not None:
-        try:
-            error = absolute_error(found.trajectory, dataset.truth)
-            report["after"]["ate_rmse_m"] = error.rmse
-        except InputError as problem:
-            report["accuracy_problem"] = str(problem)
+    if len(runs) > 1:
+        most = [run.first <= moved.argmax() for run in found].count(True) - 1
+        report["moved_most_run"] = str(runs[most].folder)
+        report["runs"] = [{"run": str(run.folder), "frames": len(one.updates)}
+                          for run, one in zip(runs, found, strict=True)]  # fmt: skip
+    errors = report["runs"] if len(runs) > 1 else [report["after"]]
+    for error, run, one in zip(errors, runs, found, strict=True):
+        if run.dataset.truth is not None:
+            try:
+                error["ate_rmse_m"] = absolute_error(one.trajectory, run.dataset.truth).rmse
+            except InputError as problem:
+                report["accuracy_problem"] = str(problem)
     return report
 
 
@@ -186,8 +269,11 @@ def _table(report: dict[str, Any]) -> Table:
     for label, name in rows.items():
         values = (report[part][name] for part in ("before", "after"))
         table.add_row(label, *(f"{value:.4g}" for value in values))
-    if "ate_rmse_m" in report["after"]:
-        table.add_row("ATE against the truth (m)", "", f"{report['after']['ate_rmse_m']:.4f}")
+    told = [run["ate_rmse_m"] for run in (report["after"], *report.get("runs", []))
+            if "ate_rmse_m" in run]  # fmt: skip
+    if told:
+        errors = ", ".join(f"{error:.4f}" for error in told)
+        table.add_row("ATE against the truth (m)", "", errors)
     moved = f"{report['moved_mean_m']:.4f}, most {report['moved_max_m']:.4f}"
     table.add_row("poses moved by (m)", "", moved)
     return table

@@ -15,12 +15,14 @@ from loam_gtsam.cli.options.common import (
     SourceOptions,
     argument,
     flag,
+    key_value,
     known,
     one_of,
     option,
 )
 
 if TYPE_CHECKING:  # the help of a command needs neither GTSAM nor SciPy
+    from loam_gtsam.datasets.base import Dataset
     from loam_gtsam.studies.contenders import Contender
 
 
@@ -134,6 +136,38 @@ class MergeOptions(OutputOptions):
     maps: list[Path] = argument(
         "MAP...", "Two or more folders with the results of runs, or maps (.lgmap) alone."
     )
+    refine: list[str] | None = option(
+        "The data set of a run, as it was given to loam-gtsam run; once for each MAP, in their "
+        "order. Then planes and poses of all runs are adjusted together, into DIR/refined.",
+        metavar="PATH",
+    )
+    start: list[int] | None = option(
+        "Number of the first sweep that the run used; once for each --refine [default: 0].", min=0
+    )
+    loader_options: list[str] | None = option(
+        "Option of the loader of all data sets, e.g. topic=/points; may be given repeatedly.",
+        "--option",
+        metavar="KEY=VALUE",
+    )
+
+    def datasets(self) -> list[Dataset]:
+        """Open the data sets of --refine."""
+        from loam_gtsam.datasets import open_dataset
+        from loam_gtsam.datasets.base import PartOf
+
+        paths, starts = self.refine or [], self.start or [0] * len(self.refine or [])
+        if paths and len(paths) != len(self.maps):
+            raise typer.BadParameter(
+                f"--refine: expected the data set of each of the {len(self.maps)} maps, in their "
+                f"order, got {len(paths)}"
+            )
+        if len(starts) != len(paths):
+            raise typer.BadParameter(
+                f"--start: expected one for each of the {len(paths)} --refine, got {len(starts)}"
+            )
+        options = dict(key_value("--option", entry) for entry in self.loader_options or [])
+        opened = [open_dataset(path, **options) for path in paths]
+        return [PartOf(one, start, 1) for one, start in zip(opened, starts, strict=True)]
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -2,7 +2,8 @@
 
 Each world is driven once as a whole, and in parts that overlap; the parts are mapped apart, saved
 and merged from their files. With ``--changed`` every other part is another drive: with other noise,
-and in a world of which a share of the objects is gone or moved.
+and in a world of which a share of the objects is gone or moved. With ``--refine`` the parts are
+then adjusted together.
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ import numpy as np
 
 from benchmarks.localisation import with_changes
 from benchmarks.tables import write_csv
-from loam_gtsam.datasets.base import PartOf
+from loam_gtsam.datasets.base import Dataset, PartOf
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.maps import MergedMaps, SavedMap, merge_maps, save_map
 from loam_gtsam.pipeline import RunResult, run
+from loam_gtsam.refine.runs import refine_runs, run_points
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Trajectory
 
@@ -44,6 +46,8 @@ class Row:
     nees : over six freedoms of the places of the last part, in the frame of the first
     loops, unused : between the maps
     seconds : that merging took
+    refined_mm, refined_nees, refined_s : the same of the parts adjusted together, the NEES over all
+        poses of the last part; NaN without ``--refine``
     """
 
     world: str
@@ -58,6 +62,9 @@ class Row:
     loops: int
     unused: int
     seconds: float
+    refined_mm: float
+    refined_nees: float
+    refined_s: float
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -68,12 +75,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--parts", type=int, default=2, help="of a drive")
     parser.add_argument("--overlap", type=int, default=90, help="sweeps of two parts in common")
     parser.add_argument("--changed", type=float, help="share of the objects, for every other part")
+    parser.add_argument("--refine", action="store_true", help="adjust the parts together")
     parser.add_argument("--output", type=Path, default=_RESULTS, help="folder for the table")
     options = parser.parse_args(arguments)
     rows = []
     for world in options.worlds:
         for seed in options.seeds:
-            rows.append(measure(world, seed, options.parts, options.overlap, options.changed))
+            parts = options.parts, options.overlap, options.changed
+            rows.append(measure(world, seed, *parts, refine=options.refine))
             print(rows[-1], flush=True)
     names = [item.name for item in fields(Row)]
     cells = [[getattr(row, name) for name in names] for row in rows]
@@ -81,7 +90,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def measure(name: str, seed: int, parts: int, overlap: int, changed: float | None) -> Row:
+def measure(
+    name: str, seed: int, parts: int, overlap: int, changed: float | None, *, refine: bool = False
+) -> Row:
     """Map a world as a whole and in parts, and merge these."""
     world = SimulatedWorld(name, seed=seed)
     other = world
@@ -92,9 +103,9 @@ def measure(name: str, seed: int, parts: int, overlap: int, changed: float | Non
     drives = [(world, other)[number % 2] for number in range(parts)]
     with tempfile.TemporaryDirectory() as folder:
         files = [Path(folder) / f"{number}.lgmap" for number in range(parts)]
-        runs = []
-        for file, start, drive in zip(files, starts, drives, strict=True):
-            runs.append(run(PartOf(drive, start, 1, None, None), max_frames=length))
+        pieces, runs = [PartOf(d, n, 1) for d, n in zip(drives, starts, strict=True)], []
+        for file, piece in zip(files, pieces, strict=True):
+            runs.append(run(piece, max_frames=length))
             pipeline = runs[-1].pipeline
             assert pipeline is not None
             save_map(file, pipeline)
@@ -105,14 +116,39 @@ def measure(name: str, seed: int, parts: int, overlap: int, changed: float | Non
         for opened in maps:
             opened.close()
     whole = run(world)
-    way = _joined([merged.trajectory(number, done.updates) for number, done in enumerate(runs)])
+    ways = [merged.trajectory(number, done.updates) for number, done in enumerate(runs)]
+    way = _joined(ways)
     alone = [absolute_error(done.trajectory, world.truth).rmse for done in runs]
     errors = [absolute_error(found, world.truth).rmse for found in (way, whole.trajectory)]
+    refined = _refined(world, pieces, runs, merged, ways) if refine else (np.nan,) * 3
     return Row(
         name, seed, parts, overlap * world.truth.path_length / len(world), 1e3 * max(alone),
         1e3 * errors[0], 1e3 * errors[1], errors[0] / errors[1], _nees(world, runs, merged),
-        sum(merged.ties.values()), merged.unused, seconds,
+        sum(merged.ties.values()), merged.unused, seconds, *refined,
     )  # fmt: skip
+
+
+def _refined(
+    world: SimulatedWorld, pieces: Sequence[Dataset], runs: Sequence[RunResult],
+    merged: MergedMaps, ways: Sequence[Trajectory],
+) -> tuple[float, float, float]:  # fmt: skip
+    """Parts adjusted together: error in millimetres, NEES over six of the last part, seconds."""
+    started = time.perf_counter()
+    updates = [done.updates for done in runs]
+    points = [run_points(piece, done.updates, done.config)
+              for piece, done in zip(pieces, runs, strict=True)]  # fmt: skip
+    graph = merged.graph.saved()
+    found = refine_runs(points, updates, ways, graph=graph, starts=merged.starts)
+    seconds = time.perf_counter() - started
+    error = absolute_error(_joined([one.trajectory for one in found]), world.truth).rmse
+    began, last = ways[0], found[-1].trajectory
+    true = world.truth_at(np.append(began.stamps[:1], last.stamps)).map_T_lidar
+    there = began.map_T_lidar[0] @ inverse_pose(true[0]) @ true[1:]
+    squared = []
+    for pose, right, covariance in zip(last.map_T_lidar, there, found[-1].covariances, strict=True):
+        off = gtsam.Pose3.Logmap(gtsam.Pose3(right).between(gtsam.Pose3(pose)))
+        squared.append(off @ np.linalg.solve(covariance, off) / 6.0)
+    return 1e3 * error, float(np.mean(squared)), seconds
 
 
 def _joined(ways: Sequence[Trajectory]) -> Trajectory:

@@ -165,8 +165,8 @@ def localise(options: LocaliseOptions) -> int:
 def merge(options: MergeOptions) -> int:
     """Join the maps of several runs that have places in common: one frame, one pose graph, one map.
 
-    No data are read again. The frame is that of the first. Exits with 1, and writes nothing, if a
-    map has no place in common with the others.
+    Without --refine no data are read again. The frame is that of the first. Exits with 1, and
+    writes nothing, if a map has no place in common with the others.
     """
     from loam_gtsam.cli.merge import execute
 

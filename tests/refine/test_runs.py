@@ -16,7 +16,7 @@ from loam_gtsam.loops.keyframes import noise_model
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.maps.merging import MergedMaps, merge_maps
 from loam_gtsam.pipeline import RunResult
-from loam_gtsam.refine.adjustment import Settings
+from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
 from loam_gtsam.refine.sweeps import Path
 from loam_gtsam.studies.evaluation import absolute_error, interpolate
@@ -98,6 +98,15 @@ def test_both_runs_are_nearer_to_the_truth_than_merged_and_in_one_frame(two, ref
     assert len(every) > max(parts)
     sweeps = [one.held_out()[1] for one in refined]
     assert (sweeps[0].min(), sweeps[0].max(), sweeps[1].min()) == (0, 34, 35)
+
+
+def test_long_runs_are_adjusted_in_windows_each_of_one_run(two) -> None:
+    windows: list[tuple[int, int]] = []
+    found = two.refined(settings=Settings(whole=20), on_window=lambda *at: windows.append(at))
+    assert windows == [(1, 4), (2, 4), (3, 4), (4, 4)]  # 24 and 11 sweeps of each
+    ways = [one.trajectory for one in found]
+    before, after = (rms(np.concatenate(two.errors(of))) for of in (two.ways, ways))
+    assert after < before
 
 
 def with_loop(graph: SavedGraph, earlier: int, later: int, beside: float) -> SavedGraph:

@@ -11,13 +11,13 @@ import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
-from benchmarks.tables import write_csv
+from benchmarks.tables import write_rows
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.streets import Scene
@@ -85,9 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sizes = options.frames or None, options.columns
             rows.append(measure(world, seed, options.starts, options.changed, *sizes))
             print(rows[-1], flush=True)
-    names = [item.name for item in fields(Row)]
-    cells = [[getattr(row, name) for name in names] for row in rows]
-    write_csv(options.output / "localisation.csv", names, cells, digits=4)
+    write_rows(options.output / "localisation.csv", rows)
     return int(any(row.wrong or row.elsewhere_fixes for row in rows))
 
 

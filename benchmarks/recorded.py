@@ -7,19 +7,25 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import gtsam
 import numpy as np
 
 from benchmarks.cases import EvidenceTable, Verdict
 from benchmarks.process import processor_clock
 from loam_gtsam.config import Config
-from loam_gtsam.datasets import open_dataset
+from loam_gtsam.datasets import ArrayDataset, open_dataset
+from loam_gtsam.frontend.rings import rings_from_elevation
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import run
+from loam_gtsam.registration.odometry import Guess
+from loam_gtsam.types import DatasetError, Features, FloatArray, MapUpdate, Scan, Trajectory
 
 MAPPING = ("prepare", "match", "solve", "insert")
 """Our stages from features and a guess to a pose and a larger map; theirs gives no covariance."""
 SHARE = 0.25
 """Target: of A-LOAM's mapping stage, from its own sweeps on."""
+_UNIT, _ORIGIN = 0.002, np.array([0.0, 0.0, 0.03618])
+"""Metres: of the integers of an .xyz16 file, and where the beams of an Ouster begin."""
 _PARTS = ("reg_total", "odo_total", "map_total")
 """Milliseconds of scan registration, odometry and mapping, in ``timing.csv``."""
 
@@ -122,3 +128,63 @@ def table(results: Sequence[RivalResult]) -> EvidenceTable:
             )
         )
     return EvidenceTable("growth_recorded", "Beside the recorded C++ systems", header, tuple(rows))
+
+
+def hand_held(folder: Path) -> ArrayDataset:
+    """Sweeps of a 64-beam Ouster, de-skewed and without rings: the beams are those of the first.
+
+    De-skewing moves the points off the elevations of their beams; in the first sweep, of a lidar at
+    rest, the beams stand out.
+    """
+
+    def elevations(points: FloatArray) -> FloatArray:
+        x, y, z = (points - _ORIGIN).T
+        return np.asarray(np.arctan2(z, np.hypot(x, y)))
+
+    files = sorted(folder.glob("*.xyz16"))
+    sweeps = [_UNIT * np.fromfile(file, "<i2").reshape(-1, 3) for file in files]
+    found, note = rings_from_elevation(sweeps[0].T.astype(np.float32), "os1-64")
+    if found is None:
+        raise DatasetError(f"{files[0]}: {note}")
+    beams = np.bincount(found.rings, elevations(sweeps[0])) / np.bincount(found.rings)
+    between = 0.5 * (beams[1:] + beams[:-1])
+    scans = [
+        Scan(points, stamp, rings=np.searchsorted(between, elevations(points)))
+        for points, stamp in zip(sweeps, given_poses(folder).stamps.tolist(), strict=True)
+    ]
+    return ArrayDataset(scans, name=folder.name, sensor={"times": "none"})
+
+
+def given_poses(folder: Path) -> Trajectory:
+    """The poses that FAST-LIO gave the hand-held sweeps; they are no truth."""
+    table = np.loadtxt(folder / "fastlio_poses.txt")
+    poses = np.tile(np.eye(4), (len(table), 1, 1))
+    poses[:, :3] = table[:, 1:].reshape(-1, 3, 4)
+    return Trajectory(np.round(table[:, 0] * 1e9).astype(np.int64), poses)
+
+
+class GivenSteps:
+    """The odometry by the steps between given poses.
+
+    From one of the hand-held sweeps to the next the lidar turns by up to 40 degrees, which no
+    constant velocity foretells.
+    """
+
+    def __init__(self, poses: Trajectory) -> None:
+        self._poses = dict(
+            zip(poses.stamps.tolist(), map(gtsam.Pose3, poses.map_T_lidar), strict=True)
+        )
+
+    def guess(self, features: Features, last: MapUpdate | None) -> Guess:
+        """The pose of the last sweep, and the step from there."""
+        pose = gtsam.Pose3()
+        if last is not None:
+            step = self._poses[last.stamp].between(self._poses[features.stamp])
+            pose = last.map_T_lidar.compose(step)
+        return Guess(pose, np.zeros(6))
+
+    def remember(self, features: Features) -> None:
+        """Nothing."""
+
+    def reset(self) -> None:
+        """Nothing."""

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import astuple, fields
 from pathlib import Path
+from typing import Any
 
 
 def write_csv(
@@ -17,6 +19,11 @@ def write_csv(
         writer.writerow(names)
         for row in rows:
             writer.writerow([f"{v:.{digits}g}" if isinstance(v, float) else v for v in row])
+
+
+def write_rows(path: Path, rows: Sequence[Any], digits: int = 4) -> None:
+    """Write rows that are data classes of one kind, below the names of their fields."""
+    write_csv(path, [item.name for item in fields(rows[0])], map(astuple, rows), digits)
 
 
 def markdown_table(names: Sequence[str], rows: Iterable[Sequence[object]]) -> Iterator[str]:

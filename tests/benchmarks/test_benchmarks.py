@@ -23,6 +23,8 @@ from benchmarks import (
     ouster,
     peers,
     recorded,
+    refining,
+    refining_growth,
     robustness,
     soak,
     soak_faults,
@@ -59,7 +61,7 @@ class InProcess:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    for module in (growth, robustness, soak, worlds, loops):
+    for module in (growth, refining, refining_growth, robustness, soak, worlds, loops):
         if hasattr(module, "ProcessPoolExecutor"):
             monkeypatch.setattr(module, "ProcessPoolExecutor", InProcess)
     return monkeypatch
@@ -128,6 +130,69 @@ def test_long_drives_leave_cubes_behind_and_keep_them(
     assert len(table(tmp_path / "growth_times.csv")) == 7
     with pytest.raises(SystemExit):
         growth.main(["--frames", "9"])  # no tenths
+
+
+def test_refined_runs_are_judged_as_the_runs_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    to = ["--seeds", "1", "--output", str(tmp_path)]
+    assert refining.main(["--quick", *to]) == 0
+    (row,) = table(tmp_path / "refining.csv")
+    assert (row["seed"], row["frames"], row["broken"], row["problem"]) == ("0", "12", "0", "")
+    ratio = float(row["refined_mm"]) / float(row["run_mm"])
+    assert ratio < 0.95
+    assert float(row["ratio"]) == pytest.approx(ratio, rel=1e-3)
+    assert 0.2 < float(row["nees_1"]) < 5.0
+    assert float(row["thin_mm"]) < float(row["thick_mm"])
+    assert f"geometric mean {ratio:.2f}" in capsys.readouterr().out
+    two = [refining.Row("room", 0, ratio=0.5), refining.Row("room", 1, ratio=2.0)]
+    assert "geometric mean 1.000, worst 2.00" in refining.summary(two)
+    with pytest.raises(SystemExit):
+        refining.main(["--worlds", "nowhere", *to])
+
+
+def test_what_chance_makes_is_told_from_two_drives() -> None:
+    plain, noisy = (world.name for world in refining.MICROMETRE)
+    apart = [(plain, 0, 10.0), (plain, 1, 20.0), (noisy, 0, 13.0), (noisy, 1, 16.0)]
+    rows = [refining.Row(name, seed, run_mm=5.0, refined_mm=mm) for name, seed, mm in apart]
+    rows.append(refining.Row(plain, 2, problem="ended early"))
+    assert "refined_mm: standard deviation by chance 2.50 mm" in refining.spread(rows)
+    assert "run_mm: standard deviation by chance 0.00 mm" in refining.spread(rows)
+
+
+def test_hand_held_sweeps_are_held_against_the_poses_that_come_with_them(
+    tmp_path: Path, here: pytest.MonkeyPatch
+) -> None:
+    here.setenv("LOAM_GTSAM_DATA", str(tmp_path))
+    world = SimulatedWorld("room", frames=8, sensor="os1-64", columns=300, speed=0.1)
+    folder = tmp_path / "hilti_os0_64"
+    folder.mkdir()
+    poses = world.truth.map_T_lidar[:, :3].reshape(-1, 12).copy()
+    poses[4, 3] += 0.05  # the given poses are no truth
+    rows = np.column_stack([1e-9 * world.truth.stamps, poses])
+    np.savetxt(folder / "fastlio_poses.txt", rows, "%.9f")
+    for number, scan in enumerate(world):
+        counts = np.rint((scan.points + recorded._ORIGIN) / recorded._UNIT)
+        counts.astype("<i2").tofile(folder / f"{number:06d}.xyz16")
+    assert refining.main(["--recorded", "--output", str(tmp_path)]) == 0
+    (row,) = table(tmp_path / "refining_recorded.csv")
+    assert (row["frames"], row["run_mm"], row["problem"]) == ("8", "nan", "")
+    assert float(row["beside_mm"]) < float(row["given_mm"])
+
+
+def test_first_sweeps_of_a_drive_are_refined_for_what_they_cost(
+    tmp_path: Path, here: pytest.MonkeyPatch
+) -> None:
+    here.setitem(refining_growth.DRIVES, "room", growth.Drive("room", columns=450))
+    sizes = ["--growth", "--drives", "room", "--sizes", "6", "14"]
+    assert refining.main([*sizes, "--output", str(tmp_path)]) == 0
+    short, long = table(tmp_path / "refining_growth.csv")
+    assert (short["sweeps"], long["sweeps"]) == ("6", "14")
+    assert 0 < int(short["points"]) < int(long["points"])
+    assert 0 < int(short["planes"]) < int(long["planes"])
+    assert 0.0 < float(long["data_mb"]) <= float(long["peak_mb"])
+    assert float(long["refined_mm"]) < float(long["run_mm"])
+    assert (tmp_path / "refining_growth.png").stat().st_size > 0
 
 
 def test_disturbed_runs_fill_the_page(tmp_path: Path, here: pytest.MonkeyPatch) -> None:

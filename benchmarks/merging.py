@@ -13,14 +13,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 
 import gtsam
 import numpy as np
 
 from benchmarks.localisation import with_changes
-from benchmarks.tables import write_csv
+from benchmarks.tables import write_rows
 from loam_gtsam.datasets.base import Dataset, PartOf
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -84,9 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             parts = options.parts, options.overlap, options.changed
             rows.append(measure(world, seed, *parts, refine=options.refine))
             print(rows[-1], flush=True)
-    names = [item.name for item in fields(Row)]
-    cells = [[getattr(row, name) for name in names] for row in rows]
-    write_csv(options.output / "merging.csv", names, cells, digits=4)
+    write_rows(options.output / "merging.csv", rows)
     return 0
 
 

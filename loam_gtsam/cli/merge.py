@@ -84,7 +84,7 @@ def _runs(
                 f"{path}: --refine expects the map of one run, with its run.npz and config.yaml "
                 "beside it; give the folder of the run, or leave out --refine"
             )
-        found.append(FinishedRun.read(path.parent, dataset))
+        found.append(FinishedRun.read(path.parent, dataset, frames))
     return found
 
 

@@ -103,15 +103,16 @@ class FinishedRun:
     config: Config
 
     @staticmethod
-    def read(folder: Path, dataset: Dataset) -> FinishedRun:
-        """Read the folder of a run; a DatasetError if it is none."""
+    def read(folder: Path, dataset: Dataset, updates: list[MapUpdate] | None = None) -> FinishedRun:
+        """Read a run, but for ``updates`` that are known; a DatasetError if the folder has none."""
         if not (folder / "run.npz").exists() or not (folder / "config.yaml").exists():
             raise DatasetError(
                 f"{folder}: expected the folder of a finished run, with run.npz and config.yaml; "
                 "make one with loam-gtsam run PATH --output FOLDER"
             )
-        updates, config = read_updates(folder / "run.npz"), load_config(folder / "config.yaml")
-        return FinishedRun(folder, dataset, updates, config)
+        if updates is None:
+            updates = read_updates(folder / "run.npz")
+        return FinishedRun(folder, dataset, updates, load_config(folder / "config.yaml"))
 
     def points(self, most: int, *, quiet: bool) -> RunPoints:
         """The points of the data set; an InputError that names the folder if it is of another."""

@@ -72,8 +72,7 @@ def test_what_a_window_tells_is_a_quadratic_form_about_its_poses() -> None:
     rng = np.random.default_rng(3)
     poses = np.array([gtsam.Pose3.Expmap(rng.normal(size=6)).matrix() for _ in range(5)])
     root = rng.normal(size=(24, 24))
-    form = np.zeros((24, 24))
-    form[:] = root @ root.T
+    form = root @ root.T
     numbers = np.array([0, 1, 2, 4])
     # As of planes: nothing changes if all move together.
     together = np.vstack([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses[numbers]])

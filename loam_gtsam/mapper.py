@@ -293,6 +293,9 @@ class Mapper:
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
+        if found.message:
+            expected = frame.predicted.map_T_middle
+            self._errors.jumped(frame.sweep.stamp, expected, solution.map_T_lidar)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)

@@ -32,6 +32,7 @@ _LASTING = 0.3
 innovations correlate by 0 to 0.5, by axis and place (street, park, room, garage, trees)."""
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
 _KNOWN = 3  # accelerations from which their mean is believed
+_CLEAR = 3.0  # standard deviations that accelerations do not explain
 
 
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
@@ -208,6 +209,27 @@ class PoseErrors:
     def _follows(self, last: Moment | None) -> bool:
         """Whether the velocity is that at the middle of the last sweep."""
         return last is not None and last.solved and last.stamp == self._expected.stamp
+
+    def jumped(self, stamp: int, expected: gtsam.Pose3, found: gtsam.Pose3) -> None:
+        """Account for a pose that a search found elsewhere than the motion had led to expect.
+
+        One place speaks against the other: the lidar may have been carried away, or be where the
+        map has nothing yet, and another place looks the same. Unless the usual acceleration, kept
+        up since the last solved sweep, explains the step within three standard deviations, both
+        places are as likely: along each axis the mean squared error of either is half the square
+        of the step.
+
+        ``stamp`` is that of the middle of the sweep, the poses belong to it.
+        """
+        if self._last is None:
+            return
+        seconds = (stamp - self._last.stamp) * 1e-9
+        step = expected.localCoordinates(found)
+        turn_and_shift = np.linalg.norm(step.reshape(2, 3), axis=1)
+        explained = np.sqrt(self._motion.variances.reshape(2, 3).sum(axis=1)) * 0.5 * seconds**2
+        if (turn_and_shift > _CLEAR * explained).any():
+            in_map = found.AdjointMap() * step
+            self._drift = self._drift + 0.5 * in_map @ in_map.T
 
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""

@@ -16,7 +16,8 @@ from support.worlds import updates as made_up
 
 from loam_gtsam.config import preset
 from loam_gtsam.datasets.base import PartOf
-from loam_gtsam.geometry import inverse_pose
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.geometry import inverse_pose, transform
 from loam_gtsam.maps.first_fix import Candidate
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, Hypothesis
 from loam_gtsam.maps.localizer import Localizer, localise
@@ -264,6 +265,40 @@ def test_the_command_localises_in_the_map_that_a_run_wrote(mapped, tmp_path, mon
     missing = loam("localise", spec, "nothing.lgmap")
     assert missing.exit_code == 1
     assert "there is no such file" in missing.output
+
+
+def test_what_is_gone_since_the_map_was_made_is_cleaned_out_of_the_larger_map(
+    tmp_path, monkeypatch
+):
+    """Of a cupboard of the first day, the drive of the second day sees what was behind it."""
+    monkeypatch.chdir(tmp_path)
+    drive = world(frames=10)
+    scene = drive.scene
+    last = drive.world_T_start @ drive.truth.map_T_lidar[-1]
+    cupboard = np.array([[*(last @ [2.0, 0.0, 0.0, 1.0])[:2], 0.75, 0.3, 0.3, 0.75, 0.0]])
+    solids = replace(scene.solids, boxes=np.concatenate([scene.solids.boxes, cupboard]))
+    before = SimulatedWorld(replace(scene, solids=solids), seed=1, frames=10, columns=450)
+    first = run(before)
+    save_map("before.lgmap", first.pipeline)
+    spec = "sim:rooms?seed=1&frames=10&columns=450"
+    for command in (("localise", spec, "before.lgmap", "--extend", "--output", "out"),
+                    ("clean", spec, "out")):  # fmt: skip
+        done = loam(*command, "--no-plot", "--quiet")
+        assert done.exit_code == 0, done.output
+    start = first.updates[0].map_T_lidar.matrix() @ inverse_pose(before.world_T_start)
+
+    def points(path):
+        with SavedMap(path) as saved:
+            held = np.concatenate(saved.points())
+        in_world = transform(inverse_pose(start), held)
+        near = np.abs(in_world - cupboard[0, :3]) < cupboard[0, 3:6] + 0.1
+        stood = near.all(axis=1) & (in_world[:, 2] > 0.1)
+        return int(stood.sum()), int((~stood).sum())
+
+    was, now = points("out/map.lgmap"), points("out/cleaned/map.lgmap")
+    assert was[0] > 15
+    assert now[0] <= 0.1 * was[0]
+    assert now[1] > 0.98 * was[1]
 
 
 def test_a_map_stays_open_to_its_localizer(mapped):

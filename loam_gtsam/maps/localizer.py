@@ -25,12 +25,13 @@ from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, time
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
-from loam_gtsam.maps.first_fix import PlaceSearch
+from loam_gtsam.maps.first_fix import PlaceSearch, same
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
 from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
+from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import (
     BadSweep,
@@ -139,9 +140,9 @@ class Localizer:
             extraction = extract(sweep, self.config, self._parts.get("features"))
         if self._fixed:
             update = self._tracking.process(sweep, extraction)
-            if self._extend:
-                self._add_places()
             if not self._given_up(update):
+                if self._extend:
+                    self._add_places()
                 return self._told(update)
             self._search()
         features = sweep.features if isinstance(sweep, FeatureSweep) else None
@@ -158,9 +159,16 @@ class Localizer:
         return self._begin(features, fix)
 
     def _given_up(self, update: MapUpdate) -> bool:
-        """Whether tracking has ended."""
+        """Whether tracking has ended: nothing fits, or only a place where no motion leads.
+
+        Another place of the map may look the same as that one, so the whole map has to be asked.
+        """
         self._unsolved = 0 if update.status.solved else self._unsolved + 1
         patience = self.config.relocalization.memory
+        if update.status.solved and self._last is not None:
+            last, seconds = self._last, (update.stamp - self._last.stamp) * 1e-9
+            if not same(advance(last.map_T_lidar, last.twist, seconds), update.map_T_lidar):
+                return True
         return update.status is FrameStatus.LOST or self._unsolved >= patience
 
     def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:

@@ -87,6 +87,9 @@ def test_a_lidar_that_is_carried_away_is_found_again(mapped, saved):
     sweeps = [drive.sweep(n) for n in range(8)]
     shift = first[-1].stamp + 100_000_000 - sweeps[0].stamp
     second = [localizer.process(replace(sweep, stamp=sweep.stamp + shift)) for sweep in sweeps]
+    # A place near by that fits might be another that looks the same: the whole map is asked.
+    assert [update.status for update in second[:SWEEPS]] == [FrameStatus.LOST] * SWEEPS
+    assert localizer.fixes == 2
     pairs = zip(second, sweeps, strict=True)
     solved = [replace(u, stamp=s.stamp) for u, s in pairs if u.status.solved]
     off = [np.linalg.norm(error[3:]) for error in errors(mapped, drive, solved)]

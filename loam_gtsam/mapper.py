@@ -221,8 +221,6 @@ class Mapper:
 
     _named = property(lambda self: NamedSolver(self.solver, self.extra_factors))
 
-    # -- the steps of a frame ----------------------------------------------------------------
-
     def _check(self, features: Features) -> MapUpdate | None:
         """The update of a sweep that cannot be used; None if it can."""
         check_kind(features, Features, "features", "extract_features makes them of a Scan")
@@ -294,8 +292,7 @@ class Mapper:
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
         if found.message:
-            expected = frame.predicted.map_T_middle
-            self._errors.jumped(frame.sweep.stamp, expected, solution.map_T_lidar)
+            self._errors.jumped(frame.predicted, solution.map_T_lidar)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)

@@ -298,8 +298,7 @@ def match_uprights(
 
     A car or a rock far away has one point on each of few rings: no five of them make a line. It is
     known to be within ``reach`` of them, evenly in a disc; that is a standard deviation of half of
-    ``reach`` to either side, of the point as of each neighbour. How high it is stays open. The
-    points of one thing are off together, so that all of them count as one.
+    ``reach`` to either side, of the point as of each neighbour. How high it is stays open.
     Parameters are those of :func:`match_lines`.
     """
     found = squared_distances < reach**2
@@ -309,12 +308,10 @@ def match_uprights(
     near = np.where(found[:, :, None], neighbours.take(rows, axis=0), 0.0)
     centres = near.sum(axis=1) / count[:, None]
     up = map_T_lidar[:3, 2]
-    across = np.eye(3) - np.outer(up, up)
-    level = points_map.take(rows, axis=0) @ across
-    distances = np.linalg.norm(level - centres @ across, axis=1)
+    away = points_map.take(rows, axis=0) - centres
+    distances = np.linalg.norm(away - (away @ up)[:, None] * up, axis=1)
     weights = _line_weights(distances, config)
-    together = (np.linalg.norm(level[:, None] - level, axis=2) < reach).sum(axis=1)
-    sigmas = 0.5 * reach * np.sqrt((1.0 + 1.0 / count) * together)
+    sigmas = 0.5 * reach * np.sqrt(1.0 + 1.0 / count)
     lines = centres, np.broadcast_to(up, centres.shape), distances, sigmas, weights
     tilts = np.full(len(rows), _LEAN)
     matches = EdgeMatches(points.take(rows, axis=0), *lines, rows, tilts)

@@ -15,7 +15,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
-from loam_gtsam.registration.odometry import Moment, Turns
+from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 from loam_gtsam.types import (
@@ -210,7 +210,7 @@ class PoseErrors:
         """Whether the velocity is that at the middle of the last sweep."""
         return last is not None and last.solved and last.stamp == self._expected.stamp
 
-    def jumped(self, stamp: int, expected: gtsam.Pose3, found: gtsam.Pose3) -> None:
+    def jumped(self, expected: Prediction, found: gtsam.Pose3) -> None:
         """Account for a pose that a search found elsewhere than the motion had led to expect.
 
         One place speaks against the other: the lidar may have been carried away, or be where the
@@ -218,13 +218,11 @@ class PoseErrors:
         up since the last solved sweep, explains the step within three standard deviations, both
         places are as likely: along each axis the mean squared error of either is half the square
         of the step.
-
-        ``stamp`` is that of the middle of the sweep, the poses belong to it.
         """
         if self._last is None:
             return
-        seconds = (stamp - self._last.stamp) * 1e-9
-        step = expected.localCoordinates(found)
+        seconds = (expected.posed.sweep.stamp - self._last.stamp) * 1e-9
+        step = expected.map_T_middle.localCoordinates(found)
         turn_and_shift = np.linalg.norm(step.reshape(2, 3), axis=1)
         explained = np.sqrt(self._motion.variances.reshape(2, 3).sum(axis=1)) * 0.5 * seconds**2
         if (turn_and_shift > _CLEAR * explained).any():

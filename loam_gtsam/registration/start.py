@@ -14,12 +14,9 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
-from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
-from loam_gtsam.registration.matches import subset
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
     APART,
@@ -133,7 +130,7 @@ class Start:
             if number == 0 or tried.total >= enough
         )
         for tried in others:
-            if _better(tried, best, frame.matcher.config):
+            if _better(tried, best):
                 best = tried
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
@@ -256,24 +253,21 @@ def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
     return transform(pose, edges), transform(pose, planes)
 
 
-def _better(tried: _Tried, best: _Tried, config: Config) -> bool:
+def _better(tried: _Tried, best: _Tried) -> bool:
     """Whether one place is clearly better than another; a count of lines varies by its root."""
-    if tried.total > CLEARLY * best.total and _told_apart(tried, best, config):
+    if tried.total > CLEARLY * best.total and _told_apart(tried, best):
         return True
     chance = _CHANCE * np.sqrt(tried.lines + best.lines)
     return CLEARLY * tried.total >= best.total and bool(tried.lines - best.lines > chance)
 
 
-def _told_apart(tried: _Tried, best: _Tried, config: Config) -> bool:
-    """Whether most of the way from one place to the other is along directions that a scan fixes.
-
-    Lines that are known no better than to half the reach of the search are found at any place.
-    """
-    pose, found = tried.solution.map_T_lidar, tried.solution.matches
-    known = found.edges.sigmas < 0.5 * config.matching.max_distance
-    form = localizability(replace(found, edges=subset(found.edges, known)), pose)
-    way = pose.localCoordinates(best.solution.map_T_lidar)
-    seen = way
-    for weak in (form.projector(config.solver.min_aligned), tried.solution.weak):
-        seen = seen if weak is None else seen - weak @ seen
+def _told_apart(tried: _Tried, best: _Tried) -> bool:
+    """Whether most of the way from one place to the other is along directions that a scan fixes."""
+    weak = tried.solution.weak
+    if weak is None:
+        return True
+    way = tried.solution.map_T_lidar.localCoordinates(best.solution.map_T_lidar)
+    form = tried.solution.localizability
+    assert form is not None
+    seen = way - weak @ way
     return bool(seen @ form.displacement @ seen > 0.5 * way @ form.displacement @ way)

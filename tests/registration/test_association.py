@@ -441,12 +441,6 @@ def test_what_stands_alone_is_matched_with_the_few_points_near_by(count):
     np.testing.assert_allclose(edges.sigmas, [0.5 * np.sqrt(1.0 + 1.0 / count)])
     assert len(near_by(changed(wide_search=1.0), alone)) == 0
     assert len(near_by(CONFIG, None)) == 0
-    # Three points of one thing, one above the other, tell no more than one of them.
-    level = features[[0, 0, 0, 2]] + np.outer([0.0, 0.1, 0.2, 0.0], [0.0, 0.0, 1.0])
-    rows = chosen_rows(4, 0, CONFIG, np.full(4, True), alone)
-    three = match_features(level, none, pose, held, held, CONFIG, rows).edges
-    np.testing.assert_array_equal(three.indices, [0, 1, 2])
-    np.testing.assert_allclose(three.sigmas, [edges.sigmas[0] * np.sqrt(3.0)] * 3)
     walls, on_walls = zip(*(wall(across, 10) for across in (X, Y, Z)), strict=True)
     held_planes, config = map_of(np.concatenate(walls)), changed(max_planes=0)
     for planes, count in ((on_walls, 0), (on_walls[:2], 1)):  # these leave the height open

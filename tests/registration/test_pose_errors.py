@@ -320,11 +320,13 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     errors = PoseErrors(Config())
     before = [calibrated(errors, k) for k in range(frames)][-1]
     found = gtsam.Pose3().retract(np.array(step))
-    errors.jumped((frames + 4) * FRAME, gtsam.Pose3(), found)
+    sweep = SimpleNamespace(stamp=(frames + 4) * FRAME)
+    expected = SimpleNamespace(posed=SimpleNamespace(sweep=sweep), map_T_middle=gtsam.Pose3())
+    errors.jumped(expected, found)
     after = calibrated(errors, frames + 4, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
-    expected = 0.5 * np.square(step) if told else np.zeros(6)
-    np.testing.assert_allclose(added, expected, atol=1e-6)
+    half = 0.5 * np.square(step) if told else np.zeros(6)
+    np.testing.assert_allclose(added, half, atol=1e-6)
     # The motion after it is as well known as ever.
     later = calibrated(errors, frames + 5, found)
     assert np.abs(relative_covariance(after, later)).max() < 0.1

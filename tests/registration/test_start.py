@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import gtsam
 import numpy as np
 import pytest
@@ -13,7 +11,6 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration import start
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
@@ -69,27 +66,6 @@ def test_a_platform_at_rest_stays_where_it_is(scene, options):
     mapper = Mapper(CONFIG)
     updates = [mapper.register(one) for one in features]
     assert errors(world, updates).max() < 0.1
-
-
-@pytest.mark.parametrize(
-    ("sigma", "way", "apart"),
-    [(0.05, [3.0, 0.0, 0.0], True), (0.55, [3.0, 0.0, 0.0], False), (0.55, [0.0, 3.0, 0.0], True)],
-)
-def test_lines_that_are_found_at_any_place_do_not_tell_two_places_apart(sigma, way, apart):
-    """Walls at both sides and the ground leave the way ahead to twelve poles."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-9.0, 9.0, (120, 3))
-    normals = np.eye(3)[1 + np.arange(120) % 2]
-    ones, none = np.ones(120), np.zeros(120)
-    planes = PlaneMatches(points, normals, none, none, 0.05 * ones, ones, np.arange(120), none)
-    poles, up = points[:12], np.tile([0.0, 0.0, 1.0], (12, 1))
-    lines = EdgeMatches(
-        poles, poles, up, none[:12], np.full(12, sigma), ones[:12], np.arange(12), none[:12]
-    )
-    here = SimpleNamespace(map_T_lidar=gtsam.Pose3(), matches=ScanMatches(lines, planes), weak=None)
-    there = SimpleNamespace(map_T_lidar=gtsam.Pose3(gtsam.Rot3(), np.array(way)))
-    tried, best = (SimpleNamespace(solution=solution) for solution in (here, there))
-    assert start._told_apart(tried, best, CONFIG) == apart
 
 
 def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):

@@ -33,6 +33,7 @@ from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.relocalization import RELOCALISED
 from loam_gtsam.types import (
     BadSweep,
     Features,
@@ -165,7 +166,7 @@ class Localizer:
         """
         self._unsolved = 0 if update.status.solved else self._unsolved + 1
         patience = self.config.relocalization.memory
-        if update.status.solved and self._last is not None:
+        if update.message.startswith(RELOCALISED) and self._last is not None:
             last, seconds = self._last, (update.stamp - self._last.stamp) * 1e-9
             if not same(advance(last.map_T_lidar, last.twist, seconds), update.map_T_lidar):
                 return True

@@ -30,6 +30,7 @@ _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
+RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 
@@ -231,7 +232,7 @@ def search(
     if best is not None and best[2] is not moving:
         moved = f"moved by {distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)}"
         after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
-        return Found(best[1], best[2], f"relocalised{after}, {moved}" if lost else moved)
+        return Found(best[1], best[2], f"{RELOCALISED}{after}, {moved}" if lost else moved)
     if not lost:
         return Found(solution, moving)
     guess = frame.predicted.map_T_middle

@@ -292,7 +292,7 @@ class Mapper:
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
         if found.message:
-            self._errors.jumped(frame.predicted, solution.map_T_lidar)
+            self._errors.jumped(frame.predicted.map_T_middle, solution.map_T_lidar)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)

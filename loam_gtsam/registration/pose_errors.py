@@ -15,7 +15,8 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
-from loam_gtsam.registration.odometry import Moment, Prediction, Turns
+from loam_gtsam.registration.odometry import Moment, Turns
+from loam_gtsam.registration.relocalization import APART
 from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 from loam_gtsam.types import (
@@ -32,7 +33,6 @@ _LASTING = 0.3
 innovations correlate by 0 to 0.5, by axis and place (street, park, room, garage, trees)."""
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
 _KNOWN = 3  # accelerations from which their mean is believed
-_CLEAR = 3.0  # standard deviations that accelerations do not explain
 
 
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
@@ -210,22 +210,16 @@ class PoseErrors:
         """Whether the velocity is that at the middle of the last sweep."""
         return last is not None and last.solved and last.stamp == self._expected.stamp
 
-    def jumped(self, expected: Prediction, found: gtsam.Pose3) -> None:
+    def jumped(self, expected: gtsam.Pose3, found: gtsam.Pose3) -> None:
         """Account for a pose that a search found elsewhere than the motion had led to expect.
 
-        One place speaks against the other: the lidar may have been carried away, or be where the
-        map has nothing yet, and another place looks the same. Unless the usual acceleration, kept
-        up since the last solved sweep, explains the step within three standard deviations, both
-        places are as likely: along each axis the mean squared error of either is half the square
-        of the step.
+        Map and motion contradict each other: the lidar may have been carried away, or be where the
+        map has nothing yet, and another place looks the same. Both places are as likely: along each
+        axis the mean squared error of either is half the square of the step.
         """
-        if self._last is None:
-            return
-        seconds = (expected.posed.sweep.stamp - self._last.stamp) * 1e-9
-        step = expected.map_T_middle.localCoordinates(found)
-        turn_and_shift = np.linalg.norm(step.reshape(2, 3), axis=1)
-        explained = np.sqrt(self._motion.variances.reshape(2, 3).sum(axis=1)) * 0.5 * seconds**2
-        if (turn_and_shift > _CLEAR * explained).any():
+        step = expected.localCoordinates(found)
+        turn, shift = np.linalg.norm(step.reshape(2, 3), axis=1)
+        if shift > APART[0] or turn > APART[1]:  # else it is the same place
             in_map = found.AdjointMap() * step
             self._drift = self._drift + 0.5 * in_map @ in_map.T
 

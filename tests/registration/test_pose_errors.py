@@ -303,32 +303,27 @@ def test_a_pose_so_far_off_that_its_adjoint_is_singular(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("frames", "step", "told"),
+    ("step", "told"),
     [
-        (2, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0], False),  # an unknown motion: 2 m/s^2 for 0.5 s
-        (2, [0.0, 0.0, 0.0, 9.0, -2.0, 0.0], True),
-        (6, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0], True),  # it was at rest
-        (6, [0.0, 0.0, 0.3, 0.0, 0.0, 0.0], True),
-        (6, [0.0, 0.0, 0.0, 1e-5, 0.0, 0.0], False),
+        ([0.0, 0.0, 0.0, 1.4, 0.0, 0.0], False),  # the same place
+        ([0.0, 0.0, 0.2, 0.0, 0.0, 0.0], False),
+        ([0.0, 0.0, 0.0, 5.0, -2.0, 0.0], True),
+        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], True),
     ],
 )
-def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
-    frames, step, told, monkeypatch
-):
+def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(step, told, monkeypatch):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
     errors = PoseErrors(Config())
-    before = [calibrated(errors, k) for k in range(frames)][-1]
+    before = [calibrated(errors, k) for k in range(4)][-1]
     found = gtsam.Pose3().retract(np.array(step))
-    sweep = SimpleNamespace(stamp=(frames + 4) * FRAME)
-    expected = SimpleNamespace(posed=SimpleNamespace(sweep=sweep), map_T_middle=gtsam.Pose3())
-    errors.jumped(expected, found)
-    after = calibrated(errors, frames + 4, found)
+    errors.jumped(gtsam.Pose3(), found)
+    after = calibrated(errors, 4, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
-    half = 0.5 * np.square(step) if told else np.zeros(6)
-    np.testing.assert_allclose(added, half, atol=1e-6)
+    expected = 0.5 * np.square(step) if told else np.zeros(6)
+    np.testing.assert_allclose(added, expected, atol=1e-6)
     # The motion after it is as well known as ever.
-    later = calibrated(errors, frames + 5, found)
+    later = calibrated(errors, 5, found)
     assert np.abs(relative_covariance(after, later)).max() < 0.1
 
 

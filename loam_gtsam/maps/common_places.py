@@ -25,8 +25,8 @@ from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, walk
 from loam_gtsam.loops.loop_selection import consistent, consistent_set
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key
-from loam_gtsam.maps.first_fix import same
 from loam_gtsam.maps.map_file import LAYERS, SavedMap
+from loam_gtsam.registration.relocalization import same
 from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate, Uncertainty
 from loam_gtsam.voxels.cubes import CubePoints, joined
 from loam_gtsam.voxels.tags import views

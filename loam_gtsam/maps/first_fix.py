@@ -20,7 +20,7 @@ from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key,
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
-from loam_gtsam.registration.relocalization import APART, Fit, likely_poses, sample_features
+from loam_gtsam.registration.relocalization import Fit, likely_poses, same, sample_features
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FloatArray
@@ -122,12 +122,6 @@ class PlaceSearch:
             if len(chosen) == _TRIES:
                 break
         return chosen
-
-
-def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
-    """Whether two poses are no farther apart than the starts of a search."""
-    turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
-    return bool(one.range(other) < APART[0] and turn < APART[1])
 
 
 def distinct(candidates: list[Candidate]) -> list[Candidate]:

@@ -8,9 +8,9 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, same, standing_fit
+from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, standing_fit
 from loam_gtsam.maps.saved_maps import SavedMaps
-from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.relocalization import Fit, same
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
 SWEEPS = 3

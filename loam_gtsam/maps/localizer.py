@@ -25,7 +25,7 @@ from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, time
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
-from loam_gtsam.maps.first_fix import PlaceSearch, same
+from loam_gtsam.maps.first_fix import PlaceSearch
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
 from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.map_graph import MapGraph
@@ -33,7 +33,7 @@ from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.registration.relocalization import RELOCALISED
+from loam_gtsam.registration.relocalization import RELOCALISED, same
 from loam_gtsam.types import (
     BadSweep,
     Features,

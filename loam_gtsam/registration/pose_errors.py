@@ -16,7 +16,7 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.odometry import Moment, Turns
-from loam_gtsam.registration.relocalization import APART
+from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 from loam_gtsam.types import (
@@ -217,10 +217,8 @@ class PoseErrors:
         map has nothing yet, and another place looks the same. Both places are as likely: along each
         axis the mean squared error of either is half the square of the step.
         """
-        step = expected.localCoordinates(found)
-        turn, shift = np.linalg.norm(step.reshape(2, 3), axis=1)
-        if shift > APART[0] or turn > APART[1]:  # else it is the same place
-            in_map = found.AdjointMap() * step
+        if not same(expected, found):
+            in_map = found.AdjointMap() * expected.localCoordinates(found)
             self._drift = self._drift + 0.5 * in_map @ in_map.T
 
     def cut(self) -> None:

@@ -286,6 +286,12 @@ def _place(
     return None if best is None else best[1]
 
 
+def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
+    """Whether two poses are no farther apart than the starts of a search."""
+    turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
+    return bool(one.range(other) < APART[0] and turn < APART[1])
+
+
 def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
     """A (6,) body velocity in the axes of ``a``, from the axes of ``b``."""
     return (a_R_b.matrix() @ twist.reshape(2, 3).T).T.reshape(6)
@@ -331,8 +337,8 @@ def likely_poses(
         rotation = gtsam.Rot3.Yaw(turn).compose(pose.rotation())
         best.append(gtsam.Pose3(rotation, pose.translation() + np.array([x, y, 0.0])))
         away = np.abs((moves[:, 2] - turn + np.pi) % (2.0 * np.pi) - np.pi)
-        same = (np.linalg.norm(at - at[top], axis=1) < APART[0]) & (away < APART[1])
-        scores[same] = 0.0
+        taken = (np.linalg.norm(at - at[top], axis=1) < APART[0]) & (away < APART[1])
+        scores[taken] = 0.0
     return best
 
 

@@ -239,6 +239,7 @@ def test_every_fault_of_the_soak_is_injected_and_counted(
     assert result.met
     assert not replace(result, exceptions=Counter({"ValueError: x": 1})).met
     assert not replace(result, ate=0.06).met
+    assert not replace(result, false_ok=1).met
     miscounted = dict(result.summary) | {"faults": dict(result.summary["faults"]) | {"late": 0}}
     assert not replace(result, summary=miscounted).met
     used = 200.0 + 0.003 * np.arange(soak._JUDGED)

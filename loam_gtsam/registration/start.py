@@ -14,9 +14,12 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
+from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
+from loam_gtsam.registration.matches import subset
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
     APART,
@@ -25,6 +28,7 @@ from loam_gtsam.registration.relocalization import (
     Found,
     likely_poses,
     lines_that_agree,
+    same,
     sample_features,
 )
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
@@ -130,7 +134,7 @@ class Start:
             if number == 0 or tried.total >= enough
         )
         for tried in others:
-            if _better(tried, best):
+            if _better(tried, best, frame.matcher.config):
                 best = tried
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
@@ -154,6 +158,8 @@ class Start:
         if len(sweeps) not in _TOGETHER:
             self._sweeps = sweeps
             return frame, found
+        if len(sweeps) == _TOGETHER[1]:
+            sweeps = self._as_the_second_step(frame, sweeps, solver)
         for _ in range(_ROUNDS):
             sweeps = self._with_motion(sweeps)
             for number, sweep in enumerate(sweeps):
@@ -174,6 +180,33 @@ class Start:
             frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
         )
         return frame, replace(found, solution=solution, twist=frame.twist_of(solution))
+
+    def _as_the_second_step(
+        self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
+    ) -> list[EarlySweep]:
+        """The sweeps with another first motion, if that of the second step leads to a better place.
+
+        The first one was searched for on a grid, with two sweeps that may see little of each other.
+        """
+        first, second, third = (sweep.map_T_middle for sweep in sweeps)
+        early, late = (sweeps[k].moment.seconds_to(sweeps[k + 1].posed.sweep.stamp) for k in (0, 1))
+        step = gtsam.Pose3.Logmap(second.between(third)) * (early / late)
+        place = first.compose(gtsam.Pose3.Expmap(step))
+        if sweeps[1].held or sweeps[2].held or same(place, second):
+            return sweeps
+        best, tried = (
+            self._registered(
+                frame,
+                self._with_motion([sweeps[0], replace(sweeps[1], map_T_middle=pose)]),
+                solver,
+            )
+            for pose in (second, place)
+        )
+        if not _better(tried, best, frame.matcher.config):
+            return sweeps
+        moved = tried.solution.map_T_lidar
+        last = replace(sweeps[2], map_T_middle=moved.compose(second.between(third)))
+        return [*tried.sweeps, last]
 
     def _with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
         """The sweeps, de-skewed for the motion between their poses."""
@@ -253,21 +286,24 @@ def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
     return transform(pose, edges), transform(pose, planes)
 
 
-def _better(tried: _Tried, best: _Tried) -> bool:
+def _better(tried: _Tried, best: _Tried, config: Config) -> bool:
     """Whether one place is clearly better than another; a count of lines varies by its root."""
-    if tried.total > CLEARLY * best.total and _told_apart(tried, best):
+    if tried.total > CLEARLY * best.total and _told_apart(tried, best, config):
         return True
     chance = _CHANCE * np.sqrt(tried.lines + best.lines)
     return CLEARLY * tried.total >= best.total and bool(tried.lines - best.lines > chance)
 
 
-def _told_apart(tried: _Tried, best: _Tried) -> bool:
-    """Whether most of the way from one place to the other is along directions that a scan fixes."""
-    weak = tried.solution.weak
-    if weak is None:
-        return True
-    way = tried.solution.map_T_lidar.localCoordinates(best.solution.map_T_lidar)
-    form = tried.solution.localizability
-    assert form is not None
-    seen = way - weak @ way
+def _told_apart(tried: _Tried, best: _Tried, config: Config) -> bool:
+    """Whether most of the way from one place to the other is along directions that a scan fixes.
+
+    Lines that are known no better than to half the reach of the search are found at any place.
+    """
+    pose, found = tried.solution.map_T_lidar, tried.solution.matches
+    known = found.edges.sigmas < 0.5 * config.matching.max_distance
+    form = localizability(replace(found, edges=subset(found.edges, known)), pose)
+    way = pose.localCoordinates(best.solution.map_T_lidar)
+    seen = way
+    for weak in (form.projector(config.solver.min_aligned), tried.solution.weak):
+        seen = seen if weak is None else seen - weak @ seen
     return bool(seen @ form.displacement @ seen > 0.5 * way @ form.displacement @ way)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration import start
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
@@ -49,6 +53,33 @@ def test_sweeps_may_be_missing_between_the_first_two():
     assert max(far) < 0.3
 
 
+def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatch):
+    """With the second sweep, or with the third alone, 2.5 m behind where it was taken."""
+    found = {}
+    look_again = start.Start._as_the_second_step
+
+    def from_behind(self, frame, sweeps, solver):
+        behind = gtsam.Pose3(gtsam.Rot3(), np.array([-2.5, 0.0, 0.0]))
+        for first in (1, 2):
+            late = [
+                replace(sweep, map_T_middle=behind.compose(sweep.map_T_middle))
+                for sweep in sweeps[first:]
+            ]
+            given = [*sweeps[:first], *late]
+            found[first] = given, look_again(self, frame, given, solver)
+        found["true"] = sweeps
+        return sweeps
+
+    monkeypatch.setattr(start.Start, "_as_the_second_step", from_behind)
+    _, features = features_of("avenue", 11, speed=10.0, start="moving")
+    mapper = Mapper(CONFIG)
+    for one in features[::5]:
+        mapper.register(one)
+    for sweep, true in zip(found[1][1], found["true"], strict=True):
+        assert sweep.map_T_middle.range(true.map_T_middle) < 0.1
+    assert found[2][1] is found[2][0]
+
+
 @pytest.mark.parametrize(
     ("scene", "options"),
     [
@@ -66,6 +97,27 @@ def test_a_platform_at_rest_stays_where_it_is(scene, options):
     mapper = Mapper(CONFIG)
     updates = [mapper.register(one) for one in features]
     assert errors(world, updates).max() < 0.1
+
+
+@pytest.mark.parametrize(
+    ("sigma", "way", "apart"),
+    [(0.05, [3.0, 0.0, 0.0], True), (0.55, [3.0, 0.0, 0.0], False), (0.55, [0.0, 3.0, 0.0], True)],
+)
+def test_lines_that_are_found_at_any_place_do_not_tell_two_places_apart(sigma, way, apart):
+    """Walls at both sides and the ground leave the way ahead to twelve poles."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-9.0, 9.0, (120, 3))
+    normals = np.eye(3)[1 + np.arange(120) % 2]
+    ones, none = np.ones(120), np.zeros(120)
+    planes = PlaneMatches(points, normals, none, none, 0.05 * ones, ones, np.arange(120), none)
+    poles, up = points[:12], np.tile([0.0, 0.0, 1.0], (12, 1))
+    lines = EdgeMatches(
+        poles, poles, up, none[:12], np.full(12, sigma), ones[:12], np.arange(12), none[:12]
+    )
+    here = SimpleNamespace(map_T_lidar=gtsam.Pose3(), matches=ScanMatches(lines, planes), weak=None)
+    there = SimpleNamespace(map_T_lidar=gtsam.Pose3(gtsam.Rot3(), np.array(way)))
+    tried, best = (SimpleNamespace(solution=solution) for solution in (here, there))
+    assert start._told_apart(tried, best, CONFIG) == apart
 
 
 def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):

@@ -19,7 +19,7 @@ from loam_gtsam.imu_prior import roll_pitch
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
 from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.registration.solvers import POSE_KEY
-from loam_gtsam.studies.evaluation import absolute_error
+from loam_gtsam.studies.evaluation import absolute_error, squared_errors
 from loam_gtsam.types import (
     BadSweep,
     ConfigError,
@@ -337,6 +337,19 @@ def test_in_a_gap_of_the_imu_frames_go_without(shaken, sweeps):
     assert set(motions[:10] + motions[13:]) == {"gyro"}
     assert result.imu.report.gaps == 1
     assert ate(result, shaken) < 0.03
+
+
+def test_where_the_gyro_ends_within_a_sweep_the_pose_is_as_sure_as_told(shaken, sweeps):
+    updates = run(data_of(shaken, sweeps[:13], lambda s: (s < 1.02) | (s > 1.6))).updates
+    truth = [gtsam.Pose3(pose) for pose in shaken.truth.map_T_lidar[:14]]
+    for number in (8, 9, 10, 11):  # two sweeps with a gyro, one with a fifth of one, one without
+        turned = truth[number].between(truth[number + 1]).rotation()
+        missing = updates[number].twist[:3] - gtsam.Rot3.Logmap(turned) / 0.1
+        assert np.linalg.norm(missing) < (0.02 if number < 10 else 0.5)
+        pair = [updates[0], updates[number]], [truth[0], truth[number]]
+        assert squared_errors(*pair)[1] < 6.0 * 4.0
+
+
 
 
 @pytest.mark.parametrize("angles", [(180.0, 0.0, 0.0), (0.0, 0.0, 90.0)])

@@ -152,10 +152,11 @@ class MovingSweep:
     def twist_at_reference(self, rate: FloatArray, velocity: FloatArray) -> FloatArray:
         """(6,) body velocity at the reference time.
 
-        ``velocity`` (3,) m/s is that at the middle of the sweep, in the axes of the lidar there.
+        ``velocity`` (3,) m/s is that at the middle of the sweep, in the axes of the lidar there;
+        ``rate`` (3,) rad/s counts if no gyro knows that of the sweep.
         """
         if self._turned is not None:
-            velocity = self._middle_R_reference.T @ velocity
+            rate, velocity = self._rate, self._middle_R_reference.T @ velocity
         return np.concatenate([rate, velocity])
 
     def deskewed(

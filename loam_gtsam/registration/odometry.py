@@ -220,17 +220,17 @@ def twist_to(
 ) -> FloatArray:
     """(6,) body velocity that belongs to a pose at the middle of a sweep.
 
-    With the IMU's prediction it is that which is expected if this is the pose; else that between
-    the middles of the last sweep and of this sweep; ``otherwise`` without a last sweep, or if its
-    middle is not earlier (sweeps of unlike length).
+    It is that between the middles of the last sweep and of this sweep; ``otherwise`` without a last
+    sweep, or if its middle is not earlier (sweeps of unlike length). With the IMU's prediction the
+    velocity is that which is expected if this is the pose.
     """
-    if inertial is not None:
-        velocity = inertial.velocity_at(map_T_middle)
-        velocity = map_T_middle.rotation().matrix().T @ velocity
-        return sweep.twist_at_reference(otherwise[:3], velocity)
-    if last is None or sweep.stamp <= last.stamp:
-        return otherwise
-    return sweep.twist_since(last[:2], map_T_middle)
+    twist = otherwise
+    if last is not None and sweep.stamp > last.stamp:
+        twist = sweep.twist_since(last[:2], map_T_middle)
+    if inertial is None:
+        return twist
+    velocity = map_T_middle.rotation().matrix().T @ inertial.velocity_at(map_T_middle)
+    return sweep.twist_at_reference(twist[:3], velocity)
 
 
 def solved_twist(

@@ -269,7 +269,7 @@ class PoseErrors:
         last = self._last
         back = -sweep.middle * update.map_T_lidar.rotation().matrix().T
         of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
-        turned = np.repeat([self._gyro_noise**2 * abs(sweep.middle), 0.0], 3)
+        turned = np.concatenate([self._missed(sweep)[:3], np.zeros(3)])
         own = of_state @ fused.covariance @ of_state.T + np.diag(turned) + lasting @ lasting.T
         shared = np.zeros((6, 6))
         if last is not None and last.of_state is not None and last.lasting is not None:
@@ -305,19 +305,24 @@ class PoseErrors:
             own = own + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
             self._motion.add(last, sweep.stamp, middle, covariance)
+        own = to_reference @ (own + np.diag(self._missed(sweep))) @ to_reference.T
+        now = _Middle(sweep.stamp, middle, covariance, kept, to_reference, reference_stamp)
+        return symmetric(own), shared, now
+
+    def _missed(self, sweep: MovingSweep) -> FloatArray:
+        """(6,) variances of what the mean velocity misses from the middle to the reference time."""
         # The acceleration times this is the distance of an arc from its chord: at the reference
         # time, between the last two middles, and in the mean over the sweep.
         bend = sweep.duration**2 / 24.0
-        if np.isfinite(seconds):
+        if self._last is not None and sweep.stamp > self._last.stamp:
+            seconds = (sweep.stamp - self._last.stamp) * 1e-9
             bend += 0.5 * sweep.middle * (seconds - sweep.middle)
-        missed = bend**2 * self._motion.variances
-        if turned:
+        missed: FloatArray = bend**2 * self._motion.variances
+        if _turned(sweep):
             missed[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
             missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
-        own = to_reference @ (own + np.diag(missed)) @ to_reference.T
-        now = _Middle(sweep.stamp, middle, covariance, kept, to_reference, reference_stamp)
-        return symmetric(own), shared, now
+        return missed
 
 
 def _turned(sweep: MovingSweep) -> bool:

@@ -6,6 +6,9 @@ import logging
 import os
 from pathlib import Path
 
+# Before numpy is imported: the threads of workers that share two cores get in each other's way.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import pytest
 from hypothesis import HealthCheck, settings
 

@@ -350,8 +350,6 @@ def test_where_the_gyro_ends_within_a_sweep_the_pose_is_as_sure_as_told(shaken, 
         assert squared_errors(*pair)[1] < 6.0 * 4.0
 
 
-
-
 @pytest.mark.parametrize("angles", [(180.0, 0.0, 0.0), (0.0, 0.0, 90.0)])
 def test_with_wrong_extrinsics_the_gyro_is_given_up_and_the_run_tracks(shaken, sweeps, angles):
     result = run(data_of(shaken, sweeps), with_imu(lidar_R_imu_deg=angles))

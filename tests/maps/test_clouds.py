@@ -125,7 +125,7 @@ def test_a_drive_is_found_in_a_foreign_cloud(mapped, tmp_path, monkeypatch):
     origin = np.array(done.output.split("origin is at ")[1].split(", "), np.float64)
     with SavedMap("cloud.lgmap") as saved:
         localizer = Localizer(saved)
-        numbers = range(10, 18)
+        numbers = range(16, 24)  # while it stands still, a rival fits as well
         found = [localizer.process(mapped.world.sweep(number)) for number in numbers]
     assert found[-1].status is FrameStatus.OK
     for number, update in zip(numbers, found, strict=True):

@@ -294,8 +294,7 @@ class PoseErrors:
             last = None
         seconds = np.inf if last is None else (sweep.stamp - last.stamp) * 1e-9
         share = np.full(6, sweep.middle / seconds)
-        turned = _turned(sweep)
-        if turned:  # the rotation within the sweep is measured
+        if _turned(sweep):  # the rotation within the sweep is measured
             share[:3] = 0.0
         kept = 1.0 - share
         own = kept[:, None] * covariance * kept

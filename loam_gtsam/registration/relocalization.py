@@ -64,6 +64,12 @@ def lines_that_agree(matches: ScanMatches) -> BoolArray:
     return agree
 
 
+def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
+    """Whether two poses are no farther apart than the starts of a search."""
+    turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
+    return bool(one.range(other) < APART[0] and turn < APART[1])
+
+
 class FitMonitor:
     """Fits of the last sweeps, against which the next sweep is judged."""
 
@@ -284,12 +290,6 @@ def _place(
         if tried.solved and (best is None or total > best[0]):
             best = total, tried.map_T_lidar
     return None if best is None else best[1]
-
-
-def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
-    """Whether two poses are no farther apart than the starts of a search."""
-    turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
-    return bool(one.range(other) < APART[0] and turn < APART[1])
 
 
 def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:

@@ -158,7 +158,7 @@ class Start:
         if len(sweeps) not in _TOGETHER:
             self._sweeps = sweeps
             return frame, found
-        if len(sweeps) == _TOGETHER[1]:
+        if len(sweeps) == 3:
             sweeps = self._as_the_second_step(frame, sweeps, solver)
         for _ in range(_ROUNDS):
             sweeps = self._with_motion(sweeps)

@@ -50,6 +50,11 @@ class FeatureConfig(Section):
     """The curvature at a point takes this many neighbours on either side of it in its ring."""
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
+    edge_reach: float = parameter(
+        0.5, unit="beams", source="LOAM takes the last point", low=0.0, high=1.0
+    )
+    """A surface reaches this many beam spacings beyond the last of its points before a drop, in the
+    mean; the edge is taken there, and at 0 on the last point."""
     range_noise: float = parameter(0.02, unit="m", source="LOAM takes all that is no edge", low=0.0)
     """The ranges of the sensor have this standard deviation. A plane point is taken only where its
     ring scatters about a smooth surface by less than four times this value, which foliage does

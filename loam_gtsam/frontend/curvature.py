@@ -13,6 +13,13 @@ from loam_gtsam.config import FeatureConfig
 from loam_gtsam.geometry import squared_norm
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
+LINKED_BEAMS = 2.5
+"""Beam spacings between two points that are neighbours, at most: one lost beam is bridged."""
+EMPTY_BEAMS = 5.5
+"""Beam spacings without a point at least, for there to be nothing: four beams in a row are lost by
+chance where one in four returns nothing, as on dark ground."""
+_NEARER = 2.0
+"""A surface that is continued comes nearer by less than this factor."""
 _LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
 """Residual sum of squares of a straight line through five even samples, from their second
 differences a, b, c: ``0.4 (a^2 + c^2) + 0.7 b^2 + 0.8 b (a + c) + 0.4 a c``, the quadratic form of
@@ -77,6 +84,53 @@ def prominence(xyz: NDArray[np.float32], half_window: int, chosen: IntArray) -> 
     unit = np.sqrt(1.0 + (share**2 + (1.0 - share) ** 2) / half_window)
     off: FloatArray = np.abs(expected - centre) / (centre**2 * unit)
     return off
+
+
+def ends_of_surfaces(
+    xyz: NDArray[np.float32], half_window: int, chosen: IntArray, drop: float, beams: float
+) -> FloatArray:
+    """Where the surfaces end on which some points are the last ones before a drop.
+
+    The last beam that meets a surface passes its end by anything up to the spacing of the beams,
+    always on the same side: an edge that is taken there moves with the range, and with the side
+    from which it is seen. The surface goes on along its last points, on which the inverse range
+    is linear in the direction of the beam (see :func:`prominence`).
+
+    Parameters
+    ----------
+    xyz : (3, N) points of the sweep
+    half_window : neighbours at most by which a surface is continued
+    chosen : (M,) indices of points whose windows stay within their rings
+    drop : metres in range between two neighbours that are on one surface, at most
+    beams : beam spacings by which a surface reaches beyond its last point
+
+    Returns
+    -------
+    (M, 3) metres, the points that were measured where there is no drop, or one on both sides. A
+    beam that returned nothing is a drop as well, if its neighbours did not either.
+    """
+    ended = xyz.take(chosen, axis=1).T.astype(np.float64)
+    for side in (-1, 1):  # of the surface, seen from its last point
+        rows = chosen[:, None] + side * np.arange(-1, half_window + 1)
+        window = xyz.take(rows, axis=1).astype(np.float64)
+        ranges = np.sqrt(squared_norm(window))
+        rays = np.concatenate((window / ranges, [1.0 / ranges]))
+        turn = np.sqrt(squared_norm(np.diff(rays[:3], axis=2)))
+        linked = np.abs(np.diff(ranges[:, 1:], axis=1)) < drop
+        count = np.logical_and.accumulate(linked, axis=1).sum(axis=1)
+        last, far = rays[:, :, 1], np.take_along_axis(rays, count[None, :, None] + 1, axis=2)
+        step = (last - far[:, :, 0]) / np.maximum(count, 1)
+        spacing = np.sqrt(squared_norm(step[:3]))
+        farther = ranges[:, 0] - ranges[:, 1] > drop
+        falls = (turn[:, 0] > EMPTY_BEAMS * spacing) | (
+            farther & (turn[:, 0] < LINKED_BEAMS * spacing)
+        )
+        here = np.flatnonzero((count > 0) & falls)
+        beyond = last[:, here] + beams * step[:, here]
+        inverse = np.maximum(beyond[3], last[3, here] / _NEARER)
+        inverse *= np.sqrt(squared_norm(beyond[:3]))
+        ended[here] = (beyond[:3] / inverse).T
+    return ended
 
 
 def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:

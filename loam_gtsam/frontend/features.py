@@ -19,6 +19,7 @@ the published code:
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from loam_gtsam.config import SMALL, Config, MapConfig
 from loam_gtsam.frontend.curvature import (
     curvature,
+    ends_of_surfaces,
     prominence,
     roughness,
     squared_gaps,
@@ -270,10 +272,16 @@ def _assemble(
         flat = np.arange(len(flat))
     points, plane_times, plane_rings = planes
     stands_out = prominence(sweep.xyz, settings.half_window, edges)
+    edge_points = measured(edges)[0]
+    if settings.edge_reach > 0.0:
+        drop = math.sqrt(settings.occlusion_gap)
+        edge_points = ends_of_surfaces(
+            sweep.xyz, settings.half_window, edges, drop, settings.edge_reach
+        )
     with_poles = np.concatenate((edges, poles.middles))
     return Features(
         stamp=scan.stamp + round(reference * 1e9),
-        edges=np.concatenate((measured(edges)[0], poles.points)),
+        edges=np.concatenate((edge_points, poles.points)),
         planes=points,
         edge_times=times[with_poles],
         plane_times=plane_times,

@@ -12,19 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.frontend.curvature import EMPTY_BEAMS, LINKED_BEAMS
 from loam_gtsam.geometry import squared_norm
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
-_LINKED_BEAMS = 2.5
-"""Beam spacings between two neighbours of a run at most: one lost beam is bridged."""
-_EMPTY_BEAMS = 5.5
-"""Beam spacings without a point at least, for there to be nothing: four beams in a row are lost by
-chance where one in four returns nothing, as on dark ground."""
 _LINKED = 0.2
 """Metres between two neighbours of a run that are always allowed."""
 _ROUND = 0.25 * np.pi
 """Distance of a cylinder's axis from the mean of the points seen on it, as a share of the radius:
 the mean of ``sqrt(1 - x^2)`` over the width."""
+_THINNEST = 0.05
+"""Width of the thinnest posts, as of railings and signs, metres."""
+_BEFOREHAND = 10.0
+"""Runs of a sweep that tell as much about the widths in it as is known beforehand."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,8 +86,8 @@ def find_poles(
     # On a ring of a few points the last may lie beside the first, and still be a turn away.
     turn[tails[tails - heads < most]] = np.inf
     farther = _to_next(ranges, heads, tails)
-    apart, empty = turn > _LINKED_BEAMS * spacing, turn > _EMPTY_BEAMS * spacing
-    reach = np.maximum(_LINKED, _LINKED_BEAMS * spacing * ranges)
+    apart, empty = turn > LINKED_BEAMS * spacing, turn > EMPTY_BEAMS * spacing
+    reach = np.maximum(_LINKED, LINKED_BEAMS * spacing * ranges)
     cut = apart | (np.hypot(farther, turn * ranges) > reach)
     # A run does not go on from the end of a ring to its start: it is cut there.
     ends = cut.copy()
@@ -107,10 +107,34 @@ def find_poles(
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
     across = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) + spacing
-    radii = 0.5 * across * distance
+    radii = 0.5 * _likely_widths(across * distance, spacing * distance, length == 1)
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
     return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])
+
+
+def _likely_widths(widths: FloatArray, apart: FloatArray, single: BoolArray) -> FloatArray:
+    """(M,) metres: the ``widths`` of runs, with those of ``single`` points guessed from the others.
+
+    One beam may have met anything narrower than twice the distance to the next beam, ``apart``
+    (M,), and if it is wider than that distance, another beam the sooner. So it is as wide as the
+    runs of more points of the sweep are in the mean, weighted by the chance that one beam alone
+    meets these; see docs/maths/features.md, equation 2. Where they are few: as wide as things are
+    if widths x are as frequent as ``1 / x^2``.
+    """
+    likely, limit = widths.copy(), apart[single]
+    known = np.sort(widths[~single])
+    sums = np.cumsum([[0.0, *1.0 / known], [0.0, *np.ones(len(known))], [0.0, *known]], axis=1)
+    surely, maybe = (sums[:, np.searchsorted(known, most, "right")] for most in (limit, 2 * limit))
+    maybe -= surely
+    # The chance is 1 up to the distance, and from there on 2 distances / width - 1.
+    weight, total = surely[1:] + 2.0 * limit * maybe[:2] - maybe[1:]
+    most = np.maximum(limit, _THINNEST)
+    guess = 2.0 * np.log(2.0) * most - _THINNEST
+    guess /= np.log(most / _THINNEST) + 1.0 - np.log(2.0)
+    guess = np.minimum(guess, limit)
+    likely[single] = (total + _BEFOREHAND * guess) / (weight + _BEFOREHAND)
+    return likely
 
 
 def _to_next(

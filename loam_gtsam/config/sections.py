@@ -50,15 +50,11 @@ class FeatureConfig(Section):
     """The curvature at a point takes this many neighbours on either side of it in its ring."""
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
-    edge_reach: float = parameter(
-        0.5, unit="beams", source="LOAM takes the last point", low=0.0, high=1.0
-    )
-    """A surface reaches this many beam spacings beyond the last of its points before a drop, in the
-    mean; the edge is taken there, and at 0 on the last point."""
+    edge_reach: float = parameter(0.5, unit="beams", source="LOAM uses 0", low=0.0, high=1.0)
+    """An edge before a drop is this far beyond the last point on its surface, where it is at 0."""
     range_noise: float = parameter(0.02, unit="m", source="LOAM takes all that is no edge", low=0.0)
-    """The ranges of the sensor have this standard deviation. A plane point is taken only where its
-    ring scatters about a smooth surface by less than four times this value, which foliage does
-    not; 0 turns the test off."""
+    """The ranges of the sensor have this standard deviation. A plane point lies where its ring
+    scatters by less than four times this about a smooth surface; 0 turns the test off."""
     post_depth: float = parameter(0.5, unit="m", source="LOAM has no such search", low=0.0)
     """A pole, a run of a ring too short for the curvature, is an edge where it stands in front of
     what is on both sides of it by more than this; 0 turns the search for poles off."""
@@ -339,8 +335,7 @@ class ImuConfig(Section):
     coupling: Literal["tight", "loose", "off"] = parameter("tight")
     """The measurements of the IMU act in this way: tight, gyro and accelerometer predict every pose
     and are estimated together with the scans (pose, velocity, biases, gravity); loose, the gyro
-    turns the prediction and the sweep; off, not at all. Roll and pitch act by the prior, except if
-    off."""
+    turns prediction and sweep; off, not at all. Roll and pitch act by the prior, unless off."""
     prior: Literal["off", "blend", "equivalent", "sigma"] = parameter(
         "equivalent", source="LOAM blends"
     )

@@ -101,7 +101,8 @@ def ends_of_surfaces(
     xyz : (3, N) points of the sweep
     half_window : neighbours at most by which a surface is continued
     chosen : (M,) indices of points whose windows stay within their rings
-    drop : metres in range between two neighbours that are on one surface, at most
+    drop : metres in range between two neighbours that may always be on one surface; far away it
+        is what grazed surfaces have, ``LINKED_BEAMS`` times the way between two beams
     beams : beam spacings by which a surface reaches beyond its last point
 
     Returns
@@ -116,15 +117,14 @@ def ends_of_surfaces(
         ranges = np.sqrt(squared_norm(window))
         rays = np.concatenate((window / ranges, [1.0 / ranges]))
         turn = np.sqrt(squared_norm(np.diff(rays[:3], axis=2)))
-        linked = np.abs(np.diff(ranges[:, 1:], axis=1)) < drop
+        spacing = np.median(turn, axis=1)
+        most = np.maximum(drop, LINKED_BEAMS * spacing * ranges[:, 1])
+        linked = np.abs(np.diff(ranges[:, 1:], axis=1)) < most[:, None]
         count = np.logical_and.accumulate(linked, axis=1).sum(axis=1)
         last, far = rays[:, :, 1], np.take_along_axis(rays, count[None, :, None] + 1, axis=2)
         step = (last - far[:, :, 0]) / np.maximum(count, 1)
-        spacing = np.sqrt(squared_norm(step[:3]))
-        farther = ranges[:, 0] - ranges[:, 1] > drop
-        falls = (turn[:, 0] > EMPTY_BEAMS * spacing) | (
-            farther & (turn[:, 0] < LINKED_BEAMS * spacing)
-        )
+        falls = (ranges[:, 0] - ranges[:, 1] > most) & (turn[:, 0] < LINKED_BEAMS * spacing)
+        falls |= turn[:, 0] > EMPTY_BEAMS * spacing
         here = np.flatnonzero((count > 0) & falls)
         beyond = last[:, here] + beams * step[:, here]
         inverse = np.maximum(beyond[3], last[3, here] / _NEARER)

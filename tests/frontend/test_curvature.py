@@ -6,6 +6,7 @@ import pytest
 from loam_gtsam.config import FeatureConfig
 from loam_gtsam.frontend.curvature import (
     curvature,
+    ends_of_surfaces,
     prominence,
     roughness,
     squared_gaps,
@@ -126,6 +127,71 @@ def test_next_to_a_step_a_surface_is_smooth_and_the_step_stands_out() -> None:
     # Five neighbours are beyond the step: 5 * 3 m * (8 m / 11 m), or its inverse, over sqrt(110).
     expected = np.array([0.0, 15.0 * 8 / 11, 15.0 * 11 / 8]) / np.sqrt(110)
     assert prominence(step, 5, np.array([380, 399, 400])) == pytest.approx(expected, abs=0.02)
+
+
+STEP = np.deg2rad(0.4)
+
+
+def wall_before(behind: float, incidence: float, begin: float, lost: tuple[int, ...] = ()):
+    """A wall from beam 20 + ``begin`` to beam 50, 20 m away there; what is behind it is farther.
+
+    Returns the points, the beams they belong to and where the wall begins; ``behind`` may be NaN.
+    """
+    number = np.arange(80)
+    towards = np.array([np.cos(35 * STEP + incidence), np.sin(35 * STEP + incidence)])
+    here = np.array([np.cos(50 * STEP), np.sin(50 * STEP)])
+    reach = 20.0 * (here @ towards)
+    directions = np.array([np.cos(number * STEP), np.sin(number * STEP)])
+    ranges = reach / (towards @ directions)
+    ranges[(number < 20.0 + begin) | (number > 50)] = behind
+    ranges[list(lost)] = np.nan
+    end = np.array([np.cos((20.0 + begin) * STEP), np.sin((20.0 + begin) * STEP)])
+    met = np.isfinite(ranges)
+    return one_ring(number[met] * STEP, ranges[met]), number[met], end * reach / (towards @ end)
+
+
+@pytest.mark.parametrize("incidence", [-1.0, 0.0, 1.0])
+@pytest.mark.parametrize("behind", [45.0, np.nan])
+def test_edges_before_a_drop_lie_where_walls_end_in_the_mean(behind, incidence) -> None:
+    before, after = [], []
+    for begin in np.linspace(-0.95, 0.0, 20):  # the first beam on the wall is the twentieth
+        xyz, number, end = wall_before(behind, incidence, begin)
+        chosen = np.flatnonzero(number == 20)
+        if np.isnan(behind):
+            assert len(number) == 31  # nothing is behind it: the ring goes on elsewhere
+            xyz = np.concatenate((xyz[:, -10:], xyz), axis=1)
+            chosen = chosen + 10
+        moved = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.5)
+        before.append(xyz[:2, chosen[0]] - end)
+        after.append(moved[0, :2] - end)
+    late, right = (np.linalg.norm(np.mean(errors, axis=0)) for errors in (before, after))
+    assert late > 0.4 * 20.0 * STEP
+    assert right < 0.1 * late
+
+
+def test_only_ends_of_surfaces_before_a_drop_are_moved() -> None:
+    xyz, number, _ = wall_before(45.0, 0.3, 0.0)
+    # The last points on either side, one within the wall, and one behind it.
+    chosen = np.searchsorted(number, [20, 50, 35, 19])
+    moved = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.5)
+    same = np.all(moved == xyz[:, chosen].T, axis=1)
+    assert same.tolist() == [False, False, True, True]
+    turned = np.arctan2(moved[:2, 1], moved[:2, 0]) / STEP
+    assert turned == pytest.approx([19.5, 50.5], abs=1e-3)
+    assert ends_of_surfaces(xyz, 5, chosen, 0.3, 0.0) == pytest.approx(xyz[:, chosen].T)
+    # Nothing is known of a surface with one point, nor of what lies behind lost beams.
+    alone = one_ring(number * STEP, np.where(number == 30, 20.0, 45.0))
+    there = np.searchsorted(number, [30])
+    assert np.array_equal(ends_of_surfaces(alone, 5, there, 0.3, 0.5), alone[:, there].T)
+    xyz, number, _ = wall_before(45.0, 0.3, 0.0, lost=(17, 18, 19))
+    first = np.searchsorted(number, [20])
+    assert np.array_equal(ends_of_surfaces(xyz, 5, first, 0.3, 0.5), xyz[:, first].T)
+
+
+def test_a_lost_beam_on_the_wall_does_not_move_its_end() -> None:
+    xyz, number, _ = wall_before(45.0, 0.3, 0.0, lost=(22,))
+    moved = ends_of_surfaces(xyz, 5, np.searchsorted(number, [20]), 0.3, 0.5)[0]
+    assert np.arctan2(moved[1], moved[0]) / STEP == pytest.approx(19.5, abs=0.15)
 
 
 def test_too_short_a_sweep_is_rough_everywhere() -> None:

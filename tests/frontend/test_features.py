@@ -157,7 +157,8 @@ class Picked:
     """Where, in organised order, the edge, sharp and flat points of a scan are."""
 
     def __init__(self, scan: Scan, config: Config) -> None:
-        config = config.changed("features.thinning=voxels")  # which leaves flat points as measured
+        # Both leave the points as they were measured.
+        config = config.changed("features.thinning=voxels", "features.edge_reach=0")
         self.sweep = organise(scan, config)
         self.features = extract_features(scan, config)
         where = {tuple(point): i for i, point in enumerate(scan.points[self.sweep.index])}

@@ -134,3 +134,62 @@ def test_poles_become_edges_near_their_axes_and_stay_out_of_the_planes():
     assert with_poles.edge_prominence[on].min() > 0.5
     assert near_poles(with_poles, world, with_poles.planes).sum() == 0
     assert with_poles.sharp.max(initial=-1) < len(with_poles.edges)
+
+
+def posts(widths, distances, step):
+    """A ring, one beam every ``step``, that meets one flat post of each width, 3 degrees apart.
+
+    The posts begin anywhere between two beams; a wall is 300 m away.
+    """
+    rng = np.random.default_rng(0)
+    beams = np.arange(int(np.deg2rad(3.0) * len(widths) / step) + 20) * step
+    ranges = np.full(len(beams), 300.0)
+    for number, (width, metres) in enumerate(zip(widths, distances, strict=True)):
+        begin = np.deg2rad(3.0) * (number + 0.3) + step * rng.random()
+        ranges[(beams >= begin) & (beams < begin + width / metres)] = metres
+    return ring_of(beams, ranges)
+
+
+def ring_of(angle, ranges):
+    return (np.array([np.cos(angle), np.sin(angle), 0.0 * angle]) * ranges).astype(np.float32)
+
+
+def radii_of(poles, points):
+    """How far poles lie behind the points of their runs, as radii of round ones."""
+    means = [
+        points[:, a : b + 1].mean(axis=1) for a, b in zip(poles.first, poles.last, strict=True)
+    ]
+    behind = np.linalg.norm(poles.points, axis=1) - np.linalg.norm(means, axis=1)
+    return behind / (np.pi / 4.0)
+
+
+@pytest.mark.parametrize("width", [0.12, 0.5])
+def test_what_one_beam_met_is_as_wide_as_what_more_beams_met(width):
+    step = np.deg2rad(0.4)
+    near, far = width / (3.0 * step), 2.0 * width / step
+    points = posts(np.full(160, width), np.repeat([near, far], [60, 100]), step)
+    poles = found(points, width=2.0)
+    radii, single = radii_of(poles, points), poles.first == poles.last
+    # Half of those far away are met, by one beam each.
+    assert (np.count_nonzero(~single), np.count_nonzero(single)) == (60, pytest.approx(50, abs=15))
+    assert radii[~single].mean() == pytest.approx(0.5 * width, rel=0.15)
+    assert radii[single].mean() == pytest.approx(0.5 * width, rel=0.15)  # not 1.0, the beams' gap
+
+
+def test_without_others_what_one_beam_met_is_rather_thin():
+    step = np.deg2rad(0.4)
+    for begin in np.linspace(0.0, 1.0, 20):  # until a beam meets it
+        angle = np.arange(60) * step
+        ranges = np.full(60, 60.0)
+        start = (30.0 + begin) * step
+        ranges[(angle >= start) & (angle < start + 0.12 / 40.0)] = 40.0
+        points = ring_of(angle, ranges)
+        if len(poles := found(points, width=2.0)):
+            break
+    apart = 2.0 * 40.0 * np.sin(0.5 * step)
+    # The mean of widths as frequent as 1 / x^2 from 5 cm on, by a sum over a grid of them.
+    x = np.linspace(0.05, 2.0 * apart, 100_000)
+    chance = np.minimum(x / apart, 2.0 - x / apart) / x**2
+    mean = np.sum(chance * x) / np.sum(chance)
+    assert 2.0 * radii_of(poles, points)[0] == pytest.approx(mean, rel=1e-3)
+    assert mean < 0.7 * apart

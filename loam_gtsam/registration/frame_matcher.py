@@ -119,6 +119,13 @@ class MapPair:
             plane_map.insert(planes, map_T_middle.translation(), faces)
         self._thinned = None
 
+    def insert_on_trial(self, posed: PosedSweep, map_T_middle: gtsam.Pose3) -> None:
+        """Add a sweep to the maps in use only, which are then no map to keep."""
+        edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
+        self.edges.insert(edges)
+        self.planes.insert(planes, map_T_middle.translation())
+        self._thinned = None
+
     def too_sparse(self, predicted: Prediction, config: Config) -> str:
         """Why there are too few points around a sweep to solve in; empty if there are enough."""
         pose, solver = predicted.map_T_middle.matrix(), config.solver

@@ -174,9 +174,8 @@ class Start:
                 if solution.solved:
                     sweeps[number] = replace(sweeps[number], map_T_middle=solution.map_T_lidar)
         sweeps = self._with_motion(sweeps)
-        solution = self._solved(
-            frame, sweeps[-1], self._matcher(frame, sweeps, len(sweeps) - 1), solver
-        )
+        matcher = self._matcher(frame, sweeps, len(sweeps) - 1, to_keep=True)
+        solution = self._solved(frame, sweeps[-1], matcher, solver)
         if not solution.solved:
             self._fill(frame, self._sweeps)
             return frame, found
@@ -256,9 +255,11 @@ class Start:
         points = transform(solution.map_T_lidar.matrix(), points)
         return _Tried(len(rows.edges), points, *told, [sweeps[0], second], solution)
 
-    def _matcher(self, frame: Frame, sweeps: Sequence[EarlySweep], number: int) -> FrameMatcher:
-        """The matches of one of the sweeps with a map of all the others, which it makes."""
-        self._fill(frame, [*sweeps[:number], *sweeps[number + 1 :]])
+    def _matcher(
+        self, frame: Frame, sweeps: Sequence[EarlySweep], number: int, *, to_keep: bool = False
+    ) -> FrameMatcher:
+        """The matches of one of the sweeps with a map of all the others, which may be to keep."""
+        self._fill(frame, [*sweeps[:number], *sweeps[number + 1 :]], on_trial=not to_keep)
         old, posed = frame.matcher, sweeps[number].posed
         return FrameMatcher.of(posed, old.maps, old.config, old.last, old.clock, refine=False)
 
@@ -270,13 +271,16 @@ class Start:
         priors = frame.priors if one.posed.sweep is frame.sweep else ()
         return solver.solve(matcher, one.map_T_middle, priors, expected)
 
-    def _fill(self, frame: Frame, sweeps: Sequence[EarlySweep]) -> None:
-        """Make the map of these sweeps."""
+    def _fill(self, frame: Frame, sweeps: Sequence[EarlySweep], *, on_trial: bool = False) -> None:
+        """Make the map of these sweeps; one on trial is made as far as a solve reads it."""
         maps = frame.matcher.maps
         maps.clear()
         maps.recenter(self._map_T_first)
         for sweep in sweeps:
-            maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
+            if on_trial:
+                maps.insert_on_trial(sweep.posed, sweep.map_T_middle)
+            else:
+                maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
 
 
 def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:

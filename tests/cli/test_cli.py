@@ -52,7 +52,7 @@ class FakeDataset(ListDataset):
 
 @pytest.fixture(scope="module")
 def scans() -> list[Scan]:
-    return list(SimulatedWorld("room", frames=FRAMES))
+    return list(SimulatedWorld("room", frames=FRAMES, columns=450))
 
 
 @pytest.fixture
@@ -72,9 +72,13 @@ def said(*arguments: object, code: int = 0) -> str:
     return " ".join(result.output.split())
 
 
+QUICK_START = ("--set", "deskew.model=predicted")
+"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
+
+
 def mapped(*more: object, code: int = 0) -> str:
     """What ``run`` says of whatever opens; its results are in the folder out."""
-    return said("run", "x", "--no-plot", "--output", "out", *more, code=code)
+    return said("run", "x", "--no-plot", "--output", "out", *QUICK_START, *more, code=code)
 
 
 def summary_in(folder: Path | str) -> dict[str, Any]:
@@ -101,7 +105,7 @@ def test_demo_writes_everything_and_says_how_accurate_it_is():
 def test_run_opens_built_in_worlds_and_uses_every_option():
     Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
     said(
-        "run", "sim:room?frames=9", "--frames", 3, "--output", "out", "--no-plot",
+        "run", "sim:room?frames=9&columns=450", "--frames", 3, "--output", "out", "--no-plot",
         "--config", "mine.yaml", "--sensor", "vlp16", "--set", "solver.iterations=7",
         "--set", "map.window=[11, 11, 5]", "--set", "deskew.enabled=false", "--option", "seed=3",
     )  # fmt: skip
@@ -168,7 +172,7 @@ def test_poses_that_no_scan_fixes_are_told_in_one_line():
 
 
 def test_a_few_odd_frames_leave_a_run_in_trust(opens):
-    world = SimulatedWorld("room", frames=21, columns=300)
+    world = SimulatedWorld("room", frames=21, columns=200)
     opens([*world, BadSweep(world[20].stamp + 1, "damaged")])
     text = mapped()
     assert "1 of 22 poses (5 %) are not fixed by their scans (1 unusable_scan)" in text
@@ -215,7 +219,7 @@ def test_what_is_odd_about_the_input_is_told_after_a_run(opens, scans, monkeypat
 @pytest.mark.parametrize("error", [DatasetError("the bag breaks off"), RuntimeError("oops")])
 def test_an_error_in_the_middle_keeps_what_was_computed(opens, scans, error):
     opens([*scans[:3], error, scans[3]])
-    result = loam("run", "x", "--no-plot", "--output", "out")
+    result = loam("run", "x", "--no-plot", "--output", "out", *QUICK_START)
     assert result.exit_code == 1
     assert len(read_tum("out/trajectory.tum")) == 3
     assert str(error) in summary_in("out")["error"]
@@ -323,7 +327,7 @@ class Endless(SimulatedWorld):
                 first.points, first.stamp + number * 10**8, first.times, first.rings, first.span
             )
 
-loam_gtsam.datasets.open_dataset = lambda *a, **k: Endless("room", frames=1000)
+loam_gtsam.datasets.open_dataset = lambda *a, **k: Endless("room", frames=1000, columns=450)
 main()
 """
 
@@ -383,7 +387,7 @@ def test_a_signal_is_noted_unless_it_is_ignored_and_handlers_are_put_back(ignore
 
 
 def test_run_says_what_was_made_of_the_imu():
-    text = said("run", "sim:room", "--frames", 3, "--no-plot")
+    text = said("run", "sim:room?columns=450", "--frames", 3, "--no-plot", *QUICK_START)
     for part in (
         "IMU, level roll", "samples, at rest", "IMU, orientation its own", "mrad/s",
         "IMU, roll and pitch priors: 1 none, 2 equivalent", "IMU, de-skew 3 gyro",
@@ -391,27 +395,27 @@ def test_run_says_what_was_made_of_the_imu():
         assert part in text
     assert "given up" not in text
     off = ["--set", "imu.coupling=off", "--output", "off"]
-    assert "IMU" not in said("run", "sim:room", "--frames", 2, "--no-plot", *off)
+    assert "IMU" not in said("run", "sim:room?columns=450", "--frames", 2, "--no-plot", *off)
     assert summary_in("off")["imu"] is None
 
 
 def test_run_says_that_the_imu_is_mounted_otherwise():
     turned = ["--set", "imu.lidar_R_imu_deg=[180.0, 0.0, 0.0]"]
-    text = said("run", "sim:shaken?columns=900", "--frames", 40, "--no-plot", *turned)
+    text = said("run", "sim:shaken?columns=450", "--frames", 40, "--no-plot", *turned)
     assert "its gyro turned unlike the scans and was given up" in text
     assert re.search(r"fit those of the scans better by (179|180) degrees", text)
 
 
 def test_inspect_names_an_imu_that_is_late(monkeypatch):
     """With the offset that is named there is nothing to say."""
-    imu = SimulatedWorld("shaken", frames=60, columns=900).imu
+    imu = SimulatedWorld("shaken", frames=60, columns=450).imu
     late = replace(imu, stamps=imu.stamps + 100_000_000)
     monkeypatch.setattr(SimulatedWorld, "imu", late)
-    text = said("inspect", "sim:shaken?columns=900&frames=30")
+    text = said("inspect", "sim:shaken?columns=450&frames=30")
     assert re.search(r"its clock is (9[5-9]|10[0-5]) ms late", text)
     assert "30 sweeps mapped, from 0 s on" in text
     offset = ["--set", "imu.time_offset=-0.1"]
-    assert "problem" not in said("inspect", "sim:shaken?columns=900&frames=30", *offset)
+    assert "problem" not in said("inspect", "sim:shaken?columns=450&frames=30", *offset)
 
 
 def test_inspect_maps_where_the_lidar_turns():
@@ -431,17 +435,18 @@ def test_inspect_takes_the_rate_of_the_recording(monkeypatch):
     monkeypatch.setattr(
         report, "where_it_turns", lambda *a: asked.append(a[2:]) or where_it_turns(*a)
     )
-    text = said("inspect", "sim:shaken?columns=600&frames=30", "--every", 2)
+    text = said("inspect", "sim:shaken?columns=300&frames=30", "--every", 2)
     assert asked == [(pytest.approx(10.0), pytest.approx(3.0))]
     assert "15 sweeps mapped, from 0 s on" in text
 
 
 def test_inspect_shows_what_was_understood_of_sweeps_and_imu(opens, scans, monkeypatch):
-    text = said("inspect", "sim:room?frames=3")
+    room = "sim:room?frames=3&columns=450"
+    text = said("inspect", room)
     for part in ("simulated world", "16 rings from the ring field", "per-point times",
                  "samples at 200 Hz, orientation its own", "can be run"):  # fmt: skip
         assert part in text
-    assert "IMU, used" not in said("inspect", "sim:room?frames=3", "--set", "imu.coupling=off")
+    assert "IMU, used" not in said("inspect", room, "--set", "imu.coupling=off")
     opens(scans[:1])
     assert "IMU, used" not in said("inspect", "x")
     imu = SimulatedWorld("room", frames=2).imu
@@ -464,7 +469,7 @@ def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
 
 def test_run_closes_loops_and_writes_the_graph():
     small = ["--set", "pose_graph.keyframe_distance=1", "--set", "loops.min_way=6"]
-    text = said("run", "sim:room?frames=60&columns=400&speed=3", "--loops", *small)
+    text = said("run", "sim:room?frames=60&columns=300&speed=3", "--loops", *small)
     found = int(re.search(r"(\d+) of (\d+) found are used", text)[1])
     assert found >= 1
     folder = Path("loam_gtsam_output/room_vlp16")
@@ -558,7 +563,7 @@ def test_sweep_is_the_old_name_of_study_and_says_so_and_no_help_is_cut_off(monke
 
 
 def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
-    spec = "sim:room?frames=12&columns=600"
+    spec = "sim:room?frames=12&columns=450"
     assert loam("run", spec, "--output", "out", "--refine", "--no-plot", "--quiet").exit_code == 0
     report = json.loads(Path("out/refined/report.json").read_text())
     assert report["frames"] == 12

@@ -22,7 +22,8 @@ from loam_gtsam.datasets.sim.disturbances import (
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
-from loam_gtsam.pipeline import Pipeline, run
+from loam_gtsam.io.rollback import Before
+from loam_gtsam.pipeline import Pipeline, effective_config, run
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.odometry import Moment, predict
@@ -73,6 +74,23 @@ def put(drive, calm, move=(0.0, 0.0, 0.0), turn_deg=0.0):
 def kidnapped(drive, calm):
     """Across the room and turned, out of which no solve finds its way."""
     return put(drive, calm, (-3.0, 2.0, 0.0), 120.0)
+
+
+@pytest.fixture(scope="module")
+def begun(calm):
+    """The run up to the sweep AT, with the watch and without: the pipelines, and the updates."""
+    pipelines = [Pipeline(effective_config(config, calm)) for config in (Config(), OFF)]
+    return [(one, [one.process(sweep) for sweep in list(calm)[:AT]]) for one in pipelines]
+
+
+def ended(begun, dataset):
+    """A run that was begun, with the sweeps from AT on; another can then end it otherwise."""
+    pipeline, updates = begun
+    before = Before(pipeline)
+    rest = [pipeline.process(sweep) for sweep in list(dataset)[AT:]]
+    result = pipeline.result([*updates, *rest])
+    before.restore()
+    return result
 
 
 def errors(result, dataset):
@@ -216,12 +234,9 @@ def test_a_few_points_stand_for_a_sweep():
 
 
 @pytest.fixture(scope="module")
-def before(calm):
+def before(begun):
     """The mapper when the sweep AT comes."""
-    pipeline = Pipeline()
-    for sweep in list(calm)[:AT]:
-        pipeline.process(sweep)
-    return pipeline.mapper
+    return begun[0][0].mapper
 
 
 def frame_of(mapper, sweep):
@@ -297,8 +312,8 @@ def test_a_sweep_that_fits_keeps_its_solution_if_the_search_finds_nothing_better
     np.testing.assert_array_equal(found.twist, frame.twist_of(solution))
 
 
-def test_an_ordinary_run_is_the_same_without_the_watch(calm):
-    watched, bare = run(calm), run(calm, OFF)
+def test_an_ordinary_run_is_the_same_without_the_watch(begun, calm):
+    watched, bare = (ended(one, calm) for one in begun)
     assert np.array_equal(watched.trajectory.map_T_lidar, bare.trajectory.map_T_lidar)
     assert all(update.message == "" for update in watched.updates[1:] if update.status == "ok")
 
@@ -318,8 +333,8 @@ def test_disturbances_do_not_make_sweeps_lost(calm, disturbances):
     assert np.linalg.norm(away[:, :3, 3], axis=1).max() < 0.2
 
 
-def test_a_kidnapped_lidar_is_found_at_once(kidnapped):
-    result = run(kidnapped)
+def test_a_kidnapped_lidar_is_found_at_once(begun, kidnapped):
+    result, wrong = (ended(one, kidnapped) for one in begun)
     update = result.updates[AT]
     assert update.status.solved
     assert "relocalised, moved by 3." in update.message
@@ -329,16 +344,15 @@ def test_a_kidnapped_lidar_is_found_at_once(kidnapped):
     told = np.sqrt(np.linalg.eigvalsh(update.covariance[3:, 3:])[-1])
     assert 1.5 < told < 4.0
     # Without the monitor it is not: a second map grows beside the first.
-    wrong = run(kidnapped, OFF)
     assert wrong.updates[AT].status.solved
     assert errors(wrong, kidnapped)[AT] > 1.0
 
 
 @pytest.mark.parametrize(("move", "turn_deg"), [((0.0, 1.0, 0.0), 0.0), ((0.0, 0.0, 0.0), 30.0)])
-def test_a_jump_is_no_motion(drive, calm, move, turn_deg):
+def test_a_jump_is_no_motion(begun, drive, calm, move, turn_deg):
     """The solve finds these by itself; what would be wrong is the motion within the sweep."""
     dataset = put(drive, calm, move, turn_deg)
-    result, bare = run(dataset), run(dataset, OFF)
+    result, bare = (ended(one, dataset) for one in begun)
     assert "moved by" in result.updates[AT].message
     assert np.linalg.norm(result.updates[AT].twist) < 2.0
     assert np.linalg.norm(bare.updates[AT].twist) > 4.0
@@ -370,21 +384,19 @@ def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
     assert np.linalg.norm(updates[-1].map_T_lidar.translation() - truth) < 0.15
 
 
-def test_few_matches_twice_in_a_row_start_a_search(calm):
+def test_few_matches_twice_in_a_row_start_a_search(begun, calm):
     """The guess leads away from the map; the sweep is found where the last one was."""
-    pipeline = Pipeline()
-    sweeps = list(calm)
-    for sweep in sweeps[:20]:
-        last = pipeline.process(sweep)
-    mapper = pipeline.mapper
+    (pipeline, updates), sweeps = begun[0], list(calm)
+    was, last, mapper = Before(pipeline), updates[-1], pipeline.mapper
     here = last.map_T_lidar
     far = gtsam.Pose3(here.rotation(), here.translation() + np.array([40.0, 0.0, 0.0]))
     mapper.last = replace(last, map_T_lidar=far)
-    assert pipeline.process(sweeps[20]).status is FrameStatus.FEW_MATCHES
-    found = pipeline.process(sweeps[21])
+    assert pipeline.process(sweeps[AT]).status is FrameStatus.FEW_MATCHES
+    found = pipeline.process(sweeps[AT + 1])
+    was.restore()
     assert found.status.solved
     assert "relocalised after 1 lost sweeps" in found.message
-    away = found.map_T_lidar.translation() - calm.truth.map_T_lidar[21, :3, 3]
+    away = found.map_T_lidar.translation() - calm.truth.map_T_lidar[AT + 1, :3, 3]
     assert np.linalg.norm(away) < 0.1
 
 
@@ -405,11 +417,18 @@ def broken(samples, kind):
     return ImuSamples(samples.stamps, orientation, gyro, force)
 
 
+@pytest.fixture(scope="module")
+def street():
+    """A world that is driven through, and the sweeps."""
+    world = SimulatedWorld("street_loop", frames=24, columns=400, start="moving")
+    return world, list(world)
+
+
 @pytest.mark.parametrize("coupling", ["loose", "tight"])
 @pytest.mark.parametrize("kind", ["nothing", "gyro", "accelerometer", "attitude"])
-def test_an_imu_that_breaks_is_left_out(kind, coupling):
-    world = SimulatedWorld("street_loop", frames=30, columns=600, start="moving")
-    sweeps = ArrayDataset(list(world), imu=broken(world.imu, kind), sensor=world.sensor)
+def test_an_imu_that_breaks_is_left_out(street, kind, coupling):
+    world, scans = street
+    sweeps = ArrayDataset(scans, imu=broken(world.imu, kind), sensor=world.sensor)
     result = run(sweeps, Config().changed({"imu.coupling": coupling}))
     assert all(update.status.solved for update in result.updates[1:])
     truth = world.truth.map_T_lidar

@@ -15,7 +15,7 @@ from loam_gtsam.registration.odometry import Guess
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
 
-FRAMES = 24
+FRAMES = 16
 CLOSE = ("loops.enabled=true", "pose_graph.keyframe_distance=0.2", "loops.min_way=1.0")
 
 
@@ -33,11 +33,10 @@ def wheels(context):
 
 
 class Curious(GtsamSolver):
-    """A solver of a user's own that asks for matches more often than it needs."""
+    """A solver of a user's own that asks for matches once more than it needs."""
 
     def solve(self, associate, guess, priors=(), motion=None):
-        for _ in range(3):
-            associate(guess)
+        associate(guess)
         return super().solve(associate, guess, priors, motion)
 
 
@@ -55,18 +54,20 @@ class Steady:
         pass
 
 
+PREDICTED = "deskew.model=predicted"
+"""What runs beside the mapper does not meet the joint start of its map, half of a short run."""
 MODES = {
     "plain": ((), {}),
     "loose": (("imu.coupling=loose",), {}),
-    "scan to scan": (("odometry.method=scan_to_scan",), {}),
-    "loops": (CLOSE, {}),
+    "scan to scan": (("odometry.method=scan_to_scan", PREDICTED), {}),
+    "loops": ((*CLOSE, PREDICTED), {}),
     "loops, loose": ((*CLOSE, "imu.coupling=loose"), {}),
     "own factors": ((), {"extra_factors": gps}),
     "own factors between sweeps": ((), {"extra_factors": wheels}),
-    "own closer": (CLOSE, {"loop_closer": ScanLoopCloser}),
+    "own closer": ((*CLOSE, PREDICTED), {"loop_closer": ScanLoopCloser}),
     "own solver": ((), {"solver": Curious}),
     "a place that becomes small": (("map.small_below=5.24",), {}),
-    "own odometry": ((), {"odometry": Steady}),
+    "own odometry": ((PREDICTED,), {"odometry": Steady}),
     "classical": (("solver.method=loam", "imu.prior=off"), {}),
 }
 
@@ -116,7 +117,7 @@ def test_a_reset_pipeline_is_a_new_one_and_looking_changes_nothing(make, sweeps)
     """Looking: state by state, in the middle of a run, and in what comes after."""
     expected = outcome(make(), sweeps)
     used = make()
-    for sweep in sweeps[9:17]:
+    for sweep in sweeps[7:15]:
         used.process(sweep)
     used.reset()
 
@@ -142,7 +143,7 @@ def state_of(pipeline):
 @pytest.mark.parametrize("mode", ["plain", "loops, loose", "scan to scan"])
 def test_workers_change_nothing(mode, world):
     config = Config().changed(*MODES[mode][0])
-    here, there = (run(world, config, max_frames=8, workers=count) for count in (0, 1))
+    here, there = (run(world, config, max_frames=5, workers=count) for count in (0, 1))
     assert np.array_equal(here.trajectory.map_T_lidar, there.trajectory.map_T_lidar)
     assert np.array_equal(here.plane_points, there.plane_points)
 
@@ -164,7 +165,7 @@ def test_a_refused_sweep_is_not_remembered(world, sweeps):
     for count, sweep in enumerate(sweeps[:8]):
         updates.append(pipeline.process(sweep))
         if count == 4:
-            ahead = replace(sweeps[20], stamp=sweep.stamp + 3600 * 10**9)
+            ahead = replace(sweeps[15], stamp=sweep.stamp + 3600 * 10**9)
             statuses.append(pipeline.process(ahead).status)
     assert statuses == [FrameStatus.BAD_STAMP]
     poses = np.stack([update.map_T_lidar.matrix() for update in updates])

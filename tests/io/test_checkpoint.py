@@ -76,12 +76,17 @@ def held_near_the_start(context):
 
 LOOPS = Config().changed("loops.enabled=true", "loops.min_way=6", "pose_graph.keyframe_distance=1")
 IMU = Config().changed("imu.lag=5")
+SCANS = Config().changed("odometry.method=scan_to_scan")
 DENSE = Config().changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
 CASES = {
-    "plain": ("street_loop?frames=8", Config(), [1, 2, 5]),
-    "imu in the graph": ("corridor?frames=16", IMU, [3, 11]),
-    "scan to scan": ("trees?frames=6", Config().changed("odometry.method=scan_to_scan"), [4]),
-    "classical": ("room?frames=8", preset("aloam"), [4]),
+    "plain": ("street_loop?frames=8&columns=450", Config(), [1, 2, 5]),
+    "imu in the graph": ("corridor?frames=16&columns=450", IMU, [3, 11]),
+    "scan to scan": (
+        "trees?frames=6&columns=450",
+        Config().changed("odometry.method=scan_to_scan"),
+        [4],
+    ),
+    "classical": ("room?frames=8&columns=400", preset("aloam"), [4]),
     "loops": ("room?frames=60&columns=400&speed=3", LOOPS, [20, 52]),
     "own closer": ("room?frames=40&columns=400&speed=4", DENSE, [12, 33]),
     "own factors": ("room?frames=6&columns=400", Config(), [3]),
@@ -128,7 +133,7 @@ def test_an_own_solver_is_given_again(tmp_path):
 
 
 def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):
-    dataset = open_dataset("sim:room?frames=5")
+    dataset = open_dataset("sim:room?frames=5&columns=300")
     checkpoint = Checkpoint(tmp_path / "checkpoint", seconds=0.0)
     assert_same(run(dataset, checkpoint=checkpoint), run(dataset))
     names = sorted(path.name for path in checkpoint.folder.iterdir())
@@ -141,7 +146,7 @@ def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):
 
 
 def test_without_resume_an_old_checkpoint_goes_but_only_files_of_checkpoints(tmp_path):
-    dataset = open_dataset("sim:room?frames=3")
+    dataset = open_dataset("sim:room?frames=3&columns=300")
     stopped(dataset, Config(), tmp_path / "old", 2)
     (tmp_path / "old" / ".state_0000003.npz.77.tmp").write_text("of a killed process")
     assert len(run(dataset, checkpoint=Checkpoint(tmp_path / "old")).updates) == 3
@@ -162,7 +167,7 @@ def test_without_resume_an_old_checkpoint_goes_but_only_files_of_checkpoints(tmp
 def test_a_file_of_another_with_the_name_of_a_checkpoint_is_left_and_told(name, tmp_path):
     np.savez(tmp_path / name, positions=np.zeros(3))
     with pytest.raises(OutputError, match=f"{name}: the file has the name of a checkpoint's"):
-        run(open_dataset("sim:room?frames=1"), checkpoint=Checkpoint(tmp_path))
+        run(open_dataset("sim:room?frames=1&columns=300"), checkpoint=Checkpoint(tmp_path))
     Checkpoint(tmp_path).remove()
     assert (tmp_path / name).exists()
 
@@ -201,7 +206,9 @@ def test_what_cannot_be_kept_later_costs_checkpoints_but_no_results(end, tmp_pat
 
 
 def test_another_configuration_is_told(tmp_path):
-    dataset, other = (open_dataset(f"sim:{world}?frames=3") for world in ("room", "trees"))
+    dataset, other = (
+        open_dataset(f"sim:{world}?frames=3&columns=300") for world in ("room", "trees")
+    )
     stopped(dataset, Config(), tmp_path, 2)
     with pytest.raises(OutputError, match="another run: its configuration"):
         stopped(dataset, Config().changed("solver.iterations=7"), tmp_path, None)
@@ -211,7 +218,7 @@ def test_another_configuration_is_told(tmp_path):
 
 @pytest.mark.parametrize("keep", [slice(1, None), slice(1)], ids=["other sweeps", "too few"])
 def test_other_sweeps_are_told(keep, tmp_path):
-    scans = list(open_dataset("sim:room?frames=4"))
+    scans = list(open_dataset("sim:room?frames=4&columns=300"))
     folder = tmp_path / "checkpoint"
     stopped(ListDataset(scans), Config(), folder, 2)
     with pytest.raises(DatasetError, match="of the run to go on with"):
@@ -223,7 +230,7 @@ def test_other_sweeps_are_told(keep, tmp_path):
     [("state_*", "cut"), ("state_*", "other"), ("frames_*", "cut"), ("frames_*", "gone")],
 )
 def test_a_damaged_checkpoint_is_told(pattern, damage, tmp_path):
-    dataset = open_dataset("sim:room?frames=3")
+    dataset = open_dataset("sim:room?frames=3&columns=300")
     stopped(dataset, Config(), tmp_path, 2)
     file = next(tmp_path.glob(pattern))
     file.write_bytes(file.read_bytes()[:1000] if damage == "cut" else b"not an archive")
@@ -236,12 +243,14 @@ def test_a_damaged_checkpoint_is_told(pattern, damage, tmp_path):
 def test_a_run_goes_on_without_checkpoints_if_they_cannot_be_written(tmp_path, caplog):
     (tmp_path / "file").write_text("")
     checkpoint = Checkpoint(tmp_path / "file" / "checkpoint", seconds=0.0)
-    assert len(run(open_dataset("sim:room?frames=4"), checkpoint=checkpoint).updates) == 4
+    assert (
+        len(run(open_dataset("sim:room?frames=4&columns=300"), checkpoint=checkpoint).updates) == 4
+    )
     assert caplog.text.count("no checkpoint") == 1
 
 
 def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path):
-    dataset = open_dataset("sim:room?frames=6")
+    dataset = open_dataset("sim:room?frames=6&columns=300")
     frames = []
 
     def interrupting(context):
@@ -259,7 +268,7 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
 
 # -- from the command line ----------------------------------------------------------------------
 
-RUN = ("run", "sim:room?frames=40&columns=900", "--no-plot", "--output")
+RUN = ("run", "sim:room?frames=40&columns=450", "--no-plot", "--output")
 
 
 def arrays(folder):

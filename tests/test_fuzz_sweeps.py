@@ -49,7 +49,7 @@ def test_every_valid_configuration_survives_yaml(config: Config) -> None:
 
 # -- sweeps ----------------------------------------------------------------------------------------
 
-WORLD = SimulatedWorld("room", frames=8, columns=360, sensor="vlp16")
+WORLD = SimulatedWorld("room", frames=8, columns=240, sensor="vlp16")
 SWEEPS = [WORLD[number] for number in range(8)]
 
 

@@ -184,7 +184,7 @@ def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, coupling
     """With a loop closer of one's own, and looked at after every frame."""
     dataset = open_dataset("sim:corridor?frames=16&columns=300&speed=8")
     limits = {"keyframe_distance": 0.1, "follow_distance": 1e-4, "follow_angle_deg": 1e-4}
-    config = settings(**limits).changed({"imu.coupling": coupling})
+    config = settings(**limits).changed({"imu.coupling": coupling, "deskew.model": "predicted"})
     sweeps = list(dataset)
 
     def pipeline():

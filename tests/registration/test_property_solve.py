@@ -180,7 +180,7 @@ of the voxels are 0.2 and 0.4 m long."""
 
 @cache
 def sweeps() -> tuple[Scan, ...]:
-    return tuple(SimulatedWorld("room", frames=5, columns=450, sensor="vlp16"))
+    return tuple(SimulatedWorld("room", frames=4, columns=450, sensor="vlp16"))
 
 
 @cache

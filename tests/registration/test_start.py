@@ -35,7 +35,7 @@ def errors(world, updates):
 
 @pytest.mark.parametrize("speed", [5.0, 20.0, 36.0])
 def test_a_run_may_start_at_any_speed(speed):
-    world, features = features_of("avenue", 12, speed=speed, start="moving")
+    world, features = features_of("avenue", 9, speed=speed, start="moving")
     mapper = Mapper(CONFIG)
     updates = [mapper.register(one) for one in features]
     assert all(update.status.solved for update in updates[1:])

@@ -304,13 +304,14 @@ def test_a_wrong_factory_is_told(name, told):
 
 def test_what_is_off_by_more_than_is_told_is_counted(dataset):
     """The same run, held against a truth that drifts: the fault is in the numbers, not hidden."""
-    good = score(compare_solvers(dataset, [find_contender("gtsam")]).runs[0], dataset.truth)
+    (ours,) = compare_solvers(dataset, [find_contender("gtsam")]).runs
+    good = score(ours, dataset.truth)
     assert good.beyond == 0
     assert 0.05 < good.nees < 5.0
     poses = dataset.truth.map_T_lidar.copy()
     poses[:, 0, 3] += np.linspace(0.0, 2.0, len(poses))
     wrong = Trajectory(dataset.truth.stamps, poses)
-    bad = score(compare_solvers(dataset, [find_contender("gtsam")]).runs[0], wrong)
+    bad = score(ours, wrong)
     assert bad.beyond == FRAMES - 1
     assert bad.nees > 100.0
     assert bad.start_m > 1.5 * bad.ate_m

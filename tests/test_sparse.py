@@ -16,7 +16,7 @@ def alone(**changes):
 
 @pytest.mark.parametrize(("wide", "degenerate"), [(1.0, 0), (4.0, 11)])
 def test_the_rings_of_one_sweep_on_open_ground_are_enough_with_a_wide_search(wide, degenerate):
-    world = SimulatedWorld("open_field", frames=12)
+    world = SimulatedWorld("open_field", frames=12, columns=900)
     result = run(world, alone(wide_search=wide))
     found = [update.status is FrameStatus.DEGENERATE for update in result.updates]
     assert sum(found) == degenerate == sum(update.status.solved for update in result.updates)
@@ -27,7 +27,7 @@ def test_the_rings_of_one_sweep_on_open_ground_are_enough_with_a_wide_search(wid
 
 
 def test_a_way_between_poles_on_rough_ground_holds():
-    world = SimulatedWorld("sparse_terrain", frames=80)
+    world = SimulatedWorld("sparse_terrain", frames=60, columns=900)
     result = run(world, alone())
     error = absolute_error(result.trajectory, world.truth)
     assert error.rmse < 0.03

@@ -25,7 +25,8 @@ def empty_folder(tmp_path, monkeypatch):
 
 
 def mapped(*arguments, code=0, folder="out"):
-    result = loam("run", WORLD, "--no-plot", "--output", folder, *arguments)
+    quick = "--set", "deskew.model=predicted"  # no sweep is mapped anew with those that follow
+    result = loam("run", WORLD, "--no-plot", "--output", folder, *quick, *arguments)
     assert result.exit_code == code, result.output
     return result.output
 

@@ -355,13 +355,13 @@ def test_forgotten_samples_are_left_out_and_taken_again_after_the_clock_was_set_
 
 
 def test_a_day_of_samples_takes_no_more_memory_than_an_hour():
-    """At 20 Hz, a minute at a time, with a gap, repeats and late ones; through the filter."""
+    """At 10 Hz, a minute at a time, with a gap, repeats and late ones; through the filter."""
     config = ImuConfig()
     buffer, rng, sizes = ImuBuffer(config), np.random.default_rng(0), []
-    count, minute = 1200, 60 * 10**9
+    count, minute = 600, 60 * 10**9
     for number in range(24 * 60):
-        stamps = number * minute + np.arange(count, dtype=np.int64) * 50_000_000
-        stamps = np.concatenate([stamps[:600], stamps[610:], stamps[5:9], stamps[:3] - 2 * minute])
+        stamps = number * minute + np.arange(count, dtype=np.int64) * 100_000_000
+        stamps = np.concatenate([stamps[:300], stamps[310:], stamps[5:9], stamps[:3] - 2 * minute])
         gyro, noise = rng.normal(0.0, 0.1, (2, len(stamps), 3))
         buffer.add(ImuSamples(stamps, None, gyro, 5.66 + noise))
         newest = (number + 1) * minute
@@ -371,4 +371,4 @@ def test_a_day_of_samples_takes_no_more_memory_than_an_hour():
             frozen = freeze({"buffer": buffer}, {"config": config})
             sizes.append(sum(part.nbytes for part in frozen.values()))
     assert max(sizes[1:]) < 1.2 * sizes[0]
-    assert buffer.report.samples > 24 * 60 * 1000
+    assert buffer.report.samples > 24 * 60 * 500

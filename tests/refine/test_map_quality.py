@@ -7,7 +7,7 @@ from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.types import InputError
 
 
-def _wall(scatter, count=20_000, seed=0):
+def _wall(scatter, count=8_000, seed=0):
     rng = np.random.default_rng(seed)
     points = rng.uniform([0.0, 0.25, 0.0], [5.0, 0.25, 3.0], (count, 3))
     points[:, 1] += scatter * rng.normal(size=count)

@@ -459,7 +459,7 @@ def test_matches_are_believed_up_to_the_error_of_one_side_of_the_sensor():
 
 
 def test_where_it_shakes_a_solved_motion_halves_the_error():
-    world = SimulatedWorld("shaken", frames=50, columns=450)
+    world = SimulatedWorld("shaken", frames=35, columns=450)
 
     def error(model):
         result = run(world, Config().changed({"deskew.model": model, "imu.coupling": "off"}))

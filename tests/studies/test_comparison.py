@@ -44,11 +44,13 @@ from loam_gtsam.types import (
 )
 
 FRAMES = 6
+QUICK = Config().changed("deskew.model=predicted")
+"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def find_contender(name):
-    """A solver in the default configuration, or a peer."""
-    return make_contender(Group.PEER if name in PEERS else Group.SOLVER, name, Config())
+    """A solver that starts quickly, or a peer."""
+    return make_contender(Group.PEER if name in PEERS else Group.SOLVER, name, QUICK)
 
 
 def poses(run_or_result):
@@ -56,7 +58,7 @@ def poses(run_or_result):
 
 
 def test_our_solver_gives_what_run_gives(dataset):
-    alone = run(dataset, Config())
+    alone = run(dataset, QUICK)
     result = compare_solvers(dataset, [find_contender("gtsam")])
     np.testing.assert_array_equal(poses(result.runs[0]), poses(alone))
     assert result.runs[0].map_points == len(alone.edge_points) + len(alone.plane_points)
@@ -90,7 +92,7 @@ def test_features_are_extracted_once_for_all(dataset, monkeypatch):
     calls = []
     real = contenders.extract
     monkeypatch.setattr(contenders, "extract", lambda *a: (calls.append(a), real(*a))[1])
-    result = compare_solvers(dataset, [Contender(n, Config()) for n in ("one", "two")])
+    result = compare_solvers(dataset, [Contender(n, QUICK) for n in ("one", "two")])
     assert len(calls) == FRAMES
     np.testing.assert_array_equal(poses(result.runs[0]), poses(result.runs[1]))
     differences = frame_differences(result)
@@ -100,8 +102,8 @@ def test_features_are_extracted_once_for_all(dataset, monkeypatch):
 
 
 def test_shared_guess_gives_all_the_guesses_of_the_first(dataset):
-    other = config_from_dict({"odometry": {"method": "scan_to_scan"}})
-    contenders = [Contender("velocity", Config()), Contender("scan", other)]
+    other = QUICK.changed("odometry.method=scan_to_scan")
+    contenders = [Contender("velocity", QUICK), Contender("scan", other)]
     own, shared = (
         poses(compare_solvers(dataset, contenders, shared_guess=flag).runs[1])
         for flag in (False, True)
@@ -202,7 +204,7 @@ def test_relative_errors_of_all_are_over_the_same_lengths():
 
 
 def test_recorded_features_are_for_ours_only(sweeps, fake):
-    config = Config()
+    config = QUICK
     odometry = [gtsam.Pose3(gtsam.Rot3(), [0.1 * number, 0.0, 0.0]) for number in range(3)]
     features = [extract_features(scan, config) for scan in sweeps[:3]]
     data = Sweeps(list(map(FeatureSweep, features, odometry)))
@@ -245,14 +247,14 @@ class Recorder:
 @pytest.mark.parametrize("shared_guess", [False, True])
 def test_a_user_s_own_solver_is_compared_with_the_others(dataset, shared_guess):
     own = Recorder()
-    pair = [find_contender("gtsam"), Contender("own", Config(), parts={"solver": own})]
+    pair = [find_contender("gtsam"), Contender("own", QUICK, parts={"solver": own})]
     result = compare_solvers(dataset, pair, shared_guess=shared_guess)
     assert own.calls >= FRAMES - 1
     np.testing.assert_allclose(poses(result.runs[1]), poses(result.runs[0]), atol=1e-9)
 
 
 def test_loops_are_closed_in_a_comparison_as_in_a_run(dataset):
-    config = Config().changed("loops.enabled=true")
+    config = QUICK.changed("loops.enabled=true")
     found = compare_solvers(dataset, [Contender("loops", config)]).runs[0]
     np.testing.assert_array_equal(poses(found), poses(run(dataset, config)))
     assert "loops" in found.updates[-1].timings
@@ -271,7 +273,7 @@ def test_own_parts_by_name_give_what_the_package_gives(dataset):
     chosen = [
         find_contender("gtsam"),
         find_contender(f"{__name__}:make_recorder"),
-        make_contender(Group.FEATURES, f"{__name__}:make_front_end", Config()),
+        make_contender(Group.FEATURES, f"{__name__}:make_front_end", QUICK),
     ]
     result = compare_solvers(dataset, chosen)
     assert [entry.name for entry in result.runs] == ["gtsam", "make_recorder", "make_front_end"]

@@ -87,8 +87,8 @@ CASES = {
         [4],
     ),
     "classical": ("room?frames=8&columns=400", preset("aloam"), [4]),
-    "loops": ("room?frames=60&columns=400&speed=3", LOOPS, [20, 52]),
-    "own closer": ("room?frames=40&columns=400&speed=4", DENSE, [12, 33]),
+    "loops": ("room?frames=60&columns=300&speed=3", LOOPS, [20, 52]),
+    "own closer": ("room?frames=40&columns=300&speed=4", DENSE, [12, 33]),
     "own factors": ("room?frames=6&columns=400", Config(), [3]),
     "workers": ("room?frames=8&columns=400", Config(), [4]),
 }

@@ -11,10 +11,10 @@ import pytest
 
 from loam_gtsam import Mapper
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration import start
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.matches import ChosenRows
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
@@ -99,25 +99,74 @@ def test_a_platform_at_rest_stays_where_it_is(scene, options):
     assert errors(world, updates).max() < 0.1
 
 
+def orchard(seed):
+    """Rows of trees 4 m apart, one every 1.6 m, no two alike."""
+    rng = np.random.default_rng(seed)
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(-40, 60, 1.6), np.arange(-10, 11, 4)))
+    x, y = x + rng.normal(0.0, 0.15, len(x)), y + rng.normal(0.0, 0.1, len(x))
+    sizes, flat = rng.uniform(0.7, 1.2, len(x)), np.zeros(len(x))
+    trunks = np.stack([x, y, rng.uniform(0.05, 0.15, len(x)), flat - 1.0, flat + 1.8], axis=1)
+    crowns = np.stack([x, y, flat + 2.1, sizes, sizes, 0.9 * sizes], axis=1)
+    solids = Solids(cylinders=trunks, ellipsoids=crowns, foliage=np.ones(len(x), np.bool_))
+    way = np.stack([np.arange(0.0, 48.0, 8.0), np.zeros(6)], axis=1)
+    return Scene("orchard", solids, way, speed=1.5, height=1.2)
+
+
+@pytest.mark.parametrize(("start_", "columns"), [("rest", 360), ("rest", 512), ("moving", 720)])
+def test_among_things_that_repeat_a_run_does_not_begin_one_of_them_a_sweep_off(start_, columns):
+    options = {"sensor": "os1-32", "columns": columns, "start": start_, "seed": 1}
+    world, features = features_of(orchard(1), 3, **options)
+    mapper = Mapper(CONFIG)
+    assert errors(world, [mapper.register(one) for one in features]).max() < 0.1
+
+
+UP, AHEAD, ASIDE = np.eye(3)[[2, 0, 1]]
+
+
+def place(at, lines, planes, normal):
+    """A motion that was tried: what upright lines and planes with a normal say of it."""
+    evidence = np.concatenate([lines, planes]).astype(float)
+    points = np.random.default_rng(0).uniform(-9.0, 9.0, (len(evidence), 3)) + at
+    axes = np.concatenate([np.tile(UP, (len(lines), 1)), np.tile(normal, (len(planes), 1))])
+    return start._Tried(len(lines), points, evidence, axes, [], None)
+
+
 @pytest.mark.parametrize(
-    ("sigma", "way", "apart"),
-    [(0.05, [3.0, 0.0, 0.0], True), (0.55, [3.0, 0.0, 0.0], False), (0.55, [0.0, 3.0, 0.0], True)],
+    ("lines", "planes", "normal", "better"),
+    [
+        (0, 300, UP, False),  # ground agrees at any place
+        (0, 300, ASIDE, False),  # so do walls along the way
+        (0, 300, AHEAD, True),
+        (20, -100, UP, True),  # what stands on the ground decides
+        (20, -100, AHEAD, False),  # what lies across the way contradicts the lines
+        (4, 4, AHEAD, False),  # chance
+        (-300, 300, AHEAD, False),
+    ],
 )
-def test_lines_that_are_found_at_any_place_do_not_tell_two_places_apart(sigma, way, apart):
-    """Walls at both sides and the ground leave the way ahead to twelve poles."""
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-9.0, 9.0, (120, 3))
-    normals = np.eye(3)[1 + np.arange(120) % 2]
-    ones, none = np.ones(120), np.zeros(120)
-    planes = PlaneMatches(points, normals, none, none, 0.05 * ones, ones, np.arange(120), none)
-    poles, up = points[:12], np.tile([0.0, 0.0, 1.0], (12, 1))
-    lines = EdgeMatches(
-        poles, poles, up, none[:12], np.full(12, sigma), ones[:12], np.arange(12), none[:12]
-    )
-    here = SimpleNamespace(map_T_lidar=gtsam.Pose3(), matches=ScanMatches(lines, planes), weak=None)
-    there = SimpleNamespace(map_T_lidar=gtsam.Pose3(gtsam.Rot3(), np.array(way)))
-    tried, best = (SimpleNamespace(solution=solution) for solution in (here, there))
-    assert start._told_apart(tried, best, CONFIG) == apart
+def test_a_place_is_better_if_more_lies_for_it_across_the_way_there(lines, planes, normal, better):
+    """So many more lines and planes agree at a place 3 m ahead than here."""
+
+    def agreeing(more):
+        return np.repeat([0, 1], [500 - abs(more), abs(more)]) * (more > 0)
+
+    there = place(3.0 * AHEAD, agreeing(lines), agreeing(planes), normal)
+    here = place(0.0 * AHEAD, agreeing(-lines), agreeing(-planes), normal)
+    assert start._better(there, here) == better
+
+
+@pytest.mark.parametrize(("against", "better"), [(0, True), (30, False)])
+def test_one_feature_that_contradicts_outweighs_some_that_agree(against, better):
+    say = np.concatenate([np.ones(60), np.full(against, -start._AGAINST), np.zeros(100)])
+    there = place(3.0 * AHEAD, [], say, AHEAD)
+    assert start._better(there, place(0.0 * AHEAD, [], 0.0 * say, AHEAD)) == better
+    assert not start._better(there, there)
+
+
+def test_a_place_that_is_not_solved_has_no_evidence_and_is_no_better():
+    rows = ChosenRows(np.arange(3), np.arange(4), None)
+    evidence, axes = start._evidence(rows, SimpleNamespace(solved=False))
+    assert not evidence.any()
+    assert not axes.any()
 
 
 def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):

@@ -313,7 +313,8 @@ def _better(tried: _Tried, best: _Tried) -> bool:
 
     A feature counts as far as its line or plane lies across the way from one place to the other:
     ground and walls along the way agree at both, but for chance. Lines and planes are two tests,
-    each against its own chance, which count alike (Stouffer's method).
+    each against its own chance, which count alike (Stouffer's method); neither may speak against
+    the place. At rest few lines are found: next to a point lie those of its own ring.
     """
     way = tried.points - best.points
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _TINY)
@@ -322,4 +323,4 @@ def _better(tried: _Tried, best: _Tried) -> bool:
     across[: tried.edges] = np.sqrt(np.maximum(1.0 - across[: tried.edges] ** 2, 0.0))
     gains = np.split(across * (tried.evidence - best.evidence), [tried.edges])
     scores = [gain.sum() / max(float(np.linalg.norm(gain)), _TINY) for gain in gains]
-    return bool(sum(scores) > _CHANCE * np.sqrt(len(scores)))
+    return bool(sum(scores) > _CHANCE * np.sqrt(len(scores)) and min(scores) > -_CHANCE)

@@ -112,10 +112,14 @@ def orchard(seed):
     return Scene("orchard", solids, way, speed=1.5, height=1.2)
 
 
-@pytest.mark.parametrize(("start_", "columns"), [("rest", 360), ("rest", 512), ("moving", 720)])
-def test_among_things_that_repeat_a_run_does_not_begin_one_of_them_a_sweep_off(start_, columns):
-    options = {"sensor": "os1-32", "columns": columns, "start": start_, "seed": 1}
-    world, features = features_of(orchard(1), 3, **options)
+@pytest.mark.parametrize(
+    ("seed", "columns", "begin"), [(0, 720, "rest"), (3, 512, "rest"), (2, 512, "moving")]
+)
+def test_among_things_that_repeat_a_run_does_not_begin_some_of_them_a_sweep_off(
+    seed, columns, begin
+):
+    options = {"sensor": "os1-32", "columns": columns, "start": begin, "seed": seed}
+    world, features = features_of(orchard(seed), 3, **options)
     mapper = Mapper(CONFIG)
     assert errors(world, [mapper.register(one) for one in features]).max() < 0.1
 
@@ -141,6 +145,8 @@ def place(at, lines, planes, normal):
         (20, -100, AHEAD, False),  # what lies across the way contradicts the lines
         (4, 4, AHEAD, False),  # chance
         (-300, 300, AHEAD, False),
+        (100, -12, AHEAD, False),  # planes speak clearly against it
+        (100, -6, AHEAD, True),
     ],
 )
 def test_a_place_is_better_if_more_lies_for_it_across_the_way_there(lines, planes, normal, better):

@@ -36,8 +36,8 @@ _ROUNDS = 2  # times that each of them is then registered with the map of the ot
 _PLACES = 6  # motions between the first two sweeps that are tried beside the expected one
 _AGAINST = 5.0
 """Number of features that agree which one outweighs that contradicts. At the right place 3 of 1000
-matches contradict by noise, at a wrong one ten times as many (medians of 315 starts, of which 12
-go wrong with any number from 3 to 7)."""
+matches contradict by noise, at a wrong one ten times as many (medians of 315 starts, of which 10
+go wrong, and at most 14 with any number from 3 to 10)."""
 _TINY = 1e-9
 _HOPEFUL = 0.5
 """Part of the best place's share, by few matches, below which a place is not looked at closer."""
@@ -139,7 +139,7 @@ class Start:
             if number == 0 or tried.share >= enough
         )
         for tried in others:
-            if _better(tried, best):
+            if _better(tried, best, frame.matcher.config.solver.min_aligned):
                 best = tried
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
@@ -208,7 +208,7 @@ class Start:
             )
             for pose in (second, place)
         )
-        if not _better(tried, best):
+        if not _better(tried, best, frame.matcher.config.solver.min_aligned):
             return sweeps
         moved = tried.solution.map_T_lidar
         last = replace(sweeps[2], map_T_middle=moved.compose(second.between(third)))
@@ -308,19 +308,22 @@ def _evidence(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatAr
     return evidence, axes
 
 
-def _better(tried: _Tried, best: _Tried) -> bool:
+def _better(tried: _Tried, best: _Tried, least: float) -> bool:
     """Whether one place is better than another by more than chance.
 
     A feature counts as far as its line or plane lies across the way from one place to the other:
-    ground and walls along the way agree at both, but for chance. Lines and planes are two tests,
-    each against its own chance, which count alike (Stouffer's method); neither may speak against
-    the place. At rest few lines are found: next to a point lie those of its own ring.
+    ground and walls along the way agree at both, but for chance. Neither lines nor planes may speak
+    against the place: at rest few lines are found, for next to a point lie those of its own ring.
+    ``least`` is the number of features at least, counted as if they lay across.
     """
     way = tried.points - best.points
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _TINY)
     axes = np.where(tried.axes.any(axis=1, keepdims=True), tried.axes, best.axes)
     across = np.abs(np.einsum("ij,ij->i", axes, way))
     across[: tried.edges] = np.sqrt(np.maximum(1.0 - across[: tried.edges] ** 2, 0.0))
-    gains = np.split(across * (tried.evidence - best.evidence), [tried.edges])
-    scores = [gain.sum() / max(float(np.linalg.norm(gain)), _TINY) for gain in gains]
-    return bool(sum(scores) > _CHANCE * np.sqrt(len(scores)) and min(scores) > -_CHANCE)
+    gain = across * (tried.evidence - best.evidence)
+    every, lines, planes = (
+        float(part.sum() / max(np.linalg.norm(part), _TINY))
+        for part in (gain, gain[: tried.edges], gain[tried.edges :])
+    )
+    return every > _CHANCE and min(lines, planes) > -_CHANCE and bool(across @ gain > least)

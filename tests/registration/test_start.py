@@ -157,15 +157,22 @@ def test_a_place_is_better_if_more_lies_for_it_across_the_way_there(lines, plane
 
     there = place(3.0 * AHEAD, agreeing(lines), agreeing(planes), normal)
     here = place(0.0 * AHEAD, agreeing(-lines), agreeing(-planes), normal)
-    assert start._better(there, here) == better
+    assert start._better(there, here, 8.0) == better
 
 
 @pytest.mark.parametrize(("against", "better"), [(0, True), (30, False)])
 def test_one_feature_that_contradicts_outweighs_some_that_agree(against, better):
     say = np.concatenate([np.ones(60), np.full(against, -start._AGAINST), np.zeros(100)])
     there = place(3.0 * AHEAD, [], say, AHEAD)
-    assert start._better(there, place(0.0 * AHEAD, [], 0.0 * say, AHEAD)) == better
-    assert not start._better(there, there)
+    assert start._better(there, place(0.0 * AHEAD, [], 0.0 * say, AHEAD), 8.0) == better
+    assert not start._better(there, there, 8.0)
+
+
+def test_many_features_that_hardly_lie_across_the_way_are_not_enough():
+    leaning = np.array([0.02, 0.0, 1.0])
+    here, there = (place(x * AHEAD, [], np.full(600, x > 0.0), leaning) for x in (0.0, 3.0))
+    assert not start._better(there, here, 8.0)
+    assert start._better(there, here, 0.1)
 
 
 def test_a_place_that_is_not_solved_has_no_evidence_and_is_no_better():

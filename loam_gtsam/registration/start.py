@@ -111,8 +111,7 @@ class Start:
 
         The places where the second sweep may have been taken are tried, each with both sweeps
         de-skewed for the motion that leads there. Another place than the expected one is chosen if
-        more features agree there, and if the scan tells the two places apart. Open ground agrees
-        everywhere: among places at which as many agree, what stands on it decides.
+        more of the features that tell the two apart are for it than by chance.
         """
         if len(self._sweeps) > 1:
             return expected

@@ -272,12 +272,11 @@ def _assemble(
         flat = np.arange(len(flat))
     points, plane_times, plane_rings = planes
     stands_out = prominence(sweep.xyz, settings.half_window, edges)
-    edge_points = measured(edges)[0]
     if settings.edge_reach > 0.0:
-        drop = math.sqrt(settings.occlusion_gap)
-        edge_points = ends_of_surfaces(
-            sweep.xyz, settings.half_window, edges, drop, settings.edge_reach
-        )
+        drop, beams = math.sqrt(settings.occlusion_gap), settings.edge_reach
+        edge_points = ends_of_surfaces(sweep.xyz, settings.half_window, edges, drop, beams)
+    else:
+        edge_points = measured(edges)[0]
     with_poles = np.concatenate((edges, poles.middles))
     return Features(
         stamp=scan.stamp + round(reference * 1e9),

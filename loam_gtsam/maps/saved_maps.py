@@ -105,10 +105,13 @@ class SavedMaps(MapPair):
         map_T_middle: gtsam.Pose3,
         keyframe: int,
         matches: ScanMatches | None = None,
+        *,
+        on_trial: bool = False,
     ) -> None:
         """Add a sweep, if the map grows."""
         if self.grows:
-            super().insert(posed, map_T_middle, self.owners[keyframe], matches)
+            owner = self.owners[keyframe]
+            super().insert(posed, map_T_middle, owner, matches, on_trial=on_trial)
 
     def move(self, *_: object) -> int:
         """Nothing: the map stays where it is."""

@@ -109,21 +109,20 @@ class MapPair:
         map_T_middle: gtsam.Pose3,
         keyframe: int,
         matches: ScanMatches | None = None,
+        *,
+        on_trial: bool = False,
     ) -> None:
-        """Add a sweep, by its last matches if there are any; its points belong to a keyframe."""
+        """Add a sweep, by its last matches if there are any; its points belong to a keyframe.
+
+        If it is ``on_trial``, only to the maps in use, which are then no maps to keep.
+        """
         edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
         faces = None if matches is None else matches.faces
-        for edge_map, plane_map in (self._open, self._small)[: 1 + self.small]:
+        kept = (self._open, self._small)[: 1 + self.small]
+        for edge_map, plane_map in kept[-1:] if on_trial else kept:
             edge_map.owner = plane_map.owner = keyframe
             edge_map.insert(edges)  # which has no side: a corner shows from both
             plane_map.insert(planes, map_T_middle.translation(), faces)
-        self._thinned = None
-
-    def insert_on_trial(self, posed: PosedSweep, map_T_middle: gtsam.Pose3) -> None:
-        """Add a sweep to the maps in use only, which are then no map to keep."""
-        edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
-        self.edges.insert(edges)
-        self.planes.insert(planes, map_T_middle.translation())
         self._thinned = None
 
     def too_sparse(self, predicted: Prediction, config: Config) -> str:

@@ -20,9 +20,9 @@ from loam_gtsam.registration.matches import ScanMatches, spread_rows
 from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
-from loam_gtsam.types import FloatArray, FrameStatus, IntArray, MapUpdate
+from loam_gtsam.types import BoolArray, FloatArray, FrameStatus, IntArray, MapUpdate
 
-AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
+_AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
 _CELL = 0.5  # metres: half the reach of a match, which is then the neighbouring cell
 _SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
 _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than a cell
@@ -47,15 +47,21 @@ class Fit:
         """The fit of matches, from the number of features that were offered for matching."""
         if not len(matches):
             return cls(0.0, 0.0)
-        edges, planes = matches.edges, matches.planes
-        agree = np.count_nonzero(edges.distances < AGREE * edges.sigmas)
-        agree += np.count_nonzero(np.abs(planes.distances) < AGREE * planes.sigmas)
+        agree = sum(int(np.count_nonzero(mask)) for mask in agreeing(matches))
         return cls(len(matches) / max(offered, 1), agree / len(matches))
 
     @property
     def total(self) -> float:
         """Share of the features whose matches agree."""
         return self.share * self.agreement
+
+
+def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
+    """Masks of the line and of the plane matches within three of their standard deviations."""
+    edges, planes = matches.edges, matches.planes
+    lines: BoolArray = edges.distances < _AGREE * edges.sigmas
+    surfaces: BoolArray = np.abs(planes.distances) < _AGREE * planes.sigmas
+    return lines, surfaces
 
 
 def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:

@@ -20,9 +20,9 @@ from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.matches import ChosenRows
 from loam_gtsam.registration.odometry import Moment, Prediction
 from loam_gtsam.registration.relocalization import (
-    AGREE,
     APART,
     Found,
+    agreeing,
     likely_poses,
     same,
     sample_features,
@@ -276,10 +276,7 @@ class Start:
         maps.clear()
         maps.recenter(self._map_T_first)
         for sweep in sweeps:
-            if on_trial:
-                maps.insert_on_trial(sweep.posed, sweep.map_T_middle)
-            else:
-                maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
+            maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe, on_trial=on_trial)
 
 
 def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
@@ -298,11 +295,8 @@ def _evidence(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatAr
         edges, planes = solution.matches.edges, solution.matches.planes
         lines = np.searchsorted(rows.edges, edges.indices)
         others = len(rows.edges) + np.searchsorted(rows.planes, planes.indices)
-        for places, distances, found in (
-            (lines, edges.distances, edges),
-            (others, np.abs(planes.distances), planes),
-        ):
-            evidence[places] = np.where(distances < AGREE * found.sigmas, 1.0, -_AGAINST)
+        for places, agree in zip((lines, others), agreeing(solution.matches), strict=True):
+            evidence[places] = np.where(agree, 1.0, -_AGAINST)
         axes[lines], axes[others] = edges.directions, planes.normals
     return evidence, axes
 

@@ -151,12 +151,13 @@ class PoseErrors:
         scan: ScanError | None,
         last: Moment | None,
         fused: Fused | None = None,
+        doubt: FloatArray | None = None,
     ) -> MapUpdate:
         """The update of a solved frame with its covariance; to be called after :meth:`of_scan`.
 
         The sweep has the motion of the solution, which is at its middle; ``last`` is the middle of
         the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
-        and IMU together.
+        and IMU together; ``doubt`` is a further covariance (6, 6) of this pose alone, map frame.
         """
         first = self._scans == 1
         if scan is None:
@@ -180,6 +181,8 @@ class PoseErrors:
         to_middle = middle.between(update.map_T_lidar).AdjointMap()
         by_scan = to_reference @ (np.eye(6) - scan.user) @ to_middle
         drifted = by_scan @ from_map
+        if doubt is not None:
+            own = own + drifted @ doubt @ drifted.T
         uncertainty = Uncertainty(
             own=own,
             shared=shared,
@@ -219,7 +222,11 @@ class PoseErrors:
         """
         if not same(expected, found):
             in_map = found.AdjointMap() * expected.localCoordinates(found)
-            self._drift = self._drift + 0.5 * in_map @ in_map.T
+            self.allow(0.5 * in_map @ in_map.T)
+
+    def allow(self, doubt: FloatArray) -> None:
+        """Account from now on for an error with this covariance (6, 6), map frame."""
+        self._drift = self._drift + doubt
 
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""

@@ -29,6 +29,7 @@ _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than 
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
+_EACH = 5  # of the trial poses, from which the chance that a point hits is told
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
@@ -370,11 +371,16 @@ def _scores(
     metres = _SPACING * _CELL * np.column_stack([ahead, aside])
     most = int(np.ceil(min(most_turn, np.pi) / _TURN))
     turns = _TURN * np.arange(-most, most + (most_turn < np.pi))
+    bases = [
+        np.ravel_multi_index(tuple(_cells(level @ gtsam.Rot3.Yaw(turn).matrix().T, shape).T), shape)
+        for turn in turns.tolist()
+    ]
+    few = shifts[:: _EACH, None]
+    chance = np.mean([field[base + few].mean(axis=0) for base in bases], axis=0) / 2.0
+    told = -np.log(np.maximum(chance, 1.0 / (len(few) * len(bases)))).astype(np.float32)
     scores = np.empty((len(turns), len(shifts)))
-    for row, turn in zip(scores, turns.tolist(), strict=True):
-        turned = level @ gtsam.Rot3.Yaw(turn).matrix().T
-        base = np.ravel_multi_index(tuple(_cells(turned, shape).T), shape)
-        row[:] = field[base + shifts[:, None]].sum(axis=1, dtype=np.int64)
+    for row, base in zip(scores, bases, strict=True):
+        row[:] = field[base + shifts[:, None]] @ told
     moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(shifts))])
     return scores.ravel(), moves
 

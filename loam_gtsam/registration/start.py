@@ -14,6 +14,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
+from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
@@ -28,7 +29,7 @@ from loam_gtsam.registration.relocalization import (
     sample_features,
 )
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import BoolArray, FloatArray
 
 _TOGETHER = (2, 3, 5, 8)
 """Numbers of sweeps at which all are registered anew: each time half as many more or so."""
@@ -73,13 +74,13 @@ class EarlySweep:
 
 
 class _Tried(NamedTuple):
-    """A first motion that was tried."""
+    """A sweep, registered with the map of those before it."""
 
     edges: int  # number of edges, which come first among the features that may be matched
     points: FloatArray  # (F, 3) where these are in the map
     evidence: FloatArray  # (F,) what each says of the motion, see :func:`_evidence`
     axes: FloatArray  # (F, 3) of their lines and planes
-    sweeps: list[EarlySweep]
+    sweeps: list[EarlySweep]  # it and those before it
     solution: Solution
 
     @property
@@ -88,12 +89,18 @@ class _Tried(NamedTuple):
         return float(np.count_nonzero(self.evidence > 0.0)) / max(len(self.evidence), 1)
 
 
+_Way = tuple[_Tried, ...]
+"""A first motion and where it led: the sweeps after the first, one after the other."""
+
+
 class Start:
     """The first sweeps of a run; the pose of the very first at its reference time never changes."""
 
     def __init__(self, first: Prediction, keyframe: int) -> None:
         self._map_T_first = first.map_T_lidar
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, True, first.motion, keyframe)]
+        self._ways: list[_Way] = []
+        """The way that the sweeps took, and those that explain them as well, but for chance."""
 
     @classmethod
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
@@ -132,17 +139,43 @@ class Start:
             self._tried(frame, place, solver) for place in (expected.solution.map_T_lidar, *places)
         ]
         enough = _HOPEFUL * max(tried.share for tried in quick)
-        best, *others = (
-            self._registered(frame, self._with_motion(tried.sweeps), solver)
-            for number, tried in enumerate(quick)
-            if number == 0 or tried.share >= enough
+        self._choose(
+            [
+                (self._registered(frame, self._with_motion(tried.sweeps), solver),)
+                for number, tried in enumerate(quick)
+                if number == 0 or tried.share >= enough
+            ],
+            frame.matcher.config,
         )
-        for tried in others:
-            if _better(tried, best, frame.matcher.config.solver.min_aligned):
-                best = tried
+        best = self._ways[0][0]
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
         return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
+
+    def _choose(self, ways: list[_Way], config: Config) -> None:
+        """Keep the best of some ways, and those that it is not better than by more than chance."""
+        least, near = config.solver.min_aligned, config.map.plane_voxel
+        best, *others = ways
+        for way in others:
+            if _better(way, best, least):
+                best = way
+        self._ways = [best]
+        for way in ways:
+            apart = all(_apart(way, kept, near) for kept in self._ways)
+            if apart and not _better(best, way, least):
+                self._ways.append(way)
+
+    def doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
+        """Covariance (6, 6) of a pose, map frame, for other first motions that are as likely.
+
+        Among several places, one of which is right, the mean squared error of any of them.
+        """
+        total = np.zeros((6, 6))
+        for way in self._ways[1:]:
+            place = _continued(way[-1].sweeps, stamp)
+            step = map_T_lidar.AdjointMap() @ map_T_lidar.localCoordinates(place)
+            total += np.outer(step, step) / len(self._ways)
+        return total
 
     def add(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
@@ -162,17 +195,8 @@ class Start:
         if len(sweeps) not in _TOGETHER:
             self._sweeps = sweeps
             return frame, found
-        if len(sweeps) == 3:
-            sweeps = self._as_the_second_step(frame, sweeps, solver)
-        for _ in range(_ROUNDS):
-            sweeps = self._with_motion(sweeps)
-            for number, sweep in enumerate(sweeps):
-                if sweep.held and sweep.posed.sweep is not frame.sweep:
-                    continue
-                solution = self._solved(frame, sweep, self._matcher(frame, sweeps, number), solver)
-                if solution.solved:
-                    sweeps[number] = replace(sweeps[number], map_T_middle=solution.map_T_lidar)
-        sweeps = self._with_motion(sweeps)
+        sweeps = self._together(frame, sweeps, solver, _ROUNDS)
+        sweeps = self._with_motion(self._told_apart(frame, sweeps, solver))
         matcher = self._matcher(frame, sweeps, len(sweeps) - 1, to_keep=True)
         solution = self._solved(frame, sweeps[-1], matcher, solver)
         if not solution.solved:
@@ -186,32 +210,64 @@ class Start:
         )
         return frame, replace(found, solution=solution, twist=frame.twist_of(solution))
 
-    def _as_the_second_step(
+    def _together(
+        self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver, rounds: int
+    ) -> list[EarlySweep]:
+        """The sweeps, each registered with the map of all the others, so many times."""
+        for _ in range(rounds):
+            sweeps = self._with_motion(sweeps)
+            for number, sweep in enumerate(sweeps):
+                if sweep.held and sweep.posed.sweep is not frame.sweep:
+                    continue
+                solution = self._solved(frame, sweep, self._matcher(frame, sweeps, number), solver)
+                if solution.solved:
+                    sweeps[number] = replace(sweeps[number], map_T_middle=solution.map_T_lidar)
+        return sweeps
+
+    def _told_apart(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
     ) -> list[EarlySweep]:
-        """The sweeps with another first motion, if that of the second step leads to a better place.
+        """The sweeps on the way that explains them best, of all that began as well.
 
-        The first one was searched for on a grid, with two sweeps that may see little of each other.
+        With the third sweep there is one more way, that of the second step: the first motion was
+        searched for on a grid, with two sweeps that may see little of each other.
         """
-        first, second, third = (sweep.map_T_middle for sweep in sweeps)
-        early, late = (sweeps[k].moment.seconds_to(sweeps[k + 1].posed.sweep.stamp) for k in (0, 1))
-        step = gtsam.Pose3.Logmap(second.between(third)) * (early / late)
-        place = first.compose(gtsam.Pose3.Expmap(step))
-        if sweeps[1].held or sweeps[2].held or same(place, second):
+        if len(sweeps) == 2:
             return sweeps
-        best, tried = (
-            self._registered(
-                frame,
-                self._with_motion([sweeps[0], replace(sweeps[1], map_T_middle=pose)]),
-                solver,
+        others, self._ways = [way[-1].sweeps for way in self._ways[1:]], []
+        if any(sweep.held for sweep in sweeps[1:]):
+            return sweeps
+        if len(sweeps) == 3:
+            first, second, third = sweeps
+            seconds = first.moment.seconds_to(second.moment.stamp)
+            place = first.map_T_middle.compose(_step(second, third, seconds))
+            if not same(place, second.map_T_middle):
+                others.append([first, replace(second, map_T_middle=place)])
+        if not others:
+            return sweeps
+        followed = [self._followed(frame, way, sweeps[len(way) :], solver) for way in others]
+        ways = [
+            tuple(
+                self._registered(frame, self._with_motion(way[:count]), solver)
+                for count in range(2, len(way) + 1)
             )
-            for pose in (second, place)
-        )
-        if not _better(tried, best, frame.matcher.config.solver.min_aligned):
-            return sweeps
-        moved = tried.solution.map_T_lidar
-        last = replace(sweeps[2], map_T_middle=moved.compose(second.between(third)))
-        return [*tried.sweeps, last]
+            for way in (sweeps, *followed)
+        ]
+        self._choose(ways, frame.matcher.config)
+        return sweeps if self._ways[0] is ways[0] else self._ways[0][-1].sweeps
+
+    def _followed(
+        self,
+        frame: Frame,
+        way: list[EarlySweep],
+        sweeps: Sequence[EarlySweep],
+        solver: ScanSolver,
+    ) -> list[EarlySweep]:
+        """A way with further sweeps, each expected at constant velocity, registered together."""
+        for sweep in sweeps:
+            expected = replace(sweep, map_T_middle=_continued(way, sweep.moment.stamp))
+            way = self._registered(frame, self._with_motion([*way, expected]), solver).sweeps
+        return self._together(frame, way, solver, 1)
 
     def _with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
         """The sweeps, de-skewed for the motion between their poses."""
@@ -244,15 +300,15 @@ class Start:
         *,
         quickly: bool = False,
     ) -> _Tried:
-        """The second of two sweeps registered with the first, and what its features say of it."""
-        matcher = self._matcher(frame, sweeps, 1)
+        """The last of some sweeps, registered with the others, and what its features say of it."""
+        matcher = self._matcher(frame, sweeps, len(sweeps) - 1)
         matcher = matcher.with_few_matches() if quickly else matcher
-        solution = self._solved(frame, sweeps[1], matcher, solver)
-        second = replace(sweeps[1], map_T_middle=solution.map_T_lidar)
+        solution = self._solved(frame, sweeps[-1], matcher, solver)
+        last = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
         rows, told = matcher.rows, _evidence(matcher.rows, solution)
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)
-        return _Tried(len(rows.edges), points, *told, [sweeps[0], second], solution)
+        return _Tried(len(rows.edges), points, *told, [*sweeps[:-1], last], solution)
 
     def _matcher(
         self, frame: Frame, sweeps: Sequence[EarlySweep], number: int, *, to_keep: bool = False
@@ -301,22 +357,51 @@ def _evidence(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatAr
     return evidence, axes
 
 
-def _better(tried: _Tried, best: _Tried, least: float) -> bool:
-    """Whether one place is better than another by more than chance.
+def _continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
+    """Where the motion between the last two sweeps leads by a stamp, nanoseconds."""
+    last = sweeps[-1]
+    return last.map_T_middle.compose(_step(*sweeps[-2:], last.moment.seconds_to(stamp)))
+
+
+def _step(one: EarlySweep, other: EarlySweep, seconds: float) -> gtsam.Pose3:
+    """The motion from one sweep to the next, for so many seconds."""
+    moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
+    return gtsam.Pose3.Expmap(moved * (seconds / one.moment.seconds_to(other.moment.stamp)))
+
+
+def _apart(one: _Way, other: _Way, near: float) -> bool:
+    """Whether two ways differ by more than ``near``, metres, at any feature of the last sweep."""
+    way = one[-1].points - other[-1].points
+    return bool(np.linalg.norm(way, axis=1).max(initial=0.0) > near)
+
+
+def _better(tried: _Way, best: _Way, least: float) -> bool:
+    """Whether one way is better than another by more than chance.
 
     A feature counts as far as its line or plane lies across the way from one place to the other:
     ground and walls along the way agree at both, but for chance. Neither lines nor planes may speak
     against the place: at rest few lines are found, for next to a point lie those of its own ring.
     ``least`` is the number of features at least, counted as if they lay across.
     """
+    found = [_gain(*pair) for pair in zip(tried, best, strict=True)]
+    gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
+    every, lines, planes = (
+        float(part.sum() / max(np.sqrt(len(found)) * np.linalg.norm(part), _TINY))
+        for part in (gain, gain[edge], gain[~edge])
+    )
+    weight = sum(weighed for _, _, weighed in found) / len(found)
+    return every > _CHANCE and min(lines, planes) > -_CHANCE and weight > least
+
+
+def _gain(tried: _Tried, best: _Tried) -> tuple[FloatArray, BoolArray, float]:
+    """What each feature (F,) says for one place against another, whether it is an edge, and the
+    sum, each counted once more as far as it lies across.
+    """
+    edge = np.arange(len(best.points)) < best.edges
     way = tried.points - best.points
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _TINY)
     axes = np.where(tried.axes.any(axis=1, keepdims=True), tried.axes, best.axes)
     across = np.abs(np.einsum("ij,ij->i", axes, way))
-    across[: tried.edges] = np.sqrt(np.maximum(1.0 - across[: tried.edges] ** 2, 0.0))
+    across[edge] = np.sqrt(np.maximum(1.0 - across[edge] ** 2, 0.0))
     gain = across * (tried.evidence - best.evidence)
-    every, lines, planes = (
-        float(part.sum() / max(np.linalg.norm(part), _TINY))
-        for part in (gain, gain[: tried.edges], gain[tried.edges :])
-    )
-    return every > _CHANCE and min(lines, planes) > -_CHANCE and bool(across @ gain > least)
+    return gain, edge, float(across @ gain)

@@ -9,9 +9,11 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from loam_gtsam.config import RelocalizationConfig
@@ -28,8 +30,9 @@ _SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
 _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than a cell
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
-_SAMPLE = (60, 140)  # number of edge and plane features that are scored
-_EACH = 5  # of the trial poses, from which the chance that a point hits is told
+_SAMPLE = (500, 140)  # largest numbers of edge and plane features that are looked at
+_SCORED = 200  # of these, those that hit most rarely and are scored
+_CHANCES = 20_000  # trial poses, or so, that tell how rarely a point hits
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
@@ -55,6 +58,15 @@ class Fit:
     def total(self) -> float:
         """Share of the features whose matches agree."""
         return self.share * self.agreement
+
+
+def beyond_any_motion(step: FloatArray, seconds: float, config: RelocalizationConfig) -> bool:
+    """Whether no acceleration explains a step (6,) away from constant velocity, rad and m."""
+    reach = 0.5 * seconds**2
+    return bool(
+        np.linalg.norm(step[:3]) > reach * config.max_turn_acceleration
+        or np.linalg.norm(step[3:]) > reach * config.max_acceleration
+    )
 
 
 def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
@@ -121,11 +133,7 @@ class FitMonitor:
 
         ``step`` is the (6,) tangent from the predicted pose to the solved one, rad and m.
         """
-        reach, config = 0.5 * seconds**2, self.config
-        return self.ready and bool(
-            np.linalg.norm(step[:3]) > reach * config.max_turn_acceleration
-            or np.linalg.norm(step[3:]) > reach * config.max_acceleration
-        )
+        return self.ready and beyond_any_motion(step, seconds, self.config)
 
     @property
     def radius(self) -> float:
@@ -315,9 +323,10 @@ def likely_poses(
     """Poses from which a sweep may have been taken, the likeliest first.
 
     Trial poses lie on a grid of 1 m and 5 degrees around each centre, with the height and the tilt
-    of the centre. The score of a trial pose is the number of points in cells that hold map points;
-    a point in a cell beside such a cell counts half (the likelihood field of Thrun, Burgard and
-    Fox, Probabilistic Robotics, section 6.4, in its simplest form).
+    of the centre. A point scores in a cell that holds map points, and half in a cell beside one
+    (the likelihood field of Thrun, Burgard and Fox, Probabilistic Robotics, section 6.4, in its
+    simplest form). It scores minus the logarithm of the share of the trial poses at which it does:
+    ground, which fits everywhere, tells nothing, and a post, which fits at few places, tells much.
 
     Parameters
     ----------
@@ -326,9 +335,14 @@ def likely_poses(
     count : largest number of poses, which are more than 1.5 m or 12 degrees apart
     most_turn : largest rotation against the centre about the vertical axis, rad
     """
-    tried = [_scores(points, map_points, pose, radius, most_turn) for pose in around]
-    scores, moves = (np.concatenate(parts) for parts in zip(*tried, strict=True))
-    owner = np.repeat(np.arange(len(tried)), [len(scored) for scored, _ in tried])
+    tried = [_trials(points, map_points, pose, radius, most_turn) for pose in around]
+    chance = np.mean([trials.chance() for trials in tried], axis=0)
+    hit = np.flatnonzero(chance)
+    rare = hit[np.argsort(chance[hit], kind="stable")[:_SCORED]]
+    told = -np.log(chance[rare]).astype(np.float32)
+    scores = np.concatenate([trials.scores(rare, told) for trials in tried])
+    moves = np.concatenate([trials.moves for trials in tried])
+    owner = np.repeat(np.arange(len(tried)), [len(trials.moves) for trials in tried])
     best: list[gtsam.Pose3] = []
     at = moves[:, :2] + np.array([pose.translation() for pose in around])[owner, :2]
     while len(best) < count and len(scores) and scores.max() > 0.0:
@@ -343,14 +357,38 @@ def likely_poses(
     return best
 
 
-def _scores(
+class _Trials(NamedTuple):
+    """Trial poses around a centre, and the field of cells that hold map points."""
+
+    field: NDArray[np.uint8]  # 2 in a cell that holds some, 1 beside it, 0 elsewhere
+    near: BoolArray  # (N,) whether a point is near enough to be scored
+    bases: IntArray  # (R, N) cells of the points, for each yaw
+    shifts: IntArray  # (S,) by which these move with the trial positions
+    moves: FloatArray  # (R S, 3) offsets of the trial poses: x and y in metres, yaw in rad
+
+    def chance(self) -> FloatArray:
+        """Share of what each point (N,) would score if it hit at every trial pose."""
+        some = self.shifts[:: max(1, len(self.moves) // _CHANCES), None]
+        hits = [self.field[base + some].mean(axis=0) for base in self.bases]
+        share: FloatArray = 0.5 * np.mean(hits, axis=0) * self.near
+        return share
+
+    def scores(self, points: IntArray, weights: NDArray[np.float32]) -> FloatArray:
+        """Score of each trial pose by some of the points."""
+        scores = np.empty((len(self.bases), len(self.shifts)))
+        for row, base in zip(scores, self.bases[:, points], strict=True):
+            row[:] = self.field[base + self.shifts[:, None]] @ (weights * self.near[points])
+        return scores.ravel()
+
+
+def _trials(
     points: FloatArray,
     map_points: FloatArray,
     map_T_lidar: gtsam.Pose3,
     radius: float,
     most_turn: float,
-) -> tuple[FloatArray, FloatArray]:
-    """Scores (T,) of trial poses, and their offsets (T, 3): x and y in metres, yaw in rad."""
+) -> _Trials:
+    """The trial poses around a centre."""
     steps = int(radius / (_SPACING * _CELL))
     size = 2 * (int(np.ceil((_REACH + radius) / _CELL)) + 2)
     shape = (size, size, 2 * (int(_HEIGHT / _CELL) + 1))
@@ -363,7 +401,6 @@ def _scores(
 
     level = points @ map_T_lidar.rotation().matrix().T
     near = (np.linalg.norm(level[:, :2], axis=1) < _REACH) & (np.abs(level[:, 2]) < _HEIGHT)
-    level = level[near]
     ahead, aside = np.divmod(np.arange((2 * steps + 1) ** 2), 2 * steps + 1) - np.array([[steps]])
     close = ahead**2 + aside**2 <= (steps + 0.5) ** 2
     ahead, aside = ahead[close], aside[close]
@@ -371,18 +408,11 @@ def _scores(
     metres = _SPACING * _CELL * np.column_stack([ahead, aside])
     most = int(np.ceil(min(most_turn, np.pi) / _TURN))
     turns = _TURN * np.arange(-most, most + (most_turn < np.pi))
-    bases = [
-        np.ravel_multi_index(tuple(_cells(level @ gtsam.Rot3.Yaw(turn).matrix().T, shape).T), shape)
-        for turn in turns.tolist()
-    ]
-    few = shifts[:: _EACH, None]
-    chance = np.mean([field[base + few].mean(axis=0) for base in bases], axis=0) / 2.0
-    told = -np.log(np.maximum(chance, 1.0 / (len(few) * len(bases)))).astype(np.float32)
-    scores = np.empty((len(turns), len(shifts)))
-    for row, base in zip(scores, bases, strict=True):
-        row[:] = field[base + shifts[:, None]] @ told
+    yaws = [gtsam.Rot3.Yaw(turn).matrix() for turn in turns.tolist()]
+    turned = np.where(near[:, None], level, 0.0) @ np.transpose(yaws, (0, 2, 1))
+    bases = np.ravel_multi_index(tuple(np.moveaxis(_cells(turned, shape), -1, 0)), shape)
     moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(shifts))])
-    return scores.ravel(), moves
+    return _Trials(field, near, bases, shifts, moves)
 
 
 def _cells(points: FloatArray, shape: tuple[int, int, int]) -> IntArray:

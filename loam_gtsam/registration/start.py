@@ -14,7 +14,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
@@ -24,6 +24,7 @@ from loam_gtsam.registration.relocalization import (
     APART,
     Found,
     agreeing,
+    beyond_any_motion,
     likely_poses,
     same,
     sample_features,
@@ -153,8 +154,12 @@ class Start:
         return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
 
     def _choose(self, ways: list[_Way], config: Config) -> None:
-        """Keep the best of some ways, and those that it is not better than by more than chance."""
+        """Keep the best of some ways, and those that it is not better than by more than chance.
+
+        Ways that no acceleration explains are none, if there are others.
+        """
         least, near = config.solver.min_aligned, config.map.plane_voxel
+        ways = [way for way in ways if _drivable(way, config.relocalization)] or ways
         best, *others = ways
         for way in others:
             if _better(way, best, least):
@@ -162,7 +167,7 @@ class Start:
         self._ways = [best]
         for way in ways:
             apart = all(_apart(way, kept, near) for kept in self._ways)
-            if apart and not _better(best, way, least):
+            if apart and min(_signs(way, best)[:3]) > -_CHANCE:
                 self._ways.append(way)
 
     def doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
@@ -359,14 +364,26 @@ def _evidence(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatAr
 
 def _continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
     """Where the motion between the last two sweeps leads by a stamp, nanoseconds."""
-    last = sweeps[-1]
-    return last.map_T_middle.compose(_step(*sweeps[-2:], last.moment.seconds_to(stamp)))
+    before, last = sweeps[-2:]
+    return last.map_T_middle.compose(_step(before, last, last.moment.seconds_to(stamp)))
 
 
 def _step(one: EarlySweep, other: EarlySweep, seconds: float) -> gtsam.Pose3:
     """The motion from one sweep to the next, for so many seconds."""
     moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
     return gtsam.Pose3.Expmap(moved * (seconds / one.moment.seconds_to(other.moment.stamp)))
+
+
+def _drivable(way: _Way, config: RelocalizationConfig) -> bool:
+    """Whether some acceleration explains each change of the velocity on a way."""
+    sweeps = way[-1].sweeps
+    for number in range(2, len(sweeps)):
+        last, now = sweeps[number - 1].moment, sweeps[number].moment
+        expected = _continued(sweeps[:number], now.stamp)
+        step = expected.localCoordinates(now.map_T_lidar)
+        if beyond_any_motion(step, last.seconds_to(now.stamp), config):
+            return False
+    return True
 
 
 def _apart(one: _Way, other: _Way, near: float) -> bool:
@@ -378,10 +395,21 @@ def _apart(one: _Way, other: _Way, near: float) -> bool:
 def _better(tried: _Way, best: _Way, least: float) -> bool:
     """Whether one way is better than another by more than chance.
 
+    Neither lines nor planes may speak against it: at rest few lines are found, for next to a point
+    lie those of its own ring. ``least`` is the number of features at least, counted as if they lay
+    across.
+    """
+    every, lines, planes, weight = _signs(tried, best)
+    return every > _CHANCE and min(lines, planes) > -_CHANCE and weight > least
+
+
+def _signs(tried: _Way, best: _Way) -> tuple[float, float, float, float]:
+    """How much all features, lines and planes speak for one way against another, in standard
+    deviations, and how many features more agree with it, counted as far as they lie across.
+
     A feature counts as far as its line or plane lies across the way from one place to the other:
-    ground and walls along the way agree at both, but for chance. Neither lines nor planes may speak
-    against the place: at rest few lines are found, for next to a point lie those of its own ring.
-    ``least`` is the number of features at least, counted as if they lay across.
+    ground and walls along the way agree at both, but for chance. The sweeps see the same things, so
+    that more of them are not more evidence.
     """
     found = [_gain(*pair) for pair in zip(tried, best, strict=True)]
     gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
@@ -389,8 +417,7 @@ def _better(tried: _Way, best: _Way, least: float) -> bool:
         float(part.sum() / max(np.sqrt(len(found)) * np.linalg.norm(part), _TINY))
         for part in (gain, gain[edge], gain[~edge])
     )
-    weight = sum(weighed for _, _, weighed in found) / len(found)
-    return every > _CHANCE and min(lines, planes) > -_CHANCE and weight > least
+    return every, lines, planes, sum(weight for _, _, weight in found) / len(found)
 
 
 def _gain(tried: _Tried, best: _Tried) -> tuple[FloatArray, BoolArray, float]:

@@ -226,21 +226,27 @@ def test_several_centres_are_searched(corner):
     assert truth.range(found[0]) < 1.0
 
 
-def test_posts_count_more_than_ground():
-    """Rings on the ground fit best where they overlap: at rest. A few posts say otherwise."""
-    turns = np.radians(np.arange(0.0, 360.0, 2.0))
-    rings = np.concatenate(
-        [np.column_stack([r * np.cos(turns), r * np.sin(turns), 0.0 * turns - 1.5]) for r in (4, 8)]
-    )
-    posts = np.random.default_rng(5).uniform(-20.0, 20.0, (6, 2)).repeat(3, axis=0)
+def test_what_is_rare_counts_more_than_ground():
+    """The ground that two sweeps see overlaps most at rest; what stands on it says otherwise."""
+    rng = np.random.default_rng(5)
+
+    def seen_ground():
+        x, y = rng.uniform(-12.0, 12.0, (2, 500))
+        return np.column_stack([x, y, np.full(500, -1.5)])[np.hypot(x, y) < 12.0]
+
+    posts = np.repeat(rng.uniform(-15.0, 15.0, (6, 2)), 3, axis=0)
     posts = np.column_stack([posts, np.tile([-1.0, 0.0, 1.0], 6)])
-    truth = gtsam.Pose3(gtsam.Rot3(), np.array([3.0, 0.0, 0.0]))
-    seen = np.concatenate([truth.transformTo(posts.T).T, rings])
-    known = np.concatenate([posts, rings])
-    found = likely_poses(seen, known, [gtsam.Pose3()], radius=5.0, count=1, most_turn=0.1)
-    assert truth.range(found[0]) < 0.1
-    alone = likely_poses(rings, rings, [gtsam.Pose3()], radius=5.0, count=1, most_turn=0.1)
-    assert alone[0].range(gtsam.Pose3()) < 0.1
+    truth = gtsam.Pose3(gtsam.Rot3(), np.array([4.0, 0.0, 0.0]))
+    ground, known = seen_ground(), seen_ground()
+    around = [gtsam.Pose3()], 5.0, 1, 0.1
+    (found,) = likely_poses(
+        np.concatenate([truth.transformTo(posts.T).T, ground]),
+        np.concatenate([posts, known]),
+        *around,
+    )
+    assert truth.range(found) < 0.1
+    (alone,) = likely_poses(ground, known, *around)
+    assert truth.range(alone) > 2.0
 
 
 def test_a_few_points_stand_for_a_sweep():

@@ -15,6 +15,7 @@ from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration import start
 from loam_gtsam.registration.matches import ChosenRows
+from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FrameStatus
@@ -118,7 +119,7 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
 
 
 def test_one_first_motion_leaves_no_doubt():
-    world, features = features_of("street_loop", 2)
+    _, features = features_of("street_loop", 2)
     mapper = Mapper(CONFIG)
     update = [mapper.register(one) for one in features][-1]
     assert len(mapper._start._ways) == 1
@@ -202,22 +203,76 @@ def test_a_place_is_better_if_more_lies_for_it_across_the_way_there(lines, plane
 
     there = place(3.0 * AHEAD, agreeing(lines), agreeing(planes), normal)
     here = place(0.0 * AHEAD, agreeing(-lines), agreeing(-planes), normal)
-    assert start._better(there, here, 8.0) == better
+    assert start._better((there,), (here,), 8.0) == better
 
 
 @pytest.mark.parametrize(("against", "better"), [(0, True), (30, False)])
 def test_one_feature_that_contradicts_outweighs_some_that_agree(against, better):
     say = np.concatenate([np.ones(60), np.full(against, -start._AGAINST), np.zeros(100)])
     there = place(3.0 * AHEAD, [], say, AHEAD)
-    assert start._better(there, place(0.0 * AHEAD, [], 0.0 * say, AHEAD), 8.0) == better
-    assert not start._better(there, there, 8.0)
+    here = place(0.0 * AHEAD, [], 0.0 * say, AHEAD)
+    assert start._better((there,), (here,), 8.0) == better
+    assert not start._better((there,), (there,), 8.0)
 
 
 def test_many_features_that_hardly_lie_across_the_way_are_not_enough():
     leaning = np.array([0.02, 0.0, 1.0])
     here, there = (place(x * AHEAD, [], np.full(600, x > 0.0), leaning) for x in (0.0, 3.0))
-    assert not start._better(there, here, 8.0)
-    assert start._better(there, here, 0.1)
+    assert not start._better((there,), (here,), 8.0)
+    assert start._better((there,), (here,), 0.1)
+
+
+def test_several_sweeps_that_see_the_same_are_one_piece_of_evidence():
+    here, there = (place(x * AHEAD, [], np.repeat([0, x > 0], [90, 8]), AHEAD) for x in (0.0, 3.0))
+    for sweeps in (1, 4):
+        assert not start._better((there,) * sweeps, (here,) * sweeps, 1.0)
+    here, there = (place(x * AHEAD, [], np.full(50, x > 0.0), AHEAD) for x in (0.0, 3.0))
+    assert start._better((there,) * 4, (here,) * 4, 8.0)
+
+
+def first_sweep():
+    """What a start is made of."""
+    posed = SimpleNamespace(sweep=SimpleNamespace(stamp=0))
+    at = gtsam.Pose3()
+    return SimpleNamespace(map_T_lidar=at, map_T_middle=at, posed=posed, motion=None), 0
+
+
+def way_of(*steps, planes=0):
+    """A way by steps of these metres ahead, a tenth of a second each."""
+    at, sweeps = 0.0, []
+    for number, step in enumerate((0.0, *steps)):
+        at += step
+        stamp = 100_000_000 * number
+        pose = gtsam.Pose3(gtsam.Rot3(), np.array([at, 0.0, 0.0]))
+        sweeps.append(SimpleNamespace(map_T_middle=pose, moment=Moment(stamp, pose, True)))
+    tried = place(at * AHEAD, np.zeros(40), np.full(40, planes), AHEAD)
+    return tuple(tried._replace(sweeps=sweeps[: k + 2]) for k in range(len(steps)))
+
+
+@pytest.mark.parametrize(
+    ("steps", "planes", "kept"),
+    [
+        ((1.0, 1.0), 0, True),  # as good
+        ((1.0, 1.0), -1, False),  # planes are against it
+        ((0.1, 0.1), 0, False),  # near enough to be the same
+        ((1.0, 0.1), 0, False),  # a brake with 90 m/s^2
+    ],
+)
+def test_ways_that_may_be_true_are_kept(steps, planes, kept):
+    begun = start.Start(*first_sweep())
+    ways = [way_of(0.0, 0.0), way_of(*steps, planes=planes)]
+    begun._choose(ways, CONFIG)
+    assert begun._ways == ways[: 1 + kept]
+    after = begun._sweeps[0].moment.stamp + 300_000_000
+    expected = 0.5 * sum([*steps, steps[-1]]) ** 2 if kept else 0.0
+    assert begun.doubt(after, gtsam.Pose3())[3, 3] == pytest.approx(expected)
+
+
+def test_a_way_that_no_acceleration_explains_is_better_than_none():
+    begun = start.Start(*first_sweep())
+    way = way_of(2.0, -2.0)
+    begun._choose([way], CONFIG)
+    assert begun._ways == [way]
 
 
 def test_a_place_that_is_not_solved_has_no_evidence_and_is_no_better():

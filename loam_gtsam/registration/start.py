@@ -239,7 +239,7 @@ class Start:
         """
         if len(sweeps) == 2:
             return sweeps
-        others, self._ways = [way[-1].sweeps for way in self._ways[1:]], []
+        others, self._ways = [_moved(sweeps, way[-1].sweeps) for way in self._ways[1:]], []
         if any(sweep.held for sweep in sweeps[1:]):
             return sweeps
         if len(sweeps) == 3:
@@ -360,6 +360,14 @@ def _evidence(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatAr
             evidence[places] = np.where(agree, 1.0, -_AGAINST)
         axes[lines], axes[others] = edges.directions, planes.normals
     return evidence, axes
+
+
+def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:
+    """The first of some sweeps, with the motions and poses of others of the same time."""
+    return [
+        replace(one, posed=other.posed, map_T_middle=other.map_T_middle)
+        for one, other in zip(sweeps, to, strict=False)
+    ]
 
 
 def _continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:

@@ -284,13 +284,9 @@ class Mapper:
 
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
-        doubt = None
         if self._start is not None:
             frame, found = self._start.add(frame, found, self.keyframe, self._named)
-            doubt = self._start.doubt(frame.sweep.stamp, found.solution.map_T_lidar)
-            if self._start.complete:
-                self._errors.allow(doubt)
-                doubt, self._start = None, None
+            self._start = None if self._start.complete else self._start
         solution = found.solution
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
@@ -303,7 +299,8 @@ class Mapper:
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last
-        update = self._errors.calibrated(update, frame.sweep, solution, scan, last, fused, doubt)
+        parts = frame.sweep, solution, scan, last, fused, found.doubt
+        update = self._errors.calibrated(update, *parts)
         clock.lap("covariance")
         return update
 

@@ -116,6 +116,7 @@ class PoseErrors:
         self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionFilter(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
+        self._doubt = np.zeros((6, 6))
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
@@ -157,7 +158,8 @@ class PoseErrors:
 
         The sweep has the motion of the solution, which is at its middle; ``last`` is the middle of
         the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
-        and IMU together; ``doubt`` is a further covariance (6, 6) of this pose alone, map frame.
+        and IMU together; ``doubt`` is a further covariance (6, 6) of the pose, map frame, until the
+        start of the run is over, and None from then on.
         """
         first = self._scans == 1
         if scan is None:
@@ -183,6 +185,9 @@ class PoseErrors:
         drifted = by_scan @ from_map
         if doubt is not None:
             own = own + drifted @ doubt @ drifted.T
+        else:  # what is still in doubt after the start is an error of the map
+            self._drift = self._drift + self._doubt
+        self._doubt = np.zeros((6, 6)) if doubt is None else doubt
         uncertainty = Uncertainty(
             own=own,
             shared=shared,
@@ -222,11 +227,7 @@ class PoseErrors:
         """
         if not same(expected, found):
             in_map = found.AdjointMap() * expected.localCoordinates(found)
-            self.allow(0.5 * in_map @ in_map.T)
-
-    def allow(self, doubt: FloatArray) -> None:
-        """Account from now on for an error with this covariance (6, 6), map frame."""
-        self._drift = self._drift + doubt
+            self._drift = self._drift + 0.5 * in_map @ in_map.T
 
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""

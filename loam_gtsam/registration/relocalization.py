@@ -155,6 +155,7 @@ class Found:
     solution: Solution  # at the middle of the sweep
     twist: FloatArray  # (6,) body velocity with which the sweep was de-skewed
     message: str = ""  # sentence for the user if the search moved the sweep
+    doubt: FloatArray | None = None  # (6, 6) covariance, map frame, of a start that is not sure
 
 
 @dataclass(frozen=True, slots=True, eq=False)

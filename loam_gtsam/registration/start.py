@@ -170,8 +170,19 @@ class Start:
             if apart and min(_signs(way, best)[:3]) > -_CHANCE:
                 self._ways.append(way)
 
-    def doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
-        """Covariance (6, 6) of a pose, map frame, for other first motions that are as likely.
+    def add(
+        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
+    ) -> tuple[Frame, Found]:
+        """Add a solved sweep; after some, all are registered anew and the map is made of them.
+
+        Returns the sweep and its solve in the new map, which does not hold this sweep yet.
+        """
+        frame, found = self._added(frame, found, keyframe, solver)
+        doubt = self._doubt(frame.sweep.stamp, found.solution.map_T_lidar)
+        return frame, replace(found, doubt=doubt)
+
+    def _doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
+        """Covariance (6, 6) of a pose, map frame, for other first motions that fit as well.
 
         Among several places, one of which is right, the mean squared error of any of them.
         """
@@ -182,13 +193,9 @@ class Start:
             total += np.outer(step, step) / len(self._ways)
         return total
 
-    def add(
+    def _added(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
     ) -> tuple[Frame, Found]:
-        """Add a solved sweep; after some, all are registered anew and the map is made of them.
-
-        Returns the sweep and its solve in the new map, which does not hold this sweep yet.
-        """
         new = EarlySweep(
             frame.sweep.at(found.twist),
             found.solution.map_T_lidar,

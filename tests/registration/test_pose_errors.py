@@ -251,12 +251,12 @@ def test_a_gyro_leaves_its_noise():
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
 
 
-def calibrated(errors, number, map_T_lidar=gtsam.Pose3()):  # noqa: B008
+def calibrated(errors, number, map_T_lidar=gtsam.Pose3(), doubt=None):  # noqa: B008
     """A frame at rest, whatever its matches are."""
     update = MapUpdate(number * FRAME, map_T_lidar, FrameStatus.OK)
     solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
-    return errors.calibrated(update, sweep, solution, errors.of_scan(solution), None)
+    return errors.calibrated(update, sweep, solution, errors.of_scan(solution), None, doubt=doubt)
 
 
 def test_ground_that_replaces_none_counts_half(monkeypatch):
@@ -339,3 +339,21 @@ def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatc
     assert np.isnan(updates[2].covariance).all()
     assert updates[3].uncertainty.follows is None
     np.testing.assert_array_equal(updates[3].uncertainty.shared, 0.0)
+
+
+@pytest.mark.parametrize("stays", [True, False])
+def test_what_is_in_doubt_at_the_end_of_the_start_is_an_error_of_the_map(stays, monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    errors, doubt = PoseErrors(Config()), np.diag([0.0, 0.0, 0.0, 4.0, 1.0, 0.0])
+    doubts = [doubt, doubt, doubt if stays else 0.0 * doubt, None, None]
+    updates = [calibrated(errors, k, doubt=one) for k, one in enumerate(doubts)]
+    told = np.array([np.diag(update.covariance)[3:5] for update in updates])
+    assert (told[:2] > [4.0, 1.0]).all()
+    assert (told[2:] > [4.0, 1.0]).all() == stays
+    assert (told[2:] < 0.1).all() != stays
+    # Nothing is in doubt that lies behind both frames.
+    assert np.diag(relative_covariance(*updates[-2:]))[3] < 0.1
+    motion = relative_covariance(*updates[:2])
+    assert np.linalg.eigvalsh(motion)[0] > 0.0
+    assert motion[3, 3] > 4.0

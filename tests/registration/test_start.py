@@ -123,7 +123,7 @@ def test_one_first_motion_leaves_no_doubt():
     mapper = Mapper(CONFIG)
     update = [mapper.register(one) for one in features][-1]
     assert len(mapper._start._ways) == 1
-    assert not mapper._start.doubt(update.stamp, update.map_T_lidar).any()
+    assert not mapper._start._doubt(update.stamp, update.map_T_lidar).any()
 
 
 @pytest.mark.parametrize(
@@ -265,7 +265,7 @@ def test_ways_that_may_be_true_are_kept(steps, planes, kept):
     assert begun._ways == ways[: 1 + kept]
     after = begun._sweeps[0].moment.stamp + 300_000_000
     expected = 0.5 * sum([*steps, steps[-1]]) ** 2 if kept else 0.0
-    assert begun.doubt(after, gtsam.Pose3())[3, 3] == pytest.approx(expected)
+    assert begun._doubt(after, gtsam.Pose3())[3, 3] == pytest.approx(expected)
 
 
 def test_a_way_that_no_acceleration_explains_is_better_than_none():

@@ -287,7 +287,7 @@ class Mapper:
         if self._start is not None:
             frame, found = self._start.add(frame, found, self.keyframe, self._named)
             self._start = None if self._start.complete else self._start
-        solution = found.solution
+        solution, doubt = found.solution, found.doubt
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
         scan = self._errors.of_scan(solution, small=self.maps.small)
@@ -299,8 +299,7 @@ class Mapper:
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last
-        parts = frame.sweep, solution, scan, last, fused, found.doubt
-        update = self._errors.calibrated(update, *parts)
+        update = self._errors.calibrated(update, frame.sweep, solution, scan, last, fused, doubt)
         clock.lap("covariance")
         return update
 

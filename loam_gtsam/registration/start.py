@@ -140,35 +140,16 @@ class Start:
             self._tried(frame, place, solver) for place in (expected.solution.map_T_lidar, *places)
         ]
         enough = _HOPEFUL * max(tried.share for tried in quick)
-        self._choose(
-            [
-                (self._registered(frame, self._with_motion(tried.sweeps), solver),)
-                for number, tried in enumerate(quick)
-                if number == 0 or tried.share >= enough
-            ],
-            frame.matcher.config,
-        )
+        ways = [
+            (self._registered(frame, self._with_motion(tried.sweeps), solver),)
+            for number, tried in enumerate(quick)
+            if number == 0 or tried.share >= enough
+        ]
+        self._ways = _kept(ways, frame.matcher.config)
         best = self._ways[0][0]
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
         return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
-
-    def _choose(self, ways: list[_Way], config: Config) -> None:
-        """Keep the best of some ways, and those that it is not better than by more than chance.
-
-        Ways that no acceleration explains are none, if there are others.
-        """
-        least, near = config.solver.min_aligned, config.map.plane_voxel
-        ways = [way for way in ways if _drivable(way, config.relocalization)] or ways
-        best, *others = ways
-        for way in others:
-            if _better(way, best, least):
-                best = way
-        self._ways = [best]
-        for way in ways:
-            apart = all(_apart(way, kept, near) for kept in self._ways)
-            if apart and min(_signs(way, best)[:3]) > -_CHANCE:
-                self._ways.append(way)
 
     def add(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
@@ -265,7 +246,7 @@ class Start:
             )
             for way in (sweeps, *followed)
         ]
-        self._choose(ways, frame.matcher.config)
+        self._ways = _kept(ways, frame.matcher.config)
         return sweeps if self._ways[0] is ways[0] else self._ways[0][-1].sweeps
 
     def _followed(
@@ -387,6 +368,25 @@ def _step(one: EarlySweep, other: EarlySweep, seconds: float) -> gtsam.Pose3:
     """The motion from one sweep to the next, for so many seconds."""
     moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
     return gtsam.Pose3.Expmap(moved * (seconds / one.moment.seconds_to(other.moment.stamp)))
+
+
+def _kept(ways: Sequence[_Way], config: Config) -> list[_Way]:
+    """The best of some ways, and after it those that are as good, but for chance.
+
+    Ways that no acceleration explains are none, if there are others.
+    """
+    least, near = config.solver.min_aligned, config.map.plane_voxel
+    ways = [way for way in ways if _drivable(way, config.relocalization)] or ways
+    best = ways[0]
+    for way in ways[1:]:
+        if _better(way, best, least):
+            best = way
+    kept = [best]
+    for way in ways:
+        apart = all(_apart(way, other, near) for other in kept)
+        if apart and min(_signs(way, best)[:3]) > -_CHANCE:
+            kept.append(way)
+    return kept
 
 
 def _drivable(way: _Way, config: RelocalizationConfig) -> bool:

@@ -261,7 +261,7 @@ def way_of(*steps, planes=0):
 def test_ways_that_may_be_true_are_kept(steps, planes, kept):
     begun = start.Start(*first_sweep())
     ways = [way_of(0.0, 0.0), way_of(*steps, planes=planes)]
-    begun._choose(ways, CONFIG)
+    begun._ways = start._kept(ways, CONFIG)
     assert begun._ways == ways[: 1 + kept]
     after = begun._sweeps[0].moment.stamp + 300_000_000
     expected = 0.5 * sum([*steps, steps[-1]]) ** 2 if kept else 0.0
@@ -269,10 +269,8 @@ def test_ways_that_may_be_true_are_kept(steps, planes, kept):
 
 
 def test_a_way_that_no_acceleration_explains_is_better_than_none():
-    begun = start.Start(*first_sweep())
     way = way_of(2.0, -2.0)
-    begun._choose([way], CONFIG)
-    assert begun._ways == [way]
+    assert start._kept([way], CONFIG) == [way]
 
 
 def test_a_place_that_is_not_solved_has_no_evidence_and_is_no_better():

@@ -30,9 +30,9 @@ _SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
 _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than a cell
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
-_SAMPLE = (500, 140)  # largest numbers of edge and plane features that are looked at
-_SCORED = 200  # of these, those that hit most rarely and are scored
+_SAMPLE = (60, 140)  # number of edge and plane features that are scored
 _CHANCES = 20_000  # trial poses, or so, that tell how rarely a point hits
+_RAREST = 200  # number of points, those that hit most rarely, that are scored if rare ones count
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
@@ -307,10 +307,12 @@ def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
     return (a_R_b.matrix() @ twist.reshape(2, 3).T).T.reshape(6)
 
 
-def sample_features(edges: FloatArray, planes: FloatArray) -> FloatArray:
-    """(N, 3) a few evenly spread features of a sweep, metres."""
-    pairs = zip((edges, planes), _SAMPLE, strict=True)
-    return np.concatenate([points[spread_rows(len(points), most)] for points, most in pairs])
+def sample_features(
+    edges: FloatArray, planes: FloatArray, most: tuple[int, int] = _SAMPLE
+) -> FloatArray:
+    """(N, 3) some evenly spread features of a sweep, at ``most`` so many of each kind, metres."""
+    pairs = zip((edges, planes), most, strict=True)
+    return np.concatenate([points[spread_rows(len(points), count)] for points, count in pairs])
 
 
 def likely_poses(
@@ -320,14 +322,15 @@ def likely_poses(
     radius: float,
     count: int,
     most_turn: float = np.pi,
+    *,
+    rare: bool = False,
 ) -> list[gtsam.Pose3]:
     """Poses from which a sweep may have been taken, the likeliest first.
 
     Trial poses lie on a grid of 1 m and 5 degrees around each centre, with the height and the tilt
-    of the centre. A point scores in a cell that holds map points, and half in a cell beside one
-    (the likelihood field of Thrun, Burgard and Fox, Probabilistic Robotics, section 6.4, in its
-    simplest form). It scores minus the logarithm of the share of the trial poses at which it does:
-    ground, which fits everywhere, tells nothing, and a post, which fits at few places, tells much.
+    of the centre. The score of a trial pose is the number of points in cells that hold map points;
+    a point in a cell beside such a cell counts half (the likelihood field of Thrun, Burgard and
+    Fox, Probabilistic Robotics, section 6.4, in its simplest form).
 
     Parameters
     ----------
@@ -335,13 +338,18 @@ def likely_poses(
     around, radius : centres of the search, ``map_T_lidar``, and metres around each
     count : largest number of poses, which are more than 1.5 m or 12 degrees apart
     most_turn : largest rotation against the centre about the vertical axis, rad
+    rare : whether a point counts minus the logarithm of the share of the trial poses at which it
+        hits: ground, which fits everywhere, tells nothing, and a post, which fits at few places,
+        tells much. For two sweeps that follow each other: what is new or gone is rare as well.
     """
     tried = [_trials(points, map_points, pose, radius, most_turn) for pose in around]
-    chance = np.mean([trials.chance() for trials in tried], axis=0)
-    hit = np.flatnonzero(chance)
-    rare = hit[np.argsort(chance[hit], kind="stable")[:_SCORED]]
-    told = -np.log(chance[rare]).astype(np.float32)
-    scores = np.concatenate([trials.scores(rare, told) for trials in tried])
+    scored, weights = np.arange(len(points)), np.ones(len(points), np.float32)
+    if rare:
+        chance = np.mean([trials.chance() for trials in tried], axis=0)
+        hit = np.flatnonzero(chance)
+        scored = hit[np.argsort(chance[hit], kind="stable")[:_RAREST]]
+        weights = -np.log(chance[scored]).astype(np.float32)
+    scores = np.concatenate([trials.scores(scored, weights) for trials in tried])
     moves = np.concatenate([trials.moves for trials in tried])
     owner = np.repeat(np.arange(len(tried)), [len(trials.moves) for trials in tried])
     best: list[gtsam.Pose3] = []

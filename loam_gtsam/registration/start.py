@@ -36,6 +36,8 @@ _TOGETHER = (2, 3, 5, 8)
 """Numbers of sweeps at which all are registered anew: each time half as many more or so."""
 _ROUNDS = 2  # times that each of them is then registered with the map of the others
 _PLACES = 6  # motions between the first two sweeps that are tried beside the expected one
+_SAMPLE = (500, 140)
+"""Number of edges and planes that are looked at for these: ten of 500 edges may lie on posts."""
 _AGAINST = 5.0
 """Number of features that agree which one outweighs that contradicts. At the right place 3 of 1000
 matches contradict by noise, at a wrong one ten times as many (medians of 315 starts, of which 10
@@ -129,12 +131,13 @@ class Start:
         if middle.range(first.map_T_middle) > APART[0]:  # a guess, and it may be wrong
             around.append(first.map_T_middle)
         places = likely_poses(
-            sample_features(*frame.matcher.posed.points),
+            sample_features(*frame.matcher.posed.points, _SAMPLE),
             np.concatenate(_in_map(first)),
             around,
             min(_FASTEST * seconds, _FARTHEST),
             _PLACES,
             most_turn=_TURNING * seconds,
+            rare=True,
         )
         quick = [
             self._tried(frame, place, solver) for place in (expected.solution.map_T_lidar, *places)

@@ -405,9 +405,18 @@ def _drivable(way: _Way, config: RelocalizationConfig) -> bool:
 
 
 def _apart(one: _Way, other: _Way, near: float) -> bool:
-    """Whether two ways differ by more than ``near``, metres, at any feature of the last sweep."""
-    way = one[-1].points - other[-1].points
-    return bool(np.linalg.norm(way, axis=1).max(initial=0.0) > near)
+    """Whether most features of the last sweep are farther than ``near``, metres, from each other.
+
+    Compared are the motions since the first sweep, not the points, which are de-skewed for them.
+    """
+    moved = [
+        way[-1].sweeps[0].map_T_middle.between(way[-1].sweeps[-1].map_T_middle)
+        for way in (one, other)
+    ]
+    seen = transform(one[-1].sweeps[-1].map_T_middle.inverse().matrix(), one[-1].points)
+    ends = [transform(pose.matrix(), seen) for pose in moved]
+    away = np.linalg.norm(ends[0] - ends[1], axis=1)
+    return bool(np.count_nonzero(away > near) > 0.5 * len(away))
 
 
 def _better(tried: _Way, best: _Way, least: float) -> bool:

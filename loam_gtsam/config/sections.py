@@ -255,7 +255,7 @@ class SolverConfig(Section):
     method: Literal["gtsam", "loam", "aloam"] = parameter("gtsam")
     """The pose is solved by a factor graph (gtsam), by LOAM's Gauss-Newton on Euler angles (loam),
     or by A-LOAM's robust Levenberg-Marquardt (aloam)."""
-    iterations: int = parameter(20, source="LOAM uses 10", low=1, high=1000)
+    iterations: int = parameter(20, source="LOAM uses 10", low=1, high=200)
     """A solve associates the features with the map at most this many times."""
     inner_iterations: int = parameter(2, source="A-LOAM uses 4", low=1, high=1000)
     """After each association, Levenberg-Marquardt takes at most this many iterations."""

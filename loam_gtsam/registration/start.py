@@ -180,6 +180,7 @@ class Start:
     def _added(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
     ) -> tuple[Frame, Found]:
+        """As :meth:`add`, without what is in doubt."""
         new = EarlySweep(
             frame.sweep.at(found.twist),
             found.solution.map_T_lidar,
@@ -431,12 +432,10 @@ def _better(tried: _Way, best: _Way, least: float) -> bool:
 
 
 def _signs(tried: _Way, best: _Way) -> tuple[float, float, float, float]:
-    """How much all features, lines and planes speak for one way against another, in standard
-    deviations, and how many features more agree with it, counted as far as they lie across.
+    """How much speaks for one way against another.
 
-    A feature counts as far as its line or plane lies across the way from one place to the other:
-    ground and walls along the way agree at both, but for chance. The sweeps see the same things, so
-    that more of them are not more evidence.
+    In standard deviations, of all features, of lines and of planes; and the number of features that
+    speak for it more than against it. The sweeps see the same things, and count as one.
     """
     found = [_gain(*pair) for pair in zip(tried, best, strict=True)]
     gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
@@ -448,8 +447,10 @@ def _signs(tried: _Way, best: _Way) -> tuple[float, float, float, float]:
 
 
 def _gain(tried: _Tried, best: _Tried) -> tuple[FloatArray, BoolArray, float]:
-    """What each feature (F,) says for one place against another, whether it is an edge, and the
-    sum, each counted once more as far as it lies across.
+    """What each feature (F,) says for one place against another, which are edges, and their number.
+
+    A feature counts as far as its line or plane lies across the way from one place to the other:
+    ground and walls along the way agree at both, but for chance.
     """
     edge = np.arange(len(best.points)) < best.edges
     way = tried.points - best.points

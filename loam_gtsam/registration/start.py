@@ -377,10 +377,12 @@ def _step(one: EarlySweep, other: EarlySweep, seconds: float) -> gtsam.Pose3:
 def _kept(ways: Sequence[_Way], config: Config) -> list[_Way]:
     """The best of some ways, and after it those that are as good, but for chance.
 
-    Ways that no acceleration explains are none, if there are others.
+    The first one is the way that was taken. If some acceleration explains it, others that none
+    explains are no ways.
     """
     least, near = config.solver.min_aligned, config.map.plane_voxel
-    ways = [way for way in ways if _drivable(way, config.relocalization)] or ways
+    if _drivable(ways[0], config.relocalization):
+        ways = [way for way in ways if _drivable(way, config.relocalization)]
     best = ways[0]
     for way in ways[1:]:
         if _better(way, best, least):
@@ -455,8 +457,12 @@ def _gain(tried: _Tried, best: _Tried) -> tuple[FloatArray, BoolArray, float]:
     edge = np.arange(len(best.points)) < best.edges
     way = tried.points - best.points
     way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _TINY)
-    axes = np.where(tried.axes.any(axis=1, keepdims=True), tried.axes, best.axes)
-    across = np.abs(np.einsum("ij,ij->i", axes, way))
-    across[edge] = np.sqrt(np.maximum(1.0 - across[edge] ** 2, 0.0))
+    matched = [one.axes.any(axis=1) for one in (tried, best)]
+    along = [np.einsum("ij,ij->i", one.axes, way) ** 2 for one in (tried, best)]
+    each = [
+        has * np.where(edge, 1.0 - cosine, cosine)
+        for has, cosine in zip(matched, along, strict=True)
+    ]
+    across = np.sqrt(np.clip(sum(each) / np.maximum(sum(matched), 1), 0.0, 1.0))
     gain = across * (tried.evidence - best.evidence)
     return gain, edge, float(across @ gain)

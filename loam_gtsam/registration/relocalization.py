@@ -384,9 +384,11 @@ class _Trials(NamedTuple):
 
     def scores(self, points: IntArray, weights: NDArray[np.float32]) -> FloatArray:
         """Score of each trial pose by some of the points."""
+        near = self.near[points]
+        points, weights = points[near], weights[near]
         scores = np.empty((len(self.bases), len(self.shifts)))
         for row, base in zip(scores, self.bases[:, points], strict=True):
-            row[:] = self.field[base + self.shifts[:, None]] @ (weights * self.near[points])
+            row[:] = self.field[base + self.shifts[:, None]] @ weights
         return scores.ravel()
 
 

@@ -19,7 +19,7 @@ from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.matches import ChosenRows
-from loam_gtsam.registration.odometry import Moment, Prediction
+from loam_gtsam.registration.odometry import Moment, Prediction, advance
 from loam_gtsam.registration.relocalization import (
     APART,
     Found,
@@ -102,8 +102,8 @@ class Start:
     def __init__(self, first: Prediction, keyframe: int) -> None:
         self._map_T_first = first.map_T_lidar
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, True, first.motion, keyframe)]
-        self._ways: list[_Way] = []
-        """The way that the sweeps took, and those that explain them as well, but for chance."""
+        self._rivals: list[list[EarlySweep]] = []
+        """The sweeps on other ways, which explain them as well, but for chance."""
 
     @classmethod
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
@@ -148,8 +148,7 @@ class Start:
             for number, tried in enumerate(quick)
             if number == 0 or tried.share >= enough
         ]
-        self._ways = _kept(ways, frame.matcher.config)
-        best = self._ways[0][0]
+        (best,) = self._best(ways, frame.matcher.config)
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
         return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
@@ -171,10 +170,10 @@ class Start:
         Among several places, one of which is right, the mean squared error of any of them.
         """
         total = np.zeros((6, 6))
-        for way in self._ways[1:]:
-            place = _continued(way[-1].sweeps, stamp)
+        for sweeps in self._rivals:
+            place = _continued(sweeps, stamp)
             step = map_T_lidar.AdjointMap() @ map_T_lidar.localCoordinates(place)
-            total += np.outer(step, step) / len(self._ways)
+            total += np.outer(step, step) / (1 + len(self._rivals))
         return total
 
     def _added(
@@ -231,13 +230,13 @@ class Start:
         """
         if len(sweeps) == 2:
             return sweeps
-        others, self._ways = [_moved(sweeps, way[-1].sweeps) for way in self._ways[1:]], []
+        others, self._rivals = [_moved(sweeps, rival) for rival in self._rivals], []
         if any(sweep.held for sweep in sweeps[1:]):
             return sweeps
         if len(sweeps) == 3:
             first, second, third = sweeps
             seconds = first.moment.seconds_to(second.moment.stamp)
-            place = first.map_T_middle.compose(_step(second, third, seconds))
+            place = advance(first.map_T_middle, _twist(second, third), seconds)
             if not same(place, second.map_T_middle):
                 others.append([first, replace(second, map_T_middle=place)])
         if not others:
@@ -250,8 +249,14 @@ class Start:
             )
             for way in (sweeps, *followed)
         ]
-        self._ways = _kept(ways, frame.matcher.config)
-        return sweeps if self._ways[0] is ways[0] else self._ways[0][-1].sweeps
+        best = self._best(ways, frame.matcher.config)
+        return sweeps if best is ways[0] else best[-1].sweeps
+
+    def _best(self, ways: Sequence[_Way], config: Config) -> _Way:
+        """The best of some ways; those that are as good are rivals from then on."""
+        best, *rivals = _kept(ways, config)
+        self._rivals = [way[-1].sweeps for way in rivals]
+        return best
 
     def _followed(
         self,
@@ -365,13 +370,14 @@ def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:
 def _continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
     """Where the motion between the last two sweeps leads by a stamp, nanoseconds."""
     before, last = sweeps[-2:]
-    return last.map_T_middle.compose(_step(before, last, last.moment.seconds_to(stamp)))
+    return advance(last.map_T_middle, _twist(before, last), last.moment.seconds_to(stamp))
 
 
-def _step(one: EarlySweep, other: EarlySweep, seconds: float) -> gtsam.Pose3:
-    """The motion from one sweep to the next, for so many seconds."""
+def _twist(one: EarlySweep, other: EarlySweep) -> FloatArray:
+    """Mean body velocity (6,) from one sweep to the next, rad/s and m/s."""
     moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
-    return gtsam.Pose3.Expmap(moved * (seconds / one.moment.seconds_to(other.moment.stamp)))
+    twist: FloatArray = moved / one.moment.seconds_to(other.moment.stamp)
+    return twist
 
 
 def _kept(ways: Sequence[_Way], config: Config) -> list[_Way]:

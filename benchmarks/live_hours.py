@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gtsam
 import numpy as np
 
 from benchmarks.cases import ROOT
@@ -30,13 +31,15 @@ from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.world import SENSORS
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.ros.live import LiveMapper
-from loam_gtsam.types import FloatArray, ImuSamples, Scan
+from loam_gtsam.studies.evaluation import FIVE_SIGMA, squared_errors
+from loam_gtsam.types import FloatArray, FrameStatus, ImuSamples, MapUpdate, Scan
 
 EVERY = 2_000
 PERIOD, PERIODS = 30.0, 6
 """Seconds from one lap to the next, and laps after which the wander of the IMU repeats itself."""
 COLUMNS = ("frame", "process_mb", "cpu_ms", "worst_ms", "map_points", "imu_samples", "keyframes",
-           "loops", "forgotten", "not_solved", "worst_error_m")  # fmt: skip
+           "loops", "forgotten", "not_solved", "worst_error_m", "beyond")  # fmt: skip
+"""``beyond`` are frames ``ok`` whose pose is off by more than five told standard deviations."""
 _SPEED, _LAP = 0.6840360804642713, 20.0
 """m/s at which the lap takes this many seconds, a whole number of periods of the sway."""
 _BRAKING = 3.0  # seconds
@@ -123,7 +126,7 @@ class Round:
             parts = (rays, "f4"), (ranges[column, ring], "f4"), (column, "i2"), (ring, "i2")
             self._sweeps.append([np.ascontiguousarray(part, kind) for part, kind in parts])
         poses = motion.world_T_lidar(0.1 * np.arange(self.frames))
-        self._truth = (inverse_pose(poses[0]) @ poses)[:, :3, 3]
+        self._truth = inverse_pose(poses[0]) @ poses
         stamps = np.arange(0, self.frames * _SWEEP, _SAMPLE)
         self._samples = imu.samples(motion, stamps, stamps * 1e-9, 0)
 
@@ -137,10 +140,13 @@ class Round:
         rings = ring[kept].astype(np.int32)
         return Scan(points, _EPOCH + number * _SWEEP, times=times, rings=rings)
 
-    def error(self, stamp: int, position: FloatArray) -> float:
-        """Metres from where the lidar was, counted from its first sweep."""
-        number = (stamp - _EPOCH) // _SWEEP
-        return float(np.linalg.norm(position - self._truth[number % self.frames]))
+    def errors(self, first: MapUpdate, update: MapUpdate) -> tuple[float, float]:
+        """Metres from where the lidar was, and the squared error in told standard deviations."""
+        number = (update.stamp - _EPOCH) // _SWEEP
+        true = [gtsam.Pose3(self._truth[k % self.frames]) for k in (0, number)]
+        moved = first.map_T_lidar.between(update.map_T_lidar).translation()
+        squared = squared_errors([first, update], true).get(1, np.inf)
+        return float(np.linalg.norm(moved - true[1].translation())), squared
 
     def sample(self, number: int) -> tuple[int, ImuSamples, int]:
         """Stamp of the sample of that number, and its row in a lap's."""
@@ -154,7 +160,8 @@ def measure(frames: int, minutes: float, *, loops: bool) -> Iterator[tuple[float
     live = LiveMapper(config, imu=True)
     samples, end = 0, time.monotonic() + 60.0 * minutes
     milliseconds: list[float] = []
-    not_solved, error = 0, 0.0
+    updates: list[MapUpdate] = []
+    not_solved, error, beyond = 0, 0.0, 0
     for number in range(frames):
         scan = laps.sweep(number)
         message, ready = cloud(scan), scan.stamp + 150_000_000
@@ -164,12 +171,16 @@ def measure(frames: int, minutes: float, *, loops: bool) -> Iterator[tuple[float
             samples += 1
         live.add_cloud(message)
         while (result := live.step()) is not None:
-            update = result.update
-            not_solved += not update.status.solved
-            error = max(error, laps.error(update.stamp, update.map_T_lidar.translation()))
+            updates.append(result.update)
         milliseconds.append(1e3 * (time.process_time() - begun))
+        for update in updates[1:]:
+            metres, squared = laps.errors(updates[0], update)
+            not_solved += not update.status.solved
+            error = max(error, metres)
+            beyond += update.status is FrameStatus.OK and squared > FIVE_SIGMA
+        del updates[1:]
         if number % EVERY == EVERY - 1:
-            yield (number, *_state(live, milliseconds), not_solved, error)
+            yield (number, *_state(live, milliseconds), not_solved, error, beyond)
             milliseconds.clear()
             error = 0.0
             if time.monotonic() > end:

@@ -38,8 +38,11 @@ EVERY = 2_000
 PERIOD, PERIODS = 30.0, 6
 """Seconds from one lap to the next, and laps after which the wander of the IMU repeats itself."""
 COLUMNS = ("frame", "process_mb", "cpu_ms", "worst_ms", "map_points", "imu_samples", "keyframes",
-           "loops", "forgotten", "not_solved", "worst_error_m", "beyond")  # fmt: skip
-"""``beyond`` are frames ``ok`` whose pose is off by more than five told standard deviations."""
+           "loops", "forgotten", "not_solved", "worst_error_m", "worst_odom_m",
+           "beyond")  # fmt: skip
+"""Errors are those of poses in ``map``, which loops correct, and in ``odom``, which drifts on;
+``beyond`` are frames ``ok`` that are off by more than five told standard deviations in ``odom``.
+"""
 _SPEED, _LAP = 0.6840360804642713, 20.0
 """m/s at which the lap takes this many seconds, a whole number of periods of the sway."""
 _BRAKING = 3.0  # seconds
@@ -140,28 +143,25 @@ class Round:
         rings = ring[kept].astype(np.int32)
         return Scan(points, _EPOCH + number * _SWEEP, times=times, rings=rings)
 
-    def errors(self, first: MapUpdate, update: MapUpdate) -> tuple[float, float]:
-        """Metres from where the lidar was, and the squared error in told standard deviations."""
-        number = (update.stamp - _EPOCH) // _SWEEP
-        true = [gtsam.Pose3(self._truth[k % self.frames]) for k in (0, number)]
-        moved = first.map_T_lidar.between(update.map_T_lidar).translation()
-        squared = squared_errors([first, update], true).get(1, np.inf)
-        return float(np.linalg.norm(moved - true[1].translation())), squared
+    def true(self, stamp: int) -> gtsam.Pose3:
+        """Pose of the lidar, seen from its first sweep."""
+        number = (stamp - _EPOCH) // _SWEEP
+        return gtsam.Pose3(self._truth[number % self.frames])
 
     def sample(self, number: int) -> tuple[int, ImuSamples, int]:
         """Stamp of the sample of that number, and its row in a lap's."""
         return _EPOCH + number * _SAMPLE, self._samples, number % len(self._samples.stamps)
 
 
-def measure(frames: int, minutes: float, *, loops: bool) -> Iterator[tuple[float, ...]]:
+def measure(frames: int, minutes: float, *, with_loops: bool) -> Iterator[tuple[float, ...]]:
     """A row of :data:`COLUMNS` for every :data:`EVERY` frames, until one of the limits."""
     laps = Round()
-    config = Config().changed({"imu.lidar_t_imu": laps.lever, "loops.enabled": loops})
+    config = Config().changed({"imu.lidar_t_imu": laps.lever, "loops.enabled": with_loops})
     live = LiveMapper(config, imu=True)
     samples, end = 0, time.monotonic() + 60.0 * minutes
     milliseconds: list[float] = []
     updates: list[MapUpdate] = []
-    not_solved, error, beyond = 0, 0.0, 0
+    not_solved, beyond, errors = 0, 0, np.zeros(2)
     for number in range(frames):
         scan = laps.sweep(number)
         message, ready = cloud(scan), scan.stamp + 150_000_000
@@ -173,16 +173,24 @@ def measure(frames: int, minutes: float, *, loops: bool) -> Iterator[tuple[float
         while (result := live.step()) is not None:
             updates.append(result.update)
         milliseconds.append(1e3 * (time.process_time() - begun))
+        loops = live.pipeline.loops
         for update in updates[1:]:
-            metres, squared = laps.errors(updates[0], update)
+            start, true = updates[0], laps.true(update.stamp)
+            odom = start.map_T_lidar.between(update.map_T_lidar)
+            corrected = odom
+            if loops is not None:
+                pose = loops.map_T_odom.compose(update.map_T_lidar)
+                corrected = start.map_T_lidar.between(pose)
+            squared = squared_errors([start, update], [gtsam.Pose3(), true]).get(1, np.inf)
+            off = [np.linalg.norm(true.between(pose).translation()) for pose in (corrected, odom)]
+            errors = np.maximum(errors, off)
             not_solved += not update.status.solved
-            error = max(error, metres)
             beyond += update.status is FrameStatus.OK and squared > FIVE_SIGMA
         del updates[1:]
         if number % EVERY == EVERY - 1:
-            yield (number, *_state(live, milliseconds), not_solved, error, beyond)
+            yield (number, *_state(live, milliseconds), not_solved, *errors.tolist(), beyond)
             milliseconds.clear()
-            error = 0.0
+            errors = np.zeros(2)
             if time.monotonic() > end:
                 break
     print(live.report())
@@ -211,7 +219,7 @@ def main() -> None:
     rows = []
     name = "live_hours_loops.csv" if options.loops else "live_hours.csv"
     options.output.mkdir(parents=True, exist_ok=True)
-    for row in measure(options.frames, options.minutes, loops=options.loops):
+    for row in measure(options.frames, options.minutes, with_loops=options.loops):
         rows.append(row)
         write_csv(options.output / name, COLUMNS, rows)
     table = np.array(rows)

@@ -153,10 +153,10 @@ class Round:
         return _EPOCH + number * _SAMPLE, self._samples, number % len(self._samples.stamps)
 
 
-def measure(frames: int, minutes: float, *, with_loops: bool) -> Iterator[tuple[float, ...]]:
+def measure(frames: int, minutes: float, *, loops: bool) -> Iterator[tuple[float, ...]]:
     """A row of :data:`COLUMNS` for every :data:`EVERY` frames, until one of the limits."""
     laps = Round()
-    config = Config().changed({"imu.lidar_t_imu": laps.lever, "loops.enabled": with_loops})
+    config = Config().changed({"imu.lidar_t_imu": laps.lever, "loops.enabled": loops})
     live = LiveMapper(config, imu=True)
     samples, end = 0, time.monotonic() + 60.0 * minutes
     milliseconds: list[float] = []
@@ -173,17 +173,9 @@ def measure(frames: int, minutes: float, *, with_loops: bool) -> Iterator[tuple[
         while (result := live.step()) is not None:
             updates.append(result.update)
         milliseconds.append(1e3 * (time.process_time() - begun))
-        loops = live.pipeline.loops
         for update in updates[1:]:
-            start, true = updates[0], laps.true(update.stamp)
-            odom = start.map_T_lidar.between(update.map_T_lidar)
-            corrected = odom
-            if loops is not None:
-                pose = loops.map_T_odom.compose(update.map_T_lidar)
-                corrected = start.map_T_lidar.between(pose)
-            squared = squared_errors([start, update], [gtsam.Pose3(), true]).get(1, np.inf)
-            off = [np.linalg.norm(true.between(pose).translation()) for pose in (corrected, odom)]
-            errors = np.maximum(errors, off)
+            metres, squared = _errors(live, updates[0], update, laps.true(update.stamp))
+            errors = np.maximum(errors, metres)
             not_solved += not update.status.solved
             beyond += update.status is FrameStatus.OK and squared > FIVE_SIGMA
         del updates[1:]
@@ -194,6 +186,17 @@ def measure(frames: int, minutes: float, *, with_loops: bool) -> Iterator[tuple[
             if time.monotonic() > end:
                 break
     print(live.report())
+
+
+def _errors(
+    live: LiveMapper, first: MapUpdate, update: MapUpdate, true: gtsam.Pose3
+) -> tuple[list[float], float]:
+    """Metres off in ``map`` and in ``odom``; the latter squared, in told standard deviations."""
+    loops, odom = live.pipeline.loops, update.map_T_lidar
+    corrected = odom if loops is None else loops.map_T_odom.compose(odom)
+    moved = [first.map_T_lidar.between(pose) for pose in (corrected, odom)]
+    squared = squared_errors([first, update], [gtsam.Pose3(), true]).get(1, np.inf)
+    return [true.range(pose) for pose in moved], squared
 
 
 def _state(live: LiveMapper, milliseconds: list[float]) -> tuple[float, ...]:
@@ -219,7 +222,7 @@ def main() -> None:
     rows = []
     name = "live_hours_loops.csv" if options.loops else "live_hours.csv"
     options.output.mkdir(parents=True, exist_ok=True)
-    for row in measure(options.frames, options.minutes, with_loops=options.loops):
+    for row in measure(options.frames, options.minutes, loops=options.loops):
         rows.append(row)
         write_csv(options.output / name, COLUMNS, rows)
     table = np.array(rows)

@@ -91,6 +91,7 @@ class Mapper:
     registered : the last sweep as it went into the map; None if it did not
     imu : what the mapper makes of the IMU; None without one
     monitor : tells whether sweeps fit the map
+    errors : calibrates the covariances
     maps : the map of edges and that of planes
     keyframe : number of the keyframe to which the points of the next frames belong
 
@@ -119,8 +120,7 @@ class Mapper:
         self.keyframe = 0
         self.last: MapUpdate | None = None
         self.registered: Registered | None = None
-        self.monitor = FitMonitor(self.config.relocalization)
-        self._errors = PoseErrors(self.config)
+        self.monitor, self.errors = FitMonitor(self.config.relocalization), PoseErrors(self.config)
         self._stamps = StampCheck()
         self._start: Start | None = None
         self._moment: Moment | None = None
@@ -172,7 +172,7 @@ class Mapper:
             guess = self.imu.first_pose(features.stamp, guess)
         sweep = MovingSweep(features, self.config, self.imu.trusted_gyro if self.imu else None)
         before = self.last, self._moment, self.imu
-        expected = self._errors.expected(sweep.stamp, *before[1:]) if guess is None else None
+        expected = self.errors.expected(sweep.stamp, *before[1:]) if guess is None else None
         predicted = predict(sweep, *before, self.config.solver, guess, twist, expected)
         try:
             self.maps.recenter(predicted.map_T_middle, features.reach)
@@ -201,7 +201,7 @@ class Mapper:
                         self._start = None
                         self._insert(*placed, update.status, update.message, clock)
         if not update.status.solved:
-            self._errors.skipped(sweep)
+            self.errors.skipped(sweep)
         self.last = replace(update, timings=clock.seconds)
         return self.last
 
@@ -237,7 +237,7 @@ class Mapper:
             self.last = replace(last, stamp=last.stamp + refusal.clock_step)
             if self._moment is not None:
                 self._moment = self._moment._replace(stamp=self._moment.stamp + refusal.clock_step)
-            self._errors.cut()
+            self.errors.cut()
         bad, message, fault = FrameStatus.BAD_STAMP, refusal.message, refusal.fault
         return MapUpdate(stamp, last.map_T_lidar, bad, message, twist=last.twist, fault=fault)
 
@@ -259,7 +259,7 @@ class Mapper:
             context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
             factors += own_factors(self.extra_factors, context)
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
-        steady = self._errors.accelerations
+        steady = self.errors.accelerations
         matcher = FrameMatcher.of(*args, inertial=predicted.inertial, accelerations=steady)
         return Frame(matcher, predicted, factors)
 
@@ -290,16 +290,16 @@ class Mapper:
         solution, doubt = found.solution, found.doubt
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
-        scan = self._errors.of_scan(solution, small=self.maps.small)
+        scan = self.errors.of_scan(solution, small=self.maps.small)
         if found.message:
-            self._errors.jumped(frame.predicted.map_T_middle, solution.map_T_lidar)
+            self.errors.jumped(frame.predicted.map_T_middle, solution.map_T_lidar)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last
-        update = self._errors.calibrated(update, frame.sweep, solution, scan, last, fused, doubt)
+        update = self.errors.calibrated(update, frame.sweep, solution, scan, last, fused, doubt)
         clock.lap("covariance")
         return update
 

@@ -100,7 +100,10 @@ class LoopMapping:
         """
         there = self._misplaced(metres, degrees)
         if there:
-            self.points_moved += self._mapper.maps.move(self._moves(there))
+            moves, newest = self._moves(there), self.graph.keyframes[-1].odom_T_lidar
+            self.points_moved += self._mapper.maps.move(moves)
+            nearest = min(there, key=lambda index: newest.range(self._placed[index]))
+            self._mapper.errors.moved(gtsam.Pose3(moves[nearest]))
         for index, pose in there.items():
             self._placed[index] = pose
 

@@ -116,7 +116,7 @@ class PoseErrors:
         self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionFilter(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
-        self._doubt = np.zeros((6, 6))
+        self._doubt, self._moved = np.zeros((2, 6, 6))
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
@@ -199,7 +199,7 @@ class PoseErrors:
             effective_matches=scan.effective_matches,
         )
         self._last = now
-        total = self._drift + self._blind @ self._blind.T
+        total = self._drift + self._blind @ self._blind.T + self._moved
         total = total + self._origin.error(self._motion.variances)
         covariance = symmetric(own + drifted @ total @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
@@ -228,6 +228,15 @@ class PoseErrors:
         if not same(expected, found):
             in_map = found.AdjointMap() * expected.localCoordinates(found)
             self._drift = self._drift + 0.5 * in_map @ in_map.T
+
+    def moved(self, step: gtsam.Pose3) -> None:
+        """Account for points of the map that a loop closure moved by a step, in map axes.
+
+        The frames to come follow them, while the first pose stays where it was. The motion from one
+        frame to another is none the worse for it: see :func:`relative_covariance`.
+        """
+        in_map = gtsam.Pose3.Logmap(step)
+        self._moved = self._moved + np.outer(in_map, in_map)
 
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""

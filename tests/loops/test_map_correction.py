@@ -15,6 +15,8 @@ from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.maps.map_graph import graph_arrays, graph_of, graph_of_arrays
 from loam_gtsam.pipeline import Pipeline, imu_buffer
+from loam_gtsam.registration.frame_matcher import MapPair
+from loam_gtsam.registration.pose_errors import PoseErrors
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import InputError
 
@@ -125,6 +127,20 @@ def test_only_keyframes_that_lie_elsewhere_move_their_points(metres, moves):
     before = marks(mapper)
     loops.correct_map(metres, 180.0)  # nothing is left to do
     np.testing.assert_array_equal(marks(mapper), before)
+
+
+@pytest.mark.parametrize("metres", [100.0, 1e-3])
+def test_the_pose_errors_learn_of_the_step_of_the_nearest_points_that_move(metres, monkeypatch):
+    steps, moves = [], []
+    monkeypatch.setattr(PoseErrors, "moved", lambda _, step: steps.append(step.matrix()))
+    move = MapPair.move
+    monkeypatch.setattr(MapPair, "move", lambda self, by: moves.append(by) or move(self, by))
+    driven(first=len(POSES) - 1, follow_distance=metres, follow_angle_deg=180.0)
+    assert len(steps) == len(moves) == (metres < 1.0)
+    if steps:
+        *earlier, last = (update.map_T_lidar for update in updates(POSES, DRIFT))
+        nearest = min(moves[0], key=lambda index: last.range(earlier[index]))
+        np.testing.assert_array_equal(steps[0], moves[0][nearest])
 
 
 def test_counts_and_ends_are_those_of_the_graph():

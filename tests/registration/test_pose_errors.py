@@ -357,3 +357,16 @@ def test_what_is_in_doubt_at_the_end_of_the_start_is_an_error_of_the_map(stays, 
     motion = relative_covariance(*updates[:2])
     assert np.linalg.eigvalsh(motion)[0] > 0.0
     assert motion[3, 3] > 4.0
+
+
+def test_a_map_that_loops_have_moved_is_an_error_of_the_pose_and_not_of_its_motion(monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    errors = PoseErrors(Config())
+    before = [calibrated(errors, k) for k in range(4)][-1]
+    errors.moved(gtsam.Pose3(gtsam.Rot3(), np.array([0.3, 0.0, 0.0])))
+    errors.moved(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, -0.4, 0.0])))
+    after = calibrated(errors, 4)
+    added = np.diag(after.covariance - before.covariance)
+    np.testing.assert_allclose(added, [0.0, 0.0, 0.0, 0.09, 0.16, 0.0], atol=1e-4)
+    assert np.abs(relative_covariance(before, after)).max() < 1e-4

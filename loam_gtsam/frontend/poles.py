@@ -21,10 +21,18 @@ _LINKED = 0.2
 _ROUND = 0.25 * np.pi
 """Distance of a cylinder's axis from the mean of the points seen on it, as a share of the radius:
 the mean of ``sqrt(1 - x^2)`` over the width."""
-_THINNEST = 0.05
-"""Width of the thinnest posts, as of railings and signs, metres."""
+_NOISE = 0.1
+"""Metres by which the ranges of two points of a pole differ by chance."""
+_WIDTHS = 0.05 * 1.08 ** np.arange(58)
+"""Metres, from the thinnest posts of railings and signs to twice the widest poles."""
+_EXPECTED = (1.0 / _WIDTHS) / (1.0 / _WIDTHS).sum()
+"""How frequent they are known to be beforehand: in proportion to ``1 / x^2``, which is what makes
+half as many twice as wide."""
 _BEFOREHAND = 10.0
-"""Runs of a sweep that tell as much about the widths in it as is known beforehand."""
+"""Things by which that counts."""
+_STEPS = 10
+"""Of the iteration; fifty change no width by more than a twentieth."""
+_TINY = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,6 +73,8 @@ def find_poles(
 ) -> Poles:
     """Find the runs of a ring that are narrow, and nearer than what is on either side of them.
 
+    A run that is deeper than wide is of a surface that is seen at a grazing angle, as of a rail.
+
     Parameters
     ----------
     xyz : (3, N) metres, ring after ring in firing order
@@ -100,41 +110,44 @@ def find_poles(
     gap_after = np.where(empty[last], np.inf, farther[last])
     length = last - first + 1
     depths = np.minimum(gap_before, gap_after).astype(np.float64)
+    wide = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) * ranges[last]
     chosen = (length <= most) & cut[last] & cut[before] & (depths > depth)
+    chosen &= np.abs(ranges[last] - ranges[first]) <= wide + _NOISE
     first, last, depths, length = first[chosen], last[chosen], depths[chosen], length[chosen]
     sums = np.zeros((3, xyz.shape[1] + 1))
     np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
     across = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) + spacing
-    radii = 0.5 * _likely_widths(across * distance, spacing * distance, length == 1)
+    radii = 0.5 * _likely_widths(across * distance, spacing * distance)
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
     return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])
 
 
-def _likely_widths(widths: FloatArray, apart: FloatArray, single: BoolArray) -> FloatArray:
-    """(M,) metres: the ``widths`` of runs, with those of ``single`` points guessed from the others.
+def _likely_widths(widths: FloatArray, apart: FloatArray) -> FloatArray:
+    """(M,) metres: the means of what the things may be wide that beams ``apart`` (M,) have met.
 
-    One beam may have met anything narrower than twice the distance to the next beam, ``apart``
-    (M,), and if it is wider than that distance, another beam the sooner. So it is as wide as the
-    runs of more points of the sweep are in the mean, weighted by the chance that one beam alone
-    meets these; see docs/maths/features.md, equation 2. Where they are few: as wide as things are
-    if widths x are as frequent as ``1 / x^2``.
+    Beams of ``widths`` (M,) in all may have met anything that is wider or narrower by less than
+    the distance to the next beam. How frequent which width is, is what makes the whole sweep
+    likeliest: the self-consistent estimate of B. W. Turnbull, The empirical distribution function
+    with arbitrarily grouped, censored and truncated data, J. R. Stat. Soc. B 38, 1976. Truncated,
+    for what is narrow and far away is mostly missed; see docs/maths/features.md, equation 2.
     """
-    likely, limit = widths.copy(), apart[single]
-    known = np.sort(widths[~single])
-    sums = np.cumsum([[0.0, *1.0 / known], [0.0, *np.ones(len(known))], [0.0, *known]], axis=1)
-    surely, maybe = (sums[:, np.searchsorted(known, most, "right")] for most in (limit, 2 * limit))
-    maybe -= surely
-    # The chance is 1 up to the distance, and from there on 2 distances / width - 1.
-    weight, total = surely[1:] + 2.0 * limit * maybe[:2] - maybe[1:]
-    most = np.maximum(limit, _THINNEST)
-    guess = 2.0 * np.log(2.0) * most - _THINNEST
-    guess /= np.log(most / _THINNEST) + 1.0 - np.log(2.0)
-    guess = np.minimum(guess, limit)
-    likely[single] = (total + _BEFOREHAND * guess) / (weight + _BEFOREHAND)
-    return likely
+    ratio = _WIDTHS / apart[:, None]
+    chance = np.maximum(1.0 - np.abs(ratio - (widths / apart)[:, None]), _TINY)
+    met = np.minimum(ratio, 1.0)
+    frequency = _EXPECTED
+    for _ in range(_STEPS):
+        # Loops of its own, not BLAS: the same sums with any number of threads.
+        seen = np.einsum("ij,i->j", chance, 1.0 / np.einsum("ij,j->i", chance, frequency))
+        there = np.einsum("ij,i->j", met, 1.0 / np.einsum("ij,j->i", met, frequency))
+        frequency = frequency * seen + _BEFOREHAND * _EXPECTED
+        frequency /= there + _BEFOREHAND
+        frequency /= frequency.sum()
+    total = np.einsum("ij,j->i", chance, frequency)
+    means: FloatArray = np.einsum("ij,j->i", chance, frequency * _WIDTHS) / total
+    return means
 
 
 def _to_next(

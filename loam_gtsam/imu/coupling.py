@@ -11,6 +11,7 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.preintegration import Fused, InertialOdometry, Prediction
+from loam_gtsam.imu.preintegration_window import VELOCITY
 from loam_gtsam.types import FloatArray, SweepError
 
 _FORCE = 0.2, 3.0
@@ -26,6 +27,7 @@ _FASTEST = 20.0  # m/s: standard deviation of a speed that nothing told
 _UNLIKELY = float(chdtri(6, 2.0 * ndtr(-5.0)))
 """Squared Mahalanobis distance from which a pose contradicts its prediction: as unlikely as five
 standard deviations."""
+_UNFELT = 2.0  # m/s^2: standard deviation of an acceleration that nothing told, as of the solver
 _OUTWEIGHS = 5  # frames that agree and one that contradicts: the one after it knows no velocity
 _DISTRUST = 3 * _OUTWEIGHS  # from which, less agreements, the accelerometer is not used
 
@@ -55,6 +57,7 @@ class TightCoupling:
         self.config = config
         self._odometry: InertialOdometry | None = None
         self._predicted: int | None = None
+        self._unfelt = False  # whether samples were missing, or absurd, since the last frame
         self._contradictions = 0
 
     @property
@@ -67,7 +70,7 @@ class TightCoupling:
 
         It is not before the first :meth:`observe`, nor if the samples have a gap or are absurd.
         """
-        self._predicted = None
+        self._predicted, self._unfelt = None, True
         if self._odometry is None:
             return None
         margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
@@ -78,12 +81,12 @@ class TightCoupling:
             prediction = self._odometry.predict(stamp, samples)
         except SweepError:
             return None
-        self._predicted = stamp
+        self._predicted, self._unfelt = stamp, False
         return prediction if self.trusted else None
 
     def reject(self) -> None:
         """Take the last prediction back: a sweep fitted better without the IMU."""
-        self._predicted = None
+        self._predicted, self._unfelt = None, False
 
     def bend(
         self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray,
@@ -135,6 +138,8 @@ class TightCoupling:
             velocity = (pose.translation() - last[1].translation()) / seconds
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
+                if self._unfelt:
+                    velocity, spread = self._gone_on(stamp, velocity, spread)
                 self._odometry.restart(stamp, pose, velocity, spread)
             elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):
                 self._odometry = InertialOdometry(
@@ -143,6 +148,17 @@ class TightCoupling:
         except SweepError:  # no window can begin here: with the next frame, then
             self._odometry = None
         return None
+
+    def _gone_on(
+        self, stamp: int, velocity: FloatArray, spread: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """A velocity (3,) and its covariance (3, 3), with the one before a gap in the samples."""
+        assert self._odometry is not None
+        state = self._odometry.state
+        grown = _UNFELT * (stamp - state.stamp) * 1e-9
+        before = state.covariance[VELOCITY, VELOCITY] + grown**2 * np.eye(3)
+        gain = before @ np.linalg.inv(before + spread)
+        return state.velocity + gain @ (velocity - state.velocity), symmetric(gain @ spread)
 
     def _believable(self, first: int, last: int, buffer: ImuBuffer) -> bool:
         """Whether a lidar that is carried about may feel what it felt between two stamps."""

@@ -171,6 +171,8 @@ class PoseErrors:
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
         self._add_drift(sweep, solution, scan, last, factor * scan.renewed)
+        if fused is not None:
+            self._expected.told(middle.rotation().unrotate(fused.velocity))
         if fused is None or solution.weak is not None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
         else:

@@ -209,6 +209,33 @@ def test_a_rejected_prediction_is_not_fused():
     assert coupling.observe(last, now, np.eye(6), DOWN, data) is None
 
 
+@pytest.mark.parametrize("gap", [True, False])
+def test_a_speed_goes_on_through_a_gap_in_the_samples_where_no_scan_sees_it(gap):
+    """5 m/s along x, seen until frame 10; then scans see no x, and poses seem to stand still."""
+    seen, blind = np.diag([1e6] * 3 + [1e4] * 3), np.diag([1e6] * 3 + [0.0, 1e4, 1e4])
+    stamps = resting().samples_between(NOW - 10**9, NOW + 10**10).stamps
+    missing = gap & (stamps > NOW + 10 * FRAME) & (stamps < NOW + 13 * FRAME)
+    stamps = stamps[~missing]
+    felt, still = np.tile([0.0, 0.0, 9.81], (len(stamps), 1)), np.zeros((len(stamps), 3))
+    data = ImuBuffer(ImuConfig(), ImuSamples(stamps, None, still, felt))
+    coupling = TightCoupling(ImuConfig())
+    for number in range(1, 14):
+        last, now = (
+            (NOW + k * FRAME, gtsam.Pose3(gtsam.Rot3(), np.array([0.5 * min(k, 10), 0.0, 0.0])))
+            for k in (number - 1, number)
+        )
+        predicted = coupling.predict(now[0], data)
+        assert (predicted is None) == (number == 1 or (gap and number > 10))
+        if not gap and number > 10:  # nor does one go on that the scans have refuted
+            coupling.reject()
+        coupling.observe(last, now, seen if number <= 10 else blind, DOWN, data)
+    predicted = coupling.predict(NOW + 14 * FRAME, data)
+    assert predicted.velocity[0] == pytest.approx(5.0 if gap else 0.0, abs=0.3)
+    if gap:  # known to an acceleration of 2 m/s^2 for 0.3 s, and to 0.5 m/s where a window begins
+        speed = np.sqrt(predicted.covariance[3, 3]) / 0.1
+        assert speed == pytest.approx(np.hypot(0.6, 0.5), rel=0.3)
+
+
 def test_a_speed_along_which_no_scan_sees_may_be_any():
     """The window begins with the second frame: blind along x of a lidar that faces along y."""
     turned = gtsam.Pose3(gtsam.Rot3.Yaw(np.pi / 2.0), np.zeros(3))

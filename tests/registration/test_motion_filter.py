@@ -71,6 +71,14 @@ def test_what_no_scan_sees_goes_on_as_it_was():
     np.testing.assert_allclose(follow(ways, 1e-3, blind=30)[10:], 0.5, atol=0.01)
 
 
+def test_a_velocity_that_an_imu_told_goes_on_and_is_as_badly_known_as_without():
+    motion, alone = after([True] * 5)[0], after([True] * 5)[0]
+    motion.told(np.array([4.0, 0.0, 0.0]))
+    assert motion.expected(6 * FRAME, moved(0)).x() == pytest.approx(4.0 * SECONDS)
+    assert alone.expected(6 * FRAME, moved(0)).x() == pytest.approx(0.0)
+    np.testing.assert_array_equal(motion.covariance, alone.covariance)
+
+
 def test_a_step_back_after_a_blind_way_is_no_velocity_but_tells_one():
     """Slower by 0.05 m a frame for ten blind ones: the next scan finds the pose 0.5 m back."""
     motion, sigma = MotionFilter(CONFIG), 1e-3

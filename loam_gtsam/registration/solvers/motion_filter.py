@@ -103,6 +103,13 @@ class MotionFilter:
         # With a known rotation, the velocity in the map is constant, not the body velocity.
         return last.compose(gtsam.Pose3(turned, way[3:]))
 
+    def told(self, velocity: FloatArray) -> None:
+        """Go on with a velocity (3,) of the last solved pose that an IMU told, m/s, its axes.
+
+        The covariance stays that of the scans alone, the larger one.
+        """
+        self._twist[3:] = velocity
+
     def observe(
         self,
         stamp: int,

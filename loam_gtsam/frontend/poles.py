@@ -119,20 +119,21 @@ def find_poles(
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
     across = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) + spacing
-    radii = 0.5 * _likely_widths(across * distance, spacing * distance)
+    radii = 0.5 * _likely_widths(across * distance, spacing * distance, length == 1)
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
     return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])
 
 
-def _likely_widths(widths: FloatArray, apart: FloatArray) -> FloatArray:
-    """(M,) metres: the means of what the things may be wide that beams ``apart`` (M,) have met.
+def _likely_widths(widths: FloatArray, apart: FloatArray, single: BoolArray) -> FloatArray:
+    """(M,) metres: the ``widths`` of runs, with those of ``single`` beams guessed from all runs.
 
-    Beams of ``widths`` (M,) in all may have met anything that is wider or narrower by less than
-    the distance to the next beam. How frequent which width is, is what makes the whole sweep
-    likeliest: the self-consistent estimate of B. W. Turnbull, The empirical distribution function
-    with arbitrarily grouped, censored and truncated data, J. R. Stat. Soc. B 38, 1976. Truncated,
-    for what is narrow and far away is mostly missed; see docs/maths/features.md, equation 2.
+    Beams that are ``apart`` (M,) may have met anything that is wider or narrower than the run by
+    less than that. Over many sweeps the runs of more beams are as wide as what they met; one beam
+    alone has mostly met what is narrower. How frequent which width is, is what makes the whole
+    sweep likeliest: the self-consistent estimate of B. W. Turnbull, The empirical distribution
+    function with arbitrarily grouped, censored and truncated data, J. R. Stat. Soc. B 38, 1976.
+    Truncated, for what is narrow and far away is mostly missed. See docs/maths/features.md.
     """
     ratio = _WIDTHS / apart[:, None]
     chance = np.maximum(1.0 - np.abs(ratio - (widths / apart)[:, None]), _TINY)
@@ -145,9 +146,10 @@ def _likely_widths(widths: FloatArray, apart: FloatArray) -> FloatArray:
         frequency = frequency * seen + _BEFOREHAND * _EXPECTED
         frequency /= there + _BEFOREHAND
         frequency /= frequency.sum()
-    total = np.einsum("ij,j->i", chance, frequency)
-    means: FloatArray = np.einsum("ij,j->i", chance, frequency * _WIDTHS) / total
-    return means
+    alone, likely = chance[single], widths.copy()
+    likely[single] = np.einsum("ij,j->i", alone, frequency * _WIDTHS)
+    likely[single] /= np.einsum("ij,j->i", alone, frequency)
+    return likely
 
 
 def _to_next(

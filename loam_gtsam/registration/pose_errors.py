@@ -32,6 +32,9 @@ _LASTING = 0.3
 """Share of a scan's covariance that stays for some frames and that no filter averages: consecutive
 innovations correlate by 0 to 0.5, by axis and place (street, park, room, garage, trees)."""
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
+_PAUSE = 1.0
+"""Seconds for which a velocity may have changed where a clock was set: nothing tells how long the
+sweeps took that were on neither clock."""
 _KNOWN = 3  # accelerations from which their mean is believed
 
 
@@ -120,6 +123,7 @@ class PoseErrors:
         self._first: MovingSweep | None = None
         self._origin = _Origin()
         self._last: _Middle | None = None
+        self._paused = False
 
     @property
     def accelerations(self) -> FloatArray | None:
@@ -175,6 +179,8 @@ class PoseErrors:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
         if fused is None or solution.weak is not None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
+            if self._paused:
+                own = own + np.diag(_changed(update.twist, sweep, self._motion.variances))
         else:
             lasting = symmetric(to_reference @ scan.covariance @ to_reference.T)
             root = np.sqrt(_LASTING) * positive_root(lasting)
@@ -200,7 +206,7 @@ class PoseErrors:
             residual_variance=scan.residual_variance,
             effective_matches=scan.effective_matches,
         )
-        self._last = now
+        self._last, self._paused = now, False
         total = self._drift + self._blind @ self._blind.T + self._moved
         total = total + self._origin.error(self._motion.variances)
         covariance = symmetric(own + drifted @ total @ drifted.T)
@@ -242,7 +248,7 @@ class PoseErrors:
 
     def cut(self) -> None:
         """Start anew in time: the next frame is on another clock than the frames before."""
-        self._last = None
+        self._last, self._paused = None, True
         self._expected.cut()
 
     def _add_drift(
@@ -341,6 +347,19 @@ class PoseErrors:
         if sweep.motion is SweepMotion.GYRO:
             missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
         return missed
+
+
+def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -> FloatArray:
+    """(6,) variances of what a velocity from before a pause misses at the reference time.
+
+    ``twist`` (6,) is that velocity, rad/s and m/s, which may have turned as well;
+    ``accelerations`` are (6,) mean squares.
+    """
+    squares = accelerations.copy()
+    squares[:3] *= not _turned(sweep)
+    squares[3:] += np.sum(np.cross(twist[:3], twist[3:]) ** 2)
+    changed: FloatArray = (sweep.middle * _PAUSE) ** 2 * squares
+    return changed
 
 
 def _turned(sweep: MovingSweep) -> bool:

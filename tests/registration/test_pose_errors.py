@@ -251,9 +251,9 @@ def test_a_gyro_leaves_its_noise():
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
 
 
-def calibrated(errors, number, map_T_lidar=gtsam.Pose3(), doubt=None):  # noqa: B008
+def calibrated(errors, number, map_T_lidar=gtsam.Pose3(), doubt=None, twist=np.zeros(6)):  # noqa: B008
     """A frame at rest, whatever its matches are."""
-    update = MapUpdate(number * FRAME, map_T_lidar, FrameStatus.OK)
+    update = MapUpdate(number * FRAME, map_T_lidar, FrameStatus.OK, twist=twist)
     solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
     return errors.calibrated(update, sweep, solution, errors.of_scan(solution), None, doubt=doubt)
@@ -370,3 +370,19 @@ def test_a_map_that_loops_have_moved_is_an_error_of_the_pose_and_not_of_its_moti
     added = np.diag(after.covariance - before.covariance)
     np.testing.assert_allclose(added, [0.0, 0.0, 0.0, 0.09, 0.16, 0.0], atol=1e-4)
     assert np.abs(relative_covariance(before, after)).max() < 1e-4
+
+
+@pytest.mark.parametrize("paused", [True, False])
+def test_after_a_pause_the_velocity_may_have_turned(paused, monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    errors = PoseErrors(Config())
+    for k in range(6):
+        calibrated(errors, k)
+    if paused:
+        errors.cut()
+    # 2 m/s round a bend of 0.5 rad/s for a second: 1 m/s, over the half of a sweep.
+    twist = np.array([0.0, 0.0, 0.5, 2.0, 0.0, 0.0])
+    told = [calibrated(errors, k, twist=twist).uncertainty.own for k in (6, 7)]
+    expected = [0.05 if paused else 0.0, 0.0]
+    np.testing.assert_allclose([np.sqrt(own[4, 4]) for own in told], expected, atol=2e-3)

@@ -121,9 +121,8 @@ class PoseErrors:
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
         self._doubt, self._moved = np.zeros((2, 6, 6))
         self._first: MovingSweep | None = None
-        self._origin = _Origin()
+        self._origin, self._paused = _Origin(), False
         self._last: _Middle | None = None
-        self._paused = False
 
     @property
     def accelerations(self) -> FloatArray | None:
@@ -179,8 +178,7 @@ class PoseErrors:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
         if fused is None or solution.weak is not None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
-            if self._paused:
-                own = own + np.diag(_changed(update.twist, sweep, self._motion.variances))
+            own = own + self._paused * _changed(update.twist, sweep, self._motion.variances)
         else:
             lasting = symmetric(to_reference @ scan.covariance @ to_reference.T)
             root = np.sqrt(_LASTING) * positive_root(lasting)
@@ -350,7 +348,7 @@ class PoseErrors:
 
 
 def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -> FloatArray:
-    """(6,) variances of what a velocity from before a pause misses at the reference time.
+    """(6, 6) covariance of what a velocity from before a pause misses at the reference time.
 
     ``twist`` (6,) is that velocity, rad/s and m/s, which may have turned as well;
     ``accelerations`` are (6,) mean squares.
@@ -358,8 +356,7 @@ def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -
     squares = accelerations.copy()
     squares[:3] *= not _turned(sweep)
     squares[3:] += np.sum(np.cross(twist[:3], twist[3:]) ** 2)
-    changed: FloatArray = (sweep.middle * _PAUSE) ** 2 * squares
-    return changed
+    return np.diag((sweep.middle * _PAUSE) ** 2 * squares)
 
 
 def _turned(sweep: MovingSweep) -> bool:

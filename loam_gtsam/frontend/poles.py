@@ -92,7 +92,7 @@ def find_poles(
     ranges = np.sqrt(squared_norm(xyz))
     beams = xyz / ranges
     turn = np.sqrt(squared_norm(_to_next(beams, heads, tails)))
-    spacing = float(np.median(turn))
+    spacing = max(float(np.median(turn)), _TINY)
     # On a ring of a few points the last may lie beside the first, and still be a turn away.
     turn[tails[tails - heads < most]] = np.inf
     farther = _to_next(ranges, heads, tails)

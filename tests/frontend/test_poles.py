@@ -176,6 +176,12 @@ def test_what_one_beam_met_is_as_wide_as_what_more_beams_met(width):
     assert radii[single].mean() == pytest.approx(0.5 * width, rel=0.15)  # not 1.0, the beams' gap
 
 
+def test_beams_in_one_direction_have_no_width():
+    ranges = np.where(np.arange(40) % 4, 10.0, 20.0)
+    points = (np.array([[1.0], [0.0], [0.0]]) * ranges).astype(np.float32)
+    assert np.isfinite(found(points, width=2.0).points).all()
+
+
 @pytest.mark.parametrize("share", [0.25, 0.75])
 def test_things_near_by_that_one_beam_met_tell_of_the_widths_too(share):
     # Two beams have met what is 1.3 beams wide in three of ten cases: those alone are two wide.

@@ -110,16 +110,16 @@ def find_poles(
     gap_after = np.where(empty[last], np.inf, farther[last])
     length = last - first + 1
     depths = np.minimum(gap_before, gap_after).astype(np.float64)
-    wide = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) * ranges[last]
+    turned = np.linalg.norm(beams[:, last] - beams[:, first], axis=0)
     chosen = (length <= most) & cut[last] & cut[before] & (depths > depth)
-    chosen &= np.abs(ranges[last] - ranges[first]) <= wide + _NOISE
-    first, last, depths, length = first[chosen], last[chosen], depths[chosen], length[chosen]
+    chosen &= np.abs(ranges[last] - ranges[first]) <= turned * ranges[last] + _NOISE
+    runs = first, last, depths, length, turned
+    first, last, depths, length, turned = (column[chosen] for column in runs)
     sums = np.zeros((3, xyz.shape[1] + 1))
     np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
-    across = np.linalg.norm(beams[:, last] - beams[:, first], axis=0) + spacing
-    radii = 0.5 * _likely_widths(across * distance, spacing * distance, length == 1)
+    radii = 0.5 * _likely_widths((turned + spacing) * distance, spacing * distance, length == 1)
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
     return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])

@@ -57,7 +57,7 @@ class TightCoupling:
         self.config = config
         self._odometry: InertialOdometry | None = None
         self._predicted: int | None = None
-        self._unfelt = False  # whether samples were missing, or absurd, since the last frame
+        self._rejected = False  # whether the prediction of this frame was taken back
         self._contradictions = 0
 
     @property
@@ -70,7 +70,7 @@ class TightCoupling:
 
         It is not before the first :meth:`observe`, nor if the samples have a gap or are absurd.
         """
-        self._predicted, self._unfelt = None, True
+        self._predicted, self._rejected = None, False
         if self._odometry is None:
             return None
         margin, since = round(self.config.max_gap * 1e9), self._odometry.state.stamp
@@ -81,12 +81,12 @@ class TightCoupling:
             prediction = self._odometry.predict(stamp, samples)
         except SweepError:
             return None
-        self._predicted, self._unfelt = stamp, False
+        self._predicted = stamp
         return prediction if self.trusted else None
 
     def reject(self) -> None:
         """Take the last prediction back: a sweep fitted better without the IMU."""
-        self._predicted, self._unfelt = None, False
+        self._predicted, self._rejected = None, True
 
     def bend(
         self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray,
@@ -138,7 +138,7 @@ class TightCoupling:
             velocity = (pose.translation() - last[1].translation()) / seconds
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
-                if self._unfelt:
+                if not self._rejected:  # but samples were missing, or absurd
                     velocity, spread = self._gone_on(stamp, velocity, spread)
                 self._odometry.restart(stamp, pose, velocity, spread)
             elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):

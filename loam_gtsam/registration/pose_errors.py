@@ -178,7 +178,8 @@ class PoseErrors:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
         if fused is None or solution.weak is not None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
-            own = own + self._paused * _changed(update.twist, sweep, self._motion.variances)
+            if self._paused:
+                own = own + _changed(update.twist, sweep, self._motion.variances)
         else:
             lasting = symmetric(to_reference @ scan.covariance @ to_reference.T)
             root = np.sqrt(_LASTING) * positive_root(lasting)
@@ -187,8 +188,7 @@ class PoseErrors:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         from_map = update.map_T_lidar.inverse().AdjointMap()
         to_middle = middle.between(update.map_T_lidar).AdjointMap()
-        by_scan = to_reference @ (np.eye(6) - scan.user) @ to_middle
-        drifted = by_scan @ from_map
+        drifted = to_reference @ (np.eye(6) - scan.user) @ to_middle @ from_map
         if doubt is not None:
             own = own + drifted @ doubt @ drifted.T
         else:  # what is still in doubt after the start is an error of the map

@@ -20,6 +20,9 @@ _CLEAR = 3.0  # sigmas of a normal by which a displacement must leave its surfac
 _MOVED = 0.1
 """Share of the root mean square displacement by which a point must move to count in full: points on
 a pole move by millimetres in a turn about the pole, and say nothing about this turn."""
+_STILL = 0.01
+"""Metres by which a motion of one rad or metre moves the matched points (root mean square), at
+least: a turn about the only few points there are does not move them at all."""
 _RANK = 1e-6  # singular value over the largest one, below which there is no direction
 _HELD = 0.5  # share of ``min_aligned`` that lines alone must reach before planes are left out
 
@@ -31,7 +34,7 @@ class Localizability:
     Attributes
     ----------
     directions : (6, 6) rows, tangent vectors at the pose (rad, m), each scaled to move the matched
-        points by 1 m (root mean square)
+        points by 1 m (root mean square), as far as it moves them
     aligned : (6,) number of matches that fix each direction: the sum of squared cosines between
         normal and displacement, over the matches that see the motion at all
     information : (6,) information of the scan along each direction, 1 / m^2, noise included
@@ -166,8 +169,8 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     unit = displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
     floor = np.finfo(np.float64).eps * (np.trace(noise) + 1.0)
     columns = _eigenvectors(information, noise + floor * (unit + np.eye(6)))
-    scale = np.sqrt(np.einsum("ik,ij,jk->k", columns, unit, columns))
-    directions = columns.T / np.maximum(scale, floor)[:, None]
+    moved = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", columns, unit, columns), 0.0))
+    directions = columns.T / np.maximum(moved, _STILL * np.linalg.norm(columns, axis=0))[:, None]
 
     sight = _sight(points, normals, tilts, directions)
     first = len(sight) - len(matches.planes)

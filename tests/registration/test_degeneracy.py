@@ -97,6 +97,17 @@ def test_a_corridor_is_weak_along_its_axis_although_its_noise_is_information():
     assert angle(weak[0], 3) < 5.0
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 3])
+def test_turns_about_the_only_points_are_motions_of_finite_size(count):
+    points, normals = whole_room()
+    matches = ScanMatches(NO_EDGES, surfaces(points[:count], normals[:count]))
+    found = localizability(matches, POSE)
+    assert np.isfinite(found.directions).all()
+    assert np.linalg.norm(found.directions, axis=1).max() < 1e3
+    assert (found.aligned[0], found.information[0]) == pytest.approx((0.0, 0.0), abs=1e-6)
+    assert np.isfinite(found.projector(LEAST)).all()
+
+
 def test_enough_of_an_end_wall_lifts_it():
     points, normals = room()
     end = np.column_stack([np.full(40, 20.0), *np.random.default_rng(3).uniform(-2, 2, (2, 40))])

@@ -136,6 +136,18 @@ def test_the_loop_ends_when_the_pose_stays_unless_told_to_go_on(stop, rounds):
     assert (found.iterations, found.converged, found.map_T_lidar.x()) == (rounds, True, rounds)
 
 
+@pytest.mark.parametrize(("far", "solved"), [(9e3, True), (1.1e4, False), (np.nan, False)])
+def test_a_pose_out_of_this_world_is_no_solution(far, solved):
+    def optimise(matches, pose):
+        moved = gtsam.Pose3(gtsam.Rot3(), np.array([far, 0.0, 0.0]))
+        return Solution(moved, True, True, matches, 1, 3, 10.0, 1.0, np.eye(6))
+
+    guess = gtsam.Pose3()
+    found = rematch(lambda pose: make_matches(), guess, changed(iterations=3), optimise)
+    assert found.solved is solved
+    assert same(found.map_T_lidar, guess) is not solved
+
+
 def test_a_plain_function_is_asked_at_every_pose():
     asked = []
 

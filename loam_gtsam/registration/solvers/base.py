@@ -23,6 +23,9 @@ SCAN_VARIANCE = 4.0
 does not tell it: where some direction is not seen, the map was made by the same guesses as the
 scan, and agrees with them."""
 
+_FAR = 1e4
+"""Metres from its guess at which a pose is no solution: a sweep has no map there to match."""
+
 Associate = Callable[[gtsam.Pose3], ScanMatches]
 """Gives the matches of a sweep at a pose ``map_T_lidar``: a pure function."""
 
@@ -217,6 +220,8 @@ def rematch(
             return Solution.unsolved(guess, matches, iteration, steps)
         found = optimise(matches, pose)
         pose, steps = found.map_T_lidar, steps + found.solver_iterations
+        if not guess.range(pose) < _FAR:  # nor if it is not a number
+            return Solution.unsolved(guess, matches, iteration, steps)
         if iteration == 1:
             error_before = found.error_before
         if found.converged and stop:

@@ -117,6 +117,18 @@ class MovingSweep:
             return np.zeros(3)
         return interpolated(seconds, *self._bend)
 
+    def velocity_at(self, seconds: float, twist: FloatArray) -> FloatArray | None:
+        """(3,) m/s at that time from the middle, in the axes of the middle; None if on a line.
+
+        ``twist`` is the (6,) body velocity at the reference time.
+        """
+        if self._bend is None:
+            return None
+        times, path = self._bend
+        felt = interpolated(seconds, times, np.gradient(path, times, axis=0, edge_order=2))
+        velocity: FloatArray = self._middle_R_reference @ twist[3:] + felt
+        return velocity
+
     def seconds(self, edges: IntArray, planes: IntArray) -> tuple[FloatArray, FloatArray]:
         """Seconds (N,) from the middle of the sweep to chosen edges and planes, by their rows."""
         return self._seconds[0].take(edges), self._seconds[1].take(planes)

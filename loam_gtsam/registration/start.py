@@ -280,7 +280,7 @@ class Start:
             if sweep.stamp > last.stamp:  # not for sweeps of unlike length
                 twist = sweep.twist_since(last[:2], now.map_T_middle)
                 moved[number] = replace(now, posed=sweep.at(twist))
-        posed = moved[0].posed.sweep.at(moved[1].posed.twist)
+        posed = moved[0].posed.sweep.at(_first_twist(*moved[:2]))
         middle = posed.map_T_middle(self._map_T_first)
         moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
         return moved
@@ -335,6 +335,16 @@ class Start:
         maps.recenter(self._map_T_first)
         for sweep in sweeps:
             maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe, on_trial=on_trial)
+
+
+def _first_twist(first: EarlySweep, second: EarlySweep) -> FloatArray:
+    """(6,) body velocity of the first sweep: that of the second, less what was felt in between."""
+    sweep, twist = second.posed.sweep, second.posed.twist
+    velocity = sweep.velocity_at((first.moment.stamp - sweep.stamp) * 1e-9, twist)
+    if velocity is None:
+        return twist
+    moved = first.map_T_middle.rotation().between(second.map_T_middle.rotation())
+    return first.posed.sweep.twist_at_reference(twist[:3], moved.matrix() @ velocity)
 
 
 def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:

@@ -83,6 +83,9 @@ def test_a_sweep_on_a_bent_path_is_undone_and_its_velocity_is_that_of_the_middle
     np.testing.assert_allclose(bent.at(twist).points[1], points, atol=1e-4)
     at = bent.middle_T_reference(twist)
     np.testing.assert_allclose(at.translation(), there[0], atol=1e-4)
+    before = bent.velocity_at(-0.1, twist)
+    np.testing.assert_allclose(before, velocity - 0.1 * acceleration, atol=2e-3)
+    assert sweep.velocity_at(-0.1, twist) is None
     # The mean velocity since the last middle, on a straight path: 2 mm off at the ends.
     straight = sweep.at(sweep.twist_since(last, gtsam.Pose3()))
     assert np.abs(straight.points[1] - points).max() > 2e-3

@@ -285,7 +285,7 @@ class Mapper:
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
         if self._start is not None:
-            frame, found = self._start.add(frame, found, self.keyframe, self._named)
+            frame, found = self._start.add(frame, found, self.keyframe, self._named, self.imu)
             self._start = None if self._start.complete else self._start
         solution, doubt = found.solution, found.doubt
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)

@@ -111,6 +111,14 @@ class MovingSweep:
         sweep._turned = next(turned), next(turned)
         return sweep
 
+    def without_turns(self) -> MovingSweep:
+        """The sweep as if no IMU had been there."""
+        sweep = copy(self)
+        sweep._turned = sweep._bend = None
+        if self._turned is not None:
+            sweep.motion = SweepMotion.CONSTANT_VELOCITY
+        return sweep
+
     def _bent(self, seconds: FloatArray | float) -> FloatArray:
         """(..., 3) the way from the straight line."""
         if self._bend is None:

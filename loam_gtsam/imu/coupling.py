@@ -30,6 +30,11 @@ standard deviations."""
 _UNFELT = 2.0  # m/s^2: standard deviation of an acceleration that nothing told, as of the solver
 _OUTWEIGHS = 5  # frames that agree and one that contradicts: the one after it knows no velocity
 _DISTRUST = 3 * _OUTWEIGHS  # from which, less agreements, the accelerometer is not used
+_GIVEN_UP = 5.0  # frames of disagreement less those of agreement from which a gyro is not used
+_TURNED = float(chdtri(3, 2.0 * ndtr(-5.0)))
+"""As ``_UNLIKELY``, of a rotation."""
+_CLEAR = 3.0  # frames of disagreement for which a rotation far beyond that counts
+_LONGER = 6  # times that a gyro which is given up again is given up for twice as long
 
 
 def _spread(map_T_lidar: gtsam.Pose3, information: FloatArray, seconds: float) -> FloatArray:
@@ -46,11 +51,48 @@ def _spread(map_T_lidar: gtsam.Pose3, information: FloatArray, seconds: float) -
     return spread
 
 
+class GyroTrust:
+    """Counts frames in which a gyro and the scans disagree, less those in which they agree.
+
+    Both kinds are needed: a difference that is beyond all noise whatever is believed of the scan,
+    and one beyond what prediction and scan say of themselves, which is seen much sooner.
+    """
+
+    def __init__(self) -> None:
+        self._frames, self._given_up = 0.0, 0
+
+    @property
+    def holds(self) -> bool:
+        """Whether the gyro is to be used."""
+        return self._frames < _GIVEN_UP
+
+    def compared(self, *, agree: bool) -> None:
+        """Take in a frame in which scan and gyro agree or not."""
+        self._count(-1.0 if agree else 1.0)
+
+    def surprised(self, distance: float) -> None:
+        """Take in the squared Mahalanobis distance of a turn from its prediction."""
+        if distance > _TURNED:
+            self._count(min(distance / _TURNED, _CLEAR))
+
+    def _count(self, frames: float) -> None:
+        held, most = self.holds, _GIVEN_UP * 2.0 ** (self._given_up + 1)
+        self._frames = min(max(self._frames + frames, 0.0), most)
+        if held and not self.holds:
+            self._frames = most
+            self._given_up = min(self._given_up + 1, _LONGER)
+
+
 class TightCoupling:
     """What scans and IMU together know of pose, velocity, biases and gravity.
 
     For every frame :meth:`predict`, then :meth:`observe`. While scans contradict the predictions
     for some frames in a row, there are none.
+
+    Attributes
+    ----------
+    turn_surprise : how the last :meth:`observe` found the predicted rotation, as a squared
+        Mahalanobis distance; 0 without a prediction
     """
 
     def __init__(self, config: ImuConfig) -> None:
@@ -59,6 +101,7 @@ class TightCoupling:
         self._predicted: int | None = None
         self._rejected = False  # whether the prediction of this frame was taken back
         self._contradictions = 0
+        self.turn_surprise = 0.0
 
     @property
     def trusted(self) -> bool:
@@ -125,11 +168,13 @@ class TightCoupling:
         gravity : (3,) m/s^2, map frame, with which the estimate begins, as with the buffer's bias
         """
         stamp, pose = now
+        self.turn_surprise = 0.0
         if stamp <= last[0]:  # sweeps of unlike length
             return None
         try:
             if self._odometry is not None and self._predicted == stamp:
                 fused = self._odometry.update(pose, information)
+                self.turn_surprise = self._odometry.turn_surprise
                 agree = fused is not None and self._odometry.surprise < _UNLIKELY
                 count = self._contradictions + (-1 if agree else _OUTWEIGHS)
                 self._contradictions = min(max(count, 0), 2 * _DISTRUST)

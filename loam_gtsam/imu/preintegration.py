@@ -121,6 +121,7 @@ class InertialOdometry:
     ----------
     state : the newest frame
     surprise : squared Mahalanobis distance between the last scan and its prediction; chi-squared
+    turn_surprise : the same of the rotation alone
     restarts : how often the window was begun anew by itself: at the scan's pose, because the scan
         contradicts the prediction (more than 30 standard deviations); or at the predicted pose,
         because the graph could not be solved. Biases and gravity are kept.
@@ -148,7 +149,7 @@ class InertialOdometry:
             raise InputError(f"map_gravity: expected about 9.81 m/s^2, got {size:.3g}")
         self._lidar_T_imu = gtsam.Pose3(gtsam.Rot3(), np.asarray(config.lidar_t_imu, np.float64))
         self._to_lidar: FloatArray = self._lidar_T_imu.AdjointMap()
-        self.restarts, self.surprise = 0, 0.0
+        self.restarts, self.surprise, self.turn_surprise = 0, 0.0, 0.0
         covariance = np.zeros((STATE, STATE))
         biases = np.repeat(np.square([sigmas.acceleration_bias, sigmas.gyro_bias]), 3)
         covariance[BIASES, BIASES] = np.diag(biases)
@@ -215,6 +216,8 @@ class InertialOdometry:
                 self._start(predicted, 1)
                 return None
             self.surprise = float(surprise @ np.linalg.solve(expected, surprise))
+            told = derivative[:3] @ covariance @ derivative[:3].T
+            self.turn_surprise = _surprise_of_turn(error[:3], told, information)
             if self.surprise > _JUMP**2:
                 known = _updated(covariance, rows, expected)
                 # A velocity that was wrong looks like this too: it is free along the jump, and
@@ -303,6 +306,18 @@ def _updated(covariance: FloatArray, rows: FloatArray, expected: FloatArray) -> 
     left = np.eye(6) - gain @ rows
     updated: FloatArray = left @ covariance @ left.T + gain @ gain.T
     return updated + _LEAST_SIGMA**2 * np.eye(6)
+
+
+def _surprise_of_turn(error: FloatArray, told: FloatArray, information: FloatArray) -> float:
+    """Squared Mahalanobis distance of a rotation (3,) that was predicted to (3, 3) ``told``.
+
+    ``information`` (6, 6) is that of the scan: of its rotation, whatever the translation.
+    """
+    across, shifts = information[:3, 3:], information[3:, 3:]
+    turns = information[:3, :3] - across @ np.linalg.pinv(shifts, hermitian=True) @ across.T
+    # The inverse of both covariances' sum; that of the scan may be infinite.
+    both = np.linalg.solve(np.eye(3) + turns @ told, turns)
+    return float(error @ both @ error)
 
 
 def _has_inverse(matrix: FloatArray) -> bool:

@@ -13,7 +13,7 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import checked_pose
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.coupling import TightCoupling
+from loam_gtsam.imu.coupling import GyroTrust, TightCoupling
 from loam_gtsam.imu.diagnosis import LATEST, scans_problems
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
 from loam_gtsam.imu.preintegration import Fused, Prediction
@@ -34,7 +34,6 @@ from loam_gtsam.types import FloatArray, TiltPrior, check_kind
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
 """Angle and share of the turn by which gyro and scan must differ to disagree: above all noise."""
-_DISTRUST = 5  # frames of disagreement less those of agreement from which the gyro is not used
 _PAIRS = 2000  # number of pairs of frames, the newest, behind the check of the mounting
 _SURE = 4.2  # sigmas of one attitude: three of the difference of two
 
@@ -88,7 +87,7 @@ class ImuTracker:
         """Forget all frames: as a new tracker on the same buffer, with the bias it was given."""
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
-        self._disagreements = 0
+        self._gyro = GyroTrust()
         self._spans, self._turns = np.zeros((0, 2), np.int64), np.zeros((0, 6))
         self._coupling = TightCoupling(self.config)
 
@@ -103,7 +102,7 @@ class ImuTracker:
     @property
     def trusted_gyro(self) -> ImuBuffer | None:
         """The buffer, while its gyro agrees with the scans."""
-        return self.buffer if self._disagreements < _DISTRUST else None
+        return self.buffer if self._gyro.holds else None
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -209,12 +208,11 @@ class ImuTracker:
         by_scan, by_gyro = gtsam.Rot3.Logmap(scan), gtsam.Rot3.Logmap(turned)
         self._turns = np.vstack([self._turns, np.hstack([by_scan, by_gyro])])[-_PAIRS:]
         self._spans = np.vstack([self._spans, [last[0], now[0]]])[-_PAIRS:]
-        if _disagree(scan, turned, *_DISAGREEMENT):
-            self._disagreements = min(self._disagreements + 1, 2 * _DISTRUST)
-            return
-        self._disagreements = max(self._disagreements - 1, 0)
-        rate = gtsam.Rot3.Logmap(scan.between(turned)) / ((now[0] - last[0]) * 1e-9)
-        self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
+        agree = not _disagree(scan, turned, *_DISAGREEMENT)
+        self._gyro.compared(agree=agree)
+        if agree:
+            rate = gtsam.Rot3.Logmap(scan.between(turned)) / ((now[0] - last[0]) * 1e-9)
+            self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
 
     def reject(self) -> None:
         """Take the last prediction back: a sweep fitted better without the IMU."""
@@ -287,11 +285,14 @@ class ImuTracker:
     ) -> Fused | None:
         """Take in what the scan alone said about a moment; the pose by both, None if by none.
 
-        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed.
+        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed. A
+        gyro that is contradicted is doubted.
         """
         if self.config.coupling != "tight" or self.level is None:
             return None
-        return self._coupling.observe(last, now, information, self._down(), self.buffer)
+        fused = self._coupling.observe(last, now, information, self._down(), self.buffer)
+        self._gyro.surprised(self._coupling.turn_surprise)
+        return fused
 
     def _down(self) -> FloatArray:
         assert self.level is not None

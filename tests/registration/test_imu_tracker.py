@@ -317,10 +317,46 @@ def test_a_gyro_that_turns_otherwise_is_given_up_after_five_frames_and_may_come_
     assert tracker.rotation_between(NOW, NOW + FRAME) is None
     np.testing.assert_array_equal(tracker.buffer.gyro_bias, np.zeros(3))  # nothing learnt from it
     compare(tracker, wrong[5:])
-    compare(tracker, right[30:36])  # the count of faults is bounded
+    compare(tracker, right[30:46])  # the count of faults is bounded
     assert tracker.trusted_gyro is None
-    compare(tracker, right[35:37])
+    compare(tracker, right[45:47])
     assert tracker.trusted_gyro is tracker.buffer
+
+
+def test_a_gyro_that_is_given_up_again_is_given_up_for_twice_as_long():
+    away = []
+    tracker = turning_tracker((0.0, 0.0, 0.8))
+    wrong, right = frames((0.8, 0.0, 0.0), 6), frames((0.0, 0.0, 0.8), 60)
+    for _ in range(2):
+        compare(tracker, wrong)
+        assert tracker.trusted_gyro is None
+        away.append(0)
+        while tracker.trusted_gyro is None:
+            compare(tracker, right[away[-1] : away[-1] + 2])
+            away[-1] += 1
+    assert away == [6, 20]  # from 10, and from 20 and the four wrong frames that followed, to 4
+
+
+@pytest.mark.parametrize(
+    ("turn", "sigma", "given_up_after"),
+    [(0.0, 1e-4, None), (0.01, 1e-4, None), (0.1, 1e-4, 5), (1.0, 1e-4, 1), (0.1, 1e-2, None)],
+)
+def test_a_gyro_whose_predictions_are_contradicted_is_given_up_soon(turn, sigma, given_up_after):
+    """One that feels no turn while the scans see some degrees to and fro, to ``sigma`` rad."""
+    tracker = tracker_for(accelerating(2.0))
+    information = sigma**-2.0 * np.diag([1.0, 1.0, 1.0, 1e-2, 1e-2, 1e-2])
+    trusted = []
+    for frame in range(1, 10):
+        last, now = (
+            (stamp, gtsam.Pose3(gtsam.Rot3.Yaw(np.radians(turn * (k % 2))), pose.translation()))
+            for k, (stamp, pose) in ((k, at(k, 2.0)) for k in (frame - 1, frame))
+        )
+        tracker.predict(now[0])
+        tracker.compare_gyro(last, now)
+        tracker.observe(last, now, information)
+        trusted.append(tracker.trusted_gyro is not None)
+    lost = None if all(trusted) else trusted.index(False)
+    assert lost == given_up_after
 
 
 @pytest.mark.parametrize(("degrees", "agrees"), [(0.29, True), (0.31, False)])

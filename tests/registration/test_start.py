@@ -11,13 +11,14 @@ import pytest
 
 from loam_gtsam import Mapper, run
 from loam_gtsam.config import Config
+from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
-from loam_gtsam.registration import start
 from loam_gtsam.registration.matches import ChosenRows
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver
+from loam_gtsam.registration.start import first_sweeps, ways
 from loam_gtsam.types import FrameStatus
 
 CONFIG = Config().changed("imu.coupling=off")
@@ -57,7 +58,7 @@ def test_sweeps_may_be_missing_between_the_first_two():
 def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatch):
     """With the second sweep, or with the third alone, 2.5 m behind where it was taken."""
     found = {}
-    look_again = start.Start._told_apart
+    look_again = first_sweeps.Start._told_apart
 
     def from_behind(self, frame, sweeps, solver):
         if len(sweeps) == 2:
@@ -73,7 +74,7 @@ def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatc
         found["true"] = sweeps
         return sweeps
 
-    monkeypatch.setattr(start.Start, "_told_apart", from_behind)
+    monkeypatch.setattr(first_sweeps.Start, "_told_apart", from_behind)
     _, features = features_of("avenue", 11, speed=10.0, start="moving")
     mapper = Mapper(CONFIG)
     for one in features[::5]:
@@ -178,7 +179,7 @@ def place(at, lines, planes, normal):
     evidence = np.concatenate([lines, planes]).astype(float)
     points = np.random.default_rng(0).uniform(-9.0, 9.0, (len(evidence), 3)) + at
     axes = np.concatenate([np.tile(UP, (len(lines), 1)), np.tile(normal, (len(planes), 1))])
-    return start._Tried(len(lines), points, evidence, axes, [], None)
+    return ways.Tried(len(lines), points, evidence, axes, [], None)
 
 
 @pytest.mark.parametrize(
@@ -203,31 +204,31 @@ def test_a_place_is_better_if_more_lies_for_it_across_the_way_there(lines, plane
 
     there = place(3.0 * AHEAD, agreeing(lines), agreeing(planes), normal)
     here = place(0.0 * AHEAD, agreeing(-lines), agreeing(-planes), normal)
-    assert start._better((there,), (here,), 8.0) == better
+    assert ways._better((there,), (here,), 8.0) == better
 
 
 @pytest.mark.parametrize(("against", "better"), [(0, True), (30, False)])
 def test_one_feature_that_contradicts_outweighs_some_that_agree(against, better):
-    say = np.concatenate([np.ones(60), np.full(against, -start._AGAINST), np.zeros(100)])
+    say = np.concatenate([np.ones(60), np.full(against, -ways._AGAINST), np.zeros(100)])
     there = place(3.0 * AHEAD, [], say, AHEAD)
     here = place(0.0 * AHEAD, [], 0.0 * say, AHEAD)
-    assert start._better((there,), (here,), 8.0) == better
-    assert not start._better((there,), (there,), 8.0)
+    assert ways._better((there,), (here,), 8.0) == better
+    assert not ways._better((there,), (there,), 8.0)
 
 
 def test_many_features_that_hardly_lie_across_the_way_are_not_enough():
     leaning = np.array([0.02, 0.0, 1.0])
     here, there = (place(x * AHEAD, [], np.full(600, x > 0.0), leaning) for x in (0.0, 3.0))
-    assert not start._better((there,), (here,), 8.0)
-    assert start._better((there,), (here,), 0.1)
+    assert not ways._better((there,), (here,), 8.0)
+    assert ways._better((there,), (here,), 0.1)
 
 
 def test_several_sweeps_that_see_the_same_are_one_piece_of_evidence():
     here, there = (place(x * AHEAD, [], np.repeat([0, x > 0], [90, 8]), AHEAD) for x in (0.0, 3.0))
     for sweeps in (1, 4):
-        assert not start._better((there,) * sweeps, (here,) * sweeps, 1.0)
+        assert not ways._better((there,) * sweeps, (here,) * sweeps, 1.0)
     here, there = (place(x * AHEAD, [], np.full(50, x > 0.0), AHEAD) for x in (0.0, 3.0))
-    assert start._better((there,) * 4, (here,) * 4, 8.0)
+    assert ways._better((there,) * 4, (here,) * 4, 8.0)
 
 
 def first_sweep():
@@ -259,10 +260,10 @@ def way_of(*steps, planes=0):
     ],
 )
 def test_ways_that_may_be_true_are_kept(steps, planes, kept):
-    begun = start.Start(*first_sweep())
-    ways = [way_of(0.0, 0.0), way_of(*steps, planes=planes)]
-    assert start._kept(ways, CONFIG) == ways[: 1 + kept]
-    assert begun._best(ways, CONFIG) is ways[0]
+    begun = first_sweeps.Start(*first_sweep())
+    tried = [way_of(0.0, 0.0), way_of(*steps, planes=planes)]
+    assert ways.kept_ways(tried, CONFIG) == tried[: 1 + kept]
+    assert begun._best(tried, CONFIG) is tried[0]
     after = begun._sweeps[0].moment.stamp + 300_000_000
     expected = 0.5 * sum([*steps, steps[-1]]) ** 2 if kept else 0.0
     assert begun._doubt(after, gtsam.Pose3())[3, 3] == pytest.approx(expected)
@@ -271,20 +272,20 @@ def test_ways_that_may_be_true_are_kept(steps, planes, kept):
 def test_the_way_that_was_taken_stays_though_no_acceleration_explains_it():
     """Where little is seen, poses scatter; a motion that nothing contradicts is smooth."""
     taken, smooth = way_of(2.0, -2.0), way_of(2.0, 2.0)
-    assert start._kept([taken, smooth], CONFIG) == [taken, smooth]
-    assert start._kept([smooth, taken], CONFIG) == [smooth]
+    assert ways.kept_ways([taken, smooth], CONFIG) == [taken, smooth]
+    assert ways.kept_ways([smooth, taken], CONFIG) == [smooth]
 
 
 def test_a_place_that_is_not_solved_has_no_evidence_and_is_no_better():
     rows = ChosenRows(np.arange(3), np.arange(4), None)
-    evidence, axes = start._evidence(rows, SimpleNamespace(solved=False))
+    evidence, axes = ways.evidence_of(rows, SimpleNamespace(solved=False))
     assert not evidence.any()
     assert not axes.any()
 
 
 def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
     asked = []
-    monkeypatch.setattr(start, "likely_poses", lambda *_, **__: asked.append(1) or [])
+    monkeypatch.setattr(first_sweeps, "likely_poses", lambda *_, **__: asked.append(1) or [])
     _, features = features_of("avenue", 4, speed=20.0, start="moving")
     for config, searches in ((CONFIG.changed("deskew.model=predicted"), 0), (CONFIG, 1)):
         mapper = Mapper(config)
@@ -296,8 +297,8 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
 def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch):
     _, features = features_of("square", 2, speed=24.0, start="moving")
     found, closer = [], []
-    for share in (0.0, start._HOPEFUL, 1.0):
-        monkeypatch.setattr(start, "_HOPEFUL", share)
+    for share in (0.0, first_sweeps._HOPEFUL, 1.0):
+        monkeypatch.setattr(first_sweeps, "_HOPEFUL", share)
         solver = Counting(CONFIG.solver)
         mapper = Mapper(CONFIG, solver=solver)
         found.append([mapper.register(one).map_T_lidar.matrix() for one in features])
@@ -327,7 +328,7 @@ def test_the_search_leaves_the_map_of_the_motion_that_it_chose(monkeypatch):
         shares.append([Fit.of(m, 1000).total for m in (found.solution.matches, again)])
         return frame, found
 
-    monkeypatch.setattr(start.Start, "add", add)
+    monkeypatch.setattr(first_sweeps.Start, "add", add)
     _, features = features_of("avenue", 2, speed=36.0, start="moving")
     mapper = Mapper(CONFIG)
     for one in features:
@@ -372,7 +373,18 @@ def test_the_first_sweep_has_the_velocity_that_the_imu_felt_there():
     updates = run(world).updates
     moved = [updates[0].map_T_lidar.between(update.map_T_lidar) for update in updates]
     truth = [gtsam.Pose3(pose) for pose in world.truth.map_T_lidar]
-    assert max(pose.range(true) for pose, true in zip(moved, truth, strict=True)) < 0.02  # with that, 0.042
+    assert max(pose.range(true) for pose, true in zip(moved, truth, strict=True)) < 0.02  # 0.042
+
+
+def test_a_gyro_that_is_given_up_during_the_start_leaves_nothing_in_the_map():
+    """One in degrees per second, which at rest shakes every sweep."""
+    world = SimulatedWorld("park", seed=2, frames=8, columns=600, imu="mems")
+    wrong = replace(world.imu, gyro=np.rad2deg(world.imu.gyro))
+    updates = run(ArrayDataset(list(world), imu=wrong)).updates
+    moved = updates[0].map_T_lidar.between(updates[-1].map_T_lidar)
+    true = gtsam.Pose3(world.truth.map_T_lidar[-1])
+    assert true.range(moved) < 0.015  # with the sweeps as they were, 0.06
+    assert np.linalg.norm(gtsam.Rot3.Logmap(true.between(moved).rotation())) < np.radians(0.1)
 
 
 def test_after_a_reset_the_next_sweep_is_a_start_again():

@@ -8,29 +8,35 @@ registered again and again, each with the map of all the others.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, RelocalizationConfig
-from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.config import Config
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
-from loam_gtsam.registration.matches import ChosenRows
-from loam_gtsam.registration.odometry import Moment, Prediction, advance
+from loam_gtsam.registration.imu_tracker import ImuTracker
+from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.relocalization import (
     APART,
     Found,
-    agreeing,
-    beyond_any_motion,
     likely_poses,
     same,
     sample_features,
 )
-from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
-from loam_gtsam.types import BoolArray, FloatArray
+from loam_gtsam.registration.solvers import ScanSolver, Solution
+from loam_gtsam.registration.start.ways import (
+    EarlySweep,
+    Tried,
+    Way,
+    continued,
+    evidence_of,
+    kept_ways,
+    mean_twist,
+    without_turns,
+)
+from loam_gtsam.types import FloatArray, SweepMotion
 
 _TOGETHER = (2, 3, 5, 8)
 """Numbers of sweeps at which all are registered anew: each time half as many more or so."""
@@ -38,62 +44,11 @@ _ROUNDS = 2  # times that each of them is then registered with the map of the ot
 _PLACES = 6  # motions between the first two sweeps that are tried beside the expected one
 _SAMPLE = (500, 140)
 """Number of edges and planes that are looked at for these: ten of 500 edges may lie on posts."""
-_AGAINST = 5.0
-"""Number of features that agree which one outweighs that contradicts. At the right place 3 of 1000
-matches contradict by noise, at a wrong one ten times as many (medians of 315 starts, of which 10
-go wrong, and at most 14 with any number from 3 to 10)."""
-_TINY = 1e-9
 _HOPEFUL = 0.5
 """Part of the best place's share, by few matches, below which a place is not looked at closer."""
-_CHANCE = 3.0  # standard deviations beyond which a difference is no chance
 _FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
 _FARTHEST = 30.0  # metres: largest distance between the first two sweeps
 _TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical axis
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class EarlySweep:
-    """One of the first sweeps of a run, where it is in the map.
-
-    Attributes
-    ----------
-    posed : the sweep, de-skewed
-    map_T_middle : pose at the middle of the sweep
-    held : whether further factors decided on the pose, which is then left as it is
-    expected : the expected motion, for directions that the scan does not fix
-    keyframe : number of the keyframe to which the points belong
-    """
-
-    posed: PosedSweep
-    map_T_middle: gtsam.Pose3
-    held: bool
-    expected: MotionPrior
-    keyframe: int
-
-    @property
-    def moment(self) -> Moment:
-        """The middle of the sweep."""
-        return Moment(self.posed.sweep.stamp, self.map_T_middle, True)
-
-
-class _Tried(NamedTuple):
-    """A sweep, registered with the map of those before it."""
-
-    edges: int  # number of edges, which come first among the features that may be matched
-    points: FloatArray  # (F, 3) where these are in the map
-    evidence: FloatArray  # (F,) what each says of the motion, see :func:`_evidence`
-    axes: FloatArray  # (F, 3) of their lines and planes
-    sweeps: list[EarlySweep]  # it and those before it
-    solution: Solution
-
-    @property
-    def share(self) -> float:
-        """Share of the features whose matches agree."""
-        return float(np.count_nonzero(self.evidence > 0.0)) / max(len(self.evidence), 1)
-
-
-_Way = tuple[_Tried, ...]
-"""A first motion and where it led: the sweeps after the first, one after the other."""
 
 
 class Start:
@@ -104,6 +59,7 @@ class Start:
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, True, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
+        self._anew = False  # whether the sweeps are to be registered anew with the next one
 
     @classmethod
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
@@ -154,15 +110,25 @@ class Start:
         return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
 
     def add(
-        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
-    ) -> tuple[Frame, Found]:
+        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver,
+        imu: ImuTracker | None = None,
+    ) -> tuple[Frame, Found]:  # fmt: skip
         """Add a solved sweep; after some, all are registered anew and the map is made of them.
 
         Returns the sweep and its solve in the new map, which does not hold this sweep yet.
+        A gyro that is not trusted any more leaves the sweeps before as well.
         """
+        if imu is not None and imu.trusted_gyro is None:
+            self._forget_gyro()
         frame, found = self._added(frame, found, keyframe, solver)
         doubt = self._doubt(frame.sweep.stamp, found.solution.map_T_lidar)
         return frame, replace(found, doubt=doubt)
+
+    def _forget_gyro(self) -> None:
+        """Take the gyro out of all sweeps, which are to be registered anew."""
+        if any(sweep.posed.sweep.motion is SweepMotion.GYRO for sweep in self._sweeps):
+            self._sweeps, *self._rivals = map(without_turns, (self._sweeps, *self._rivals))
+            self._anew = True
 
     def _doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """Covariance (6, 6) of a pose, map frame, for other first motions that fit as well.
@@ -171,7 +137,7 @@ class Start:
         """
         total = np.zeros((6, 6))
         for sweeps in self._rivals:
-            place = _continued(sweeps, stamp)
+            place = continued(sweeps, stamp)
             step = map_T_lidar.AdjointMap() @ map_T_lidar.localCoordinates(place)
             total += np.outer(step, step) / (1 + len(self._rivals))
         return total
@@ -180,17 +146,12 @@ class Start:
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
     ) -> tuple[Frame, Found]:
         """As :meth:`add`, without what is in doubt."""
-        new = EarlySweep(
-            frame.sweep.at(found.twist),
-            found.solution.map_T_lidar,
-            bool(frame.priors),
-            frame.predicted.motion,
-            keyframe,
-        )
-        sweeps = [*self._sweeps, new]
-        if len(sweeps) not in _TOGETHER:
+        new = frame.sweep.at(found.twist), found.solution.map_T_lidar, bool(frame.priors)
+        sweeps = [*self._sweeps, EarlySweep(*new, frame.predicted.motion, keyframe)]
+        if len(sweeps) not in _TOGETHER and not self._anew:
             self._sweeps = sweeps
             return frame, found
+        self._anew = False
         sweeps = self._together(frame, sweeps, solver, _ROUNDS)
         sweeps = self._with_motion(self._told_apart(frame, sweeps, solver))
         matcher = self._matcher(frame, sweeps, len(sweeps) - 1, to_keep=True)
@@ -236,7 +197,7 @@ class Start:
         if len(sweeps) == 3:
             first, second, third = sweeps
             seconds = first.moment.seconds_to(second.moment.stamp)
-            place = advance(first.map_T_middle, _twist(second, third), seconds)
+            place = advance(first.map_T_middle, mean_twist(second, third), seconds)
             if not same(place, second.map_T_middle):
                 others.append([first, replace(second, map_T_middle=place)])
         if not others:
@@ -252,9 +213,9 @@ class Start:
         best = self._best(ways, frame.matcher.config)
         return sweeps if best is ways[0] else best[-1].sweeps
 
-    def _best(self, ways: Sequence[_Way], config: Config) -> _Way:
+    def _best(self, ways: Sequence[Way], config: Config) -> Way:
         """The best of some ways; those that are as good are rivals from then on."""
-        best, *rivals = _kept(ways, config)
+        best, *rivals = kept_ways(ways, config)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best
 
@@ -267,7 +228,7 @@ class Start:
     ) -> list[EarlySweep]:
         """A way with further sweeps, each expected at constant velocity, registered together."""
         for sweep in sweeps:
-            expected = replace(sweep, map_T_middle=_continued(way, sweep.moment.stamp))
+            expected = replace(sweep, map_T_middle=continued(way, sweep.moment.stamp))
             way = self._registered(frame, self._with_motion([*way, expected]), solver).sweeps
         return self._together(frame, way, solver, 1)
 
@@ -285,7 +246,7 @@ class Start:
         moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
         return moved
 
-    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> _Tried:
+    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> Tried:
         """The first two sweeps, the second near a pose, registered by few matches."""
         first = self._sweeps[0]
         moved = first.map_T_middle.between(map_T_middle)
@@ -301,16 +262,16 @@ class Start:
         solver: ScanSolver,
         *,
         quickly: bool = False,
-    ) -> _Tried:
+    ) -> Tried:
         """The last of some sweeps, registered with the others, and what its features say of it."""
         matcher = self._matcher(frame, sweeps, len(sweeps) - 1)
         matcher = matcher.with_few_matches() if quickly else matcher
         solution = self._solved(frame, sweeps[-1], matcher, solver)
         last = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
-        rows, told = matcher.rows, _evidence(matcher.rows, solution)
+        rows, told = matcher.rows, evidence_of(matcher.rows, solution)
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)
-        return _Tried(len(rows.edges), points, *told, [*sweeps[:-1], last], solution)
+        return Tried(len(rows.edges), points, *told, [*sweeps[:-1], last], solution)
 
     def _matcher(
         self, frame: Frame, sweeps: Sequence[EarlySweep], number: int, *, to_keep: bool = False
@@ -353,132 +314,9 @@ def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
     return transform(pose, edges), transform(pose, planes)
 
 
-def _evidence(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """What each feature (F,) says of a place, and the axis (F, 3) of its line or plane.
-
-    It is 1 if its match agrees, -5 if it contradicts, and 0 without a match.
-    """
-    evidence, axes = np.zeros(len(rows)), np.zeros((len(rows), 3))
-    if solution.solved:
-        edges, planes = solution.matches.edges, solution.matches.planes
-        lines = np.searchsorted(rows.edges, edges.indices)
-        others = len(rows.edges) + np.searchsorted(rows.planes, planes.indices)
-        for places, agree in zip((lines, others), agreeing(solution.matches), strict=True):
-            evidence[places] = np.where(agree, 1.0, -_AGAINST)
-        axes[lines], axes[others] = edges.directions, planes.normals
-    return evidence, axes
-
-
 def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:
     """The first of some sweeps, with the motions and poses of others of the same time."""
     return [
         replace(one, posed=other.posed, map_T_middle=other.map_T_middle)
         for one, other in zip(sweeps, to, strict=False)
     ]
-
-
-def _continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
-    """Where the motion between the last two sweeps leads by a stamp, nanoseconds."""
-    before, last = sweeps[-2:]
-    return advance(last.map_T_middle, _twist(before, last), last.moment.seconds_to(stamp))
-
-
-def _twist(one: EarlySweep, other: EarlySweep) -> FloatArray:
-    """Mean body velocity (6,) from one sweep to the next, rad/s and m/s."""
-    moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
-    twist: FloatArray = moved / one.moment.seconds_to(other.moment.stamp)
-    return twist
-
-
-def _kept(ways: Sequence[_Way], config: Config) -> list[_Way]:
-    """The best of some ways, and after it those that are as good, but for chance.
-
-    The first one is the way that was taken. If some acceleration explains it, others that none
-    explains are no ways.
-    """
-    least, near = config.solver.min_aligned, config.map.plane_voxel
-    if _drivable(ways[0], config.relocalization):
-        ways = [way for way in ways if _drivable(way, config.relocalization)]
-    best = ways[0]
-    for way in ways[1:]:
-        if _better(way, best, least):
-            best = way
-    kept = [best]
-    for way in ways:
-        apart = all(_apart(way, other, near) for other in kept)
-        if apart and min(_signs(way, best)[:3]) > -_CHANCE:
-            kept.append(way)
-    return kept
-
-
-def _drivable(way: _Way, config: RelocalizationConfig) -> bool:
-    """Whether some acceleration explains each change of the velocity on a way."""
-    sweeps = way[-1].sweeps
-    for number in range(2, len(sweeps)):
-        last, now = sweeps[number - 1].moment, sweeps[number].moment
-        expected = _continued(sweeps[:number], now.stamp)
-        step = expected.localCoordinates(now.map_T_lidar)
-        if beyond_any_motion(step, last.seconds_to(now.stamp), config):
-            return False
-    return True
-
-
-def _apart(one: _Way, other: _Way, near: float) -> bool:
-    """Whether most features of the last sweep are farther than ``near``, metres, from each other.
-
-    Compared are the motions since the first sweep, not the points, which are de-skewed for them.
-    """
-    moved = [
-        way[-1].sweeps[0].map_T_middle.between(way[-1].sweeps[-1].map_T_middle)
-        for way in (one, other)
-    ]
-    seen = transform(one[-1].sweeps[-1].map_T_middle.inverse().matrix(), one[-1].points)
-    ends = [transform(pose.matrix(), seen) for pose in moved]
-    away = np.linalg.norm(ends[0] - ends[1], axis=1)
-    return bool(np.count_nonzero(away > near) > 0.5 * len(away))
-
-
-def _better(tried: _Way, best: _Way, least: float) -> bool:
-    """Whether one way is better than another by more than chance.
-
-    Neither lines nor planes may speak against it: at rest few lines are found, for next to a point
-    lie those of its own ring. ``least`` is the number of features at least, counted as if they lay
-    across.
-    """
-    every, lines, planes, weight = _signs(tried, best)
-    return every > _CHANCE and min(lines, planes) > -_CHANCE and weight > least
-
-
-def _signs(tried: _Way, best: _Way) -> tuple[float, float, float, float]:
-    """How much speaks for one way against another.
-
-    In standard deviations, of all features, of lines and of planes; and the number of features that
-    speak for it more than against it. The sweeps see the same things, and count as one.
-    """
-    found = [_gain(*pair) for pair in zip(tried, best, strict=True)]
-    gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
-    every, lines, planes = (
-        float(part.sum() / max(np.sqrt(len(found)) * np.linalg.norm(part), _TINY))
-        for part in (gain, gain[edge], gain[~edge])
-    )
-    return every, lines, planes, sum(weight for _, _, weight in found) / len(found)
-
-
-def _gain(tried: _Tried, best: _Tried) -> tuple[FloatArray, BoolArray, float]:
-    """What each feature (F,) says for one place against another, which are edges, and their number.
-
-    A feature counts as far as its line or plane lies across the way from one place to the other:
-    ground and walls along the way agree at both, but for chance.
-    """
-    edge = np.arange(len(best.points)) < best.edges
-    way = tried.points - best.points
-    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _TINY)
-    matched = [one.axes.any(axis=1) for one in (tried, best)]
-    along = [np.einsum("ij,ij->i", one.axes, way) ** 2 for one in (tried, best)]
-    each = [
-        has * np.where(edge, 1.0 - cosine, cosine)
-        for has, cosine in zip(matched, along, strict=True)
-    ]
-    across = np.sqrt(np.clip(sum(each) / np.maximum(sum(matched), 1), 0.0, 1.0))
-    gain = across * (tried.evidence - best.evidence)
-    return gain, edge, float(across @ gain)

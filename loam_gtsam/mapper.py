@@ -291,11 +291,11 @@ class Mapper:
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = frame.sweep.at(found.twist)
         scan = self.errors.of_scan(solution, small=self.maps.small)
-        if found.message:
-            self.errors.jumped(frame.predicted.map_T_middle, solution.map_T_lidar)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
-            posed, solution, pose, tilt, fused = with_imu(self.imu, posed, *told)
+            posed, solution, pose, tilt, fused, unlike = with_imu(self.imu, posed, *told)
+        if found.message or unlike:
+            self.errors.jumped(frame.predicted.map_T_middle, solution.map_T_lidar, unlike=unlike)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last

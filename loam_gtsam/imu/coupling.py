@@ -91,6 +91,7 @@ class TightCoupling:
 
     Attributes
     ----------
+    contradicted : whether the last :meth:`observe` met a pose that is unlike a trusted prediction
     turn_surprise : how the last :meth:`observe` found the predicted rotation, as a squared
         Mahalanobis distance; 0 without a prediction
     """
@@ -101,7 +102,7 @@ class TightCoupling:
         self._predicted: int | None = None
         self._rejected = False  # whether the prediction of this frame was taken back
         self._contradictions = 0
-        self.turn_surprise = 0.0
+        self.contradicted, self.turn_surprise = False, 0.0
 
     @property
     def trusted(self) -> bool:
@@ -168,14 +169,16 @@ class TightCoupling:
         gravity : (3,) m/s^2, map frame, with which the estimate begins, as with the buffer's bias
         """
         stamp, pose = now
-        self.turn_surprise = 0.0
+        self.contradicted, self.turn_surprise = False, 0.0
         if stamp <= last[0]:  # sweeps of unlike length
             return None
         try:
             if self._odometry is not None and self._predicted == stamp:
                 fused = self._odometry.update(pose, information)
                 self.turn_surprise = self._odometry.turn_surprise
-                agree = fused is not None and self._odometry.surprise < _UNLIKELY
+                unlikely = self._odometry.surprise >= _UNLIKELY
+                self.contradicted = unlikely and self.trusted
+                agree = fused is not None and not unlikely
                 count = self._contradictions + (-1 if agree else _OUTWEIGHS)
                 self._contradictions = min(max(count, 0), 2 * _DISTRUST)
                 return fused if agree and self.trusted else None

@@ -204,6 +204,7 @@ class InertialOdometry:
             raise InputError("nothing has been predicted: call predict() once for every frame")
         frame, self._pending = self._pending, None
         before, predicted = self.state.covariance, frame.predicted
+        self.surprise = self.turn_surprise = 0.0
         left = np.eye(STATE)  # share of the predicted state's error that the scan leaves
         if len(root):
             error, derivative = scan_residual(predicted.map_T_imu, self._lidar_T_imu, measured)

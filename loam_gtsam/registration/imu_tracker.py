@@ -46,6 +46,7 @@ class Registration(NamedTuple):
     map_T_lidar: gtsam.Pose3  # at the reference time
     tilt: TiltPrior = TiltPrior.NONE  # how roll and pitch acted
     fused: Fused | None = None  # scan, gyro and accelerometer together; None if not
+    contradicted: bool = False  # whether they predicted another pose
 
 
 def with_imu(
@@ -243,7 +244,7 @@ class ImuTracker:
         without the IMU and its (6, 6) information; None if nothing is known of it.
         """
         stamp, reference_stamp = posed.sweep.stamp, posed.sweep.reference_stamp
-        fused: Fused | None = None
+        fused, self._coupling.contradicted = None, False
         if last is not None and last.solved:
             self.compare_gyro(last[:2], (stamp, solution.map_T_lidar))
             if alone is not None:
@@ -258,7 +259,7 @@ class ImuTracker:
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        return Registration(posed, solution, pose, tilt, fused)
+        return Registration(posed, solution, pose, tilt, fused, self._coupling.contradicted)
 
     def predict(self, stamp: int) -> Prediction | None:
         """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.

@@ -224,28 +224,28 @@ class PoseErrors:
         """Whether the velocity is that at the middle of the last sweep."""
         return last is not None and last.solved and last.stamp == self._expected.stamp
 
-    def jumped(self, expected: gtsam.Pose3, found: gtsam.Pose3) -> None:
-        """Account for a pose that a search found elsewhere than the motion had led to expect.
+    def jumped(self, expected: gtsam.Pose3, found: gtsam.Pose3, *, unlike: bool = False) -> None:
+        """Account for a pose elsewhere than the motion had led to expect.
 
         Map and motion contradict each other: the lidar may have been carried away, or be where the
         map has nothing yet, and another place looks the same. Both places are as likely: along each
-        axis the mean squared error of either is half the square of the step.
+        axis the mean squared error of either is half the square of the step. An IMU to which the
+        pose is ``unlike`` knew better where to expect it.
         """
-        if not same(expected, found):
+        if unlike or not same(expected, found):
             in_map = found.AdjointMap() * expected.localCoordinates(found)
             self._drift = self._drift + 0.5 * in_map @ in_map.T
 
     def moved(self, step: gtsam.Pose3) -> None:
         """Account for points of the map that a loop closure moved by a step, in map axes.
 
-        The frames to come follow them, while the first pose stays where it was. The motion from one
-        frame to another is none the worse for it: see :func:`relative_covariance`.
+        The frames to come follow them, the first pose does not. No motion is the worse for it.
         """
         in_map = gtsam.Pose3.Logmap(step)
         self._moved = self._moved + np.outer(in_map, in_map)
 
     def cut(self) -> None:
-        """Start anew in time: the next frame is on another clock than the frames before."""
+        """Start anew in time: the next frame is on another clock."""
         self._last, self._paused = None, True
         self._expected.cut()
 

@@ -433,6 +433,18 @@ def test_tight_coupling_predicts_what_constant_velocity_cannot(coupling):
     assert predicted.velocity[0] == pytest.approx(2.6, abs=0.02)
 
 
+@pytest.mark.parametrize(("step", "unlike"), [(0.0, False), (0.005, False), (0.4, True)])
+def test_a_scan_that_is_not_where_a_trusted_imu_expects_it_is_told(step, unlike):
+    tracker = tracker_for(accelerating(2.0))
+    observed(tracker, range(8), 2.0, 1e6 * np.eye(6))
+    assert not tracker._coupling.contradicted
+    stamp, pose = at(8, 2.0)
+    tracker.predict(stamp)
+    away = pose.compose(gtsam.Pose3(FLAT, np.array([0.0, step, 0.0])))
+    tracker.observe(at(7, 2.0), (stamp, away), 1e6 * np.eye(6))
+    assert tracker._coupling.contradicted is unlike
+
+
 def test_a_gap_in_the_imu_leaves_the_prediction_out_and_it_begins_anew():
     samples = accelerating(2.0)
     since = (samples.stamps - NOW) * 1e-9

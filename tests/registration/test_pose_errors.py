@@ -304,21 +304,24 @@ def test_a_pose_so_far_off_that_its_adjoint_is_singular(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("step", "told"),
+    ("step", "unlike", "told"),
     [
-        ([0.0, 0.0, 0.0, 1.4, 0.0, 0.0], False),  # the same place
-        ([0.0, 0.0, 0.2, 0.0, 0.0, 0.0], False),
-        ([0.0, 0.0, 0.0, 5.0, -2.0, 0.0], True),
-        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], True),
+        ([0.0, 0.0, 0.0, 1.4, 0.0, 0.0], False, False),  # the same place
+        ([0.0, 0.0, 0.2, 0.0, 0.0, 0.0], False, False),
+        ([0.0, 0.0, 0.0, 5.0, -2.0, 0.0], False, True),
+        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], False, True),
+        ([0.0, 0.0, 0.0, 0.4, 0.0, 0.0], True, True),  # the IMU knew better
     ],
 )
-def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(step, told, monkeypatch):
+def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
+    step, unlike, told, monkeypatch
+):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
     errors = PoseErrors(Config())
     before = [calibrated(errors, k) for k in range(4)][-1]
     found = gtsam.Pose3().retract(np.array(step))
-    errors.jumped(gtsam.Pose3(), found)
+    errors.jumped(gtsam.Pose3(), found, unlike=unlike)
     after = calibrated(errors, 4, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
     expected = 0.5 * np.square(step) if told else np.zeros(6)

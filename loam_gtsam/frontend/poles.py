@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from loam_gtsam.frontend.curvature import EMPTY_BEAMS, LINKED_BEAMS
 from loam_gtsam.geometry import squared_norm
@@ -32,6 +33,8 @@ _BEFOREHAND = 10.0
 """Things by which that counts."""
 _STEPS = 10
 """Of the iteration; fifty change no width by more than a twentieth."""
+_UPRIGHT = 1.0, 1.5, 0.5
+"""Rings, beams and metres by which two runs on one post are apart at most."""
 _TINY = 1e-9
 
 
@@ -119,14 +122,26 @@ def find_poles(
     np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
-    radii = 0.5 * _likely_widths((turned + spacing) * distance, spacing * distance, length == 1)
+    rings = np.searchsorted(ring_starts, first, side="right")
+    upright = _upright(rings, np.arctan2(means[:, 1], means[:, 0]) / spacing, distance)
+    widths, apart = (turned + spacing) * distance, spacing * distance
+    radii = 0.5 * _likely_widths(widths, apart, length == 1, upright)
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
     return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])
 
 
-def _likely_widths(widths: FloatArray, apart: FloatArray, single: BoolArray) -> FloatArray:
-    """(M,) metres: the ``widths`` of runs, with those of ``single`` beams guessed from all runs.
+def _upright(rings: IntArray, beams: FloatArray, distances: FloatArray) -> BoolArray:
+    """(M,) which runs go on in a ring beside theirs: posts do, drops of rain do not."""
+    near = KDTree(np.column_stack([rings, beams, distances]) / _UPRIGHT)
+    count: IntArray = near.query_ball_point(near.data, 1.0, p=np.inf, return_length=True)
+    return count > 1
+
+
+def _likely_widths(
+    widths: FloatArray, apart: FloatArray, single: BoolArray, upright: BoolArray
+) -> FloatArray:
+    """(M,) metres: the ``widths`` of runs, with those of ``single`` beams guessed from ``upright``.
 
     Beams that are ``apart`` (M,) may have met anything that is wider or narrower than the run by
     less than that. Over many sweeps the runs of more beams are as wide as what they met; one beam
@@ -138,7 +153,8 @@ def _likely_widths(widths: FloatArray, apart: FloatArray, single: BoolArray) -> 
     ratio = _WIDTHS / apart[:, None]
     chance = np.maximum(1.0 - np.abs(ratio - (widths / apart)[:, None]), _TINY)
     met = np.minimum(ratio, 1.0)
-    frequency = _EXPECTED
+    frequency, every = _EXPECTED, chance
+    chance, met = chance[upright], met[upright]
     for _ in range(_STEPS):
         # Loops of its own, not BLAS: the same sums with any number of threads.
         seen = np.einsum("ij,i->j", chance, 1.0 / np.einsum("ij,j->i", chance, frequency))
@@ -146,7 +162,7 @@ def _likely_widths(widths: FloatArray, apart: FloatArray, single: BoolArray) -> 
         frequency = frequency * seen + _BEFOREHAND * _EXPECTED
         frequency /= there + _BEFOREHAND
         frequency /= frequency.sum()
-    alone, likely = chance[single], widths.copy()
+    alone, likely = every[single], widths.copy()
     likely[single] = np.einsum("ij,j->i", alone, frequency * _WIDTHS)
     likely[single] /= np.einsum("ij,j->i", alone, frequency)
     return likely

@@ -33,6 +33,9 @@ _HEIGHT = 10.0  # largest height above or below the lidar of a point that is sco
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
 _CHANCES = 20_000  # trial poses, or so, that tell how rarely a point hits
 _RAREST = 200  # number of points, those that hit most rarely, that are scored if rare ones count
+_AS_WELL = 0.75
+"""Part of the best place's fit from which another place fits as well, but for chance: of 200
+matches, half of which agree, three standard deviations."""
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
@@ -223,10 +226,12 @@ def search(
     usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
     lost = monitor.lost > 0 or monitor.misfit(before)
     start: gtsam.Pose3 | None = solution.map_T_lidar
+    rivals: list[gtsam.Pose3] = []
     moving = frame.twist_of(solution)
     twists = [steady, np.zeros(6) if lost else moving]
     if lost:
-        start = _place(frame, solution, monitor, solver)
+        place = _place(frame, solution, monitor, solver)
+        start, rivals = (None, []) if place is None else place
         if start is not None:
             twists.append(
                 _turned(steady, start.rotation().between(frame.predicted.map_T_middle.rotation()))
@@ -248,7 +253,8 @@ def search(
     if best is not None and best[2] is not moving:
         moved = f"moved by {distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)}"
         after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
-        return Found(best[1], best[2], f"{RELOCALISED}{after}, {moved}" if lost else moved)
+        text = f"{RELOCALISED}{after}, {moved}" if lost else moved
+        return Found(best[1], best[2], text, any_of(best[1].map_T_lidar, rivals))
     if not lost:
         return Found(solution, moving)
     guess = frame.predicted.map_T_middle
@@ -258,6 +264,18 @@ def search(
         f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
         f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps",
     )
+
+
+def any_of(pose: gtsam.Pose3, rivals: Sequence[gtsam.Pose3]) -> FloatArray | None:
+    """Covariance (6, 6) of a pose, map frame, if one of the rivals may be right; None without any.
+
+    The mean squared error of any of the places, about each.
+    """
+    if not rivals:
+        return None
+    steps = np.array([pose.AdjointMap() @ pose.localCoordinates(rival) for rival in rivals])
+    total: FloatArray = steps.T @ steps / (1 + len(rivals))
+    return total
 
 
 def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpdate:
@@ -277,8 +295,11 @@ def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpd
 
 def _place(
     frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
-) -> gtsam.Pose3 | None:
-    """The pose around the prediction at which a few matches fit best; None if there is none."""
+) -> tuple[gtsam.Pose3, list[gtsam.Pose3]] | None:
+    """The pose around the prediction at which a few matches fit best, and others that fit as well.
+
+    None if there is none.
+    """
     matcher = frame.matcher
     around = monitor.around(frame.predicted.map_T_middle)
     known = [
@@ -291,15 +312,24 @@ def _place(
     starts += likely_poses(points, np.concatenate(known), around, monitor.radius, _PLACES)
     matcher.clock.lap("relocalize")
     trial = replace(matcher, refine=False).with_few_matches()
-    best: tuple[float, gtsam.Pose3] | None = None
+    places: list[tuple[float, gtsam.Pose3]] = []
     for start in starts:
         # Few matches leave directions open: along these a place stays where it is.
         here = MotionPrior(start, frame.predicted.motion.information)
         tried = solver.solve(trial, start, frame.priors, here)
-        total = Fit.of(tried.matches, trial.offered).total
-        if tried.solved and (best is None or total > best[0]):
-            best = total, tried.map_T_lidar
-    return None if best is None else best[1]
+        if tried.solved:
+            places.append((Fit.of(tried.matches, trial.offered).total, tried.map_T_lidar))
+    best = max((total for total, _ in places), default=0.0)
+    expected = frame.predicted.map_T_middle
+    near = [place for place in places if place[0] >= _AS_WELL * best]
+    # Where much repeats, a place one bay farther on fits as well. The nearest is the likeliest, but
+    # not if it was tried in vain.
+    near.sort(key=lambda place: place[0] if monitor.lost else -expected.range(place[1]))
+    near.reverse()
+    if not near:
+        return None
+    chosen, *others = (pose for _, pose in near)
+    return chosen, [pose for pose in others if not same(chosen, pose)]
 
 
 def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:

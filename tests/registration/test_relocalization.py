@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from copy import copy, deepcopy
 from dataclasses import replace
+from types import SimpleNamespace
 
 import gtsam
 import numpy as np
@@ -24,6 +25,7 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.io.rollback import Before
 from loam_gtsam.pipeline import Pipeline, effective_config, run
+from loam_gtsam.registration import relocalization
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.odometry import Moment, predict
@@ -311,6 +313,43 @@ def test_along_what_a_sweep_does_not_show_a_tried_place_stays_where_it_is(before
     search_in(before, list(kidnapped)[AT], before.monitor)
     assert len(before.solver.away) > 5
     assert max(before.solver.away) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("fits", "lost", "chosen", "rivals"),
+    [
+        ((0.40, 0.50, 0.45), 0, 0, [1, 2]),  # all as good: the nearest
+        ((0.30, 0.50, 0.45), 0, 1, [2]),
+        ((0.40, 0.50, 0.30), 1, 1, [0]),  # it was tried in vain: the best
+        ((0.30, 0.50, 0.30), 0, 1, []),
+    ],
+)
+def test_of_places_that_fit_as_well_the_nearest_is_tried(
+    fits, lost, chosen, rivals, before, calm, monkeypatch
+):
+    frame = frame_of(before, list(calm)[AT])
+    expected = frame.predicted.map_T_middle
+    places = [expected.compose(gtsam.Pose3(gtsam.Rot3(), [x, 0.0, 0.0])) for x in (0.2, 4.0, 8.0)]
+    solver = SimpleNamespace(
+        solve=lambda matcher, start, *_: SimpleNamespace(solved=True, map_T_lidar=start, matches=0)
+    )
+    told = iter(fits)
+    monkeypatch.setattr(relocalization, "likely_poses", lambda *_: places)
+    monkeypatch.setattr(Fit, "of", lambda *_: SimpleNamespace(total=next(told)))
+    unsolved = SimpleNamespace(solved=False)
+    watch = SimpleNamespace(lost=lost, radius=10.0, around=lambda pose: [pose])
+    found, others = relocalization._place(frame, unsolved, watch, solver)
+    assert found is places[chosen]
+    assert {id(other) for other in others} == {id(places[k]) for k in rivals}
+
+
+def test_rivals_are_told_as_the_mean_squared_error_of_any_of_them():
+    pose = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), [3.0, 1.0, 0.0])
+    rivals = [pose.compose(gtsam.Pose3(gtsam.Rot3(), [x, 0.0, 0.0])) for x in (2.0, -4.0)]
+    spread = relocalization.any_of(pose, rivals)
+    along = np.array([np.cos(0.5), np.sin(0.5), 0.0])
+    np.testing.assert_allclose(spread[3:, 3:], (4.0 + 16.0) / 3.0 * np.outer(along, along))
+    assert relocalization.any_of(pose, []) is None
 
 
 def test_a_search_of_too_small_a_radius_says_that_the_sweep_is_lost(before, kidnapped):

@@ -63,4 +63,4 @@ def test_things_that_stand_alone_far_away_hold_a_drive_that_starts_at_speed(spee
     off = np.linalg.norm((found - true)[:, :3, 3], axis=1)
     assert (off.max() < 0.02 * world.truth.path_length) == held
     told = [update.status is FrameStatus.OK for update in result.updates]
-    assert (sum(told) > 30) == held
+    assert (sum(told) > 0.5 * len(told)) == held

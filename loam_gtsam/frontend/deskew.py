@@ -113,10 +113,11 @@ class MovingSweep:
 
     def without_turns(self) -> MovingSweep:
         """The sweep as if no IMU had been there."""
+        if self._turned is None:
+            return self
         sweep = copy(self)
         sweep._turned = sweep._bend = None
-        if self._turned is not None:
-            sweep.motion = SweepMotion.CONSTANT_VELOCITY
+        sweep.motion = SweepMotion.CONSTANT_VELOCITY
         return sweep
 
     def _bent(self, seconds: FloatArray | float) -> FloatArray:

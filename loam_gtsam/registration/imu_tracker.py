@@ -244,11 +244,12 @@ class ImuTracker:
         without the IMU and its (6, 6) information; None if nothing is known of it.
         """
         stamp, reference_stamp = posed.sweep.stamp, posed.sweep.reference_stamp
-        fused, self._coupling.contradicted = None, False
+        fused, contradicted = None, False
         if last is not None and last.solved:
             self.compare_gyro(last[:2], (stamp, solution.map_T_lidar))
             if alone is not None:
                 fused = self.observe(last[:2], (stamp, alone[0]), alone[1])
+                contradicted = self._coupling.contradicted
         if fused is not None:
             self.buffer.gyro_bias = fused.gyro_bias
             solution = replace(solution, map_T_lidar=fused.map_T_lidar)
@@ -259,7 +260,7 @@ class ImuTracker:
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        return Registration(posed, solution, pose, tilt, fused, self._coupling.contradicted)
+        return Registration(posed, solution, pose, tilt, fused, contradicted)
 
     def predict(self, stamp: int) -> Prediction | None:
         """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.
@@ -286,8 +287,7 @@ class ImuTracker:
     ) -> Fused | None:
         """Take in what the scan alone said about a moment; the pose by both, None if by none.
 
-        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed. A
-        gyro that is contradicted is doubted.
+        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed.
         """
         if self.config.coupling != "tight" or self.level is None:
             return None

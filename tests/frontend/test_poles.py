@@ -181,9 +181,14 @@ def test_what_one_beam_met_is_as_wide_as_what_more_beams_met(width):
 
 def found_in_two_rings(points):
     """Poles of a sweep whose second ring meets the same, a little higher; and its points."""
-    higher = points + np.float32([[0.0], [0.0], [0.05]])
-    both, count = np.hstack([points, higher]), points.shape[1]
-    return find_poles(both, np.array([0, count, 2 * count]), 0.5, 2.0, 9), both
+    both = np.hstack([points, points + np.float32([[0.0], [0.0], [0.05]])])
+    return found_in_halves(both), both
+
+
+def found_in_halves(both):
+    """Poles of two rings with as many points."""
+    count = both.shape[1] // 2
+    return found(both, width=2.0, starts=[0, count, 2 * count])
 
 
 def test_drops_of_rain_do_not_tell_how_wide_posts_are():
@@ -194,8 +199,7 @@ def test_drops_of_rain_do_not_tell_how_wide_posts_are():
     rng, ranges = np.random.default_rng(0), np.linalg.norm(both, axis=0)
     drops = (rng.random(len(ranges)) < 0.1) & (ranges > 250.0)
     wet = np.float32(both * np.where(drops, rng.uniform(2.0, 100.0, len(ranges)) / ranges, 1.0))
-    count = points.shape[1]
-    poles = find_poles(wet, np.array([0, count, 2 * count]), 0.5, 2.0, 9)
+    poles = found_in_halves(wet)
     of_posts = np.isin(poles.first, dry.first)
     assert np.count_nonzero(~of_posts) > 150
     still = np.isin(dry.first, poles.first)

@@ -21,6 +21,7 @@ from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.relocalization import (
     APART,
     Found,
+    any_of,
     likely_poses,
     same,
     sample_features,
@@ -131,16 +132,9 @@ class Start:
             self._anew = True
 
     def _doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
-        """Covariance (6, 6) of a pose, map frame, for other first motions that fit as well.
-
-        Among several places, one of which is right, the mean squared error of any of them.
-        """
-        total = np.zeros((6, 6))
-        for sweeps in self._rivals:
-            place = continued(sweeps, stamp)
-            step = map_T_lidar.AdjointMap() @ map_T_lidar.localCoordinates(place)
-            total += np.outer(step, step) / (1 + len(self._rivals))
-        return total
+        """Covariance (6, 6) of a pose, map frame, for other first motions that fit as well."""
+        doubt = any_of(map_T_lidar, [continued(sweeps, stamp) for sweeps in self._rivals])
+        return np.zeros((6, 6)) if doubt is None else doubt
 
     def _added(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver

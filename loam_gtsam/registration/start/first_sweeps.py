@@ -19,20 +19,20 @@ from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.relocalization import (
-    APART,
     Found,
     any_of,
     likely_poses,
     same,
     sample_features,
 )
+from loam_gtsam.registration.relocalization.evidence import Evidence
+from loam_gtsam.registration.relocalization.fits import APART
 from loam_gtsam.registration.solvers import ScanSolver, Solution
 from loam_gtsam.registration.start.ways import (
     EarlySweep,
     Tried,
     Way,
     continued,
-    evidence_of,
     kept_ways,
     mean_twist,
     without_turns,
@@ -99,11 +99,11 @@ class Start:
         quick = [
             self._tried(frame, place, solver) for place in (expected.solution.map_T_lidar, *places)
         ]
-        enough = _HOPEFUL * max(tried.share for tried in quick)
+        enough = _HOPEFUL * max(tried.evidence.share for tried in quick)
         ways = [
             (self._registered(frame, self._with_motion(tried.sweeps), solver),)
             for number, tried in enumerate(quick)
-            if number == 0 or tried.share >= enough
+            if number == 0 or tried.evidence.share >= enough
         ]
         (best,) = self._best(ways, frame.matcher.config)
         self._sweeps = best.sweeps[:1]
@@ -262,10 +262,7 @@ class Start:
         matcher = matcher.with_few_matches() if quickly else matcher
         solution = self._solved(frame, sweeps[-1], matcher, solver)
         last = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
-        rows, told = matcher.rows, evidence_of(matcher.rows, solution)
-        points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
-        points = transform(solution.map_T_lidar.matrix(), points)
-        return Tried(len(rows.edges), points, *told, [*sweeps[:-1], last], solution)
+        return Tried(Evidence.of(matcher, solution), [*sweeps[:-1], last], solution)
 
     def _matcher(
         self, frame: Frame, sweeps: Sequence[EarlySweep], number: int, *, to_keep: bool = False

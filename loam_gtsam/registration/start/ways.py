@@ -12,18 +12,11 @@ import numpy as np
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
-from loam_gtsam.registration.matches import ChosenRows
 from loam_gtsam.registration.odometry import Moment, advance
-from loam_gtsam.registration.relocalization import agreeing, beyond_any_motion
+from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, Favour, favour
+from loam_gtsam.registration.relocalization.fits import beyond_any_motion
 from loam_gtsam.registration.solvers import MotionPrior, Solution
-from loam_gtsam.types import BoolArray, FloatArray
-
-_AGAINST = 5.0
-"""Number of features that agree which one outweighs that contradicts. At the right place 3 of 1000
-matches contradict by noise, at a wrong one ten times as many (medians of 315 starts, of which 10
-go wrong, and at most 14 with any number from 3 to 10)."""
-_CHANCE = 3.0  # standard deviations beyond which a difference is no chance
-_TINY = 1e-9
+from loam_gtsam.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -54,17 +47,9 @@ class EarlySweep:
 class Tried(NamedTuple):
     """A sweep, registered with the map of those before it."""
 
-    edges: int  # number of edges, which come first among the features that may be matched
-    points: FloatArray  # (F, 3) where these are in the map
-    evidence: FloatArray  # (F,) what each says of the motion, see :func:`evidence_of`
-    axes: FloatArray  # (F, 3) of their lines and planes
+    evidence: Evidence
     sweeps: list[EarlySweep]  # it and those before it
     solution: Solution
-
-    @property
-    def share(self) -> float:
-        """Share of the features whose matches agree."""
-        return float(np.count_nonzero(self.evidence > 0.0)) / max(len(self.evidence), 1)
 
 
 Way = tuple[Tried, ...]
@@ -92,22 +77,6 @@ def without_turns(sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
     ]
 
 
-def evidence_of(rows: ChosenRows, solution: Solution) -> tuple[FloatArray, FloatArray]:
-    """What each feature (F,) says of a place, and the axis (F, 3) of its line or plane.
-
-    It is 1 if its match agrees, -5 if it contradicts, and 0 without a match.
-    """
-    evidence, axes = np.zeros(len(rows)), np.zeros((len(rows), 3))
-    if solution.solved:
-        edges, planes = solution.matches.edges, solution.matches.planes
-        lines = np.searchsorted(rows.edges, edges.indices)
-        others = len(rows.edges) + np.searchsorted(rows.planes, planes.indices)
-        for places, agree in zip((lines, others), agreeing(solution.matches), strict=True):
-            evidence[places] = np.where(agree, 1.0, -_AGAINST)
-        axes[lines], axes[others] = edges.directions, planes.normals
-    return evidence, axes
-
-
 def kept_ways(ways: Sequence[Way], config: Config) -> list[Way]:
     """The best of some ways, and after it those that are as good, but for chance.
 
@@ -124,7 +93,7 @@ def kept_ways(ways: Sequence[Way], config: Config) -> list[Way]:
     kept = [best]
     for way in ways:
         apart = all(_apart(way, other, near) for other in kept)
-        if apart and min(_signs(way, best)[:3]) > -_CHANCE:
+        if apart and min(_favour(way, best)[:3]) > -CHANCE:
             kept.append(way)
     return kept
 
@@ -150,7 +119,7 @@ def _apart(one: Way, other: Way, near: float) -> bool:
         way[-1].sweeps[0].map_T_middle.between(way[-1].sweeps[-1].map_T_middle)
         for way in (one, other)
     ]
-    seen = transform(one[-1].sweeps[-1].map_T_middle.inverse().matrix(), one[-1].points)
+    seen = transform(one[-1].sweeps[-1].map_T_middle.inverse().matrix(), one[-1].evidence.points)
     ends = [transform(pose.matrix(), seen) for pose in moved]
     away = np.linalg.norm(ends[0] - ends[1], axis=1)
     return bool(np.count_nonzero(away > near) > 0.5 * len(away))
@@ -163,40 +132,9 @@ def _better(tried: Way, best: Way, least: float) -> bool:
     lie those of its own ring. ``least`` is the number of features at least, counted as if they lay
     across.
     """
-    every, lines, planes, weight = _signs(tried, best)
-    return every > _CHANCE and min(lines, planes) > -_CHANCE and weight > least
+    every, lines, planes, weight = _favour(tried, best)
+    return every > CHANCE and min(lines, planes) > -CHANCE and weight > least
 
 
-def _signs(tried: Way, best: Way) -> tuple[float, float, float, float]:
-    """How much speaks for one way against another.
-
-    In standard deviations, of all features, of lines and of planes; and the number of features that
-    speak for it more than against it. The sweeps see the same things, and count as one.
-    """
-    found = [_gain(*pair) for pair in zip(tried, best, strict=True)]
-    gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
-    every, lines, planes = (
-        float(part.sum() / max(np.sqrt(len(found)) * np.linalg.norm(part), _TINY))
-        for part in (gain, gain[edge], gain[~edge])
-    )
-    return every, lines, planes, sum(weight for _, _, weight in found) / len(found)
-
-
-def _gain(tried: Tried, best: Tried) -> tuple[FloatArray, BoolArray, float]:
-    """What each feature (F,) says for one place against another, which are edges, and their number.
-
-    A feature counts as far as its line or plane lies across the way from one place to the other:
-    ground and walls along the way agree at both, but for chance.
-    """
-    edge = np.arange(len(best.points)) < best.edges
-    way = tried.points - best.points
-    way /= np.maximum(np.linalg.norm(way, axis=1, keepdims=True), _TINY)
-    matched = [one.axes.any(axis=1) for one in (tried, best)]
-    along = [np.einsum("ij,ij->i", one.axes, way) ** 2 for one in (tried, best)]
-    each = [
-        has * np.where(edge, 1.0 - cosine, cosine)
-        for has, cosine in zip(matched, along, strict=True)
-    ]
-    across = np.sqrt(np.clip(sum(each) / np.maximum(sum(matched), 1), 0.0, 1.0))
-    gain = across * (tried.evidence - best.evidence)
-    return gain, edge, float(across @ gain)
+def _favour(tried: Way, best: Way) -> Favour:
+    return favour([one.evidence for one in tried], [one.evidence for one in best])

@@ -1,0 +1,16 @@
+"""Relocalisation: detection of sweeps that do not fit the map, and the search for their pose."""
+
+from loam_gtsam.registration.relocalization.fits import Fit as Fit
+from loam_gtsam.registration.relocalization.fits import FitMonitor as FitMonitor
+from loam_gtsam.registration.relocalization.fits import same as same
+from loam_gtsam.registration.relocalization.likely_poses import likely_poses as likely_poses
+from loam_gtsam.registration.relocalization.likely_poses import sample_features as sample_features
+from loam_gtsam.registration.relocalization.search import RELOCALISED as RELOCALISED
+from loam_gtsam.registration.relocalization.search import Found as Found
+from loam_gtsam.registration.relocalization.search import Lost as Lost
+from loam_gtsam.registration.relocalization.search import any_of as any_of
+from loam_gtsam.registration.relocalization.search import doubtful as doubtful
+from loam_gtsam.registration.relocalization.search import found_at as found_at
+from loam_gtsam.registration.relocalization.search import search as search
+from loam_gtsam.registration.relocalization.search import second_opinion as second_opinion
+from loam_gtsam.registration.relocalization.search import unplaced as unplaced

@@ -1,0 +1,141 @@
+"""How well sweeps fit the map, and what is usual.
+
+The matches of a wrong pose disagree with the map. How many usually do differs from place to place
+(grass, people, a bare hall), so that each sweep is compared with those before it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import RelocalizationConfig
+from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.types import BoolArray, FloatArray
+
+_AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
+_BEYOND = 3.0  # standard deviations of the usual agreement below which one is unusual
+_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
+_EVEN = 1e-3  # standard deviation at least: one of 1000 matches
+APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """A measure of how well a sweep fits the map at a pose."""
+
+    share: float  # of the features that are matched
+    agreement: float  # share of the matches within three of their standard deviations
+
+    @classmethod
+    def of(cls, matches: ScanMatches, offered: int) -> Fit:
+        """The fit of matches, from the number of features that were offered for matching."""
+        if not len(matches):
+            return cls(0.0, 0.0)
+        agree = sum(int(np.count_nonzero(mask)) for mask in agreeing(matches))
+        return cls(len(matches) / max(offered, 1), agree / len(matches))
+
+    @property
+    def total(self) -> float:
+        """Share of the features whose matches agree."""
+        return self.share * self.agreement
+
+
+def beyond_any_motion(step: FloatArray, seconds: float, config: RelocalizationConfig) -> bool:
+    """Whether no acceleration explains a step (6,) away from constant velocity, rad and m."""
+    reach = 0.5 * seconds**2
+    return bool(
+        np.linalg.norm(step[:3]) > reach * config.max_turn_acceleration
+        or np.linalg.norm(step[3:]) > reach * config.max_acceleration
+    )
+
+
+def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
+    """Masks of the line and of the plane matches within three of their standard deviations."""
+    edges, planes = matches.edges, matches.planes
+    lines: BoolArray = edges.distances < _AGREE * edges.sigmas
+    surfaces: BoolArray = np.abs(planes.distances) < _AGREE * planes.sigmas
+    return lines, surfaces
+
+
+def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
+    """Whether two poses are no farther apart than the starts of a search."""
+    turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
+    return bool(one.range(other) < APART[0] and turn < APART[1])
+
+
+class FitMonitor:
+    """Fits of the last sweeps, against which the next sweep is judged."""
+
+    def __init__(self, config: RelocalizationConfig) -> None:
+        self.config = config
+        self.lost = 0  # sweeps in a row that did not fit
+        self.last: gtsam.Pose3 | None = None  # pose of the last sweep that fitted
+        self._past: deque[Fit] = deque(maxlen=config.memory)
+
+    @property
+    def ready(self) -> bool:
+        """Whether ``memory`` sweeps are accepted; before that, no sweep counts as a misfit."""
+        return len(self._past) == self.config.memory
+
+    @property
+    def usual(self) -> Fit:
+        """Medians over the last accepted sweeps."""
+        past = np.array([(fit.share, fit.agreement) for fit in self._past])
+        share, agreement = np.median(past, axis=0).tolist() if len(past) else (0.0, 0.0)
+        return Fit(share, agreement)
+
+    def accept(self, fit: Fit, map_T_lidar: gtsam.Pose3) -> None:
+        """Add the fit of a sweep that went into the map."""
+        self.lost, self.last = 0, map_T_lidar
+        self._past.append(fit)
+
+    def misfit(self, fit: Fit) -> bool:
+        """Whether a sweep contradicts the map, or hardly any of its features has a match.
+
+        A moderately low share is no misfit, because the ground may be new.
+        """
+        usual, config = self.usual, self.config
+        return self.ready and (
+            fit.agreement < config.min_agreement * usual.agreement
+            or fit.total < config.min_share * usual.total
+        )
+
+    def unusual(self, fit: Fit) -> bool:
+        """Whether fewer matches agree than in the sweeps before, beyond their scatter."""
+        disagree = 1.0 - np.array([past.agreement for past in self._past])
+        if not self.ready:
+            return False
+        usual = float(np.median(disagree))
+        scatter = _TO_SIGMA * float(np.median(np.abs(disagree - usual)))
+        return 1.0 - fit.agreement > usual + _BEYOND * max(scatter, _EVEN)
+
+    def fits_again(self, fit: Fit) -> bool:
+        """Whether a pose found by a search is accepted, by a stricter test than :meth:`misfit`."""
+        usual, config = self.usual, self.config
+        return (
+            fit.agreement >= config.found_agreement * usual.agreement
+            and fit.total >= config.found_share * usual.total
+        )
+
+    def jumped(self, step: FloatArray, seconds: float) -> bool:
+        """Whether a pose is farther from its prediction than any acceleration explains.
+
+        ``step`` is the (6,) tangent from the predicted pose to the solved one, rad and m.
+        """
+        return self.ready and beyond_any_motion(step, seconds, self.config)
+
+    @property
+    def radius(self) -> float:
+        """Search radius around the prediction, metres; grows with every lost sweep."""
+        config = self.config
+        return min(config.radius + config.radius_growth * self.lost, config.max_radius)
+
+    def around(self, predicted: gtsam.Pose3) -> list[gtsam.Pose3]:
+        """Centres of the search: the prediction, and the pose of the last sweep that fitted."""
+        if self.last is None or predicted.range(self.last) < self.radius:
+            return [predicted]
+        return [predicted, self.last]

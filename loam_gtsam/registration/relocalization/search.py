@@ -1,0 +1,264 @@
+"""The search for the pose of a sweep whose solution is doubtful."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.registration.degeneracy import displacements
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
+from loam_gtsam.registration.odometry import Prediction, advance
+from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, favour
+from loam_gtsam.registration.relocalization.fits import Fit, FitMonitor, same
+from loam_gtsam.registration.relocalization.likely_poses import likely_poses, sample_features
+from loam_gtsam.registration.report import distance_in_words, make_update
+from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
+from loam_gtsam.types import FloatArray, FrameStatus, MapUpdate
+
+_AS_WELL = 0.75
+"""Part of the best place's fit from which another place fits as well, but for chance: of 200
+matches, half of which agree, three standard deviations."""
+_CLOSER = 3  # largest number of places that are looked at closer
+_BASIN = 0.5
+"""Part of the reach of a match, from within which a solve converges: as the spacing of trials."""
+_PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
+RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
+CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Found:
+    """The outcome of a search that found the pose of the sweep."""
+
+    solution: Solution  # at the middle of the sweep
+    twist: FloatArray  # (6,) body velocity with which the sweep was de-skewed
+    message: str = ""  # sentence for the user if the search moved the sweep
+    doubt: FloatArray | None = None  # (6, 6) covariance, map frame, of a start that is not sure
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lost:
+    """The outcome of a search that found nothing, with a sentence for the user."""
+
+    solution: Solution  # of no pose, with the matches at the expected one
+    message: str
+
+
+def found_at(frame: Frame, solution: Solution) -> Found:
+    """The sweep at a solved pose, with the motion that leads there."""
+    return Found(solution, frame.twist_of(solution))
+
+
+def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
+    """Whether the solution of a sweep is doubtful, so that the sweep must be searched for.
+
+    ``last_twist`` is the (6,) body velocity of the last sweep: the prediction may be a user's.
+    """
+    moment = frame.matcher.last
+    if not monitor.config.enabled or moment is None:
+        return False
+    if monitor.lost or not solution.solved:
+        return monitor.lost > 0
+    seconds = moment.seconds_to(frame.sweep.stamp)
+    expected = advance(moment.map_T_lidar, last_twist, seconds)
+    if monitor.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
+        return True
+    fit = Fit.of(solution.matches, frame.matcher.offered)
+    return monitor.misfit(fit) or _another_optimum(frame, solution, monitor, fit)
+
+
+def _another_optimum(frame: Frame, solution: Solution, monitor: FitMonitor, fit: Fit) -> bool:
+    """Whether a solve may have ended in another optimum than the true one.
+
+    Unusually few matches agree, and the solve led so far from the expected pose that features were
+    farther from where they belong than half the reach of a match.
+    """
+    if not monitor.unusual(fit):
+        return False
+    matches, reach = solution.matches, frame.matcher.config.matching.max_distance
+    points = np.concatenate([matches.edges.points, matches.planes.points])
+    return _moved(points, frame.predicted.map_T_middle, solution.map_T_lidar) > _BASIN * reach
+
+
+def second_opinion(
+    frame: Frame, found: Found, alone: Prediction, solver: ScanSolver
+) -> tuple[Frame, Found]:
+    """The sweep as predicted and de-skewed without the IMU, if it clearly fits the map better so.
+
+    ``alone`` is that prediction; ``frame`` and ``found`` are returned if it does not.
+    """
+    m = frame.matcher
+    parts = alone.posed, m.maps, m.config, m.last, m.clock
+    matcher = FrameMatcher.of(*parts, refine=m.refine, accelerations=m.accelerations)
+    other = replace(frame, matcher=matcher, predicted=alone)
+    solution = other.solve(solver)
+    if not solution.solved:
+        return frame, found
+    fit, before = (
+        Fit.of(solution.matches, matcher.offered),
+        Fit.of(found.solution.matches, m.offered),
+    )
+    better = not found.solution.solved or fit.total > CLEARLY * before.total
+    return (other, found_at(other, solution)) if better else (frame, found)
+
+
+def search(
+    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
+) -> Found | Lost:
+    """Search for the pose of a sweep whose solution is doubtful.
+
+    A sweep that fits badly is looked for around the expected pose. One that fits, but less than
+    usual, is believed elsewhere only if its features say so.
+    """
+    matcher = frame.matcher
+    usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
+    lost, moving = monitor.lost > 0 or monitor.misfit(before), frame.twist_of(solution)
+    if not (lost or _another_optimum(frame, solution, monitor, before)):  # it jumped
+        here = solution.map_T_lidar
+        found = _with_motion(frame, here, [matcher.posed.twist, moving], monitor, solver)
+        matcher.clock.lap("relocalize")
+        return Found(solution, moving) if found is None or found.twist is moving else found
+    evidence, least = Evidence.of(matcher, solution), matcher.config.solver.min_aligned
+    places = _places(frame, solution, monitor, solver)
+    for place in places[: 1 if monitor.lost else _CLOSER]:
+        twists = _motions(frame, place, None if lost else moving)
+        found = _with_motion(frame, place, twists, monitor, solver)
+        if found is None:
+            continue
+        told = favour([Evidence.of(matcher.moving_at(found.twist), found.solution)], [evidence])
+        if lost or (told.every > CHANCE and told.weight > least):
+            rivals = [pose for pose in places if not same(place, pose)]
+            matcher.clock.lap("relocalize")
+            after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
+            return replace(
+                found,
+                message=f"{RELOCALISED}{after}, {found.message}",
+                doubt=any_of(found.solution.map_T_lidar, rivals),
+            )
+    matcher.clock.lap("relocalize")
+    if not lost:
+        return Found(solution, moving)
+    guess = frame.predicted.map_T_middle
+    nowhere = Solution.unsolved(guess, solution.matches, solution.iterations, 0)
+    return Lost(
+        nowhere,
+        f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
+        f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps",
+    )
+
+
+def _motions(frame: Frame, place: gtsam.Pose3, moving: FloatArray | None) -> list[FloatArray]:
+    """The (6,) velocities with which a sweep may have been taken at a place.
+
+    The motion of a lidar that was carried away between two sweeps says nothing about the motion
+    within the sweeps. These are tried: the predicted velocity, rest or that of the solution, the
+    predicted one in axes that were turned on the vehicle, and that of a drive to the place.
+    """
+    matcher, steady = frame.matcher, frame.matcher.posed.twist
+    turned = place.rotation().between(frame.predicted.map_T_middle.rotation())
+    twists = [steady, np.zeros(6) if moving is None else moving, _turned(steady, turned)]
+    if matcher.last is not None and matcher.last.solved:
+        twists.append(matcher.twist_to(place))
+    return twists if frame.sweep.duration > 0.0 else twists[:1]
+
+
+def _with_motion(
+    frame: Frame, place: gtsam.Pose3, twists: Sequence[FloatArray],
+    monitor: FitMonitor, solver: ScanSolver,
+) -> Found | None:  # fmt: skip
+    """The sweep near a place, with the first velocity of those by which it clearly fits best.
+
+    None if it does not fit again with any.
+    """
+    matcher, best = frame.matcher, None
+    for twist in twists:
+        here = MotionPrior(place, frame.predicted.motion.information)
+        found = solver.solve(matcher.moving_at(twist), place, frame.priors, here)
+        fit = Fit.of(found.matches, matcher.offered)
+        if not (found.solved and monitor.fits_again(fit)):
+            continue
+        if best is None or fit.total > CLEARLY * best[0].total:
+            best = fit, found, twist
+    if best is None:
+        return None
+    moved = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)
+    return Found(best[1], best[2], f"moved by {moved}")
+
+
+def any_of(pose: gtsam.Pose3, rivals: Sequence[gtsam.Pose3]) -> FloatArray | None:
+    """Covariance (6, 6) of a pose, map frame, if one of the rivals may be right; None without any.
+
+    The mean squared error of any of the places, about each.
+    """
+    if not rivals:
+        return None
+    steps = np.array([pose.AdjointMap() @ pose.localCoordinates(rival) for rival in rivals])
+    total: FloatArray = steps.T @ steps / (1 + len(rivals))
+    return total
+
+
+def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpdate:
+    """The update of a sweep that is lost, or that matches too little; the monitor counts it."""
+    least, solution = frame.matcher.config.solver.min_matches, outcome.solution
+    if isinstance(outcome, Lost):
+        monitor.lost += 1
+        status, message = FrameStatus.LOST, outcome.message
+    else:
+        # Once may be chance; a sweep that has plenty to match is searched for the next time.
+        monitor.lost += monitor.config.enabled and frame.matcher.offered >= 2 * least
+        status = FrameStatus.FEW_MATCHES
+        message = f"{len(solution.matches)} matches; {least} are needed"
+    predicted = frame.predicted
+    return make_update(predicted.posed, predicted.map_T_lidar, status, message, solution)
+
+
+def _places(
+    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
+) -> list[gtsam.Pose3]:
+    """The poses around the prediction at which a few matches fit best, or as well but for chance.
+
+    Where much repeats, a place one bay farther on fits as well. The nearest, which comes first, is
+    the likeliest. Once it was tried in vain, the best comes first.
+    """
+    matcher, expected = frame.matcher, frame.predicted.map_T_middle
+    around = monitor.around(expected)
+    known = [
+        cubes.points(cubes.neighbourhood(pose.matrix()))
+        for pose in around
+        for cubes in (matcher.maps.edges, matcher.maps.planes)
+    ]
+    starts = [solution.map_T_lidar] if solution.solved else []
+    points = sample_features(*matcher.posed.points)
+    as_well = None if monitor.lost else _AS_WELL
+    where = np.concatenate(known), around, monitor.radius, _PLACES
+    starts += likely_poses(points, *where, as_well=as_well)
+    matcher.clock.lap("relocalize")
+    trial = replace(matcher, refine=False).with_few_matches()
+    places: list[tuple[float, gtsam.Pose3]] = []
+    for start in starts:
+        # Few matches leave directions open: along these a place stays where it is.
+        here = MotionPrior(start, frame.predicted.motion.information)
+        tried = solver.solve(trial, start, frame.priors, here)
+        if tried.solved:
+            places.append((Fit.of(tried.matches, trial.offered).total, tried.map_T_lidar))
+    best = max((total for total, _ in places), default=0.0)
+    as_good = [place for place in places if place[0] >= _AS_WELL * best]
+    ranks = [-total if monitor.lost else _moved(points, expected, pose) for total, pose in as_good]
+    return [as_good[number][1] for number in np.argsort(ranks, kind="stable")]
+
+
+def _moved(points: FloatArray, one: gtsam.Pose3, other: gtsam.Pose3) -> float:
+    """Root mean square of the distances, metres, between points (N, 3) at one pose and another."""
+    form = displacements(points, np.full(len(points), 1.0 / max(len(points), 1)))
+    step = one.localCoordinates(other)
+    squared = float(step @ form @ step)
+    return math.sqrt(max(squared, 0.0))
+
+
+def _turned(twist: FloatArray, a_R_b: gtsam.Rot3) -> FloatArray:
+    """A (6,) body velocity in the axes of ``a``, from the axes of ``b``."""
+    return (a_R_b.matrix() @ twist.reshape(2, 3).T).T.reshape(6)

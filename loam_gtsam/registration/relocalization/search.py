@@ -13,7 +13,7 @@ from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, favour
-from loam_gtsam.registration.relocalization.fits import Fit, FitMonitor, same
+from loam_gtsam.registration.relocalization.fits import Fit, FitMonitor, beyond_any_motion, same
 from loam_gtsam.registration.relocalization.likely_poses import likely_poses, sample_features
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
@@ -152,17 +152,20 @@ def search(
 
 
 def _motions(frame: Frame, place: gtsam.Pose3, moving: FloatArray | None) -> list[FloatArray]:
-    """The (6,) velocities with which a sweep may have been taken at a place.
+    """The (6,) velocities with which a sweep may have been taken at a place, the likeliest first.
 
-    The motion of a lidar that was carried away between two sweeps says nothing about the motion
-    within the sweeps. These are tried: the predicted velocity, rest or that of the solution, the
-    predicted one in axes that were turned on the vehicle, and that of a drive to the place.
+    They are that of a drive to the place, the predicted one, rest or that of the solution, and the
+    predicted one in axes that were turned on the vehicle. If no acceleration leads to the place,
+    the lidar was carried there between two sweeps, and a drive is the least likely.
     """
-    matcher, steady = frame.matcher, frame.matcher.posed.twist
-    turned = place.rotation().between(frame.predicted.map_T_middle.rotation())
-    twists = [steady, np.zeros(6) if moving is None else moving, _turned(steady, turned)]
-    if matcher.last is not None and matcher.last.solved:
-        twists.append(matcher.twist_to(place))
+    matcher, expected = frame.matcher, frame.predicted.map_T_middle
+    steady, last = matcher.posed.twist, matcher.last
+    turned = _turned(steady, place.rotation().between(expected.rotation()))
+    twists = [steady, np.zeros(6) if moving is None else moving, turned]
+    if last is not None and last.solved:
+        step, seconds = expected.localCoordinates(place), last.seconds_to(frame.sweep.stamp)
+        carried = beyond_any_motion(step, seconds, matcher.config.relocalization)
+        twists.insert(len(twists) if carried else 0, matcher.twist_to(place))
     return twists if frame.sweep.duration > 0.0 else twists[:1]
 
 

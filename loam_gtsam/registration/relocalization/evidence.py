@@ -10,7 +10,7 @@ import numpy as np
 
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import FrameMatcher
-from loam_gtsam.registration.relocalization.fits import agreeing
+from loam_gtsam.registration.relocalization.fits import AGREE, agreeing
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import BoolArray, FloatArray
 
@@ -48,8 +48,12 @@ class Evidence:
             edges, planes = solution.matches.edges, solution.matches.planes
             lines = np.searchsorted(rows.edges, edges.indices)
             others = len(rows.edges) + np.searchsorted(rows.planes, planes.indices)
-            for places, agree in zip((lines, others), agreeing(solution.matches), strict=True):
-                signs[places] = np.where(agree, 1.0, -_AGAINST)
+            reach, agree = matcher.matching.max_distance, agreeing(solution.matches)
+            for places, sure, sigmas in zip(
+                (lines, others), agree, (edges.sigmas, planes.sigmas), strict=True
+            ):
+                by_chance = np.minimum(AGREE * sigmas / reach, 1.0)
+                signs[places] = (1.0 - by_chance) * np.where(sure, 1.0, -_AGAINST)
             axes[lines], axes[others] = edges.directions, planes.normals
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)

@@ -16,7 +16,7 @@ from loam_gtsam.config import RelocalizationConfig
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.types import BoolArray, FloatArray
 
-_AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
+AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
 _BEYOND = 3.0  # standard deviations of the usual agreement below which one is unusual
 _TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 _EVEN = 1e-3  # standard deviation at least: one of 1000 matches
@@ -56,8 +56,8 @@ def beyond_any_motion(step: FloatArray, seconds: float, config: RelocalizationCo
 def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
     """Masks of the line and of the plane matches within three of their standard deviations."""
     edges, planes = matches.edges, matches.planes
-    lines: BoolArray = edges.distances < _AGREE * edges.sigmas
-    surfaces: BoolArray = np.abs(planes.distances) < _AGREE * planes.sigmas
+    lines: BoolArray = edges.distances < AGREE * edges.sigmas
+    surfaces: BoolArray = np.abs(planes.distances) < AGREE * planes.sigmas
     return lines, surfaces
 
 

@@ -159,7 +159,8 @@ class RelocalizationConfig(Section):
     """Every sweep is tested, and is lost if it fits the map less well than the sweeps before it;
     false believes every solve."""
     memory: int = parameter(10, low=1, high=10_000)
-    """The usual shares are medians over this many earlier sweeps; no sweep is lost before them."""
+    """The usual shares are medians over this many earlier sweeps at most; no sweep is lost before
+    there are four of them."""
     min_agreement: float = parameter(
         0.8, source="0.88 or more is usual, at most 0.75 when kidnapped", low=0.0, high=1.0
     )

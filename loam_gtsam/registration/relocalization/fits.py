@@ -18,6 +18,7 @@ from loam_gtsam.types import BoolArray, FloatArray
 
 AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
 _BEYOND = 3.0  # standard deviations of the usual agreement below which one is unusual
+_KNOWN = 4  # sweeps from which the usual is known
 _TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 _EVEN = 1e-3  # standard deviation at least: one of 1000 matches
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
@@ -78,8 +79,8 @@ class FitMonitor:
 
     @property
     def ready(self) -> bool:
-        """Whether ``memory`` sweeps are accepted; before that, no sweep counts as a misfit."""
-        return len(self._past) == self.config.memory
+        """Whether enough sweeps are accepted; before that, no sweep counts as a misfit."""
+        return len(self._past) >= min(self.config.memory, _KNOWN)
 
     @property
     def usual(self) -> Fit:

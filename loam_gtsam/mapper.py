@@ -6,6 +6,7 @@ Within a frame, poses belong to the middle of the sweep (see
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -295,7 +296,9 @@ class Mapper:
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike = with_imu(self.imu, posed, *told)
         if found.message or unlike:
-            self.errors.jumped(frame.predicted.map_T_middle, solution.map_T_lidar, unlike=unlike)
+            moment, expected = frame.matcher.last, frame.predicted.map_T_middle
+            seconds = math.inf if moment is None else moment.seconds_to(posed.sweep.stamp)
+            self.errors.jumped(expected, solution.map_T_lidar, seconds, unlike=unlike)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last

@@ -35,6 +35,8 @@ _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
 _PAUSE = 1.0
 """Seconds for which a velocity may have changed where a clock was set: nothing tells how long the
 sweeps took that were on neither clock."""
+_USUAL = 3.0  # times the root mean square of the accelerations within which one is usual
+_LONGER = 1.5  # times the time between two sweeps for which accelerations are known
 _KNOWN = 3  # accelerations from which their mean is believed
 
 
@@ -224,16 +226,20 @@ class PoseErrors:
         """Whether the velocity is that at the middle of the last sweep."""
         return last is not None and last.solved and last.stamp == self._expected.stamp
 
-    def jumped(self, expected: gtsam.Pose3, found: gtsam.Pose3, *, unlike: bool = False) -> None:
+    def jumped(
+        self, expected: gtsam.Pose3, found: gtsam.Pose3, seconds: float, *, unlike: bool = False
+    ) -> None:
         """Account for a pose elsewhere than the motion had led to expect.
 
         Map and motion contradict each other: the lidar may have been carried away, or be where the
         map has nothing yet, and another place looks the same. Both places are as likely: along each
         axis the mean squared error of either is half the square of the step. An IMU to which the
-        pose is ``unlike`` knew better where to expect it.
+        pose is ``unlike`` knew better where to expect it. A step is no contradiction if the
+        accelerations of before explain it in the ``seconds`` since the last sweep.
         """
-        if unlike or not same(expected, found):
-            in_map = found.AdjointMap() * expected.localCoordinates(found)
+        step = expected.localCoordinates(found)
+        if unlike or not (same(expected, found) or self._motion.explains(step, seconds)):
+            in_map = found.AdjointMap() * step
             self._drift = self._drift + 0.5 * in_map @ in_map.T
 
     def moved(self, step: gtsam.Pose3) -> None:
@@ -408,7 +414,7 @@ class _Acceleration:
         self._window = window
         self._count = 0
         self._expected = expected
-        self._mean = np.zeros(6)
+        self._mean, self._period = np.zeros(6), 0.0
         self._last: tuple[int, FloatArray] | None = None
 
     @property
@@ -422,6 +428,16 @@ class _Acceleration:
         """Whether enough accelerations were met for their mean to be believed."""
         return self._count >= _KNOWN
 
+    def explains(self, step: FloatArray, seconds: float) -> bool:
+        """Whether usual accelerations explain a step (6,) from constant velocity, rad and m.
+
+        Those of longer than usual are not known: held for two seconds they explain any room.
+        """
+        usual = np.sqrt(self.variances.reshape(2, 3).sum(axis=1))
+        reach = _USUAL * seconds**2 * usual  # they are second differences of poses
+        far = np.linalg.norm(step.reshape(2, 3), axis=1)
+        return self.known and seconds < _LONGER * self._period and bool((far <= reach).all())
+
     def add(
         self, last: _Middle, stamp: int, map_T_lidar: gtsam.Pose3, covariance: FloatArray
     ) -> None:
@@ -433,7 +449,7 @@ class _Acceleration:
             return
         # A second difference has the errors of three poses, with weights 1, -2, 1.
         noise = 6.0 * np.diag(covariance) / seconds**4
-        self._count += 1
+        self._count, self._period = self._count + 1, seconds
         gain = max(1.0 / self._count, 1.0 / self._window)
         squared = ((velocity - before[1]) / seconds) ** 2
         self._mean = self._mean + gain * (squared - noise - self._mean)

@@ -304,30 +304,34 @@ def test_a_pose_so_far_off_that_its_adjoint_is_singular(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("step", "unlike", "told"),
+    ("step", "usual", "seconds", "unlike", "told"),
     [
-        ([0.0, 0.0, 0.0, 1.4, 0.0, 0.0], False, False),  # the same place
-        ([0.0, 0.0, 0.2, 0.0, 0.0, 0.0], False, False),
-        ([0.0, 0.0, 0.0, 5.0, -2.0, 0.0], False, True),
-        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], False, True),
-        ([0.0, 0.0, 0.0, 0.4, 0.0, 0.0], True, True),  # the IMU knew better
+        ([0.0, 0.0, 0.0, 1.4, 0.0, 0.0], 0.0, 0.1, False, False),  # the same place
+        ([0.0, 0.0, 0.2, 0.0, 0.0, 0.0], 0.0, 0.1, False, False),
+        ([0.0, 0.0, 0.0, 5.0, -2.0, 0.0], 0.0, 0.1, False, True),
+        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], 0.0, 0.1, False, True),
+        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], 20.0, 0.1, False, False),  # 30 rad/s^2 once more
+        ([0.0, 0.0, 0.7, 0.0, 0.0, 0.0], 20.0, 0.1, False, True),
+        ([0.0, 0.0, 0.3, 0.0, 0.0, 0.0], 20.0, 0.2, False, True),  # not over two sweeps
+        ([0.0, 0.0, 0.0, 0.4, 0.0, 0.0], 20.0, 0.1, True, True),  # the IMU knew better
     ],
 )
 def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
-    step, unlike, told, monkeypatch
+    step, usual, seconds, unlike, told, monkeypatch
 ):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
     errors = PoseErrors(Config())
-    before = [calibrated(errors, k) for k in range(4)][-1]
+    before = [calibrated(errors, k) for k in range(6)][-1]
     found = gtsam.Pose3().retract(np.array(step))
-    errors.jumped(gtsam.Pose3(), found, unlike=unlike)
-    after = calibrated(errors, 4, found)
+    errors._motion._mean[:] = [0.0, 0.0, usual**2, usual**2, 0.0, 0.0]
+    errors.jumped(gtsam.Pose3(), found, seconds, unlike=unlike)
+    after = calibrated(errors, 6, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
     expected = 0.5 * np.square(step) if told else np.zeros(6)
     np.testing.assert_allclose(added, expected, atol=1e-6)
     # The motion after it is as well known as ever.
-    later = calibrated(errors, 5, found)
+    later = calibrated(errors, 7, found)
     assert np.abs(relative_covariance(after, later)).max() < 0.1
 
 

@@ -25,7 +25,6 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.io.rollback import Before
 from loam_gtsam.pipeline import Pipeline, effective_config, run
-from loam_gtsam.registration import relocalization
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.odometry import Moment, predict
@@ -34,14 +33,17 @@ from loam_gtsam.registration.relocalization import (
     FitMonitor,
     Found,
     Lost,
+    any_of,
     doubtful,
+    doubtful_sweeps,
     likely_poses,
     sample_features,
     search,
 )
+from loam_gtsam.registration.relocalization.evidence import Evidence, favour
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
-from loam_gtsam.types import FrameStatus, ImuSamples
+from loam_gtsam.types import FrameStatus, ImuSamples, Trajectory
 
 AT = 22
 """The sweep before which the lidar is put somewhere else."""
@@ -154,11 +156,33 @@ def test_two_thresholds_keep_apart_lost_and_found(monitor, fit, misfit, again):
     assert monitor.fits_again(fit) is again
 
 
-def test_nothing_is_unusual_at_the_start():
-    monitor = FitMonitor(RelocalizationConfig(memory=2))
-    monitor.accept(Fit(0.6, 1.0), gtsam.Pose3())
-    assert not monitor.misfit(Fit(0.0, 0.0))
-    assert not monitor.jumped(np.full(6, 100.0), 0.1)
+@pytest.mark.parametrize(("accepted", "known"), [(3, False), (4, True)])
+def test_nothing_is_unusual_in_the_first_sweeps(accepted, known):
+    monitor = FitMonitor(RelocalizationConfig(memory=10))
+    for _ in range(accepted):
+        monitor.accept(Fit(0.6, 1.0), gtsam.Pose3())
+    assert monitor.misfit(Fit(0.0, 0.0)) is known
+    assert monitor.unusual(Fit(0.6, 0.9)) is known
+    assert monitor.jumped(np.full(6, 100.0), 0.1) is known
+
+
+@pytest.mark.parametrize(
+    ("agreements", "agreement", "unusual"),
+    [
+        ([0.99, 0.98, 0.99, 1.0, 0.985], 0.90, True),
+        ([0.99, 0.98, 0.99, 1.0, 0.985], 0.97, False),
+        ([0.85, 0.95, 0.9, 0.92, 0.87], 0.80, False),  # people pass by
+        ([0.99, 0.5, 0.99, 1.0, 0.985], 0.90, True),  # one that did not fit either changes nothing
+    ],
+)
+def test_unusual_is_what_agrees_less_than_the_scatter_of_the_sweeps_before(
+    agreements, agreement, unusual
+):
+    monitor = FitMonitor(RelocalizationConfig())
+    for one in agreements:
+        monitor.accept(Fit(0.6, one), gtsam.Pose3())
+    assert monitor.unusual(Fit(0.6, agreement)) is unusual
+    assert not monitor.misfit(Fit(0.6, agreement))
 
 
 @pytest.mark.parametrize(
@@ -217,6 +241,17 @@ def test_the_likeliest_place_is_the_true_one(corner, away, turn):
         for second in found[:i]:
             apart = first.localCoordinates(second)
             assert np.linalg.norm(apart[3:]) >= 1.5 or abs(apart[2]) >= np.radians(12.0)
+
+
+@pytest.mark.parametrize(("as_well", "nearest"), [(None, False), (0.75, True)])
+def test_along_a_corridor_the_nearest_of_the_poses_that_fit_alike_comes_first(as_well, nearest):
+    """Two walls, of which a far part is seen a little better."""
+    ends = np.linspace(-20.0, 20.0, 2000)
+    walls = [np.column_stack([ends, np.full(2000, y), np.zeros(2000)]) for y in (-1.0, 1.0)]
+    points = np.concatenate(walls)[::25]
+    known = np.concatenate(walls) - [6.0, 0.0, 0.0]
+    found = likely_poses(points, known, [gtsam.Pose3()], 8.0, 1, as_well=as_well)[0]
+    assert bool(np.linalg.norm(found.translation()[:2]) < 0.1) is nearest
 
 
 def test_several_centres_are_searched(corner):
@@ -316,16 +351,16 @@ def test_along_what_a_sweep_does_not_show_a_tried_place_stays_where_it_is(before
 
 
 @pytest.mark.parametrize(
-    ("fits", "lost", "chosen", "rivals"),
+    ("fits", "lost", "order"),
     [
-        ((0.40, 0.50, 0.45), 0, 0, [1, 2]),  # all as good: the nearest
-        ((0.30, 0.50, 0.45), 0, 1, [2]),
-        ((0.40, 0.50, 0.30), 1, 1, [0]),  # it was tried in vain: the best
-        ((0.30, 0.50, 0.30), 0, 1, []),
+        ((0.40, 0.50, 0.45), 0, [0, 1, 2]),  # all as good: the nearest first
+        ((0.30, 0.50, 0.45), 0, [1, 2]),
+        ((0.40, 0.50, 0.30), 1, [1, 0]),  # it was tried in vain: the best first
+        ((0.30, 0.50, 0.30), 0, [1]),
     ],
 )
-def test_of_places_that_fit_as_well_the_nearest_is_tried(
-    fits, lost, chosen, rivals, before, calm, monkeypatch
+def test_of_places_that_fit_as_well_the_nearest_comes_first(
+    fits, lost, order, before, calm, monkeypatch
 ):
     frame = frame_of(before, list(calm)[AT])
     expected = frame.predicted.map_T_middle
@@ -334,22 +369,95 @@ def test_of_places_that_fit_as_well_the_nearest_is_tried(
         solve=lambda matcher, start, *_: SimpleNamespace(solved=True, map_T_lidar=start, matches=0)
     )
     told = iter(fits)
-    monkeypatch.setattr(relocalization, "likely_poses", lambda *_: places)
+    monkeypatch.setattr(doubtful_sweeps, "likely_poses", lambda *_, **__: places)
     monkeypatch.setattr(Fit, "of", lambda *_: SimpleNamespace(total=next(told)))
     unsolved = SimpleNamespace(solved=False)
     watch = SimpleNamespace(lost=lost, radius=10.0, around=lambda pose: [pose])
-    found, others = relocalization._place(frame, unsolved, watch, solver)
-    assert found is places[chosen]
-    assert {id(other) for other in others} == {id(places[k]) for k in rivals}
+    found = doubtful_sweeps._places(frame, unsolved, watch, solver)
+    assert [id(pose) for pose in found] == [id(places[k]) for k in order]
+
+
+@pytest.mark.parametrize(("metres", "doubt"), [(0.3, False), (0.8, True)])
+def test_a_solve_that_led_far_and_fits_unusually_little_is_in_doubt(metres, doubt, before, calm):
+    frame = frame_of(before, list(calm)[AT])
+    solution = frame.solve(before.solver)
+    monitor = deepcopy(before.monitor)
+    assert not doubtful(frame, solution, monitor, before.last.twist)
+    far = gtsam.Pose3(gtsam.Rot3(), [metres, 0.0, 0.0]).compose(solution.map_T_lidar)
+    expected = replace(frame.predicted, map_T_middle=far)
+    away = replace(frame, predicted=expected)
+    assert not doubtful(away, solution, monitor, before.last.twist)  # it fits as it should
+    monitor.unusual = lambda fit: True
+    assert doubtful(away, solution, monitor, before.last.twist) is doubt
+
+
+def test_what_is_in_doubt_is_believed_elsewhere_only_if_its_features_say_so(
+    before, calm, monkeypatch
+):
+    frame = frame_of(before, list(calm)[AT])
+    solution = frame.solve(before.solver)
+    monitor = deepcopy(before.monitor)
+    wrong = replace(solution, map_T_lidar=solution.map_T_lidar.retract([0, 0, 0.2, 0, 0, 0]))
+    wrong = replace(wrong, matches=frame.matcher(wrong.map_T_lidar))
+    monkeypatch.setattr(doubtful_sweeps, "_another_optimum", lambda *_: True)
+    monitor.misfit = lambda fit: False
+    found = search(frame, wrong, monitor, before.solver)
+    assert found.message.startswith("relocalised")
+    assert found.solution.map_T_lidar.equals(solution.map_T_lidar, 1e-2)
+    kept = search(frame, solution, monitor, before.solver)
+    assert (kept.solution, kept.message) == (solution, "")
+
+
+@pytest.mark.parametrize("objects", [True, False])
+def test_a_rival_to_which_the_features_object_is_none(objects, before, calm, monkeypatch):
+    frame = frame_of(before, list(calm)[AT])
+    found = Found(frame.solve(before.solver), np.zeros(6))
+    here = found.solution.map_T_lidar
+    places = [here.compose(gtsam.Pose3(gtsam.Rot3(), [x, 0.0, 0.0])) for x in (0.1, 3.0)]
+    solver = SimpleNamespace(
+        solve=lambda matcher, start, *_: SimpleNamespace(solved=True, map_T_lidar=start)
+    )
+    monkeypatch.setattr(doubtful_sweeps, "_speaks_for", lambda *_: objects)
+    rivals = doubtful_sweeps._rivals(frame, found, places, solver)
+    assert rivals == ([] if objects else places[1:])  # the first is the same place
+
+
+@pytest.mark.parametrize(("metres", "place"), [(0.2, 0), (3.0, -1)])
+def test_a_drive_is_the_likeliest_motion_unless_no_acceleration_leads_there(
+    metres, place, before, calm
+):
+    frame = frame_of(before, list(calm)[AT])
+    there = frame.predicted.map_T_middle.compose(gtsam.Pose3(gtsam.Rot3(), [metres, 0.0, 0.0]))
+    motions = doubtful_sweeps._motions(frame, there, None)
+    assert len(motions) == 4
+    np.testing.assert_array_equal(motions[place], frame.matcher.twist_to(there))
+
+
+def test_a_match_that_any_place_would_agree_with_says_nothing(before, calm):
+    matcher = frame_of(before, list(calm)[AT]).matcher
+    solution = before.solver.solve(matcher, before.last.map_T_middle)
+    planes = solution.matches.planes
+    spread = np.full(len(planes), 0.4 * matcher.matching.max_distance)
+    wide = replace(solution.matches, planes=replace(planes, sigmas=spread))
+    sure, chance = (
+        Evidence.of(matcher, replace(solution, matches=one)) for one in (solution.matches, wide)
+    )
+    rows = len(matcher.rows.edges)
+    assert sure.signs[rows:].max() > 0.8
+    assert not chance.signs[rows:].any()
+    nowhere = Evidence.of(matcher, replace(solution, solved=False))
+    assert not nowhere.signs.any()
+    assert not nowhere.axes.any()
+    assert favour([sure], [sure]) == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_rivals_are_told_as_the_mean_squared_error_of_any_of_them():
     pose = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), [3.0, 1.0, 0.0])
     rivals = [pose.compose(gtsam.Pose3(gtsam.Rot3(), [x, 0.0, 0.0])) for x in (2.0, -4.0)]
-    spread = relocalization.any_of(pose, rivals)
+    spread = any_of(pose, rivals)
     along = np.array([np.cos(0.5), np.sin(0.5), 0.0])
     np.testing.assert_allclose(spread[3:, 3:], (4.0 + 16.0) / 3.0 * np.outer(along, along))
-    assert relocalization.any_of(pose, []) is None
+    assert any_of(pose, []) is None
 
 
 def test_a_search_of_too_small_a_radius_says_that_the_sweep_is_lost(before, kidnapped):
@@ -498,3 +606,15 @@ def test_an_imu_that_breaks_is_left_out(street, kind, coupling):
     for update, pose in zip(result.updates, truth, strict=True):
         moved = result.updates[0].map_T_lidar.between(update.map_T_lidar)
         assert moved.range(gtsam.Pose3(pose)) < 0.3
+
+
+def test_a_shaken_lidar_at_two_sweeps_a_second_is_not_lost():
+    """From one sweep to the next it turns by up to 44 degrees, which no motion foretells."""
+    world = SimulatedWorld("shaken", seed=1, frames=60, columns=450)
+    truth = Trajectory(world.truth.stamps[::5], world.truth.map_T_lidar[::5])
+    sweeps = ArrayDataset([world[k] for k in range(0, 60, 5)], truth=truth)
+    blind, searched = (run(sweeps, config) for config in (OFF, Config()))
+    assert errors(blind, sweeps).max() > 1.0
+    assert errors(searched, sweeps).max() < 0.2
+    relocalised = [update.message for update in searched.updates if "relocalised" in update.message]
+    assert relocalised

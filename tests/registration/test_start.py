@@ -14,9 +14,9 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
-from loam_gtsam.registration.matches import ChosenRows
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.relocalization.evidence import _AGAINST, Evidence
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.registration.start import first_sweeps, ways
 from loam_gtsam.types import FrameStatus
@@ -115,7 +115,7 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
     world, states = ahead_only
     updates = [update for update, _ in states]
     assert errors(world, updates)[-1] < 0.1
-    assert states[2][1] < states[1][1]
+    assert states[4][1] < states[1][1]
     assert updates[4].covariance[3, 3] < 0.1 * updates[1].covariance[3, 3]
 
 
@@ -179,7 +179,7 @@ def place(at, lines, planes, normal):
     evidence = np.concatenate([lines, planes]).astype(float)
     points = np.random.default_rng(0).uniform(-9.0, 9.0, (len(evidence), 3)) + at
     axes = np.concatenate([np.tile(UP, (len(lines), 1)), np.tile(normal, (len(planes), 1))])
-    return ways.Tried(len(lines), points, evidence, axes, [], None)
+    return ways.Tried(Evidence(len(lines), points, evidence, axes), [], None)
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_a_place_is_better_if_more_lies_for_it_across_the_way_there(lines, plane
 
 @pytest.mark.parametrize(("against", "better"), [(0, True), (30, False)])
 def test_one_feature_that_contradicts_outweighs_some_that_agree(against, better):
-    say = np.concatenate([np.ones(60), np.full(against, -ways._AGAINST), np.zeros(100)])
+    say = np.concatenate([np.ones(60), np.full(against, -_AGAINST), np.zeros(100)])
     there = place(3.0 * AHEAD, [], say, AHEAD)
     here = place(0.0 * AHEAD, [], 0.0 * say, AHEAD)
     assert ways._better((there,), (here,), 8.0) == better
@@ -274,13 +274,6 @@ def test_the_way_that_was_taken_stays_though_no_acceleration_explains_it():
     taken, smooth = way_of(2.0, -2.0), way_of(2.0, 2.0)
     assert ways.kept_ways([taken, smooth], CONFIG) == [taken, smooth]
     assert ways.kept_ways([smooth, taken], CONFIG) == [smooth]
-
-
-def test_a_place_that_is_not_solved_has_no_evidence_and_is_no_better():
-    rows = ChosenRows(np.arange(3), np.arange(4), None)
-    evidence, axes = ways.evidence_of(rows, SimpleNamespace(solved=False))
-    assert not evidence.any()
-    assert not axes.any()
 
 
 def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):

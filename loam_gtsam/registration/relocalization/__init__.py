@@ -1,10 +1,5 @@
 """Relocalisation: detection of sweeps that do not fit the map, and the search for their pose."""
 
-from loam_gtsam.registration.relocalization.fits import Fit as Fit
-from loam_gtsam.registration.relocalization.fits import FitMonitor as FitMonitor
-from loam_gtsam.registration.relocalization.fits import same as same
-from loam_gtsam.registration.relocalization.likely_poses import likely_poses as likely_poses
-from loam_gtsam.registration.relocalization.likely_poses import sample_features as sample_features
 from loam_gtsam.registration.relocalization.doubtful_sweeps import RELOCALISED as RELOCALISED
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Found as Found
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Lost as Lost
@@ -14,3 +9,8 @@ from loam_gtsam.registration.relocalization.doubtful_sweeps import found_at as f
 from loam_gtsam.registration.relocalization.doubtful_sweeps import search as search
 from loam_gtsam.registration.relocalization.doubtful_sweeps import second_opinion as second_opinion
 from loam_gtsam.registration.relocalization.doubtful_sweeps import unplaced as unplaced
+from loam_gtsam.registration.relocalization.fits import Fit as Fit
+from loam_gtsam.registration.relocalization.fits import FitMonitor as FitMonitor
+from loam_gtsam.registration.relocalization.fits import same as same
+from loam_gtsam.registration.relocalization.likely_poses import likely_poses as likely_poses
+from loam_gtsam.registration.relocalization.likely_poses import sample_features as sample_features

@@ -122,16 +122,12 @@ def search(
         found = _with_motion(frame, here, [matcher.posed.twist, moving], monitor, solver)
         matcher.clock.lap("relocalize")
         return Found(solution, moving) if found is None or found.twist is moving else found
-    evidence, least = Evidence.of(matcher, solution), matcher.config.solver.min_aligned
     places = _places(frame, solution, monitor, solver)
     for place in places[: 1 if monitor.lost else _CLOSER]:
         twists = _motions(frame, place, None if lost else moving)
         found = _with_motion(frame, place, twists, monitor, solver)
-        if found is None:
-            continue
-        told = favour([Evidence.of(matcher.moving_at(found.twist), found.solution)], [evidence])
-        if lost or (told.every > CHANCE and told.weight > least):
-            rivals = [pose for pose in places if not same(place, pose)]
+        if found is not None and (lost or _speaks_for(frame, found, solution)):
+            rivals = _rivals(frame, found, places, solver)
             matcher.clock.lap("relocalize")
             after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
             return replace(
@@ -149,6 +145,27 @@ def search(
         f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
         f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps",
     )
+
+
+def _speaks_for(frame: Frame, found: Found, other: Solution) -> bool:
+    """Whether the features speak for a found place against another one, beyond chance."""
+    matcher = frame.matcher.moving_at(found.twist)
+    told = favour([Evidence.of(matcher, found.solution)], [Evidence.of(matcher, other)])
+    return told.every > CHANCE and told.weight > matcher.config.solver.min_aligned
+
+
+def _rivals(
+    frame: Frame, found: Found, places: Sequence[gtsam.Pose3], solver: ScanSolver
+) -> list[gtsam.Pose3]:
+    """Other places than the one where the sweep was found, to which its features do not object."""
+    rivals, matcher = [], frame.matcher.moving_at(found.twist)
+    for place in places:
+        if not same(place, found.solution.map_T_lidar):
+            here = MotionPrior(place, frame.predicted.motion.information)
+            other = solver.solve(matcher, place, frame.priors, here)
+            if other.solved and not _speaks_for(frame, found, other):
+                rivals.append(other.map_T_lidar)
+    return rivals
 
 
 def _motions(frame: Frame, place: gtsam.Pose3, moving: FloatArray | None) -> list[FloatArray]:

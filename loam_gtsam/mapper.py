@@ -281,7 +281,9 @@ class Mapper:
             if frame.predicted is alone:
                 self.imu.reject()
                 doubt = doubtful(frame, found.solution, self.monitor, twist)
-        return frame, search(frame, found.solution, self.monitor, self._named) if doubt else found
+        if doubt is None:
+            return frame, found
+        return frame, search(frame, found.solution, self.monitor, self._named, doubt)
 
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""

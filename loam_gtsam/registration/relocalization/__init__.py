@@ -1,6 +1,7 @@
 """Relocalisation: detection of sweeps that do not fit the map, and the search for their pose."""
 
 from loam_gtsam.registration.relocalization.doubtful_sweeps import RELOCALISED as RELOCALISED
+from loam_gtsam.registration.relocalization.doubtful_sweeps import Doubt as Doubt
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Found as Found
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Lost as Lost
 from loam_gtsam.registration.relocalization.doubtful_sweeps import any_of as any_of

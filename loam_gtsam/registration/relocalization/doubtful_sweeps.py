@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from enum import Enum
 
 import gtsam
 import numpy as np
@@ -30,6 +31,14 @@ RELOCALISED = "relocalised"  # begins the message of a frame that was found else
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
 
 
+class Doubt(Enum):
+    """Why a solution is doubtful."""
+
+    MISFIT = "the sweep does not fit the map there, or is to be found after others were lost"
+    JUMP = "no acceleration leads there"
+    OPTIMUM = "another optimum may be the true one"
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Found:
     """The outcome of a search that found the pose of the sweep."""
@@ -53,22 +62,26 @@ def found_at(frame: Frame, solution: Solution) -> Found:
     return Found(solution, frame.twist_of(solution))
 
 
-def doubtful(frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray) -> bool:
-    """Whether the solution of a sweep is doubtful, so that the sweep must be searched for.
+def doubtful(
+    frame: Frame, solution: Solution, monitor: FitMonitor, last_twist: FloatArray
+) -> Doubt | None:
+    """Why the solution of a sweep is doubtful, so that the sweep must be searched for, if it is.
 
     ``last_twist`` is the (6,) body velocity of the last sweep: the prediction may be a user's.
     """
     moment = frame.matcher.last
     if not monitor.config.enabled or moment is None:
-        return False
+        return None
     if monitor.lost or not solution.solved:
-        return monitor.lost > 0
+        return Doubt.MISFIT if monitor.lost else None
+    fit = Fit.of(solution.matches, frame.matcher.offered)
+    if monitor.misfit(fit):
+        return Doubt.MISFIT
     seconds = moment.seconds_to(frame.sweep.stamp)
     expected = advance(moment.map_T_lidar, last_twist, seconds)
     if monitor.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
-        return True
-    fit = Fit.of(solution.matches, frame.matcher.offered)
-    return monitor.misfit(fit) or _another_optimum(frame, solution, monitor, fit)
+        return Doubt.JUMP
+    return Doubt.OPTIMUM if _another_optimum(frame, solution, monitor, fit) else None
 
 
 def _another_optimum(frame: Frame, solution: Solution, monitor: FitMonitor, fit: Fit) -> bool:
@@ -107,38 +120,39 @@ def second_opinion(
 
 
 def search(
-    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver
+    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver, doubt: Doubt
 ) -> Found | Lost:
     """Search for the pose of a sweep whose solution is doubtful.
 
-    A sweep that fits badly is looked for around the expected pose. One that fits, but less than
-    usual, is believed elsewhere only if its features say so.
+    A sweep that jumped is solved again with the motion from before. One that does not fit is looked
+    for around the expected pose; so is one that may have another optimum, which is believed only if
+    the features speak for it.
     """
-    matcher = frame.matcher
-    usual, before = monitor.usual, Fit.of(solution.matches, matcher.offered)
-    lost, moving = monitor.lost > 0 or monitor.misfit(before), frame.twist_of(solution)
-    if not (lost or _another_optimum(frame, solution, monitor, before)):  # it jumped
-        here = solution.map_T_lidar
-        found = _with_motion(frame, here, [matcher.posed.twist, moving], monitor, solver)
+    matcher, moving = frame.matcher, frame.twist_of(solution)
+    if doubt is Doubt.JUMP:
+        twists = [matcher.posed.twist, moving]
+        found = _with_motion(frame, solution.map_T_lidar, twists, monitor, solver)
         matcher.clock.lap("relocalize")
         return Found(solution, moving) if found is None or found.twist is moving else found
+    lost = doubt is Doubt.MISFIT
     places = _places(frame, solution, monitor, solver)
     for place in places[: 1 if monitor.lost else _CLOSER]:
-        twists = _motions(frame, place, None if lost else moving)
+        twists = _motions(frame, place, np.zeros(6) if lost else moving)
         found = _with_motion(frame, place, twists, monitor, solver)
         if found is not None and (lost or _speaks_for(frame, found, solution)):
-            rivals = _rivals(frame, found, places, solver)
-            matcher.clock.lap("relocalize")
+            rivals = any_of(found.solution.map_T_lidar, _rivals(frame, found, places, solver))
             after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
-            return replace(
-                found,
-                message=f"{RELOCALISED}{after}, {found.message}",
-                doubt=any_of(found.solution.map_T_lidar, rivals),
-            )
+            found = replace(found, message=f"{RELOCALISED}{after}, {found.message}", doubt=rivals)
+            break
+    else:
+        found = None
     matcher.clock.lap("relocalize")
+    if found is not None:
+        return found
     if not lost:
         return Found(solution, moving)
-    guess = frame.predicted.map_T_middle
+    guess, usual = frame.predicted.map_T_middle, monitor.usual
+    before = Fit.of(solution.matches, matcher.offered)
     nowhere = Solution.unsolved(guess, solution.matches, solution.iterations, 0)
     return Lost(
         nowhere,
@@ -168,17 +182,17 @@ def _rivals(
     return rivals
 
 
-def _motions(frame: Frame, place: gtsam.Pose3, moving: FloatArray | None) -> list[FloatArray]:
+def _motions(frame: Frame, place: gtsam.Pose3, other: FloatArray) -> list[FloatArray]:
     """The (6,) velocities with which a sweep may have been taken at a place, the likeliest first.
 
-    They are that of a drive to the place, the predicted one, rest or that of the solution, and the
-    predicted one in axes that were turned on the vehicle. If no acceleration leads to the place,
+    They are that of a drive to the place, the predicted one, an ``other`` one, and the predicted
+    one in axes that were turned on the vehicle. If no acceleration leads to the place,
     the lidar was carried there between two sweeps, and a drive is the least likely.
     """
     matcher, expected = frame.matcher, frame.predicted.map_T_middle
     steady, last = matcher.posed.twist, matcher.last
     turned = _turned(steady, place.rotation().between(expected.rotation()))
-    twists = [steady, np.zeros(6) if moving is None else moving, turned]
+    twists = [steady, other, turned]
     if last is not None and last.solved:
         step, seconds = expected.localCoordinates(place), last.seconds_to(frame.sweep.stamp)
         carried = beyond_any_motion(step, seconds, matcher.config.relocalization)

@@ -24,11 +24,12 @@ from typing import Any
 import gtsam
 import numpy as np
 
+from benchmarks import recorded
 from benchmarks.cases import ROOT, data_folder
 from benchmarks.process import processor_clock
 from benchmarks.tables import markdown_table
 from loam_gtsam.config import Config
-from loam_gtsam.datasets import Dataset, SimulatedWorld, open_dataset
+from loam_gtsam.datasets import ArrayDataset, Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies import evaluation
@@ -73,6 +74,16 @@ class World:
             ahead = SimulatedWorld(self.scene, seed=seed, imu=imu or "white", **self.options)
             dataset = ahead.seen_from(mount(seed)) if seed else ahead
         return PartOf(dataset, self.first, self.every)
+
+
+class Carried(World):
+    """Sweeps of a lidar that was carried about, two a second; the truth are poses of FAST-LIO."""
+
+    def open(self, seed: int, imu: str | None) -> Dataset:
+        """The same for every seed."""
+        folder = data_folder() / self.scene
+        sweeps, poses = recorded.hand_held(folder), recorded.given_poses(folder)
+        return ArrayDataset(list(sweeps), truth=poses, sensor=sweeps.sensor)
 
 
 def mount(seed: int) -> FloatArray:
@@ -141,12 +152,22 @@ DEGENERATE = (
     _sim("single_plane", frames=100),
     _sim("single_pole"),
 )
-RECORDED = tuple(
-    World(name, name, recorded=True) for name in ("sim_town", "sim_park", "kitti_2011_09_26_0002")
-) + tuple(
-    World(f"KITTI, every {n}.", "kitti_2011_09_26_0002", every=n, first=5, recorded=True)
-    for n in (2, 3)
+RECORDED = (
+    tuple(
+        World(name, name, recorded=True)
+        for name in ("sim_town", "sim_park", "kitti_2011_09_26_0002")
+    )
+    + tuple(
+        World(f"KITTI, every {n}.", "kitti_2011_09_26_0002", every=n, first=5, recorded=True)
+        for n in (2, 3)
+    )
+    + (Carried("OS0-64, carried", "hilti_os0_64", recorded=True),)
 )
+SLOW = tuple(
+    replace(_sim(scene, f"{scene}, every 5.", frames=400, columns=900), every=5)
+    for scene in ("rooms", "room", "shaken", "garage", "square", "forest", "park", "stairwell")
+)
+"""Two sweeps a second: the lidar turns by up to 44 degrees from one to the next."""
 
 
 def _starts() -> Iterator[World]:
@@ -169,6 +190,7 @@ GROUPS = {
     "worlds": BUILT_IN,
     "degenerate": DEGENERATE,
     "recorded": RECORDED,
+    "slow": SLOW,
     "starts": STARTS,
 }
 QUICK = (_sim("room", frames=12, columns=600),)

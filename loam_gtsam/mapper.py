@@ -6,7 +6,6 @@ Within a frame, poses belong to the middle of the sweep (see
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -267,23 +266,21 @@ class Mapper:
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""
         assert self.last is not None
-        found = found_at(frame, frame.solve(self._named))
-        twist, stamp = self.last.twist, frame.sweep.stamp
+        found, twist = found_at(frame, frame.solve(self._named)), self.last.twist
         if self._start is not None:
             found = self._start.first_motion(frame, found, self._named)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
-        if self.imu is not None and (
-            doubt or self.imu.contradicted(self._moment, found.solution, stamp)
-        ):
+        now = self._moment, found.solution, frame.sweep.stamp
+        if self.imu is not None and (doubt is not None or self.imu.contradicted(*now)):
             sweep, before = MovingSweep(features, self.config), (self.last, self._moment, None)
             alone = predict(sweep, *before, self.config.solver)
             frame, found = second_opinion(frame, found, alone, self._named)
             if frame.predicted is alone:
                 self.imu.reject()
                 doubt = doubtful(frame, found.solution, self.monitor, twist)
-        if doubt is None:
-            return frame, found
-        return frame, search(frame, found.solution, self.monitor, self._named, doubt)
+        if doubt is not None:
+            return frame, search(frame, found.solution, self.monitor, self._named, doubt)
+        return frame, found
 
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
@@ -298,9 +295,7 @@ class Mapper:
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike = with_imu(self.imu, posed, *told)
         if found.message or unlike:
-            moment, expected = frame.matcher.last, frame.predicted.map_T_middle
-            seconds = math.inf if moment is None else moment.seconds_to(posed.sweep.stamp)
-            self.errors.jumped(expected, solution.map_T_lidar, seconds, unlike=unlike)
+            self.errors.jumped(frame.predicted, solution.map_T_lidar, unlike=unlike)
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last

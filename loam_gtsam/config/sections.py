@@ -159,8 +159,7 @@ class RelocalizationConfig(Section):
     """Every sweep is tested, and is lost if it fits the map less well than the sweeps before it;
     false believes every solve."""
     memory: int = parameter(10, low=1, high=10_000)
-    """The usual shares are medians over this many earlier sweeps at most; no sweep is lost before
-    there are four of them."""
+    """The usual shares are medians over up to this many earlier sweeps; none is lost before 4."""
     min_agreement: float = parameter(
         0.8, source="0.88 or more is usual, at most 0.75 when kidnapped", low=0.0, high=1.0
     )

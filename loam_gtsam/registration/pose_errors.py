@@ -15,7 +15,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
-from loam_gtsam.registration.odometry import Moment, Turns
+from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
@@ -226,20 +226,17 @@ class PoseErrors:
         """Whether the velocity is that at the middle of the last sweep."""
         return last is not None and last.solved and last.stamp == self._expected.stamp
 
-    def jumped(
-        self, expected: gtsam.Pose3, found: gtsam.Pose3, seconds: float, *, unlike: bool = False
-    ) -> None:
-        """Account for a pose elsewhere than the motion had led to expect.
+    def jumped(self, expected: Prediction, pose: gtsam.Pose3, *, unlike: bool) -> None:
+        """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
-        Map and motion contradict each other: the lidar may have been carried away, or be where the
-        map has nothing yet, and another place looks the same. Both places are as likely: along each
-        axis the mean squared error of either is half the square of the step. An IMU to which the
-        pose is ``unlike`` knew better where to expect it. A step is no contradiction if the
-        accelerations of before explain it in the ``seconds`` since the last sweep.
+        If no usual acceleration leads there, map and motion contradict each other: the lidar was
+        carried away, or another place looks the same. Both are as likely: along each axis the mean
+        squared error is half the square of the step. An IMU that it is ``unlike`` knew better.
         """
-        step = expected.localCoordinates(found)
-        if unlike or not (same(expected, found) or self._motion.explains(step, seconds)):
-            in_map = found.AdjointMap() * step
+        before, stamp = expected.map_T_middle, expected.posed.sweep.stamp
+        step = before.localCoordinates(pose)
+        if unlike or not (same(before, pose) or self._motion.explains(step, stamp)):
+            in_map = pose.AdjointMap() * step
             self._drift = self._drift + 0.5 * in_map @ in_map.T
 
     def moved(self, step: gtsam.Pose3) -> None:
@@ -428,15 +425,18 @@ class _Acceleration:
         """Whether enough accelerations were met for their mean to be believed."""
         return self._count >= _KNOWN
 
-    def explains(self, step: FloatArray, seconds: float) -> bool:
+    def explains(self, step: FloatArray, stamp: int) -> bool:
         """Whether usual accelerations explain a step (6,) from constant velocity, rad and m.
 
         Those of longer than usual are not known: held for two seconds they explain any room.
         """
+        if not self.known or self._last is None:
+            return False
+        seconds = (stamp - self._last[0]) * 1e-9
         usual = np.sqrt(self.variances.reshape(2, 3).sum(axis=1))
         reach = _USUAL * seconds**2 * usual  # they are second differences of poses
         far = np.linalg.norm(step.reshape(2, 3), axis=1)
-        return self.known and seconds < _LONGER * self._period and bool((far <= reach).all())
+        return seconds < _LONGER * self._period and bool((far <= reach).all())
 
     def add(
         self, last: _Middle, stamp: int, map_T_lidar: gtsam.Pose3, covariance: FloatArray

@@ -325,7 +325,10 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     before = [calibrated(errors, k) for k in range(6)][-1]
     found = gtsam.Pose3().retract(np.array(step))
     errors._motion._mean[:] = [0.0, 0.0, usual**2, usual**2, 0.0, 0.0]
-    errors.jumped(gtsam.Pose3(), found, seconds, unlike=unlike)
+    stamp = before.stamp + round(seconds * 1e9)
+    posed = SimpleNamespace(sweep=SimpleNamespace(stamp=stamp))
+    expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed)
+    errors.jumped(expected, found, unlike=unlike)
     after = calibrated(errors, 6, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
     expected = 0.5 * np.square(step) if told else np.zeros(6)

@@ -229,13 +229,12 @@ class PoseErrors:
     def jumped(self, expected: Prediction, pose: gtsam.Pose3, *, unlike: bool) -> None:
         """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
-        If no usual acceleration leads there, map and motion contradict each other: the lidar was
-        carried away, or another place looks the same. Both are as likely: along each axis the mean
-        squared error is half the square of the step. An IMU that it is ``unlike`` knew better.
+        If no usual acceleration leads there, the lidar was carried away, or another place is alike:
+        half the square of the step is the mean along each axis. An IMU it is ``unlike`` knew better.
         """
-        before, stamp = expected.map_T_middle, expected.posed.sweep.stamp
+        before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step = before.localCoordinates(pose)
-        if unlike or not (same(before, pose) or self._motion.explains(step, stamp)):
+        if unlike or not (same(before, pose) or self._motion.explains(step, now)):
             in_map = pose.AdjointMap() * step
             self._drift = self._drift + 0.5 * in_map @ in_map.T
 

@@ -230,7 +230,7 @@ class PoseErrors:
         """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
         If no usual acceleration leads there, the lidar was carried away, or another place is alike:
-        half the square of the step is the mean along each axis. An IMU it is ``unlike`` knew better.
+        half the square of the step is the mean along each axis. An IMU it is ``unlike`` knew more.
         """
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step = before.localCoordinates(pose)

@@ -430,18 +430,22 @@ def test_a_drive_is_the_likeliest_motion_unless_no_acceleration_leads_there(
     np.testing.assert_array_equal(motions[place], frame.matcher.twist_to(there))
 
 
-def test_a_match_that_any_place_would_agree_with_says_nothing(before, calm):
+def test_in_a_dense_map_a_match_that_any_place_would_agree_with_says_nothing(before, calm):
     matcher = frame_of(before, list(calm)[AT]).matcher
     solution = before.solver.solve(matcher, before.last.map_T_middle)
     planes = solution.matches.planes
     spread = np.full(len(planes), 0.4 * matcher.matching.max_distance)
     wide = replace(solution.matches, planes=replace(planes, sigmas=spread))
     sure, chance = (
-        Evidence.of(matcher, replace(solution, matches=one)) for one in (solution.matches, wide)
+        Evidence.of(matcher, replace(solution, matches=one), dense=True)
+        for one in (solution.matches, wide)
     )
     rows = len(matcher.rows.edges)
     assert sure.signs[rows:].max() > 0.8
     assert not chance.signs[rows:].any()
+    # In a thin map it says that there is something to match with.
+    thin = Evidence.of(matcher, replace(solution, matches=wide))
+    assert thin.signs[rows:].any()
     nowhere = Evidence.of(matcher, replace(solution, solved=False))
     assert not nowhere.signs.any()
     assert not nowhere.axes.any()

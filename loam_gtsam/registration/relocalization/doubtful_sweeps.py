@@ -164,7 +164,8 @@ def search(
 def _speaks_for(frame: Frame, found: Found, other: Solution) -> bool:
     """Whether the features speak for a found place against another one, beyond chance."""
     matcher = frame.matcher.moving_at(found.twist)
-    told = favour([Evidence.of(matcher, found.solution)], [Evidence.of(matcher, other)])
+    here, there = (Evidence.of(matcher, one, dense=True) for one in (found.solution, other))
+    told = favour([here], [there])
     return told.every > CHANCE and told.weight > matcher.config.solver.min_aligned
 
 

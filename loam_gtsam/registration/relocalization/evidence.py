@@ -40,8 +40,12 @@ class Evidence:
     axes: FloatArray
 
     @classmethod
-    def of(cls, matcher: FrameMatcher, solution: Solution) -> Evidence:
-        """What the features of a matcher say of the place where they were solved."""
+    def of(cls, matcher: FrameMatcher, solution: Solution, *, dense: bool = False) -> Evidence:
+        """What the features of a matcher say of the place where they were solved.
+
+        In a ``dense`` map there is something to match with at any place, and a feature counts by
+        the chance that a match within reach of it does not agree.
+        """
         rows = matcher.rows
         signs, axes = np.zeros(len(rows)), np.zeros((len(rows), 3))
         if solution.solved:
@@ -52,8 +56,9 @@ class Evidence:
             for places, sure, sigmas in zip(
                 (lines, others), agree, (edges.sigmas, planes.sigmas), strict=True
             ):
-                by_chance = np.minimum(AGREE * sigmas / reach, 1.0)
-                signs[places] = (1.0 - by_chance) * np.where(sure, 1.0, -_AGAINST)
+                signs[places] = np.where(sure, 1.0, -_AGAINST)
+                if dense:
+                    signs[places] *= 1.0 - np.minimum(AGREE * sigmas / reach, 1.0)
             axes[lines], axes[others] = edges.directions, planes.normals
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)

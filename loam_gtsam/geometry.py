@@ -14,6 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array, check_kind
 
 _Real = TypeVar("_Real", np.float32, np.float64)
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation over median absolute deviation of a normal distribution."""
 _SMALL_ANGLE = 1e-9
 _GRID = 1 << 20
 """Voxels on either side of the origin that the keys of voxels tell apart."""

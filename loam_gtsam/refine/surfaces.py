@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from loam_gtsam.geometry import voxel_keys
+from loam_gtsam.geometry import MAD_TO_SIGMA, voxel_keys
 from loam_gtsam.types import FloatArray, InputError, IntArray
 
 _LEAST_POINTS = 12
@@ -204,4 +204,4 @@ def _scatters(residuals: FloatArray, labels: IntArray, count: int, sigma: float)
     ends = np.cumsum(np.bincount(labels, minlength=count))
     middle = np.minimum(ends - (np.diff(ends, prepend=0) + 1) // 2, max(len(size) - 1, 0))
     medians = size[order][middle] if len(size) else np.zeros(count)
-    return np.clip(1.4826 * medians, _THIN * sigma, sigma)
+    return np.clip(MAD_TO_SIGMA * medians, _THIN * sigma, sigma)

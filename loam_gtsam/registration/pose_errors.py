@@ -229,8 +229,8 @@ class PoseErrors:
     def jumped(self, expected: Prediction, pose: gtsam.Pose3, *, unlike: bool) -> None:
         """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
-        If no usual acceleration leads there, the lidar was carried away, or another place is alike:
-        half the square of the step is the mean along each axis. An IMU it is ``unlike`` knew more.
+        If no usual acceleration leads there, it may only look alike: the mean squared error is half
+        the square of the step, along each axis. An IMU to which it is ``unlike`` knew better.
         """
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step = before.localCoordinates(pose)

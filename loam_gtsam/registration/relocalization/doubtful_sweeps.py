@@ -46,7 +46,7 @@ class Found:
     solution: Solution  # at the middle of the sweep
     twist: FloatArray  # (6,) body velocity with which the sweep was de-skewed
     message: str = ""  # sentence for the user if the search moved the sweep
-    doubt: FloatArray | None = None  # (6, 6) covariance, map frame, of a start that is not sure
+    doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,31 +128,27 @@ def search(
     for around the expected pose; so is one that may have another optimum, which is believed only if
     the features speak for it.
     """
-    matcher, moving = frame.matcher, frame.twist_of(solution)
-    if doubt is Doubt.JUMP:
-        twists = [matcher.posed.twist, moving]
-        found = _with_motion(frame, solution.map_T_lidar, twists, monitor, solver)
+    matcher = frame.matcher
+    if doubt is Doubt.MISFIT:
+        found = _elsewhere(frame, solution, monitor, solver)
         matcher.clock.lap("relocalize")
-        return Found(solution, moving) if found is None or found.twist is moving else found
-    lost = doubt is Doubt.MISFIT
-    places = _places(frame, solution, monitor, solver)
-    for place in places[: 1 if monitor.lost else _CLOSER]:
-        twists = _motions(frame, place, np.zeros(6) if lost else moving)
-        found = _with_motion(frame, place, twists, monitor, solver)
-        if found is not None and (lost or _speaks_for(frame, found, solution)):
-            rivals = any_of(found.solution.map_T_lidar, _rivals(frame, found, places, solver))
-            after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
-            found = replace(found, message=f"{RELOCALISED}{after}, {found.message}", doubt=rivals)
-            break
+        return _lost(frame, solution, monitor) if found is None else found
+    stays = found_at(frame, solution)
+    if doubt is Doubt.JUMP:
+        twists = [matcher.posed.twist, stays.twist]
+        found = _with_motion(frame, solution.map_T_lidar, twists, monitor, solver)
+        if found is not None and found.twist is stays.twist:
+            found = None
     else:
-        found = None
+        found = _elsewhere(frame, solution, monitor, solver, stays)
     matcher.clock.lap("relocalize")
-    if found is not None:
-        return found
-    if not lost:
-        return Found(solution, moving)
+    return stays if found is None else found
+
+
+def _lost(frame: Frame, solution: Solution, monitor: FitMonitor) -> Lost:
+    """The sweep, that fits nowhere, with its solution at the expected pose."""
     guess, usual = frame.predicted.map_T_middle, monitor.usual
-    before = Fit.of(solution.matches, matcher.offered)
+    before = Fit.of(solution.matches, frame.matcher.offered)
     nowhere = Solution.unsolved(guess, solution.matches, solution.iterations, 0)
     return Lost(
         nowhere,
@@ -161,11 +157,33 @@ def search(
     )
 
 
-def _speaks_for(frame: Frame, found: Found, other: Solution) -> bool:
-    """Whether the features speak for a found place against another one, beyond chance."""
-    matcher = frame.matcher.moving_at(found.twist)
-    here, there = (Evidence.of(matcher, one, dense=True) for one in (found.solution, other))
-    told = favour([here], [there])
+def _elsewhere(
+    frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver,
+    stays: Found | None = None,
+) -> Found | None:  # fmt: skip
+    """The sweep in the first of the likely places in which it fits again; None if in none.
+
+    If it ``stays`` where it was solved otherwise, its features must speak against that.
+    """
+    places = _places(frame, solution, monitor, solver)
+    other = np.zeros(6) if stays is None else stays.twist
+    for place in places[: 1 if monitor.lost else _CLOSER]:
+        twists = _motions(frame, place, other)
+        found = _with_motion(frame, place, twists, monitor, solver)
+        if found is None:
+            continue
+        matcher = frame.matcher.moving_at(found.twist)
+        here = Evidence.of(matcher, found.solution, dense=True)
+        if stays is None or _speaks_for(here, stays.solution, matcher):
+            rivals = any_of(found.solution.map_T_lidar, _rivals(frame, found, places, solver))
+            after = f" after {monitor.lost} lost sweeps" if monitor.lost else ""
+            return replace(found, message=f"{RELOCALISED}{after}, {found.message}", doubt=rivals)
+    return None
+
+
+def _speaks_for(here: Evidence, other: Solution, matcher: FrameMatcher) -> bool:
+    """Whether the features of a matcher speak for a place against another one, beyond chance."""
+    told = favour([here], [Evidence.of(matcher, other, dense=True)])
     return told.every > CHANCE and told.weight > matcher.config.solver.min_aligned
 
 
@@ -174,11 +192,11 @@ def _rivals(
 ) -> list[gtsam.Pose3]:
     """Other places than the one where the sweep was found, to which its features do not object."""
     rivals, matcher = [], frame.matcher.moving_at(found.twist)
+    here = Evidence.of(matcher, found.solution, dense=True)
     for place in places:
         if not same(place, found.solution.map_T_lidar):
-            here = MotionPrior(place, frame.predicted.motion.information)
-            other = solver.solve(matcher, place, frame.priors, here)
-            if other.solved and not _speaks_for(frame, found, other):
+            other = _solved_near(frame, matcher, place, solver)
+            if other.solved and not _speaks_for(here, other, matcher):
                 rivals.append(other.map_T_lidar)
     return rivals
 
@@ -211,8 +229,7 @@ def _with_motion(
     """
     matcher, best = frame.matcher, None
     for twist in twists:
-        here = MotionPrior(place, frame.predicted.motion.information)
-        found = solver.solve(matcher.moving_at(twist), place, frame.priors, here)
+        found = _solved_near(frame, matcher.moving_at(twist), place, solver)
         fit = Fit.of(found.matches, matcher.offered)
         if not (found.solved and monitor.fits_again(fit)):
             continue
@@ -222,6 +239,14 @@ def _with_motion(
         return None
     moved = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)
     return Found(best[1], best[2], f"moved by {moved}")
+
+
+def _solved_near(
+    frame: Frame, matcher: FrameMatcher, place: gtsam.Pose3, solver: ScanSolver
+) -> Solution:
+    """The sweep, solved from a place: along directions that its matches leave open it stays."""
+    here = MotionPrior(place, frame.predicted.motion.information)
+    return solver.solve(matcher, place, frame.priors, here)
 
 
 def any_of(pose: gtsam.Pose3, rivals: Sequence[gtsam.Pose3]) -> FloatArray | None:
@@ -275,9 +300,7 @@ def _places(
     trial = replace(matcher, refine=False).with_few_matches()
     places: list[tuple[float, gtsam.Pose3]] = []
     for start in starts:
-        # Few matches leave directions open: along these a place stays where it is.
-        here = MotionPrior(start, frame.predicted.motion.information)
-        tried = solver.solve(trial, start, frame.priors, here)
+        tried = _solved_near(frame, trial, start, solver)
         if tried.solved:
             places.append((Fit.of(tried.matches, trial.offered).total, tried.map_T_lidar))
     best = max((total for total, _ in places), default=0.0)

@@ -13,13 +13,13 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import RelocalizationConfig
+from loam_gtsam.geometry import MAD_TO_SIGMA
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.types import BoolArray, FloatArray
 
 AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of normal noise
 _BEYOND = 3.0  # standard deviations of the usual agreement below which one is unusual
 _KNOWN = 4  # sweeps from which the usual is known
-_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 _EVEN = 1e-3  # standard deviation at least: one of 1000 matches
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 
@@ -107,12 +107,11 @@ class FitMonitor:
 
     def unusual(self, fit: Fit) -> bool:
         """Whether fewer matches agree than in the sweeps before, beyond their scatter."""
-        disagree = 1.0 - np.array([past.agreement for past in self._past])
         if not self.ready:
             return False
-        usual = float(np.median(disagree))
-        scatter = _TO_SIGMA * float(np.median(np.abs(disagree - usual)))
-        return 1.0 - fit.agreement > usual + _BEYOND * max(scatter, _EVEN)
+        usual, past = self.usual.agreement, np.array([one.agreement for one in self._past])
+        scatter = MAD_TO_SIGMA * float(np.median(np.abs(past - usual)))
+        return fit.agreement < usual - _BEYOND * max(scatter, _EVEN)
 
     def fits_again(self, fit: Fit) -> bool:
         """Whether a pose found by a search is accepted, by a stricter test than :meth:`misfit`."""

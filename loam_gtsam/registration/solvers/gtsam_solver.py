@@ -18,6 +18,7 @@ from loam_gtsam.factors import (
     plane_rows,
     scan_match_factor,
 )
+from loam_gtsam.geometry import MAD_TO_SIGMA
 from loam_gtsam.registration.degeneracy import (
     Directions,
     Localizability,
@@ -42,8 +43,6 @@ from loam_gtsam.types import BoolArray, FloatArray
 _REDESCENDING = 2.816
 """Width of a Geman-McClure kernel over the width of a Huber kernel with the same efficiency on
 normal noise: 3.787 and 1.345 at 95 %."""
-
-_TO_SIGMA = 1.4826  # standard deviation over median absolute deviation of a normal distribution
 
 _FUSE = gtsam.LevenbergMarquardtParams()
 _FUSE.setVerbosityLM("SILENT")
@@ -323,7 +322,7 @@ def match_rows(
     edge_weights, plane_weights = e.weights, p.weights
     if len(matches) and np.isfinite(kernel_width):
         units, half = np.concatenate([edge_units, plane_units]), len(matches) // 2
-        scatter = _TO_SIGMA * float(np.partition(units, half)[half])
+        scatter = MAD_TO_SIGMA * float(np.partition(units, half)[half])
         width = kernel_width * max(1.0, scatter)
         edge_weights = edge_weights * _kept(edge_units, width, kernel)
         plane_weights = plane_weights * _kept(plane_units, width, kernel)

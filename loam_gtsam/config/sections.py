@@ -18,9 +18,9 @@ class SensorConfig(Section):
     )
     """The model of the lidar selects the table of beam elevations for rings from elevations; auto
     detects the model from the data."""
-    rings: Literal["auto", "field", "rows", "elevation"] = parameter("auto")
+    rings: Literal["auto", "field", "rows", "elevation", "none"] = parameter("auto")
     """Ring numbers of the points come from a field of the cloud, from its rows or from the
-    elevations of the points; auto tries the three in this order."""
+    elevations of the points; auto tries these in this order, and else there are none (Livox)."""
     times: Literal["auto", "field", "azimuth", "none"] = parameter("auto")
     """Times of the points come from a field of the cloud or from the azimuths of the points; auto
     tries the two in this order, and none maps the sweeps without de-skewing."""

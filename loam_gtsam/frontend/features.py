@@ -37,6 +37,7 @@ from loam_gtsam.frontend.curvature import (
 )
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.frontend.poles import Poles, find_poles
+from loam_gtsam.frontend.unorganised import on_flat_patches, posts
 from loam_gtsam.geometry import run_starts, squared_norm, voxel_filter
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError, SweepFault
 
@@ -54,7 +55,8 @@ _ENOUGH = 8192
 def extract_features(scan: Scan, config: Config) -> Features:
     """Edge and plane points of a sweep, at the positions they were measured.
 
-    Positions stay raw, and every feature keeps its time, so that
+    Those of a sweep without rings are found by :mod:`loam_gtsam.frontend.unorganised`, and have no
+    ``sharp`` and no ``flat``. Positions stay raw, and every feature keeps its time, so that
     :func:`loam_gtsam.geometry.move_points` can de-skew them. ``sharp`` and ``flat`` are the first
     rows of ``edges`` and ``planes``.
 
@@ -70,6 +72,8 @@ def extract_features(scan: Scan, config: Config) -> Features:
         the message says what was found and what to set.
     """
     sweep = organise(scan, config)
+    if not sweep.rings.known:
+        return _without_rings(scan, config, sweep)
     xyz, ring_starts, settings = sweep.xyz, sweep.ring_starts, config.features
     window = settings.half_window
     inside = window_fits(ring_starts, window)
@@ -239,9 +243,7 @@ def _assemble(
     n_sharp: int, gaps: NDArray[np.float32], poles: Poles,
 ) -> Features:  # fmt: skip
     """Gather positions, times from the reference time, and rings; poles are the last edges."""
-    span = sweep.span
-    moments = {"start": span[0], "middle": 0.5 * sum(span), "end": span[1], "stamp": 0.0}
-    reference = moments[config.deskew.reference]
+    span, reference = sweep.span, _reference(sweep, config)
     times = sweep.times - reference
     ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
 
@@ -293,6 +295,47 @@ def _assemble(
         not_finite=sweep.not_finite,
         reach=reach,
     )
+
+
+def _without_rings(scan: Scan, config: Config, sweep: OrganisedSweep) -> Features:
+    """Means of voxels on flat patches as planes, and the middles of posts as edges."""
+    span, reference, reach = sweep.span, _reference(sweep, config), _reach(sweep.xyz)
+    settings, none = config.features, np.empty(0, np.int64)
+    size = scale_of(reach, config.map) * settings.plane_voxel
+    columns = np.column_stack([sweep.xyz.T, sweep.times - reference])
+    rows = voxel_filter(columns, size, oblique=True)
+    points, times = rows[:, :3].copy(), rows[:, 3].copy()
+    is_flat = on_flat_patches(points, times, settings.range_noise)
+    edges, edge_times = posts(points, times, ~is_flat, settings)
+    n_planes = int(np.count_nonzero(is_flat))
+    if not n_planes + len(edges):
+        raise SweepError(
+            f"no features: of {len(points)} patches of {len(sweep.index)} points none is flat to "
+            f"within a few times the range noise of {settings.range_noise:g} m, and no post stands "
+            "apart; set features.range_noise to that of the sensor",
+            SweepFault.NO_FEATURES,
+        )
+    return Features(
+        stamp=scan.stamp + round(reference * 1e9),
+        edges=edges,
+        planes=points[is_flat],
+        edge_times=edge_times,
+        plane_times=times[is_flat],
+        edge_rings=np.zeros(len(edges), np.int64),
+        plane_rings=np.zeros(n_planes, np.int64),
+        sharp=none,
+        flat=none,
+        span=(span[0] - reference, span[1] - reference),
+        not_finite=sweep.not_finite,
+        reach=reach,
+    )
+
+
+def _reference(sweep: OrganisedSweep, config: Config) -> float:
+    """Seconds from the stamp of the sweep to the moment of its pose."""
+    first, end = sweep.span
+    moments = {"start": first, "middle": 0.5 * (first + end), "end": end, "stamp": 0.0}
+    return moments[config.deskew.reference]
 
 
 def scale_of(reach: float, config: MapConfig) -> float:

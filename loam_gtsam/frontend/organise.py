@@ -5,6 +5,7 @@ LOAM's features compare consecutive measurements of one beam, so they need this 
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -15,12 +16,14 @@ from loam_gtsam.config import Config, SensorConfig, as_config
 from loam_gtsam.frontend.rings import (
     MAX_RINGS,
     RingAssignment,
+    are_rings,
     azimuth_steps,
     beams_of,
     rings_from_elevation,
     rings_from_file_order,
     rings_from_labels,
     rings_from_rows,
+    without_rings,
 )
 from loam_gtsam.geometry import run_starts
 from loam_gtsam.types import (
@@ -198,32 +201,49 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
     """Find the beam of each point.
 
     ``sensor.rings`` selects the source; ``auto`` tries the ring field, the order of the points (in
-    a range image, or in a file written ring after ring), and the elevations. SweepError if no
-    source gives at least two rings; the message lists the sources.
+    a range image, or in a file written ring after ring), and the elevations. If none of them has
+    rings, there are none, unless a source or a model is set: then SweepError lists what was tried.
     """
+    if sensor.rings == "none":
+        return without_rings(len(columns), "sensor.rings: none")
     tried: list[str] = []
-    found: RingAssignment | None = None
-    if sensor.rings in ("auto", "field"):
-        if columns.labels is None:
-            tried.append("ring field: the scan has none")
+    for source, (found, reason) in _sources(columns, sensor):
+        if found is None:
+            tried.append(f"{source}: {reason}")
+        elif not are_rings(found, columns.xyz):
+            tried.append(f"{found.method}: elevations do not run smoothly around a ring")
         else:
-            found = rings_from_labels(columns.labels, columns.xyz)
-    if found is None and sensor.rings in ("auto", "rows"):
+            return _checked(found, columns, sensor)
+    if sensor.rings == sensor.model == "auto":
+        return without_rings(len(columns), "; ".join(tried))
+    raise SweepError(
+        f"no rings for a sweep of {len(columns)} points ({'; '.join(tried)}); give Scan.rings or "
+        "Scan.rows, set sensor.rings to another source and sensor.model to the sensor, or "
+        "sensor.rings to none for one that sweeps no rings",
+        SweepFault.BAD_RINGS,
+    )
+
+
+def _sources(
+    columns: SweepColumns, sensor: SensorConfig
+) -> Iterator[tuple[str, tuple[RingAssignment | None, str]]]:
+    """Name of each source that may be asked, its rings or None, and why."""
+    asked = sensor.rings
+    if asked in ("auto", "field"):
+        labels = columns.labels
+        rings = None if labels is None else rings_from_labels(labels, columns.xyz)
+        yield "ring field", (rings, "the scan has none")
+    if asked in ("auto", "rows"):
         if columns.row_of is not None:
-            found = rings_from_rows(columns.row_of)
+            yield "row order", (rings_from_rows(columns.row_of), "")
         else:
-            found, reason = rings_from_file_order(columns.azimuth)
-            tried.append(f"row order: {reason}")
-    if found is None and sensor.rings in ("auto", "elevation"):
-        found, reason = rings_from_elevation(columns.xyz, sensor.model)
-        tried.append(f"elevation: {reason}")
-    if found is None:
-        raise SweepError(
-            f"no rings for a sweep of {len(columns)} points ({'; '.join(tried)}); a "
-            "sensor that does not sweep rings, as a Livox, cannot be used; for any other, give "
-            "Scan.rings or Scan.rows, or set sensor.rings and sensor.model",
-            SweepFault.BAD_RINGS,
-        )
+            yield "row order", rings_from_file_order(columns.azimuth)
+    if asked in ("auto", "elevation"):
+        yield "elevation", rings_from_elevation(columns.xyz, sensor.model)
+
+
+def _checked(found: RingAssignment, columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
+    """The rings; SweepError if they are too few, too many, or not those of the sensor."""
     if found.count < 2 or found.count > MAX_RINGS:
         raise SweepError(
             f"{found.count} ring(s) from {found.method} in a sweep of {len(columns)} points: "
@@ -253,6 +273,13 @@ def assign_times(columns: SweepColumns, rings: RingAssignment, config: Config) -
     if source == "auto":
         needed = "azimuth" if config.deskew.enabled else "none"
         source = needed if columns.times is None else "field"
+        if source == "azimuth" and not rings.known:
+            raise SweepError(
+                f"neither rings nor times for a sweep of {len(columns)} points, {rings.note}; give "
+                "Scan.times, or set sensor.times to none if the points are de-skewed, or to "
+                "azimuth if the sensor spins",
+                SweepFault.BAD_TIMES,
+            )
     if source == "none":
         zeros = np.zeros(len(columns))
         return TimeAssignment(zeros, (0.0, 0.0), "none", "no times: the sweep is not de-skewed")
@@ -288,7 +315,7 @@ def _check_sensor(
     seconds, default = span[1] - span[0], type(sensor)()
     if sensor.period != default.period and not 0.5 < seconds / sensor.period < 2.0:
         problem = f"sensor.period is {sensor.period:g} s, and the points span {seconds:.3g} s"
-    if sensor.spin != "auto" and columns.times is not None:
+    if sensor.spin != "auto" and columns.times is not None and rings.known:
         order = np.lexsort((columns.times, rings.rings))
         number = rings.rings[order]
         step = azimuth_steps(columns.azimuth[order])[number[1:] == number[:-1]]
@@ -397,7 +424,9 @@ def organise(scan: Scan, config: Config) -> OrganisedSweep:
 def _firing_order(
     columns: SweepColumns, rings: RingAssignment, timing: TimeAssignment
 ) -> IntArray | None:
-    """Order of the points by ring and time; None if they are in that order."""
+    """Order of the points by ring and time; None if they are in that order, or have no rings."""
+    if not rings.known:
+        return None
     number = rings.rings
     clock = timing.times
     if timing.method == "none":

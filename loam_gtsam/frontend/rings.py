@@ -34,6 +34,8 @@ _CORE = 0.25
 have nothing to do with the beams lie there half of the time."""
 _CORE_SHARE = 0.9
 """Least share of points on the beams for a set of beams to be believed."""
+_SMOOTH = np.deg2rad(2.0)
+"""Radians by which neighbours on a ring differ in elevation at most, by the median."""
 _STRAY = 0.1
 """A peak in the histogram of elevations is a beam if it has this share of the height of the
 typical peak (the one the median point belongs to); lower ones are stray returns."""
@@ -54,7 +56,7 @@ class RingAssignment:
     ----------
     rings : (N,) uint16 beam numbers, 0 to ``count - 1``, in the order of the elevations
     count : number of beams that measured anything
-    method : "field", "rows", "file order" or "elevation"
+    method : "field", "rows", "file order", "elevation" or "none"
     note : one sentence for the user
     ring_major : whether the points are stored ring after ring
     """
@@ -64,6 +66,29 @@ class RingAssignment:
     method: str
     note: str
     ring_major: bool
+
+    @property
+    def known(self) -> bool:
+        """Whether there are rings: else all points have the number 0, in the order of the scan."""
+        return self.method != "none"
+
+
+def without_rings(count: int, why: str) -> RingAssignment:
+    """No rings, for so many points."""
+    note = f"no rings ({why}): features are flat patches and posts"
+    return RingAssignment(np.zeros(count, np.uint16), 1, "none", note, ring_major=True)
+
+
+def are_rings(found: RingAssignment, xyz: NDArray[np.float32]) -> bool:
+    """Whether the elevation runs smoothly around the fullest ring, as it does in any frame.
+
+    The beams of a Livox are numbered, too, but swing up and down.
+    """
+    fullest = np.argmax(np.bincount(found.rings))
+    x, y, z = xyz[:, found.rings == fullest]
+    around = np.argsort(np.arctan2(y, x))
+    elevation = np.arctan2(z, np.hypot(x, y))[around]
+    return len(around) < 2 or float(np.median(np.abs(np.diff(elevation)))) < _SMOOTH
 
 
 def _assignment(rings: NDArray[np.integer], count: int, method: str, note: str) -> RingAssignment:

@@ -3,10 +3,13 @@
 from dataclasses import replace
 from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
 from loam_gtsam.config import Config, DeskewConfig, SensorConfig
+from loam_gtsam.datasets.sim.patterns import PATTERNS
+from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.organise import assign_rings, organise, usable_columns
 from loam_gtsam.frontend.rings import ELEVATIONS, rings_from_file_order
 from loam_gtsam.types import Scan, SweepError
@@ -203,23 +206,58 @@ def test_sources_without_rings_are_refused_with_the_reason() -> None:
             rings_of(Scan(given, 0), config)
 
 
-def test_elevations_without_beams_are_refused_with_what_was_tried() -> None:
-    rng = np.random.default_rng(0)
-    direction = rng.normal(size=(5000, 3))
-    points = 10 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+def scattered(count: int = 5000) -> np.ndarray:
+    """Points all around, in no order."""
+    direction = np.random.default_rng(0).normal(size=(count, 3))
+    return 10 * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+
+
+def test_elevations_without_beams_are_refused_with_what_was_tried_if_a_model_is_set() -> None:
     with pytest.raises(SweepError) as caught:
-        organise(Scan(points, 0), Config())
+        organise(Scan(scattered(), 0), sensor(model="os1-64"))
     for part in ("ring field: the scan has none", "row order: azimuth", "elevation: no table",
-                 "set sensor.rings and sensor.model"):  # fmt: skip
+                 "sensor.rings to none for one that sweeps no rings"):  # fmt: skip
         assert part in str(caught.value)
+
+
+def test_points_in_no_order_have_no_rings_and_stay_as_they_are() -> None:
+    times = np.linspace(0.0, 0.1, 5000)
+    for config in (Config(), sensor(rings="none")):
+        sweep = organise(Scan(scattered(), 0, times=times), config)
+        assert not sweep.rings.known
+        assert sweep.rings.note.startswith("no rings (")
+        assert np.array_equal(sweep.index, np.arange(5000))
+        assert np.array_equal(sweep.times, times)
+
+
+def test_neither_rings_nor_times_are_refused_unless_the_points_are_said_to_be_de_skewed() -> None:
+    with pytest.raises(SweepError, match=r"neither rings nor times .* set sensor.times to none"):
+        organise(Scan(scattered(), 0), Config())
+    assert organise(Scan(scattered(), 0), sensor(times="none")).times.max() == 0.0
+    assert organise(Scan(scattered(), 0), sensor(times="azimuth")).times.max() > 0.09
+    assert organise(Scan(scattered(), 0), Config().changed("deskew.enabled=false")).span == (0, 0)
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_the_numbered_beams_of_a_lidar_that_sweeps_no_rings_are_none(pattern: str) -> None:
+    scan = SimulatedWorld("room", sensor=pattern, frames=1, columns=4000).sweep(0)
+    numbered = replace(scan, rings=np.arange(len(scan.points)) % 4)
+    assert not organise(numbered, Config()).rings.known
+    with pytest.raises(SweepError, match="field: elevations do not run smoothly around a ring"):
+        organise(numbered, sensor(rings="field"))
+
+
+def test_rings_of_a_lidar_that_is_mounted_askew_are_rings() -> None:
+    points, rings, _ = firing(VLP16)
+    askew = points @ gtsam.Rot3.Ypr(0.3, 0.7, -0.5).matrix().T
+    assert organise(Scan(askew, 0, rings=rings), Config()).rings.count == 16
 
 
 @pytest.mark.parametrize("count", [1, 300])
 def test_too_few_and_too_many_rings_are_refused(count: int) -> None:
-    points, _, _ = firing(VLP16)
-    labels = np.arange(len(points)) % count
+    points, rings, _ = firing(np.linspace(-20.0, 20.0, count))
     with pytest.raises(SweepError, match=f"{count} ring.*expected 2 to 256"):
-        organise(Scan(points, 0, rings=labels), Config())
+        organise(Scan(points, 0, rings=rings), Config())
 
 
 @pytest.mark.parametrize("clockwise", [True, False])

@@ -16,6 +16,7 @@ import numpy as np
 from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.sim.inertial import IMUS, Axes, ImuErrors
 from loam_gtsam.datasets.sim.motion import Motion
+from loam_gtsam.datasets.sim.patterns import PATTERNS, fired
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.streets import Scene, build_avenue
@@ -59,14 +60,14 @@ _IMU_MARGIN = 200_000_000  # nanoseconds of IMU data before the first and after 
 class SimulatedWorld(Loader):
     """A data set made on the fly, the same for the same arguments on every run.
 
-    The sensor spins clockwise from straight behind; all beams of a column fire together, and
-    points come in firing order. It gathers speed within three seconds. The IMU has the lidar's
-    axes; where it sits is in ``sensor``.
+    The sensor spins clockwise from straight behind, and all beams of a column fire together; or it
+    sweeps no rings, as a Livox. Points come in firing order. It gathers speed within three seconds.
+    The IMU has the lidar's axes; where it sits is in ``sensor``.
 
     Parameters
     ----------
     scene : one of :data:`SCENES`, or a :class:`Scene` of your own
-    sensor : one of :data:`SENSORS`
+    sensor : one of :data:`SENSORS`, or of :data:`~loam_gtsam.datasets.sim.patterns.PATTERNS`
     frames : sweeps; None is the scene's own number: once round and two seconds more for
         ``street_loop``, to the end for the corridors and the slopes. Closed paths are driven
         round and round, open ones have an end.
@@ -76,7 +77,7 @@ class SimulatedWorld(Loader):
     foliage_noise : mean depth by which a beam enters a tree crown (exponential), metres
     rate : sweeps per second
     speed : m/s on a straight, less in bends; None is the scene's own
-    columns : firings per sweep; None is the sensor's own
+    columns : firings per sweep, points if there are no rings; None is the sensor's own
     max_range : metres
     start : ``rest``, or ``moving``: the same way, its first sweep taken at full speed
     imu : ``white``, at the lidar's origin with white noise and constant biases; or ``mems``, beside
@@ -127,14 +128,15 @@ class SimulatedWorld(Loader):
     ) -> None:
         if isinstance(scene, str):
             _one_of("scene", scene, SCENES)
-        _one_of("sensor", sensor, SENSORS)
+        _one_of("sensor", sensor, SENSORS | PATTERNS)
         _one_of("start", start, STARTS)
         _one_of("imu", imu, IMUS)
         _whole_at_least(0, seed=seed)
         _whole_at_least(1, frames=frames)
         _whole_at_least(8, columns=columns)
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
-        elevations, default_columns = SENSORS[sensor]
+        self._pattern = sensor if sensor in PATTERNS else None
+        elevations, default_columns = SENSORS.get(sensor) or (np.zeros(1), PATTERNS[sensor][1])
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
         noises = {"gyro_noise": gyro_noise, "acceleration_noise": acceleration_noise}
@@ -154,7 +156,9 @@ class SimulatedWorld(Loader):
         self._motion = Motion(self.scene, speed, start == "moving")
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"
-        self.sensor: Mapping[str, Any] = _SPIN | {"model": sensor, "period": 1.0 / rate}
+        self._lidar = sensor
+        spins = {"rings": "none"} if self._pattern else _SPIN | {"model": sensor}
+        self.sensor: Mapping[str, Any] = spins | {"period": 1.0 / rate}
         if any(self._imu_errors.lever):
             self.sensor = self.sensor | {"imu.lidar_t_imu": self._imu_errors.lever}
         turns = np.arange(self._columns) / self._columns
@@ -175,10 +179,13 @@ class SimulatedWorld(Loader):
         """Sweep ``i``, the same whether or not others were made: processes can share the work."""
         if not 0 <= i < self._frames:
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
-        stamp = self._stamp(i)
-        times = (stamp - _EPOCH) * 1e-9 + self._times
+        stamp, beams, offsets = self._stamp(i), self._beams, self._times
+        since = (stamp - _EPOCH) * 1e-9
+        if self._pattern:
+            beams, offsets = fired(self._pattern, self._columns, since, 1.0 / self._rate)
+        times = since + offsets
         world_T_lidar = self._motion.world_T_lidar(times)
-        directions = np.einsum("cij,jcb->icb", world_T_lidar[:, :3, :3], self._beams)
+        directions = np.einsum("cij,jcb->icb", world_T_lidar[:, :3, :3], beams)
         origins = world_T_lidar[:, :3, 3]
         ranges, soft = cast_rays(self.scene.solids, origins, directions, self._max_range, times)
         rng = np.random.default_rng([self._seed, i])
@@ -187,9 +194,12 @@ class SimulatedWorld(Loader):
         ranges[soft] += self._foliage * rng.standard_exponential(int(soft.sum()))
         seen = np.isfinite(ranges) & ~lost & (ranges > _MIN_RANGE)
         column, ring = np.nonzero(seen)
-        points = np.ascontiguousarray((self._beams[:, seen] * ranges[seen]).T, dtype=np.float32)
-        times, rings = self._times[column], ring.astype(np.int32)
-        return Scan(points, stamp, times=times, rings=rings, span=(0.0, 1.0 / self._rate))
+        points = np.ascontiguousarray((beams[:, seen] * ranges[seen]).T, dtype=np.float32)
+        times, rings, span = offsets[column], ring.astype(np.int32), (0.0, 1.0 / self._rate)
+        if self._pattern:
+            order = np.argsort(times, kind="stable")
+            return Scan(points[order], stamp, times=times[order], span=span)
+        return Scan(points, stamp, times=times, rings=rings, span=span)
 
     def seen_from(self, lidar_T_moved: FloatArray) -> SimulatedWorld:
         """The same drive of a lidar at another place (4, 4); poses count from this one's start."""
@@ -228,11 +238,12 @@ class SimulatedWorld(Loader):
 
     def info(self) -> DatasetInfo:
         """Scene, sensor, frames and length of the way; reads nothing."""
-        beams, columns = self._beams.shape[2], self._columns
+        fires = f"{self._beams.shape[2]} beams x {self._columns} columns, clockwise"
+        fires = f"{self._columns} points, no rings" if self._pattern else fires
         within = math.hypot(self._imu_errors.attitude_noise, self._imu_errors.attitude_drift)
         facts = {
             "scene": self.scene.name,
-            "sensor": f"{self.sensor['model']}: {beams} beams x {columns} columns, clockwise",
+            "sensor": f"{self._lidar}: {fires}",
             "frames": f"{self._frames} at {self._rate:g} Hz",
             "path": f"{self.truth.path_length:.1f} m, {'closed' if self.scene.closed else 'open'}",
             "noise": f"{self._range_noise:g} m, {100.0 * self._dropout:g} % lost",

@@ -8,6 +8,7 @@ import pickle
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.sim.motion import GRAVITY
@@ -83,9 +84,12 @@ def middle_sweep(scene: str, **options) -> tuple[SimulatedWorld, int]:
     return world, min(len(world) - 1, 150)
 
 
-@pytest.mark.parametrize("scene", SCENES)
-def test_every_exact_point_lies_on_a_surface_and_nothing_stands_before_it(scene):
-    world, index = middle_sweep(scene, columns=600)
+@pytest.mark.parametrize(
+    ("scene", "sensor"),
+    [*((scene, "vlp16") for scene in SCENES), ("street_loop", "mid360"), ("square", "avia")],
+)
+def test_every_exact_point_lies_on_a_surface_and_nothing_stands_before_it(scene, sensor):
+    world, index = middle_sweep(scene, columns=600 if sensor == "vlp16" else 6000, sensor=sensor)
     scan = world[index]
     rng = np.random.default_rng(0)
     pick = rng.choice(len(scan.points), 400, replace=False)
@@ -166,6 +170,23 @@ def test_sensors_have_their_beams_and_fire_in_order(name):
     assert scan.points.dtype == np.float32
     assert scan.span == (0.0, 0.1)
     assert len(SENSORS[name][0]) * 90 >= len(scan.points) > 0.98 * len(elevations) * 90
+
+
+@pytest.mark.parametrize(("name", "field"), [("avia", (-41, 41)), ("mid360", (-7, 52))])
+def test_lidars_without_rings_fill_their_field_otherwise_in_every_sweep(name, field):
+    world = SimulatedWorld("room", sensor=name, columns=3000, **EXACT)
+    scans = [world[3], world[4]]
+    for scan in scans:
+        assert scan.rings is None
+        assert np.all(np.diff(scan.times) > 0.0)
+        assert 0.0 <= scan.times[0] < scan.times[-1] < scan.span[1] == 0.1
+        elevation = np.rad2deg(np.arcsin(scan.points[:, 2] / np.linalg.norm(scan.points, axis=1)))
+        azimuth = np.rad2deg(np.arctan2(scan.points[:, 1], scan.points[:, 0]))
+        assert field[0] < elevation.min() < field[0] + 8
+        assert field[1] - 8 < elevation.max() < field[1]
+        assert np.ptp(azimuth) > (350 if name == "mid360" else 60)
+    beams = [scan.points / np.linalg.norm(scan.points, axis=1, keepdims=True) for scan in scans]
+    assert np.median(cKDTree(beams[0]).query(beams[1])[0]) > 1e-3
 
 
 @pytest.mark.parametrize("scene", SCENES)

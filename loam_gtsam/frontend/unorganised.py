@@ -48,12 +48,13 @@ def on_flat_patches(points: FloatArray, times: FloatArray, noise: float) -> Bool
     if count < 4:
         return np.zeros(len(points), np.bool_)
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    patches = np.column_stack([points, times])[tree.query(points, k=count)[1]]
-    x, y, z, t = (patches - patches.mean(axis=1, keepdims=True)).transpose(2, 0, 1)
+    near = np.ascontiguousarray(tree.query(points, k=count)[1].T)
+    patches = np.vstack([points.T, times]).take(near, axis=1)
+    x, y, z, t = patches - patches.mean(axis=1, keepdims=True)
     pairs = ((x, x), (y, y), (z, z), (x, y), (y, z), (x, z))
-    covariance = np.stack([(a * b).mean(axis=1) for a, b in pairs])
-    moved = np.stack([(axis * t).mean(axis=1) for axis in (x, y, z)])
-    spread = (t * t).mean(axis=1) + max(noise / _SPEED, 1e-6) ** 2 / count
+    covariance = np.stack([(a * b).mean(axis=0) for a, b in pairs])
+    moved = np.stack([(axis * t).mean(axis=0) for axis in (x, y, z)])
+    spread = (t * t).mean(axis=0) + max(noise / _SPEED, 1e-6) ** 2 / count
     covariance -= moved[[0, 1, 2, 0, 1, 0]] * moved[[0, 1, 2, 1, 2, 2]] / spread
     across, along, _ = symmetric_eigenvalues(covariance)
     is_flat: BoolArray = across < _FLAT * along

@@ -31,6 +31,7 @@ from benchmarks.tables import markdown_table
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import ArrayDataset, Dataset, SimulatedWorld, open_dataset
 from loam_gtsam.datasets.base import PartOf
+from loam_gtsam.datasets.sim.patterns import PATTERNS
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies import evaluation
 from loam_gtsam.studies.evaluation import FIVE_SIGMA, FREEDOM, absolute_error, interpolate
@@ -168,6 +169,11 @@ SLOW = tuple(
     for scene in ("rooms", "room", "shaken", "garage", "square", "forest", "park", "stairwell")
 )
 """Two sweeps a second: the lidar turns by up to 44 degrees from one to the next."""
+WITHOUT_RINGS = tuple(
+    replace(w, name=f"{w.name}, {lidar}", options={**w.options, "sensor": lidar, "max_range": 70.0})
+    for w in BUILT_IN[:15]
+    for lidar in PATTERNS
+)
 
 
 def _starts() -> Iterator[World]:
@@ -191,6 +197,7 @@ GROUPS = {
     "degenerate": DEGENERATE,
     "recorded": RECORDED,
     "slow": SLOW,
+    "without rings": WITHOUT_RINGS,
     "starts": STARTS,
 }
 QUICK = (_sim("room", frames=12, columns=600),)

@@ -81,7 +81,7 @@ def views(
     Raises
     ------
     DatasetError
-        If the sweeps are not those of the frames.
+        If the sweeps are not those of the frames, or have no rings.
     """
     for number, (sweep, update, pose) in enumerate(zip(dataset, updates, poses, strict=False)):
         if not isinstance(sweep, Scan):
@@ -95,6 +95,11 @@ def views(
             found = organise(sweep, config)
         except SweepError as error:
             raise DatasetError(f"sweep {number}: {error}; give the data set of the run") from error
+        if not found.rings.known:
+            raise DatasetError(
+                f"sweep {number}: {found.rings.note}; expected rings, between which a beam is known "
+                "to have passed"
+            )
         offset = (update.stamp - sweep.stamp) * 1e-9
         if not found.span[0] - 1e-3 <= offset <= found.span[1] + 1e-3:
             raise DatasetError(

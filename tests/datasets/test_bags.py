@@ -16,6 +16,7 @@ from support.bags import (
     Recording,
     cloud,
     imu,
+    livox,
     store_of,
     sweep_points,
     sweeps,
@@ -25,6 +26,7 @@ from support.bags import (
 from loam_gtsam.datasets import BagDataset, Dataset, open_dataset
 from loam_gtsam.datasets.bags.bag import POINT_CLOUD
 from loam_gtsam.datasets.bags.bag_reader import choose_topic
+from loam_gtsam.datasets.decode.livox import read_custom
 from loam_gtsam.types import BadSweep, DatasetError, LoamError, Scan
 
 
@@ -58,6 +60,45 @@ def test_bag_round_trip(tmp_path: Path, kind: str) -> None:
     assert info.facts["point times"].startswith("field 'time' in s, relative to the stamp")
     assert info.facts["IMU"] == "9 samples, 200.00 Hz, with orientation"
     assert info.problems == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_message_of_a_livox_is_read_with_its_times_and_without_rings(
+    tmp_path: Path, kind: str
+) -> None:
+    times, stamps = np.linspace(0.0, 0.0999, 301), [START + i * 100_000_000 for i in range(3)]
+    recording: Recording = [
+        ("/livox/lidar", s + LATENCY, livox(store_of(kind), s, sweep_points(i, 301), times))
+        for i, s in enumerate(stamps)
+    ]
+    path = write_bag(tmp_path / "run", kind, recording)
+    dataset = open_dataset(path)
+    assert dataset.info().facts["point times"].startswith("field 'offset_time' in ns, relative")
+    for index, scan in enumerate(dataset):
+        assert isinstance(scan, Scan)
+        assert scan.stamp == stamps[index]
+        assert scan.rings is None
+        np.testing.assert_array_equal(scan.points, sweep_points(index, 301))
+        np.testing.assert_allclose(scan.times, times, atol=1e-9)
+    recording[1:1] = sweeps(kind, 1)  # what is common comes first, and another may be asked for
+    both = write_bag(tmp_path / "both", kind, recording)
+    assert BagDataset(both).topic == "/points"
+    assert len(BagDataset(both, topic="/livox/lidar")) == 3
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3"])
+def test_a_livox_message_that_is_cut_off_is_a_bad_sweep(kind: str) -> None:
+    store = store_of(kind)
+    message = livox(store, START, sweep_points(0, 50), np.linspace(0.0, 0.1, 50))
+    serialize = store.serialize_ros1 if kind == "ros1" else store.serialize_cdr
+    raw, cdr = bytes(serialize(message, message.__msgtype__)), kind != "ros1"
+    assert read_custom(raw, cdr=cdr).width == 50
+    for length, says in ((len(raw) - 1, "50 points of .* are cut off"), (30, "in the header")):
+        with pytest.raises(DatasetError, match=says):
+            read_custom(raw[:length], cdr=cdr)
+    if cdr:
+        with pytest.raises(DatasetError, match="expected little-endian CDR"):
+            read_custom(b"\0\0" + raw[2:], cdr=True)
 
 
 @pytest.mark.parametrize("kind", ["sqlite3", "mcap"])

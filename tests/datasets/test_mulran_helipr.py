@@ -142,35 +142,46 @@ def test_the_gyro_is_where_the_orientation_says(tmp_path: Path) -> None:
     assert "without gyro and accelerometer (8 columns)" in " ".join(dataset.info().problems)
 
 
-@pytest.mark.parametrize("lidar", ["Ouster", "Velodyne"])
+@pytest.mark.parametrize("lidar", write.HELIPR_SENSORS)
 def test_a_helipr_sequence_has_times_rings_and_truth(tmp_path: Path, lidar: str) -> None:
     dataset = open_dataset(write.write_helipr(tmp_path, lidar))
     assert isinstance(dataset, HeLiPRDataset)
-    sensor = "os1-128" if lidar == "Ouster" else "vlp16"
-    write.expect_sweeps(dataset, write.sweeps(sensor, 512))
+    write.expect_sweeps(dataset, write.sweeps(*write.HELIPR_SENSORS[lidar]))
     write.expect_truth(dataset)  # it is of the lidar already
     # The toolbox has the lidar in the IMU's axes; the IMU is then on the other side.
-    x, _, z = dataset.sensor["imu.lidar_t_imu"]
-    assert (x > 0.0, z < 0.0) == (True, True)
+    x, y, z = dataset.sensor["imu.lidar_t_imu"]
+    assert z < 0.0
+    assert (x > 0.0) == (lidar in ("Ouster", "Velodyne"))  # the others are in front of it
+    assert np.sign(y) == {"Avia": 1.0, "Aeva": -1.0}.get(lidar, np.sign(y))
     facts = dataset.info().facts
-    assert facts["fields"].startswith("x float32, y float32, z float32, intensity float32")
+    assert facts["fields"].startswith("x float32, y float32, z float32, ")
     assert "relative to the stamp" in facts["point times"]
     assert "HeLiPR-Pointcloud-Toolbox" not in facts  # no IMU, no extrinsics shown
     if lidar == "Ouster":
         write.expect_mapped(dataset, imu=False)
 
 
-def test_helipr_takes_the_lidar_asked_for_and_refuses_what_has_no_rings(tmp_path: Path) -> None:
+def test_helipr_takes_the_lidar_asked_for(tmp_path: Path) -> None:
     write.write_helipr(tmp_path)
     write.write_helipr(tmp_path, "Velodyne")
     assert "Ouster" in open_dataset(tmp_path).info().kind
     assert "Velodyne" in open_dataset(tmp_path, lidar="Velodyne").info().kind
-    with pytest.raises(DatasetError, match=r"expected Ouster or Velodyne, got 'Avia': it does not"):
-        open_dataset(tmp_path, lidar="Avia")
-    only_avia = tmp_path / "avia"
-    (only_avia / "LiDAR" / "Avia").mkdir(parents=True)
-    with pytest.raises(DatasetError, match=r"expected LiDAR/Ouster or LiDAR/Velodyne; Avia cannot"):
-        open_dataset(only_avia)
+    with pytest.raises(DatasetError, match=r"one of Ouster, Velodyne, Avia, Aeva; got 'Ariva'"):
+        open_dataset(tmp_path, lidar="Ariva")
+    with pytest.raises(DatasetError, match=r"no HeLiPR sequence: expected LiDAR/Aeva"):
+        open_dataset(tmp_path, lidar="Aeva")
+
+
+def test_points_of_an_aeva_have_no_intensity_before_some_day(tmp_path: Path) -> None:
+    root = write.write_helipr(tmp_path, "Aeva")
+    later, *_ = sorted((root / "LiDAR" / "Aeva").iterdir())
+    points = np.fromfile(later, np.uint8).reshape(-1, 29)
+    for file in (root / "LiDAR" / "Aeva").iterdir():
+        file.unlink()
+    points[:, :25].tofile(later.with_stem("1690000000000000000"))
+    (sweep,) = open_dataset(root)
+    assert len(sweep.points) == len(points)
+    assert sweep.times.max() > 0.09
 
 
 def test_helipr_says_what_is_broken(tmp_path: Path) -> None:

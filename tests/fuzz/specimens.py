@@ -277,7 +277,13 @@ def known() -> dict[str, Specimen]:
     velodyne = records(intensity=("<f4", 7.0), ring=("<u2", RINGS), time=("<f4", TIMES))
     ouster = records(intensity=("<f4", 7.0), t=("<u4", TIMES * 1e9), reflectivity=("<u2", 1),
                      ring=("<u2", RINGS), ambient=("<u2", 1))  # fmt: skip
-    for lidar, sweep in (("Ouster", ouster), ("Velodyne", velodyne)):
+    avia = records(intensity=("u1", 7), tag=("u1", 0), laser=("u1", 1),
+                   offset_time=("<u4", TIMES * 1e9))  # fmt: skip
+    aeva = records(reflectivity=("<f4", 7.0), velocity=("<f4", 1.0),
+                   offset_time=("<i4", TIMES * 1e9), laser=("u1", 1),
+                   intensity=("<f4", 7.0))  # fmt: skip
+    sorts = ("Ouster", ouster), ("Velodyne", velodyne), ("Avia", avia), ("Aeva", aeva)
+    for lidar, sweep in sorts:
         files = {f"LiDAR/{lidar}/{stamp}.bin": sweep.tobytes() for stamp in STAMPS}
         files[f"LiDAR_GT/{lidar}_gt.txt"] = rows(STAMPS, *ns)
         files["Inertial_data/xsens_imu.csv"] = xsens

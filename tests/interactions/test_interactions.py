@@ -68,6 +68,7 @@ MODES = {
     "own solver": ((), {"solver": Curious}),
     "a place that becomes small": (("map.small_below=5.24",), {}),
     "own odometry": ((PREDICTED,), {"odometry": Steady}),
+    "without rings": (("sensor.rings=none",), {}),
     "classical": (("solver.method=loam", "imu.prior=off"), {}),
 }
 

@@ -11,10 +11,20 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
+LIVOX = "livox_ros_driver2/msg/"
+_LIVOX = {
+    "CustomPoint": "uint32 offset_time\nfloat32 x\nfloat32 y\nfloat32 z\n"
+    "uint8 reflectivity\nuint8 tag\nuint8 line\n",
+    "CustomMsg": "std_msgs/Header header\nuint64 timebase\nuint32 point_num\nuint8 lidar_id\n"
+    "uint8[3] rsvd\nCustomPoint[] points\n",
+}
+for _store in (ROS1, ROS2):
+    for _name, _text in _LIVOX.items():
+        _store.register(get_types_from_msg(_text, LIVOX + _name))
 KINDS = ["ros1", "sqlite3", "mcap"]
 START = 1_700_000_000_000_000_000
 LATENCY = 30_000_000
@@ -47,6 +57,24 @@ def cloud(store: Any, stamp: int, points: np.ndarray, **columns: np.ndarray) -> 
     fields = [types["sensor_msgs/msg/PointField"](**vars(field)) for field in parts["fields"]]
     parts |= {"header": header(store, stamp), "fields": fields}
     return types["sensor_msgs/msg/PointCloud2"](**parts)
+
+
+def livox(store: Any, stamp: int, points: np.ndarray, seconds: np.ndarray) -> Any:
+    """Points of a Livox, by six lasers in turn."""
+    point = store.types[LIVOX + "CustomPoint"]
+    rows = zip(np.rint(seconds * 1e9).astype(int), points.astype(float), strict=True)
+    return store.types[LIVOX + "CustomMsg"](
+        header=header(store, stamp),
+        timebase=stamp,
+        point_num=len(points),
+        lidar_id=1,
+        rsvd=np.zeros(3, np.uint8),
+        points=[
+            point(offset_time=time, x=xyz[0], y=xyz[1], z=xyz[2],
+                  reflectivity=9, tag=16, line=number % 6)
+            for number, (time, xyz) in enumerate(rows)
+        ],
+    )  # fmt: skip
 
 
 def imu(

@@ -158,6 +158,15 @@ def write_pcd(path: Path, columns: dict[str, np.ndarray], data: str = "binary") 
     path.write_bytes("\n".join(header).encode() + b"\n" + body)
 
 
+HELIPR_SENSORS = {
+    "Ouster": ("os1-128", 512),
+    "Velodyne": ("vlp16", 512),
+    "Avia": ("avia", 6000),
+    "Aeva": ("avia", 6000),
+}
+"""Simulated sensors in place of those of the data set, and their columns."""
+
+
 def write_helipr(root: Path, lidar: str = "Ouster") -> Path:
     """As the record of the file player: no padding between the fields."""
     folder = root / "LiDAR" / lidar
@@ -168,18 +177,21 @@ def write_helipr(root: Path, lidar: str = "Ouster") -> Path:
             "x y z intensity t reflectivity ring ambient",
         ),
         "Velodyne": ("<f4 <f4 <f4 <f4 <u2 <f4", "x y z intensity ring time"),
+        "Avia": ("<f4 <f4 <f4 u1 u1 u1 <u4", "x y z intensity tag line t"),
+        "Aeva": ("<f4 <f4 <f4 <f4 <f4 <i4 u1 <f4", "x y z reflectivity velocity t line intensity"),
     }[lidar]
     record = np.dtype(list(zip(kinds[1].split(), kinds[0].split(), strict=True)))
-    assert record.itemsize == {"Ouster": 26, "Velodyne": 22}[lidar]
-    for sweep in sweeps("os1-128" if lidar == "Ouster" else "vlp16", 512):
+    assert record.itemsize == {"Ouster": 26, "Velodyne": 22, "Avia": 19, "Aeva": 29}[lidar]
+    for sweep in sweeps(*HELIPR_SENSORS[lidar]):
         points = np.zeros(len(sweep.points), record)
         for axis, name in enumerate("xyz"):
             points[name] = sweep.points[:, axis]
-        points["ring"] = sweep.rings
-        if lidar == "Ouster":
-            points["t"] = np.rint(sweep.times * 1e9)
-        else:
+        if sweep.rings is not None:
+            points["ring"] = sweep.rings
+        if lidar == "Velodyne":
             points["time"] = sweep.times
+        else:
+            points["t"] = np.rint(sweep.times * 1e9)
         points.tofile(folder / f"{sweep.stamp}.bin")
     truth = lidar_truth()
     write_rows(root / "LiDAR_GT" / f"{lidar}_gt.txt", truth.stamps, quaternion_rows(truth), " ")

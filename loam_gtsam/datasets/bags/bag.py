@@ -1,4 +1,7 @@
-"""ROS 1, ROS 2 and MCAP bags with ``PointCloud2`` sweeps, without ROS; those of known rigs."""
+"""ROS 1, ROS 2 and MCAP bags with sweeps, without ROS; those of known rigs.
+
+Sweeps are ``PointCloud2``, or the ``CustomMsg`` of Livox.
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ import numpy as np
 
 from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo, Loader
-from loam_gtsam.datasets.decode import aiding, extrinsics, pointcloud2, tables
+from loam_gtsam.datasets.decode import aiding, extrinsics, livox, pointcloud2, tables
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
@@ -59,7 +62,9 @@ class BagDataset(Loader):
         with closing(bag_reader.open_bag(self._path, self._parts)) as reader:
             topics = bag_reader.topic_types(reader)
         choose = partial(bag_reader.choose_topic, self._path, topics, problems=self._problems)
-        self.topic = choose(POINT_CLOUD, topic)
+        clouds = POINT_CLOUD, *livox.KINDS
+        found = bag_reader.find_topic(choose, topics, clouds, topic)
+        self.topic = found or choose(POINT_CLOUD, topic)
         self.imu_topic = None
         if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
             self.imu_topic = choose(IMU, imu_topic)

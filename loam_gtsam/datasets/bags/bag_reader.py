@@ -12,7 +12,7 @@ import numpy as np
 from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.typesys import Stores, get_typestore
 
-from loam_gtsam.datasets.decode import aiding
+from loam_gtsam.datasets.decode import aiding, livox
 from loam_gtsam.datasets.decode.pointcloud2 import decode_imu
 from loam_gtsam.datasets.decode.tables import DEFAULT_PERIOD_NS, clean_imu
 from loam_gtsam.errors import nearest
@@ -107,8 +107,6 @@ def choose_topic(
         kinds = [what.lower() for what, _ in topics.values()]
         packets = any("packet" in k or (k.endswith("scan") and "laser" not in k) for k in kinds)
         hint = "; raw packets become PointCloud2 with the driver of the sensor" if packets else ""
-        if any("livox" in k for k in kinds):
-            hint += "; a Livox does not sweep rings, and cannot be used"
         there = f"the bag has: {listing or 'no messages'}{hint}"
         raise DatasetError(f"{path}: no topic of type {kind}; {there}")
     option = _OPTIONS.get(kind, "--topic")
@@ -168,7 +166,10 @@ def read_messages(
             interval = received - last if received > last else interval
             last = received
             try:
-                content = reader.deserialize(raw, connection.msgtype)
+                if connection.msgtype in livox.KINDS:
+                    content: Any = livox.read_custom(raw, cdr=reader.is2)
+                else:
+                    content = reader.deserialize(raw, connection.msgtype)
             except Exception as error:
                 text = f"{path}, topic {connection.topic}: cannot deserialise: {_reason(error)}"
                 yield BadSweep(received, text)

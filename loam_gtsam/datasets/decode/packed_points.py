@@ -55,7 +55,7 @@ def read_records(path: Path, stamp: int, record: np.dtype[Any]) -> PackedCloud:
             f"{path}: {len(data)} bytes is not a multiple of {step} "
             f"({', '.join(record.names or ())}); the file is truncated or in another format"
         )
-    return _packed(stamp, record, 1, len(data) // step, data)
+    return packed(stamp, record, 1, len(data) // step, data)
 
 
 def read_pcd(path: Path, stamp: int) -> PackedCloud:
@@ -86,7 +86,7 @@ def read_pcd(path: Path, stamp: int) -> PackedCloud:
             f"{path}: {width} x {height} points of {record.itemsize} bytes need {needed} bytes, "
             f"got {len(body)}; the file is cut off"
         )
-    return _packed(stamp, record, height, width, body[:needed])
+    return packed(stamp, record, height, width, body[:needed])
 
 
 def read_ply(path: Path, stamp: int) -> PackedCloud:
@@ -133,7 +133,7 @@ def _of_structure(path: Path, stamp: int, points: NDArray[Any]) -> PackedCloud:
     if not {"x", "y", "z"} <= set(names):
         raise DatasetError(f"{path}: expected fields x, y, z; got {', '.join(names)}")
     data = np.ascontiguousarray(little).view(np.uint8).reshape(-1)
-    return _packed(stamp, little.dtype, 1, len(little), data)
+    return packed(stamp, little.dtype, 1, len(little), data)
 
 
 def firing_by_firing(cloud: PackedCloud, beams: int, columns: int, source: str) -> PackedCloud:
@@ -154,9 +154,10 @@ def _read_bytes(path: Path) -> NDArray[np.uint8]:
         raise DatasetError(f"{path}: cannot read the sweep: {error}") from error
 
 
-def _packed(
+def packed(
     stamp: int, record: np.dtype[Any], height: int, width: int, data: NDArray[np.uint8]
 ) -> PackedCloud:
+    """Cloud of ``height`` x ``width`` records of little-endian fields; ``stamp`` in nanoseconds."""
     assert record.fields is not None
     header = SimpleNamespace(stamp=SimpleNamespace(sec=stamp // 10**9, nanosec=stamp % 10**9))
     fields = tuple(

@@ -9,8 +9,7 @@ from pathlib import Path
 from loam_gtsam.types import DatasetError
 
 MULRAN_FOLDERS = ("Ouster", "sensor_data/Ouster")
-HELIPR_LIDARS = ("Ouster", "Velodyne")  # those that sweep rings
-HELIPR_OTHERS = ("Avia", "Aeva")
+HELIPR_LIDARS = ("Ouster", "Velodyne", "Avia", "Aeva")
 NEWER_COLLEGE_SCANS = "raw_format/ouster_scan"
 SPIRES_CLOUDS = "raw/lidar-clouds"
 
@@ -35,8 +34,7 @@ def known_loader(path: Path) -> str | None:
         return "OxfordSpiresBags"
     if (path / "lidar").is_dir() and (path / "applanix").is_dir():
         return "BoreasDataset"
-    lidars = (*HELIPR_LIDARS, *HELIPR_OTHERS)
-    if any((path / "LiDAR" / lidar).is_dir() or helipr_truth(path, lidar) for lidar in lidars):
+    if any((path / "LiDAR" / name).is_dir() or helipr_truth(path, name) for name in HELIPR_LIDARS):
         return "HeLiPRDataset"
     return "MulRanDataset" if first_existing(path, MULRAN_FOLDERS) is not None else None
 

@@ -5,7 +5,7 @@ Downloads nothing. The folder it writes is described in docs/outputs.md.
 
 from loam_gtsam import SimulatedWorld, absolute_error, run, write_run
 
-world = SimulatedWorld("street_loop", frames=40)  # 709 go once round the block
+world = SimulatedWorld("street_loop", frames=25)  # 709 go once round the block
 result = run(world)
 
 error = absolute_error(result.trajectory, world.truth)

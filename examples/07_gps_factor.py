@@ -15,7 +15,7 @@ SIGMA = 0.02  # metres: a receiver with corrections
 LONGEST = 400_000_000  # nanoseconds between two fixes that are still interpolated
 
 # A short-sighted lidar: no sweep says how far one went.
-world = SimulatedWorld("corridor_bare", frames=60, columns=900, max_range=6.0)
+world = SimulatedWorld("corridor_bare", frames=60, columns=450, max_range=6.0)
 
 # The receiver: a fix in 0.3 s, and none from 2.7 to 3.3 s. Its antenna is at the lidar, and its
 # positions are in the frame of the first pose: so is the map, if it is not levelled.

@@ -16,7 +16,7 @@ FLOOR_SIGMAS = (0.005, 0.002, 0.002)  # height in m, tilt in rad: how flat the f
 WHEELS = (10.0, 10.0, 0.01, 0.003, 0.003, 10.0)
 
 # A short-sighted lidar between bare walls: no sweep says how far one went.
-world = SimulatedWorld("corridor_bare", frames=60, columns=900, max_range=6.0)
+world = SimulatedWorld("corridor_bare", frames=45, columns=450, max_range=6.0)
 floor_up = world.world_T_start[2, :3]  # z of the world in the map, which is the first pose's frame
 off = Config().changed("imu.coupling=off")  # the factors have to do it
 

@@ -10,7 +10,7 @@ import numpy as np
 from loam_gtsam import Config, RunResult, SimulatedWorld, run
 
 # The lidar sees the wall behind it for the first 20 m, then nothing along the corridor.
-world = SimulatedWorld("corridor_bare", frames=110, columns=900, max_range=20.0)
+world = SimulatedWorld("corridor_bare", frames=80, columns=360, max_range=20.0)
 
 
 def off_along(result: RunResult) -> float:

@@ -47,7 +47,7 @@ class NearestKeyframe:
         return found if isinstance(found, LoopClosure) else None
 
 
-world = SimulatedWorld("room", frames=100, columns=400, speed=2.0)
+world = SimulatedWorld("room", frames=80, columns=300, speed=2.0)
 drift = gtsam.Pose3(gtsam.Rot3.Yaw(0.002), np.array([0.003, 0.002, 0.0]))  # a frame
 mapper, graph, closer = Mapper(config), PoseGraph(config), NearestKeyframe()
 odometry, last = gtsam.Pose3(), gtsam.Pose3()

@@ -13,8 +13,8 @@ from loam_gtsam.maps import SavedMap, merge_maps, save_map
 from loam_gtsam.studies.evaluation import absolute_error
 
 config = Config().changed("pose_graph.keyframe_distance=0.5")  # small steps for a small room
-world = SimulatedWorld("room", frames=60, columns=300, speed=3.0)
-parts = {"first": (0, 35), "second": (25, 60)}
+world = SimulatedWorld("room", frames=50, columns=300, speed=3.0)
+parts = {"first": (0, 28), "second": (20, 50)}
 
 runs = []
 for name, (start, end) in parts.items():  # a job for each, with as many cores as there are

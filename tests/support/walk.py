@@ -65,7 +65,7 @@ def recorded(world: SimulatedWorld, kind: str) -> Recording:
 
 def write_drive(folder: Path) -> None:
     """drive.bag, PATH, MONDAY, TUESDAY, MAP, poses.tum and spec.yaml, of which the pages speak."""
-    world = SimulatedWorld("rooms", frames=4, columns=300, speed=2.0)
+    world = SimulatedWorld("rooms", frames=4, columns=240, speed=2.0)
     write_bag(folder / "drive", "ros1", recorded(world, "ros1"))
     for name in ("PATH", "MONDAY", "TUESDAY"):
         write_bag(folder / name, "sqlite3", recorded(world, "sqlite3"))

@@ -106,7 +106,7 @@ def test_run_opens_built_in_worlds_and_uses_every_option():
     Path("mine.yaml").write_text("solver: {iterations: 3, min_matches: 20}\n")
     said(
         "run", "sim:room?frames=9&columns=450", "--frames", 3, "--output", "out", "--no-plot",
-        "--config", "mine.yaml", "--sensor", "vlp16", "--set", "solver.iterations=7",
+        "--config", "mine.yaml", "--sensor", "vlp16", "--set", "solver.iterations=7", *QUICK_START,
         "--set", "map.window=[11, 11, 5]", "--set", "deskew.enabled=false", "--option", "seed=3",
     )  # fmt: skip
     assert files_in("out") == {*BASE_FILES, "truth.tum", "truth_matched.tum"}
@@ -161,10 +161,14 @@ def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
 
 
 def test_poses_that_no_scan_fixes_are_told_in_one_line():
-    text = said("run", "sim:room?frames=3&columns=300", "--output", "room")
+    text = said(
+        "run", "sim:room?frames=3&columns=300", "--output", "room", "--no-plot", *QUICK_START
+    )
     assert "not fixed" not in text
     assert "weakly constrained" not in text
-    text = said("run", "sim:open_field?frames=4&columns=300", "--output", "field")
+    text = said(
+        "run", "sim:open_field?frames=4&columns=300", "--output", "field", "--no-plot", *QUICK_START
+    )
     told = "DO NOT TRUST THIS RUN: 3 of 4 poses (75 %) are not fixed by their scans (3 degenerate)"
     assert f"{told}, first that of frame 1; another sensor" in text
     assert "weakly constrained: x, y, rz (3 directions)" in text
@@ -334,7 +338,8 @@ main()
 
 def start_endless_run(pause: float, workers: int = 0) -> subprocess.Popen[str]:
     """A run that goes on for ever; returns when it reads its fourth sweep, ``pause`` s long."""
-    command = ["run", "x", "--output", "out", "--no-plot", "--workers", str(workers), str(pause)]
+    command = ["run", "x", "--output", "out", "--no-plot", *QUICK_START]
+    command += ["--workers", str(workers), str(pause)]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     start = [sys.executable, "-c", _ENDLESS, *command]
     process = subprocess.Popen(start, env=os.environ | {"COLUMNS": "300"}, **pipes)
@@ -395,27 +400,29 @@ def test_run_says_what_was_made_of_the_imu():
         assert part in text
     assert "given up" not in text
     off = ["--set", "imu.coupling=off", "--output", "off"]
-    assert "IMU" not in said("run", "sim:room?columns=450", "--frames", 2, "--no-plot", *off)
+    assert "IMU" not in said(
+        "run", "sim:room?columns=450", "--frames", 2, "--no-plot", *off, *QUICK_START
+    )
     assert summary_in("off")["imu"] is None
 
 
 def test_run_says_that_the_imu_is_mounted_otherwise():
     turned = ["--set", "imu.lidar_R_imu_deg=[180.0, 0.0, 0.0]"]
-    text = said("run", "sim:shaken?columns=450", "--frames", 40, "--no-plot", *turned)
+    text = said("run", "sim:shaken?columns=300", "--frames", 40, "--no-plot", *QUICK_START, *turned)
     assert "its gyro turned unlike the scans and was given up" in text
     assert re.search(r"fit those of the scans better by (179|180) degrees", text)
 
 
 def test_inspect_names_an_imu_that_is_late(monkeypatch):
     """With the offset that is named there is nothing to say."""
-    imu = SimulatedWorld("shaken", frames=60, columns=450).imu
+    imu = SimulatedWorld("shaken", frames=60).imu
     late = replace(imu, stamps=imu.stamps + 100_000_000)
     monkeypatch.setattr(SimulatedWorld, "imu", late)
-    text = said("inspect", "sim:shaken?columns=450&frames=30")
+    text = said("inspect", "sim:shaken?columns=300&frames=30")
     assert re.search(r"its clock is (9[5-9]|10[0-5]) ms late", text)
     assert "30 sweeps mapped, from 0 s on" in text
     offset = ["--set", "imu.time_offset=-0.1"]
-    assert "problem" not in said("inspect", "sim:shaken?columns=450&frames=30", *offset)
+    assert "problem" not in said("inspect", "sim:shaken?columns=300&frames=30", *offset)
 
 
 def test_inspect_maps_where_the_lidar_turns():
@@ -468,8 +475,9 @@ def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
 
 
 def test_run_closes_loops_and_writes_the_graph():
-    small = ["--set", "pose_graph.keyframe_distance=1", "--set", "loops.min_way=6"]
-    text = said("run", "sim:room?frames=60&columns=300&speed=3", "--loops", *small)
+    small = ["--set", "pose_graph.keyframe_distance=0.7", "--set", "loops.min_way=3"]
+    drive = "sim:room?frames=30&columns=240&speed=4&start=moving"
+    text = said("run", drive, "--loops", "--no-plot", *small, *QUICK_START)
     found = int(re.search(r"(\d+) of (\d+) found are used", text)[1])
     assert found >= 1
     folder = Path("loam_gtsam_output/room_vlp16")
@@ -564,7 +572,8 @@ def test_sweep_is_the_old_name_of_study_and_says_so_and_no_help_is_cut_off(monke
 
 def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
     spec = "sim:room?frames=12&columns=450"
-    assert loam("run", spec, "--output", "out", "--refine", "--no-plot", "--quiet").exit_code == 0
+    done = loam("run", spec, "--output", "out", "--refine", "--no-plot", "--quiet", *QUICK_START)
+    assert done.exit_code == 0
     report = json.loads(Path("out/refined/report.json").read_text())
     assert report["frames"] == 12
     assert report["after"]["ate_rmse_m"] < 0.01

@@ -13,6 +13,7 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam import Checkpoint, Features, FeatureSweep, Mapper, MapUpdate
 from loam_gtsam.cli.report import summary
+from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.stamp_check import IN_A_ROW, StampCheck
 from loam_gtsam.pipeline import Pipeline, run
@@ -113,6 +114,10 @@ def test_a_clock_set_back_is_said_and_not_followed():
     faults = judged([*steps(START, 5), *steps(START - DAY, 20), START + 5 * TENTH])
     back = 20 - IN_A_ROW + 1
     assert faults[4:] == ["stamp_back"] * (IN_A_ROW - 1) + ["clock_set_back"] * back + [""]
+
+
+QUICK = Config().changed("deskew.model=predicted")
+"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.fixture(scope="module")
@@ -222,9 +227,9 @@ def test_a_run_that_was_stopped_between_doubted_sweeps_goes_on_as_it_was(drive, 
         if number == 8:
             raise KeyboardInterrupt
 
-    whole = run(dataset)
-    run(dataset, on_frame=stop, checkpoint=Checkpoint(tmp_path / "here"))
-    on = run(dataset, checkpoint=Checkpoint(tmp_path / "here", resume=True))
+    whole = run(dataset, QUICK)
+    run(dataset, QUICK, on_frame=stop, checkpoint=Checkpoint(tmp_path / "here"))
+    on = run(dataset, QUICK, checkpoint=Checkpoint(tmp_path / "here", resume=True))
     assert [u.fault for u in on.updates] == [u.fault for u in whole.updates]
     assert on.faults == {"stamp_ahead": IN_A_ROW - 1, "clock_set_ahead": 1}
     np.testing.assert_array_equal(on.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
@@ -235,7 +240,7 @@ def test_the_summary_on_the_screen_names_what_was_not_used():
     nothing = replace(scans[1], points=np.full_like(scans[1].points, np.nan))
     console = Console(file=StringIO(), width=100)
     for sweeps in ([scans[0], nothing, scans[2], scans[2]], scans):
-        console.print(summary(run(ListDataset(sweeps)), "x", 1.0, {}))
+        console.print(summary(run(ListDataset(sweeps), QUICK), "x", 1.0, {}))
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "1 not_finite, 1 duplicate_stamp" in text
     assert text.count("not used") == 1

@@ -18,10 +18,20 @@ from loam_gtsam.types import BadSweep, DatasetError, Features, FrameStatus, Scan
 pytestmark = pytest.mark.filterwarnings("error")
 
 
+QUICK = Config().changed("deskew.model=predicted")
+"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
+
+
 @pytest.fixture(scope="module")
 def sweeps():
     world = SimulatedWorld("room", frames=6, columns=450)
     return list(world)
+
+
+@pytest.fixture(scope="module")
+def whole(sweeps):
+    """The run of all sweeps, without processes."""
+    return run(ListDataset(sweeps), QUICK)
 
 
 def kill_all():
@@ -37,7 +47,7 @@ def numbered(sweeps):
 def test_a_run_is_the_same_at_any_number_of_processes(sweeps):
     broken = Scan(sweeps[2].points[:3], sweeps[2].stamp)
     mixed = [*sweeps[:2], broken, BadSweep(sweeps[3].stamp, "unreadable"), *sweeps[4:]]
-    results = [run(ListDataset(mixed), workers=workers) for workers in (0, 1, 2)]
+    results = [run(ListDataset(mixed), QUICK, workers=workers) for workers in (0, 1, 2)]
     messages = [[update.message for update in result.updates] for result in results]
     assert messages[0] == messages[1] == messages[2]
     assert "unreadable" in messages[0][3]
@@ -73,29 +83,27 @@ def test_an_error_of_the_data_comes_after_the_sweeps_before_it(sweeps):
         next(found)
 
 
-def test_a_process_that_dies_costs_nothing_but_time(sweeps, caplog):
+def test_a_process_that_dies_costs_nothing_but_time(sweeps, whole, caplog):
     def kill(number, update):
         if number == 1:
             kill_all()
 
     with caplog.at_level(logging.WARNING, "loam_gtsam.frontend.workers"):
-        killed = run(ListDataset(sweeps), workers=1, on_frame=kill)
+        killed = run(ListDataset(sweeps), QUICK, workers=1, on_frame=kill)
     assert caplog.text.count("died") == 1
-    whole = run(ListDataset(sweeps))
     assert np.array_equal(killed.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
 
 
-def test_a_process_that_is_stopped_costs_nothing_but_time(sweeps, caplog, monkeypatch):
+def test_a_process_that_is_stopped_costs_nothing_but_time(sweeps, whole, caplog, monkeypatch):
     def stop(number, update):
         if number == 0:  # the process has answered once, and is quick from now on
             monkeypatch.setattr("loam_gtsam.frontend.workers._SILENCE", 0.5)
             (child,) = multiprocessing.active_children()
             os.kill(child.pid, signal.SIGSTOP)
 
-    stopped = run(ListDataset(sweeps), workers=1, on_frame=stop)
+    stopped = run(ListDataset(sweeps), QUICK, workers=1, on_frame=stop)
     assert caplog.text.count("did not answer for 0.5 s") == 1
     assert multiprocessing.active_children() == []
-    whole = run(ListDataset(sweeps))
     assert np.array_equal(stopped.trajectory.map_T_lidar, whole.trajectory.map_T_lidar)
 
 

@@ -9,7 +9,9 @@ import threading
 import time
 from array import array
 from collections import deque
+from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import count
 from pathlib import Path
 from types import ModuleType
@@ -53,19 +55,22 @@ from loam_gtsam.ros.live_inputs import LiveImu
 from loam_gtsam.ros.live_report import OTHER_REASONS, LiveLog
 from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, SweepFault
 
-FRAMES = 12
+FRAMES = 11
 SHORT = 6
+DESKEW = DeskewConfig(model="predicted")
+QUICK = Config(deskew=DESKEW)
+"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.fixture(scope="module")
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    world = SimulatedWorld("shaken", frames=FRAMES, columns=360)
+    world = SimulatedWorld("shaken", frames=FRAMES, columns=240)
     return bag_of(tmp_path_factory.mktemp("live") / "shaken", recorded(world))
 
 
 @pytest.fixture(scope="module")
 def offline(bag: Path) -> RunResult:
-    return run(open_dataset(bag))
+    return run(open_dataset(bag), QUICK)
 
 
 def poses(updates: Any) -> np.ndarray:
@@ -138,7 +143,7 @@ def shaken_up(messages: list[Message]) -> list[Message]:
 def test_a_live_run_is_that_of_the_bag_however_the_messages_come(
     bag: Path, offline: RunResult, interleaved: Any
 ) -> None:
-    live, results = lived(interleaved(messages_of(bag)))
+    live, results = lived(interleaved(messages_of(bag)), config=QUICK)
     assert_the_same(live, results, offline)
     report = live.report()
     assert report.statuses == {"first": 1, "ok": FRAMES - 1}
@@ -148,7 +153,7 @@ def test_a_live_run_is_that_of_the_bag_however_the_messages_come(
 
 
 def test_it_is_the_same_from_several_threads(bag: Path, offline: RunResult) -> None:
-    config = Config(live=LiveConfig(when_full="never", imu_wait=60.0))
+    config = Config(live=LiveConfig(when_full="never", imu_wait=60.0), deskew=DESKEW)
     updates: list[MapUpdate] = []
     live = LiveMapper(config, imu=True, observe=lambda sweep, update, _: updates.append(update))
     stop = threading.Event()
@@ -206,8 +211,8 @@ def test_units_of_g_and_missing_orientations_are_read_as_those_of_a_bag(tmp_path
             a.x, a.y, a.z = a.x / 9.80665, a.y / 9.80665, a.z / 9.80665
             q.x = q.y = q.z = q.w = 0.1  # with a covariance that does not say so
     path = bag_of(tmp_path / "bag", messages)
-    live, results = lived(messages_of(path))
-    assert_the_same(live, results, run(open_dataset(path)))
+    live, results = lived(messages_of(path), config=QUICK)
+    assert_the_same(live, results, run(open_dataset(path), QUICK))
     aid = live.pipeline.mapper.imu
     assert aid is not None
     assert aid.level is not None
@@ -220,7 +225,7 @@ def test_messages_of_rclpy_are_read_as_those_of_rosbags(bag: Path, offline: RunR
         if message.topic == POINTS:  # rclpy hands bytes out as array.array
             content = replace(message.content, data=array("B", message.content.data.tobytes()))
             messages[number] = replace(message, content=content)
-    assert_the_same(*lived(messages), offline)
+    assert_the_same(*lived(messages, config=QUICK), offline)
 
 
 class OneLoop:
@@ -249,7 +254,7 @@ def near_the_start(_: Any) -> list[gtsam.NonlinearFactor]:
 AT_THE_END = DeskewConfig(rotation="orientation", reference="end")
 PARTS: dict[str, tuple[Config, Any]] = {
     "loops": (
-        Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9)),
+        Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9), deskew=DESKEW),
         lambda: {"loop_closer": OneLoop()},
     ),
     "tight": (
@@ -260,42 +265,52 @@ PARTS: dict[str, tuple[Config, Any]] = {
         Config(deskew=AT_THE_END, imu=ImuConfig(average_seconds=0.0)),
         dict,
     ),
-    "longer averages": (Config(imu=ImuConfig(average_seconds=0.2, still_seconds=0.3)), dict),
-    "own factors": (Config(), lambda: {"extra_factors": near_the_start}),
-    "own solver": (Config(), lambda: {"solver": make_solver(preset("aloam").solver)}),
+    "longer averages": (
+        Config(imu=ImuConfig(average_seconds=0.2, still_seconds=0.3), deskew=DESKEW),
+        dict,
+    ),
+    "own factors": (QUICK, lambda: {"extra_factors": near_the_start}),
+    "own solver": (QUICK, lambda: {"solver": make_solver(preset("aloam").solver)}),
     "own odometry": (
-        Config(),
+        QUICK,
         lambda: {"odometry": make_odometry(OdometryConfig(method="scan_to_scan"))},
     ),
 }
 
 
 @pytest.fixture(scope="module")
-def short_bag(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def short_bags(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Of an IMU that tells its orientation, and of one that does not."""
     world = SimulatedWorld("shaken", frames=SHORT, columns=240)
-    messages = recorded(world, "mcap", unknown=request.param)
-    return bag_of(tmp_path_factory.mktemp("short") / "bag", messages, "mcap")
+    recordings = [recorded(world, "mcap", unknown=unknown) for unknown in (False, True)]
+    folder = tmp_path_factory.mktemp
+    return [bag_of(folder("short") / "bag", messages, "mcap") for messages in recordings]
 
 
 @pytest.fixture(scope="module")
-def plain(short_bag: Path) -> RunResult:
-    return run(open_dataset(short_bag))
+def plain(short_bags: list[Path]) -> Callable[[bool, Any], RunResult]:
+    """Runs of these bags without any part, by the model of the de-skew."""
+
+    @cache
+    def run_of(unknown: bool, model: Any) -> RunResult:
+        return run(open_dataset(short_bags[unknown]), Config(deskew=DeskewConfig(model=model)))
+
+    return run_of
 
 
 # One half of the parts with an IMU that tells its orientation, the other half with one without.
 @pytest.mark.parametrize(
-    ("short_bag", "name"),
-    sorted((number % 2 == 1, name) for number, name in enumerate(PARTS)),
-    indirect=["short_bag"],
+    ("unknown", "name"), [(number % 2 == 1, name) for number, name in enumerate(PARTS)]
 )
 def test_with_every_part_a_live_run_is_that_of_the_bag_and_again_after_a_reset(
-    short_bag: Path, plain: RunResult, name: str
+    short_bags: list[Path], plain: Callable[[bool, Any], RunResult], unknown: bool, name: str
 ) -> None:
     config, parts = PARTS[name]
+    short_bag, without = short_bags[unknown], plain(unknown, config.deskew.model)
     dataset = open_dataset(short_bag)
     pipeline = Pipeline(config, imu=imu_buffer(dataset, config), **parts())
     expected = pipeline.result([pipeline.process(sweep) for sweep in dataset])
-    assert expected.loops or (poses(expected.updates) != poses(plain.updates)).any()
+    assert expected.loops or (poses(expected.updates) != poses(without.updates)).any()
     clock = Clock()
     live = LiveMapper(config, imu=True, clock=clock, **parts())
     assert_the_same(live, replay(live, clock, messages_of(short_bag)), expected)
@@ -313,7 +328,7 @@ def test_a_run_goes_on_after_the_clock_was_set_back_if_it_is_reset(bag: Path) ->
             live.reset()
 
     clock = Clock()
-    live = LiveMapper(imu=True, clock=clock, observe=observe)
+    live = LiveMapper(QUICK, imu=True, clock=clock, observe=observe)
     messages = messages_of(bag)
     later = [replace(m, received=m.received + 3600 * 1000 * MS) for m in messages]
     results = replay(live, clock, [*map(ahead, messages), *later])
@@ -326,8 +341,8 @@ def test_sweeps_from_the_future_cost_the_next_ones_no_samples(tmp_path: Path) ->
     for number in [n for n, m in enumerate(messages) if m.topic == POINTS][22:25]:
         messages[number] = ahead(messages[number])
     path = bag_of(tmp_path / "bag", messages)
-    live, results = lived(messages_of(path))
-    assert_the_same(live, results, run(open_dataset(path)))
+    live, results = lived(messages_of(path), config=QUICK)
+    assert_the_same(live, results, run(open_dataset(path), QUICK))
     assert live.report().statuses["bad_stamp"] == 3
 
 
@@ -408,7 +423,7 @@ def test_sweeps_wait_for_samples_by_the_clock_that_is_put_right() -> None:
 
 
 def test_impatience_is_counted_and_changes_the_result(bag: Path, offline: RunResult) -> None:
-    hasty = Config(live=LiveConfig(imu_wait=0.0))
+    hasty = Config(live=LiveConfig(imu_wait=0.0), deskew=DESKEW)
     live, results = lived(late(messages_of(bag), IMU, 500 * MS), config=hasty)
     assert live.report().without_imu > FRAMES // 2
     assert live.report().late["imu"] > 0
@@ -551,8 +566,7 @@ def test_a_faulty_cloud_is_counted_with_its_reason_and_the_run_goes_on(
 ) -> None:
     sweeps = [m for m in messages_of(bag) if m.topic == POINTS][:3]
     spoilt = replace(sweeps[1], content=spoil(sweeps[1].content))
-    quick = Config().changed("deskew.model=predicted")
-    live, results = lived([sweeps[0], spoilt, sweeps[2]], imu=False, config=quick)
+    live, results = lived([sweeps[0], spoilt, sweeps[2]], imu=False, config=QUICK)
     statuses = [result.update.status for result in results]
     assert statuses[0] is FrameStatus.FIRST
     assert statuses[1] is FrameStatus.UNUSABLE_SCAN

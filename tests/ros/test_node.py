@@ -213,7 +213,7 @@ def test_frames_by_rep_105(bag: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     moved = gtsam.Pose3(gtsam.Rot3.Yaw(0.3), np.array([1.0, 2.0, 0.5]))
     monkeypatch.setattr(LoopMapping, "map_T_odom", moved)
     settings = bag.parent / "loops.yaml"
-    settings.write_text("loops: {enabled: true}\n")
+    settings.write_text("loops: {enabled: true}\ndeskew: {model: predicted}\n")
     node = FakeNode(odom_frame="odom", map_frame="map", lidar_frame="lidar", config=str(settings))
     play(node, LiveNode(node), raw_messages(bag), FRAMES)
     read = [(topic, ROS2.deserialize_cdr(raw, TYPES[topic])) for topic, raw in node.published]

@@ -76,7 +76,7 @@ def test_with_an_imu_too_each_gives_what_run_gives(sweeps, world, group):
     dataset = Sweeps(sweeps, world.truth)
     dataset.imu = world.imu
     names = ("loam", "aloam") if group is Group.PRESET else ("gtsam", "loam", "aloam")
-    result = compare_solvers(dataset, [make_contender(group, name, Config()) for name in names])
+    result = compare_solvers(dataset, [make_contender(group, name, QUICK) for name in names])
     for name, entry in zip(names, result.runs, strict=True):
         np.testing.assert_array_equal(poses(entry), poses(run(dataset, entry.config)))
         tilts = {str(update.tilt_prior) for update in entry.updates[1:]}

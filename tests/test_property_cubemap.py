@@ -45,8 +45,8 @@ class Reference:
             self.low[axis] = max(self.low[axis], c - (n - 1 - margin))
 
     def inside(self, cube: Cell) -> bool:
-        spans = zip(cube, self.low, self.config.window, strict=True)
-        return all(low <= i < low + n for i, low, n in spans)
+        (i, j, k), (a, b, c), (u, v, w) = cube, self.low, self.config.window
+        return a <= i < a + u and b <= j < b + v and c <= k < c + w
 
     def insert(self, points: Any, owner: int) -> None:
         new: dict[tuple[Cell, Cell], list[Any]] = {}

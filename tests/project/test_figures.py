@@ -24,7 +24,7 @@ def figures() -> ModuleType:
 
 
 def test_one_command_makes_every_picture_of_the_readme(figures: ModuleType, tmp_path: Path) -> None:
-    assert figures.main(["--frames", "6", "--output", str(tmp_path)]) == 0
+    assert figures.main(["--frames", "4", "--output", str(tmp_path)]) == 0
     made = {path.name for path in tmp_path.iterdir()}
     assert all(image.imread(tmp_path / name).std() > 0.02 for name in made)
     pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]

@@ -61,7 +61,7 @@ def two(tmp_path_factory) -> Two:
     for number, (drive, (start, end)) in enumerate(zip(drives, CUTS, strict=True)):
         part = PartOf(drive, start, 1)
         runs.append(run(part, config, max_frames=end - start))
-        points.append(run_points(part, runs[-1].updates, runs[-1].config, most=1500))
+        points.append(run_points(part, runs[-1].updates, runs[-1].config, most=1000))
         save_map(folder / f"{number}.lgmap", runs[-1].pipeline)
         maps.append(SavedMap(folder / f"{number}.lgmap"))
     return Two(drives[0].truth, runs, merge_maps(maps, folder / "both.lgmap"), points)

@@ -60,7 +60,7 @@ OFF = with_search(enabled=False)
 @pytest.fixture(scope="module")
 def drive():
     """Some sweeps of the room, which it sees from end to end."""
-    return SimulatedWorld("room", frames=28, columns=600)
+    return SimulatedWorld("room", frames=28, columns=450)
 
 
 @pytest.fixture(scope="module")
@@ -592,7 +592,7 @@ def broken(samples, kind):
 @pytest.fixture(scope="module")
 def street():
     """A world that is driven through, and the sweeps."""
-    world = SimulatedWorld("street_loop", frames=24, columns=400, start="moving")
+    world = SimulatedWorld("street_loop", frames=16, columns=400, start="moving")
     return world, list(world)
 
 

@@ -135,7 +135,7 @@ class SimulatedWorld(Loader):
         _whole_at_least(1, frames=frames)
         _whole_at_least(8, columns=columns)
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
-        self._pattern = sensor if sensor in PATTERNS else None
+        self._lidar, self._rings = sensor, sensor in SENSORS
         elevations, default_columns = SENSORS.get(sensor) or (np.zeros(1), PATTERNS[sensor][1])
         self._columns = default_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
@@ -156,8 +156,7 @@ class SimulatedWorld(Loader):
         self._motion = Motion(self.scene, speed, start == "moving")
         self._frames = self._count(frames)
         self.name = f"{self.scene.name} {sensor}"
-        self._lidar = sensor
-        spins = {"rings": "none"} if self._pattern else _SPIN | {"model": sensor}
+        spins = _SPIN | {"model": sensor} if self._rings else {"rings": "none"}
         self.sensor: Mapping[str, Any] = spins | {"period": 1.0 / rate}
         if any(self._imu_errors.lever):
             self.sensor = self.sensor | {"imu.lidar_t_imu": self._imu_errors.lever}
@@ -181,8 +180,8 @@ class SimulatedWorld(Loader):
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
         stamp, beams, offsets = self._stamp(i), self._beams, self._times
         since = (stamp - _EPOCH) * 1e-9
-        if self._pattern:
-            beams, offsets = fired(self._pattern, self._columns, since, 1.0 / self._rate)
+        if not self._rings:
+            beams, offsets = fired(self._lidar, self._columns, since, 1.0 / self._rate)
         times = since + offsets
         world_T_lidar = self._motion.world_T_lidar(times)
         directions = np.einsum("cij,jcb->icb", world_T_lidar[:, :3, :3], beams)
@@ -196,7 +195,7 @@ class SimulatedWorld(Loader):
         column, ring = np.nonzero(seen)
         points = np.ascontiguousarray((beams[:, seen] * ranges[seen]).T, dtype=np.float32)
         times, rings, span = offsets[column], ring.astype(np.int32), (0.0, 1.0 / self._rate)
-        if self._pattern:
+        if not self._rings:
             order = np.argsort(times, kind="stable")
             return Scan(points[order], stamp, times=times[order], span=span)
         return Scan(points, stamp, times=times, rings=rings, span=span)
@@ -239,7 +238,7 @@ class SimulatedWorld(Loader):
     def info(self) -> DatasetInfo:
         """Scene, sensor, frames and length of the way; reads nothing."""
         fires = f"{self._beams.shape[2]} beams x {self._columns} columns, clockwise"
-        fires = f"{self._columns} points, no rings" if self._pattern else fires
+        fires = fires if self._rings else f"{self._columns} points, no rings"
         within = math.hypot(self._imu_errors.attitude_noise, self._imu_errors.attitude_drift)
         facts = {
             "scene": self.scene.name,

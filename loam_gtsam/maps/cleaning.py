@@ -97,8 +97,8 @@ def views(
             raise DatasetError(f"sweep {number}: {error}; give the data set of the run") from error
         if not found.rings.known:
             raise DatasetError(
-                f"sweep {number}: {found.rings.note}; expected rings, between which a beam is known "
-                "to have passed"
+                f"sweep {number}: {found.rings.note}; expected rings, between which beams are "
+                "known to have passed"
             )
         offset = (update.stamp - sweep.stamp) * 1e-9
         if not found.span[0] - 1e-3 <= offset <= found.span[1] + 1e-3:

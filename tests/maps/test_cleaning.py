@@ -13,7 +13,9 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.geometry import move_points, run_starts, transform, voxel_keys
 from loam_gtsam.maps import SavedMap
-from loam_gtsam.maps.cleaning import View, count_votes
+from loam_gtsam.maps.cleaning import View, count_votes, views
+from loam_gtsam.pipeline import run
+from loam_gtsam.types import DatasetError
 
 STEP = 100_000_000
 
@@ -55,6 +57,14 @@ def test_people_go_and_houses_stay(square):
     assert people.sum() > 1000
     assert votes.moved[people & near].mean() > 0.92  # of 32 sweeps; docs/localise.md has 250
     assert votes.moved[~people].mean() < 0.01
+
+
+def test_sweeps_without_rings_are_refused_with_the_reason():
+    world = SimulatedWorld("room", sensor="mid360", frames=3)
+    result = run(world, Config().changed("imu.coupling=off"))
+    poses = np.stack([update.map_T_lidar.matrix() for update in result.updates])
+    with pytest.raises(DatasetError, match=r"sweep 1: no rings .*; expected rings, between which"):
+        list(views(world, result.updates, poses, result.config))
 
 
 def test_one_sweep_or_one_ring_votes_for_nothing_that_it_saw(square):

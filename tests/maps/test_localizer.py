@@ -70,6 +70,14 @@ def test_a_drive_is_found_and_tracked_with_the_maps_error_in_its_covariance(
     assert (tmp_path / "same.lgmap").read_bytes() == mapped.path.read_bytes()
 
 
+def test_a_lidar_without_rings_is_found_in_the_map_of_one_with_rings(mapped, saved):
+    drive = SimulatedWorld("rooms", seed=1, frames=14, sensor="mid360")
+    found = localise(drive, saved)
+    assert found.fixes == 1
+    assert len(found.solved) > 3
+    assert max(np.linalg.norm(e[3:]) for e in errors(mapped, drive, found.solved)) < NEAR
+
+
 def test_nothing_is_found_in_the_map_of_another_place(saved):
     found = localise(world("park", seed=3, frames=7), saved)
     assert (found.fixes, found.solved) == (0, [])

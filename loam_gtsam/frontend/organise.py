@@ -201,8 +201,9 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
     """Find the beam of each point.
 
     ``sensor.rings`` selects the source; ``auto`` tries the ring field, the order of the points (in
-    a range image, or in a file written ring after ring), and the elevations. If none of them has
-    rings, there are none, unless a source or a model is set: then SweepError lists what was tried.
+    a range image, or in a file written ring after ring), and the elevations, and believes only
+    rings around which the elevation runs smoothly. If none of them has rings, there are none,
+    unless a source or a model is set: then SweepError lists what was tried.
     """
     if sensor.rings == "none":
         return without_rings(len(columns), "sensor.rings: none")
@@ -210,7 +211,7 @@ def assign_rings(columns: SweepColumns, sensor: SensorConfig) -> RingAssignment:
     for source, (found, reason) in _sources(columns, sensor):
         if found is None:
             tried.append(f"{source}: {reason}")
-        elif not are_rings(found, columns.xyz):
+        elif sensor.rings == "auto" and not are_rings(found, columns.xyz):
             tried.append(f"{found.method}: elevations do not run smoothly around a ring")
         else:
             return _checked(found, columns, sensor)

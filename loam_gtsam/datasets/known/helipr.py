@@ -25,18 +25,10 @@ RECORDS = {
     "Avia": np.dtype(
         [*_XYZ, ("intensity", "u1"), ("tag", "u1"), ("laser", "u1"), ("offset_time", "<u4")]
     ),
-    "Aeva": np.dtype(
-        [
-            *_XYZ,
-            ("reflectivity", "<f4"),
-            ("velocity", "<f4"),
-            ("offset_time", "<i4"),
-            ("laser", "u1"),
-        ]
-    ),
+    "Aeva": np.dtype([*_XYZ, *_AEVA]),
 }
 """Fields of a point, without padding (the data set's file player)."""
-_AEVA_INTENSITY = np.dtype([*RECORDS["Aeva"].descr, ("intensity", "<f4")])
+_AEVA_LATER = np.dtype([*_XYZ, *_AEVA, ("intensity", "<f4")])
 _AEVA_CHANGE = 1_691_936_557_946_849_179
 """Nanoseconds after which a point of the Aeva has an intensity, too (HeLiPR-Pointcloud-Toolbox)."""
 IMU_T_LIDAR = {
@@ -120,7 +112,7 @@ class HeLiPRDataset(StampedFiles):
 
 
 def _read_aeva(path: Path, stamp: int) -> PackedCloud:
-    record = _AEVA_INTENSITY if stamp > _AEVA_CHANGE else RECORDS["Aeva"]
+    record = _AEVA_LATER if stamp > _AEVA_CHANGE else RECORDS["Aeva"]
     return read_records(path, stamp, record)
 
 

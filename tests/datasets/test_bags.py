@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ from support.bags import (
 
 from loam_gtsam.datasets import BagDataset, Dataset, open_dataset
 from loam_gtsam.datasets.bags.bag import POINT_CLOUD
-from loam_gtsam.datasets.bags.bag_reader import choose_topic
+from loam_gtsam.datasets.bags.bag_reader import check_metadata, choose_topic
 from loam_gtsam.datasets.decode.livox import read_custom
 from loam_gtsam.types import BadSweep, DatasetError, LoamError, Scan
 
@@ -249,3 +250,10 @@ def test_truncated_ros2_never_escapes_loam_error(tmp_path: Path, kind: str) -> N
         else:
             assert isinstance(got[-1], BadSweep)
     assert refused >= 2
+
+
+@pytest.mark.parametrize(("topic", "kind", "says"), [(7, "a/msg/B", "name"), ("/a", 7, "type")])
+def test_metadata_that_are_no_text_are_refused(topic: object, kind: object, says: str) -> None:
+    connection = SimpleNamespace(topic=topic, msgtype=kind, msgcount=1)
+    with pytest.raises(ValueError, match=f"expected the {says} of a topic, its metadata have 7"):
+        check_metadata(SimpleNamespace(connections=[connection], start_time=0))  # type: ignore[arg-type]

@@ -150,6 +150,12 @@ def recording(kind: str, points: str = "/points", imu: str = "/imu", clock: str 
     return entries
 
 
+def livox(kind: str) -> Any:
+    """Three sweeps in Livox's own message."""
+    store = bags.store_of(kind)
+    return [("/livox", stamp, bags.livox(store, stamp, POINTS, TIMES)) for stamp in STAMPS]
+
+
 def bag(
     kind: str, entries: Any, name: str = "run", compression: Any = None
 ) -> Callable[[Path], object]:
@@ -326,6 +332,8 @@ def rigs() -> dict[str, Specimen]:
         "Hilti": Specimen(hilti, at("exp04.bag")),
         "NTU VIRAL": Specimen(made(bag("ros1", viral, "eee_01")), at("eee_01.bag")),
         "receiver and wheels": Specimen(made(bag("ros1", aided)), at("run.bag")),
+        "Livox ros1": Specimen(made(bag("ros1", livox("ros1"))), at("run.bag")),
+        "Livox mcap": Specimen(made(bag("mcap", livox("mcap"))), at("run")),
         "wheels' poses": Specimen(
             made(bag("ros1", aided)), at("run.bag", wheels_topic="/odom", gnss_topic="/fix")
         ),

@@ -52,7 +52,7 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
         reader = AnyReader(bags, default_typestore=get_typestore(store))
         reader.open()
         try:
-            _check_metadata(reader)
+            check_metadata(reader)
         except BaseException:
             reader.close()
             raise
@@ -65,12 +65,13 @@ def open_bag(path: Path, parts: Sequence[Path] = ()) -> AnyReader:
     return reader
 
 
-def _check_metadata(reader: AnyReader) -> None:
+def check_metadata(reader: AnyReader) -> None:
     """ValueError unless the names and numbers of messages that a bag states make sense."""
     for connection in reader.connections:
         name, count = connection.topic, connection.msgcount
-        if not isinstance(name, str):
-            raise ValueError(f"expected a topic's name, its metadata have {name!r}")
+        for what, text in (("name", name), ("type", connection.msgtype)):
+            if not isinstance(text, str):
+                raise ValueError(f"expected the {what} of a topic, its metadata have {text!r}")
         if not isinstance(count, int) or not 0 <= count < _MOST:
             raise ValueError(f"topic {name}: expected a number of messages, got {count!r}")
     if not isinstance(reader.start_time, int) or abs(reader.start_time) > _MOST:

@@ -9,6 +9,7 @@ from loam_gtsam.config import FeatureConfig
 from loam_gtsam.datasets import ArrayDataset
 from loam_gtsam.frontend.features import extract_features, thinned
 from loam_gtsam.frontend.unorganised import on_flat_patches, posts
+from loam_gtsam.geometry import transform
 from loam_gtsam.studies.evaluation import FIVE_SIGMA, squared_errors
 from loam_gtsam.types import Scan, SweepError, SweepFault, stack_poses
 
@@ -152,6 +153,26 @@ def test_points_in_any_order_and_without_times_are_mapped():
     off, _ = errors(result, world)
     assert result.status_counts == {"first": 1, "ok": 19}
     assert off.max() < 0.03
+
+
+def test_two_lidars_in_one_scan_are_better_than_one():
+    lidar = SimulatedWorld("corridor", frames=25, columns=450, seed=3)
+    lidar_T_second = gtsam.Pose3(gtsam.Rot3.Roll(1.2), np.array([0.3, -0.4, 0.2])).matrix()
+    second = lidar.seen_from(lidar_T_second)
+    scans = [
+        Scan(
+            np.concatenate([one.points, transform(lidar_T_second, other.points)]),
+            one.stamp,
+            times=np.concatenate([one.times, other.times]),
+        )
+        for one, other in zip(lidar, second, strict=True)
+    ]
+    config = Config().changed("imu.coupling=off")
+    alone, _ = errors(run(lidar, config), lidar)
+    both, wrong = errors(run(ArrayDataset(scans, name="both"), config), lidar)
+    assert wrong == 0
+    assert both.max() < 0.02
+    assert both.mean() < 0.8 * alone.mean()
 
 
 def test_scan_to_scan_needs_rings_and_leaves_the_prediction_without():

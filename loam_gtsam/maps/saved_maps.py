@@ -105,13 +105,11 @@ class SavedMaps(MapPair):
         map_T_middle: gtsam.Pose3,
         keyframe: int,
         matches: ScanMatches | None = None,
-        *,
-        on_trial: bool = False,
     ) -> None:
         """Add a sweep, if the map grows."""
         if self.grows:
             owner = self.owners[keyframe]
-            super().insert(posed, map_T_middle, owner, matches, on_trial=on_trial)
+            super().insert(posed, map_T_middle, owner, matches)
 
     def move(self, *_: object) -> int:
         """Nothing: the map stays where it is."""

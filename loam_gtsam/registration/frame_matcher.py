@@ -109,20 +109,30 @@ class MapPair:
         map_T_middle: gtsam.Pose3,
         keyframe: int,
         matches: ScanMatches | None = None,
-        *,
-        on_trial: bool = False,
     ) -> None:
-        """Add a sweep, by its last matches if there are any; its points belong to a keyframe.
-
-        If it is ``on_trial``, only to the maps in use, which are then no maps to keep.
-        """
+        """Add a sweep, by its last matches if there are any; its points belong to a keyframe."""
         edges, planes = (transform(map_T_middle.matrix(), points) for points in posed.points)
         faces = None if matches is None else matches.faces
         kept = (self._open, self._small)[: 1 + self.small]
-        for edge_map, plane_map in kept[-1:] if on_trial else kept:
+        for edge_map, plane_map in kept:
             edge_map.owner = plane_map.owner = keyframe
             edge_map.insert(edges)  # which has no side: a corner shows from both
             plane_map.insert(planes, map_T_middle.translation(), faces)
+        self._thinned = None
+
+    def insert_on_trial(self, sweeps: Sequence[tuple[PosedSweep, gtsam.Pose3]]) -> None:
+        """Add sweeps at their poses, as far as a solve reads them: the maps are none to keep.
+
+        All at once, which takes half the time of one after the other.
+        """
+        moved = [
+            [transform(pose.matrix(), points) for points in posed.points] for posed, pose in sweeps
+        ]
+        edges, planes = map(np.concatenate, zip(*moved, strict=True))
+        origins = np.array([pose.translation() for _, pose in sweeps])
+        edge_map, plane_map = self._small if self.small else self._open
+        edge_map.insert(edges)
+        plane_map.insert(planes, origins.repeat([len(points) for _, points in moved], axis=0))
         self._thinned = None
 
     def too_sparse(self, predicted: Prediction, config: Config) -> str:

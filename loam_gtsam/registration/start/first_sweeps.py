@@ -268,7 +268,12 @@ class Start:
         self, frame: Frame, sweeps: Sequence[EarlySweep], number: int, *, to_keep: bool = False
     ) -> FrameMatcher:
         """The matches of one of the sweeps with a map of all the others, which may be to keep."""
-        self._fill(frame, [*sweeps[:number], *sweeps[number + 1 :]], on_trial=not to_keep)
+        others = [*sweeps[:number], *sweeps[number + 1 :]]
+        if to_keep:
+            self._fill(frame, others)
+        else:
+            self._clear(frame)
+            frame.matcher.maps.insert_on_trial([(one.posed, one.map_T_middle) for one in others])
         old, posed = frame.matcher, sweeps[number].posed
         return FrameMatcher.of(posed, old.maps, old.config, old.last, old.clock, refine=False)
 
@@ -280,13 +285,15 @@ class Start:
         priors = frame.priors if one.posed.sweep is frame.sweep else ()
         return solver.solve(matcher, one.map_T_middle, priors, expected)
 
-    def _fill(self, frame: Frame, sweeps: Sequence[EarlySweep], *, on_trial: bool = False) -> None:
-        """Make the map of these sweeps; one on trial is made as far as a solve reads it."""
-        maps = frame.matcher.maps
-        maps.clear()
-        maps.recenter(self._map_T_first)
+    def _fill(self, frame: Frame, sweeps: Sequence[EarlySweep]) -> None:
+        """Make the map of these sweeps."""
+        self._clear(frame)
         for sweep in sweeps:
-            maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe, on_trial=on_trial)
+            frame.matcher.maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
+
+    def _clear(self, frame: Frame) -> None:
+        frame.matcher.maps.clear()
+        frame.matcher.maps.recenter(self._map_T_first)
 
 
 def _first_twist(first: EarlySweep, second: EarlySweep) -> FloatArray:

@@ -44,7 +44,7 @@ from loam_gtsam.registration.relocalization import (
 from loam_gtsam.registration.relocalization.evidence import Evidence, favour
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
-from loam_gtsam.types import FrameStatus, ImuSamples, Trajectory
+from loam_gtsam.types import FrameStatus, ImuSamples, TiltPrior, Trajectory
 
 AT = 22
 """The sweep before which the lidar is put somewhere else."""
@@ -603,6 +603,9 @@ def test_an_imu_that_breaks_is_left_out(street, kind, coupling):
     sweeps = ArrayDataset(scans, imu=broken(world.imu, kind), sensor=world.sensor)
     result = run(sweeps, Config().changed({"imu.coupling": coupling}))
     assert all(update.status.solved for update in result.updates[1:])
+    assert result.imu.gyro_trusted == (kind != "gyro")
+    last = result.updates[-1].tilt_prior
+    assert last is (TiltPrior.DROPPED if kind == "attitude" else TiltPrior.EQUIVALENT)
     truth = world.truth.map_T_lidar
     for update, pose in zip(result.updates, truth, strict=True):
         moved = result.updates[0].map_T_lidar.between(update.map_T_lidar)

@@ -171,7 +171,8 @@ SLOW = tuple(
 """Two sweeps a second: the lidar turns by up to 44 degrees from one to the next."""
 WITHOUT_RINGS = tuple(
     replace(w, name=f"{w.name}, {lidar}", options={**w.options, "sensor": lidar, "max_range": 70.0})
-    for w in BUILT_IN[:15]
+    for w in BUILT_IN
+    if "sensor" not in w.options
     for lidar in PATTERNS
 )
 

@@ -84,6 +84,8 @@ def test_the_message_of_a_livox_is_read_with_its_times_and_without_rings(
     recording[1:1] = sweeps(kind, 1)  # what is common comes first, and another may be asked for
     both = write_bag(tmp_path / "both", kind, recording)
     assert BagDataset(both).topic == "/points"
+    with pytest.raises(DatasetError, match=r"no topic '/x'; the bag has: .*/livox/lidar"):
+        BagDataset(both, topic="/x")
     assert len(BagDataset(both, topic="/livox/lidar")) == 3
 
 
@@ -115,6 +117,8 @@ def test_topics_are_chosen_and_named(tmp_path: Path) -> None:
     recording = [*sweeps("ros1", 2, "/a"), *sweeps("ros1", 3, "/b")]
     recording.append(("/imu", START, imu(ROS1, START)))
     path = write_bag(tmp_path / "run", "ros1", recording)
+    with pytest.raises(DatasetError, match=f"topic '/imu' is .*, expected {POINT_CLOUD}; the bag"):
+        BagDataset(path, topic="/imu")
     dataset = BagDataset(path)
     assert dataset.topic == "/b"
     assert len(dataset) == 3

@@ -154,7 +154,9 @@ def test_a_helipr_sequence_has_times_rings_and_truth(tmp_path: Path, lidar: str)
     assert (x > 0.0) == (lidar in ("Ouster", "Velodyne"))  # the others are in front of it
     assert np.sign(y) == {"Avia": 1.0, "Aeva": -1.0}.get(lidar, np.sign(y))
     facts = dataset.info().facts
-    assert facts["fields"].startswith("x float32, y float32, z float32, ")
+    own = {"Avia": "intensity uint8", "Aeva": "reflectivity float32"}
+    fourth = own.get(lidar, "intensity float32")
+    assert facts["fields"].startswith(f"x float32, y float32, z float32, {fourth}")
     assert "relative to the stamp" in facts["point times"]
     assert "HeLiPR-Pointcloud-Toolbox" not in facts  # no IMU, no extrinsics shown
     if lidar == "Ouster":

@@ -62,9 +62,8 @@ class BagDataset(Loader):
         with closing(bag_reader.open_bag(self._path, self._parts)) as reader:
             topics = bag_reader.topic_types(reader)
         choose = partial(bag_reader.choose_topic, self._path, topics, problems=self._problems)
-        clouds = POINT_CLOUD, *livox.KINDS
-        found = bag_reader.find_topic(choose, topics, clouds, topic)
-        self.topic = found or choose(POINT_CLOUD, topic)
+        kind = bag_reader.first_kind(topics, (POINT_CLOUD, *livox.KINDS), topic)
+        self.topic = choose(kind or POINT_CLOUD, topic)
         self.imu_topic = None
         if imu_topic is not None or any(kind == IMU for kind, _ in topics.values()):
             self.imu_topic = choose(IMU, imu_topic)

@@ -125,6 +125,14 @@ def choose_topic(
     return chosen
 
 
+def first_kind(
+    topics: Mapping[str, tuple[str, int]], kinds: Sequence[str], asked: str | None
+) -> str | None:
+    """The first of some types of which a bag has a topic, or the topic that is asked for is."""
+    there = {kind for name, (kind, _) in topics.items() if asked in (None, name)}
+    return next((kind for kind in kinds if kind in there), None)
+
+
 def find_topic(
     choose: Callable[[str, str | None], str],
     topics: Mapping[str, tuple[str, int]],
@@ -135,11 +143,8 @@ def find_topic(
 
     ``choose`` is :func:`choose_topic` of the bag; a topic that is ``asked`` for must be of one.
     """
-    there = {kind for name, (kind, _) in topics.items() if asked in (None, name)}
-    for kind in kinds:
-        if kind in there:
-            return choose(kind, asked)
-    return None if asked is None else choose(kinds[-1], asked)
+    kind = first_kind(topics, kinds, asked)
+    return None if kind is None and asked is None else choose(kind or kinds[-1], asked)
 
 
 def read_messages(

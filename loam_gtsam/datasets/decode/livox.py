@@ -18,9 +18,10 @@ KINDS = (
     "livox_interfaces/msg/CustomMsg",
 )
 """The same message of the drivers for ROS 1 and 2, old and new."""
-_OFFSETS = {"offset_time": 0, "x": 4, "y": 8, "z": 12, "reflectivity": 16, "tag": 17, "laser": 18}
-_FORMATS = ["<u4", "<f4", "<f4", "<f4", "u1", "u1", "u1"]
-_SIZE = 19  # bytes of a point; in ROS 2 the next one begins at a multiple of four
+_BYTES = ("reflectivity", "u1"), ("tag", "u1"), ("laser", "u1")
+_POINT = np.dtype([("offset_time", "<u4"), ("x", "<f4"), ("y", "<f4"), ("z", "<f4"), *_BYTES])
+_ALIGNED = np.dtype([*_POINT.descr, ("filled", "V1")])
+"""In ROS 2 the next point begins at a multiple of four bytes."""
 
 
 def read_custom(raw: bytes | memoryview, *, cdr: bool) -> PackedCloud:
@@ -51,19 +52,12 @@ def read_custom(raw: bytes | memoryview, *, cdr: bool) -> PackedCloud:
         (count,) = struct.unpack_from("<I", body, at)
     except struct.error as error:
         raise DatasetError(f"CustomMsg: {len(raw)} bytes are cut off in the header") from error
-    step = _SIZE + 1 if cdr else _SIZE
+    record = _ALIGNED if cdr else _POINT
+    step = record.itemsize
     data = np.frombuffer(body[at + 4 :], np.uint8)
-    if len(data) < count * step - (step - _SIZE):
+    if len(data) < count * step - (step - _POINT.itemsize):
         raise DatasetError(
             f"CustomMsg: {count} points of {step} bytes are cut off, {len(data)} bytes are left"
         )
     data = np.append(data, np.uint8(0))[: count * step]  # the last one is not filled up
-    record = np.dtype(
-        {
-            "names": [*_OFFSETS],
-            "formats": _FORMATS,
-            "offsets": [*_OFFSETS.values()],
-            "itemsize": step,
-        }
-    )
     return packed(seconds * 10**9 + nanoseconds, record, 1, count, data)

@@ -50,6 +50,13 @@ PATTERNS: dict[str, tuple[Callable[..., tuple[FloatArray, FloatArray]], int]] = 
 """Livox lidars: how their beams move, and points in a sweep of 0.1 s."""
 
 
+def unit_vectors(azimuth: FloatArray, elevation: FloatArray) -> FloatArray:
+    """(3, ...) directions of angles in rad, of shapes that go together."""
+    level, up = np.cos(elevation), np.sin(elevation)
+    across = np.cos(azimuth) * level, np.sin(azimuth) * level
+    return np.stack([*across, np.broadcast_to(up, across[0].shape)])
+
+
 def fired(pattern: str, count: int, start: float, duration: float) -> tuple[FloatArray, FloatArray]:
     """The beams of one sweep, clockwise from straight behind.
 
@@ -68,7 +75,6 @@ def fired(pattern: str, count: int, start: float, duration: float) -> tuple[Floa
     firing = np.arange(count)
     times = duration * firing / count
     azimuth, elevation = map(np.deg2rad, PATTERNS[pattern][0](start + times, firing))
-    level = np.cos(elevation)
-    beams = np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevation)])
+    beams = unit_vectors(azimuth, elevation)
     around = np.argsort(-np.arctan2(beams[1], beams[0]), kind="stable")
     return beams[:, around, None], times[around]

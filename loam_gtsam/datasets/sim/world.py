@@ -16,7 +16,7 @@ import numpy as np
 from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.sim.inertial import IMUS, Axes, ImuErrors
 from loam_gtsam.datasets.sim.motion import Motion
-from loam_gtsam.datasets.sim.patterns import PATTERNS, fired
+from loam_gtsam.datasets.sim.patterns import PATTERNS, fired, unit_vectors
 from loam_gtsam.datasets.sim.raycast import Ground, Solids, cast_rays
 from loam_gtsam.datasets.sim.scenes import BUILDERS
 from loam_gtsam.datasets.sim.streets import Scene, build_avenue
@@ -136,8 +136,8 @@ class SimulatedWorld(Loader):
         _whole_at_least(8, columns=columns)
         self.scene = BUILDERS[scene](seed) if isinstance(scene, str) else scene
         self._lidar, self._rings = sensor, sensor in SENSORS
-        elevations, default_columns = SENSORS.get(sensor) or (np.zeros(1), PATTERNS[sensor][1])
-        self._columns = default_columns if columns is None else columns
+        _, own_columns = SENSORS[sensor] if self._rings else PATTERNS[sensor]
+        self._columns = own_columns if columns is None else columns
         speed = self.scene.speed if speed is None else float(speed)
         noises = {"gyro_noise": gyro_noise, "acceleration_noise": acceleration_noise}
         _at_least(0.0, range_noise=range_noise, foliage_noise=foliage_noise)
@@ -160,9 +160,6 @@ class SimulatedWorld(Loader):
         self.sensor: Mapping[str, Any] = spins | {"period": 1.0 / rate}
         if any(self._imu_errors.lever):
             self.sensor = self.sensor | {"imu.lidar_t_imu": self._imu_errors.lever}
-        turns = np.arange(self._columns) / self._columns
-        self._times = turns / rate
-        self._beams = _beam_directions(turns, elevations)
         self.world_T_start: FloatArray = self._motion.world_T_lidar(np.zeros(1))[0]
 
     def __len__(self) -> int:
@@ -178,9 +175,11 @@ class SimulatedWorld(Loader):
         """Sweep ``i``, the same whether or not others were made: processes can share the work."""
         if not 0 <= i < self._frames:
             raise IndexError(f"sweep {i}: this world has {self._frames} sweeps")
-        stamp, beams, offsets = self._stamp(i), self._beams, self._times
+        stamp = self._stamp(i)
         since = (stamp - _EPOCH) * 1e-9
-        if not self._rings:
+        if self._rings:
+            beams, offsets = self._turn
+        else:
             beams, offsets = fired(self._lidar, self._columns, since, 1.0 / self._rate)
         times = since + offsets
         world_T_lidar = self._motion.world_T_lidar(times)
@@ -237,8 +236,9 @@ class SimulatedWorld(Loader):
 
     def info(self) -> DatasetInfo:
         """Scene, sensor, frames and length of the way; reads nothing."""
-        fires = f"{self._beams.shape[2]} beams x {self._columns} columns, clockwise"
-        fires = fires if self._rings else f"{self._columns} points, no rings"
+        fires = f"{self._columns} points, no rings"
+        if self._rings:
+            fires = f"{len(SENSORS[self._lidar][0])} beams x {self._columns} columns, clockwise"
         within = math.hypot(self._imu_errors.attitude_noise, self._imu_errors.attitude_drift)
         facts = {
             "scene": self.scene.name,
@@ -253,6 +253,14 @@ class SimulatedWorld(Loader):
         }
         return DatasetInfo(kind="simulated world", path=self.scene.name, facts=facts)
 
+    @cached_property
+    def _turn(self) -> tuple[FloatArray, FloatArray]:
+        """Beams (3, columns, B) of a lidar that spins, clockwise from straight behind; seconds."""
+        turns = np.arange(self._columns) / self._columns
+        elevations = np.deg2rad(SENSORS[self._lidar][0])
+        azimuths = np.pi - 2.0 * np.pi * turns[:, None]
+        return unit_vectors(azimuths, elevations[None, :]), turns / self._rate
+
     def _stamp(self, i: int) -> int:
         return _EPOCH + round(i * 1e9 / self._rate)
 
@@ -266,13 +274,6 @@ class SimulatedWorld(Loader):
             text = f"{ends}, got {count}; ask for fewer or lower the speed"
             raise ConfigError(f"frames: the path of {self.scene.name!r} {text}")
         return count
-
-
-def _beam_directions(turns: FloatArray, elevations_deg: FloatArray) -> FloatArray:
-    """(3, columns, beams) unit vectors, clockwise from straight behind."""
-    azimuth, elevation = np.pi - 2.0 * np.pi * turns[:, None], np.deg2rad(elevations_deg)[None, :]
-    level, up = np.cos(elevation), np.broadcast_to(np.sin(elevation), (len(turns), elevation.size))
-    return np.stack([np.cos(azimuth) * level, np.sin(azimuth) * level, up])
 
 
 def _seconds(stamps: IntArray) -> FloatArray:

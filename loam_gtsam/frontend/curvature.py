@@ -35,6 +35,31 @@ def window_fits(ring_starts: IntArray, half_window: int) -> BoolArray:
     return fits
 
 
+def running_sums(xyz: NDArray[np.float32]) -> FloatArray:
+    """(3, N + 1) metres: column i is the sum of the first i points of the sweep."""
+    sums = np.zeros((3, xyz.shape[1] + 1))
+    np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
+    return sums
+
+
+def window_means(sums: FloatArray, half_window: int) -> FloatArray:
+    """(3, N) mean of the points in the window around each, cut at the ends of the sweep.
+
+    ``sums`` are those of :func:`running_sums`; ``half_window`` is the number of neighbours on
+    either side.
+    """
+    count, width = sums.shape[1] - 1, 2 * half_window + 1
+    means = np.empty((3, count))
+    whole = means[:, half_window : max(count - half_window, half_window)]
+    np.subtract(sums[:, width:], sums[:, :-width], out=whole)
+    whole /= width
+    begin = min(half_window, count)
+    cut = np.r_[:begin, max(count - half_window, begin) : count]
+    first, end = np.maximum(cut - half_window, 0), np.minimum(cut + half_window + 1, count)
+    means[:, cut] = (sums[:, end] - sums[:, first]) / (end - first)
+    return means
+
+
 def curvature(xyz: NDArray[np.float32], half_window: int) -> NDArray[np.float32]:
     """LOAM's curvature: squared norm of the sum of differences to the neighbours on the ring.
 
@@ -117,7 +142,7 @@ def ends_of_surfaces(
         ranges = np.sqrt(squared_norm(window))
         rays = np.concatenate((window / ranges, [1.0 / ranges]))
         turn = np.sqrt(squared_norm(np.diff(rays[:3], axis=2)))
-        spacing = np.median(turn, axis=1)
+        spacing = _medians(turn)
         most = np.maximum(drop, LINKED_BEAMS * spacing * ranges[:, 1])
         linked = np.abs(np.diff(ranges[:, 1:], axis=1)) < most[:, None]
         count = np.logical_and.accumulate(linked, axis=1).sum(axis=1)
@@ -131,6 +156,14 @@ def ends_of_surfaces(
         inverse *= np.sqrt(squared_norm(beyond[:3]))
         ended[here] = (beyond[:3] / inverse).T
     return ended
+
+
+def _medians(rows: FloatArray) -> FloatArray:
+    """(M,) medians of the rows of (M, K), for a small K faster than ``np.median``."""
+    ordered = np.sort(rows, axis=1)
+    middle = rows.shape[1] // 2
+    medians: FloatArray = 0.5 * (ordered[:, (rows.shape[1] - 1) // 2] + ordered[:, middle])
+    return medians
 
 
 def roughness(xyz: NDArray[np.float32]) -> NDArray[np.float32]:

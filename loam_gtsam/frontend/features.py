@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +32,11 @@ from loam_gtsam.frontend.curvature import (
     ends_of_surfaces,
     prominence,
     roughness,
+    running_sums,
     squared_gaps,
     unreliable_points,
     window_fits,
+    window_means,
 )
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.frontend.poles import Poles, find_poles
@@ -50,6 +53,8 @@ _REACH = 0.75
 open, too, where it is mounted low."""
 _ENOUGH = 8192
 """Points from which the reach is found: more make no difference."""
+_LARGEST = (32 << 20) - (64 << 10)
+"""Bytes, just below the largest block whose return to the system glibc takes as a hint."""
 
 
 def extract_features(scan: Scan, config: Config) -> Features:
@@ -71,6 +76,7 @@ def extract_features(scan: Scan, config: Config) -> Features:
         If too few points are usable, no ring is long enough, or rings or times cannot be found;
         the message says what was found and what to set.
     """
+    _keep_freed_memory()
     sweep = organise(scan, config)
     if not sweep.rings.known:
         return _without_rings(scan, config, sweep)
@@ -84,7 +90,8 @@ def extract_features(scan: Scan, config: Config) -> Features:
             f"least {2 * window + 1} are needed (rings: {sweep.rings.note})",
             SweepFault.NO_FEATURES,
         )
-    poles = find_poles(xyz, ring_starts, settings.post_depth, settings.post_width, 2 * window)
+    sums = running_sums(xyz)
+    poles = find_poles(xyz, sums, ring_starts, settings.post_depth, settings.post_width, 2 * window)
     inside &= ~poles.members(xyz.shape[1])
 
     bend = curvature(xyz, window)
@@ -111,7 +118,18 @@ def extract_features(scan: Scan, config: Config) -> Features:
         rest[flat] = False
     n_sharp = int(np.count_nonzero(rank < settings.sharp_per_sector))
     rows = edges, flat, np.flatnonzero(rest)
-    return _assemble(scan, config, sweep, rows, n_sharp, gaps, poles)
+    return _assemble(scan, config, sweep, rows, n_sharp, gaps, sums, poles)
+
+
+@cache
+def _keep_freed_memory() -> None:
+    """Let the process keep the memory of a sweep for the next one, once and for all.
+
+    The arrays of a sweep are of some megabytes, which glibc would give back to the system and ask
+    for again, page by page: a third of the time of 64 beams. It gives back less after it has seen
+    a large block come and go (mallopt(3), M_MMAP_THRESHOLD); nothing writes to this one.
+    """
+    np.empty(_LARGEST, np.uint8)
 
 
 def thinned(features: Features, config: MapConfig) -> Features:
@@ -240,7 +258,7 @@ def pick_by_sector(
 
 def _assemble(
     scan: Scan, config: Config, sweep: OrganisedSweep, rows: tuple[IntArray, IntArray, IntArray],
-    n_sharp: int, gaps: NDArray[np.float32], poles: Poles,
+    n_sharp: int, gaps: NDArray[np.float32], sums: FloatArray, poles: Poles,
 ) -> Features:  # fmt: skip
     """Gather positions, times from the reference time, and rings; poles are the last edges."""
     span, reference = sweep.span, _reference(sweep, config)
@@ -258,11 +276,11 @@ def _assemble(
         rest = np.union1d(flat, rest)
         planes, flat = measured(rest), np.searchsorted(rest, flat)
     elif settings.thinning == "runs":
-        starts = cut_into_runs(sweep.xyz, gaps, rest, size, settings.half_window)
+        starts = cut_into_runs(sums, gaps, rest, size, settings.half_window)
         planes = averaged_along_rings(sweep.xyz, times, ring, rest, starts)
-        smooth = np.intersect1d(flat, rest, assume_unique=True)
-        places = np.searchsorted(rest, smooth)
-        flat = np.unique(np.searchsorted(starts, places, side="right") - 1)
+        places = np.searchsorted(rest, flat)
+        smooth = rest.take(places, mode="clip") == flat
+        flat = np.unique(np.searchsorted(starts, places[smooth], side="right") - 1)
     else:
         filtered = voxel_filter_by_ring(sweep.xyz[:, rest], times[rest], ring[rest], size)
         (points, seconds, rings), others = measured(flat), filtered
@@ -352,11 +370,7 @@ def _reach(xyz: NDArray[np.float32]) -> float:
 
 
 def cut_into_runs(
-    xyz: NDArray[np.float32],
-    gaps: NDArray[np.float32],
-    chosen: IntArray,
-    length: float,
-    half_window: int,
+    sums: FloatArray, gaps: NDArray[np.float32], chosen: IntArray, length: float, half_window: int
 ) -> IntArray:
     """Where runs of points of a ring begin that are about as long as a length.
 
@@ -367,7 +381,7 @@ def cut_into_runs(
 
     Parameters
     ----------
-    xyz : (3, N) metres, ring after ring
+    sums : (3, N + 1) metres, of the points ring after ring, see :func:`running_sums`
     gaps : (N,) squared distances to the next point, square metres; infinite at the end of a ring
     chosen : (M,) the points to be cut, ascending, M > 0
     length : metres; a gap that is wider ends a run as well
@@ -377,15 +391,9 @@ def cut_into_runs(
     -------
     (R,) rows of ``chosen``.
     """
-    count = xyz.shape[1]
-    sums = np.zeros((3, count + 1))
-    np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
-    rows = np.arange(count)
-    first = np.maximum(rows - half_window, 0)
-    end = np.minimum(rows + half_window + 1, count)
-    means = (sums.take(end, axis=1) - sums.take(first, axis=1)) / (end - first)
-    steps = squared_norm(np.diff(means, prepend=means[:, :1]))
-    steps[1:] = np.minimum(steps[1:], gaps[:-1])  # a gap near by is no step of this one
+    means = window_means(sums, half_window)
+    steps = np.zeros(means.shape[1])
+    np.minimum(squared_norm(means[:, 1:] - means[:, :-1]), gaps[:-1], out=steps[1:])
     way = np.cumsum(np.sqrt(steps))
     number = np.floor(way / length)
     number[1:] += np.cumsum(gaps[:-1] > length * length)

@@ -72,7 +72,12 @@ class Poles:
 
 
 def find_poles(
-    xyz: NDArray[np.float32], ring_starts: IntArray, depth: float, width: float, most: int
+    xyz: NDArray[np.float32],
+    sums: FloatArray,
+    ring_starts: IntArray,
+    depth: float,
+    width: float,
+    most: int,
 ) -> Poles:
     """Find the runs of a ring that are narrow, and nearer than what is on either side of them.
 
@@ -81,6 +86,8 @@ def find_poles(
     Parameters
     ----------
     xyz : (3, N) metres, ring after ring in firing order
+    sums : (3, N + 1) metres, of the points before each, see
+        :func:`~loam_gtsam.frontend.curvature.running_sums`
     ring_starts : (R + 1,) where each ring begins; the last entry is N
     depth : metres by which a run must stand before the next points on both sides, where there are
         any; 0 finds no poles
@@ -113,13 +120,12 @@ def find_poles(
     gap_after = np.where(empty[last], np.inf, farther[last])
     length = last - first + 1
     depths = np.minimum(gap_before, gap_after).astype(np.float64)
-    turned = np.linalg.norm(beams[:, last] - beams[:, first], axis=0)
     chosen = (length <= most) & cut[last] & cut[before] & (depths > depth)
-    chosen &= np.abs(ranges[last] - ranges[first]) <= turned * ranges[last] + _NOISE
+    first, last, depths, length = (column[chosen] for column in (first, last, depths, length))
+    turned = np.linalg.norm(beams[:, last] - beams[:, first], axis=0)
+    chosen = np.abs(ranges[last] - ranges[first]) <= turned * ranges[last] + _NOISE
     runs = first, last, depths, length, turned
     first, last, depths, length, turned = (column[chosen] for column in runs)
-    sums = np.zeros((3, xyz.shape[1] + 1))
-    np.cumsum(xyz, axis=1, dtype=np.float64, out=sums[:, 1:])
     means = ((sums[:, last + 1] - sums[:, first]) / length).T
     distance = np.linalg.norm(means, axis=1)
     rings = np.searchsorted(ring_starts, first, side="right")
@@ -133,9 +139,11 @@ def find_poles(
 
 def _upright(rings: IntArray, beams: FloatArray, distances: FloatArray) -> BoolArray:
     """(M,) which runs go on in a ring beside theirs: posts do, drops of rain do not."""
-    near = KDTree(np.column_stack([rings, beams, distances]) / _UPRIGHT)
-    count: IntArray = near.query_ball_point(near.data, 1.0, p=np.inf, return_length=True)
-    return count > 1
+    places = np.column_stack([rings, beams, distances]) / _UPRIGHT
+    just_beyond = np.nextafter(1.0, 2.0)
+    nearest, _ = KDTree(places).query(places, [2], p=np.inf, distance_upper_bound=just_beyond)
+    upright: BoolArray = np.isfinite(nearest[:, 0])
+    return upright
 
 
 def _likely_widths(

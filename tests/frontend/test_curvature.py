@@ -9,9 +9,11 @@ from loam_gtsam.frontend.curvature import (
     ends_of_surfaces,
     prominence,
     roughness,
+    running_sums,
     squared_gaps,
     unreliable_points,
     window_fits,
+    window_means,
 )
 
 LOAM = FeatureConfig(post_depth=0.0)
@@ -196,3 +198,12 @@ def test_a_lost_beam_on_the_wall_does_not_move_its_end() -> None:
 
 def test_too_short_a_sweep_is_rough_everywhere() -> None:
     assert np.isinf(roughness(along_wall(8.0, GRAZED[:4]))).all()
+
+
+@pytest.mark.parametrize("count", [1, 4, 9, 10, 11, 12, 40])
+def test_the_mean_over_a_window_is_cut_at_the_ends_of_the_sweep(count: int) -> None:
+    xyz = np.random.default_rng(count).uniform(-9.0, 9.0, (3, count)).astype(np.float32)
+    means = window_means(running_sums(xyz), 5)
+    for row in range(count):
+        window = xyz[:, max(row - 5, 0) : row + 6].astype(np.float64)
+        assert means[:, row] == pytest.approx(window.mean(axis=1), abs=1e-12)

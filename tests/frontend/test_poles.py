@@ -5,6 +5,7 @@ import pytest
 
 from loam_gtsam.config import Config, FeatureConfig
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
+from loam_gtsam.frontend.curvature import running_sums
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.poles import find_poles
 
@@ -20,7 +21,7 @@ def ring(ranges, first=0.0):
 
 def found(points, depth=0.5, width=0.5, most=10, starts=None):
     bounds = np.array([0, points.shape[1]] if starts is None else starts)
-    return find_poles(points, bounds, depth, width, most)
+    return find_poles(points, running_sums(points), bounds, depth, width, most)
 
 
 def wall(count=200, metres=12.0):

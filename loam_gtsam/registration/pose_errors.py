@@ -175,22 +175,22 @@ class PoseErrors:
         to_map = middle.AdjointMap()
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
-        self._add_drift(sweep, solution, scan, last, factor * scan.renewed)
+        by_imu = None if solution.weak is not None else fused
+        self._add_drift(sweep, solution, scan, last, _renewed(scan, by_imu, factor))
         if fused is not None:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
-        if fused is None or solution.weak is not None:
+        if by_imu is None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
             if self._paused:
                 own = own + _changed(update.twist, sweep, self._motion.variances)
         else:
             lasting = symmetric(to_reference @ scan.covariance @ to_reference.T)
             root = np.sqrt(_LASTING) * positive_root(lasting)
-            own, shared, now = self._own_of(update, sweep, middle, fused, to_reference, root)
+            own, shared, now = self._own_of(update, sweep, middle, by_imu, to_reference, root)
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
-        from_map = update.map_T_lidar.inverse().AdjointMap()
-        to_middle = middle.between(update.map_T_lidar).AdjointMap()
-        drifted = to_reference @ (np.eye(6) - scan.user) @ to_middle @ from_map
+        from_map = middle.inverse().AdjointMap()
+        drifted = to_reference @ (np.eye(6) - scan.user) @ from_map
         if doubt is not None:
             own = own + drifted @ doubt @ drifted.T
         else:  # what is still in doubt after the start is an error of the map
@@ -347,6 +347,20 @@ class PoseErrors:
         if sweep.motion is SweepMotion.GYRO:
             missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
         return missed
+
+
+def _renewed(scan: ScanError, fused: Fused | None, factor: float) -> FloatArray:
+    """(6, 6) what new ground adds to the map's error; ``factor`` times, of a scan alone.
+
+    Beside an IMU it pulls the pose by no more than the gain of the scan, and takes over, by its
+    share of the scan, what the pose is off by the IMU.
+    """
+    if fused is None:
+        return factor * scan.renewed
+    gain = fused.covariance[:6, :6] @ scan.information
+    pulled, left = gain @ scan.renewed @ gain.T, np.eye(6) - gain
+    taken_over = scan.renewed @ np.linalg.solve(scan.covariance, scan.renewed)
+    return symmetric(factor * pulled + left @ taken_over @ left.T)
 
 
 def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -> FloatArray:

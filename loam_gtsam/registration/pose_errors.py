@@ -176,7 +176,8 @@ class PoseErrors:
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
         by_imu = None if solution.weak is not None else fused
-        self._add_drift(sweep, solution, scan, last, _renewed(scan, by_imu, factor))
+        drift = scan.drift(factor, None if by_imu is None else by_imu.covariance[:6, :6])
+        self._add_drift(sweep, solution, scan, last, drift)
         if fused is not None:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
         if by_imu is None:
@@ -189,8 +190,7 @@ class PoseErrors:
             own, shared, now = self._own_of(update, sweep, middle, by_imu, to_reference, root)
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
-        from_map = middle.inverse().AdjointMap()
-        drifted = to_reference @ (np.eye(6) - scan.user) @ from_map
+        drifted = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
         if doubt is not None:
             own = own + drifted @ doubt @ drifted.T
         else:  # what is still in doubt after the start is an error of the map
@@ -347,20 +347,6 @@ class PoseErrors:
         if sweep.motion is SweepMotion.GYRO:
             missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
         return missed
-
-
-def _renewed(scan: ScanError, fused: Fused | None, factor: float) -> FloatArray:
-    """(6, 6) what new ground adds to the map's error; ``factor`` times, of a scan alone.
-
-    Beside an IMU it pulls the pose by no more than the gain of the scan, and takes over, by its
-    share of the scan, what the pose is off by the IMU.
-    """
-    if fused is None:
-        return factor * scan.renewed
-    gain = fused.covariance[:6, :6] @ scan.information
-    pulled, left = gain @ scan.renewed @ gain.T, np.eye(6) - gain
-    taken_over = scan.renewed @ np.linalg.solve(scan.covariance, scan.renewed)
-    return symmetric(factor * pulled + left @ taken_over @ left.T)
 
 
 def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -> FloatArray:

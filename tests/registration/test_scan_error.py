@@ -10,7 +10,7 @@ from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import Solution, match_rows
-from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
+from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
 
 CONFIG = CovarianceConfig()
 SIGMA = 0.05
@@ -206,3 +206,52 @@ def test_ground_is_new_once_and_forgotten_in_time():
     for n in (20.0, 30.0, 40.0, 50.0):
         assert seen.cells(row + np.array([n, 0.0, 0.0]))[1].all()
     assert seen.cells(row)[1].all()
+
+
+@pytest.mark.parametrize(
+    ("frames", "wander"), [(5, 1e9), (5, 0.1), (20, 1e9), (20, 0.1), (20, 0.01), (50, 0.1)]
+)
+def test_drift_beside_an_imu_is_that_of_a_filter_that_makes_its_own_map(frames, wander):
+    """In one dimension: each frame has one new point and forgets the oldest one of its map."""
+    scan = ScanError(
+        covariance=2.0 / frames * np.eye(6),  # of points and map, each of unit variance
+        renewed=2.0 / frames**2 * np.eye(6),
+        information=np.eye(6) / (2.0 / frames + 12.0 / frames**2),
+        user=np.zeros((6, 6)), expected=np.zeros((6, 6)), raw=np.zeros((6, 6)), step=np.zeros(6),
+        residual_variance=1.0, effective_matches=1.0,
+    )  # fmt: skip
+    predicted, known = wander / frames, 0.0
+    for _ in range(2000):
+        known = 1.0 / (1.0 / (known + predicted) + scan.information[0, 0])
+    told = scan.drift(4.0, known * np.eye(6))
+    gain = known * scan.information[0, 0]
+
+    rng, runs = np.random.default_rng(frames), 400
+    pose, points, poses = np.zeros(runs), rng.normal(size=(frames, runs)), []
+    for frame in range(500):
+        seen = (points + rng.normal(size=points.shape)).mean(axis=0)
+        moved = min(predicted, 1.0) ** 0.5 * rng.normal(size=runs)
+        pose = gain * seen + (1.0 - gain) * (pose + moved)
+        points[frame % frames] = pose + rng.normal(size=runs)
+        poses.append(pose)
+    far, near = (np.mean((poses[-1] - poses[-1 - k]) ** 2) for k in (400, 100))
+    assert 0.7 < np.trace(told) / 6.0 / ((far - near) / 300.0) < 1.7
+    np.testing.assert_allclose(told, told[0, 0] * np.eye(6), atol=1e-12)
+
+
+def test_drift_is_less_beside_an_imu_by_each_direction():
+    rng = np.random.default_rng(0)
+    axes = np.linalg.qr(rng.normal(size=(6, 6)))[0]
+    stretch = axes * np.array([1e-3, 2e-3, 5e-3, 1e-2, 3e-2, 0.1])
+    unit, nothing = stretch @ stretch.T, np.zeros((6, 6))
+    scan = ScanError(
+        unit, 0.1 * unit, nothing, nothing, nothing, np.linalg.inv(unit), np.zeros(6), 1.0, 1.0
+    )
+    gains = np.array([1.0, 0.5, 0.1, 0.9, 0.3, 0.02])
+    told = scan.drift(6.0, stretch * gains @ stretch.T)
+    back = np.linalg.inv(stretch)
+    left = 1.0 - gains
+    pulls = np.mean([1.0 - left**j for j in range(1, 11)], axis=0)
+    expected = 3.0 * 0.1 * pulls**2 + 0.01 * left**2
+    np.testing.assert_allclose(back @ told @ back.T, np.diag(expected), atol=1e-9)
+    np.testing.assert_array_equal(scan.drift(6.0, None), 6.0 * scan.renewed)

@@ -19,6 +19,11 @@ _PRIOR_CELLS = 6.0
 """Weight, in cells, of the scatter of all residuals beside that of the cells: with fewer than six
 cells the scores alone do not span the six directions."""
 _LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
+_LEAST_POSE = 1e-30  # (1e-15 rad or m)^2: no pose is known as well
+_LEAST_SHARE = 1e-4  # of a pose, or of the ground: less is not told from none
+_BESIDE_IMU = 0.5
+"""Share of ``covariance.drift`` that is left beside an accelerometer, which measures the motion
+within the sweep: nothing of it goes into the map."""
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
@@ -48,6 +53,29 @@ class ScanError:
     step: FloatArray
     residual_variance: float
     effective_matches: float
+
+    def drift(self, factor: float, fused: FloatArray | None) -> FloatArray:
+        """(6, 6) what new ground adds to the map's error: docs/maths/covariance.md, (6), (10).
+
+        ``factor`` is ``covariance.drift`` for a scan alone; ``fused`` (6, 6) is the covariance of
+        the pose by scan and IMU together, None without one. Beside an IMU the ground pulls the pose
+        by the gain of the scan, again in every frame while it is in sight, and takes over what the
+        IMU is off.
+        """
+        if fused is None:
+            return factor * self.renewed
+        variances, turn = np.linalg.eigh(fused)
+        roots = np.sqrt(np.maximum(variances, _LEAST_POSE))
+        gains, axes = np.linalg.eigh(_through((turn * roots).T, self.information))
+        gains = np.clip(gains, _LEAST_SHARE, 1.0)
+        share = np.linalg.lstsq(self.covariance, self.renewed, rcond=None)[0]
+        frames = 1.0 / np.clip(np.trace(share) / 6.0, _LEAST_SHARE, 1.0)
+        left = 1.0 - gains
+        pulls = 1.0 - left * (1.0 - left**frames) / (frames * gains)
+        out, back = turn * roots @ axes, axes.T @ (turn / roots).T
+        pulled = _through(out * pulls @ back, self.renewed)
+        taken_over = _through(out * left @ back, self.renewed @ share)
+        return symmetric(_BESIDE_IMU * factor * pulled + taken_over)
 
     def with_factors(
         self, map_T_lidar: gtsam.Pose3, factors: Sequence[gtsam.NonlinearFactor]
@@ -160,6 +188,10 @@ def scan_error(
     step = np.linalg.lstsq(information, -jacobian.T @ residuals, rcond=None)[0]
     found = covariance, renewed, *shares, raw, symmetric(alone), step.astype(np.float64)
     return ScanError(*found, variance, effective)
+
+
+def _through(matrix: FloatArray, covariance: FloatArray) -> FloatArray:
+    return matrix @ covariance @ matrix.T
 
 
 def _sums(rows: FloatArray, numbers: IntArray, count: int) -> FloatArray:

@@ -100,7 +100,7 @@ class _Middle:
 class PoseErrors:
     """Calibrates the covariances of a run, frame by frame.
 
-    Of ``config``, ``covariance``, the weights in ``solver`` and ``imu.gyro_noise`` are used.
+    Of ``config``, ``covariance`` is used, with ``solver``, ``imu.gyro_noise`` and ``imu.lag``.
     """
 
     def __init__(self, config: Config) -> None:
@@ -116,7 +116,7 @@ class PoseErrors:
         self._kernel_width = config.solver.kernel_width if graph else np.inf
         # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
         self._with_priors = graph
-        self._gyro_noise = config.imu.gyro_noise
+        self._gyro_noise, self._lag = config.imu.gyro_noise, config.imu.lag
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionFilter(config.solver)
@@ -176,8 +176,8 @@ class PoseErrors:
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
         by_imu = None if solution.weak is not None else fused
-        drift = scan.drift(factor, None if by_imu is None else by_imu.covariance[:6, :6])
-        self._add_drift(sweep, solution, scan, last, drift)
+        settled = None if self._scans <= self._lag or by_imu is None else by_imu.covariance[:6, :6]
+        self._add_drift(sweep, solution, scan, last, scan.drift(factor, settled))
         if fused is not None:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
         if by_imu is None:

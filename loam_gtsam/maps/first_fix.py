@@ -27,7 +27,9 @@ from loam_gtsam.types import FloatArray
 
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
 _TRIES = 6  # number of places that are tried
-_STARTS = 3  # number of poses around a place at which a registration starts
+_STARTS = 18  # number of poses around all of these at which a registration starts
+_NEAR_STARTS = 3  # the same around one pose
+_AS_WELL = 0.75  # part of the score of the best of these that each of them has
 _NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
 
@@ -74,11 +76,9 @@ class PlaceSearch:
         edges, planes = posed.points
         if not self._places or not len(edges) + len(planes):
             return []
-        found: list[Candidate] = []
-        starts = self._starts(np.concatenate([edges, planes]))
-        for start in [*starts, *([] if near is None else [near])]:
-            found += self.around(posed, start, self._config.loops.search, reach)
-        return distinct(found)
+        alike = self._alike(np.concatenate([edges, planes]))
+        centres = alike if near is None else [*alike, near]
+        return self._registered(posed, centres, self._config.loops.search, reach, _STARTS)
 
     def around(
         self,
@@ -89,24 +89,39 @@ class PlaceSearch:
         most_turn: float = np.pi,
     ) -> list[Candidate]:
         """The poses within a radius, metres, at which registrations of the sweep end."""
-        maps = self._maps
-        maps.recenter(map_T_middle, reach)
-        near = map_T_middle.matrix()
-        layers = maps.edges, maps.planes
-        held = np.concatenate([cubes.points(cubes.surroundings(near)) for cubes in layers])
+        return self._registered(posed, [map_T_middle], radius, reach, _NEAR_STARTS, most_turn)
+
+    def _registered(
+        self,
+        posed: PosedSweep,
+        centres: Sequence[gtsam.Pose3],
+        radius: float,
+        reach: float,
+        count: int,
+        most_turn: float = np.pi,
+    ) -> list[Candidate]:
+        """Where registrations end that begin at the likeliest poses around some centres."""
+        maps, held = self._maps, []
+        for centre in centres:
+            maps.recenter(centre, reach)
+            layers, near = (maps.edges, maps.planes), centre.matrix()
+            parts = [cubes.points(cubes.surroundings(near)) for cubes in layers]
+            held.append(np.concatenate(parts))
         sample = sample_features(*posed.points)
-        starts = likely_poses(sample, held, [map_T_middle], radius, _STARTS, most_turn)
-        whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
-        trial = whole.with_few_matches()
+        starts = likely_poses(sample, held, centres, radius, count, most_turn, least=_AS_WELL)
         found = []
-        for start in starts:
+        # Place by place, so that each cube is read once.
+        for start in sorted(starts, key=lambda s: np.argmin([s.range(c) for c in centres])):
+            maps.recenter(start, reach)
+            whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
+            trial = whole.with_few_matches()
             solution = self._solver.solve(trial, start)
             if solution.solved:
                 fit = standing_fit(solution.matches, trial.offered, solution.map_T_lidar)
                 found.append(Candidate(solution.map_T_lidar, fit))
         return distinct(found)
 
-    def _starts(self, points: FloatArray) -> list[gtsam.Pose3]:
+    def _alike(self, points: FloatArray) -> list[gtsam.Pose3]:
         """Poses at the places that look most alike."""
         own, places = scan_context(points, self._config.loops), self._places
         _, near = self._tree.query(heading_free_key(own), k=min(_ALIKE, len(places)))

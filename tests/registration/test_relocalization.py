@@ -264,6 +264,22 @@ def test_several_centres_are_searched(corner):
     assert truth.range(found[0]) < 1.0
 
 
+def test_of_several_places_those_are_left_out_that_fit_worse(corner):
+    """Each has its own part of the map; one above the other is another place."""
+    truth, up = gtsam.Pose3(gtsam.Rot3(), np.array([4.0, 3.0, 0.3])), np.array([0.0, 0.0, 3.0])
+    centres = [truth, gtsam.Pose3(truth.rotation(), truth.translation() + up)]
+    seen = truth.transformTo(corner[::15].T).T
+
+    def found(share, least):
+        known = corner, corner[: int(share * len(corner))] + up
+        return likely_poses(seen, known, centres, 0.0, 9, 0.0, least=least)
+
+    assert len(found(1.0, 0.75)) == 2
+    assert len(found(0.5, 0.0)) == 2
+    (best,) = found(0.5, 0.75)
+    assert truth.equals(best, 1e-9)
+
+
 @pytest.mark.parametrize("rare", [True, False])
 def test_what_is_rare_counts_more_than_ground(rare):
     """The ground that two sweeps see overlaps most at rest; what stands on it says otherwise."""

@@ -34,7 +34,7 @@ def sample_features(
 
 def likely_poses(
     points: FloatArray,
-    map_points: FloatArray,
+    map_points: FloatArray | Sequence[FloatArray],
     around: Sequence[gtsam.Pose3],
     radius: float,
     count: int,
@@ -42,6 +42,7 @@ def likely_poses(
     *,
     rare: bool = False,
     as_well: float | None = None,
+    least: float = 0.0,
 ) -> list[gtsam.Pose3]:
     """Poses from which a sweep may have been taken, the likeliest first.
 
@@ -52,7 +53,8 @@ def likely_poses(
 
     Parameters
     ----------
-    points, map_points : (N, 3), a few hundred of the sweep in the lidar frame, and (M, 3), metres
+    points : (N, 3) metres, lidar frame, a few hundred of the sweep
+    map_points : (M, 3) metres, of the map; or those around each centre
     around, radius : centres of the search, ``map_T_lidar``, and metres around each
     count : largest number of poses, which are more than 1.5 m or 12 degrees apart
     most_turn : largest rotation against the centre about the vertical axis, rad
@@ -61,8 +63,11 @@ def likely_poses(
         tells much. For two sweeps that follow each other: what is new or gone is rare as well.
     as_well : part of the best score from which another trial pose is as good: of those the nearest
         to its centre is the likeliest. Along a corridor all fit alike. None takes the best
+    least : part of the best score that every pose must have
     """
-    tried = [_trials(points, map_points, pose, radius, most_turn) for pose in around]
+    held = [map_points] * len(around) if isinstance(map_points, np.ndarray) else map_points
+    places = zip(held, around, strict=True)
+    tried = [_trials(points, near, pose, radius, most_turn) for near, pose in places]
     scored, weights = np.arange(len(points)), np.ones(len(points), np.float32)
     if rare:
         chance = np.mean([trials.chance() for trials in tried], axis=0)
@@ -74,8 +79,10 @@ def likely_poses(
     owner = np.repeat(np.arange(len(tried)), [len(trials.moves) for trials in tried])
     best: list[gtsam.Pose3] = []
     away = np.linalg.norm(moves[:, :2], axis=1)
-    at = moves[:, :2] + np.array([pose.translation() for pose in around])[owner, :2]
-    while len(best) < count and len(scores) and scores.max() > 0.0:
+    at = np.array([pose.translation() for pose in around]).reshape(-1, 3)[owner]
+    at[:, :2] += moves[:, :2]
+    worst = least * scores.max(initial=0.0)
+    while len(best) < count and len(scores) and scores.max() > worst:
         top = int(scores.argmax())
         if as_well is not None:
             good = np.flatnonzero(scores >= as_well * scores[top])

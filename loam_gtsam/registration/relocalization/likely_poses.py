@@ -8,7 +8,6 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from loam_gtsam.registration.matches import spread_rows
 from loam_gtsam.registration.relocalization.fits import APART
@@ -136,11 +135,12 @@ def _trials(
     size = 2 * (int(np.ceil((_REACH + radius) / _CELL)) + 2)
     shape = (size, size, 2 * (int(_HEIGHT / _CELL) + 1))
     centre = np.asarray(map_T_lidar.translation())
-    cells = _cells(map_points - centre, shape)
-    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
+    cells = _cells(map_points - centre, shape).T
+    sides = zip(cells, shape, strict=True)
+    inside = np.logical_and.reduce([(row >= 0) & (row < end) for row, end in sides])
     held = np.zeros(shape, np.uint8)
-    held[tuple(cells[inside].T)] = 1
-    field = (held + maximum_filter(held, size=3)).ravel()
+    held[tuple(cells[:, inside])] = 1
+    field = (held + _grown(held)).ravel()
 
     level = points @ map_T_lidar.rotation().matrix().T
     near = (np.linalg.norm(level[:, :2], axis=1) < _REACH) & (np.abs(level[:, 2]) < _HEIGHT)
@@ -156,6 +156,16 @@ def _trials(
     bases = np.ravel_multi_index(tuple(np.moveaxis(_cells(turned, shape), -1, 0)), shape)
     moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(shifts))])
     return _Trials(field, near, bases, shifts, moves)
+
+
+def _grown(held: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """1 in every cell that is held, or touches one that is, by a corner at least."""
+    grown = held.copy()
+    for axis in range(held.ndim):
+        before, after = grown.copy().swapaxes(0, axis), grown.swapaxes(0, axis)
+        after[1:] |= before[:-1]
+        after[:-1] |= before[1:]
+    return grown
 
 
 def _cells(points: FloatArray, shape: tuple[int, int, int]) -> IntArray:

@@ -1,7 +1,8 @@
 """The first fix: where in a saved map a sweep was taken, without any idea before.
 
-Places that look like the sweep (Scan Context) are tried by registration, each at several positions
-and headings. One sweep is not believed: :mod:`loam_gtsam.maps.hypotheses` follows what is found.
+Registrations begin at the likeliest positions and headings around the places that look like the
+sweep (Scan Context). One sweep is not believed: :mod:`loam_gtsam.maps.hypotheses` follows what is
+found.
 """
 
 from __future__ import annotations

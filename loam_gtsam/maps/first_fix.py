@@ -110,12 +110,11 @@ class PlaceSearch:
             held.append(np.concatenate(parts))
         sample = sample_features(*posed.points)
         starts = likely_poses(sample, held, centres, radius, count, most_turn, least=_AS_WELL)
-        found = []
+        whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
+        trial, found = whole.with_few_matches(), []
         # Place by place, so that each cube is read once.
         for start in sorted(starts, key=lambda s: np.argmin([s.range(c) for c in centres])):
             maps.recenter(start, reach)
-            whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
-            trial = whole.with_few_matches()
             solution = self._solver.solve(trial, start)
             if solution.solved:
                 fit = standing_fit(solution.matches, trial.offered, solution.map_T_lidar)

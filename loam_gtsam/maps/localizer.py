@@ -182,7 +182,9 @@ class Localizer:
         self._fixed, self._unsolved, self._sure, self._seen = True, 0, 0, None
         self.fixes += 1
         again = "" if self.fixes == 1 else " again"
-        return self._told(replace(fix, message=f"found in the map{again}"))
+        told = self._told(replace(fix, message=f"found in the map{again}"))
+        self._seen = None  # what was seen so far is of another mapper, whose drift is another
+        return told
 
     def _nowhere(self, stamp: int, status: FrameStatus, message: str) -> MapUpdate:
         last = self._last

@@ -148,6 +148,28 @@ def test_what_no_sweep_saw_counts_until_some_in_a_row_have_seen_it(saved):
     assert drifted == [False, True, True, True, True, True, False]
 
 
+def test_what_a_hypothesis_has_drifted_until_the_fix_does_not_count(mapped, saved):
+    """It has a mapper of its own, and may have been followed for long."""
+    drive, localizer = other_drive(mapped), Localizer(saved)
+    add = localizer._hypotheses.add
+
+    def late(features, near):
+        fix, why = add(features, near)
+        if fix is not None:
+            long_ago = {"blind": np.ones((6, 9)), "forgotten": np.full(9, 1e3)}
+            fix = replace(fix, uncertainty=replace(fix.uncertainty, **long_ago))
+        return fix, why
+
+    localizer._hypotheses.add = late
+    updates = [localizer.process(drive.sweep(n)) for n in range(SWEEPS + 1)]
+    assert updates[-1].status is FrameStatus.OK
+    update = localizer._tracking.process(drive.sweep(SWEEPS + 1))
+    told = localizer._told(replace(update, status=FrameStatus.DEGENERATE))
+    from_map = update.map_T_lidar.inverse().AdjointMap()
+    of_map = from_map @ localizer.map_covariance(update.map_T_lidar) @ from_map.T
+    np.testing.assert_allclose(told.covariance, update.uncertainty.own + of_map, atol=1e-12)
+
+
 def test_the_maps_error_is_that_of_the_first_visit_near_by(saved):
     localizer = Localizer(saved)
     first, last = saved.places[0], saved.places[-1]

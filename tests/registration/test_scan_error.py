@@ -255,3 +255,4 @@ def test_drift_is_less_beside_an_imu_by_each_direction():
     expected = 3.0 * 0.1 * pulls**2 + 0.01 * left**2
     np.testing.assert_allclose(back @ told @ back.T, np.diag(expected), atol=1e-9)
     np.testing.assert_array_equal(scan.drift(6.0, None), 6.0 * scan.renewed)
+    np.testing.assert_array_equal(scan.drift(0.0, stretch * gains @ stretch.T), nothing)

@@ -62,7 +62,7 @@ class ScanError:
         by the gain of the scan, again in every frame while it is in sight, and takes over what the
         IMU is off.
         """
-        if fused is None:
+        if fused is None or factor == 0.0:  # no ground is new in a map that stays as it is
             return factor * self.renewed
         variances, turn = np.linalg.eigh(fused)
         roots = np.sqrt(np.maximum(variances, _LEAST_POSE))

@@ -22,6 +22,7 @@ from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import Fit, likely_poses, same, sample_features
+from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.types import FloatArray
@@ -30,7 +31,6 @@ _ALIKE = 40  # number of places with the most similar heading-free keys that are
 _TRIES = 6  # number of places that are tried
 _STARTS = 18  # number of poses around all of these at which a registration starts
 _NEAR_STARTS = 3  # the same around one pose
-_AS_WELL = 0.75  # part of the score of the best of these that each of them has
 _NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
 
@@ -109,7 +109,7 @@ class PlaceSearch:
             parts = [cubes.points(cubes.surroundings(near)) for cubes in layers]
             held.append(np.concatenate(parts))
         sample = sample_features(*posed.points)
-        starts = likely_poses(sample, held, centres, radius, count, most_turn, least=_AS_WELL)
+        starts = likely_poses(sample, held, centres, radius, count, most_turn, least=AS_WELL)
         whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
         trial, found = whole.with_few_matches(), []
         # Place by place, so that each cube is read once.

@@ -130,9 +130,8 @@ class MapPair:
         ]
         edges, planes = map(np.concatenate, zip(*moved, strict=True))
         origins = np.array([pose.translation() for _, pose in sweeps])
-        edge_map, plane_map = self._small if self.small else self._open
-        edge_map.insert(edges)
-        plane_map.insert(planes, origins.repeat([len(points) for _, points in moved], axis=0))
+        self.edges.insert(edges)
+        self.planes.insert(planes, origins.repeat([len(points) for _, points in moved], axis=0))
         self._thinned = None
 
     def too_sparse(self, predicted: Prediction, config: Config) -> str:

@@ -14,15 +14,18 @@ from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, favour
-from loam_gtsam.registration.relocalization.fits import Fit, FitMonitor, beyond_any_motion, same
+from loam_gtsam.registration.relocalization.fits import (
+    AS_WELL,
+    Fit,
+    FitMonitor,
+    beyond_any_motion,
+    same,
+)
 from loam_gtsam.registration.relocalization.likely_poses import likely_poses, sample_features
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, FrameStatus, MapUpdate
 
-_AS_WELL = 0.75
-"""Part of the best place's fit from which another place fits as well, but for chance: of 200
-matches, half of which agree, three standard deviations."""
 _CLOSER = 3  # largest number of places that are looked at closer
 _BASIN = 0.5
 """Part of the reach of a match, from within which a solve converges: as the spacing of trials."""
@@ -293,7 +296,7 @@ def _places(
     ]
     starts = [solution.map_T_lidar] if solution.solved else []
     points = sample_features(*matcher.posed.points)
-    as_well = None if monitor.lost else _AS_WELL
+    as_well = None if monitor.lost else AS_WELL
     where = np.concatenate(known), around, monitor.radius, _PLACES
     starts += likely_poses(points, *where, as_well=as_well)
     matcher.clock.lap("relocalize")
@@ -304,7 +307,7 @@ def _places(
         if tried.solved:
             places.append((Fit.of(tried.matches, trial.offered).total, tried.map_T_lidar))
     best = max((total for total, _ in places), default=0.0)
-    as_good = [place for place in places if place[0] >= _AS_WELL * best]
+    as_good = [place for place in places if place[0] >= AS_WELL * best]
     ranks = [-total if monitor.lost else _moved(points, expected, pose) for total, pose in as_good]
     return [as_good[number][1] for number in np.argsort(ranks, kind="stable")]
 

@@ -21,6 +21,9 @@ AGREE = 3.0  # sigmas within which a match agrees with the pose: 99.7 % of norma
 _BEYOND = 3.0  # standard deviations of the usual agreement below which one is unusual
 _KNOWN = 4  # sweeps from which the usual is known
 _EVEN = 1e-3  # standard deviation at least: one of 1000 matches
+AS_WELL = 0.75
+"""Part of the best place's fit from which another place fits as well, but for chance: of 200
+matches, half of which agree, three standard deviations."""
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
 
 

@@ -22,6 +22,7 @@ from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import Fit, likely_poses, same, sample_features
+from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import GtsamSolver
@@ -30,8 +31,8 @@ from loam_gtsam.types import FloatArray
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
 _TRIES = 6  # number of places that are tried
 _STARTS = 18  # number of poses around all of these at which a registration starts
-_NEAR_STARTS = 3  # the same around one pose
 _NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
+_OPTIMA = (0.3, np.radians(3.0))  # metres and rad between two optima of registrations
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
 
 
@@ -43,10 +44,12 @@ class Candidate:
     ----------
     map_T_middle : pose at the middle of the sweep
     fit : of the features off level ground
+    evidence : of all features, for and against the pose
     """
 
     map_T_middle: gtsam.Pose3
     fit: Fit
+    evidence: Evidence
 
 
 class PlaceSearch:
@@ -57,71 +60,85 @@ class PlaceSearch:
     places : of the map
     maps : its cubes
     config : of the mapper
+    inside : whether the lidar is surely in the map
     """
 
-    def __init__(self, places: Sequence[Place], maps: SavedMaps, config: Config) -> None:
+    def __init__(
+        self, places: Sequence[Place], maps: SavedMaps, config: Config, *, inside: bool = False
+    ) -> None:
         self._places, self._maps, self._config = places, maps, config
+        self._inside = inside
         keys = [heading_free_key(place.descriptor.astype(np.float64)) for place in places]
         self._tree = cKDTree(np.array(keys).reshape(-1, config.loops.rings))
         near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
         self._solver = GtsamSolver(config.solver.changed(**near))
 
     def find(
-        self, posed: PosedSweep, reach: float, near: gtsam.Pose3 | None = None
+        self, posed: PosedSweep, reach: float, known: Sequence[gtsam.Pose3] = ()
     ) -> list[Candidate]:
-        """The poses that fit the map, no two of them near each other, the best first.
+        """The poses that fit the map, each an optimum of its own, the best first.
 
-        ``near`` is a further pose, if there is one, around which the sweep is looked for; ``reach``
-        is that of its features.
+        They are where registrations end that begin at the likeliest poses around the places that
+        look like the sweep, and at ``known`` poses; ``reach`` is that of its features.
         """
         edges, planes = posed.points
         if not self._places or not len(edges) + len(planes):
             return []
-        alike = self._alike(np.concatenate([edges, planes]))
-        centres = alike if near is None else [*alike, near]
-        return self._registered(posed, centres, self._config.loops.search, reach, _STARTS)
-
-    def around(
-        self,
-        posed: PosedSweep,
-        map_T_middle: gtsam.Pose3,
-        radius: float,
-        reach: float,
-        most_turn: float = np.pi,
-    ) -> list[Candidate]:
-        """The poses within a radius, metres, at which registrations of the sweep end."""
-        return self._registered(posed, [map_T_middle], radius, reach, _NEAR_STARTS, most_turn)
-
-    def _registered(
-        self,
-        posed: PosedSweep,
-        centres: Sequence[gtsam.Pose3],
-        radius: float,
-        reach: float,
-        count: int,
-        most_turn: float = np.pi,
-    ) -> list[Candidate]:
-        """Where registrations end that begin at the likeliest poses around some centres."""
         maps, held = self._maps, []
+        centres = [*self._lookalikes(np.concatenate([edges, planes])), *known]
         for centre in centres:
             maps.recenter(centre, reach)
-            layers, near = (maps.edges, maps.planes), centre.matrix()
-            parts = [cubes.points(cubes.surroundings(near)) for cubes in layers]
+            layers, at = (maps.edges, maps.planes), centre.matrix()
+            parts = [cubes.points(cubes.surroundings(at)) for cubes in layers]
             held.append(np.concatenate(parts))
-        sample = sample_features(*posed.points)
-        starts = likely_poses(sample, held, centres, radius, count, most_turn, least=AS_WELL)
+        radius, sample = self._config.loops.search, sample_features(edges, planes)
+        starts = likely_poses(sample, held, centres, radius, _STARTS, least=AS_WELL)
         whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
         trial, found = whole.with_few_matches(), []
         # Place by place, so that each cube is read once.
-        for start in sorted(starts, key=lambda s: np.argmin([s.range(c) for c in centres])):
+        for start in sorted(
+            [*starts, *known], key=lambda s: np.argmin([s.range(c) for c in centres])
+        ):
             maps.recenter(start, reach)
             solution = self._solver.solve(trial, start)
             if solution.solved:
-                fit = standing_fit(solution.matches, trial.offered, solution.map_T_lidar)
-                found.append(Candidate(solution.map_T_lidar, fit))
-        return distinct(found)
+                pose = solution.map_T_lidar
+                fit = standing_fit(solution.matches, trial.offered, pose)
+                found.append(Candidate(pose, fit, Evidence.of(trial, solution, dense=True)))
+        found = distinct(found)
+        against = [sum(self._favoured(other, one) for other in found) for one in found]
+        return [found[number] for number in np.argsort(against, kind="stable")]
 
-    def _alike(self, points: FloatArray) -> list[gtsam.Pose3]:
+    def _favoured(self, one: Candidate, other: Candidate) -> bool:
+        """Whether a sweep speaks for a pose, against another one."""
+        return speaks_for(one.evidence, other.evidence, self._config.solver.min_aligned)
+
+    def rivals(self, pose: gtsam.Pose3, found: list[Candidate], far: float) -> list[Candidate]:
+        """What may be right as well if a sweep is at a pose: all if it was not found there.
+
+        Rivals are poses to which the sweep does not object. A place that is not in the map may look
+        like one of those that are, if these look alike. So rivals are all poses, too, that fit
+        nearly as well: to that share ``far`` away, or to :data:`AS_WELL` where the same is seen.
+        """
+        own = _at(pose, found)
+        if own is None:
+            return found
+        return [c for c in found if c is not own and self._may_be(c, own, far)]
+
+    def _may_be(self, other: Candidate, own: Candidate, far: float) -> bool:
+        """Whether another pose may be the right one as well; see :meth:`rivals`."""
+        if not self._favoured(own, other):
+            return True
+        near = other.map_T_middle.range(own.map_T_middle) < self._config.loops.search
+        nearly = (AS_WELL if near else far) * own.fit.total
+        return not self._inside and other.fit.total >= nearly
+
+    def refuted(self, pose: gtsam.Pose3, found: list[Candidate]) -> bool:
+        """Whether a sweep speaks against a pose and for another one, or was not found there."""
+        own = _at(pose, found)
+        return own is None or any(self._favoured(c, own) for c in found)
+
+    def _lookalikes(self, points: FloatArray) -> list[gtsam.Pose3]:
         """Poses at the places that look most alike."""
         own, places = scan_context(points, self._config.loops), self._places
         _, near = self._tree.query(heading_free_key(own), k=min(_ALIKE, len(places)))
@@ -139,11 +156,21 @@ class PlaceSearch:
         return chosen
 
 
+def _at(pose: gtsam.Pose3, found: list[Candidate]) -> Candidate | None:
+    """What was found at a pose."""
+    return next((c for c in found if same_optimum(c.map_T_middle, pose)), None)
+
+
+def same_optimum(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
+    """Whether two registrations have ended in the same optimum."""
+    return same(one, other, _OPTIMA)
+
+
 def distinct(candidates: list[Candidate]) -> list[Candidate]:
-    """The best of those that are near each other, the best first."""
+    """The best of those that ended in the same optimum, the best first."""
     chosen: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: -c.fit.total):
-        if not any(same(candidate.map_T_middle, other.map_T_middle) for other in chosen):
+    for candidate in sorted(candidates, key=lambda c: -c.fit.favour):
+        if not any(same_optimum(candidate.map_T_middle, other.map_T_middle) for other in chosen):
             chosen.append(candidate)
     return chosen
 

@@ -8,21 +8,21 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, standing_fit
+from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, same_optimum, standing_fit
 from loam_gtsam.maps.saved_maps import SavedMaps
-from loam_gtsam.registration.relocalization import Fit, same
+from loam_gtsam.registration.odometry import advance
+from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
 SWEEPS = 3
-"""Sweeps in a row, each solved with a known motion, that must fit before a fix is believed."""
-_HYPOTHESES = 3  # that are followed at a time
+"""Sweeps in a row that must fit before a fix is believed."""
+_HYPOTHESES = 3  # that a search adds at most; twice as many are followed at a time
 _HOPEFUL = 0.5  # share of the best candidate's fit from which another one is followed, too
-_CLEARLY = ((0.9, 0.75), (0.75, 0.5))
+_CLEARLY = ((0.9, AS_WELL), (0.75, 0.5))
 """The less a place is as it was, the clearer must it stand out: least share of the matches that
-agree, and share of the fix's own fit that no other place may then reach. Wrong registrations have
-0.75 at most, right ones in an unchanged place 0.97 or more (``loops.min_agreement``). Of poses near
-by, where the same walls fit by half, the first share is asked."""
-_FASTEST, _TURNING = 50.0, 3.0  # m/s and rad/s, of the first motion
+agree, and share of the fix's own fit that no other place may then reach. Of a place that is as it
+was nearly all agree (``loops.min_agreement``), of one that looks the same up to 0.98."""
 
 
 class Hypothesis:
@@ -30,31 +30,23 @@ class Hypothesis:
 
     Attributes
     ----------
-    fits : of the sweeps with a known motion
+    fits : of the sweeps
     last : result for the last sweep
     """
 
-    def __init__(self, posed: PosedSweep, features: Features, start: gtsam.Pose3, mapper: Mapper):
+    def __init__(self, posed: PosedSweep, features: Features, start: Candidate, mapper: Mapper):
         self._mapper, self._config = mapper, mapper.config
-        self._start: tuple[int, gtsam.Pose3] | None = (posed.sweep.stamp, start)
-        self.fits: list[Fit] = []
-        self.last = mapper.register(features, start.compose(posed.middle_T_reference), posed.twist)
+        self.fits = [start.fit]
+        pose = start.map_T_middle.compose(posed.middle_T_reference)
+        self.last = mapper.register(features, pose, posed.twist)
 
-    def follow(self, features: Features, search: PlaceSearch) -> bool:
-        """Whether the next sweep is solved, too, and the last ones may yet fit."""
-        guess: gtsam.Pose3 | None = None
-        twist: FloatArray | None = None
-        if self._start is not None:  # the second sweep may be metres away from the first
-            sweep = MovingSweep(features, self._config)
-            posed = sweep.at(self.last.twist)
-            seconds = max((sweep.stamp - self._start[0]) * 1e-9, 0.0)
-            reach = max(1.0, _FASTEST * seconds), _TURNING * seconds + np.radians(5.0)
-            near = search.around(posed, self._start[1], reach[0], features.reach, reach[1])
-            if not near or sweep.stamp <= self._start[0]:
-                return False
-            twist = sweep.twist_since(self._start, near[0].map_T_middle)
-            guess = near[0].map_T_middle.compose(sweep.at(twist).middle_T_reference)
-            self._start = None
+    def follow(self, features: Features, twist: FloatArray) -> bool:
+        """Whether the next sweep is solved, too, and the last ones may yet fit.
+
+        ``twist`` (6,) is the body velocity with which the lidar came to that sweep.
+        """
+        seconds = (features.stamp - self.last.stamp) * 1e-9
+        guess = advance(self.last.map_T_lidar, twist, seconds)
         self.last = self._mapper.register(features, guess, twist)
         seen = self._mapper.registered
         if not self.last.status.solved or seen is None or seen.matches is None:
@@ -83,6 +75,9 @@ class Hypothesis:
 class Hypotheses:
     """All hypotheses about where a lidar is in a saved map.
 
+    How it moves is told by a map of its own, of the sweeps since the search began: a sweep that is
+    not de-skewed fits badly anywhere.
+
     Parameters
     ----------
     search : of the map
@@ -92,6 +87,7 @@ class Hypotheses:
 
     def __init__(self, search: PlaceSearch, maps: SavedMaps, config: Config) -> None:
         self._search, self._maps, self._config = search, maps, config
+        self._motion = Mapper(config.changed({"map.archive_megabytes": 0.0}))
         self._held: list[Hypothesis] = []
 
     def add(
@@ -101,56 +97,47 @@ class Hypotheses:
 
         ``near`` is a pose, if there is one, around which the sweep is looked for as well.
         """
-        sweep = MovingSweep(features, self._config)
-        self._held = [h for h in self._held if h.follow(features, self._search)]
-        self._held = _different(sorted(self._held, key=lambda held: -held.fits[-1].total))
-        message = ""
-        for held in [held for held in self._held if held.rivals_below() > 0.0]:
-            rivals = self._rivals(sweep.at(held.last.twist), features, held)
+        moved = self._motion.register(features)
+        if not moved.status.solved:
+            self._held.clear()
+            return None, f"how the lidar moves is not known yet ({moved.message})"
+        twist = moved.twist
+        self._held = _different([h for h in self._held if h.follow(features, twist)])
+        standing = [held for held in self._held if held.rivals_below() > 0.0]
+        if self._held and not standing:
+            best = _told(self._held[0].fits[-1])
+            return None, f"{len(self._held)} poses are followed; the best: {best}"
+        posed = MovingSweep(features, self._config).at(twist)
+        known = [held.pose for held in standing] + ([] if near is None else [near])
+        found = self._search.find(posed, features.reach, known)
+        if not found:
+            return None, "no place fits"
+        message = f"the best pose: {_told(found[0].fit)}"
+        for held in standing:
+            rivals = self._search.rivals(held.pose, found, held.rivals_below())
             if not rivals:
                 return held.last, ""
             message = f"{len(rivals)} other poses fit the map nearly as well as the best"
-            self._begin(sweep.at(held.last.twist), features, rivals)
-            break
-        if self._held:
-            followed = f"{len(self._held)} poses are followed"
-            return None, message or f"{followed}; the best: {_told(self._held[0].fits[-1])}"
-        posed = sweep.at(np.zeros(6))
-        found = self._search.find(posed, features.reach, near)
+        self._held = [h for h in self._held if not self._search.refuted(h.pose, found)]
         self._begin(posed, features, found)
-        return None, f"the best pose: {_told(found[0].fit)}" if found else "no place fits"
+        return None, message
 
     def _begin(self, posed: PosedSweep, features: Features, found: list[Candidate]) -> None:
         """Follow the best of what was found, if they are not followed already."""
         for candidate in found[:_HYPOTHESES]:
-            start, hopeful = candidate.map_T_middle, _HOPEFUL * found[0].fit.total
-            known = any(same(start, held.pose) for held in self._held)
-            if candidate.fit.total >= hopeful and not known and len(self._held) < 2 * _HYPOTHESES:
+            start, hopeful = candidate.map_T_middle, _HOPEFUL * found[0].fit.favour
+            known = any(same_optimum(start, held.pose) for held in self._held)
+            if candidate.fit.favour >= hopeful and not known and len(self._held) < 2 * _HYPOTHESES:
                 mapper = Mapper(self._config)
                 mapper.maps = self._maps
-                self._held.append(Hypothesis(posed, features, start, mapper))
-
-    def _rivals(self, posed: PosedSweep, features: Features, held: Hypothesis) -> list[Candidate]:
-        """Other poses at which the sweep fits nearly as well, or better."""
-        found = self._search.find(posed, features.reach, held.pose)
-        own = [c.fit.total for c in found if same(c.map_T_middle, held.pose)]
-        if not own:
-            return found or [Candidate(held.pose, held.fits[-1])]  # not found again: no fix
-        near, far = _CLEARLY[0][1] * own[0], held.rivals_below() * own[0]
-        radius = self._config.loops.search
-        return [
-            c
-            for c in found
-            if not same(c.map_T_middle, held.pose)
-            and c.fit.total >= (far if c.map_T_middle.range(held.pose) > radius else near)
-        ]
+                self._held.append(Hypothesis(posed, features, candidate, mapper))
 
 
 def _different(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
     """The first of those that have come to the same pose."""
     chosen: list[Hypothesis] = []
     for one in hypotheses:
-        if not any(same(one.pose, other.pose) for other in chosen):
+        if not any(same_optimum(one.pose, other.pose) for other in chosen):
             chosen.append(one)
     return chosen
 

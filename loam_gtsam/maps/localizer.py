@@ -63,6 +63,8 @@ class Localizer:
         descriptor in ``loops``) is that of the map. That of the map's run if None.
     imu : samples must be in it before the sweeps they belong to; None does without
     extend : add what the map does not have yet, to be saved by :meth:`save`
+    inside : the lidar is surely in the map; else it may be in a place that looks like one of those
+        in the map, and there is no fix where several of these fit nearly as well
     parts : of a user's own, see :class:`~loam_gtsam.pipeline.Parts`, for the tracking
 
     Attributes
@@ -86,6 +88,7 @@ class Localizer:
         *,
         imu: ImuBuffer | None = None,
         extend: bool = False,
+        inside: bool = False,
         **parts: Unpack[Parts],
     ) -> None:
         if not saved.places:
@@ -94,7 +97,8 @@ class Localizer:
                 "too short, or never solved; map more of the place"
             )
         self.config = config_in(saved, config, extend=extend)
-        self._saved, self._parts, self._extend = saved, parts, extend
+        self._saved, self._parts = saved, parts
+        self._extend, self._inside = extend, inside
         self._tracking = Pipeline(self.config, imu=imu, **parts)
         positions = [place.map_T_middle.translation() for place in saved.places]
         self._tree = cKDTree(np.array(positions))
@@ -115,7 +119,7 @@ class Localizer:
         self._maps.grows = False
         # A fix needs to know which directions are seen, which not every solver tells.
         config = self.config.changed(solver=SolverConfig())
-        search = PlaceSearch(self._places, self._maps, config)
+        search = PlaceSearch(self._places, self._maps, config, inside=self._inside)
         self._hypotheses = Hypotheses(search, self._maps, config)
         self._fixed = False
 
@@ -311,6 +315,7 @@ def localise(
     on_frame: OnFrame | None = None,
     workers: int = 0,
     extend: bool = False,
+    inside: bool = False,
     **parts: Unpack[Parts],
 ) -> Localisation:
     """Localise a data set in a saved map.
@@ -322,7 +327,7 @@ def localise(
     max_frames : stop after so many sweeps
     on_frame : e.g. to show progress
     workers : processes that extract the features of the sweeps to come
-    extend, parts : see :class:`Localizer`
+    extend, inside, parts : see :class:`Localizer`
 
     Returns
     -------
@@ -331,7 +336,7 @@ def localise(
     """
     config = effective_config(config or own_settings(saved), dataset)
     imu = imu_buffer(dataset, config)
-    localizer = Localizer(saved, config, imu=imu, extend=extend, **parts)
+    localizer = Localizer(saved, config, imu=imu, extend=extend, inside=inside, **parts)
     if parts.get("features") is not None:
         workers = 0
     updates: list[MapUpdate] = []

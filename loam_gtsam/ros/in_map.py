@@ -30,6 +30,7 @@ class InMap(Odometry):
     ----------
     path : of the saved map, or of the folder of its run
     config : of the live run; what belongs to the map is that of the map
+    inside : the lidar is surely in the map, see :class:`~loam_gtsam.maps.Localizer`
 
     Attributes
     ----------
@@ -41,9 +42,9 @@ class InMap(Odometry):
         If the map cannot be read.
     """
 
-    def __init__(self, path: str | Path, config: Config) -> None:
+    def __init__(self, path: str | Path, config: Config, *, inside: bool = False) -> None:
         self._saved = SavedMap(map_of_run(path))
-        self._localizer = Localizer(self._saved, config, odometry=self)
+        self._localizer = Localizer(self._saved, config, inside=inside, odometry=self)
         self._past: deque[MapUpdate] = deque(maxlen=_KEPT)
         self.map_T_odom: gtsam.Pose3 | None = None
 

@@ -51,6 +51,7 @@ PARAMETERS: dict[str, Any] = {
     "time_unit": "",
     "stamp_is": "",
     "map": "",
+    "inside": False,
     "output": "",
     "report_every": 10.0,
 }
@@ -93,8 +94,9 @@ class LiveNode:
         self._held = ExitStack()
         if self._output is not None:
             self._held.enter_context(used_alone(self._output))
-        self._in_map = InMap(values["map"], config) if values["map"] else None
-        if self._in_map is not None:
+        self._in_map = None
+        if values["map"]:
+            self._in_map = InMap(values["map"], config, inside=values["inside"])
             self._held.callback(self._in_map.close)
         self._updates: list[MapUpdate] = []
         self._on_error = on_error

@@ -18,13 +18,15 @@ from loam_gtsam.config import preset
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.geometry import inverse_pose, transform
-from loam_gtsam.maps.first_fix import Candidate
-from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, Hypothesis
+from loam_gtsam.maps.first_fix import Candidate, PlaceSearch
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypothesis
 from loam_gtsam.maps.localizer import Localizer, localise
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.maps.map_graph import MapGraph
+from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.relocalization.evidence import Evidence
 from loam_gtsam.types import BadSweep, ConfigError, FrameStatus, InputError, MapUpdate
 
 NEAR = 0.06  # metres, of a pose in the map
@@ -203,29 +205,60 @@ def test_a_hypothesis_stands_if_it_fits_and_sees_all_directions(held, below):
     assert held.held.rivals_below() == below
 
 
+def candidate(x: float, fit: float, agreeing: int) -> Candidate:
+    """A pose with walls across the way from one such pose to another."""
+    points, walls = np.zeros((100, 3)), np.tile([1.0, 0.0, 0.0], (100, 1))
+    points[:, 0] = x
+    signs = np.where(np.arange(100) < agreeing, 1.0, -5.0)
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
+    return Candidate(pose, Fit(fit, 1.0), Evidence(0, points, signs, walls))
+
+
 @pytest.mark.parametrize(
-    ("agreement", "rivals", "count"),
+    ("others", "far", "count", "inside"),
     [
-        (0.95, [(0.0, 0.3), (50.0, 0.2)], 0),
-        (0.95, [(0.0, 0.3), (50.0, 0.25)], 1),  # another place fits nearly as well
-        (0.8, [(0.0, 0.3), (50.0, 0.2)], 1),  # a changed place must stand out more
-        (0.8, [(0.0, 0.3), (3.0, 0.2)], 0),  # than another minimum near by
-        (0.8, [(0.0, 0.3), (3.0, 0.25)], 1),
-        (0.95, [(50.0, 0.1)], 1),  # not found again where it is
-        (0.95, [], 1),
+        ([(50.0, 0.2, 60)], 0.75, 0, 0),
+        ([(50.0, 0.25, 60)], 0.75, 1, 0),  # another place fits nearly as well
+        ([(50.0, 0.2, 60)], 0.5, 1, 0),  # a changed place must stand out more
+        ([(3.0, 0.2, 60)], 0.5, 0, 0),  # than another optimum near by
+        ([(3.0, 0.25, 60)], 0.5, 1, 0),
+        ([(50.0, 0.1, 100), (60.0, 0.1, 60)], 0.75, 1, 1),  # the sweep does not object
     ],
 )
-def test_a_fix_needs_that_no_other_place_fits_nearly_as_well(agreement, rivals, count):
-    class Search:
-        def find(self, posed, reach, near=None):
-            found = [Candidate(gtsam.Pose3(gtsam.Rot3(), np.array([x, 0, 0])), Fit(fit, 1.0))
-                     for x, fit in rivals]  # fmt: skip
-            return sorted(found, key=lambda candidate: -candidate.fit.total)
+def test_a_fix_needs_that_no_other_place_may_be_right(saved, others, far, count, inside):
+    found = [candidate(0.0, 0.3, 100), *(candidate(*other) for other in others)]
+    here, places, maps = found[0].map_T_middle, saved.places, SavedMaps(saved.config, saved)
+    search = PlaceSearch(places, maps, saved.config)
+    assert len(search.rivals(here, found, far)) == count
+    assert not search.refuted(here, found)
+    assert (
+        len(PlaceSearch(places, maps, saved.config, inside=True).rivals(here, found, far)) == inside
+    )
 
-    held = Held(agreement).held
-    hypotheses = Hypotheses(Search(), None, held._config)
-    features = type("Reach", (), {"reach": 20.0})
-    assert len(hypotheses._rivals(None, features, held)) == count
+
+def test_a_pose_is_given_up_if_the_sweep_speaks_against_it_or_is_not_found_there(saved):
+    search = PlaceSearch(saved.places, SavedMaps(saved.config, saved), saved.config)
+    found = [candidate(0.0, 0.3, 100), candidate(50.0, 0.2, 60)]
+    assert search.refuted(found[1].map_T_middle, found)
+    assert search.refuted(candidate(7.0, 0.3, 100).map_T_middle, found)
+    assert len(search.rivals(candidate(7.0, 0.3, 100).map_T_middle, found, 0.75)) == 2
+
+
+def test_where_bays_repeat_a_lidar_is_found_only_if_it_is_surely_in_the_map(tmp_path):
+    """Another storey would look the same but for what is parked there."""
+    monday = SimulatedWorld("garage", seed=1, frames=50, columns=600)
+    mapped = run(monday)
+    save_map(tmp_path / "garage.lgmap", mapped.pipeline)
+    tuesday = SimulatedWorld("garage", seed=1, frames=50, columns=600, range_noise=0.03)
+    drive = PartOf(tuesday, 40, 1, None, None)
+    with SavedMap(tmp_path / "garage.lgmap") as saved:
+        assert not localise(drive, saved, max_frames=8).fixes
+        found = localise(drive, saved, max_frames=8, inside=True)
+    assert found.fixes == 1
+    true = dict(zip(monday.truth.stamps.tolist(), monday.truth.map_T_lidar, strict=True))
+    start = mapped.updates[0].map_T_lidar
+    off = [u.map_T_lidar.range(start.compose(gtsam.Pose3(true[u.stamp]))) for u in found.solved]
+    assert max(off) < NEAR
 
 
 def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path):

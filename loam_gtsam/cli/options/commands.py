@@ -121,6 +121,11 @@ class LocaliseOptions(OutputOptions, PartOptions):
         "Add what the map does not have yet, and write the larger map to DIR/map.lgmap; MAP stays.",
         "--extend",
     )
+    inside: bool = flag(
+        "The lidar is surely in the map, not on another storey or beyond it: found where much "
+        "looks alike, too.",
+        "--inside",
+    )
     frames: int | None = option("Stop after so many sweeps.", min=1)
     workers: int | None = option(
         "Processes that extract features ahead; by default one for more than 200 sweeps.",

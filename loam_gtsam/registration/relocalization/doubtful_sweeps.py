@@ -13,7 +13,7 @@ import numpy as np
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.odometry import Prediction, advance
-from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, favour
+from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
     AS_WELL,
     Fit,
@@ -186,8 +186,8 @@ def _elsewhere(
 
 def _speaks_for(here: Evidence, other: Solution, matcher: FrameMatcher) -> bool:
     """Whether the features of a matcher speak for a place against another one, beyond chance."""
-    told = favour([here], [Evidence.of(matcher, other, dense=True)])
-    return told.every > CHANCE and told.weight > matcher.config.solver.min_aligned
+    there = Evidence.of(matcher, other, dense=True)
+    return speaks_for(here, there, matcher.config.solver.min_aligned)
 
 
 def _rivals(

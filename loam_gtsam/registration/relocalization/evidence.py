@@ -97,6 +97,15 @@ def favour(tried: Sequence[Evidence], others: Sequence[Evidence]) -> Favour:
     return Favour(every, lines, planes, sum(weight for _, _, weight in found) / len(found))
 
 
+def speaks_for(here: Evidence, other: Evidence, least: float) -> bool:
+    """Whether a sweep speaks for a place against another one, beyond chance and by ``least``.
+
+    That is a number of features, counted as in :class:`Favour`.
+    """
+    told = favour([here], [other])
+    return told.every > CHANCE and told.weight > least
+
+
 def _gain(tried: Evidence, other: Evidence) -> tuple[FloatArray, BoolArray, float]:
     """What each feature (F,) says for one place against another, which are edges, and their number.
 

@@ -47,6 +47,11 @@ class Fit:
         """Share of the features whose matches agree."""
         return self.share * self.agreement
 
+    @property
+    def favour(self) -> float:
+        """Share of the features whose matches agree, less that of those whose matches do not."""
+        return self.share * (2.0 * self.agreement - 1.0)
+
 
 def beyond_any_motion(step: FloatArray, seconds: float, config: RelocalizationConfig) -> bool:
     """Whether no acceleration explains a step (6,) away from constant velocity, rad and m."""
@@ -65,10 +70,10 @@ def agreeing(matches: ScanMatches) -> tuple[BoolArray, BoolArray]:
     return lines, surfaces
 
 
-def same(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
-    """Whether two poses are no farther apart than the starts of a search."""
+def same(one: gtsam.Pose3, other: gtsam.Pose3, apart: tuple[float, float] = APART) -> bool:
+    """Whether two poses are less than so many metres and rad apart: by default as starts are."""
     turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
-    return bool(one.range(other) < APART[0] and turn < APART[1])
+    return bool(one.range(other) < apart[0] and turn < apart[1])
 
 
 class FitMonitor:

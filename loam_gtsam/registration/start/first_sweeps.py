@@ -167,6 +167,9 @@ class Start:
         """The sweeps, each registered with the map of all the others, so many times."""
         for _ in range(rounds):
             sweeps = self._with_motion(sweeps)
+            if len(sweeps) > 2 and not any(sweep.held for sweep in sweeps[1:]):
+                sweeps = self._all_at_once(frame, sweeps, solver)
+                continue
             for number, sweep in enumerate(sweeps):
                 if sweep.held and sweep.posed.sweep is not frame.sweep:
                     continue
@@ -174,6 +177,22 @@ class Start:
                 if solution.solved:
                     sweeps[number] = replace(sweeps[number], map_T_middle=solution.map_T_lidar)
         return sweeps
+
+    def _all_at_once(
+        self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
+    ) -> list[EarlySweep]:
+        """The sweeps, each registered with the map of all the others where these were before.
+
+        The first one as well, and all are moved with it to where it was: what pushes every sweep
+        off a map, as planes through curved ground do, then pushes none away from another.
+        """
+        poses = []
+        for number, sweep in enumerate(sweeps):
+            solution = self._solved(frame, sweep, self._matcher(frame, sweeps, number), solver)
+            poses.append(solution.map_T_lidar if solution.solved else sweep.map_T_middle)
+        back = sweeps[0].map_T_middle.compose(poses[0].inverse())
+        moved = zip(sweeps[1:], poses[1:], strict=True)
+        return [sweeps[0], *(replace(one, map_T_middle=back.compose(pose)) for one, pose in moved)]
 
     def _told_apart(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver

@@ -167,8 +167,8 @@ class Start:
         """The sweeps, each registered with the map of all the others, so many times."""
         for _ in range(rounds):
             sweeps = self._with_motion(sweeps)
-            if len(sweeps) > 2 and not any(sweep.held for sweep in sweeps[1:]):
-                sweeps = self._all_at_once(frame, sweeps, solver)
+            if (moved := self._all_at_once(frame, sweeps, solver)) is not None:
+                sweeps = moved
                 continue
             for number, sweep in enumerate(sweeps):
                 if sweep.held and sweep.posed.sweep is not frame.sweep:
@@ -180,15 +180,20 @@ class Start:
 
     def _all_at_once(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
-    ) -> list[EarlySweep]:
+    ) -> list[EarlySweep] | None:
         """The sweeps, each registered with the map of all the others where these were before.
 
         The first one as well, and all are moved with it to where it was: what pushes every sweep
-        off a map, as planes through curved ground do, then pushes none away from another.
+        off a map, as planes through curved ground do, then pushes none away from another. None if
+        other factors hold some of them, or if the first one does not see all directions.
         """
-        poses = []
+        if len(sweeps) < 3 or any(sweep.held for sweep in sweeps[1:]):
+            return None
+        poses: list[gtsam.Pose3] = []
         for number, sweep in enumerate(sweeps):
             solution = self._solved(frame, sweep, self._matcher(frame, sweeps, number), solver)
+            if number == 0 and (not solution.solved or solution.weak is not None):
+                return None
             poses.append(solution.map_T_lidar if solution.solved else sweep.map_T_middle)
         back = sweeps[0].map_T_middle.compose(poses[0].inverse())
         moved = zip(sweeps[1:], poses[1:], strict=True)

@@ -189,15 +189,23 @@ class Start:
         """
         if len(sweeps) < 3 or any(sweep.held for sweep in sweeps[1:]):
             return None
-        poses: list[gtsam.Pose3] = []
+        solutions = []
         for number, sweep in enumerate(sweeps):
-            solution = self._solved(frame, sweep, self._matcher(frame, sweeps, number), solver)
-            if number == 0 and (not solution.solved or solution.weak is not None):
+            matcher = self._matcher(frame, sweeps, number)
+            solutions.append(self._solved(frame, sweep, matcher, solver))
+            if number == 0 and (not solutions[0].solved or solutions[0].weak is not None):
                 return None
-            poses.append(solution.map_T_lidar if solution.solved else sweep.map_T_middle)
-        back = sweeps[0].map_T_middle.compose(poses[0].inverse())
-        moved = zip(sweeps[1:], poses[1:], strict=True)
-        return [sweeps[0], *(replace(one, map_T_middle=back.compose(pose)) for one, pose in moved)]
+        first, solved = sweeps[0].map_T_middle, solutions[0]
+        pushed = first.localCoordinates(solved.map_T_lidar)
+        if solved.unseen is not None:  # no planes push it along there
+            pushed = pushed - solved.unseen @ pushed
+        back = first.compose(first.retract(pushed).inverse())
+        return [sweeps[0]] + [
+            replace(sweep, map_T_middle=back.compose(solution.map_T_lidar))
+            if solution.solved
+            else sweep
+            for sweep, solution in zip(sweeps[1:], solutions[1:], strict=True)
+        ]
 
     def _told_apart(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver

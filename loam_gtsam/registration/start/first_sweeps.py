@@ -35,6 +35,7 @@ from loam_gtsam.registration.start.ways import (
     continued,
     kept_ways,
     mean_twist,
+    moved_with_first,
     without_turns,
 )
 from loam_gtsam.types import FloatArray, SweepMotion
@@ -122,19 +123,15 @@ class Start:
         if imu is not None and imu.trusted_gyro is None:
             self._forget_gyro()
         frame, found = self._added(frame, found, keyframe, solver)
-        doubt = self._doubt(frame.sweep.stamp, found.solution.map_T_lidar)
-        return frame, replace(found, doubt=doubt)
+        others = [continued(sweeps, frame.sweep.stamp) for sweeps in self._rivals]
+        doubt = any_of(found.solution.map_T_lidar, others)
+        return frame, replace(found, doubt=np.zeros((6, 6)) if doubt is None else doubt)
 
     def _forget_gyro(self) -> None:
         """Take the gyro out of all sweeps, which are to be registered anew."""
         if any(sweep.posed.sweep.motion is SweepMotion.GYRO for sweep in self._sweeps):
             self._sweeps, *self._rivals = map(without_turns, (self._sweeps, *self._rivals))
             self._anew = True
-
-    def _doubt(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
-        """Covariance (6, 6) of a pose, map frame, for other first motions that fit as well."""
-        doubt = any_of(map_T_lidar, [continued(sweeps, stamp) for sweeps in self._rivals])
-        return np.zeros((6, 6)) if doubt is None else doubt
 
     def _added(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
@@ -167,8 +164,8 @@ class Start:
         """The sweeps, each registered with the map of all the others, so many times."""
         for _ in range(rounds):
             sweeps = self._with_motion(sweeps)
-            if (moved := self._all_at_once(frame, sweeps, solver)) is not None:
-                sweeps = moved
+            if (solutions := self._at_once(frame, sweeps, solver)) is not None:
+                sweeps = moved_with_first(sweeps, solutions)
                 continue
             for number, sweep in enumerate(sweeps):
                 if sweep.held and sweep.posed.sweep is not frame.sweep:
@@ -178,34 +175,22 @@ class Start:
                     sweeps[number] = replace(sweeps[number], map_T_middle=solution.map_T_lidar)
         return sweeps
 
-    def _all_at_once(
+    def _at_once(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
-    ) -> list[EarlySweep] | None:
-        """The sweeps, each registered with the map of all the others where these were before.
+    ) -> list[Solution] | None:
+        """Each sweep, the first as well, registered with the map of the others as they are.
 
-        The first one as well, and all are moved with it to where it was: what pushes every sweep
-        off a map, as planes through curved ground do, then pushes none away from another. None if
-        other factors hold some of them, or if the first one does not see all directions.
+        None if other factors hold some of them, or if the first one does not see all directions.
         """
         if len(sweeps) < 3 or any(sweep.held for sweep in sweeps[1:]):
             return None
-        solutions = []
+        solutions: list[Solution] = []
         for number, sweep in enumerate(sweeps):
             matcher = self._matcher(frame, sweeps, number)
             solutions.append(self._solved(frame, sweep, matcher, solver))
-            if number == 0 and (not solutions[0].solved or solutions[0].weak is not None):
+            if not solutions[0].solved or solutions[0].weak is not None:
                 return None
-        first, solved = sweeps[0].map_T_middle, solutions[0]
-        pushed = first.localCoordinates(solved.map_T_lidar)
-        if solved.unseen is not None:  # no planes push it along there
-            pushed = pushed - solved.unseen @ pushed
-        back = first.compose(first.retract(pushed).inverse())
-        return [sweeps[0]] + [
-            replace(sweep, map_T_middle=back.compose(solution.map_T_lidar))
-            if solution.solved
-            else sweep
-            for sweep, solution in zip(sweeps[1:], solutions[1:], strict=True)
-        ]
+        return solutions
 
     def _told_apart(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
@@ -246,11 +231,7 @@ class Start:
         return best
 
     def _followed(
-        self,
-        frame: Frame,
-        way: list[EarlySweep],
-        sweeps: Sequence[EarlySweep],
-        solver: ScanSolver,
+        self, frame: Frame, way: list[EarlySweep], sweeps: Sequence[EarlySweep], solver: ScanSolver
     ) -> list[EarlySweep]:
         """A way with further sweeps, each expected at constant velocity, registered together."""
         for sweep in sweeps:
@@ -282,12 +263,7 @@ class Start:
         return self._registered(frame, [first, second], solver, quickly=True)
 
     def _registered(
-        self,
-        frame: Frame,
-        sweeps: list[EarlySweep],
-        solver: ScanSolver,
-        *,
-        quickly: bool = False,
+        self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver, *, quickly: bool = False
     ) -> Tried:
         """The last of some sweeps, registered with the others, and what its features say of it."""
         matcher = self._matcher(frame, sweeps, len(sweeps) - 1)

@@ -62,6 +62,26 @@ def continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
     return advance(last.map_T_middle, mean_twist(before, last), last.moment.seconds_to(stamp))
 
 
+def moved_with_first(
+    sweeps: Sequence[EarlySweep], solutions: Sequence[Solution]
+) -> list[EarlySweep]:
+    """Sweeps that were solved, all moved with the first one to where that was.
+
+    What pushes every sweep off a map, as planes through curved ground do, then pushes none away
+    from another. Along ways that no planes fix the first one was held.
+    """
+    first, solved = sweeps[0].map_T_middle, solutions[0]
+    pushed = first.localCoordinates(solved.map_T_lidar)
+    if solved.unseen is not None:
+        pushed = pushed - solved.unseen @ pushed
+    back = first.compose(first.retract(pushed).inverse())
+    pairs = zip(sweeps[1:], solutions[1:], strict=True)
+    moved = [
+        replace(s, map_T_middle=back.compose(f.map_T_lidar)) if f.solved else s for s, f in pairs
+    ]
+    return [sweeps[0], *moved]
+
+
 def mean_twist(one: EarlySweep, other: EarlySweep) -> FloatArray:
     """Mean body velocity (6,) from one sweep to the next, rad/s and m/s."""
     moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))

@@ -169,7 +169,7 @@ def same_optimum(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
 def distinct(candidates: list[Candidate]) -> list[Candidate]:
     """The best of those that ended in the same optimum, the best first."""
     chosen: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: -c.fit.favour):
+    for candidate in sorted(candidates, key=lambda c: -c.fit.margin):
         if not any(same_optimum(candidate.map_T_middle, other.map_T_middle) for other in chosen):
             chosen.append(candidate)
     return chosen

@@ -100,7 +100,10 @@ class Hypotheses:
         moved = self._motion.register(features)
         if not moved.status.solved:
             self._held.clear()
-            return None, f"how the lidar moves is not known yet ({moved.message})"
+            if moved.status is not FrameStatus.FIRST:  # it may be anywhere now
+                self._motion.reset()
+                self._motion.register(features)
+            return None, "how the lidar moves is not known before the next sweep"
         twist = moved.twist
         self._held = _different([h for h in self._held if h.follow(features, twist)])
         standing = [held for held in self._held if held.rivals_below() > 0.0]
@@ -125,9 +128,9 @@ class Hypotheses:
     def _begin(self, posed: PosedSweep, features: Features, found: list[Candidate]) -> None:
         """Follow the best of what was found, if they are not followed already."""
         for candidate in found[:_HYPOTHESES]:
-            start, hopeful = candidate.map_T_middle, _HOPEFUL * found[0].fit.favour
+            start, hopeful = candidate.map_T_middle, _HOPEFUL * found[0].fit.margin
             known = any(same_optimum(start, held.pose) for held in self._held)
-            if candidate.fit.favour >= hopeful and not known and len(self._held) < 2 * _HYPOTHESES:
+            if candidate.fit.margin >= hopeful and not known and len(self._held) < 2 * _HYPOTHESES:
                 mapper = Mapper(self._config)
                 mapper.maps = self._maps
                 self._held.append(Hypothesis(posed, features, candidate, mapper))

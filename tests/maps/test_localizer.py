@@ -116,6 +116,22 @@ def test_a_lidar_that_is_carried_away_is_found_again(mapped, saved):
     assert second[-1].status is FrameStatus.OK
 
 
+def test_a_lidar_that_is_carried_into_the_map_while_it_is_looked_for_is_found(mapped, saved):
+    outside, drive, localizer = (
+        world("park", seed=3, frames=6),
+        other_drive(mapped),
+        Localizer(saved),
+    )
+    before = [localizer.process(sweep) for sweep in outside]
+    shift = before[-1].stamp + 100_000_000 - drive.sweep(0).stamp
+    sweeps = [drive.sweep(number) for number in range(8)]
+    after = [localizer.process(replace(sweep, stamp=sweep.stamp + shift)) for sweep in sweeps]
+    assert {update.status for update in before} == {FrameStatus.LOST}
+    assert after[-1].status is FrameStatus.OK
+    off = errors(mapped, drive, [replace(after[-1], stamp=sweeps[-1].stamp)])
+    assert np.linalg.norm(off[0][3:]) < NEAR
+
+
 def test_sweeps_that_cannot_be_used_cost_no_fix_and_a_reset_forgets(mapped, saved):
     drive, localizer = other_drive(mapped), Localizer(saved)
     none = localizer.process(BadSweep(drive.sweep(0).stamp - 1, "torn"))

@@ -48,7 +48,7 @@ class Fit:
         return self.share * self.agreement
 
     @property
-    def favour(self) -> float:
+    def margin(self) -> float:
         """Share of the features whose matches agree, less that of those whose matches do not."""
         return self.share * (2.0 * self.agreement - 1.0)
 

@@ -7,8 +7,9 @@ found.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -34,6 +35,7 @@ _STARTS = 18  # number of poses around all of these at which a registration star
 _NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
 _OPTIMA = (0.3, np.radians(3.0))  # metres and rad between two optima of registrations
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,7 +107,8 @@ class PlaceSearch:
                 pose = solution.map_T_lidar
                 fit = standing_fit(solution.matches, trial.offered, pose)
                 found.append(Candidate(pose, fit, Evidence.of(trial, solution, dense=True)))
-        found = distinct(found)
+        found.sort(key=lambda c: -c.fit.margin)
+        found = distinct(found, lambda c: c.map_T_middle)
         against = [sum(self._favoured(other, one) for other in found) for one in found]
         return [found[number] for number in np.argsort(against, kind="stable")]
 
@@ -166,12 +169,12 @@ def same_optimum(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
     return same(one, other, _OPTIMA)
 
 
-def distinct(candidates: list[Candidate]) -> list[Candidate]:
-    """The best of those that ended in the same optimum, the best first."""
-    chosen: list[Candidate] = []
-    for candidate in sorted(candidates, key=lambda c: -c.fit.margin):
-        if not any(same_optimum(candidate.map_T_middle, other.map_T_middle) for other in chosen):
-            chosen.append(candidate)
+def distinct(items: Iterable[_Item], pose: Callable[[_Item], gtsam.Pose3]) -> list[_Item]:
+    """The first of those whose poses are in the same optimum."""
+    chosen: list[_Item] = []
+    for item in items:
+        if not any(same_optimum(pose(item), pose(other)) for other in chosen):
+            chosen.append(item)
     return chosen
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, same_optimum, standing_fit
+from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, distinct, same_optimum, standing_fit
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.relocalization import Fit
@@ -105,11 +105,12 @@ class Hypotheses:
                 self._motion.register(features)
             return None, "how the lidar moves is not known before the next sweep"
         twist = moved.twist
-        self._held = _different([h for h in self._held if h.follow(features, twist)])
+        followed = [held for held in self._held if held.follow(features, twist)]
+        self._held = distinct(followed, lambda held: held.pose)
         standing = [held for held in self._held if held.rivals_below() > 0.0]
         if self._held and not standing:
-            best = _told(self._held[0].fits[-1])
-            return None, f"{len(self._held)} poses are followed; the best: {best}"
+            best = max((held.fits[-1] for held in self._held), key=lambda fit: fit.margin)
+            return None, f"{len(self._held)} poses are followed; the best: {_told(best)}"
         posed = MovingSweep(features, self._config).at(twist)
         known = [held.pose for held in standing] + ([] if near is None else [near])
         found = self._search.find(posed, features.reach, known)
@@ -134,15 +135,6 @@ class Hypotheses:
                 mapper = Mapper(self._config)
                 mapper.maps = self._maps
                 self._held.append(Hypothesis(posed, features, candidate, mapper))
-
-
-def _different(hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-    """The first of those that have come to the same pose."""
-    chosen: list[Hypothesis] = []
-    for one in hypotheses:
-        if not any(same_optimum(one.pose, other.pose) for other in chosen):
-            chosen.append(one)
-    return chosen
 
 
 def _told(fit: Fit) -> str:

@@ -80,11 +80,13 @@ def test_a_lidar_without_rings_is_found_in_the_map_of_one_with_rings(mapped, sav
     assert max(np.linalg.norm(e[3:]) for e in errors(mapped, drive, found.solved)) < NEAR
 
 
-def test_a_narrow_view_is_not_found_in_a_room_that_looks_the_same(mapped, saved):
+@pytest.mark.parametrize(("first", "is_found"), [(6, False), (18, True)])
+def test_a_narrow_view_is_not_found_in_a_room_that_looks_the_same(mapped, saved, first, is_found):
     """Rooms repeat, and the right pose need not be one of the three likeliest of a place."""
-    drive = SimulatedWorld("rooms", seed=1, frames=12, sensor="avia")
+    drive = SimulatedWorld("rooms", seed=1, frames=first + 6, sensor="avia")
     drive._seed = 2
-    found = localise(PartOf(drive, 6, 1), saved)
+    found = localise(PartOf(drive, first, 1), saved)
+    assert found.fixes == is_found
     assert all(np.linalg.norm(e[3:]) < NEAR for e in errors(mapped, drive, found.solved))
 
 
@@ -117,11 +119,8 @@ def test_a_lidar_that_is_carried_away_is_found_again(mapped, saved):
 
 
 def test_a_lidar_that_is_carried_into_the_map_while_it_is_looked_for_is_found(mapped, saved):
-    outside, drive, localizer = (
-        world("park", seed=3, frames=6),
-        other_drive(mapped),
-        Localizer(saved),
-    )
+    outside, drive = world("park", seed=3, frames=6), other_drive(mapped)
+    localizer = Localizer(saved)
     before = [localizer.process(sweep) for sweep in outside]
     shift = before[-1].stamp + 100_000_000 - drive.sweep(0).stamp
     sweeps = [drive.sweep(number) for number in range(8)]
@@ -247,9 +246,8 @@ def test_a_fix_needs_that_no_other_place_may_be_right(saved, others, far, count,
     search = PlaceSearch(places, maps, saved.config)
     assert len(search.rivals(here, found, far)) == count
     assert not search.refuted(here, found)
-    assert (
-        len(PlaceSearch(places, maps, saved.config, inside=True).rivals(here, found, far)) == inside
-    )
+    surely = PlaceSearch(places, maps, saved.config, inside=True)
+    assert len(surely.rivals(here, found, far)) == inside
 
 
 def test_a_pose_is_given_up_if_the_sweep_speaks_against_it_or_is_not_found_there(saved):
@@ -367,10 +365,10 @@ def test_what_is_gone_since_the_map_was_made_is_cleaned_out_of_the_larger_map(
     last = drive.world_T_start @ drive.truth.map_T_lidar[-1]
     cupboard = np.array([[*(last @ [2.0, 0.0, 0.0, 1.0])[:2], 0.75, 0.3, 0.3, 0.75, 0.0]])
     solids = replace(scene.solids, boxes=np.concatenate([scene.solids.boxes, cupboard]))
-    before = SimulatedWorld(replace(scene, solids=solids), seed=1, frames=10, columns=450)
+    before = SimulatedWorld(replace(scene, solids=solids), seed=1, frames=10, columns=600)
     first = run(before)
     save_map("before.lgmap", first.pipeline)
-    spec = "sim:rooms?seed=1&frames=10&columns=450"
+    spec = "sim:rooms?seed=1&frames=10&columns=600"
     for command in (("localise", spec, "before.lgmap", "--extend", "--output", "out"),
                     ("clean", spec, "out")):  # fmt: skip
         done = loam(*command, "--no-plot", "--quiet")
@@ -387,7 +385,7 @@ def test_what_is_gone_since_the_map_was_made_is_cleaned_out_of_the_larger_map(
 
     was, now = points("out/map.lgmap"), points("out/cleaned/map.lgmap")
     assert was[0] > 15
-    assert now[0] <= 0.15 * was[0]
+    assert now[0] <= 0.1 * was[0]
     assert now[1] > 0.98 * was[1]
 
 

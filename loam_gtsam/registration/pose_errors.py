@@ -208,7 +208,7 @@ class PoseErrors:
         )
         self._last, self._paused = now, False
         total = self._drift + self._blind @ self._blind.T + self._moved
-        total = total + self._origin.error(self._motion.variances)
+        total = total + self._origin.error(self._motion.at_first)
         covariance = symmetric(own + drifted @ total @ drifted.T)
         return replace(update, covariance=covariance, uncertainty=uncertainty)
 
@@ -341,7 +341,7 @@ class PoseErrors:
         if self._last is not None and sweep.stamp > self._last.stamp:
             seconds = (sweep.stamp - self._last.stamp) * 1e-9
             bend += 0.5 * sweep.middle * (seconds - sweep.middle)
-        missed: FloatArray = bend**2 * self._motion.variances
+        missed: FloatArray = bend**2 * self._motion.at_last
         if _turned(sweep):
             missed[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
@@ -412,12 +412,23 @@ class _Acceleration:
         self._expected = expected
         self._mean, self._period = np.zeros(6), 0.0
         self._last: tuple[int, FloatArray] | None = None
+        self._first, self._latest = np.zeros((2, 6))
 
     @property
     def variances(self) -> FloatArray:
         """(6,) (rad/s^2)^2 and (m/s^2)^2."""
         variances: FloatArray = np.maximum(self._mean, 0.0)
         return variances if self.known else np.maximum(variances, self._expected)
+
+    @property
+    def at_last(self) -> FloatArray:
+        """(6,) (rad/s^2)^2 and (m/s^2)^2, not less than the last one: it may just have begun."""
+        return np.maximum(self.variances, self._latest)
+
+    @property
+    def at_first(self) -> FloatArray:
+        """(6,) (rad/s^2)^2 and (m/s^2)^2 of the first ones, with the noise that they have."""
+        return self._first if self.known else self._expected
 
     @property
     def known(self) -> bool:
@@ -451,4 +462,7 @@ class _Acceleration:
         self._count, self._period = self._count + 1, seconds
         gain = max(1.0 / self._count, 1.0 / self._window)
         squared = ((velocity - before[1]) / seconds) ** 2
-        self._mean = self._mean + gain * (squared - noise - self._mean)
+        if self._count <= _KNOWN:
+            self._first = self._first + gain * (squared - self._first)
+        self._latest = squared - noise
+        self._mean = self._mean + gain * (self._latest - self._mean)

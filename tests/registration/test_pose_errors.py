@@ -193,10 +193,12 @@ def test_a_prior_of_ones_own_holds_the_pose_in_spite_of_drift():
 
 @pytest.mark.parametrize("name", ["loam", "aloam"])
 def test_classical_solvers_have_covariances_of_the_same_size(name):
-    world = SimulatedWorld("room", frames=8, columns=450)
-    ours = run(world, no_imu()).updates[-1]
-    theirs = run(world, preset(name).changed("imu.coupling=off")).updates[-1]
-    ratio = np.sqrt(np.diag(theirs.uncertainty.own) / np.diag(ours.uncertainty.own))
+    world = SimulatedWorld("room", frames=12, columns=450)
+    ours, theirs = (
+        sum(np.diag(update.uncertainty.own) for update in run(world, config).updates[-5:])
+        for config in (no_imu(), preset(name).changed("imu.coupling=off"))
+    )
+    ratio = np.sqrt(theirs / ours)
     assert ratio.min() > 0.2
     assert ratio.max() < 5.0
 
@@ -222,11 +224,11 @@ class _Sweep:
         self.stamp, self.motion, self.middle, self.duration = stamp, motion, 0.05, 0.1
 
 
-def own_errors(acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30):
-    """Own error at the start of the last of many sweeps along x."""
+def own_errors(acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30, begins=0):
+    """Own error at the start of the last of many sweeps along x, accelerated after some."""
     errors = PoseErrors(Config())
     for k in range(frames):
-        x = 0.5 * acceleration * (0.1 * k) ** 2
+        x = 0.5 * acceleration * (0.1 * max(k - begins, 0)) ** 2
         middle = gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
         sweep = _Sweep(k * FRAME, motion)
         own, _, errors._last = errors._own(sweep.stamp, sweep, middle, covariance, np.eye(6))
@@ -244,6 +246,13 @@ def test_what_a_constant_velocity_misses():
     np.testing.assert_allclose(quiet, 0.5 * noisy, atol=1e-4)
 
 
+def test_an_acceleration_that_has_just_begun_counts_in_full():
+    steady, begun = (own_errors(3.0, np.zeros((6, 6)), begins=k)[3, 3] for k in (0, 27))
+    assert begun == pytest.approx(steady, rel=1e-6)
+    over = own_errors(3.0, np.zeros((6, 6)), begins=28)[3, 3]  # half of it shows so far
+    assert over == pytest.approx(0.25 * steady, rel=1e-6)
+
+
 def test_a_gyro_leaves_its_noise():
     own = own_errors(0.0, np.zeros((6, 6)), SweepMotion.GYRO)
     expected = Config().imu.gyro_noise ** 2 * 0.05
@@ -251,12 +260,35 @@ def test_a_gyro_leaves_its_noise():
     np.testing.assert_array_equal(own_errors(0.0, np.zeros((6, 6)), SweepMotion.ORIENTATION), 0.0)
 
 
-def calibrated(errors, number, map_T_lidar=gtsam.Pose3(), doubt=None, twist=np.zeros(6)):  # noqa: B008
-    """A frame at rest, whatever its matches are."""
+def calibrated(errors, number, map_T_lidar=gtsam.Pose3(), doubt=None, twist=np.zeros(6), x=0.0):  # noqa: B008
+    """A frame at rest or at ``x``, whatever its matches are."""
     update = MapUpdate(number * FRAME, map_T_lidar, FrameStatus.OK, twist=twist)
-    solution = Solution.unsolved(gtsam.Pose3(), None, 1, 1)
+    solution = Solution.unsolved(gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])), None, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
     return errors.calibrated(update, sweep, solution, errors.of_scan(solution), None, doubt=doubt)
+
+
+def test_the_error_of_the_origin_is_that_of_the_first_motion(monkeypatch):
+    """Whoever brakes hard later does not move it; whoever started so has an origin in doubt."""
+    good = ScanError(1e-10 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+
+    def told(accelerations):
+        errors, speed, x, found = PoseErrors(Config()), 0.0, 0.0, []
+        errors.skipped(_Sweep(0, SweepMotion.CONSTANT_VELOCITY))
+        for number, acceleration in enumerate(accelerations, start=1):
+            speed += 0.1 * acceleration
+            x += 0.1 * speed
+            update = calibrated(errors, number, x=x)
+            found.append(update.covariance[3, 3] - update.uncertainty.own[3, 3])
+        return np.sqrt(found)
+
+    late, early = told([0.0] * 10 + [3.0] * 5), told([3.0] * 5 + [0.0] * 10)
+    missed = 0.5 * 0.05 * 0.15  # s^2, from the middle between both sweeps back to the start
+    unknown = missed * Config().solver.acceleration_sigma
+    assert late[0] == pytest.approx(unknown, rel=1e-3)
+    assert late[-1] < 0.01 * unknown
+    assert early[-1] == pytest.approx(3.0 * missed, rel=1e-3)
 
 
 def test_ground_that_replaces_none_counts_half(monkeypatch):

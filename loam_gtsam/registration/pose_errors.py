@@ -36,6 +36,7 @@ _PAUSE = 1.0
 """Seconds for which a velocity may have changed where a clock was set: nothing tells how long the
 sweeps took that were on neither clock."""
 _USUAL = 3.0  # times the root mean square of the accelerations within which one is usual
+_BEGUN = 2.0  # times that root above which an acceleration is the first of others
 _LONGER = 1.5  # times the time between two sweeps for which accelerations are known
 _KNOWN = 3  # accelerations from which their mean is believed
 
@@ -422,8 +423,9 @@ class _Acceleration:
 
     @property
     def at_last(self) -> FloatArray:
-        """(6,) (rad/s^2)^2 and (m/s^2)^2, not less than the last one: it may just have begun."""
-        return np.maximum(self.variances, self._latest)
+        """(6,) (rad/s^2)^2 and (m/s^2)^2: of the last one alone if a motion has just begun."""
+        begun = self._latest > _BEGUN**2 * self.variances
+        return np.where(begun, self._latest, self.variances)
 
     @property
     def at_first(self) -> FloatArray:

@@ -424,8 +424,8 @@ class _Acceleration:
     @property
     def at_last(self) -> FloatArray:
         """(6,) (rad/s^2)^2 and (m/s^2)^2: of the last one alone if a motion has just begun."""
-        begun = self._latest > _BEGUN**2 * self.variances
-        return np.where(begun, self._latest, self.variances)
+        usual = self.variances
+        return np.where(self._latest > _BEGUN**2 * usual, self._latest, usual)
 
     @property
     def at_first(self) -> FloatArray:

@@ -289,7 +289,7 @@ class Mapper:
             self._start = None if self._start.complete else self._start
         solution, doubt = found.solution, found.doubt
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
-        posed = frame.sweep.at(found.twist)
+        posed = found.posed
         scan = self.errors.of_scan(solution, small=self.maps.small)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
@@ -299,7 +299,7 @@ class Mapper:
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last
-        update = self.errors.calibrated(update, frame.sweep, solution, scan, last, fused, doubt)
+        update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, doubt)
         clock.lap("covariance")
         return update
 

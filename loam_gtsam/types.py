@@ -400,8 +400,10 @@ class MapUpdate:
         has drifted since its start; NaN if not solved. For the motion between two frames see
         :func:`loam_gtsam.relative_covariance`.
     uncertainty : the parts of the covariance; None if not solved
-    twist : (6,) body velocity at ``stamp`` (rad/s, m/s) used for the de-skew of the sweep; where
+    twist : (6,) body velocity in the middle of the sweep (rad/s, m/s) used for its de-skew; where
         an IMU gives the rotation within the sweep, its mean
+    acceleration : (6,) rad/s^2 and m/s^2, by which the de-skew let that velocity change; zero where
+        it was constant
     sweep_motion : where that rotation came from
     tilt_prior : how the IMU's roll and pitch acted
     localizability : (6,) how many matches fix each of ``directions``, counted as if their normals
@@ -434,6 +436,7 @@ class MapUpdate:
     covariance: FloatArray = field(default_factory=lambda: np.full((6, 6), np.nan))
     uncertainty: Uncertainty | None = None
     twist: FloatArray = field(default_factory=lambda: np.zeros(6))
+    acceleration: FloatArray = field(default_factory=lambda: np.zeros(6))
     sweep_motion: SweepMotion = SweepMotion.NONE
     tilt_prior: TiltPrior = TiltPrior.NONE
     localizability: FloatArray = field(default_factory=lambda: np.full(6, np.nan))

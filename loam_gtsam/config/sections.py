@@ -88,9 +88,9 @@ class DeskewConfig(Section):
     enabled: bool = parameter(True)
     """Sweeps are de-skewed with the predicted motion, and again with the solution."""
     model: Literal["predicted", "constant", "linear"] = parameter("linear", source="LOAM predicts")
-    """The motion within a sweep is the predicted one (and rest at the start), or leads from the
-    last pose to the solved one (constant), or is solved for as well (linear, if no IMU tells it).
-    Unless predicted, the first motion is searched for, and eight sweeps are registered together."""
+    """The velocity within a sweep is the predicted one (and rest at the start), or leads from the
+    last pose to the solved one (constant), or changes as poses and points tell (linear, if no IMU
+    does). Unless predicted, the first motion is searched for, with eight sweeps together."""
     rotation: Literal["auto", "orientation", "constant_velocity"] = parameter("auto")
     """The rotation within a sweep comes from the gyro of an IMU where that covers the sweep, else
     from a constant velocity (auto), or from the attitude of the IMU (orientation)."""

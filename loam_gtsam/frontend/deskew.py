@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.features import thinned
-from loam_gtsam.geometry import cross, interpolated, move_points
+from loam_gtsam.geometry import cross, cross_matrix, interpolated, move_points
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, SweepMotion
 
@@ -26,8 +26,8 @@ class MovingSweep:
     """The voxel-filtered features of a sweep as measured, each from its own position of the lidar.
 
     The rotation within the sweep comes from the gyro (or the orientation) of an IMU if the IMU
-    covers the sweep. The translation, and without an IMU the rotation too, comes from a constant
-    velocity, for which :meth:`at` de-skews the features.
+    covers the sweep. The translation, and without an IMU the rotation too, comes from a velocity,
+    for which :meth:`at` de-skews the features; it is constant, unless :meth:`accelerated`.
 
     Parameters
     ----------
@@ -47,6 +47,7 @@ class MovingSweep:
     distinct : (E,) whether an edge stands out of its ring by more than range noise
     alone : (E,) whether it is a pole, which stands before all that is beside it; None if unknown
     motion : source of the rotation within the sweep
+    acceleration : (6,) rad/s^2 and m/s^2, of the body velocity; None if that is constant
     not_finite : number of points of the sweep that were NaN or infinite
     """
 
@@ -75,6 +76,7 @@ class MovingSweep:
         self.motion = SweepMotion.CONSTANT_VELOCITY if moving else SweepMotion.NONE
         self._turned: tuple[FloatArray, FloatArray] | None = None
         self._bend: tuple[FloatArray, FloatArray] | None = None
+        self.acceleration: FloatArray | None = None
         span = np.array([first, 0.0, end]) - self.middle
         if moving and imu is not None and config.deskew.rotation != "constant_velocity":
             moments = np.concatenate([span, *self._seconds])
@@ -109,6 +111,17 @@ class MovingSweep:
             for points, seconds in zip(self._turned, self._seconds, strict=True)
         )
         sweep._turned = next(turned), next(turned)
+        return sweep
+
+    def accelerated(self, acceleration: FloatArray) -> MovingSweep:
+        """The sweep of a lidar with a (6,) body acceleration, rad/s^2 and m/s^2.
+
+        Nothing changes if a gyro knows the rotation, or without de-skewing.
+        """
+        if self.motion is not SweepMotion.CONSTANT_VELOCITY:
+            return self
+        sweep = copy(self)
+        sweep.acceleration = acceleration
         return sweep
 
     def without_turns(self) -> MovingSweep:
@@ -149,7 +162,10 @@ class MovingSweep:
     def middle_T_reference(self, twist: FloatArray) -> gtsam.Pose3:
         """The pose of the lidar at the reference time, seen from the middle of the sweep."""
         if self._turned is None:
-            return gtsam.Pose3.Expmap(-twist * self.middle)
+            step = -twist * self.middle
+            if self.acceleration is not None:
+                step = step + 0.5 * self.middle**2 * self.acceleration
+            return gtsam.Pose3.Expmap(step)
         rotation = self._middle_R_reference
         moved = rotation @ twist[3:] * -self.middle + self._bent(-self.middle)
         return gtsam.Pose3(gtsam.Rot3(rotation), moved)
@@ -197,8 +213,15 @@ class MovingSweep:
         if self.motion is SweepMotion.NONE:
             return points
         if self._turned is None:
-            return move_points(points, twist, seconds)
+            moved = move_points(points, twist, seconds)
+            return moved if self.acceleration is None else moved + self._swerved(moved, seconds)
         return points + np.outer(seconds, self._middle_R_reference @ twist[3:])
+
+    def _swerved(self, points: FloatArray, seconds: FloatArray) -> FloatArray:
+        """(N, 3) how far the acceleration moved points meanwhile."""
+        assert self.acceleration is not None
+        turn, shift = self.acceleration[:3], self.acceleration[3:]
+        return (0.5 * seconds**2)[:, None] * (points @ cross_matrix(turn).T + shift)
 
 
 @dataclass(frozen=True, eq=False)

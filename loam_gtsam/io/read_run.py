@@ -32,6 +32,7 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
     try:
         with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in _NEEDED}
+            columns["accelerations"] = file.get("accelerations", np.zeros_like(columns["twists"]))
             stages = file["stage_names"].tolist()
         return [
             _update({name: column[row] for name, column in columns.items()}, stages)
@@ -65,6 +66,7 @@ def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:
         str(at["messages"]),
         covariance=at["covariances"],
         twist=at["twists"],
+        acceleration=at["accelerations"],
         uncertainty=uncertainty,
         map_T_middle=gtsam.Pose3(at["map_T_middle"]) if at["middle_stamps"] else None,
         middle_stamp=int(at["middle_stamps"]),

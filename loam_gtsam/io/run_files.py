@@ -98,6 +98,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         "covariances": _column(updates, "covariance", shape=(6, 6)),
         "raw_covariances": _column(updates, "raw_covariance", shape=(6, 6)),
         "twists": _column(updates, "twist", shape=(6,)),
+        "accelerations": _column(updates, "acceleration", shape=(6,)),
         "sweep_motions": _column(updates, "sweep_motion", np.str_),
         "tilt_priors": _column(updates, "tilt_prior", np.str_),
         "own_covariances": _column(parts, "own", shape=(6, 6)),

@@ -245,7 +245,7 @@ def keyframe_points(
         raise InputError(
             f"features: expected those of the stamp {update.stamp}, got {features.stamp}"
         )
-    posed = MovingSweep(features, config, imu).at(update.twist)
+    posed = MovingSweep(features, config, imu).accelerated(update.acceleration).at(update.twist)
     to_reference = posed.middle_T_reference.inverse().matrix()
     edges, planes = (transform(to_reference, part) for part in posed.points)
     return edges, planes, posed.sweep.distinct

@@ -15,6 +15,7 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
+from loam_gtsam.registration.acceleration import Expected
 from loam_gtsam.registration.association import (
     match_features,
     match_surfaces,
@@ -207,9 +208,9 @@ class FrameMatcher(Matcher):
     last: Moment | None  # middle of the last sweep, from which ``deskewed`` takes the motion
     inertial: InertialPrediction | None  # from which it takes the velocity instead
     refine: bool  # whether ``deskewed`` changes anything
-    accelerations: FloatArray | None  # (6,) mean squares by which the velocity is not constant
+    accelerations: Expected | None  # by which the velocity is not constant
     clock: Clock  # books the time of every call on the stage ``match``
-    told: bool = False  # whether the matches are known to tell the motion, if it is free
+    told: bool | None = None  # whether the matches tell the motion, if it is free; None: not known
 
     @classmethod
     def of(
@@ -222,7 +223,7 @@ class FrameMatcher(Matcher):
         *,
         refine: bool = True,
         inertial: InertialPrediction | None = None,
-        accelerations: FloatArray | None = None,
+        accelerations: Expected | None = None,
     ) -> FrameMatcher:
         """The matcher with the configured matching and, if it is to ``refine``, de-skew."""
         rows, model = _rows_to_match(posed.sweep, config.matching), config.deskew.model
@@ -271,39 +272,56 @@ class FrameMatcher(Matcher):
         """The matcher of the sweep de-skewed with the motion that leads to a pose."""
         if not self.refine:
             return self
-        solved = self._solved_twist(map_T_lidar, matches)
-        if solved is None:
-            mean = self.twist_to(map_T_lidar)
-            return replace(self, posed=self.posed.sweep.at(mean), accelerations=None)
-        return replace(self, posed=self.posed.sweep.at(solved), told=True)
+        matcher = replace(self, told=self._tells(matches, map_T_lidar))
+        return replace(matcher, posed=matcher.posed_at(map_T_lidar, matches))
 
-    def twist_to(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches | None = None) -> FloatArray:
-        """(6,) body velocity that leads to a pose; ``matches`` have a say in it if it is free."""
-        solved = None if matches is None else self._solved_twist(map_T_lidar, matches)
-        if solved is not None:
-            return solved
+    def posed_at(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches | None) -> PosedSweep:
+        """The sweep, de-skewed with the motion that leads to a pose; matches may tell of it.
+
+        The path through the last middle and this one is a parabola if the motion is free.
+        """
+        twist, sweep = self.twist_to(map_T_lidar), self.posed.sweep
+        if not self.motion_is_free:
+            return sweep.at(twist)
+        assert self.last is not None
+        assert self.accelerations is not None
+        interval = self.last.seconds_to(sweep.stamp)
+        usual = self.accelerations.at(self.last.stamp, interval, twist)
+        solved = twist + 0.5 * interval * usual
+        if matches is not None and self._tells(matches, map_T_lidar):
+            solved = self._solved_twist(map_T_lidar, matches, solved, interval)
+        return sweep.accelerated(2.0 / interval * (solved - twist)).at(solved)
+
+    def twist_to(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
+        """(6,) mean body velocity that leads to a pose."""
         posed = self.posed
         return twist_to(posed.sweep, self.last, self.inertial, map_T_lidar, posed.twist)
 
-    def _solved_twist(self, map_T_lidar: gtsam.Pose3, matches: ScanMatches) -> FloatArray | None:
-        """(6,) body velocity by the matches; None if it is not free, or if they do not tell it."""
-        config, search = self.config, matches.search
-        if search is None or not self.motion_is_free:
-            return None
-        if not (self.told or self.tells_motion(localizability(matches, map_T_lidar))):
-            return None
-        assert self.last is not None
+    def _tells(self, matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> bool:
+        """Whether the matches tell the motion within the sweep."""
+        if matches.search is None or not self.motion_is_free:
+            return False
+        if self.told is not None:
+            return self.told
+        return self.tells_motion(localizability(matches, map_T_lidar))
+
+    def _solved_twist(
+        self, map_T_lidar: gtsam.Pose3, matches: ScanMatches, expected: FloatArray, interval: float
+    ) -> FloatArray:
+        """(6,) body velocity in the middle of the sweep, by the matches and the expected one."""
         assert self.accelerations is not None
-        sweep = self.posed.sweep
+        assert matches.search is not None
+        config, sweep = self.config, self.posed.sweep
         rows = match_rows(matches, config.solver.kernel_width, config.solver.kernel)
         edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
         seconds = np.concatenate([np.repeat(edges, 2), planes])
-        mean = self.twist_to(map_T_lidar)
+        # A change of the velocity is one of the acceleration: the last middle stays on the path.
+        seconds = seconds + seconds**2 / interval
         # A jump of the pose is no acceleration to believe in.
         most = np.repeat([config.solver.turn_sigma, config.solver.acceleration_sigma], 3)
-        usual = np.minimum(np.sqrt(self.accelerations), most)
-        missed = 0.5 * self.last.seconds_to(sweep.stamp) * usual
-        velocities, noise = (search.posed.twist, mean, missed), config.features.range_noise
+        unexpected = np.minimum(np.sqrt(self.accelerations.variances), most)
+        velocities = matches.search.posed.twist, expected, 0.5 * interval * unexpected
+        noise = config.features.range_noise
         return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
 
     def tells_motion(self, seen: Localizability) -> bool:
@@ -381,11 +399,10 @@ class Frame:
         start = self.predicted.map_T_middle
         return solver.solve(self.matcher, start, self.priors, self.predicted.motion)
 
-    def twist_of(self, solution: Solution) -> FloatArray:
-        """(6,) body velocity that belongs to a solution."""
+    def posed_for(self, solution: Solution) -> PosedSweep:
+        """The sweep, de-skewed with the motion that belongs to a solution."""
         matcher, seen = self.matcher, solution.localizability
-        matches = solution.matches if solution.solved else None
         if seen is not None and matcher.motion_is_free:  # saves looking again
-            matcher = replace(matcher, told=True)
-            matches = matches if matcher.tells_motion(seen) else None
-        return matcher.twist_to(solution.map_T_lidar, matches)
+            matcher = replace(matcher, told=matcher.tells_motion(seen))
+        matches = solution.matches if solution.solved else None
+        return matcher.posed_at(solution.map_T_lidar, matches)

@@ -15,6 +15,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
+from loam_gtsam.registration.acceleration import Accelerations, Expected
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import MotionFilter, Solution
@@ -35,10 +36,6 @@ _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
 _PAUSE = 1.0
 """Seconds for which a velocity may have changed where a clock was set: nothing tells how long the
 sweeps took that were on neither clock."""
-_USUAL = 3.0  # times the root mean square of the accelerations within which one is usual
-_BEGUN = 2.0  # times that root above which an acceleration is the first of others
-_LONGER = 1.5  # times the time between two sweeps for which accelerations are known
-_KNOWN = 3  # accelerations from which their mean is believed
 
 
 def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
@@ -119,7 +116,7 @@ class PoseErrors:
         self._with_priors = graph
         self._gyro_noise, self._lag = config.imu.gyro_noise, config.imu.lag
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
-        self._motion = _Acceleration(config.covariance.window, np.repeat(expected, 3) ** 2)
+        self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionFilter(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
         self._doubt, self._moved = np.zeros((2, 6, 6))
@@ -128,9 +125,9 @@ class PoseErrors:
         self._last: _Middle | None = None
 
     @property
-    def accelerations(self) -> FloatArray | None:
-        """(6,) mean squares of the body acceleration, (rad/s^2)^2 and (m/s^2)^2; None at first."""
-        return self._motion.variances if self._motion.known else None
+    def accelerations(self) -> Expected | None:
+        """What the poses so far tell of the next acceleration; None at first."""
+        return self._motion.next
 
     def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
         """The error of a solved scan; to be called once for each, in order.
@@ -302,7 +299,7 @@ class PoseErrors:
             shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
         pose = fused.covariance[:6, :6]
         if last is not None and sweep.stamp > last.stamp:
-            self._motion.add(last, sweep.stamp, middle, pose)
+            self._motion.add(last.stamp, last.map_T_lidar, sweep.stamp, middle, pose)
         now = _Middle(
             sweep.stamp, middle, pose, np.ones(6), to_reference, update.stamp, of_state, lasting
         )
@@ -329,7 +326,7 @@ class PoseErrors:
             across = share[:, None] * middle.between(last.map_T_lidar).AdjointMap()
             own = own + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
-            self._motion.add(last, sweep.stamp, middle, covariance)
+            self._motion.add(last.stamp, last.map_T_lidar, sweep.stamp, middle, covariance)
         own = to_reference @ (own + np.diag(self._missed(sweep))) @ to_reference.T
         now = _Middle(sweep.stamp, middle, covariance, kept, to_reference, reference_stamp)
         return symmetric(own), shared, now
@@ -342,7 +339,7 @@ class PoseErrors:
         if self._last is not None and sweep.stamp > self._last.stamp:
             seconds = (sweep.stamp - self._last.stamp) * 1e-9
             bend += 0.5 * sweep.middle * (seconds - sweep.middle)
-        missed: FloatArray = bend**2 * self._motion.at_last
+        missed = bend**2 * self._motion.missed(steady=sweep.acceleration is None)
         if _turned(sweep):
             missed[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
@@ -399,72 +396,3 @@ class _Origin:
         own = self.velocity + np.diag(self.bend**2 * accelerations)
         in_map: FloatArray = self.to_map @ own @ self.to_map.T
         return in_map
-
-
-class _Acceleration:
-    """Mean square of the body acceleration, from the poses at the middles of three sweeps.
-
-    ``expected`` (6,), (rad/s^2)^2 and (m/s^2)^2, stands for it until three are known.
-    """
-
-    def __init__(self, window: int, expected: FloatArray) -> None:
-        self._window = window
-        self._count = 0
-        self._expected = expected
-        self._mean, self._period = np.zeros(6), 0.0
-        self._last: tuple[int, FloatArray] | None = None
-        self._first, self._latest = np.zeros((2, 6))
-
-    @property
-    def variances(self) -> FloatArray:
-        """(6,) (rad/s^2)^2 and (m/s^2)^2."""
-        variances: FloatArray = np.maximum(self._mean, 0.0)
-        return variances if self.known else np.maximum(variances, self._expected)
-
-    @property
-    def at_last(self) -> FloatArray:
-        """(6,) (rad/s^2)^2 and (m/s^2)^2: of the last one alone if a motion has just begun."""
-        usual = self.variances
-        return np.where(self._latest > _BEGUN**2 * usual, self._latest, usual)
-
-    @property
-    def at_first(self) -> FloatArray:
-        """(6,) (rad/s^2)^2 and (m/s^2)^2 of the first ones, with the noise that they have."""
-        return self._first if self.known else self._expected
-
-    @property
-    def known(self) -> bool:
-        """Whether enough accelerations were met for their mean to be believed."""
-        return self._count >= _KNOWN
-
-    def explains(self, step: FloatArray, stamp: int) -> bool:
-        """Whether usual accelerations explain a step (6,) from constant velocity, rad and m.
-
-        Those of longer than usual are not known: held for two seconds they explain any room.
-        """
-        if not self.known or self._last is None:
-            return False
-        seconds = (stamp - self._last[0]) * 1e-9
-        usual = np.sqrt(self.variances.reshape(2, 3).sum(axis=1))
-        reach = _USUAL * seconds**2 * usual  # they are second differences of poses
-        far = np.linalg.norm(step.reshape(2, 3), axis=1)
-        return seconds < _LONGER * self._period and bool((far <= reach).all())
-
-    def add(
-        self, last: _Middle, stamp: int, map_T_lidar: gtsam.Pose3, covariance: FloatArray
-    ) -> None:
-        """Take in the motion from the middle of the last sweep to that of this one."""
-        seconds = (stamp - last.stamp) * 1e-9
-        velocity = gtsam.Pose3.Logmap(last.map_T_lidar.between(map_T_lidar)) / seconds
-        before, self._last = self._last, (stamp, velocity)
-        if before is None or before[0] != last.stamp:
-            return
-        # A second difference has the errors of three poses, with weights 1, -2, 1.
-        noise = 6.0 * np.diag(covariance) / seconds**4
-        self._count, self._period = self._count + 1, seconds
-        gain = max(1.0 / self._count, 1.0 / self._window)
-        squared = ((velocity - before[1]) / seconds) ** 2
-        if self._count <= _KNOWN:
-            self._first = self._first + gain * (squared - self._first)
-        self._latest = squared - noise
-        self._mean = self._mean + gain * (self._latest - self._mean)

@@ -38,6 +38,7 @@ def make_update(
         middle_stamp=sweep.stamp,
         map_T_middle=posed.map_T_middle(map_T_lidar),
         twist=posed.twist,
+        acceleration=np.zeros(6) if sweep.acceleration is None else sweep.acceleration,
         sweep_motion=sweep.motion,
         tilt_prior=tilt,
     )

@@ -226,7 +226,8 @@ def _deskewed(
     # As it was for this frame: the gyro may have been given up since.
     turned = update.sweep_motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
     imu = mapper.imu.buffer if turned and mapper.imu is not None else None
-    posed = MovingSweep(points, mapper.config, imu, thin=False).at(update.twist)
+    sweep = MovingSweep(points, mapper.config, imu, thin=False)
+    posed = sweep.accelerated(update.acceleration).at(update.twist)
     return transform(posed.map_T_middle(update.map_T_lidar).matrix(), posed.points[1])
 
 

@@ -246,3 +246,34 @@ def test_what_does_not_move_is_left_alone(imu):
         as_measured = moving.at(np.zeros(6)).points[1]
         np.testing.assert_array_equal(moving.at(np.ones(6)).points[1], as_measured)
         assert moving.middle_T_reference(np.ones(6)).equals(gtsam.Pose3(), 0.0)
+
+
+@pytest.mark.parametrize("reference", [0.0, 0.3, 1.0])
+def test_without_an_imu_a_velocity_that_changes_steadily_is_undone(reference):
+    """Points and pose; of a constant velocity the points at the ends are centimetres off."""
+    twist = np.array([0.2, -0.3, 0.5, 8.0, -2.0, 0.5])
+    acceleration = np.array([2.0, -3.0, 1.0, 6.0, 4.0, -5.0])
+    features, _ = sweep(reference)
+    seconds = features.plane_times - (0.5 - reference) * PERIOD
+    planes = np.array([
+        gtsam.Pose3.Expmap(twist * t + 0.5 * acceleration * t**2).transformTo(point)
+        for t, point in zip(seconds, features.planes, strict=True)
+    ])  # fmt: skip
+    steady = without_imu(replace(features, planes=planes))
+    moving = steady.accelerated(acceleration)
+    expected = in_order(features.planes)
+    found = in_order(moving.at(twist).points[1])
+    assert np.abs(found - expected).max() < 2e-3
+    assert np.abs(in_order(steady.at(twist).points[1]) - expected).max() > 0.03
+    back = (reference - 0.5) * PERIOD
+    pose = gtsam.Pose3.Expmap(twist * back + 0.5 * acceleration * back**2)
+    assert moving.at(twist).middle_T_reference.equals(pose, 1e-12)
+
+
+def test_what_an_imu_knows_or_does_not_move_is_not_accelerated():
+    features, _ = sweep()
+    for known in (
+        MovingSweep(features, config(), buffer()),
+        without_imu(replace(features, span=(0.0, 0.0))),
+    ):
+        assert known.accelerated(np.ones(6)) is known

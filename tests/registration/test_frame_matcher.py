@@ -14,6 +14,7 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as Inertial
 from loam_gtsam.registration import frame_matcher
+from loam_gtsam.registration.acceleration import Expected
 from loam_gtsam.registration.association import match_planes, translations_fixed
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.frame_matcher import FrameMatcher, MapPair
@@ -105,22 +106,52 @@ def test_deskewing_anew_makes_another_matcher(parts, matcher):
     assert plain.deskewed(HERE, found) is plain
 
 
+def expected(last, variances, share=0.0, velocity=TWIST):
+    return Expected(last.stamp, velocity, np.full(6, share), np.full(6, variances))
+
+
 def test_a_free_motion_is_solved_for_with_the_matches(parts):
     second, last, _ = parts
-    free = replace(matcher_of(*parts, accelerations=np.ones(6)), told=True)
+    free = replace(matcher_of(*parts, accelerations=expected(last, 1.0)), told=True)
     found, mean = free(HERE), second.twist_since(last[:2], HERE)
     assert free.motion_is_free
     solved = free.deskewed(HERE, found).posed.twist
     assert 1e-4 < np.abs(solved - mean).max() < 0.5
     np.testing.assert_array_equal(free.twist_to(HERE), mean)
     # Steadily driven, it is the mean velocity.
-    steady = replace(free, accelerations=np.zeros(6)).twist_to(HERE, found)
+    steady = replace(free, accelerations=expected(last, 0.0)).posed_at(HERE, found).twist
     assert np.abs(steady - mean).max() < 0.1 * np.abs(solved - mean).max()
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_the_path_leads_from_the_last_middle_to_this_one(parts, told):
+    """Whether the matches tell of it or not: a parabola through both, in rotation as well."""
+    second, last, _ = parts
+    known = expected(last, 1.0, share=0.8, velocity=TWIST - 0.3)
+    matcher = replace(matcher_of(*parts, accelerations=known), told=told)
+    posed = matcher.posed_at(HERE, matcher(HERE))
+    seconds, mean = last.seconds_to(second.stamp), second.twist_since(last[:2], HERE)
+    acceleration = posed.sweep.acceleration
+    back = -posed.twist * seconds + 0.5 * acceleration * seconds**2
+    apart = last.map_T_lidar.localCoordinates(HERE.compose(gtsam.Pose3.Expmap(back)))
+    np.testing.assert_allclose(apart, np.zeros(6), atol=1e-9)
+    usual = 0.8 * (mean - known.velocity) / seconds
+    if told:
+        assert np.abs(acceleration - usual).max() > 0.01
+    else:
+        np.testing.assert_allclose(acceleration, usual)
+
+
+def test_of_another_last_sweep_no_acceleration_is_expected(parts):
+    _, last, _ = parts
+    known = expected(last._replace(stamp=last.stamp - 1), 1.0, share=0.8)
+    matcher = replace(matcher_of(*parts, accelerations=known), told=False)
+    np.testing.assert_array_equal(matcher.posed_at(HERE, None).sweep.acceleration, np.zeros(6))
 
 
 def test_a_motion_is_not_free_that_is_known_or_assumed(parts):
     second, last, maps = parts
-    known = {"accelerations": np.ones(6)}
+    known = {"accelerations": expected(last, 1.0)}
     constant = CONFIG.changed("deskew.model=constant")
     inertial = Inertial(HERE, np.zeros(3), np.eye(6), np.zeros((3, 6)))
     others = [

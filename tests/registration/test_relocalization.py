@@ -424,7 +424,7 @@ def test_what_is_in_doubt_is_believed_elsewhere_only_if_its_features_say_so(befo
 @pytest.mark.parametrize("objects", [True, False])
 def test_a_rival_to_which_the_features_object_is_none(objects, before, calm, monkeypatch):
     frame = frame_of(before, list(calm)[AT])
-    found = Found(frame.solve(before.solver), np.zeros(6))
+    found = Found(frame.solve(before.solver), frame.sweep.at(np.zeros(6)))
     here = found.solution.map_T_lidar
     places = [here.compose(gtsam.Pose3(gtsam.Rot3(), [x, 0.0, 0.0])) for x in (0.1, 3.0)]
     solver = SimpleNamespace(
@@ -497,7 +497,7 @@ def test_a_sweep_that_fits_keeps_its_solution_if_the_search_finds_nothing_better
     found = search(frame, solution, before.monitor, nothing, Doubt.JUMP)
     assert isinstance(found, Found)
     assert (found.solution, found.message) == (solution, "")
-    np.testing.assert_array_equal(found.twist, frame.twist_of(solution))
+    np.testing.assert_array_equal(found.posed.twist, frame.posed_for(solution).twist)
 
 
 def test_an_ordinary_run_is_the_same_without_the_watch(begun, calm):

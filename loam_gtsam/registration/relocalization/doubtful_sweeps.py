@@ -10,6 +10,7 @@ from enum import Enum
 import gtsam
 import numpy as np
 
+from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.odometry import Prediction, advance
@@ -47,7 +48,7 @@ class Found:
     """The outcome of a search that found the pose of the sweep."""
 
     solution: Solution  # at the middle of the sweep
-    twist: FloatArray  # (6,) body velocity with which the sweep was de-skewed
+    posed: PosedSweep  # the sweep, de-skewed with the motion that belongs to it
     message: str = ""  # sentence for the user if the search moved the sweep
     doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
 
@@ -62,7 +63,7 @@ class Lost:
 
 def found_at(frame: Frame, solution: Solution) -> Found:
     """The sweep at a solved pose, with the motion that leads there."""
-    return Found(solution, frame.twist_of(solution))
+    return Found(solution, frame.posed_for(solution))
 
 
 def doubtful(
@@ -138,9 +139,9 @@ def search(
         return _lost(frame, solution, monitor) if found is None else found
     stays = found_at(frame, solution)
     if doubt is Doubt.JUMP:
-        twists = [matcher.posed.twist, stays.twist]
+        twists = [matcher.posed.twist, stays.posed.twist]
         found = _with_motion(frame, solution.map_T_lidar, twists, monitor, solver)
-        if found is not None and found.twist is stays.twist:
+        if found is not None and found.posed.twist is stays.posed.twist:
             found = None
     else:
         found = _elsewhere(frame, solution, monitor, solver, stays)
@@ -169,13 +170,13 @@ def _elsewhere(
     If it ``stays`` where it was solved otherwise, its features must speak against that.
     """
     places = _places(frame, solution, monitor, solver)
-    other = np.zeros(6) if stays is None else stays.twist
+    other = np.zeros(6) if stays is None else stays.posed.twist
     for place in places[: 1 if monitor.lost else _CLOSER]:
         twists = _motions(frame, place, other)
         found = _with_motion(frame, place, twists, monitor, solver)
         if found is None:
             continue
-        matcher = frame.matcher.moving_at(found.twist)
+        matcher = frame.matcher.moving_at(found.posed.twist)
         here = Evidence.of(matcher, found.solution, dense=True)
         if stays is None or _speaks_for(here, stays.solution, matcher):
             rivals = any_of(found.solution.map_T_lidar, _rivals(frame, found, places, solver))
@@ -194,7 +195,7 @@ def _rivals(
     frame: Frame, found: Found, places: Sequence[gtsam.Pose3], solver: ScanSolver
 ) -> list[gtsam.Pose3]:
     """Other places than the one where the sweep was found, to which its features do not object."""
-    rivals, matcher = [], frame.matcher.moving_at(found.twist)
+    rivals, matcher = [], frame.matcher.moving_at(found.posed.twist)
     here = Evidence.of(matcher, found.solution, dense=True)
     for place in places:
         if not same(place, found.solution.map_T_lidar):
@@ -237,7 +238,7 @@ def _with_motion(
         if not (found.solved and monitor.fits_again(fit)):
             continue
         if best is None or fit.total > CLEARLY * best[0].total:
-            best = fit, found, twist
+            best = fit, found, frame.sweep.at(twist)
     if best is None:
         return None
     moved = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)

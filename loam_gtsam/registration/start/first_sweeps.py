@@ -109,7 +109,7 @@ class Start:
         (best,) = self._best(ways, frame.matcher.config)
         self._sweeps = best.sweeps[:1]
         self._fill(frame, self._sweeps)
-        return replace(expected, solution=best.solution, twist=best.sweeps[1].posed.twist)
+        return replace(expected, solution=best.solution, posed=best.sweeps[1].posed)
 
     def add(
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver,
@@ -137,7 +137,7 @@ class Start:
         self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
     ) -> tuple[Frame, Found]:
         """As :meth:`add`, without what is in doubt."""
-        new = frame.sweep.at(found.twist), found.solution.map_T_lidar, bool(frame.priors)
+        new = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar, bool(frame.priors)
         sweeps = [*self._sweeps, EarlySweep(*new, frame.predicted.motion, keyframe)]
         if len(sweeps) not in _TOGETHER and not self._anew:
             self._sweeps = sweeps
@@ -156,7 +156,7 @@ class Start:
         frame = replace(
             frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
         )
-        return frame, replace(found, solution=solution, twist=frame.twist_of(solution))
+        return frame, replace(found, solution=solution, posed=frame.posed_for(solution))
 
     def _together(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver, rounds: int

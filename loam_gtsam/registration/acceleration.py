@@ -1,0 +1,154 @@
+"""The acceleration of the lidar, from the poses at the middles of its sweeps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.types import FloatArray
+
+_USUAL = 3.0  # times the root mean square of the accelerations within which one is usual
+_BEGUN = 2.0  # times the root mean square above which a surprise is the first of others
+_LONGER = 1.5  # times the time between two sweeps for which accelerations are known
+_LATER = 2.0 / 3.0
+"""Of the time between two second differences that passes until the acceleration that makes the
+velocity in the middle of a sweep another one than the mean since the last."""
+_KNOWN = 3  # accelerations from which their mean is believed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Expected:
+    """The next acceleration: a share of the last one, which the next pose tells.
+
+    Attributes
+    ----------
+    stamp : nanoseconds, middle of the last sweep
+    velocity : (6,) rad/s and m/s, body velocity between the middles of the last two sweeps
+    share : (6,) by axis; none where accelerations do not last
+    variances : (6,) (rad/s^2)^2 and (m/s^2)^2, of what is not expected
+    """
+
+    stamp: int
+    velocity: FloatArray
+    share: FloatArray
+    variances: FloatArray
+
+    def at(self, since: int, seconds: float, velocity: FloatArray) -> FloatArray:
+        """(6,) rad/s^2 and m/s^2, from the (6,) mean velocity over some seconds since a sweep.
+
+        Nothing is expected if that sweep is not the last one.
+        """
+        known = since == self.stamp
+        acceleration: FloatArray = known * self.share * (velocity - self.velocity) / seconds
+        return acceleration
+
+
+class Accelerations:
+    """Mean squares of the body acceleration, from the poses at the middles of three sweeps.
+
+    ``expected`` (6,), (rad/s^2)^2 and (m/s^2)^2, stands for them until three are known.
+    """
+
+    def __init__(self, window: int, expected: FloatArray) -> None:
+        self._window = window
+        self._count = 0
+        self._expected = expected
+        self._mean, self._raw, self._lasting = np.zeros((3, 6))
+        self._period = 0.0
+        self._last: tuple[int, FloatArray] | None = None
+        self._before: tuple[int, FloatArray] | None = None  # the last acceleration, noise and all
+        self._first = np.zeros(6)
+        self._latest = np.zeros((2, 6))  # the last square, and that of what was not expected
+
+    @property
+    def variances(self) -> FloatArray:
+        """(6,) (rad/s^2)^2 and (m/s^2)^2."""
+        variances: FloatArray = np.maximum(self._mean, 0.0)
+        return variances if self.known else np.maximum(variances, self._expected)
+
+    def missed(self, *, steady: bool) -> FloatArray:
+        """(6,) (rad/s^2)^2 and (m/s^2)^2 that a sweep was not de-skewed for.
+
+        A ``steady`` velocity was, or else the :class:`Expected` acceleration. If a motion has just
+        begun, the last one counts alone.
+        """
+        usual, latest = self.variances, self._latest[0]
+        if not steady:
+            usual, latest = self._unexpected, self._latest[1]
+        return np.where(latest > _BEGUN**2 * usual, latest, usual * (1.0 if steady else _LATER**2))
+
+    @property
+    def at_first(self) -> FloatArray:
+        """(6,) (rad/s^2)^2 and (m/s^2)^2 of the first ones, with the noise that they have."""
+        return self._first if self.known else self._expected
+
+    @property
+    def known(self) -> bool:
+        """Whether enough accelerations were met for their mean to be believed."""
+        return self._count >= _KNOWN
+
+    @property
+    def next(self) -> Expected | None:
+        """What is expected of the next acceleration; None at first."""
+        if not self.known or self._last is None:
+            return None
+        return Expected(*self._last, self._share, self._unexpected)
+
+    @property
+    def _share(self) -> FloatArray:
+        """(6,) of an acceleration that is left in the next one: their correlation.
+
+        Noise makes it negative, for consecutive second differences share two poses of three.
+        """
+        if not self.known:
+            return np.zeros(6)
+        correlation: FloatArray = self._lasting / np.maximum(self._raw, np.finfo(float).tiny)
+        return np.clip(correlation, 0.0, 1.0) ** _LATER
+
+    @property
+    def _unexpected(self) -> FloatArray:
+        """(6,) mean squares of what is not expected."""
+        unexpected: FloatArray = np.maximum(self.variances - self._share**2 * self._raw, 0.0)
+        return unexpected
+
+    def explains(self, step: FloatArray, stamp: int) -> bool:
+        """Whether usual accelerations explain a step (6,) from constant velocity, rad and m.
+
+        Those of longer than usual are not known: held for two seconds they explain any room.
+        """
+        if not self.known or self._last is None:
+            return False
+        seconds = (stamp - self._last[0]) * 1e-9
+        usual = np.sqrt(self.variances.reshape(2, 3).sum(axis=1))
+        reach = _USUAL * seconds**2 * usual  # they are second differences of poses
+        far = np.linalg.norm(step.reshape(2, 3), axis=1)
+        return seconds < _LONGER * self._period and bool((far <= reach).all())
+
+    def add(
+        self, last_stamp: int, last: gtsam.Pose3, stamp: int, map_T_lidar: gtsam.Pose3,
+        covariance: FloatArray,
+    ) -> None:  # fmt: skip
+        """Take in the motion from the middle of the last sweep to that of this one."""
+        seconds = (stamp - last_stamp) * 1e-9
+        velocity = gtsam.Pose3.Logmap(last.between(map_T_lidar)) / seconds
+        before, self._last = self._last, (stamp, velocity)
+        if before is None or before[0] != last_stamp:
+            return
+        # A second difference has the errors of three poses, with weights 1, -2, 1.
+        noise = 6.0 * np.diag(covariance) / seconds**4
+        acceleration = (velocity - before[1]) / seconds
+        previous, self._before = self._before, (stamp, acceleration)
+        self._count, self._period = self._count + 1, seconds
+        gain = max(1.0 / self._count, 1.0 / self._window)
+        squared = acceleration**2
+        if self._count <= _KNOWN:
+            self._first = self._first + gain * (squared - self._first)
+        known = np.zeros(6)
+        if previous is not None and previous[0] == last_stamp:
+            known = self._share * previous[1]
+            self._lasting = self._lasting + gain * (acceleration * previous[1] - self._lasting)
+        self._latest = np.stack([squared, (acceleration - known) ** 2]) - noise
+        self._raw = self._raw + gain * (squared - self._raw)
+        self._mean = self._mean + gain * (squared - noise - self._mean)

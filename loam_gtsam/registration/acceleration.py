@@ -27,12 +27,14 @@ class Expected:
     stamp : nanoseconds, middle of the last sweep
     velocity : (6,) rad/s and m/s, body velocity between the middles of the last two sweeps
     share : (6,) by axis; none where accelerations do not last
+    most : (6,) rad/s^2 and m/s^2, beyond which it is none: the pose may have jumped
     variances : (6,) (rad/s^2)^2 and (m/s^2)^2, of what is not expected
     """
 
     stamp: int
     velocity: FloatArray
     share: FloatArray
+    most: FloatArray
     variances: FloatArray
 
     def at(self, since: int, seconds: float, velocity: FloatArray) -> FloatArray:
@@ -40,9 +42,9 @@ class Expected:
 
         Nothing is expected if that sweep is not the last one.
         """
-        known = since == self.stamp
-        acceleration: FloatArray = known * self.share * (velocity - self.velocity) / seconds
-        return acceleration
+        acceleration = np.clip((velocity - self.velocity) / seconds, -self.most, self.most)
+        expected: FloatArray = (since == self.stamp) * self.share * acceleration
+        return expected
 
 
 class Accelerations:
@@ -94,7 +96,7 @@ class Accelerations:
         """What is expected of the next acceleration; None at first."""
         if not self.known or self._last is None:
             return None
-        return Expected(*self._last, self._share, self._unexpected)
+        return Expected(*self._last, self._share, _USUAL * np.sqrt(self._raw), self._unexpected)
 
     @property
     def _share(self) -> FloatArray:

@@ -35,8 +35,11 @@ def test_a_constant_acceleration_is_expected_to_go_on(axis):
     expected = known.next.at(stamp, PERIOD, mean)
     np.testing.assert_allclose(expected, 0.1 * np.eye(6)[axis], atol=2e-3)
     assert known.next.variances[axis] < 0.1 * known.variances[axis]
-    # And none of it if another sweep was the last one.
+    # None of it if another sweep was the last one, and not all of it if the pose has jumped.
     np.testing.assert_array_equal(known.next.at(stamp - 1, PERIOD, mean), np.zeros(6))
+    far = known.next.velocity + 4.0 * PERIOD * np.eye(6)[axis]
+    expected = known.next.at(stamp, PERIOD, far)
+    np.testing.assert_allclose(expected, 0.3 * np.eye(6)[axis], atol=6e-3)
 
 
 def test_a_sway_is_expected_to_go_on_in_part():

@@ -107,7 +107,9 @@ def test_deskewing_anew_makes_another_matcher(parts, matcher):
 
 
 def expected(last, variances, share=0.0, velocity=TWIST):
-    return Expected(last.stamp, velocity, np.full(6, share), np.full(6, variances))
+    return Expected(
+        last.stamp, velocity, np.full(6, share), np.full(6, np.inf), np.full(6, variances)
+    )
 
 
 def test_a_free_motion_is_solved_for_with_the_matches(parts):

@@ -13,8 +13,8 @@ _USUAL = 3.0  # times the root mean square of the accelerations within which one
 _BEGUN = 2.0  # times the root mean square above which a surprise is the first of others
 _LONGER = 1.5  # times the time between two sweeps for which accelerations are known
 _LATER = 2.0 / 3.0
-"""Of the time between two second differences that passes until the acceleration that makes the
-velocity in the middle of a sweep another one than the mean since the last."""
+"""Of the time between two sweeps, by which the acceleration that sets the velocity in the middle of
+the new one is later than the second difference of the poses, which is that in the last middle."""
 _KNOWN = 3  # accelerations from which their mean is believed
 
 

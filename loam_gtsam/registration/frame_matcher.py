@@ -288,9 +288,11 @@ class FrameMatcher(Matcher):
         interval = self.last.seconds_to(sweep.stamp)
         usual = self.accelerations.at(self.last.stamp, interval, twist)
         solved = twist + 0.5 * interval * usual
+        # Middles closer than a sweep is long tell little of the path within it.
+        span = max(interval, sweep.duration)
         if matches is not None and self._tells(matches, map_T_lidar):
-            solved = self._solved_twist(map_T_lidar, matches, solved, interval)
-        return sweep.accelerated(2.0 / interval * (solved - twist)).at(solved)
+            solved = self._solved_twist(map_T_lidar, matches, solved, span)
+        return sweep.accelerated(2.0 / span * (solved - twist)).at(solved)
 
     def twist_to(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6,) mean body velocity that leads to a pose."""
@@ -306,9 +308,13 @@ class FrameMatcher(Matcher):
         return self.tells_motion(localizability(matches, map_T_lidar))
 
     def _solved_twist(
-        self, map_T_lidar: gtsam.Pose3, matches: ScanMatches, expected: FloatArray, interval: float
+        self, map_T_lidar: gtsam.Pose3, matches: ScanMatches, expected: FloatArray, span: float
     ) -> FloatArray:
-        """(6,) body velocity in the middle of the sweep, by the matches and the expected one."""
+        """(6,) body velocity in the middle of the sweep, by the matches and the expected one.
+
+        ``span`` is the seconds in which the velocity changes by twice what it is above the mean.
+        """
+        assert self.last is not None
         assert self.accelerations is not None
         assert matches.search is not None
         config, sweep = self.config, self.posed.sweep
@@ -316,11 +322,12 @@ class FrameMatcher(Matcher):
         edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
         seconds = np.concatenate([np.repeat(edges, 2), planes])
         # A change of the velocity is one of the acceleration: the last middle stays on the path.
-        seconds = seconds + seconds**2 / interval
+        seconds = seconds + seconds**2 / span
         # A jump of the pose is no acceleration to believe in.
         most = np.repeat([config.solver.turn_sigma, config.solver.acceleration_sigma], 3)
         unexpected = np.minimum(np.sqrt(self.accelerations.variances), most)
-        velocities = matches.search.posed.twist, expected, 0.5 * interval * unexpected
+        missed = 0.5 * self.last.seconds_to(sweep.stamp) * unexpected
+        velocities = matches.search.posed.twist, expected, missed
         noise = config.features.range_noise
         return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
 

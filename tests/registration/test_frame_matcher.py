@@ -144,6 +144,17 @@ def test_the_path_leads_from_the_last_middle_to_this_one(parts, told):
         np.testing.assert_allclose(acceleration, usual)
 
 
+@pytest.mark.parametrize("told", [True, False])
+def test_sweeps_that_overlap_tell_no_path_beyond_them(parts, told):
+    """Their middles are 5 ms apart: a parabola through both would be metres off at the ends."""
+    second, last, _ = parts
+    last = last._replace(stamp=second.stamp - 5_000_000, map_T_lidar=HERE)
+    known = expected(last, 1.0, share=0.8, velocity=np.full(6, 0.1))
+    matcher = replace(matcher_of(second, last, parts[2], accelerations=known), told=told)
+    posed = matcher.posed_at(HERE, matcher(HERE))
+    assert np.abs(posed.sweep.acceleration).max() < 2.0
+
+
 def test_of_another_last_sweep_no_acceleration_is_expected(parts):
     _, last, _ = parts
     known = expected(last._replace(stamp=last.stamp - 1), 1.0, share=0.8)

@@ -27,7 +27,7 @@ class Expected:
     stamp : nanoseconds, middle of the last sweep
     velocity : (6,) rad/s and m/s, body velocity between the middles of the last two sweeps
     share : (6,) by axis; none where accelerations do not last
-    most : (6,) rad/s^2 and m/s^2, beyond which it is none: the pose may have jumped
+    most : (6,) rad/s^2 and m/s^2, to which the last one is limited: the pose may have jumped
     variances : (6,) (rad/s^2)^2 and (m/s^2)^2, of what is not expected
     """
 

@@ -233,12 +233,13 @@ def _with_motion(
     """
     matcher, best = frame.matcher, None
     for twist in twists:
-        found = _solved_near(frame, matcher.moving_at(twist), place, solver)
+        moving = matcher.moving_at(twist)
+        found = _solved_near(frame, moving, place, solver)
         fit = Fit.of(found.matches, matcher.offered)
         if not (found.solved and monitor.fits_again(fit)):
             continue
         if best is None or fit.total > CLEARLY * best[0].total:
-            best = fit, found, frame.sweep.at(twist)
+            best = fit, found, moving.posed
     if best is None:
         return None
     moved = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)

@@ -25,12 +25,11 @@ from loam_gtsam.registration.association import associate, trial_matching
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
-from loam_gtsam.registration.solvers import GtsamSolver, Solution
+from loam_gtsam.registration.solvers import GtsamSolver, Solution, trial_solver
 from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full
-_NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
 _STARTS = 3  # number of poses from the search around a candidate at which a trial starts
 
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level; slopes are
@@ -116,9 +115,7 @@ class Verifier:
     def __init__(self, config: Config) -> None:
         self._whole, self.config = config, config.loops
         self._solver = GtsamSolver(config.solver)
-        # A trial only has to come near: a full registration follows the best one.
-        near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
-        self._rough_solver = GtsamSolver(config.solver.changed(**near))
+        self._rough_solver = trial_solver(config.solver)
 
     def verify(
         self,

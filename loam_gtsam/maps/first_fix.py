@@ -7,35 +7,41 @@ found.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
 
 import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
+from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
-from loam_gtsam.registration.relocalization import Fit, likely_poses, same, sample_features
+from loam_gtsam.registration.relocalization import (
+    Fit,
+    distinct,
+    likely_poses,
+    one_per_cell,
+    same_optimum,
+    sample_features,
+)
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.registration.report import Clock
-from loam_gtsam.registration.solvers import GtsamSolver
+from loam_gtsam.registration.solvers import trial_solver
 from loam_gtsam.types import FloatArray
+from loam_gtsam.voxels.cubes import NO_POINTS
+from loam_gtsam.voxels.grid import CubeIndex
 
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
 _TRIES = 6  # number of places that are tried
 _STARTS = 18  # number of poses around all of these at which a registration starts
-_NEAR = (0.03, 0.2)  # metres and degrees: a smaller step ends a trial
-_OPTIMA = (0.3, np.radians(3.0))  # metres and rad between two optima of registrations
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
-_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,8 +78,8 @@ class PlaceSearch:
         self._inside = inside
         keys = [heading_free_key(place.descriptor.astype(np.float64)) for place in places]
         self._tree = cKDTree(np.array(keys).reshape(-1, config.loops.rings))
-        near = {"translation_tolerance": _NEAR[0], "rotation_tolerance_deg": _NEAR[1]}
-        self._solver = GtsamSolver(config.solver.changed(**near))
+        self._held: dict[tuple[CubeMap, CubeIndex], FloatArray] = {}
+        self._solver = trial_solver(config.solver)
 
     def find(
         self, posed: PosedSweep, reach: float, known: Sequence[gtsam.Pose3] = ()
@@ -90,9 +96,7 @@ class PlaceSearch:
         centres = [*self._lookalikes(np.concatenate([edges, planes])), *known]
         for centre in centres:
             maps.recenter(centre, reach)
-            layers, at = (maps.edges, maps.planes), centre.matrix()
-            parts = [cubes.points(cubes.surroundings(at)) for cubes in layers]
-            held.append(np.concatenate(parts))
+            held.append(self._held_around(centre))
         radius, sample = self._config.loops.search, sample_features(edges, planes)
         starts = likely_poses(sample, held, centres, radius, _STARTS, least=AS_WELL)
         whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
@@ -111,6 +115,19 @@ class PlaceSearch:
         found = distinct(found, lambda c: c.map_T_middle)
         against = [sum(self._favoured(other, one) for other in found) for one in found]
         return [found[number] for number in np.argsort(against, kind="stable")]
+
+    def _held_around(self, centre: gtsam.Pose3) -> FloatArray:
+        """(M, 3) points of the map around a pose, in metres, as many as tell which cells hold any.
+
+        The map does not change while a lidar is looked for.
+        """
+        held = [NO_POINTS]
+        for cubes in (self._maps.edges, self._maps.planes):
+            for cube in cubes.surroundings(centre.matrix()):
+                if (cubes, cube) not in self._held:
+                    self._held[cubes, cube] = one_per_cell(cubes.points([cube]))
+                held.append(self._held[cubes, cube])
+        return np.concatenate(held)
 
     def _favoured(self, one: Candidate, other: Candidate) -> bool:
         """Whether a sweep speaks for a pose, against another one."""
@@ -162,20 +179,6 @@ class PlaceSearch:
 def _at(pose: gtsam.Pose3, found: list[Candidate]) -> Candidate | None:
     """What was found at a pose."""
     return next((c for c in found if same_optimum(c.map_T_middle, pose)), None)
-
-
-def same_optimum(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
-    """Whether two registrations have ended in the same optimum."""
-    return same(one, other, _OPTIMA)
-
-
-def distinct(items: Iterable[_Item], pose: Callable[[_Item], gtsam.Pose3]) -> list[_Item]:
-    """The first of those whose poses are in the same optimum."""
-    chosen: list[_Item] = []
-    for item in items:
-        if not any(same_optimum(pose(item), pose(other)) for other in chosen):
-            chosen.append(item)
-    return chosen
 
 
 def standing_fit(matches: ScanMatches, offered: int, map_T_lidar: gtsam.Pose3) -> Fit:

@@ -8,10 +8,11 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, distinct, same_optimum, standing_fit
+from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, standing_fit
 from loam_gtsam.maps.saved_maps import SavedMaps
+from loam_gtsam.registration.association import trial_matching
 from loam_gtsam.registration.odometry import advance
-from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.relocalization import Fit, distinct, same_optimum
 from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
@@ -87,7 +88,8 @@ class Hypotheses:
 
     def __init__(self, search: PlaceSearch, maps: SavedMaps, config: Config) -> None:
         self._search, self._maps, self._config = search, maps, config
-        self._motion = Mapper(config.changed({"map.archive_megabytes": 0.0}))
+        few = trial_matching(config.matching)
+        self._motion = Mapper(config.changed({"map.archive_megabytes": 0.0}, matching=few))
         self._held: list[Hypothesis] = []
 
     def add(

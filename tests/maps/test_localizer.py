@@ -264,7 +264,7 @@ def test_where_bays_repeat_a_lidar_is_found_only_if_it_is_surely_in_the_map(tmp_
     mapped = run(monday)
     save_map(tmp_path / "garage.lgmap", mapped.pipeline)
     tuesday = SimulatedWorld("garage", seed=1, frames=50, columns=600, range_noise=0.03)
-    drive = PartOf(tuesday, 40, 1, None, None)
+    drive = PartOf(tuesday, 30, 1, None, None)
     with SavedMap(tmp_path / "garage.lgmap") as saved:
         assert not localise(drive, saved, max_frames=8).fixes
         found = localise(drive, saved, max_frames=8, inside=True)

@@ -38,6 +38,7 @@ from loam_gtsam.registration.relocalization import (
     doubtful,
     doubtful_sweeps,
     likely_poses,
+    one_per_cell,
     sample_features,
     search,
 )
@@ -238,6 +239,10 @@ def test_the_likeliest_place_is_the_true_one(corner, away, turn):
     error = truth.localCoordinates(found[0])
     assert np.linalg.norm(error[3:]) < 1.0
     assert np.abs(error[:3]).max() < np.radians(6.0)
+    few = one_per_cell(corner)
+    assert len(few) < 0.1 * len(corner)
+    again = likely_poses(seen, few, [predicted], radius=8.0, count=4)
+    assert all(one.equals(other, 0.0) for one, other in zip(found, again, strict=True))
     for i, first in enumerate(found):
         for second in found[:i]:
             apart = first.localCoordinates(second)

@@ -15,7 +15,7 @@ from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration.odometry import Moment
-from loam_gtsam.registration.relocalization import Fit, any_of
+from loam_gtsam.registration.relocalization import Fit, any_of, same_optimum
 from loam_gtsam.registration.relocalization.evidence import _AGAINST, Evidence
 from loam_gtsam.registration.solvers import GtsamSolver, Solution
 from loam_gtsam.registration.start import first_sweeps, ways
@@ -290,7 +290,7 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
 
 
 def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch):
-    _, features = features_of("square", 2, speed=24.0, start="moving")
+    _, features = features_of("avenue", 2, speed=24.0, start="moving")
     found, closer = [], []
     for share in (0.0, first_sweeps._HOPEFUL, 1.0):
         monkeypatch.setattr(first_sweeps, "_HOPEFUL", share)
@@ -300,6 +300,26 @@ def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch
         closer.append(solver.offered.count(max(solver.offered)))
     assert np.array_equal(*found[:2])
     assert closer[0] > closer[1] > closer[2]
+
+
+def test_places_that_lead_to_the_same_motion_are_looked_at_closer_once(monkeypatch):
+    _, features = features_of("street_loop", 2)
+    tried, registered = [], first_sweeps.Start._registered
+
+    def noted(*arguments, quickly=False):
+        result = registered(*arguments, quickly=quickly)
+        tried.append((quickly, result.moved))
+        return result
+
+    monkeypatch.setattr(first_sweeps.Start, "_registered", noted)
+    mapper = Mapper(CONFIG)
+    for one in features:
+        mapper.register(one)
+    quick, closer = [[pose for how, pose in tried if how is which] for which in (True, False)]
+    alike = [pose for pose in quick if same_optimum(pose, quick[0])]
+    assert len(quick) == 1 + first_sweeps._PLACES
+    assert len(alike) > 1
+    assert 1 <= len(closer) <= len(quick) - len(alike) + 1
 
 
 class Counting(GtsamSolver):

@@ -7,7 +7,9 @@ The matches of a wrong pose disagree with the map. How many usually do differs f
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -24,7 +26,9 @@ _EVEN = 1e-3  # standard deviation at least: one of 1000 matches
 AS_WELL = 0.75
 """Part of the best place's fit from which another place fits as well, but for chance: of 200
 matches, half of which agree, three standard deviations."""
+_OPTIMA = (0.3, np.radians(3.0))  # metres and rad between two optima of registrations
 APART = (1.5, np.radians(12.0))  # metres and rad below which two trials lead to the same pose
+_Item = TypeVar("_Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +78,20 @@ def same(one: gtsam.Pose3, other: gtsam.Pose3, apart: tuple[float, float] = APAR
     """Whether two poses are less than so many metres and rad apart: by default as starts are."""
     turn = float(np.linalg.norm(gtsam.Rot3.Logmap(one.rotation().between(other.rotation()))))
     return bool(one.range(other) < apart[0] and turn < apart[1])
+
+
+def same_optimum(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
+    """Whether two registrations have ended in the same optimum."""
+    return same(one, other, _OPTIMA)
+
+
+def distinct(items: Iterable[_Item], pose: Callable[[_Item], gtsam.Pose3]) -> list[_Item]:
+    """The first of those whose poses are in the same optimum."""
+    chosen: list[_Item] = []
+    for item in items:
+        if not any(same_optimum(pose(item), pose(other)) for other in chosen):
+            chosen.append(item)
+    return chosen
 
 
 class FitMonitor:

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.registration.matches import spread_rows
 from loam_gtsam.registration.relocalization.fits import APART
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
@@ -29,6 +30,12 @@ def sample_features(
     """(N, 3) some evenly spread features of a sweep, at ``most`` so many of each kind, metres."""
     pairs = zip((edges, planes), most, strict=True)
     return np.concatenate([points[spread_rows(len(points), count)] for points, count in pairs])
+
+
+def one_per_cell(map_points: FloatArray) -> FloatArray:
+    """(K, 3) one of the points of each cell of the field: :func:`likely_poses` needs no others."""
+    _, first = np.unique(voxel_keys(map_points, _CELL), return_index=True)
+    return map_points[first]
 
 
 def likely_poses(
@@ -76,12 +83,13 @@ def likely_poses(
     scores = np.concatenate([trials.scores(scored, weights) for trials in tried])
     moves = np.concatenate([trials.moves for trials in tried])
     owner = np.repeat(np.arange(len(tried)), [len(trials.moves) for trials in tried])
+    enough = scores > least * scores.max(initial=0.0)
+    scores, moves, owner = scores[enough], moves[enough], owner[enough]
     best: list[gtsam.Pose3] = []
     away = np.linalg.norm(moves[:, :2], axis=1)
     at = np.array([pose.translation() for pose in around]).reshape(-1, 3)[owner]
     at[:, :2] += moves[:, :2]
-    worst = least * scores.max(initial=0.0)
-    while len(best) < count and len(scores) and scores.max() > worst:
+    while len(best) < count and scores.max(initial=0.0) > 0.0:
         top = int(scores.argmax())
         if as_well is not None:
             good = np.flatnonzero(scores >= as_well * scores[top])
@@ -135,7 +143,8 @@ def _trials(
     size = 2 * (int(np.ceil((_REACH + radius) / _CELL)) + 2)
     shape = (size, size, 2 * (int(_HEIGHT / _CELL) + 1))
     centre = np.asarray(map_T_lidar.translation())
-    cells = _cells(map_points - centre, shape).T
+    corner = _CELL * np.floor(centre / _CELL)
+    cells = _cells(map_points - corner, shape).T
     sides = zip(cells, shape, strict=True)
     inside = np.logical_and.reduce([(row >= 0) & (row < end) for row, end in sides])
     held = np.zeros(shape, np.uint8)
@@ -153,6 +162,7 @@ def _trials(
     turns = _TURN * np.arange(-most, most + (most_turn < np.pi))
     yaws = [gtsam.Rot3.Yaw(turn).matrix() for turn in turns.tolist()]
     turned = np.where(near[:, None], level, 0.0) @ np.transpose(yaws, (0, 2, 1))
+    turned += centre - corner
     bases = np.ravel_multi_index(tuple(np.moveaxis(_cells(turned, shape), -1, 0)), shape)
     moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(shifts))])
     return _Trials(field, near, bases, shifts, moves)

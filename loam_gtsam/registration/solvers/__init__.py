@@ -28,3 +28,8 @@ def make_solver(config: SolverConfig) -> ScanSolver:
     if config.method == "gtsam":
         return GtsamSolver(config)
     return ClassicalSolver(config) if config.method == "loam" else ALoamSolver(config)
+
+
+def trial_solver(config: SolverConfig) -> GtsamSolver:
+    """The solver that tries a pose quickly: it only has to come near, a registration follows."""
+    return GtsamSolver(config.changed(translation_tolerance=0.03, rotation_tolerance_deg=0.2))

@@ -21,13 +21,14 @@ from loam_gtsam.registration.odometry import Prediction, advance
 from loam_gtsam.registration.relocalization import (
     Found,
     any_of,
+    distinct,
     likely_poses,
     same,
     sample_features,
 )
 from loam_gtsam.registration.relocalization.evidence import Evidence
 from loam_gtsam.registration.relocalization.fits import APART
-from loam_gtsam.registration.solvers import ScanSolver, Solution
+from loam_gtsam.registration.solvers import ScanSolver, Solution, trial_solver
 from loam_gtsam.registration.start.ways import (
     EarlySweep,
     Tried,
@@ -97,14 +98,12 @@ class Start:
             most_turn=_TURNING * seconds,
             rare=True,
         )
-        quick = [
-            self._tried(frame, place, solver) for place in (expected.solution.map_T_lidar, *places)
-        ]
+        quick = [self._tried(frame, place) for place in (expected.solution.map_T_lidar, *places)]
         enough = _HOPEFUL * max(tried.evidence.share for tried in quick)
+        hopeful = [quick[0], *(tried for tried in quick[1:] if tried.evidence.share >= enough)]
         ways = [
             (self._registered(frame, self._with_motion(tried.sweeps), solver),)
-            for number, tried in enumerate(quick)
-            if number == 0 or tried.evidence.share >= enough
+            for tried in distinct(hopeful, lambda tried: tried.moved)
         ]
         (best,) = self._best(ways, frame.matcher.config)
         self._sweeps = best.sweeps[:1]
@@ -253,13 +252,14 @@ class Start:
         moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
         return moved
 
-    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> Tried:
+    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3) -> Tried:
         """The first two sweeps, the second near a pose, registered by few matches."""
         first = self._sweeps[0]
         moved = first.map_T_middle.between(map_T_middle)
         second = EarlySweep(frame.matcher.posed, map_T_middle, False, frame.predicted.motion, 0)
         first, second = self._with_motion([first, second])
         second = replace(second, map_T_middle=first.map_T_middle.compose(moved))
+        solver = trial_solver(frame.matcher.config.solver)
         return self._registered(frame, [first, second], solver, quickly=True)
 
     def _registered(

@@ -51,6 +51,11 @@ class Tried(NamedTuple):
     sweeps: list[EarlySweep]  # it and those before it
     solution: Solution
 
+    @property
+    def moved(self) -> gtsam.Pose3:
+        """The last sweep, seen from the first one."""
+        return self.sweeps[0].map_T_middle.between(self.sweeps[-1].map_T_middle)
+
 
 Way = tuple[Tried, ...]
 """A first motion and where it led: the sweeps after the first, one after the other."""
@@ -135,12 +140,8 @@ def _apart(one: Way, other: Way, near: float) -> bool:
 
     Compared are the motions since the first sweep, not the points, which are de-skewed for them.
     """
-    moved = [
-        way[-1].sweeps[0].map_T_middle.between(way[-1].sweeps[-1].map_T_middle)
-        for way in (one, other)
-    ]
     seen = transform(one[-1].sweeps[-1].map_T_middle.inverse().matrix(), one[-1].evidence.points)
-    ends = [transform(pose.matrix(), seen) for pose in moved]
+    ends = [transform(way[-1].moved.matrix(), seen) for way in (one, other)]
     away = np.linalg.norm(ends[0] - ends[1], axis=1)
     return bool(np.count_nonzero(away > near) > 0.5 * len(away))
 

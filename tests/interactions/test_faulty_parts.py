@@ -114,7 +114,7 @@ def undisturbed() -> list[np.ndarray]:
     [
         ("factors", 2, 0, "extra_factors"),
         ("residual", 2, 0, "solver"),
-        ("solver", 1, 12, "solver"),
+        ("solver", 1, 1, "solver"),
         ("solver", 4, 2, "solver"),
         ("indeterminate", 2, 0, "solver"),
         ("loop_closer", 3, 0, "loop_closer"),

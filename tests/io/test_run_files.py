@@ -144,6 +144,17 @@ def test_the_frames_of_a_saved_run_are_those_of_the_run(result, tmp_path):
     assert there.n_plane_matches > 100
 
 
+def test_a_run_of_before_accelerations_were_written_is_read(result, tmp_path):
+    path = tmp_path / "run.npz"
+    run_files.write_npz(path, result.updates)
+    with np.load(path) as file:
+        columns = {name: file[name] for name in file.files if name != "accelerations"}
+    np.savez(path, **columns)
+    for here, there in zip(result.updates, read_updates(path), strict=True):
+        assert np.array_equal(there.twist, here.twist)
+        assert not there.acceleration.any()
+
+
 def test_covariances_stand_beside_the_poses(result, tmp_path):
     """The same lines as the trajectory; the upper triangle row by row; empty if not solved."""
     updates = list(result.updates)

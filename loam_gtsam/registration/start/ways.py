@@ -70,14 +70,15 @@ def continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
 def bent(sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
     """The sweeps, each de-skewed along the parabola through its middle and its neighbours'.
 
-    They are de-skewed for the mean velocity since the sweep before; so stay the first and the last.
+    They come de-skewed for the mean velocity since the sweep before; the first and the last stay so.
     """
     moved = list(sweeps)
     for number in range(1, len(sweeps) - 1):
         near = sweeps[number - 1 : number + 2]
         sweep, twist = near[1].posed.sweep, near[1].posed.twist
         stamps = [one.moment.stamp for one in near]
-        in_order = stamps == sorted(set(stamps))  # unlike sweeps of unlike length
+        # The middles of sweeps of unlike length may coincide, or change places.
+        in_order = stamps == sorted(set(stamps))
         if in_order and sweep.motion is SweepMotion.CONSTANT_VELOCITY:
             # Middles closer than a sweep is long tell little of the path within it.
             spans = [max(1e-9 * step, sweep.duration) for step in np.diff(stamps)]

@@ -70,7 +70,7 @@ def continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
 def bent(sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
     """The sweeps, each de-skewed along the parabola through its middle and its neighbours'.
 
-    They come de-skewed for the mean velocity since the sweep before; the first and the last stay so.
+    They come de-skewed for the mean velocity since the sweep before; the first and last stay so.
     """
     moved = list(sweeps)
     for number in range(1, len(sweeps) - 1):

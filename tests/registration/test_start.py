@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -14,7 +13,6 @@ from loam_gtsam import Mapper, run
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
-from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.relocalization import Fit, any_of, same_optimum
@@ -262,7 +260,7 @@ def way_of(*steps, planes=0):
     ],
 )
 def test_ways_that_may_be_true_are_kept(steps, planes, kept):
-    begun = first_sweeps.Start(*first_sweep(), bends=True)
+    begun = first_sweeps.Start(*first_sweep())
     tried = [way_of(0.0, 0.0), way_of(*steps, planes=planes)]
     assert ways.kept_ways(tried, CONFIG) == tried[: 1 + kept]
     assert begun._best(tried, CONFIG) is tried[0]
@@ -278,51 +276,6 @@ def test_the_way_that_was_taken_stays_though_no_acceleration_explains_it():
     taken, smooth = way_of(2.0, -2.0), way_of(2.0, 2.0)
     assert ways.kept_ways([taken, smooth], CONFIG) == [taken, smooth]
     assert ways.kept_ways([smooth, taken], CONFIG) == [smooth]
-
-
-def sweeps_on_a_parabola(times, acceleration):
-    """Sweeps whose middles are half the acceleration times the squared time ahead."""
-    _, (features,) = features_of("room", 1)
-    begun, sweeps = MovingSweep(features, CONFIG), []
-    for time in times:
-        sweep = copy(begun)
-        sweep.stamp = begun.stamp + round(1e9 * time)
-        middle = gtsam.Pose3(gtsam.Rot3(), np.array([0.5 * acceleration * time**2, 0.0, 0.0]))
-        twist = np.full(6, 7.0)
-        if sweeps and sweep.stamp > sweeps[-1].moment.stamp:
-            twist = sweep.twist_since(sweeps[-1].moment[:2], middle)
-        sweeps.append(ways.EarlySweep(sweep.at(twist), middle, False, None, 0))
-    return sweeps
-
-
-def test_between_two_sweeps_the_velocity_of_an_early_one_changes():
-    times = 0.0, 0.1, 0.25, 0.35
-    sweeps = sweeps_on_a_parabola(times, 4.0)
-    bent = ways.bent(sweeps)
-    for number in (1, 2):
-        assert bent[number].posed.twist[3] == pytest.approx(4.0 * times[number])
-        assert bent[number].posed.sweep.acceleration[3] == pytest.approx(4.0)
-    for number in (0, 3):
-        assert np.array_equal(bent[number].posed.twist, sweeps[number].posed.twist)
-        assert bent[number].posed.sweep.acceleration is None
-
-
-def test_early_sweeps_in_another_order_or_too_near_are_not_bent():
-    sweeps = sweeps_on_a_parabola((0.0, 0.1, 0.1), 4.0)[:2] + sweeps_on_a_parabola((0.1,), 4.0)
-    assert ways.bent(sweeps)[1].posed.sweep.acceleration is None
-    near = ways.bent(sweeps_on_a_parabola((0.0, 0.02, 0.04), 4.0))[1].posed.sweep
-    assert near.duration > 0.09
-    assert 0.0 < near.acceleration[3] < 0.25 * 4.0
-
-
-@pytest.mark.parametrize(("model", "bends"), [("linear", True), ("constant", False)])
-def test_early_sweeps_are_bent_if_the_velocity_within_a_sweep_is_linear(model, bends):
-    _, features = features_of("shaken", 3)
-    mapper = Mapper(CONFIG.changed({"deskew.model": model}))
-    for one in features:
-        mapper.register(one)
-    early = [one.posed.sweep.acceleration is not None for one in mapper._start._sweeps[:3]]
-    assert early == [False, bends, False]
 
 
 def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):

@@ -33,7 +33,6 @@ from loam_gtsam.registration.start.ways import (
     EarlySweep,
     Tried,
     Way,
-    bent,
     continued,
     kept_ways,
     mean_twist,
@@ -58,8 +57,7 @@ _TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical 
 class Start:
     """The first sweeps of a run; the pose of the very first at its reference time never changes."""
 
-    def __init__(self, first: Prediction, keyframe: int, *, bends: bool) -> None:
-        self._bends = bends  # whether the velocity changes within a sweep
+    def __init__(self, first: Prediction, keyframe: int) -> None:
         self._map_T_first = first.map_T_lidar
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, True, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
@@ -70,8 +68,7 @@ class Start:
     def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
         """The start of a map; None if no sweep is de-skewed anew, or the map is there already."""
         begins = maps.config.deskew.model != "predicted" and not maps.given
-        bends = maps.config.deskew.model == "linear"
-        return cls(first, keyframe, bends=bends) if begins else None
+        return cls(first, keyframe) if begins else None
 
     @property
     def complete(self) -> bool:
@@ -170,7 +167,7 @@ class Start:
                 sweeps = moved_with_first(sweeps, solutions)
                 continue
             for number, sweep in enumerate(sweeps):
-                if sweep.held and sweep.moment.stamp != frame.sweep.stamp:
+                if sweep.held and sweep.posed.sweep is not frame.sweep:
                     continue
                 solution = self._solved(frame, sweep, self._matcher(frame, sweeps, number), solver)
                 if solution.solved:
@@ -246,14 +243,14 @@ class Start:
         moved = list(sweeps)
         for number in range(1, len(moved)):
             last, now = moved[number - 1].moment, moved[number]
-            sweep = now.posed.sweep.accelerated(None)
+            sweep = now.posed.sweep
             if sweep.stamp > last.stamp:  # not for sweeps of unlike length
                 twist = sweep.twist_since(last[:2], now.map_T_middle)
                 moved[number] = replace(now, posed=sweep.at(twist))
         posed = moved[0].posed.sweep.at(_first_twist(*moved[:2]))
         middle = posed.map_T_middle(self._map_T_first)
         moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
-        return bent(moved) if self._bends else moved
+        return moved
 
     def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3) -> Tried:
         """The first two sweeps, the second near a pose, registered by few matches."""
@@ -293,7 +290,7 @@ class Start:
     ) -> Solution:
         """A sweep, registered with the map of a matcher."""
         expected = replace(one.expected, map_T_lidar=one.map_T_middle)
-        priors = frame.priors if one.moment.stamp == frame.sweep.stamp else ()
+        priors = frame.priors if one.posed.sweep is frame.sweep else ()
         return solver.solve(matcher, one.map_T_middle, priors, expected)
 
     def _fill(self, frame: Frame, sweeps: Sequence[EarlySweep]) -> None:

@@ -16,7 +16,7 @@ from loam_gtsam.registration.odometry import Moment, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, Favour, favour
 from loam_gtsam.registration.relocalization.fits import beyond_any_motion
 from loam_gtsam.registration.solvers import MotionPrior, Solution
-from loam_gtsam.types import FloatArray, SweepMotion
+from loam_gtsam.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -65,27 +65,6 @@ def continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
     """Where the motion between the last two sweeps leads by a stamp, nanoseconds."""
     before, last = sweeps[-2:]
     return advance(last.map_T_middle, mean_twist(before, last), last.moment.seconds_to(stamp))
-
-
-def bent(sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
-    """The sweeps, each de-skewed along the parabola through its middle and its neighbours'.
-
-    They come de-skewed for the mean velocity since the sweep before; the first and last stay so.
-    """
-    moved = list(sweeps)
-    for number in range(1, len(sweeps) - 1):
-        near = sweeps[number - 1 : number + 2]
-        sweep, twist = near[1].posed.sweep, near[1].posed.twist
-        stamps = [one.moment.stamp for one in near]
-        # The middles of sweeps of unlike length may coincide, or change places.
-        in_order = stamps == sorted(set(stamps))
-        if in_order and sweep.motion is SweepMotion.CONSTANT_VELOCITY:
-            # Middles closer than a sweep is long tell little of the path within it.
-            spans = [max(1e-9 * step, sweep.duration) for step in np.diff(stamps)]
-            acceleration = 2.0 / sum(spans) * (near[2].posed.twist - twist)
-            posed = sweep.accelerated(acceleration).at(twist + 0.5 * spans[0] * acceleration)
-            moved[number] = replace(near[1], posed=posed)
-    return moved
 
 
 def moved_with_first(

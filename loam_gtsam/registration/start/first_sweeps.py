@@ -98,7 +98,10 @@ class Start:
             most_turn=_TURNING * seconds,
             rare=True,
         )
-        quick = [self._tried(frame, place) for place in (expected.solution.map_T_lidar, *places)]
+        trial = trial_solver(frame.matcher.config.solver)
+        quick = [
+            self._tried(frame, place, trial) for place in (expected.solution.map_T_lidar, *places)
+        ]
         enough = _HOPEFUL * max(tried.evidence.share for tried in quick)
         hopeful = [quick[0], *(tried for tried in quick[1:] if tried.evidence.share >= enough)]
         ways = [
@@ -252,14 +255,13 @@ class Start:
         moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
         return moved
 
-    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3) -> Tried:
+    def _tried(self, frame: Frame, map_T_middle: gtsam.Pose3, solver: ScanSolver) -> Tried:
         """The first two sweeps, the second near a pose, registered by few matches."""
         first = self._sweeps[0]
         moved = first.map_T_middle.between(map_T_middle)
         second = EarlySweep(frame.matcher.posed, map_T_middle, False, frame.predicted.motion, 0)
         first, second = self._with_motion([first, second])
         second = replace(second, map_T_middle=first.map_T_middle.compose(moved))
-        solver = trial_solver(frame.matcher.config.solver)
         return self._registered(frame, [first, second], solver, quickly=True)
 
     def _registered(

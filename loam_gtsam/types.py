@@ -350,6 +350,8 @@ class Uncertainty:
         the linear acceleration that persist: ``blind @ u`` with u of unit covariance
     forgotten : (9,) what was passed on of each u from frame to frame since the start, as the
         negative logarithm of the correlation
+    in_doubt : whether the first sweeps can be explained by several motions; the covariance has what
+        they differ by
     """
 
     own: FloatArray
@@ -360,6 +362,7 @@ class Uncertainty:
     effective_matches: float
     blind: FloatArray = field(default_factory=lambda: np.zeros((6, 9)))
     forgotten: FloatArray = field(default_factory=lambda: np.zeros(9))
+    in_doubt: bool = False
 
 
 class Timings(Mapping[str, float]):

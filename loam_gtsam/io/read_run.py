@@ -33,6 +33,7 @@ def read_updates(path: str | Path) -> list[MapUpdate]:
         with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in _NEEDED}
             columns["accelerations"] = file.get("accelerations", np.zeros_like(columns["twists"]))
+            columns["in_doubt"] = file.get("in_doubt", np.zeros(len(columns["stamps"]), np.bool_))
             stages = file["stage_names"].tolist()
         return [
             _update({name: column[row] for name, column in columns.items()}, stages)
@@ -58,6 +59,7 @@ def _update(at: Mapping[str, Any], stages: Sequence[str]) -> MapUpdate:
             effective_matches=float(at["effective_matches"]),
             blind=at["blind_drifts"],
             forgotten=at["forgotten"],
+            in_doubt=bool(at["in_doubt"]),
         )
     return MapUpdate(
         int(at["stamps"]),

@@ -109,6 +109,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         "follows": np.array(follows, np.int64),
         "residual_variances": _column(parts, "residual_variance"),
         "effective_matches": _column(parts, "effective_matches"),
+        "in_doubt": _column(parts, "in_doubt", np.bool_),
         "stage_names": np.array(names, np.str_),
         "stage_seconds": seconds,
     }

@@ -63,12 +63,12 @@ class Places:
         self._positions = np.empty((0, 3))
 
     def add(self, update: MapUpdate, registered: Registered | None) -> int | None:
-        """Add the place of a sweep, if it was solved and is far enough from the last place.
+        """Add the place of a sweep, if it was solved, not in doubt, and far from the last place.
 
         Returns the number of the place at which the lidar has come; None if it has come to none.
         """
-        uncertainty = update.uncertainty
-        if uncertainty is None or registered is None or not update.status.solved:
+        known = update.uncertainty
+        if known is None or known.in_doubt or registered is None or not update.status.solved:
             return None
         pose, last = registered.map_T_middle, self._last
         config = self._config.pose_graph
@@ -88,7 +88,7 @@ class Places:
             points = np.concatenate([registered.edges, registered.planes])
             descriptor = scan_context(points, self._config.loops).astype(np.float16)
             to_map = update.map_T_lidar.AdjointMap()
-            of_map = nearest_positive(to_map @ (update.covariance - uncertainty.own) @ to_map.T)
+            of_map = nearest_positive(to_map @ (update.covariance - known.own) @ to_map.T)
             self.all.append(Place(update.stamp, pose, of_map, descriptor))
             if last is not None:
                 self.links.append(self._link(last[0], last[1], number, update))

@@ -73,7 +73,7 @@ class PoseGraph(FactorGraph):
         return len(self.keyframes)
 
     def add(self, update: MapUpdate, features: Features | None = None) -> Keyframe | None:
-        """Add a frame of the run, if it was solved and is far enough from the last keyframe.
+        """Add a frame of the run, if it was solved, not in doubt, and far from the last keyframe.
 
         Without the ``features`` of its sweep no loop closure can be found. Returns the keyframe, or
         None if the frame does not become one.
@@ -83,7 +83,8 @@ class PoseGraph(FactorGraph):
         InputError
             If the frame is not later than the last keyframe.
         """
-        if update.uncertainty is None or not update.status.solved:
+        known = update.uncertainty
+        if known is None or known.in_doubt or not update.status.solved:
             return None
         last = self.keyframes[-1] if self.keyframes else None
         motion = gtsam.Pose3()

@@ -203,6 +203,7 @@ class PoseErrors:
             forgotten=self._forgotten,
             residual_variance=scan.residual_variance,
             effective_matches=scan.effective_matches,
+            in_doubt=bool(self._doubt.any()),
         )
         self._last, self._paused = now, False
         total = self._drift + self._blind @ self._blind.T + self._moved

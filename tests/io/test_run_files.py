@@ -130,8 +130,12 @@ def test_a_damaged_run_is_refused(result, tmp_path, column, value):
 
 
 def test_the_frames_of_a_saved_run_are_those_of_the_run(result, tmp_path):
-    run_files.write_npz(tmp_path / "run.npz", result.updates)
-    for here, there in zip(result.updates, read_updates(tmp_path / "run.npz"), strict=True):
+    updates = list(result.updates)
+    assert updates[1].uncertainty is not None
+    told = replace(updates[1].uncertainty, in_doubt=not updates[1].uncertainty.in_doubt)
+    updates[1] = replace(updates[1], uncertainty=told)
+    run_files.write_npz(tmp_path / "run.npz", updates)
+    for here, there in zip(updates, read_updates(tmp_path / "run.npz"), strict=True):
         poses = ("map_T_lidar", "map_T_middle")
         for name in {item.name for item in fields(MapUpdate)} - {"uncertainty", "timings", *poses}:
             if name not in ("fault", "n_not_finite"):  # the file does not have them
@@ -140,19 +144,24 @@ def test_the_frames_of_a_saved_run_are_those_of_the_run(result, tmp_path):
             one, other = (getattr(u, name) or u.map_T_lidar for u in (here, there))
             np.testing.assert_array_equal(one.matrix(), other.matrix())
         assert (there.uncertainty is None) == (here.uncertainty is None)
+        if there.uncertainty is not None and here.uncertainty is not None:
+            assert there.uncertainty.in_doubt is here.uncertainty.in_doubt
         assert there.timings == here.timings
     assert there.n_plane_matches > 100
 
 
-def test_a_run_of_before_accelerations_were_written_is_read(result, tmp_path):
+def test_a_run_of_before_accelerations_and_doubts_were_written_is_read(result, tmp_path):
     path = tmp_path / "run.npz"
     run_files.write_npz(path, result.updates)
     with np.load(path) as file:
-        columns = {name: file[name] for name in file.files if name != "accelerations"}
+        columns = {
+            name: file[name] for name in file.files if name not in ("accelerations", "in_doubt")
+        }
     np.savez(path, **columns)
     for here, there in zip(result.updates, read_updates(path), strict=True):
         assert np.array_equal(there.twist, here.twist)
         assert not there.acceleration.any()
+        assert there.uncertainty is None or there.uncertainty.in_doubt is False
 
 
 def test_covariances_stand_beside_the_poses(result, tmp_path):

@@ -19,10 +19,13 @@ from support.pose_graphs import (
     wrong_loops,
 )
 
+from loam_gtsam.config import Config
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.loops.batch import optimize_graph
 from loam_gtsam.loops.keyframes import LoopClosure
+from loam_gtsam.loops.places import Places
 from loam_gtsam.loops.pose_graph import PoseGraph
+from loam_gtsam.mapper import Registered
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate
 
@@ -48,6 +51,18 @@ def test_frames_must_be_solved_and_come_in_order():
     assert graph.trajectory([lost]).map_T_lidar.shape == (1, 4, 4)
     with pytest.raises(InputError, match="expected a stamp after 200000000"):
         filled(square(4, 1)[:3]).add(frames(square(4, 1))[1])
+
+
+def test_frames_whose_first_motion_is_in_doubt_are_neither_keyframes_nor_places():
+    graph, places = PoseGraph(settings()), Places(Config())
+    points = Registered(np.empty((0, 3)), np.zeros((1, 3)), gtsam.Pose3(), None)
+    for number, update in enumerate(frames(square(4, 1)[:3])):
+        assert update.uncertainty is not None
+        told = replace(update.uncertainty, in_doubt=number < 2)
+        update = replace(update, uncertainty=told)  # noqa: PLW2901
+        assert (graph.add(update) is None) == (number < 2)
+        assert (places.add(update, points) is None) == (number < 2)
+    assert graph.keyframes[0].stamp == places.all[0].stamp == 2 * FRAME
 
 
 def test_features_are_kept_where_they_are_at_the_stamp():

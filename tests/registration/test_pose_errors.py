@@ -405,6 +405,8 @@ def test_what_is_in_doubt_at_the_end_of_the_start_is_an_error_of_the_map(stays, 
     assert (told[:2] > [4.0, 1.0]).all()
     assert (told[2:] > [4.0, 1.0]).all() == stays
     assert (told[2:] < 0.1).all() != stays
+    in_doubt = [update.uncertainty.in_doubt for update in updates if update.uncertainty is not None]
+    assert in_doubt == [True, True, stays, False, False]
     # Nothing is in doubt that lies behind both frames.
     assert np.diag(relative_covariance(*updates[-2:]))[3] < 0.1
     motion = relative_covariance(*updates[:2])

@@ -239,6 +239,9 @@ def test_the_likeliest_place_is_the_true_one(corner, away, turn):
     error = truth.localCoordinates(found[0])
     assert np.linalg.norm(error[3:]) < 1.0
     assert np.abs(error[:3]).max() < np.radians(6.0)
+    nearer = likely_poses(seen, corner, [predicted], radius=8.0, count=4, apart=(0.8, 0.2))
+    assert nearer[0].equals(found[0], 0.0)
+    assert min(nearer[0].range(pose) for pose in nearer[1:]) < 1.5
     few = one_per_cell(corner)
     assert len(few) < 0.1 * len(corner)
     again = likely_poses(seen, few, [predicted], radius=8.0, count=4)

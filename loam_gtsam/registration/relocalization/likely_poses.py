@@ -49,6 +49,7 @@ def likely_poses(
     rare: bool = False,
     as_well: float | None = None,
     least: float = 0.0,
+    apart: tuple[float, float] = APART,
 ) -> list[gtsam.Pose3]:
     """Poses from which a sweep may have been taken, the likeliest first.
 
@@ -62,7 +63,7 @@ def likely_poses(
     points : (N, 3) metres, lidar frame, a few hundred of the sweep
     map_points : (M, 3) metres, of the map; or those around each centre
     around, radius : centres of the search, ``map_T_lidar``, and metres around each
-    count : largest number of poses, which are more than 1.5 m or 12 degrees apart
+    count : largest number of poses
     most_turn : largest rotation against the centre about the vertical axis, rad
     rare : whether a point counts minus the logarithm of the share of the trial poses at which it
         hits: ground, which fits everywhere, tells nothing, and a post, which fits at few places,
@@ -70,6 +71,7 @@ def likely_poses(
     as_well : part of the best score from which another trial pose is as good: of those the nearest
         to its centre is the likeliest. Along a corridor all fit alike. None takes the best
     least : part of the best score that every pose must have
+    apart : metres and rad, one of which at least is between any two of the poses
     """
     held = [map_points] * len(around) if isinstance(map_points, np.ndarray) else map_points
     places = zip(held, around, strict=True)
@@ -100,7 +102,7 @@ def likely_poses(
         rotation = gtsam.Rot3.Yaw(turn).compose(pose.rotation())
         best.append(gtsam.Pose3(rotation, pose.translation() + np.array([x, y, 0.0])))
         turned = np.abs((moves[:, 2] - turn + np.pi) % (2.0 * np.pi) - np.pi)
-        taken = (np.linalg.norm(at - at[top], axis=1) < APART[0]) & (turned < APART[1])
+        taken = (np.linalg.norm(at - at[top], axis=1) < apart[0]) & (turned < apart[1])
         scores[taken] = 0.0
     return best
 

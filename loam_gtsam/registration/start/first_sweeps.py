@@ -44,7 +44,10 @@ from loam_gtsam.types import FloatArray, SweepMotion
 _TOGETHER = (2, 3, 5, 8)
 """Numbers of sweeps at which all are registered anew: each time half as many more or so."""
 _ROUNDS = 2  # times that each of them is then registered with the map of the others
-_PLACES = 6  # motions between the first two sweeps that are tried beside the expected one
+_PLACES = 12  # most motions between the first two sweeps that are tried beside the expected one
+_NEAR = (0.8, APART[1])
+"""Metres and rad within which a place leads where another one did: less than the 1 m between trial
+places. In a corridor two sweeps that are registered from 0.7 m away do not find each other."""
 _SAMPLE = (500, 140)
 """Number of edges and planes that are looked at for these: ten of 500 edges may lie on posts."""
 _HOPEFUL = 0.5
@@ -86,22 +89,22 @@ class Start:
             return expected
         first, middle = self._sweeps[0], frame.predicted.map_T_middle
         seconds = first.moment.seconds_to(frame.sweep.stamp)
-        around = [middle]
-        if middle.range(first.map_T_middle) > APART[0]:  # a guess, and it may be wrong
-            around.append(first.map_T_middle)
         places = likely_poses(
             sample_features(*frame.matcher.posed.points, _SAMPLE),
             np.concatenate(_in_map(first)),
-            around,
+            _centres(middle, first.map_T_middle),
             min(_FASTEST * seconds, _FARTHEST),
             _PLACES,
             most_turn=_TURNING * seconds,
             rare=True,
+            apart=_NEAR,
         )
         trial = trial_solver(frame.matcher.config.solver)
-        quick = [
-            self._tried(frame, place, trial) for place in (expected.solution.map_T_lidar, *places)
-        ]
+        quick = [self._tried(frame, expected.solution.map_T_lidar, trial)]
+        for place in places:
+            moved = first.map_T_middle.between(place)
+            if not any(same(moved, tried.moved, _NEAR) for tried in quick):
+                quick.append(self._tried(frame, place, trial))
         enough = _HOPEFUL * max(tried.evidence.share for tried in quick)
         hopeful = [quick[0], *(tried for tried in quick[1:] if tried.evidence.share >= enough)]
         ways = [
@@ -314,6 +317,11 @@ def _first_twist(first: EarlySweep, second: EarlySweep) -> FloatArray:
         return twist
     moved = first.map_T_middle.rotation().between(second.map_T_middle.rotation())
     return first.posed.sweep.twist_at_reference(twist[:3], moved.matrix() @ velocity)
+
+
+def _centres(expected: gtsam.Pose3, first: gtsam.Pose3) -> list[gtsam.Pose3]:
+    """Where the second sweep is looked for: a guess far away from the first may be wrong."""
+    return [expected, first] if expected.range(first) > APART[0] else [expected]
 
 
 def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:

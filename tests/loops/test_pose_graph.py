@@ -59,7 +59,7 @@ def test_frames_whose_first_motion_is_in_doubt_are_neither_keyframes_nor_places(
     for number, update in enumerate(frames(square(4, 1)[:3])):
         assert update.uncertainty is not None
         told = replace(update.uncertainty, in_doubt=number < 2)
-        update = replace(update, uncertainty=told)  # noqa: PLW2901
+        update = replace(update, uncertainty=told)
         assert (graph.add(update) is None) == (number < 2)
         assert (places.add(update, points) is None) == (number < 2)
     assert graph.keyframes[0].stamp == places.all[0].stamp == 2 * FRAME

@@ -174,10 +174,14 @@ class PoseErrors:
         # At the first solve all ground is new but replaces none, which makes half the drift.
         factor = 0.5 * self._drift_factor if first else self._drift_factor
         by_imu = None if solution.weak is not None else fused
-        settled = None if self._scans <= self._lag or by_imu is None else by_imu.covariance[:6, :6]
+        known = scan.covariance if by_imu is None else by_imu.covariance[:6, :6]
+        settled = None if self._scans <= self._lag or by_imu is None else known
         self._add_drift(sweep, solution, scan, last, scan.drift(factor, settled))
         if fused is not None:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
+        before = last if first else self._last
+        if before is not None and sweep.stamp > before.stamp:
+            self._motion.add(before.stamp, before.map_T_lidar, sweep.stamp, middle, known)
         if by_imu is None:
             own, shared, now = self._own(update.stamp, sweep, middle, scan.covariance, to_reference)
             if self._paused:
@@ -189,11 +193,9 @@ class PoseErrors:
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         drifted = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
-        if doubt is not None:
-            own = own + drifted @ doubt @ drifted.T
-        else:  # what is still in doubt after the start is an error of the map
-            self._drift = self._drift + self._doubt
-        self._doubt = np.zeros((6, 6)) if doubt is None else doubt
+        if doubt is None:  # what is still in doubt after the start is an error of the map
+            self._drift, doubt = self._drift + self._doubt, np.zeros((6, 6))
+        own, self._doubt = own + drifted @ doubt @ drifted.T, doubt
         uncertainty = Uncertainty(
             own=own,
             shared=shared,
@@ -298,12 +300,8 @@ class PoseErrors:
         shared = np.zeros((6, 6))
         if last is not None and last.of_state is not None and last.lasting is not None:
             shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
-        pose = fused.covariance[:6, :6]
-        if last is not None and sweep.stamp > last.stamp:
-            self._motion.add(last.stamp, last.map_T_lidar, sweep.stamp, middle, pose)
-        now = _Middle(
-            sweep.stamp, middle, pose, np.ones(6), to_reference, update.stamp, of_state, lasting
-        )
+        parts = middle, fused.covariance[:6, :6], np.ones(6), to_reference, update.stamp
+        now = _Middle(sweep.stamp, *parts, of_state, lasting)
         return symmetric(own), shared, now
 
     def _own(
@@ -327,7 +325,6 @@ class PoseErrors:
             across = share[:, None] * middle.between(last.map_T_lidar).AdjointMap()
             own = own + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
-            self._motion.add(last.stamp, last.map_T_lidar, sweep.stamp, middle, covariance)
         own = to_reference @ (own + np.diag(self._missed(sweep))) @ to_reference.T
         now = _Middle(sweep.stamp, middle, covariance, kept, to_reference, reference_stamp)
         return symmetric(own), shared, now

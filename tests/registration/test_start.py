@@ -302,7 +302,7 @@ def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
 
 
 def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch):
-    _, features = features_of("avenue", 2, speed=30.0, start="moving")
+    _, features = features_of("corridor", 2, start="moving")
     found, closer = [], []
     for share in (0.0, first_sweeps._HOPEFUL, 1.0):
         monkeypatch.setattr(first_sweeps, "_HOPEFUL", share)
@@ -315,7 +315,7 @@ def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch
 
 
 def test_places_that_lead_to_the_same_motion_are_tried_or_looked_at_closer_once(monkeypatch):
-    _, features = features_of("street_loop", 2)
+    _, features = features_of("rooms", 2, start="moving")
     tried, started = [], []
     registered, look = first_sweeps.Start._registered, first_sweeps.Start._tried
 

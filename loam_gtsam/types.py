@@ -350,8 +350,8 @@ class Uncertainty:
         the linear acceleration that persist: ``blind @ u`` with u of unit covariance
     forgotten : (9,) what was passed on of each u from frame to frame since the start, as the
         negative logarithm of the correlation
-    in_doubt : whether the first sweeps can be explained by several motions; the covariance has what
-        they differ by
+    in_doubt : whether several places explain the sweep, of the first ones or of a search; ``own``
+        has what they differ by
     """
 
     own: FloatArray

@@ -195,7 +195,7 @@ def test_an_observer_that_fails_costs_the_run_or_nothing(name, caplog):
 
 
 def test_a_run_that_a_fault_stopped_is_gone_on_with(tmp_path):
-    part = Faulty("solver", 20)
+    part = Faulty("solver", 15)
     part.armed = True
     with pytest.raises(PartError):
         run(DATA, CONFIG, checkpoint=Checkpoint(tmp_path), solver=part)

@@ -194,14 +194,13 @@ def test_a_prior_of_ones_own_holds_the_pose_in_spite_of_drift():
 
 @pytest.mark.parametrize("name", ["loam", "aloam"])
 def test_classical_solvers_have_covariances_of_the_same_size(name):
-    world = SimulatedWorld("room", frames=8, columns=450)
+    world = SimulatedWorld("room", frames=16, columns=450)
     # Where all take the velocity as constant within a sweep.
     ours = run(world, no_imu().changed("deskew.model=constant")).updates[-1]
     theirs = run(world, preset(name).changed("imu.coupling=off")).updates[-1]
     ratio = np.sqrt(np.diag(theirs.uncertainty.own) / np.diag(ours.uncertainty.own))
-    assert 0.2 < np.median(ratio) < 5.0
-    assert ratio.min() > 0.1
-    assert ratio.max() < 10.0
+    assert ratio.min() > 0.2
+    assert ratio.max() < 5.0
 
 
 @pytest.mark.parametrize(("reference", "share"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])

@@ -19,7 +19,14 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import as_array, symmetric, transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate
+from loam_gtsam.types import (
+    BoolArray,
+    Features,
+    FloatArray,
+    InputError,
+    MapUpdate,
+    Uncertainty,
+)
 
 _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)  # rad and m: no factor may be infinitely sure
 
@@ -179,6 +186,12 @@ class LoopClosure:
             noise = gtsam.noiseModel.Robust.Create(kernel, noise)
         keys = pose_key(self.earlier), pose_key(self.later)
         return gtsam.BetweenFactorPose3(*keys, self.earlier_T_later, noise)
+
+
+def surely_placed(update: MapUpdate) -> Uncertainty | None:
+    """The uncertainty of a frame that may be a keyframe or a place: solved, and not in doubt."""
+    known = update.uncertainty
+    return None if known is None or known.in_doubt or not update.status.solved else known
 
 
 def leads_to_keyframe(motion: gtsam.Pose3, config: PoseGraphConfig) -> bool:

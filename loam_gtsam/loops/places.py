@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import Config
 from loam_gtsam.geometry import nearest_positive
-from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe
+from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe, surely_placed
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.mapper import Registered
 from loam_gtsam.registration.pose_errors import relative_covariance
@@ -67,8 +67,8 @@ class Places:
 
         Returns the number of the place at which the lidar has come; None if it has come to none.
         """
-        known = update.uncertainty
-        if known is None or known.in_doubt or registered is None or not update.status.solved:
+        known = surely_placed(update)
+        if known is None or registered is None:
             return None
         pose, last = registered.map_T_middle, self._last
         config = self._config.pose_graph

@@ -28,6 +28,7 @@ from loam_gtsam.loops.keyframes import (
     noise_model,
     numbered,
     odometry_between,
+    surely_placed,
 )
 from loam_gtsam.loops.loop_selection import LoopSelection
 from loam_gtsam.loops.own_factors import FactorGraph
@@ -83,8 +84,7 @@ class PoseGraph(FactorGraph):
         InputError
             If the frame is not later than the last keyframe.
         """
-        known = update.uncertainty
-        if known is None or known.in_doubt or not update.status.solved:
+        if surely_placed(update) is None:
             return None
         last = self.keyframes[-1] if self.keyframes else None
         motion = gtsam.Pose3()

@@ -179,6 +179,7 @@ class PoseErrors:
         self._add_drift(sweep, solution, scan, last, scan.drift(factor, settled))
         if fused is not None:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
+        # A pose in doubt tells no acceleration; that of the very first sweep does.
         before = None if self._doubt.any() else last if first else self._last
         if before is not None and sweep.stamp > before.stamp:
             self._motion.add(before.stamp, before.map_T_lidar, sweep.stamp, middle, known)

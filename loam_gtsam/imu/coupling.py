@@ -132,6 +132,21 @@ class TightCoupling:
         """Take the last prediction back: a sweep fitted better without the IMU."""
         self._predicted, self._rejected = None, True
 
+    def moved(self, map_T_lidar: gtsam.Pose3, buffer: ImuBuffer) -> None:
+        """Take the map, as the frame of the last :meth:`observe` sees it, to be elsewhere.
+
+        Only if that frame, now at this pose, is farther off than it may be by its own error. What
+        moved it is no motion, and tells neither velocity nor biases.
+        """
+        if self._odometry is None or self._odometry.distance_to(map_T_lidar) < _UNLIKELY:
+            return
+        try:
+            self._odometry.moved(map_T_lidar)
+        except SweepError:
+            self._odometry = None
+        if self._predicted is not None:
+            self.predict(self._predicted, buffer)
+
     def bend(
         self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray,
         gravity: FloatArray, buffer: ImuBuffer,

@@ -266,6 +266,30 @@ class InertialOdometry:
         state = replace(self.state, stamp=stamp, covariance=covariance)
         self._start_at(state, map_T_lidar, velocity, spread)
 
+    def distance_to(self, map_T_lidar: gtsam.Pose3) -> float:
+        """Squared Mahalanobis distance of the newest frame from a pose, by the frame's error."""
+        away = self.state.map_T_imu.localCoordinates(map_T_lidar.compose(self._lidar_T_imu))
+        return float(away @ np.linalg.solve(self.state.covariance[POSE, POSE], away))
+
+    def moved(self, map_T_lidar: gtsam.Pose3) -> None:
+        """Take the map, as the newest frame sees it, to be elsewhere: the frame is at this pose.
+
+        Velocity and gravity turn along; how well all is known stays. A prediction is forgotten.
+        SweepError if no window can begin here.
+        """
+        state, map_T_imu = self.state, map_T_lidar.compose(self._lidar_T_imu)
+        turn = map_T_imu.rotation().compose(state.map_T_imu.rotation().inverse()).matrix()
+        along = np.eye(STATE)
+        along[VELOCITY, VELOCITY] = along[GRAVITY, GRAVITY] = turn
+        moved = replace(
+            state,
+            map_T_imu=map_T_imu,
+            velocity=turn @ state.velocity,
+            map_gravity=turn @ state.map_gravity,
+            covariance=along @ state.covariance @ along.T,
+        )
+        self._start(moved)
+
     def _start_at(
         self,
         state: InertialState,

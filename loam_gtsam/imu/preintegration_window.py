@@ -246,13 +246,28 @@ def information_root(information: FloatArray) -> FloatArray:
     return root
 
 
+def _known(state: InertialState) -> gtsam.HessianFactor:
+    """What the covariance of a state says of it, under the keys of frame 0."""
+    information = np.linalg.inv(state.covariance)
+    parts = (X(0), POSE), (V(0), VELOCITY), (B(0), BIASES), (G(0), GRAVITY)
+    graph = gtsam.GaussianFactorGraph()
+    for number, (key, rows) in enumerate(parts):
+        here, size = information[rows, rows], rows.stop - rows.start
+        graph.add(gtsam.HessianFactor(key, here, np.zeros(size), 0.0))
+        for other, columns in parts[number + 1 :]:
+            more = columns.stop - columns.start
+            none = np.zeros((size, size)), np.zeros(size), np.zeros((more, more)), np.zeros(more)
+            across = none[0], information[rows, columns], *none[1:], 0.0
+            graph.add(gtsam.HessianFactor(key, other, *across))
+    return gtsam.HessianFactor(graph)
+
+
 class Window:
     """Poses, velocities and biases of the last frames, under the keys X, V, B; gravity is G(0).
 
     Parameters
     ----------
-    state : the only frame at first, with its covariance as prior. Pose, velocity and the rest are
-        taken as independent of each other.
+    state : the only frame at first, with its covariance as prior
     lag : largest number of frames
     """
 
@@ -261,17 +276,8 @@ class Window:
         self._frames: deque[WindowFrame] = deque()
         self._values = state.values(0)
         self._values.insert(G(0), state.map_gravity)
-        normal = gtsam.noiseModel.Gaussian.Covariance
-        pose, velocity = state.covariance[POSE, POSE], state.covariance[VELOCITY, VELOCITY]
-        # Biases and gravity stay correlated: the scans tell their sum much better than either.
-        rest = np.linalg.inv(state.covariance[REST, REST])
-        joint = gtsam.HessianFactor(
-            B(0), G(0), rest[:6, :6], rest[:6, 6:], np.zeros(6), rest[6:, 6:], np.zeros(3), 0.0
-        )
         self._prior = gtsam.NonlinearFactorGraph()
-        self._prior.add(gtsam.PriorFactorPose3(X(0), state.map_T_imu, normal(pose)))
-        self._prior.add(gtsam.PriorFactorVector(V(0), state.velocity, normal(velocity)))
-        self._prior.add(gtsam.LinearContainerFactor(joint, self._values))
+        self._prior.add(gtsam.LinearContainerFactor(_known(state), self._values))
 
     def __getstate__(self) -> dict[str, Any]:
         return vars(self) | {k: vars(self)[k].serialize() for k in ("_prior", "_values")}

@@ -32,8 +32,7 @@ _ROUGH, _WRONG = 2.0, 4.0
 less than one in ten of flat ones do by noise. It is wrong by four times what is beyond that."""
 _LEAN = 0.1
 """Standard deviation, rad, of the angle between the axis of the rings and what stands upright."""
-_SURE = 2.0
-"""Standard deviations beyond which a difference is none of noise (95 %)."""
+_SURE = 2.0  # standard deviations beyond which a difference is none of noise (95 %)
 
 
 def associate(
@@ -92,8 +91,7 @@ def match_features(
     if distinct is not None:
         left = distinct.copy()
         left[lines.indices] = False
-        searched = config.wide_search > 1.0 and left.any()
-        if searched and translations_fixed(surfaces)[0] < config.wide_below:
+        if left.any() and leaves_open(surfaces, config):
             # A pole that few beams met has no five points within max_distance, or only these.
             poles = rows.alone is not None and rows.alone
             ways = (match_lines, True, config.wide_search * limit), (match_uprights, poles, limit)
@@ -194,6 +192,11 @@ def translations_fixed(planes: PlaneMatches) -> FloatArray:
     across = planes.normals.T @ planes.normals - (tilts @ tilts) * np.eye(3)
     fixed: FloatArray = np.linalg.eigvalsh(across).astype(np.float64)
     return fixed
+
+
+def leaves_open(planes: PlaneMatches, config: MatchingConfig) -> bool:
+    """Whether planes leave a translation open, so that edges are searched for more widely."""
+    return config.wide_search > 1.0 and bool(translations_fixed(planes)[0] < config.wide_below)
 
 
 def trial_matching(config: MatchingConfig) -> MatchingConfig:

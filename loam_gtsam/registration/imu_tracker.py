@@ -166,7 +166,8 @@ class ImuTracker:
             return solution, TiltPrior.DROPPED
         pose, information = solution.map_T_lidar, solution.information
         level_R_lidar = self.level.level_R_map.compose(pose.rotation())
-        if too_steep(level_R_lidar, measured) or self._tilt_is_unknown(solution, level_R_lidar):
+        steep = too_steep(level_R_lidar, measured)
+        if steep or _tilt_is_unknown(solution, level_R_lidar, config.sigma_deg):
             factor, tilt = self._gravity(measured), TiltPrior.GRAVITY
         else:
             prior = equivalent_prior(level_R_lidar, information, measured, config.weight)
@@ -218,6 +219,10 @@ class ImuTracker:
     def reject(self) -> None:
         """Take the last prediction back: a sweep fitted better without the IMU."""
         self._coupling.reject()
+
+    def registered_anew(self, map_T_lidar: gtsam.Pose3) -> None:
+        """Take the last sweep to be at another pose, by the sweeps that followed."""
+        self._coupling.moved(map_T_lidar, self.buffer)
 
     def _attitude_turned(self, last: Moment | None, stamp: int, map_T_lidar: gtsam.Pose3) -> bool:
         """Whether the IMU's attitude turned as the scans did since ``last``, as far as is known."""
@@ -313,10 +318,11 @@ class ImuTracker:
         sigma = float(np.radians(self.config.sigma_deg))
         return gravity_factor(POSE_KEY, measured, sigma, self.level.map_up)
 
-    def _tilt_is_unknown(self, solution: Solution, level_R_lidar: gtsam.Rot3) -> bool:
-        """Whether the scan knows some direction of the tilt less well than the IMU."""
-        knows = tilt_information(solution.scan_information, level_R_lidar)
-        return bool(np.linalg.eigvalsh(knows)[0] < np.radians(self.config.sigma_deg) ** -2)
+
+def _tilt_is_unknown(solution: Solution, level_R_lidar: gtsam.Rot3, degrees: float) -> bool:
+    """Whether the scan knows some direction of the tilt less well than to so many degrees."""
+    knows = tilt_information(solution.scan_information, level_R_lidar)
+    return bool(np.linalg.eigvalsh(knows)[0] < np.radians(degrees) ** -2)
 
 
 def _disagree(scan: gtsam.Rot3, turned: gtsam.Rot3, angle: float, share: float) -> bool:

@@ -212,6 +212,29 @@ def test_a_rejected_prediction_is_not_fused():
     assert coupling.observe(last, now, np.eye(6), DOWN, data) is None
 
 
+@pytest.mark.parametrize("metres", [0.001, 0.5])
+def test_a_frame_that_was_registered_elsewhere_is_no_motion(metres):
+    """Beyond its own error; below it nothing changes."""
+    data, there = resting(), gtsam.Pose3(gtsam.Rot3(), [metres, 0.0, 0.0])
+    coupling = TightCoupling(ImuConfig())
+    drive(coupling, data, range(1, 20))
+    before = coupling._odometry.state
+    coupling.predict(NOW + 20 * FRAME, data)
+    coupling.moved(there, data)
+    known = np.diag([1e6] * 3 + [1e4] * 3)
+    last, now = ((NOW + k * FRAME, there) for k in (19, 20))
+    fused = coupling.observe(last, now, known, DOWN, data)
+    assert fused is not None
+    assert not coupling.contradicted
+    assert np.abs(fused.velocity).max() < 0.01
+    at = coupling._odometry.state.map_T_imu.x()
+    assert abs(at - metres) < 0.01
+    assert (coupling._odometry.distance_to(gtsam.Pose3()) > 40.0) == (metres > 0.1)
+    np.testing.assert_allclose(
+        coupling._odometry.state.acceleration_bias, before.acceleration_bias, atol=0.005
+    )
+
+
 @pytest.mark.parametrize("gap", [True, False])
 def test_a_speed_goes_on_through_a_gap_in_the_samples_where_no_scan_sees_it(gap):
     """5 m/s along x, seen until frame 10; then scans see no x, and poses seem to stand still."""

@@ -476,3 +476,31 @@ def test_restart_after_a_gap():
     np.testing.assert_array_equal(grown[15:], 0.0)
     with pytest.raises(InputError, match="or later"):
         odo.restart(before.stamp, there, np.zeros(3))
+
+
+def test_a_frame_that_is_put_elsewhere_in_the_map_tells_no_bias():
+    """The map turns by a degree under a drive: the same scans are then seen from there."""
+    found = {}
+    for knows in (True, False):
+        odo = odometry(velocity=np.array([5.0, 0.0, 0.0]))
+        drive(odo, 10, 5.0)
+        before = odo.state
+        turn = gtsam.Pose3(gtsam.Rot3.Yaw(np.radians(1.0)), ZERO)
+        if knows:
+            odo.moved(turn.compose(pose(np.eye(3), [5.0, 0.0, 0.0])))
+            known = [np.linalg.eigvalsh(one.covariance) for one in (odo.state, before)]
+            np.testing.assert_allclose(*known, rtol=1e-6)
+            turned = turn.rotation().rotate(before.velocity)
+            np.testing.assert_allclose(odo.state.velocity, turned, atol=1e-9)
+        drive(odo, 1, 5.0, turn, start=11)
+        found[knows] = np.abs(odo.state.gyro_bias - before.gyro_bias).max(), odo.turn_surprise
+    assert found[True][0] < 1e-6 < 1e-3 < found[False][0]
+    assert found[True][1] < 1e-3 < 9.0 < found[False][1]
+
+
+def test_a_frame_that_was_put_elsewhere_has_to_be_predicted_from_there():
+    odo = odometry()
+    odo.predict(START + FRAME, samples())
+    odo.moved(gtsam.Pose3())
+    with pytest.raises(InputError, match="nothing has been predicted"):
+        odo.update(gtsam.Pose3(), KNOWN)

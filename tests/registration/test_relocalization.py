@@ -26,7 +26,7 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.io.rollback import Before
 from loam_gtsam.pipeline import Pipeline, effective_config, run
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, subset
 from loam_gtsam.registration.odometry import Moment, predict
 from loam_gtsam.registration.relocalization import (
     Doubt,
@@ -467,9 +467,13 @@ def test_in_a_dense_map_a_match_that_any_place_would_agree_with_says_nothing(bef
     rows = len(matcher.rows.edges)
     assert sure.signs[rows:].max() > 0.8
     assert not chance.signs[rows:].any()
-    # In a thin map it says that there is something to match with.
-    thin = Evidence.of(matcher, replace(solution, matches=wide))
-    assert thin.signs[rows:].any()
+    # In a thin map it says that there is something to match with, if that was looked for: not if
+    # planes fix all translations.
+    ground = replace(wide, planes=subset(wide.planes, np.abs(planes.normals[:, 2]) > 0.9))
+    for matches, hints in ((wide, False), (ground, True)):
+        thin = Evidence.of(matcher, replace(solution, matches=matches))
+        assert not thin.signs[rows:].any()
+        assert (thin.hints is not None and thin.hints[rows:].any()) == hints
     nowhere = Evidence.of(matcher, replace(solution, solved=False))
     assert not nowhere.signs.any()
     assert not nowhere.axes.any()

@@ -12,6 +12,7 @@ import pytest
 from loam_gtsam import Mapper, run
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.arrays import ArrayDataset
+from loam_gtsam.datasets.sim.disturbances import Disturbed, Outliers
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration.odometry import Moment
@@ -183,6 +184,16 @@ def test_among_things_that_repeat_a_run_does_not_begin_some_of_them_a_sweep_off(
     assert errors(world, [mapper.register(one) for one in features]).max() < 0.1
 
 
+def test_points_that_stand_nowhere_make_no_first_motion():
+    """One of seven, along a bridge: whatever stands alone finds one of them near by, anywhere."""
+    options = {"sensor": "hdl32", "columns": 600, "speed": 14.0, "start": "moving"}
+    world = SimulatedWorld("bridge", seed=9, frames=3, range_noise=0.005, **options)
+    mapper = Mapper(CONFIG)
+    disturbed = Disturbed(world, [Outliers(0.15, seed=9)])
+    updates = [mapper.register(extract_features(sweep, CONFIG)) for sweep in disturbed]
+    assert errors(world, updates).max() < 0.1
+
+
 UP, AHEAD, ASIDE = np.eye(3)[[2, 0, 1]]
 
 
@@ -233,6 +244,24 @@ def test_many_features_that_hardly_lie_across_the_way_are_not_enough():
     here, there = (place(x * AHEAD, [], np.full(600, x > 0.0), leaning) for x in (0.0, 3.0))
     assert not ways._better((there,), (here,), 8.0)
     assert ways._better((there,), (here,), 0.1)
+
+
+@pytest.mark.parametrize(
+    ("here_sought", "there_sought", "better"),
+    [(True, True, True), (True, False, False), (False, True, False)],
+)
+def test_vague_matches_count_only_if_they_were_looked_for_at_both_places(
+    here_sought, there_sought, better
+):
+    def hinting(at, hints, sought):
+        tried = place(at, np.zeros(60), [], UP)
+        hints = np.full(60, float(hints)) if sought else None
+        return tried._replace(evidence=replace(tried.evidence, hints=hints))
+
+    here = hinting(0.0 * AHEAD, 0, here_sought)
+    there = hinting(3.0 * AHEAD, 1, there_sought)
+    there.evidence.axes[:], here.evidence.axes[:] = UP, UP
+    assert ways._better((there,), (here,), 8.0) == better
 
 
 def test_several_sweeps_that_see_the_same_are_one_piece_of_evidence():

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from loam_gtsam.geometry import transform
+from loam_gtsam.registration.association import leaves_open
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.relocalization.fits import AGREE, agreeing
 from loam_gtsam.registration.solvers import Solution
@@ -32,12 +33,15 @@ class Evidence:
     points : (F, 3) where the features are in the map, metres
     signs : (F,) 1 if the match of a feature agrees, -5 if it contradicts, and 0 without a match
     axes : (F, 3) of the lines and planes of the matches
+    hints : (F,) 1 where a match is so vague that it agrees anywhere within its reach: all it says
+        is that there was one to find. None if such matches were not looked for; they have no sign.
     """
 
     edges: int
     points: FloatArray
     signs: FloatArray
     axes: FloatArray
+    hints: FloatArray | None = None
 
     @classmethod
     def of(cls, matcher: FrameMatcher, solution: Solution, *, dense: bool = False) -> Evidence:
@@ -48,6 +52,7 @@ class Evidence:
         """
         rows = matcher.rows
         signs, axes = np.zeros(len(rows)), np.zeros((len(rows), 3))
+        hints, thorough = np.zeros(len(rows)), False
         if solution.solved:
             edges, planes = solution.matches.edges, solution.matches.planes
             lines = np.searchsorted(rows.edges, edges.indices)
@@ -56,13 +61,16 @@ class Evidence:
             for places, sure, sigmas in zip(
                 (lines, others), agree, (edges.sigmas, planes.sigmas), strict=True
             ):
-                signs[places] = np.where(sure, 1.0, -_AGAINST)
+                vague = AGREE * sigmas >= reach
+                signs[places] = np.where(vague, 0.0, np.where(sure, 1.0, -_AGAINST))
                 if dense:
                     signs[places] *= 1.0 - np.minimum(AGREE * sigmas / reach, 1.0)
+                hints[places] = vague
             axes[lines], axes[others] = edges.directions, planes.normals
+            thorough = not dense and leaves_open(planes, matcher.matching)
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)
-        return cls(len(rows.edges), points, signs, axes)
+        return cls(len(rows.edges), points, signs, axes, hints if thorough else None)
 
     @property
     def share(self) -> float:
@@ -110,7 +118,8 @@ def _gain(tried: Evidence, other: Evidence) -> tuple[FloatArray, BoolArray, floa
     """What each feature (F,) says for one place against another, which are edges, and their number.
 
     A feature counts as far as its line or plane lies across the way from one place to the other:
-    ground and walls along the way agree at both, but for chance.
+    ground and walls along the way agree at both, but for chance. Hints count only if they were
+    looked for at both.
     """
     edge = np.arange(len(other.points)) < other.edges
     way = tried.points - other.points
@@ -122,5 +131,8 @@ def _gain(tried: Evidence, other: Evidence) -> tuple[FloatArray, BoolArray, floa
         for has, cosine in zip(matched, along, strict=True)
     ]
     across = np.sqrt(np.clip(sum(each) / np.maximum(sum(matched), 1), 0.0, 1.0))
-    gain = across * (tried.signs - other.signs)
+    gain = tried.signs - other.signs
+    if tried.hints is not None and other.hints is not None:
+        gain = gain + tried.hints - other.hints
+    gain = across * gain
     return gain, edge, float(across @ gain)

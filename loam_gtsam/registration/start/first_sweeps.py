@@ -127,7 +127,10 @@ class Start:
         """
         if imu is not None and imu.trusted_gyro is None:
             self._forget_gyro()
+        before = frame
         frame, found = self._added(frame, found, keyframe, solver)
+        if imu is not None and frame is not before:
+            imu.registered_anew(self._sweeps[-2].map_T_middle)
         others = [continued(sweeps, frame.sweep.stamp) for sweeps in self._rivals]
         doubt = any_of(found.solution.map_T_lidar, others)
         return frame, replace(found, doubt=np.zeros((6, 6)) if doubt is None else doubt)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any
 
 import gtsam
@@ -251,14 +252,14 @@ def _known(state: InertialState) -> gtsam.HessianFactor:
     information = np.linalg.inv(state.covariance)
     parts = (X(0), POSE), (V(0), VELOCITY), (B(0), BIASES), (G(0), GRAVITY)
     graph = gtsam.GaussianFactorGraph()
-    for number, (key, rows) in enumerate(parts):
-        here, size = information[rows, rows], rows.stop - rows.start
-        graph.add(gtsam.HessianFactor(key, here, np.zeros(size), 0.0))
-        for other, columns in parts[number + 1 :]:
-            more = columns.stop - columns.start
-            none = np.zeros((size, size)), np.zeros(size), np.zeros((more, more)), np.zeros(more)
-            across = none[0], information[rows, columns], *none[1:], 0.0
-            graph.add(gtsam.HessianFactor(key, other, *across))
+    for key, rows in parts:
+        own = information[rows, rows]
+        graph.add(gtsam.HessianFactor(key, own, np.zeros(len(own)), 0.0))
+    for (key, rows), (other, columns) in combinations(parts, 2):
+        across = information[rows, columns]
+        own, theirs = (np.zeros((size, size)) for size in across.shape)
+        sides = own, across, own[0], theirs, theirs[0]
+        graph.add(gtsam.HessianFactor(key, other, *sides, 0.0))
     return gtsam.HessianFactor(graph)
 
 

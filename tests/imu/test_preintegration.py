@@ -504,3 +504,18 @@ def test_a_frame_that_was_put_elsewhere_has_to_be_predicted_from_there():
     odo.moved(gtsam.Pose3())
     with pytest.raises(InputError, match="nothing has been predicted"):
         odo.update(gtsam.Pose3(), KNOWN)
+
+
+def test_a_frame_that_is_put_where_it_was_changes_nothing():
+    """What velocity, biases and gravity have in common goes into the new window, too."""
+    biases = np.array([0.002, -0.001, 0.0015]), np.array([0.03, 0.0, 0.04])
+    found = []
+    for anew in (False, True):
+        odo = turning_on_the_spot(30, *biases)
+        if anew:
+            odo.moved(gtsam.Pose3(gtsam.Rot3.Rz(30 * 0.1 * 0.6), ZERO))
+        data = samples(biases[0] + np.array([0.0, 0.0, 0.6]), UP + biases[1], 4.0)
+        expected = odo.predict(START + 31 * FRAME, data).map_T_lidar
+        odo.update(expected.retract(np.full(6, 1e-4)), KNOWN)
+        found.append(np.sqrt(np.diag(odo.state.covariance)))
+    np.testing.assert_allclose(*found, rtol=1e-3)

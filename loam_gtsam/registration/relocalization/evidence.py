@@ -52,8 +52,9 @@ class Evidence:
         """
         rows = matcher.rows
         signs, axes = np.zeros(len(rows)), np.zeros((len(rows), 3))
-        hints, thorough = np.zeros(len(rows)), False
+        hints: FloatArray | None = None
         if solution.solved:
+            vague = np.zeros(len(rows), np.bool_)
             edges, planes = solution.matches.edges, solution.matches.planes
             lines = np.searchsorted(rows.edges, edges.indices)
             others = len(rows.edges) + np.searchsorted(rows.planes, planes.indices)
@@ -61,16 +62,17 @@ class Evidence:
             for places, sure, sigmas in zip(
                 (lines, others), agree, (edges.sigmas, planes.sigmas), strict=True
             ):
-                vague = AGREE * sigmas >= reach
-                signs[places] = np.where(vague, 0.0, np.where(sure, 1.0, -_AGAINST))
+                signs[places] = np.where(sure, 1.0, -_AGAINST)
                 if dense:
                     signs[places] *= 1.0 - np.minimum(AGREE * sigmas / reach, 1.0)
-                hints[places] = vague
+                vague[places] = AGREE * sigmas >= reach
+            signs[vague] = 0.0
             axes[lines], axes[others] = edges.directions, planes.normals
-            thorough = not dense and leaves_open(planes, matcher.matching)
+            if not dense and leaves_open(planes, matcher.matching):
+                hints = vague.astype(np.float64)
         points = np.concatenate(matcher.posed.rows(rows.edges, rows.planes))
         points = transform(solution.map_T_lidar.matrix(), points)
-        return cls(len(rows.edges), points, signs, axes, hints if thorough else None)
+        return cls(len(rows.edges), points, signs, axes, hints)
 
     @property
     def share(self) -> float:

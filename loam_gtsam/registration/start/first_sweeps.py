@@ -127,10 +127,7 @@ class Start:
         """
         if imu is not None and imu.trusted_gyro is None:
             self._forget_gyro()
-        before = frame
-        frame, found = self._added(frame, found, keyframe, solver)
-        if imu is not None and frame is not before:
-            imu.registered_anew(self._sweeps[-2].map_T_middle)
+        frame, found = self._added(frame, found, keyframe, solver, imu)
         others = [continued(sweeps, frame.sweep.stamp) for sweeps in self._rivals]
         doubt = any_of(found.solution.map_T_lidar, others)
         return frame, replace(found, doubt=np.zeros((6, 6)) if doubt is None else doubt)
@@ -142,8 +139,9 @@ class Start:
             self._anew = True
 
     def _added(
-        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver
-    ) -> tuple[Frame, Found]:
+        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver,
+        imu: ImuTracker | None,
+    ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
         new = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar, bool(frame.priors)
         sweeps = [*self._sweeps, EarlySweep(*new, frame.predicted.motion, keyframe)]
@@ -161,6 +159,8 @@ class Start:
         last, posed = sweeps[-2].moment, sweeps[-1].posed
         sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
         self._sweeps = sweeps
+        if imu is not None:
+            imu.registered_anew(last.map_T_lidar)
         frame = replace(
             frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
         )

@@ -287,7 +287,7 @@ class Mapper:
         if self._start is not None:
             frame, found = self._start.add(frame, found, self.keyframe, self._named, self.imu)
             self._start = None if self._start.complete else self._start
-        solution, doubt = found.solution, found.doubt
+        solution, rivals = found.solution, (found.doubt, found.parting)
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
         posed = found.posed
         scan = self.errors.of_scan(solution, small=self.maps.small)
@@ -299,7 +299,7 @@ class Mapper:
         status, message = status_of(solution, found.message)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last
-        update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, doubt)
+        update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)
         clock.lap("covariance")
         return update
 

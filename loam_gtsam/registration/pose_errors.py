@@ -119,7 +119,7 @@ class PoseErrors:
         self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._expected = MotionFilter(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
-        self._doubt, self._moved = np.zeros((2, 6, 6))
+        self._rivals, self._moved = _Rivals(), np.zeros((6, 6))
         self._first: MovingSweep | None = None
         self._origin, self._paused = _Origin(), False
         self._last: _Middle | None = None
@@ -156,13 +156,15 @@ class PoseErrors:
         last: Moment | None,
         fused: Fused | None = None,
         doubt: FloatArray | None = None,
+        parting: FloatArray | None = None,
     ) -> MapUpdate:
         """The update of a solved frame with its covariance; to be called after :meth:`of_scan`.
 
         The sweep has the motion of the solution, which is at its middle; ``last`` is the middle of
         the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
         and IMU together; ``doubt`` is a further covariance (6, 6) of the pose, map frame, until the
-        start of the run is over, and None from then on.
+        start of the run is over, and None from then on; ``parting`` is told with the last of these,
+        the mean square (6, 6) of a velocity at which the pose may go elsewhere, rad/s and m/s.
         """
         first = self._scans == 1
         if scan is None:
@@ -180,7 +182,7 @@ class PoseErrors:
         if fused is not None:
             self._expected.told(middle.rotation().unrotate(fused.velocity))
         # A pose in doubt tells no acceleration; that of the very first sweep does.
-        before = None if self._doubt.any() else last if first else self._last
+        before = None if self._rivals.doubt.any() else last if first else self._last
         if before is not None and sweep.stamp > before.stamp:
             self._motion.add(before.stamp, before.map_T_lidar, sweep.stamp, middle, known)
         if by_imu is None:
@@ -194,9 +196,9 @@ class PoseErrors:
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         drifted = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
-        if doubt is None:  # what is still in doubt after the start is an error of the map
-            self._drift, doubt = self._drift + self._doubt, np.zeros((6, 6))
-        own, self._doubt = own + drifted @ doubt @ drifted.T, doubt
+        begun = sweep.stamp if self._first is None else self._first.stamp
+        self._drift = self._drift + self._rivals.told((sweep.stamp - begun) * 1e-9, doubt, parting)
+        own = own + drifted @ self._rivals.doubt @ drifted.T
         uncertainty = Uncertainty(
             own=own,
             shared=shared,
@@ -206,7 +208,7 @@ class PoseErrors:
             forgotten=self._forgotten,
             residual_variance=scan.residual_variance,
             effective_matches=scan.effective_matches,
-            in_doubt=bool(self._doubt.any()),
+            in_doubt=bool(self._rivals.doubt.any()),
         )
         self._last, self._paused = now, False
         total = self._drift + self._blind @ self._blind.T + self._moved
@@ -361,6 +363,34 @@ def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -
 def _turned(sweep: MovingSweep) -> bool:
     """Whether an IMU knows the rotation of a sweep."""
     return sweep.motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
+
+
+class _Rivals:
+    """What other motions that may be the true ones add to the error of the map.
+
+    While the start lasts, the pose is in ``doubt``. What is left of it afterwards is an error of
+    the map, and goes on growing if a rival parts from the motion that was chosen: as where what
+    passes was taken for what stands.
+    """
+
+    def __init__(self) -> None:
+        self.doubt, self._parting = np.zeros((2, 6, 6))
+        self._told = 0.0  # seconds after the first sweep
+
+    def told(
+        self, seconds: float, doubt: FloatArray | None, parting: FloatArray | None
+    ) -> FloatArray:
+        """What the map's error (6, 6) grows by, with a frame so many seconds after the first one.
+
+        ``doubt`` and ``parting`` are as in :meth:`PoseErrors.calibrated`.
+        """
+        grown = max(seconds**2 - self._told**2, 0.0) * self._parting
+        if doubt is None:
+            grown, doubt = grown + self.doubt, np.zeros((6, 6))
+        if parting is not None:
+            self._parting = parting
+        self.doubt, self._told = doubt, seconds
+        return grown
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -404,6 +404,35 @@ def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatc
     np.testing.assert_array_equal(updates[3].uncertainty.shared, 0.0)
 
 
+def test_a_rival_that_parts_from_the_motion_goes_on_being_an_error_of_the_map(monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    velocity = np.diag([0.0, 0.0, 0.0, 9.0, 0.0, 0.0])
+    told = []
+    for parting in (velocity, 0.0 * velocity):
+        errors, seconds = PoseErrors(Config()), 1e-9 * FRAME * np.arange(1, 7)
+        errors.skipped(_Sweep(0, SweepMotion.CONSTANT_VELOCITY))
+        doubt = seconds[1] ** 2 * velocity  # as far as it has come with the second frame
+        rivals = [
+            (doubt, None),
+            (doubt, parting),
+            (None, None),
+            (0.0 * doubt, None),
+            *2 * [(None, None)],
+        ]
+        updates = [
+            calibrated(errors, k, doubt=one, parting=other)
+            for k, (one, other) in enumerate(rivals, start=1)
+        ]
+        told.append([update.covariance[3, 3] for update in updates])
+        assert np.linalg.eigvalsh(relative_covariance(*updates[-2:]))[0] > 0.0
+        motion = relative_covariance(updates[-2], updates[-1])[3, 3]
+        apart = parting[3, 3] * (seconds[-1] - seconds[-2]) ** 2
+        assert apart <= motion <= parting[3, 3] * (seconds[-1] ** 2 - seconds[-2] ** 2) + 1e-3
+    np.testing.assert_allclose(told[0][2:], 9.0 * seconds[2:] ** 2, rtol=0.02)
+    np.testing.assert_allclose(told[1][2:], 9.0 * seconds[1] ** 2, rtol=0.02)
+
+
 @pytest.mark.parametrize("stays", [True, False])
 def test_what_is_in_doubt_at_the_end_of_the_start_is_an_error_of_the_map(stays, monkeypatch):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)

@@ -128,7 +128,7 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
     world, states = ahead_only
     updates = [update for update, _ in states]
     assert errors(world, updates)[-1] < 0.1
-    assert states[2][1] < states[1][1]
+    assert states[4][1] < states[1][1]
     assert updates[4].covariance[3, 3] < 0.1 * updates[1].covariance[3, 3]
 
 
@@ -279,7 +279,7 @@ def first_sweep():
     return SimpleNamespace(map_T_lidar=at, map_T_middle=at, posed=posed, motion=None), 0
 
 
-def way_of(*steps, planes=0):
+def way_of(*steps, lines=0, planes=0):
     """A way by steps of these metres ahead, a tenth of a second each."""
     at, sweeps = 0.0, []
     for number, step in enumerate((0.0, *steps)):
@@ -287,7 +287,7 @@ def way_of(*steps, planes=0):
         stamp = 100_000_000 * number
         pose = gtsam.Pose3(gtsam.Rot3(), np.array([at, 0.0, 0.0]))
         sweeps.append(SimpleNamespace(map_T_middle=pose, moment=Moment(stamp, pose, True)))
-    tried = place(at * AHEAD, np.zeros(40), np.full(40, planes), AHEAD)
+    tried = place(at * AHEAD, np.full(40, lines), np.full(40, planes), AHEAD)
     return tuple(tried._replace(sweeps=sweeps[: k + 2]) for k in range(len(steps)))
 
 
@@ -310,6 +310,37 @@ def test_ways_that_may_be_true_are_kept(steps, planes, kept):
     assert (doubt is not None) == kept
     if doubt is not None:
         assert doubt[3, 3] == pytest.approx(0.5 * sum([*steps, steps[-1]]) ** 2)
+
+
+def test_one_kind_of_features_may_object_to_a_way_that_may_be_true():
+    """On a road planes are on cars, and lines on posts."""
+    taken = way_of(0.0, 0.0)
+    for lines, planes, kept in ((1, -1, True), (0, -1, False)):
+        assert (
+            len(ways.kept_ways([taken, way_of(1.0, 1.0, lines=lines, planes=planes)], CONFIG))
+            == 1 + kept
+        )
+
+
+def test_what_may_move_counts_once_against_a_way_that_may_be_true():
+    """As many planes agree at the one place alone, as lines agree there and not at the other."""
+    taken = way_of(0.0, 0.0, planes=1)
+    passed, unlike = way_of(1.0, 1.0, lines=1, planes=-5), way_of(1.0, 1.0, lines=0, planes=-5)
+    assert ways.kept_ways([taken, passed], CONFIG) == [taken, passed]
+    assert ways.kept_ways([taken, unlike], CONFIG) == [taken]
+    assert ways._favour(passed, taken).every < -3.0
+
+
+def test_a_rival_parts_from_a_way_if_it_leads_ever_farther_away():
+    taken, faster, later = (
+        way_of(*steps)[-1].sweeps for steps in ((1.0, 1.0, 1.0), (3.0, 3.0, 3.0), (5.0, 1.0, 1.0))
+    )
+    velocity = ways.parting(taken, [faster, later], 0.4)
+    np.testing.assert_allclose(
+        velocity, np.diag([0.0, 0.0, 0.0, 20.0**2 / 3.0, 0.0, 0.0]), atol=1e-9
+    )
+    for rivals in ([later], []):
+        assert not ways.parting(taken, rivals, 0.4).any()
 
 
 def test_the_way_that_was_taken_stays_though_no_acceleration_explains_it():

@@ -51,6 +51,7 @@ class Found:
     posed: PosedSweep  # the sweep, de-skewed with the motion that belongs to it
     message: str = ""  # sentence for the user if the search moved the sweep
     doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
+    parting: FloatArray | None = None  # (6, 6) mean square velocity at which these go elsewhere
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -93,12 +93,15 @@ class Favour(NamedTuple):
     weight: float
 
 
-def favour(tried: Sequence[Evidence], others: Sequence[Evidence]) -> Favour:
+def favour(
+    tried: Sequence[Evidence], others: Sequence[Evidence], *, moving: bool = False
+) -> Favour:
     """How much speaks for the places of some sweeps, against other places of the same sweeps.
 
-    The sweeps see the same things, and count as one.
+    The sweeps see the same things, and count as one. What agrees at one place and contradicts at
+    the other may be ``moving``: then it counts for the one as much as against the other.
     """
-    found = [_gain(*pair) for pair in zip(tried, others, strict=True)]
+    found = [_gain(*pair, moving) for pair in zip(tried, others, strict=True)]
     gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
     every, lines, planes = (
         float(part.sum() / max(np.sqrt(len(found)) * np.linalg.norm(part), _TINY))
@@ -116,7 +119,7 @@ def speaks_for(here: Evidence, other: Evidence, least: float) -> bool:
     return told.every > CHANCE and told.weight > least
 
 
-def _gain(tried: Evidence, other: Evidence) -> tuple[FloatArray, BoolArray, float]:
+def _gain(tried: Evidence, other: Evidence, moving: bool) -> tuple[FloatArray, BoolArray, float]:
     """What each feature (F,) says for one place against another, which are edges, and their number.
 
     A feature counts as far as its line or plane lies across the way from one place to the other:
@@ -134,6 +137,9 @@ def _gain(tried: Evidence, other: Evidence) -> tuple[FloatArray, BoolArray, floa
     ]
     across = np.sqrt(np.clip(sum(each) / np.maximum(sum(matched), 1), 0.0, 1.0))
     gain = tried.signs - other.signs
+    if moving:
+        disputed = tried.signs * other.signs < 0.0
+        gain[disputed] = np.sign(gain[disputed])
     if tried.hints is not None and other.hints is not None:
         gain = gain + tried.hints - other.hints
     gain = across * gain

@@ -37,6 +37,7 @@ from loam_gtsam.registration.start.ways import (
     kept_ways,
     mean_twist,
     moved_with_first,
+    parting,
     without_turns,
 )
 from loam_gtsam.types import FloatArray, SweepMotion
@@ -130,7 +131,11 @@ class Start:
         frame, found = self._added(frame, found, keyframe, solver, imu)
         others = [continued(sweeps, frame.sweep.stamp) for sweeps in self._rivals]
         doubt = any_of(found.solution.map_T_lidar, others)
-        return frame, replace(found, doubt=np.zeros((6, 6)) if doubt is None else doubt)
+        found = replace(found, doubt=np.zeros((6, 6)) if doubt is None else doubt)
+        if self.complete:
+            near = frame.matcher.config.map.plane_voxel
+            found = replace(found, parting=parting(self._sweeps, self._rivals, near))
+        return frame, found
 
     def _forget_gyro(self) -> None:
         """Take the gyro out of all sweeps, which are to be registered anew."""

@@ -87,6 +87,27 @@ def moved_with_first(
     return [sweeps[0], *moved]
 
 
+def parting(
+    sweeps: Sequence[EarlySweep], rivals: Sequence[Sequence[EarlySweep]], near: float
+) -> FloatArray:
+    """Mean square (6, 6) of the velocity at which any of some rivals parts from a way, map axes.
+
+    One that leads to another place and goes on as the way does, as in rows that repeat, does not
+    part from it: it is less than ``near``, metres, farther away at its end than at its beginning.
+    """
+    total = np.zeros((6, 6))
+    seconds = sweeps[1].moment.seconds_to(sweeps[-1].moment.stamp)
+    for rival in rivals:
+        ends = [
+            one.map_T_middle.AdjointMap() @ one.map_T_middle.localCoordinates(other.map_T_middle)
+            for one, other in ((sweeps[1], rival[1]), (sweeps[-1], rival[-1]))
+        ]
+        apart = ends[1] - ends[0]
+        if np.linalg.norm(apart[3:]) > near:
+            total += np.outer(apart, apart) / (seconds**2 * (1 + len(rivals)))
+    return total
+
+
 def mean_twist(one: EarlySweep, other: EarlySweep) -> FloatArray:
     """Mean body velocity (6,) from one sweep to the next, rad/s and m/s."""
     moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
@@ -118,7 +139,7 @@ def kept_ways(ways: Sequence[Way], config: Config) -> list[Way]:
     kept = [best]
     for way in ways:
         apart = all(_apart(way, other, near) for other in kept)
-        if apart and min(_favour(way, best)[:3]) > -CHANCE:
+        if apart and _favour(way, best, moving=True).every > -CHANCE:
             kept.append(way)
     return kept
 
@@ -157,5 +178,6 @@ def _better(tried: Way, best: Way, least: float) -> bool:
     return every > CHANCE and min(lines, planes) > -CHANCE and weight > least
 
 
-def _favour(tried: Way, best: Way) -> Favour:
-    return favour([one.evidence for one in tried], [one.evidence for one in best])
+def _favour(tried: Way, best: Way, *, moving: bool = False) -> Favour:
+    told = [one.evidence for one in tried], [one.evidence for one in best]
+    return favour(*told, moving=moving)

@@ -163,8 +163,8 @@ class PoseErrors:
         The sweep has the motion of the solution, which is at its middle; ``last`` is the middle of
         the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
         and IMU together; ``doubt`` is a further covariance (6, 6) of the pose, map frame, until the
-        start of the run is over, and None from then on; ``parting`` is told with the last of these,
-        the mean square (6, 6) of a velocity at which the pose may go elsewhere, rad/s and m/s.
+        start of the run is over, and None from then on; ``parting`` is the mean square (6, 6) of a
+        velocity at which the pose may go on elsewhere, rad/s and m/s, told with these.
         """
         first = self._scans == 1
         if scan is None:
@@ -196,8 +196,7 @@ class PoseErrors:
         if first and self._first is not None:
             self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
         drifted = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
-        begun = sweep.stamp if self._first is None else self._first.stamp
-        self._drift = self._drift + self._rivals.told((sweep.stamp - begun) * 1e-9, doubt, parting)
+        self._drift = self._drift + self._rivals.told(self._first, sweep.stamp, doubt, parting)
         own = own + drifted @ self._rivals.doubt @ drifted.T
         uncertainty = Uncertainty(
             own=own,
@@ -378,17 +377,21 @@ class _Rivals:
         self._told = 0.0  # seconds after the first sweep
 
     def told(
-        self, seconds: float, doubt: FloatArray | None, parting: FloatArray | None
-    ) -> FloatArray:
-        """What the map's error (6, 6) grows by, with a frame so many seconds after the first one.
+        self, first: MovingSweep | None, stamp: int,
+        doubt: FloatArray | None, parting: FloatArray | None,
+    ) -> FloatArray:  # fmt: skip
+        """What the map's error (6, 6) grows by, with a frame of this stamp of the middle.
 
         ``doubt`` and ``parting`` are as in :meth:`PoseErrors.calibrated`.
         """
-        grown = max(seconds**2 - self._told**2, 0.0) * self._parting
+        seconds = 0.0 if first is None else (stamp - first.stamp) * 1e-9
+        grown = np.zeros((6, 6))
+        if parting is not None:  # still in doubt
+            self._parting = parting
+        else:
+            grown = max(seconds**2 - self._told**2, 0.0) * self._parting
         if doubt is None:
             grown, doubt = grown + self.doubt, np.zeros((6, 6))
-        if parting is not None:
-            self._parting = parting
         self.doubt, self._told = doubt, seconds
         return grown
 

@@ -131,11 +131,9 @@ class Start:
         frame, found = self._added(frame, found, keyframe, solver, imu)
         others = [continued(sweeps, frame.sweep.stamp) for sweeps in self._rivals]
         doubt = any_of(found.solution.map_T_lidar, others)
-        found = replace(found, doubt=np.zeros((6, 6)) if doubt is None else doubt)
-        if self.complete:
-            near = frame.matcher.config.map.plane_voxel
-            found = replace(found, parting=parting(self._sweeps, self._rivals, near))
-        return frame, found
+        parts = parting(self._sweeps, self._rivals, frame.matcher.config.map.plane_voxel)
+        doubt = np.zeros((6, 6)) if doubt is None else doubt
+        return frame, replace(found, doubt=doubt, parting=parts)
 
     def _forget_gyro(self) -> None:
         """Take the gyro out of all sweeps, which are to be registered anew."""

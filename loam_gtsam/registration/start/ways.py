@@ -94,17 +94,20 @@ def parting(
 
     One that leads to another place and goes on as the way does, as in rows that repeat, does not
     part from it: it is less than ``near``, metres, farther away at its end than at its beginning.
+    Of two that part one follows what moves, which may turn: the velocity has any direction.
     """
     total = np.zeros((6, 6))
-    seconds = sweeps[1].moment.seconds_to(sweeps[-1].moment.stamp)
     for rival in rivals:
-        ends = [
+        ends = sweeps[1], sweeps[len(rival) - 1]
+        away = [
             one.map_T_middle.AdjointMap() @ one.map_T_middle.localCoordinates(other.map_T_middle)
-            for one, other in ((sweeps[1], rival[1]), (sweeps[-1], rival[-1]))
+            for one, other in zip(ends, (rival[1], rival[-1]), strict=True)
         ]
-        apart = ends[1] - ends[0]
+        apart = away[1] - away[0]
         if np.linalg.norm(apart[3:]) > near:
-            total += np.outer(apart, apart) / (seconds**2 * (1 + len(rivals)))
+            apart /= ends[0].moment.seconds_to(ends[1].moment.stamp)
+            squares = np.repeat([apart[:3] @ apart[:3], apart[3:] @ apart[3:]], 3)
+            total += np.diag(squares) / (1 + len(rivals))
     return total
 
 

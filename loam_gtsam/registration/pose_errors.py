@@ -385,11 +385,9 @@ class _Rivals:
         ``doubt`` and ``parting`` are as in :meth:`PoseErrors.calibrated`.
         """
         seconds = 0.0 if first is None else (stamp - first.stamp) * 1e-9
-        grown = np.zeros((6, 6))
-        if parting is not None:  # still in doubt
-            self._parting = parting
-        else:
-            grown = max(seconds**2 - self._told**2, 0.0) * self._parting
+        if parting is not None:  # still in doubt: nothing has grown since
+            self._parting, self._told = parting, seconds
+        grown = max(seconds**2 - self._told**2, 0.0) * self._parting
         if doubt is None:
             grown, doubt = grown + self.doubt, np.zeros((6, 6))
         self.doubt, self._told = doubt, seconds

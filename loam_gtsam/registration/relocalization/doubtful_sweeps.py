@@ -21,6 +21,7 @@ from loam_gtsam.registration.relocalization.fits import (
     FitMonitor,
     beyond_any_motion,
     same,
+    step_in_map,
 )
 from loam_gtsam.registration.relocalization.likely_poses import likely_poses, sample_features
 from loam_gtsam.registration.report import distance_in_words, make_update
@@ -262,7 +263,7 @@ def any_of(pose: gtsam.Pose3, rivals: Sequence[gtsam.Pose3]) -> FloatArray | Non
     """
     if not rivals:
         return None
-    steps = np.array([pose.AdjointMap() @ pose.localCoordinates(rival) for rival in rivals])
+    steps = np.array([step_in_map(pose, rival) for rival in rivals])
     total: FloatArray = steps.T @ steps / (1 + len(rivals))
     return total
 

@@ -85,6 +85,12 @@ def same_optimum(one: gtsam.Pose3, other: gtsam.Pose3) -> bool:
     return same(one, other, _OPTIMA)
 
 
+def step_in_map(pose: gtsam.Pose3, other: gtsam.Pose3) -> FloatArray:
+    """The (6,) tangent from one pose to another, rad and m, along the axes of the map."""
+    step: FloatArray = pose.AdjointMap() @ pose.localCoordinates(other)
+    return step
+
+
 def distinct(items: Iterable[_Item], pose: Callable[[_Item], gtsam.Pose3]) -> list[_Item]:
     """The first of those whose poses are in the same optimum."""
     chosen: list[_Item] = []

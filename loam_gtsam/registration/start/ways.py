@@ -14,7 +14,7 @@ from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.odometry import Moment, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, Favour, favour
-from loam_gtsam.registration.relocalization.fits import beyond_any_motion
+from loam_gtsam.registration.relocalization.fits import beyond_any_motion, step_in_map
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.types import FloatArray
 
@@ -98,14 +98,11 @@ def parting(
     """
     total = np.zeros((6, 6))
     for rival in rivals:
-        ends = sweeps[1], sweeps[len(rival) - 1]
-        away = [
-            one.map_T_middle.AdjointMap() @ one.map_T_middle.localCoordinates(other.map_T_middle)
-            for one, other in zip(ends, (rival[1], rival[-1]), strict=True)
-        ]
-        apart = away[1] - away[0]
+        ends = (sweeps[1], rival[1]), (sweeps[len(rival) - 1], rival[-1])
+        first, last = (step_in_map(one.map_T_middle, other.map_T_middle) for one, other in ends)
+        apart = last - first
         if np.linalg.norm(apart[3:]) > near:
-            apart /= ends[0].moment.seconds_to(ends[1].moment.stamp)
+            apart /= rival[1].moment.seconds_to(rival[-1].moment.stamp)
             squares = np.repeat([apart[:3] @ apart[:3], apart[3:] @ apart[3:]], 3)
             total += np.diag(squares) / (1 + len(rivals))
     return total

@@ -6,8 +6,9 @@ import os
 import shutil
 import sqlite3
 import struct
+import weakref
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
 
@@ -142,8 +143,10 @@ class BagWriter(ClosingWriter):
         storage = rosbag2.StoragePlugin.MCAP if self._kind else rosbag2.StoragePlugin.SQLITE3
         self._active.mkdir()
         folder = self._active / self.path.stem  # the file inside gets the name of this folder
-        writer = rosbag2.Writer(folder, version=_ROS2_VERSION, storage_plugin=storage)
+        writer: Any = rosbag2.Writer(folder, version=_ROS2_VERSION, storage_plugin=storage)
         writer.open()
+        if storage is rosbag2.StoragePlugin.SQLITE3:
+            weakref.finalize(self, _close_forgotten, writer.storage.conn).atexit = False
         return writer
 
     def _give_name(self) -> None:
@@ -165,6 +168,16 @@ class BagWriter(ClosingWriter):
                 f"{self.path}: cannot write the bag: {error}; choose another folder or free some "
                 "space"
             ) from error
+
+
+def _close_forgotten(database: sqlite3.Connection) -> None:
+    """Close the database of a bag that nobody closed.
+
+    Python would close it some time later, in a garbage collection, and SQLite then deletes the
+    journal of that *name*: by then perhaps that of the bag that replaces this one.
+    """
+    with suppress(sqlite3.Error):  # of another thread: not ours to close
+        database.close()
 
 
 def _pad_header(bag: Path) -> int:

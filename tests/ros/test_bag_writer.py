@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import shutil
 import sqlite3
 import struct
@@ -309,6 +310,22 @@ def test_a_cut_off_recording_is_kept_unless_overwritten(tmp_path: Path, name: st
     with pytest.raises(OutputError, match=rf"{name}\.active: a recording that was cut off"):
         BagWriter(tmp_path / name)
     assert len(read(write(tmp_path / name, 2, overwrite=True))[ODOMETRY]) == 2
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_forgotten_recording_does_not_spoil_the_one_that_replaces_it(
+    tmp_path: Path, name: str
+) -> None:
+    gc.disable()
+    try:
+        BagWriter(tmp_path / name).write(make_update(0))
+        with BagWriter(tmp_path / name, overwrite=True) as bag:
+            bag.write(make_update(0))
+            gc.collect()
+            bag.write(make_update(1))
+    finally:
+        gc.enable()
+    assert len(read(tmp_path / name)[ODOMETRY]) == 2
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,6 @@ from loam_gtsam.aiding.wheels import aided_odometry
 from loam_gtsam.config import Config, Section, as_config, with_implied
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
-from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import PartFaults, is_own, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -152,7 +151,7 @@ class Pipeline:
     faults : what is done about exceptions in parts of a user's own
     loops : keyframes and loops; None if none are looked for
     places : where the map can be recognised, once it is saved; keyframes are, if there are any
-    earth : where the map is on the earth, by GNSS; None if unknown
+    fixes : what became of the fixes of a GNSS receiver; None if they were not asked for yet
     """
 
     def __init__(
@@ -176,7 +175,7 @@ class Pipeline:
         self._to_reference = 0  # nanoseconds from the stamp of a sweep to that of its features
         self.places = Places(self.config)
         self.loops: LoopMapping | None = None
-        self.earth: GeoReference | None = None
+        self.fixes: TiedFixes | None = None
         closer = parts.get("loop_closer")
         if closer is None and self.config.aiding.gnss and not self.config.loops.enabled:
             closer = NoLoops()
@@ -191,7 +190,7 @@ class Pipeline:
         if self.loops is not None:
             self.loops.reset()
         self.places.reset()
-        self._last_odom = self.earth = None
+        self._last_odom = self.fixes = None
         self._to_reference = 0
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
@@ -305,9 +304,8 @@ class Pipeline:
             return None
         aid = self.mapper.imu
         up = None if aid is None or aid.level is None else aid.level.map_up
-        tied = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
-        self.earth = tied.reference
-        return tied
+        self.fixes = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
+        return self.fixes
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""

@@ -117,6 +117,8 @@ def _summary(
         "maps": maps,
         "loops_between_maps": sum(merged.ties.values()),
         "loops_not_used": merged.unused,
+        "fixes": merged.graph.sizes["fixes"],
+        "enu": None if merged.earth is None else merged.earth.as_dict(),
         "seconds": seconds,
     }
 

@@ -236,7 +236,7 @@ class Localizer:
     def save(self, path: str | Path) -> None:
         """Write the map with what was added to it; see :func:`~loam_gtsam.maps.save_map`."""
         saved = self._saved
-        graph = MapGraph(self._places, self._links, saved.graph.loops)
+        graph = MapGraph(self._places, self._links, saved.graph.loops, saved.graph.fixes)
         write_map(path, whole(self._maps), graph, saved.config, saved.frame)
 
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:

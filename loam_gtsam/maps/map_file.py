@@ -88,10 +88,12 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
     """
     aid = pipeline.mapper.imu
     level = None if aid is None else aid.level
-    frame = MapFrame(None if level is None else level.map_up, pipeline.earth)
+    tied = pipeline.fixes
+    earth, fixes = (None, None) if tied is None else (tied.reference, tied.placed)
+    frame = MapFrame(None if level is None else level.map_up, earth)
     if pipeline.loops is not None:
         points = whole(pipeline.loops.corrected_maps())
-        graph = graph_of(pipeline.loops, pipeline.config)
+        graph = graph_of(pipeline.loops, pipeline.config, fixes)
         numbers = [keyframe.index for keyframe in pipeline.loops.graph.keyframes]
         write_map(path, points, graph, pipeline.config, frame, numbers)
     else:
@@ -148,9 +150,7 @@ def write_map(
             "enu": None if earth is None else earth.as_dict(),
         },
         "config": dump_config(config),
-        "places": len(graph.places),
-        "links": len(graph.links),
-        "loops": len(graph.loops),
+        **graph.sizes,
         "layers": {
             name: [[*index, len(cube.points)] for index, cube in cubes.items()]
             for name, cubes in contents.items()
@@ -158,7 +158,7 @@ def write_map(
     }
     with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
         _add(archive, _HEADER, json.dumps(header, indent=1).encode())
-        for name, array in graph_arrays(graph).items():
+        for name, array in graph_arrays(graph, config.loops).items():
             _add(archive, f"{name}.npy", _bytes_of(array))
         for name, cubes in contents.items():
             for index, cube in cubes.items():
@@ -234,6 +234,8 @@ class SavedMap:
                 None if enu is None else GeoReference.of_dict(enu),
             )
             sizes = {name: int(header[name]) for name in ("places", "links", "loops")}
+            # Maps that were made before there were fixes in them do not say so.
+            sizes |= {name: int(header.get(name, 0)) for name in ("fixes", "receivers")}
             shapes = array_shapes(sizes, self.config.loops)
             arrays = {name: self._array(f"{name}.npy", *how) for name, how in shapes.items()}
             self.graph = graph_of_arrays(arrays)
@@ -315,7 +317,7 @@ class SavedMap:
         }
         with atomic_file(path) as file, zipfile.ZipFile(file, "w") as archive:
             _add(archive, _HEADER, json.dumps(header, indent=1).encode())
-            for name in graph_arrays(self.graph):
+            for name in graph_arrays(self.graph, self.config.loops):
                 _add(archive, f"{name}.npy", self._read(f"{name}.npy"))
             for layer, cubes in header["layers"].items():
                 for *cube, _ in cubes:

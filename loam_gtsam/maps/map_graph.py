@@ -1,19 +1,20 @@
 """The pose graph of a saved map: its places, the motions between them, and loop closures.
 
-In a file the motions are arrays. Other factors than motions, as the fixes of a GNSS receiver, are
-not in it; what they did to the poses is.
+In a file motions and the fixes of GNSS receivers are arrays. Factors of a user's own are not in it;
+what they did to the poses is.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.aiding.gnss import PlacedFixes
 from loam_gtsam.config import Config, LoopConfig
 from loam_gtsam.geometry import nearest_positive, symmetric, transform
 from loam_gtsam.loops.batch import SavedGraph
@@ -25,6 +26,16 @@ from loam_gtsam.types import FloatArray, stack_poses
 
 _PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _MOTIONS = "ends", "motions", "covariances"
+_FIXES = {
+    "poses": "places",
+    "pose_T_lidar": "place_T_lidar",
+    "enu": "enu",
+    "covariances": "covariances",
+    "receivers": "receivers",
+    "antennas": "antennas",
+    "antenna_sigmas": "antenna_sigmas",
+}
+"""Fields of :class:`PlacedFixes`, and what they are called in a file."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,14 +48,28 @@ class MapGraph:
     links : motions along the runs, from place to place, without the walk of ``pose_graph`` in their
         covariances; a place that none leads to begins a run
     loops : loop closures that were used
+    fixes : those of GNSS receivers that were used, by numbers of places; None if there are none
     """
 
     places: Sequence[Place]
     links: Sequence[LoopClosure]
     loops: Sequence[LoopClosure]
+    fixes: PlacedFixes | None = None
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Numbers of its parts, by which :func:`array_shapes` knows its arrays."""
+        fixes = self.fixes
+        return {
+            "places": len(self.places),
+            "links": len(self.links),
+            "loops": len(self.loops),
+            "fixes": 0 if fixes is None else len(fixes),
+            "receivers": 0 if fixes is None else len(fixes.antennas),
+        }
 
     def saved(self) -> SavedGraph:
-        """As it is written to other files, and optimised: links, then loops."""
+        """As it is written to other files, and optimised: links, then loops; without fixes."""
         factors, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for motion in (*self.links, *self.loops):
             factors.add(motion.factor())
@@ -54,8 +79,11 @@ class MapGraph:
         return SavedGraph(factors, poses, stamps)
 
 
-def graph_of(mapping: LoopMapping, config: Config) -> MapGraph:
-    """The keyframes of a run with loops as places, where its graph has them."""
+def graph_of(mapping: LoopMapping, config: Config, fixes: PlacedFixes | None = None) -> MapGraph:
+    """The keyframes of a run with loops as places, where its graph has them.
+
+    ``fixes`` are those that were used, by numbers of keyframes.
+    """
     graph = mapping.graph
     places, moves = [], {}
     for number, keyframe in enumerate(graph.keyframes):
@@ -83,7 +111,19 @@ def graph_of(mapping: LoopMapping, config: Config) -> MapGraph:
             links.append(_between_middles(motion, moves))
     active = zip(graph.loops, graph.active, strict=True)
     loops = [_between_middles(loop, moves) for loop, on in active if on]
-    return MapGraph(places, links, loops)
+    return MapGraph(places, links, loops, None if fixes is None else _from_middles(fixes, moves))
+
+
+def _from_middles(fixes: PlacedFixes, moves: Mapping[int, tuple[int, gtsam.Pose3]]) -> PlacedFixes:
+    """Fixes on keyframes as fixes on the middles of their sweeps, those that are places."""
+    kept = fixes.of(np.isin(fixes.poses, list(moves)).nonzero()[0])
+    found = [moves[number] for number in kept.poses.tolist()]
+    back = [move.inverse().matrix() for _, move in found]
+    return replace(
+        kept,
+        poses=np.array([place for place, _ in found], np.int64),
+        pose_T_lidar=np.array(back).reshape(-1, 4, 4) @ kept.pose_T_lidar,
+    )
 
 
 def _to_middle(keyframe: Keyframe) -> gtsam.Pose3:
@@ -115,25 +155,35 @@ def array_shapes(
         "places/covariances": (real, (places, 6, 6)),
         "places/descriptors": (np.dtype("<f2"), (places, config.rings, config.sectors)),
     }
-    for kind, count in sizes.items():
-        if kind == "places":
-            continue
+    for kind in ("links", "loops"):
+        count = sizes[kind]
         shapes |= {
             f"{kind}/ends": (whole, (count, 2)),
             f"{kind}/motions": (real, (count, 4, 4)),
             f"{kind}/covariances": (real, (count, 6, 6)),
         }
+    if count := sizes["fixes"]:
+        shapes |= {
+            "fixes/places": (whole, (count,)),
+            "fixes/place_T_lidar": (real, (count, 4, 4)),
+            "fixes/enu": (real, (count, 3)),
+            "fixes/covariances": (real, (count, 3, 3)),
+            "fixes/receivers": (whole, (count,)),
+            "fixes/antennas": (real, (sizes["receivers"], 3)),
+            "fixes/antenna_sigmas": (real, (sizes["receivers"],)),
+        }
     return shapes
 
 
-def graph_arrays(graph: MapGraph) -> dict[str, NDArray[Any]]:
+def graph_arrays(graph: MapGraph, config: LoopConfig) -> dict[str, NDArray[Any]]:
     """A graph as arrays, by name; see :func:`array_shapes`."""
     places = graph.places
+    descriptors = np.array([place.descriptor for place in places], np.float16)
     arrays: dict[str, NDArray[Any]] = {
         "places/stamps": np.array([place.stamp for place in places], np.int64),
         "places/map_T_middle": stack_poses(place.map_T_middle for place in places),
         "places/covariances": _matrices([place.covariance for place in places]),
-        "places/descriptors": np.array([place.descriptor for place in places], np.float16),
+        "places/descriptors": descriptors.reshape(-1, config.rings, config.sectors),
     }
     for kind, motions in (("links", graph.links), ("loops", graph.loops)):
         ends = np.array([(one.earlier, one.later) for one in motions], np.int64)
@@ -142,6 +192,8 @@ def graph_arrays(graph: MapGraph) -> dict[str, NDArray[Any]]:
             f"{kind}/motions": stack_poses(one.earlier_T_later for one in motions),
             f"{kind}/covariances": _matrices([one.covariance for one in motions]),
         }
+    if graph.fixes is not None and len(graph.fixes):
+        arrays |= {f"fixes/{name}": getattr(graph.fixes, own) for own, name in _FIXES.items()}
     return arrays
 
 
@@ -151,7 +203,8 @@ def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
     Raises
     ------
     ValueError
-        If a motion is between places that there are not.
+        If a motion is between places that there are not, or a fix at such a place, or if what a fix
+        has for a covariance is none.
     """
     columns = (arrays[f"places/{name}"] for name in _PLACES)
     places = [
@@ -166,7 +219,19 @@ def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
         rows = zip(*ends.T.tolist(), map(gtsam.Pose3, motions), covariances, strict=True)
         found.append([LoopClosure(*row) for row in rows])
     links, loops = found
-    return MapGraph(places, links, loops)
+    if "fixes/places" not in arrays:
+        return MapGraph(places, links, loops)
+    fixes = PlacedFixes(**{own: arrays[f"fixes/{name}"] for own, name in _FIXES.items()})
+    for name, numbers, count in (
+        ("places", fixes.poses, len(places)),
+        ("receivers", fixes.receivers, len(fixes.antennas)),
+    ):
+        if ((numbers < 0) | (numbers >= count)).any():
+            raise ValueError(f"fixes/{name}.npy: expected numbers of the {count} {name}")
+    spreads = np.linalg.eigvalsh(fixes.covariances)
+    if not ((spreads > 0.0).all() and (fixes.antenna_sigmas > 0.0).all()):
+        raise ValueError("fixes/covariances.npy, antenna_sigmas.npy: expected variances above 0")
+    return MapGraph(places, links, loops, fixes)
 
 
 def _matrices(given: Sequence[FloatArray]) -> FloatArray:

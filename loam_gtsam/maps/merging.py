@@ -14,9 +14,11 @@ import gtsam
 import numpy as np
 from scipy.spatial import cKDTree
 
+from loam_gtsam.aiding.gnss import MAP_KEY, PlacedFixes
 from loam_gtsam.config import Config
+from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
 from loam_gtsam.geometry import symmetric, transform_each
-from loam_gtsam.loops.batch import OptimizedGraph, optimize_graph
+from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import LoopClosure, noise_model, pose_key
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.pose_graph import corrected_trajectory
@@ -32,6 +34,7 @@ from loam_gtsam.voxels.tags import turn
 _LIKELY = 12.0
 """Mean squared Mahalanobis distance of the loops from all other motions, up to which the runs have
 drifted as their covariances say: twice the six freedoms."""
+_ASIDE = 100.0  # metres that fixes of one map may all be wrong by
 
 Pair = tuple[int, int]
 """Numbers of two maps, the lower one first."""
@@ -48,6 +51,7 @@ class MergedMaps:
     before : the places as they were in their maps
     ties : loop closures between the maps, by pair
     unused : of these, how many contradicted the others
+    earth : where the whole is on the earth; None if no map was tied to it
     """
 
     graph: MapGraph
@@ -55,6 +59,7 @@ class MergedMaps:
     before: Sequence[Place]
     ties: Mapping[Pair, int]
     unused: int
+    earth: GeoReference | None = None
 
     def places(self, number: int) -> Sequence[Place]:
         """Places of a map."""
@@ -107,7 +112,8 @@ def merge_maps(
     InputError
         If there are less than two maps.
     DatasetError
-        If a map has no place in common with the others, or its descriptors are of another shape.
+        If a map has no place in common with the others, its descriptors are of another shape, or
+        its fixes are somewhere else on the earth.
     OutputError
         If the file cannot be written.
     """
@@ -119,16 +125,19 @@ def merge_maps(
     ties = _tied(maps, common, on_place or (lambda done, total: None))
     starts = np.cumsum([0, *(len(saved.places) for saved in maps[:-1])]).tolist()
     whole = _Whole(maps, starts, common, config)
-    first = whole.solve([loop for loops in ties.values() for loop in loops])
+    sure = [loop for loops in ties.values() for loop in loops]
+    first = whole.solve(sure)
+    whole.take_fixes(first, sure)
     loops = [loop for pair, held in ties.items() for loop in whole.more(pair, held, first)]
     solved = whole.solve(loops, walk=False)
-    if not _agree(solved):
+    if not (_agree(solved) and whole.fixes_agree(solved)):
         solved = whole.solve(loops)
     used = [report.active for report in solved.loops[-len(loops) :]]
     merged = whole.merged(solved, [loop for loop, on in zip(loops, used, strict=True) if on])
     _connected(maps, list(merged.ties))
     contents = _moved(maps, merged)
-    write_map(path, contents, merged.graph, maps[0].config, maps[0].frame)
+    frame = replace(maps[0].frame, earth=merged.earth)
+    write_map(path, contents, merged.graph, maps[0].config, frame)
     return replace(merged, unused=len(used) - sum(used))
 
 
@@ -220,6 +229,7 @@ class _Whole:
             [one for motions in kind for one in motions] for kind in zip(*found, strict=True)
         )
         self._before = common.places
+        self._fixes: PlacedFixes | None = None
 
     def solve(self, ties: Sequence[LoopClosure], *, walk: bool = True) -> OptimizedGraph:
         """All places where links, loop closures of the maps, and those between them have them.
@@ -227,19 +237,58 @@ class _Whole:
         ``walk`` allows for drift that the runs did not know of.
         """
         links = self._walked if walk else self._links
-        aligned = zip(self._before, self._aligned(ties), strict=True)
-        places = [replace(place, map_T_middle=pose) for place, pose in aligned]
+        frames = self._frames(ties)
+        of_map = zip(self._common.map_of.tolist(), self._before, strict=True)
+        places = [replace(p, map_T_middle=frames[of].compose(p.map_T_middle)) for of, p in of_map]
         graph = MapGraph(places, links, [*self._loops, *ties]).saved()
         loops = range(len(links), graph.factors.size())
         first = places[0]
         to_place = first.map_T_middle.inverse().AdjointMap()
         noise = noise_model(symmetric(to_place @ first.covariance @ to_place.T))
         graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), first.map_T_middle, noise))
+        if self._fixes is not None:
+            self._add(self._fixes, graph, frames)
         most = self._config.pose_graph.max_chi2
         return optimize_graph(graph, max_chi2=most, loops=loops)
 
-    def _aligned(self, ties: Sequence[LoopClosure]) -> list[gtsam.Pose3]:
-        """Places of all maps in the frame of the first, by one tie for each of the others."""
+    def take_fixes(self, solved: OptimizedGraph, ties: Sequence[LoopClosure]) -> None:
+        """Use the fixes from now on, with offsets of receivers that contradict each other.
+
+        Such fixes would else outvote the loops between their maps. A DatasetError if they are
+        farther apart than receivers are wrong.
+        """
+        fixes = _fixes_of(self._maps, self._starts)
+        if fixes is None:
+            return
+        graph = SavedGraph(gtsam.NonlinearFactorGraph(solved.factors), gtsam.Values(solved.poses))
+        self._add(fixes, graph, self._frames(ties))
+        offsets = fixes.offsets(optimize_graph(graph, robust=False, loops=()).poses)
+        metres = np.linalg.norm(offsets, axis=1)
+        if metres.max() > _ASIDE:
+            pose = fixes.poses[fixes.receivers == metres.argmax()][0]
+            raise DatasetError(
+                f"{self._maps[self._common.map_of[pose]].path}: its fixes lie {metres.max():.0f} m "
+                "beside those of the other maps, as the places that they have in common tell; is "
+                "it somewhere else that looks the same? If not, map it again without aiding.gnss"
+            )
+        self._fixes = fixes.allowing_for(offsets)
+
+    def _add(
+        self, fixes: PlacedFixes, graph: SavedGraph, frames: Mapping[int, gtsam.Pose3]
+    ) -> None:
+        """Add fixes to a graph, and where the first map is on the earth by those of one map."""
+        number, earth = _on_earth(self._maps)[0]
+        enu_T_map = gtsam.Pose3(earth.enu_T_map).compose(frames[number].inverse())
+        graph.factors.push_back(fixes.factors(self._maps[0].frame.up))
+        graph.poses.insert(fixes.start(enu_T_map))
+
+    def fixes_agree(self, solved: OptimizedGraph) -> bool:
+        """Whether the fixes, if there are any, are off by no more than their covariances say."""
+        squared = np.zeros(1) if self._fixes is None else self._fixes.squared(solved.poses)
+        return float(np.mean(squared)) <= 0.5 * _LIKELY  # with half of the freedoms of a loop
+
+    def _frames(self, ties: Sequence[LoopClosure]) -> dict[int, gtsam.Pose3]:
+        """Frames of all maps in that of the first, by one tie for each of the others."""
         map_of, before = self._common.map_of, self._before
         by_pair: dict[Pair, LoopClosure] = {}
         for tie in ties:
@@ -254,10 +303,7 @@ class _Whole:
             known = pair[0] if number == pair[1] else pair[1]
             motion = motion if number == pair[1] else motion.inverse()
             frames[number] = frames[known].compose(motion)
-        return [
-            frames[int(of)].compose(place.map_T_middle)
-            for of, place in zip(map_of, before, strict=True)
-        ]
+        return frames
 
     def more(
         self, pair: Pair, held: Sequence[LoopClosure], solved: OptimizedGraph
@@ -293,8 +339,34 @@ class _Whole:
         for tie in ties:
             pair = int(map_of[tie.earlier]), int(map_of[tie.later])
             counts[pair] = counts.get(pair, 0) + 1
-        graph = MapGraph(places, self._links, [*own, *ties])
-        return MergedMaps(graph, tuple(self._starts), self._before, counts, 0)
+        graph = MapGraph(places, self._links, [*own, *ties], self._fixes)
+        earth = None
+        if self._fixes is not None:
+            origin, enu_T_map = _on_earth(self._maps)[0][1].origin, solved.poses.atPose3(MAP_KEY)
+            covariance = np.asarray(marginals.marginalCovariance(MAP_KEY))
+            earth = GeoReference(origin, enu_T_map.matrix(), covariance)
+        return MergedMaps(graph, tuple(self._starts), self._before, counts, 0, earth)
+
+
+def _on_earth(maps: Sequence[SavedMap]) -> list[tuple[int, GeoReference]]:
+    """Numbers of the maps that have fixes, and where each is by them."""
+    frames = [(n, saved.frame.earth) for n, saved in enumerate(maps) if saved.graph.fixes]
+    return [(number, earth) for number, earth in frames if earth is not None]
+
+
+def _fixes_of(maps: Sequence[SavedMap], starts: Sequence[int]) -> PlacedFixes | None:
+    """The fixes of all maps, east, north and up of the origin of the first that has some."""
+    parts: list[PlacedFixes] = []
+    receivers = 0
+    tied = _on_earth(maps)
+    for number, earth in tied:
+        fixes = maps[number].graph.fixes
+        assert fixes is not None
+        enu = east_north_up(geodetic_of(fixes.enu, earth.origin), tied[0][1].origin)
+        poses, owners = fixes.poses + starts[number], fixes.receivers + receivers
+        parts.append(replace(fixes, poses=poses, enu=enu, receivers=owners))
+        receivers += len(fixes.antennas)
+    return PlacedFixes.joined(parts) if parts else None
 
 
 def _numbered(motion: LoopClosure, start: int) -> LoopClosure:

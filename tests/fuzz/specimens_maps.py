@@ -7,23 +7,27 @@ import json
 import zipfile
 from collections.abc import Callable, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
 import numpy as np
 
 from loam_gtsam import Config, run
+from loam_gtsam.aiding.gnss import PlacedFixes
 from loam_gtsam.datasets import SimulatedWorld
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_npz
 from loam_gtsam.maps.clouds import import_cloud, read_cloud, write_cloud
 from loam_gtsam.maps.localizer import Localizer
-from loam_gtsam.maps.map_file import MAP_FILE, SavedMap, save_map
+from loam_gtsam.maps.map_file import MAP_FILE, MapFrame, SavedMap, save_map, write_map
 from loam_gtsam.maps.merging import merge_maps
+from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.types import DatasetError
 
 Specimens = Mapping[str, tuple[Mapping[str, bytes], Callable[[Path], object]]]
-WORLD = SimulatedWorld("room", frames=4, columns=60, speed=3.0, start="moving")
+WORLD = SimulatedWorld("room", frames=4, columns=120, speed=3.0, start="moving")
 _CONFIG = Config().changed("pose_graph.keyframe_distance=0.2", "loops.sectors=8", "loops.rings=3")
 
 
@@ -71,12 +75,32 @@ def room_cloud() -> np.ndarray:
     return np.concatenate([np.stack(part, 1) for part in parts])
 
 
+def write_with_fixes(path: Path, pipeline: Pipeline) -> None:
+    """The map of a run, with a fix at every place, as if it were on the earth."""
+    save_map(path, pipeline)
+    with SavedMap(path) as saved:
+        count = len(saved.places)
+        fixes = PlacedFixes(
+            np.arange(count), np.tile(np.eye(4), (count, 1, 1)),
+            np.array([place.map_T_middle.translation() for place in saved.places]),
+            np.tile(0.01 * np.eye(3), (count, 1, 1)), np.zeros(count, np.int64), np.zeros((1, 3)),
+            np.full(1, 0.05),
+        )  # fmt: skip
+        earth = GeoReference(np.array([47.5, 8.5, 450.0]), np.eye(4), 0.01 * np.eye(6))
+        cubes = {
+            layer: {index: saved.cube(layer, index) for index in indices}
+            for layer, indices in saved.layers.items()
+        }
+        graph = replace(saved.graph, fixes=fixes)
+        write_map(path, cubes, graph, saved.config, MapFrame(earth=earth))
+
+
 def maps(made: Callable[[Callable[[Path], object]], Mapping[str, bytes]]) -> Specimens:
     """By the name of the format, files and what reads them; ``made`` keeps what is written."""
     result = run(WORLD, _CONFIG)
     pipeline = result.pipeline
     assert pipeline is not None
-    whole = made(lambda folder: save_map(folder / MAP_FILE, pipeline))
+    whole = made(lambda folder: write_with_fixes(folder / MAP_FILE, pipeline))
     with zipfile.ZipFile(io.BytesIO(whole[MAP_FILE])) as archive:
         members = {name: archive.read(name) for name in archive.namelist()}
     header = json.loads(members["map.json"])

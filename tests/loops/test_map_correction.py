@@ -103,7 +103,7 @@ def test_places_and_motions_of_a_saved_map_are_those_of_the_graph():
     assert [(one.earlier, one.later) for one in saved.loops] == [
         (one.earlier, one.later) for one in loops.graph.loops
     ]
-    again = graph_of_arrays(graph_arrays(saved))
+    again = graph_of_arrays(graph_arrays(saved, Config().loops))
     for one, other in zip([*saved.links, *saved.loops], [*again.links, *again.loops], strict=True):
         np.testing.assert_array_equal(one.covariance, other.covariance)
         assert one.earlier_T_later.equals(other.earlier_T_later, 1e-12)

@@ -14,14 +14,14 @@ from support.rooms_map import FRAMES, Mapped, world
 from support.worlds import OWN
 from support.worlds import updates as made_up
 
-from loam_gtsam.config import preset
+from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.geometry import inverse_pose, transform
 from loam_gtsam.maps.first_fix import Candidate, PlaceSearch
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypothesis
 from loam_gtsam.maps.localizer import Localizer, localise
-from loam_gtsam.maps.map_file import SavedMap, save_map
+from loam_gtsam.maps.map_file import LAYERS, MapFrame, SavedMap, save_map, write_map
 from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import Pipeline, run
@@ -329,10 +329,13 @@ def test_parts_that_do_not_go_together_are_refused_at_once(mapped, saved):
         localise(mapped.world, saved, config)
 
 
-def test_a_map_without_places_is_refused(saved):
-    saved.graph = MapGraph([], [], [])
-    with pytest.raises(InputError, match="no places"):
-        Localizer(saved)
+def test_a_map_without_places_is_refused(tmp_path):
+    """As that of a run of which no frame was sure; it can be opened, for its points."""
+    path = tmp_path / "none.lgmap"
+    config, points = Config(), {layer: {} for layer in LAYERS}
+    write_map(path, points, MapGraph([], [], []), config, MapFrame())
+    with SavedMap(path) as nowhere, pytest.raises(InputError, match="no places"):
+        Localizer(nowhere)
 
 
 def test_the_command_localises_in_the_map_that_a_run_wrote(mapped, tmp_path, monkeypatch):

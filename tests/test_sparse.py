@@ -56,7 +56,7 @@ def things_far_apart():
     ("speed", "width", "held"), [(8, 2.0, True), (20, 2.0, True), (8, 0, False)]
 )
 def test_things_that_stand_alone_far_away_hold_a_drive_that_starts_at_speed(speed, width, held):
-    given = {"columns": 360, "max_range": 60.0, "start": "moving", "frames": 40}
+    given = {"columns": 360, "max_range": 60.0, "start": "moving", "frames": 30}
     world = SimulatedWorld(things_far_apart(), speed=speed, **given)
     result = run(world, alone().changed({"features.post_width": float(width)}))
     found, true = result.trajectory.map_T_lidar, world.truth.map_T_lidar

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import subprocess
+import sys
 import tracemalloc
 from collections.abc import Iterator
 from contextlib import suppress
@@ -298,3 +300,14 @@ def test_a_page_shows_names_and_does_not_run_them() -> None:
     evil = "<script>alert(1)</script>"
     sections = {evil: table_html(TextTable([evil], [[evil]])), "list": list_html({evil: evil})}
     assert "<script" not in page(evil, [evil], sections)
+
+
+# -- damage ----------------------------------------------------------------------------------------
+
+
+def test_what_is_damaged_for_hours_can_be_read_undamaged() -> None:
+    """Mutants of a file that is refused anyway show nothing: one of each format."""
+    script = ROOT.parent / "tests/fuzz/mutate.py"
+    command = [sys.executable, str(script), "--files", "1", "--values", "1"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr

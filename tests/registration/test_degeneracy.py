@@ -425,7 +425,7 @@ FIRST = {"corridor_bare": 250}
 """Sweep to begin with, when the platform moves; in the corridor out of sight of its ends."""
 
 
-def drive(scene, sweeps=12, first=50, **solver):
+def drive(scene, sweeps=8, first=50, **solver):
     """Updates and true world poses, with odometry that is one per cent too long as the guess."""
     world = SimulatedWorld(scene, columns=900)
     config = effective_config(Config(solver=SolverConfig(**solver)), world)

@@ -19,8 +19,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from loam_gtsam.config import Config, MapConfig, dump_config
-from loam_gtsam.config.tree import parse_config
+from loam_gtsam.config import Config, MapConfig, config_from_dict, config_to_dict
 from loam_gtsam.cubemap import Contents, grid_of
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.errors import DAMAGED
@@ -28,6 +27,7 @@ from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.places import Place
 from loam_gtsam.maps.map_graph import (
+    PARTS,
     MapGraph,
     array_shapes,
     graph_arrays,
@@ -42,7 +42,7 @@ from loam_gtsam.voxels.grid import CubeIndex, Grid
 
 SUFFIX = ".lgmap"
 MAP_FILE = f"map{SUFFIX}"
-VERSION = 2
+VERSION = 3
 LAYERS = "edges", "planes", "small_edges", "small_planes"
 _FORMAT = "loam_gtsam map"
 _HEADER = "map.json"
@@ -149,7 +149,7 @@ def write_map(
             "up": None if up is None else up.tolist(),
             "enu": None if earth is None else earth.as_dict(),
         },
-        "config": dump_config(config),
+        "config": config_to_dict(config),
         **graph.sizes,
         "layers": {
             name: [[*index, len(cube.points)] for index, cube in cubes.items()]
@@ -220,7 +220,7 @@ class SavedMap:
                 f"version {found[1]!s:.40}; run the data again with this release"
             )
         try:
-            self.config: Config = parse_config(header["config"], f"{self.path}: {_HEADER}")
+            self.config: Config = config_from_dict(header["config"], f"{self.path}: {_HEADER}")
             self.layers = {
                 name: {
                     (int(x), int(y), int(z)): int(count)
@@ -233,9 +233,7 @@ class SavedMap:
                 None if up is None else np.array(up, np.float64).reshape(3),
                 None if enu is None else GeoReference.of_dict(enu),
             )
-            sizes = {name: int(header[name]) for name in ("places", "links", "loops")}
-            # Maps that were made before there were fixes in them do not say so.
-            sizes |= {name: int(header.get(name, 0)) for name in ("fixes", "receivers")}
+            sizes = {name: int(header[name]) for name in PARTS}
             shapes = array_shapes(sizes, self.config.loops)
             arrays = {name: self._array(f"{name}.npy", *how) for name, how in shapes.items()}
             self.graph = graph_of_arrays(arrays)

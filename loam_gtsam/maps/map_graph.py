@@ -24,6 +24,8 @@ from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.types import FloatArray, stack_poses
 
+PARTS = "places", "links", "loops", "fixes", "receivers"
+"""What a graph has a number of, by which :func:`array_shapes` knows its arrays."""
 _PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _MOTIONS = "ends", "motions", "covariances"
 _FIXES = {
@@ -58,15 +60,10 @@ class MapGraph:
 
     @property
     def sizes(self) -> dict[str, int]:
-        """Numbers of its parts, by which :func:`array_shapes` knows its arrays."""
-        fixes = self.fixes
-        return {
-            "places": len(self.places),
-            "links": len(self.links),
-            "loops": len(self.loops),
-            "fixes": 0 if fixes is None else len(fixes),
-            "receivers": 0 if fixes is None else len(fixes.antennas),
-        }
+        """Numbers of its :data:`PARTS`."""
+        fixes = ((), ()) if self.fixes is None else (self.fixes, self.fixes.antennas)
+        every = self.places, self.links, self.loops, *fixes
+        return dict(zip(PARTS, map(len, every), strict=True))
 
     def saved(self) -> SavedGraph:
         """As it is written to other files, and optimised: links, then loops; without fixes."""

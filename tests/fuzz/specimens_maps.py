@@ -105,7 +105,7 @@ def maps(made: Callable[[Callable[[Path], object]], Mapping[str, bytes]]) -> Spe
         members = {name: archive.read(name) for name in archive.namelist()}
     header = json.loads(members["map.json"])
     # Else most words are of the configuration.
-    header["config"] = "loops:\n  sectors: 8\n  rings: 3\n"
+    header["config"] = {"loops": {"sectors": 8, "rings": 3}}
     short = {"map.json": json.dumps(header).encode(), **{n: c for n, c in members.items() if
                                                         n != "map.json"}}  # fmt: skip
     rows = made(lambda folder: write_npz(folder / "run.npz", result.updates))

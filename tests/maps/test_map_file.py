@@ -148,7 +148,7 @@ WRONG = {
     "multi-line": header_of_array("places/stamps.npy", b"{'descr': 3L,\n"),
     "pickle": array_of("places/stamps.npy", np.array([{}, {}], object)),
     "there is no 'edges'": header_with(layers={}),
-    "damaged": header_with(config="map: {cube_size: -1}"),
+    "damaged": header_with(config={"map": {"cube_size": -1}}),
 }
 
 

@@ -123,7 +123,8 @@ class Hypotheses:
             rivals = self._search.rivals(held.pose, found, held.rivals_below())
             if not rivals:
                 return held.last, ""
-            message = f"{len(rivals)} other poses fit the map nearly as well as the best"
+            fit = "pose fits" if len(rivals) == 1 else "poses fit"
+            message = f"{len(rivals)} other {fit} the map nearly as well as the best"
         self._held = [h for h in self._held if not self._search.refuted(h.pose, found)]
         self._begin(posed, features, found)
         return None, message

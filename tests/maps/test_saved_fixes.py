@@ -121,7 +121,7 @@ def test_what_is_merged_is_where_the_fixes_of_both_have_it(
     alone = surveyed.map("first")
     before = np.linalg.norm(surveyed.off(alone.places, alone.frame.earth), axis=1)
     after = np.linalg.norm(surveyed.off(merged.places, merged.frame.earth), axis=1)
-    assert after.mean() < 0.7 * before.mean()  # 17 mm and 32, with 51 if it forgot the fixes
+    assert after.mean() < 0.7 * before.mean()  # 17 mm and 32; 51 without the fixes
     assert after.max() < 0.05
     assert merged.graph.fixes is not None
     assert len(merged.graph.fixes.antennas) == 2

@@ -298,14 +298,13 @@ class Pipeline:
             roots |= {"loops": loops, "graph": loops.graph, "closer": loops.closer}
         return roots, shared
 
-    def tie_to_earth(self, updates: Sequence[MapUpdate], fixes: GnssFixes) -> TiedFixes | None:
+    def tie_to_earth(self, updates: Sequence[MapUpdate], fixes: GnssFixes) -> None:
         """Tie the keyframes of a run to the fixes of a receiver, once the run is complete."""
         if self.loops is None:
-            return None
+            return
         aid = self.mapper.imu
         up = None if aid is None or aid.level is None else aid.level.map_up
         self.fixes = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
-        return self.fixes
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map, (E, 3) and (P, 3) metres."""
@@ -317,7 +316,6 @@ class Pipeline:
         *,
         interrupted: bool = False,
         error: Exception | None = None,
-        fixes: TiedFixes | None = None,
     ) -> RunResult:
         """A whole run, from what :meth:`process` said about each of its sweeps."""
         mapper = self.mapper
@@ -336,7 +334,7 @@ class Pipeline:
             imu=None if mapper.imu is None else imu_summary(mapper.imu, updates),
             loops=self.loops,
             pipeline=self,
-            fixes=fixes,
+            fixes=self.fixes,
         )
 
 
@@ -456,5 +454,6 @@ def run(
         error = caught
     finally:
         progress.end()
-    tied = None if fixes is None else pipeline.tie_to_earth(updates, fixes)
-    return pipeline.result(updates, interrupted=interrupted, error=error, fixes=tied)
+    if fixes is not None:
+        pipeline.tie_to_earth(updates, fixes)
+    return pipeline.result(updates, interrupted=interrupted, error=error)

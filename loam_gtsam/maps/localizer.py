@@ -28,7 +28,6 @@ from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
 from loam_gtsam.maps.map_file import SavedMap, whole, write_map
-from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import advance
@@ -236,7 +235,7 @@ class Localizer:
     def save(self, path: str | Path) -> None:
         """Write the map with what was added to it; see :func:`~loam_gtsam.maps.save_map`."""
         saved = self._saved
-        graph = MapGraph(self._places, self._links, saved.graph.loops, saved.graph.fixes)
+        graph = replace(saved.graph, places=self._places, links=self._links)
         write_map(path, whole(self._maps), graph, saved.config, saved.frame)
 
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:

@@ -7,7 +7,7 @@ what they did to the poses is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import gtsam
@@ -28,16 +28,10 @@ PARTS = "places", "links", "loops", "fixes", "receivers"
 """What a graph has a number of, by which :func:`array_shapes` knows its arrays."""
 _PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _MOTIONS = "ends", "motions", "covariances"
-_FIXES = {
-    "poses": "places",
-    "pose_T_lidar": "place_T_lidar",
-    "enu": "enu",
-    "covariances": "covariances",
-    "receivers": "receivers",
-    "antennas": "antennas",
-    "antenna_sigmas": "antenna_sigmas",
-}
-"""Fields of :class:`PlacedFixes`, and what they are called in a file."""
+_FIXES = (
+    "places", "place_T_lidar", "enu", "covariances", "receivers", "antennas", "antenna_sigmas",
+)  # fmt: skip
+"""What the fields of :class:`PlacedFixes` are called in a file, in their order."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,11 +109,10 @@ def _from_middles(fixes: PlacedFixes, moves: Mapping[int, tuple[int, gtsam.Pose3
     """Fixes on keyframes as fixes on the middles of their sweeps, those that are places."""
     kept = fixes.of(np.isin(fixes.poses, list(moves)).nonzero()[0])
     found = [moves[number] for number in kept.poses.tolist()]
-    back = [move.inverse().matrix() for _, move in found]
     return replace(
         kept,
         poses=np.array([place for place, _ in found], np.int64),
-        pose_T_lidar=np.array(back).reshape(-1, 4, 4) @ kept.pose_T_lidar,
+        pose_T_lidar=stack_poses(move.inverse() for _, move in found) @ kept.pose_T_lidar,
     )
 
 
@@ -190,7 +183,8 @@ def graph_arrays(graph: MapGraph, config: LoopConfig) -> dict[str, NDArray[Any]]
             f"{kind}/covariances": _matrices([one.covariance for one in motions]),
         }
     if graph.fixes is not None and len(graph.fixes):
-        arrays |= {f"fixes/{name}": getattr(graph.fixes, own) for own, name in _FIXES.items()}
+        columns = zip(_FIXES, fields(PlacedFixes), strict=True)
+        arrays |= {f"fixes/{name}": getattr(graph.fixes, own.name) for name, own in columns}
     return arrays
 
 
@@ -218,7 +212,7 @@ def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
     links, loops = found
     if "fixes/places" not in arrays:
         return MapGraph(places, links, loops)
-    fixes = PlacedFixes(**{own: arrays[f"fixes/{name}"] for own, name in _FIXES.items()})
+    fixes = PlacedFixes(*(arrays[f"fixes/{name}"] for name in _FIXES))
     for name, numbers, count in (
         ("places", fixes.poses, len(places)),
         ("receivers", fixes.receivers, len(fixes.antennas)),

@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.cli import loam
+from support.receiver import ORIGIN
 
 from loam_gtsam.aiding.gnss import PlacedFixes
 from loam_gtsam.config import Config
@@ -26,7 +27,6 @@ from loam_gtsam.pipeline import run
 from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.types import DatasetError, FloatArray, Scan
 
-ORIGIN = np.array([47.5, 8.5, 450.0])
 ENU_T_WORLD = gtsam.Pose3(gtsam.Rot3.Yaw(2.2), np.array([20.0, -35.0, 4.0]))
 SIGMA, TOO_LONG = 0.02, 1.005
 CUTS = (0, 35), (25, 60)

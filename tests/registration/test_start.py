@@ -329,6 +329,29 @@ def test_what_may_move_counts_once_against_a_way_that_may_be_true():
     assert ways._favour(passed, taken).every < -3.0
 
 
+@pytest.mark.parametrize(
+    ("there", "here", "normal", "tell"),
+    [
+        (7, 0, AHEAD, False),
+        (9, 0, AHEAD, True),
+        (5, 4, AHEAD, True),  # they contradict each other, but may be told better
+        (300, 0, ASIDE, False),  # walls along the way
+    ],
+)
+def test_few_features_that_lie_across_the_way_tell_nothing(there, here, normal, tell):
+    """So many planes agree at a place 3 m ahead alone, and at this one alone."""
+    places = (3.0 * AHEAD, np.arange(500) < there), (0.0 * AHEAD, np.arange(500) >= 500 - here)
+    one, other = (place(at, [], agree, normal) for at, agree in places)
+    for sweeps in (1, 3):  # which see the same
+        assert ways.tell_nothing((one,) * sweeps, (other,) * sweeps, 8.0) != tell
+
+
+def test_a_way_of_which_nothing_tells_is_kept_though_its_features_object():
+    taken, other, near = way_of(0.0, 0.0), way_of(1.0, 1.0, planes=-1), way_of(1.1, 1.1)
+    assert ways.kept_ways([taken, other], CONFIG) == [taken]
+    assert ways.kept_ways([taken], CONFIG, [other, near]) == [taken, other]
+
+
 def test_a_rival_parts_from_a_way_if_it_leads_ever_farther_away():
     taken, faster, later = (
         way_of(*steps)[-1].sweeps for steps in ((1.0, 1.0, 1.0), (3.0, 3.0, 3.0), (5.0, 1.0, 1.0))

@@ -83,14 +83,15 @@ class Evidence:
 class Favour(NamedTuple):
     """How much speaks for some places against others.
 
-    In standard deviations, of all features, of lines and of planes; and the number of features that
-    speak for them more than against them, counted as if they lay across.
+    In standard deviations, of all features, of lines and of planes; and numbers of features,
+    counted as if they lay across: ``weight`` speak for them more than against, ``said`` at all.
     """
 
     every: float
     lines: float
     planes: float
     weight: float
+    said: float
 
 
 def favour(
@@ -102,12 +103,13 @@ def favour(
     the other may be ``moving``: then it counts for the one as much as against the other.
     """
     found = [_gain(*pair, moving) for pair in zip(tried, others, strict=True)]
-    gain, edge = (np.concatenate(parts) for parts in list(zip(*found, strict=True))[:2])
+    gain, edge, across = (np.concatenate(parts) for parts in zip(*found, strict=True))
     every, lines, planes = (
         float(part.sum() / max(np.sqrt(len(found)) * np.linalg.norm(part), _TINY))
         for part in (gain, gain[edge], gain[~edge])
     )
-    return Favour(every, lines, planes, sum(weight for _, _, weight in found) / len(found))
+    weight, said = (float(across @ some) / len(found) for some in (gain, np.abs(gain)))
+    return Favour(every, lines, planes, weight, said)
 
 
 def speaks_for(here: Evidence, other: Evidence, least: float) -> bool:
@@ -119,8 +121,10 @@ def speaks_for(here: Evidence, other: Evidence, least: float) -> bool:
     return told.every > CHANCE and told.weight > least
 
 
-def _gain(tried: Evidence, other: Evidence, moving: bool) -> tuple[FloatArray, BoolArray, float]:
-    """What each feature (F,) says for one place against another, which are edges, and their number.
+def _gain(
+    tried: Evidence, other: Evidence, moving: bool
+) -> tuple[FloatArray, BoolArray, FloatArray]:
+    """What each feature (F,) says for one place against another, which are edges, how far across.
 
     A feature counts as far as its line or plane lies across the way from one place to the other:
     ground and walls along the way agree at both, but for chance. Hints count only if they were
@@ -143,4 +147,4 @@ def _gain(tried: Evidence, other: Evidence, moving: bool) -> tuple[FloatArray, B
     if tried.hints is not None and other.hints is not None:
         gain = gain + tried.hints - other.hints
     gain = across * gain
-    return gain, edge, float(across @ gain)
+    return gain, edge, across

@@ -38,6 +38,7 @@ from loam_gtsam.registration.start.ways import (
     mean_twist,
     moved_with_first,
     parting,
+    tell_nothing,
     without_turns,
 )
 from loam_gtsam.types import FloatArray, SweepMotion
@@ -224,31 +225,41 @@ class Start:
                 others.append([first, replace(second, map_T_middle=place)])
         if not others:
             return sweeps
-        followed = [self._followed(frame, way, sweeps[len(way) :], solver) for way in others]
-        ways = [
-            tuple(
-                self._registered(frame, self._with_motion(way[:count]), solver)
-                for count in range(2, len(way) + 1)
-            )
-            for way in (sweeps, *followed)
-        ]
-        best = self._best(ways, frame.matcher.config)
-        return sweeps if best is ways[0] else best[-1].sweeps
+        config = frame.matcher.config
+        taken, telling, silent = self._way(frame, sweeps, solver), [], []
+        for way in others:
+            followed = self._followed(frame, way, sweeps[len(way) :], solver)
+            if tell_nothing(taken[-len(followed) :], followed, config.solver.min_aligned):
+                silent.append(followed)
+            else:
+                joined = self._together(frame, followed[-1].sweeps, solver, 1)
+                telling.append(self._way(frame, joined, solver))
+        best = self._best([taken, *telling], config, silent)
+        return sweeps if best is taken else best[-1].sweeps
 
-    def _best(self, ways: Sequence[Way], config: Config) -> Way:
-        """The best of some ways; those that are as good are rivals from then on."""
-        best, *rivals = kept_ways(ways, config)
+    def _best(self, ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -> Way:
+        """The best of some ways; those that are as good, or of which no scan tells, are rivals."""
+        best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best
 
     def _followed(
         self, frame: Frame, way: list[EarlySweep], sweeps: Sequence[EarlySweep], solver: ScanSolver
-    ) -> list[EarlySweep]:
-        """A way with further sweeps, each expected at constant velocity, registered together."""
+    ) -> Way:
+        """Further sweeps of a way, each expected at constant velocity."""
+        found: list[Tried] = []
         for sweep in sweeps:
             expected = replace(sweep, map_T_middle=continued(way, sweep.moment.stamp))
-            way = self._registered(frame, self._with_motion([*way, expected]), solver).sweeps
-        return self._together(frame, way, solver, 1)
+            found.append(self._registered(frame, self._with_motion([*way, expected]), solver))
+            way = found[-1].sweeps
+        return tuple(found)
+
+    def _way(self, frame: Frame, sweeps: Sequence[EarlySweep], solver: ScanSolver) -> Way:
+        """Each sweep after the first, registered with the map of those before it."""
+        return tuple(
+            self._registered(frame, self._with_motion(sweeps[:count]), solver)
+            for count in range(2, len(sweeps) + 1)
+        )
 
     def _with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
         """The sweeps, de-skewed for the motion between their poses."""

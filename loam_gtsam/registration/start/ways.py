@@ -123,11 +123,11 @@ def without_turns(sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
     ]
 
 
-def kept_ways(ways: Sequence[Way], config: Config) -> list[Way]:
+def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -> list[Way]:
     """The best of some ways, and after it those that are as good, but for chance.
 
     The first one is the way that was taken. If some acceleration explains it, others that none
-    explains are no ways.
+    explains are no ways. Of ``silent`` ones no scan tells whether they are as good.
     """
     least, near = config.solver.min_aligned, config.map.plane_voxel
     if _drivable(ways[0], config.relocalization):
@@ -137,11 +137,16 @@ def kept_ways(ways: Sequence[Way], config: Config) -> list[Way]:
         if _better(way, best, least):
             best = way
     kept = [best]
-    for way in ways:
-        apart = all(_apart(way, other, near) for other in kept)
-        if apart and _favour(way, best, moving=True).every > -CHANCE:
+    as_good = [way for way in ways if _favour(way, best, moving=True).every > -CHANCE]
+    for way in (*as_good, *silent):
+        if all(_apart(way, other, near) for other in kept):
             kept.append(way)
     return kept
+
+
+def tell_nothing(one: Way, other: Way, least: float) -> bool:
+    """Whether fewer than ``least`` features, counted as if they lay across, tell two ways apart."""
+    return _favour(one, other).said < least
 
 
 def _drivable(way: Way, config: RelocalizationConfig) -> bool:
@@ -174,8 +179,9 @@ def _better(tried: Way, best: Way, least: float) -> bool:
     lie those of its own ring. ``least`` is the number of features at least, counted as if they lay
     across.
     """
-    every, lines, planes, weight = _favour(tried, best)
-    return every > CHANCE and min(lines, planes) > -CHANCE and weight > least
+    told = _favour(tried, best)
+    agreed = min(told.lines, told.planes) > -CHANCE
+    return told.every > CHANCE and agreed and told.weight > least
 
 
 def _favour(tried: Way, best: Way, *, moving: bool = False) -> Favour:

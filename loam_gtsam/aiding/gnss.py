@@ -39,7 +39,7 @@ MAP_KEY: int = gtsam.symbol("g", 0)
 ANTENNA_KEY: int = gtsam.symbol("a", 0)
 """Key of the position of the first receiver's antenna in the frame of the lidar, metres."""
 _LARGEST = 16.27  # of chi squared with three degrees of freedom, 0.1 % of right fixes exceed it
-_MEDIAN = 2.366  # of chi squared with three degrees of freedom
+MEDIAN = 2.366  # of chi squared with three degrees of freedom
 _STEP = 1.6  # by which graduated non-convexity sharpens from solve to solve
 _LEAST = 0.5  # share of the fixes that must agree
 _HEADING = 0.2  # rad: with a larger standard deviation the heading counts as unknown
@@ -420,7 +420,7 @@ class _Solver:
             if sharp == 1.0:
                 break
             sharp = max(1.0, sharp / _STEP)
-        scale = max(1.0, float(np.median(squared)) / _MEDIAN)
+        scale = max(1.0, float(np.median(squared)) / MEDIAN)
         used = squared <= scale * _LARGEST
         for _ in range(5):
             if used.sum() < _FEWEST:

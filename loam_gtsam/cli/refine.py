@@ -14,10 +14,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RefineOptions
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.truth import read_truth
 from loam_gtsam.geometry import voxel_filter
 from loam_gtsam.io.atomic import write_json
@@ -25,7 +27,10 @@ from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_covariances, write_ply
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.loops.files import read_graph
+from loam_gtsam.maps.map_file import SavedMap, map_of_run
+from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.merging import MergedMaps
+from loam_gtsam.refine.fixes import Survey
 from loam_gtsam.refine.map_quality import MapQuality, common_thickness, map_quality
 from loam_gtsam.refine.rounds import Round, Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
@@ -42,6 +47,8 @@ from loam_gtsam.types import (
 from loam_gtsam.view.sections import plot_section
 
 FOLDER = "refined"
+_OF_RUN = ".tum", "_kitti.txt", "_covariance.csv", "_enu.tum"
+_CLOUD, _PICTURE, _REPORT = "map.ply", "section.png", "report.json"
 
 
 def execute(options: RefineOptions) -> int:
@@ -67,14 +74,30 @@ def refine_folder(
     settings = Settings(rounds=rounds, sigma=run.config.matching.point_sigma)
     with _progress(settings, quiet=quiet) as shown:
         found = refine_run(
-            points, run.updates, trajectory=trajectory, graph=graph, settings=settings,
-            min_aligned=run.config.solver.min_aligned, on_round=shown[0], on_window=shown[1],
+            points, run.updates, trajectory=trajectory, graph=graph, survey=_survey_of_run(folder),
+            settings=settings, min_aligned=run.config.solver.min_aligned,
+            on_round=shown[0], on_window=shown[1],
         )  # fmt: skip
     return _write_all(folder, [run], [found], draws=draws, overwrite=overwrite, quiet=quiet)
 
 
+def _survey_of_run(folder: Path) -> Survey | None:
+    if not map_of_run(folder).exists():
+        return None
+    with SavedMap(map_of_run(folder)) as saved:
+        return _survey(saved.graph, saved.frame.earth, saved.frame.up)
+
+
+def _survey(graph: MapGraph, earth: GeoReference | None, up: FloatArray | None) -> Survey | None:
+    """The fixes of a map; None if it has none."""
+    if graph.fixes is None or earth is None:
+        return None
+    stamps = np.array([place.stamp for place in graph.places], np.int64)
+    return Survey(graph.fixes, stamps, earth, up)
+
+
 def refine_merged(
-    folder: Path, runs: Sequence[FinishedRun], merged: MergedMaps, *,
+    folder: Path, runs: Sequence[FinishedRun], merged: MergedMaps, *, up: FloatArray | None = None,
     plot: bool | None = None, quiet: bool = False,
 ) -> int:  # fmt: skip
     """Refine runs whose maps were merged, together; into ``folder/refined``."""
@@ -87,8 +110,8 @@ def refine_merged(
     with _progress(settings, quiet=quiet) as shown:
         found = refine_runs(
             points, updates, ways, graph=merged.graph.saved(), starts=merged.starts,
-            settings=settings, min_aligned=config.solver.min_aligned,
-            on_round=shown[0], on_window=shown[1],
+            survey=_survey(merged.graph, merged.earth, up), settings=settings,
+            min_aligned=config.solver.min_aligned, on_round=shown[0], on_window=shown[1],
         )  # fmt: skip
     return _write_all(folder, runs, found, draws=draws, overwrite=True, quiet=quiet)
 
@@ -150,21 +173,19 @@ def _write_all(
     known = _names(len(runs))
 
     def write(target: Path) -> list[str]:
-        for refined, *names in zip(found, known[::3], known[1::3], known[2::3], strict=False):
-            _write_trajectory(target, refined, names)
+        for number, refined in enumerate(found):
+            _write_trajectory(target, refined, known[len(_OF_RUN) * number :])
         every = [part for refined in found for part in refined.all_points()]
         points = voxel_filter(np.concatenate(every), runs[0].config.map.edge_voxel)
-        write_ply(target / known[-3], np.empty((0, 3)), points)
-        files = list(known[:-2])
+        write_ply(target / _CLOUD, np.empty((0, 3)), points)
         if draws and qualities[0].planes and qualities[1].planes:
             planes = _most_improved(*qualities)
-            plot_section(target / known[-2], clouds[0][0], clouds[1][0], *planes)
-            files.append(known[-2])
-        write_json(target / known[-1], report)
-        return [*files, known[-1]]
+            plot_section(target / _PICTURE, clouds[0][0], clouds[1][0], *planes)
+        write_json(target / _REPORT, report)
+        return [name for name in known if (target / name).exists()]
 
     with console.output_folder(folder / FOLDER, known, overwrite=overwrite) as target:
-        files = console.write_results(target, known, known[-1], write)
+        files = console.write_results(target, known, _REPORT, write)
     if not quiet:
         Console().print(_table(report))
         typer.echo(f"Written to {target}: {', '.join(files)}")
@@ -172,11 +193,10 @@ def _write_all(
 
 
 def _names(runs: int) -> tuple[str, ...]:
-    """Files of a refinement: three of each run, and three of all."""
+    """Files of a refinement: those of each run, and those of all."""
     numbers = [""] if runs == 1 else [f"_{number}" for number in range(1, runs + 1)]
-    ends = ".tum", "_kitti.txt", "_covariance.csv"
-    of_runs = [f"trajectory{number}{end}" for number in numbers for end in ends]
-    return *of_runs, "map.ply", "section.png", "report.json"
+    of_runs = [f"trajectory{number}{end}" for number in numbers for end in _OF_RUN]
+    return *of_runs, _CLOUD, _PICTURE, _REPORT
 
 
 def _held_out(found: Sequence[RefinedRun], *, refined: bool) -> tuple[FloatArray, IntArray]:
@@ -201,6 +221,8 @@ def _write_trajectory(folder: Path, found: RefinedRun, names: Sequence[str]) -> 
     told = zip(trajectory.stamps, trajectory.map_T_lidar, found.covariances, strict=True)
     poses = [MapUpdate(int(s), gtsam.Pose3(p), FrameStatus.OK, covariance=c) for s, p, c in told]
     write_covariances(folder / names[2], poses)
+    if found.earth is not None:
+        write_enu(folder / names[3], trajectory, found.earth)
 
 
 def _most_improved(before: MapQuality, after: MapQuality) -> tuple[FloatArray, FloatArray]:
@@ -231,6 +253,7 @@ def _report(
         "rounds": [{name: getattr(done, name) for name in Round.__slots__}
                    for done in all_of.refined.rounds],
         "thickness_bins_mm": edges[:-1],
+        "enu": None if all_of.earth is None else all_of.earth.as_dict(),
     }  # fmt: skip
     for name, quality, thickness in (
         ("before", before, common[0]), ("after", after, common[1])

@@ -33,8 +33,9 @@ _NUMBERS_END = 1 << 56  # keys from here on are of ``gtsam.symbol``, smaller one
 def write_graph(path: str | Path, saved: SavedGraph) -> None:
     """Write a graph: ``NAME.g2o``, or ``NAME.graph``, ``.values`` and ``.stamps`` for GTSAM.
 
-    g2o holds poses and the motions between them only: other factors and variables are left out, a
-    comment tells how many factors, and the first pose is marked as fixed. Stamps go into comments.
+    g2o holds poses and the motions between them only. Other factors and variables are left out, and
+    poses that only such factors tie; a comment tells how many factors. The first pose is marked as
+    fixed. Stamps go into comments.
 
     Raises
     ------
@@ -74,7 +75,7 @@ def _write_g2o(path: Path, saved: SavedGraph) -> None:
     lines = ["# made by loam_gtsam; information: translation first, then rotation (rad)"]
     stamps = {pose_number(key): stamp for key, stamp in saved.stamps.items()}
     lines += [f"{_STAMP} {number} {stamp}" for number, stamp in sorted(stamps.items())]
-    poses = {pose_number(key): saved.poses.atPose3(key) for key in saved.keys}
+    poses = {pose_number(key): saved.poses.atPose3(key) for key in _known_to_g2o(saved)}
     lines += [f"{_POSE} {number} {_pose_text(poses[number])}" for number in sorted(poses)]
     if poses:
         lines.append(f"{_FIX} {min(poses)}")
@@ -95,6 +96,20 @@ def _write_g2o(path: Path, saved: SavedGraph) -> None:
         lines.insert(1, f"# {left_out} factors are left out, which g2o does not know")
     with atomic_file(path) as file:
         file.write(("\n".join(lines) + "\n").encode("ascii"))
+
+
+def _known_to_g2o(saved: SavedGraph) -> list[int]:
+    """Keys of the poses, without those that only factors lead to which g2o does not know.
+
+    Such a pose, as that of the map on the earth, would be in the file without anything to tie it.
+    """
+    tied: set[int] = set(sorted(saved.keys, key=pose_number)[:1])
+    others: set[int] = set()
+    for place in range(saved.factors.size()):
+        factor = saved.factors.at(place)
+        known = isinstance(factor, gtsam.BetweenFactorPose3)
+        (tied if known else others).update(factor.keys())
+    return [key for key in saved.keys if key in tied or key not in others]
 
 
 def _pose_text(pose: gtsam.Pose3) -> str:

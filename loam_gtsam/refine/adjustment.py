@@ -15,14 +15,19 @@ import gtsam
 import numpy as np
 from scipy.sparse import csc_array
 
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.geometry import as_array, symmetric
-from loam_gtsam.refine.elimination import (
-    PlaneTies,
-    Sightings,
-    about_planes,
-    transformed_moments,
+from loam_gtsam.refine.elimination import Sightings, about_planes, transformed_moments
+from loam_gtsam.refine.fixes import FixTies
+from loam_gtsam.refine.rounds import (
+    OtherFactors,
+    Round,
+    Settings,
+    Ties,
+    adjusted,
+    equations,
+    factorised,
 )
-from loam_gtsam.refine.rounds import OtherFactors, Round, Settings, adjusted, equations, factorised
 from loam_gtsam.refine.surfaces import Planes
 from loam_gtsam.refine.sweeps import Path, SweepPoints, stacked
 from loam_gtsam.refine.windows import in_windows
@@ -43,6 +48,7 @@ class Refined:
     sightings : which sweep saw which of them
     information : (6 N, 6 N) of the poses, planes eliminated, other factors included
     rounds : what each round did
+    fixes : those of a GNSS receiver that took part
     """
 
     path: Path
@@ -51,6 +57,7 @@ class Refined:
     sightings: Sightings
     information: csc_array
     rounds: tuple[Round, ...] = field(default=())
+    fixes: FixTies | None = None
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -63,6 +70,13 @@ class Refined:
     def _solver(self) -> Callable[[FloatArray], FloatArray]:
         solver: Callable[[FloatArray], FloatArray] = factorised(self.information).solve
         return solver
+
+    @cached_property
+    def earth(self) -> GeoReference | None:
+        """Where the map is on the earth; None without fixes."""
+        if self.fixes is None:
+            return None
+        return self.fixes.referenced(self.path.map_T_middle, self._solver)
 
     @cached_property
     def _path_errors(self) -> FloatArray:
@@ -138,6 +152,7 @@ def refine(
     *,
     keep: FloatArray | None = None,
     for_covariances: gtsam.NonlinearFactorGraph | None = None,
+    fixes: FixTies | None = None,
     starts: Sequence[int] = (0,),
     on_round: Callable[[Round], None] | None = None,
     on_window: Callable[[int, int], None] | None = None,
@@ -156,6 +171,7 @@ def refine(
         (:func:`~loam_gtsam.refine.elimination.seen_directions`)
     for_covariances : factors that stand for ``factors`` in the covariances, if those are less
         sure than they are given weight
+    fixes : of a GNSS receiver, on the poses
     starts : numbers of the first sweeps of the runs, if there are several
     on_round : called after each round of the whole, to show progress
     on_window : called after each window of a long drive with the number of those done, and of all
@@ -170,7 +186,8 @@ def refine(
     poses = as_array(map_T_middle, "map_T_middle", (len(sweeps), 4, 4)).copy()
     if len(sweeps) < 3:
         raise InputError(f"refine: expected 3 or more sweeps, got {len(sweeps)}")
-    others = OtherFactors(factors, poses)
+    known: tuple[Ties, ...] = () if fixes is None else (fixes,)
+    others = OtherFactors(factors, poses, known=known)
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
     asked = np.tile(np.eye(6), (len(sweeps), 1, 1))
     if keep is not None:
@@ -179,12 +196,12 @@ def refine(
     def points_at(poses: FloatArray) -> tuple[FloatArray, IntArray]:
         return stacked(Path.through(stamps, poses, starts), sweeps)
 
-    known: tuple[PlaneTies, ...] = ()
     views = 3
     if len(sweeps) > settings.whole:
         views = 2  # of stretches, each of which saw a plane from many places
         windows = in_windows(sweeps, poses, others, asked, settings, starts, on_window)
-        poses, known, points_at = windows.map_T_middle, windows.ties, windows.points_at
+        poses, points_at = windows.map_T_middle, windows.points_at
+        known = (*windows.ties, *known)
         others = OtherFactors(factors, poses, known=known)
     found = adjusted(points_at, poses, others, asked, settings, on_round, views)
     poses = found.map_T_middle
@@ -193,4 +210,5 @@ def refine(
     information, _ = equations(poses, found.planes, found.seen, found.clear, others)
     factorised(information)
     path = Path.through(stamps, poses, starts)
-    return Refined(path, tuple(sweeps), found.planes, found.seen, information, found.rounds)
+    parts = found.planes, found.seen, information, found.rounds, fixes
+    return Refined(path, tuple(sweeps), *parts)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import gtsam
 import numpy as np
@@ -18,7 +18,6 @@ from scipy.sparse.linalg import splu
 
 from loam_gtsam.geometry import transform
 from loam_gtsam.refine.elimination import (
-    PlaneTies,
     Sightings,
     eliminated,
     refitted,
@@ -177,6 +176,20 @@ def _placed(points: FloatArray, numbers: IntArray, poses: FloatArray) -> FloatAr
     return placed
 
 
+class Ties(Protocol):
+    """What is known of some poses (K of N), all else that it is known from being eliminated."""
+
+    @property
+    def numbers(self) -> IntArray:
+        """(K,) of the sweeps."""
+
+    def cost(self, poses: FloatArray) -> float:
+        """Cost at poses (N, 4, 4) of all sweeps."""
+
+    def equations(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Information (6 K, 6 K) and gradient (6 K,) there."""
+
+
 class OtherFactors:
     """What ties the poses beside the planes that are looked for, and the anchor they may need.
 
@@ -185,7 +198,7 @@ class OtherFactors:
     factors : on the poses ``gtsam.symbol("x", n)`` of N sweeps in a row
     map_T_middle : (N, 4, 4) their poses
     first : number ``n`` of the first of them
-    known : what planes that were eliminated before tell of the poses
+    known : what planes that were eliminated before, and fixes, tell of the poses
     """
 
     def __init__(
@@ -193,7 +206,7 @@ class OtherFactors:
         factors: gtsam.NonlinearFactorGraph | None,
         map_T_middle: FloatArray,
         first: int = 0,
-        known: Sequence[PlaneTies] = (),
+        known: Sequence[Ties] = (),
     ) -> None:
         self.graph = gtsam.NonlinearFactorGraph() if factors is None else factors
         self.known, self._first, self._count = known, first, len(map_T_middle)

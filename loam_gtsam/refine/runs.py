@@ -4,17 +4,19 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import pose_number
 from loam_gtsam.refine.adjustment import Refined, refine
+from loam_gtsam.refine.fixes import FixTies, Survey
 from loam_gtsam.refine.motion_factors import (
     long_motion_factors,
     loop_factors,
@@ -141,6 +143,11 @@ class RefinedRun:
         return Trajectory(every.stamps[self._rows], every.map_T_lidar[self._rows])
 
     @property
+    def earth(self) -> GeoReference | None:
+        """Where the map is on the earth; None if no fixes took part."""
+        return self.refined.earth
+
+    @property
     def covariances(self) -> FloatArray:
         """(N, 6, 6) of the poses, the first one of the first run being exact.
 
@@ -204,6 +211,7 @@ def refine_run(
     *,
     trajectory: Trajectory | None = None,
     graph: SavedGraph | None = None,
+    survey: Survey | None = None,
     factors: gtsam.NonlinearFactorGraph | None = None,
     settings: Settings | None = None,
     min_aligned: float = SolverConfig().min_aligned,
@@ -219,6 +227,7 @@ def refine_run(
     trajectory : where the adjustment begins, if loops corrected the run; else the poses of
         ``updates``
     graph : pose graph of the run, whose loop closures are used unless they contradict the others
+    survey : fixes of the run, as its map has them
     factors : further ones, on the poses of the middles of the sweeps: ``gtsam.symbol("x", n)`` is
         that of frame ``points.frames[n]``
     min_aligned : matches that must fix a direction (``solver.min_aligned``); sweeps of which one
@@ -237,7 +246,8 @@ def refine_run(
         further.push_back(loop_factors(graph, frames, run.to_middle))
     if factors is not None:
         further.push_back(factors)
-    return _adjusted([run], further, settings, min_aligned, on_round, on_window)[0]
+    ties = None if survey is None else _fix_ties(survey, [run])
+    return _adjusted([run], further, ties, settings, min_aligned, on_round, on_window)[0]
 
 
 def refine_runs(
@@ -246,6 +256,7 @@ def refine_runs(
     trajectories: Sequence[Trajectory],
     *,
     graph: SavedGraph | None = None,
+    survey: Survey | None = None,
     starts: Sequence[int] = (0,),
     factors: gtsam.NonlinearFactorGraph | None = None,
     settings: Settings | None = None,
@@ -265,6 +276,7 @@ def refine_runs(
     graph : places of the runs, at the middles of sweeps, one run after the other, with the motions
         between them: ``MergedMaps.graph.saved()``. Loop closures are used unless they contradict
         the others.
+    survey : fixes on these places
     starts : number of the first place of each run: ``MergedMaps.starts``
     factors, settings, min_aligned, on_round, on_window : as of :func:`refine_run`; factors count
         the frames of one run after those of another
@@ -276,7 +288,7 @@ def refine_runs(
         common with the others.
     """
     counts = [len(points), len(updates), len(trajectories)]
-    counts += [] if graph is None else [len(starts)]
+    counts += [] if graph is None and survey is None else [len(starts)]
     if not points or len(set(counts)) > 1:
         raise InputError(
             "refine_runs: expected points, updates, a trajectory and a start for each run, got "
@@ -296,7 +308,8 @@ def refine_runs(
         further.push_back(loop_factors(graph, frames, to_middle, starts))
     if factors is not None:
         further.push_back(factors)
-    return _adjusted(runs, further, settings, min_aligned, on_round, on_window)
+    ties = None if survey is None else _fix_ties(survey, runs, starts)
+    return _adjusted(runs, further, ties, settings, min_aligned, on_round, on_window)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -361,10 +374,29 @@ def _starts(runs: Sequence[_Run]) -> list[int]:
     return counted
 
 
+def _fix_ties(survey: Survey, runs: Sequence[_Run], starts: Sequence[int] = (0,)) -> FixTies | None:
+    """The fixes, seen from the middles of the sweeps; None if none is on a frame of the runs."""
+    first, rows, sweeps, moves = _starts(runs), [], [], []
+    steps = [run.from_places() for run in runs]
+    for row, place in enumerate(survey.fixes.poses.tolist()):
+        number = bisect_right(starts, place) - 1
+        frame = runs[number].frame.get(int(survey.stamps[place]))
+        if frame is not None:
+            rows.append(row)
+            sweeps.append(first[number] + frame)
+            moves.append(steps[number][frame].inverse().matrix() @ survey.fixes.pose_T_lidar[row])
+    if not rows:
+        return None
+    seen = replace(
+        survey.fixes.of(np.array(rows)), poses=np.array(sweeps), pose_T_lidar=np.array(moves)
+    )
+    return FixTies.of(seen, survey.reference, survey.up)
+
+
 def _adjusted(
-    runs: Sequence[_Run], further: gtsam.NonlinearFactorGraph, settings: Settings | None,
-    min_aligned: float, on_round: Callable[[Round], None] | None,
-    on_window: Callable[[int, int], None] | None,
+    runs: Sequence[_Run], further: gtsam.NonlinearFactorGraph, fixes: FixTies | None,
+    settings: Settings | None, min_aligned: float,
+    on_round: Callable[[Round], None] | None, on_window: Callable[[int, int], None] | None,
 ) -> tuple[RefinedRun, ...]:  # fmt: skip
     """Runs adjusted with their odometry and further factors."""
     starts = _starts(runs)
@@ -389,7 +421,8 @@ def _adjusted(
     ])  # fmt: skip
     found = refine(
         sweeps, before.map_T_middle, every, settings,
-        keep=asked, for_covariances=told, starts=starts, on_round=on_round, on_window=on_window,
+        keep=asked, for_covariances=told, fixes=fixes, starts=starts,
+        on_round=on_round, on_window=on_window,
     )  # fmt: skip
     refined = []
     for start, run, whole in zip(starts, runs, wholes, strict=True):

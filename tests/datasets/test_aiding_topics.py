@@ -98,6 +98,11 @@ def test_a_run_with_gnss_places_its_map_on_the_earth(tmp_path):
         assert saved.frame.earth.heading_deg == pytest.approx(90.0, abs=2.0)
     first = (tmp_path / "out" / "trajectory_enu.tum").read_text().splitlines()[0]
     assert first.startswith(f"# origin: latitude {enu['latitude_deg']:.9f}")
+    done = loam("refine", path, tmp_path / "out", "--rounds", 1, "--no-plot")
+    assert "trajectory_enu.tum" in done.output
+    report = json.loads((tmp_path / "out" / "refined" / "report.json").read_text())
+    moved = np.subtract(report["enu"]["enu_T_map"], enu["enu_T_map"])
+    assert 0.0 < np.abs(moved).max() < 0.05
     plain = loam("run", path, "--wheels", "--output", tmp_path / "no", "--frames", 2)
     assert plain.exit_code == 1
     assert "aiding.wheels: the data have nothing of wheels" in " ".join(plain.output.split())

@@ -78,6 +78,19 @@ def test_gtsam_files_keep_every_factor(tmp_path):
     assert read_graph(tmp_path / "g.graph").stamps == {}
 
 
+def test_a_pose_that_only_factors_tie_which_g2o_does_not_know_is_not_in_it(tmp_path):
+    """As that of the map on the earth: nothing in the file would hold it."""
+    saved = saved_graph()
+    earth, noise = gtsam.symbol("g", 0), gtsam.noiseModel.Isotropic.Sigma(3, 1.0)
+    saved.poses.insert(earth, gtsam.Pose3())
+    fix = gtsam.CustomFactor(noise, [X(4), earth], lambda *_: np.zeros(3))
+    saved.factors.add(fix)
+    write_graph(tmp_path / "g.g2o", saved)
+    again = read_graph(tmp_path / "g.g2o")
+    assert again.keys == [X(number) for number in range(20)]
+    assert len(optimize_graph(again).loops) == 4
+
+
 def test_gtsam_reads_the_g2o_file_too(tmp_path):
     saved = saved_graph()
     write_graph(tmp_path / "g.g2o", saved)

@@ -17,7 +17,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker
-from loam_gtsam.registration.odometry import Prediction, advance
+from loam_gtsam.registration.odometry import Prediction
 from loam_gtsam.registration.relocalization import (
     Found,
     any_of,
@@ -33,9 +33,9 @@ from loam_gtsam.registration.start.ways import (
     EarlySweep,
     Tried,
     Way,
+    by_second_step,
     continued,
     kept_ways,
-    mean_twist,
     moved_with_first,
     parting,
     tell_nothing,
@@ -207,23 +207,12 @@ class Start:
     def _told_apart(
         self, frame: Frame, sweeps: list[EarlySweep], solver: ScanSolver
     ) -> list[EarlySweep]:
-        """The sweeps on the way that explains them best, of all that began as well.
-
-        With the third sweep there is one more way, that of the second step: the first motion was
-        searched for on a grid, with two sweeps that may see little of each other.
-        """
+        """The sweeps on the way that explains them best, of all that began as well."""
         if len(sweeps) == 2:
             return sweeps
         others, self._rivals = [_moved(sweeps, rival) for rival in self._rivals], []
-        if any(sweep.held for sweep in sweeps[1:]):
-            return sweeps
-        if len(sweeps) == 3:
-            first, second, third = sweeps
-            seconds = first.moment.seconds_to(second.moment.stamp)
-            place = advance(first.map_T_middle, mean_twist(second, third), seconds)
-            if not same(place, second.map_T_middle):
-                others.append([first, replace(second, map_T_middle=place)])
-        if not others:
+        others += by_second_step(sweeps)
+        if not others or any(sweep.held for sweep in sweeps[1:]):
             return sweeps
         config = frame.matcher.config
         taken, telling, silent = self._way(frame, sweeps, solver), [], []

@@ -14,7 +14,7 @@ from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.registration.odometry import Moment, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, Favour, favour
-from loam_gtsam.registration.relocalization.fits import beyond_any_motion, step_in_map
+from loam_gtsam.registration.relocalization.fits import beyond_any_motion, same, step_in_map
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.types import FloatArray
 
@@ -65,6 +65,20 @@ def continued(sweeps: Sequence[EarlySweep], stamp: int) -> gtsam.Pose3:
     """Where the motion between the last two sweeps leads by a stamp, nanoseconds."""
     before, last = sweeps[-2:]
     return advance(last.map_T_middle, mean_twist(before, last), last.moment.seconds_to(stamp))
+
+
+def by_second_step(sweeps: Sequence[EarlySweep]) -> list[list[EarlySweep]]:
+    """Of three sweeps, the first two by the motion between the last two, if that leads elsewhere.
+
+    The first motion was searched for on a grid, with two sweeps that may see little of each other.
+    """
+    if len(sweeps) != 3:
+        return []
+    first, second, third = sweeps
+    seconds = first.moment.seconds_to(second.moment.stamp)
+    place = advance(first.map_T_middle, mean_twist(second, third), seconds)
+    led = [first, replace(second, map_T_middle=place)]
+    return [] if same(place, second.map_T_middle) else [led]
 
 
 def moved_with_first(

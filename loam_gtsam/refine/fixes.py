@@ -17,12 +17,14 @@ import numpy as np
 from loam_gtsam.aiding.gnss import ANTENNA_KEY, MAP_KEY, MEDIAN, PlacedFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.loops.keyframes import pose_key
-from loam_gtsam.types import FloatArray, IntArray
+from loam_gtsam.types import FloatArray, InputError, IntArray
 
 _MOST = 200
 """Fixes that are used at most, evenly spread: their equations are dense."""
 _STEPS, _ENOUGH = 10, 1e-10
 """Gauss-Newton steps to where the fixes fit best, and rad and m that end them."""
+_LEAST = 1e-12
+"""Eigenvalue of the information of map and antennas, its diagonal 1, below which one is unknown."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,12 +37,22 @@ class Survey:
     stamps : of the places
     reference : where the map was
     up : (3,) upward in the map; None if no IMU levelled it
+
+    Raises
+    ------
+    InputError
+        If a fix is on a place that has no stamp.
     """
 
     fixes: PlacedFixes
     stamps: IntArray
     reference: GeoReference
     up: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        numbers, count = self.fixes.poses, len(self.stamps)
+        if ((numbers < 0) | (numbers >= count)).any():
+            raise InputError(f"Survey: expected fixes on the {count} places, got others")
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,13 +95,20 @@ class FixTies:
         return order
 
     def _fitted(self, poses: FloatArray) -> tuple[gtsam.Values, FloatArray, FloatArray]:
-        """Map and antennas where they fit best; information and pull of all, in their order."""
+        """Map and antennas where they fit best; information and pull of all, in their order.
+
+        An InputError if the fixes leave open where that is.
+        """
         values = self.fixes.start(gtsam.Pose3(self.reference.enu_T_map))
         for number in self.numbers.tolist():
             values.insert(pose_key(number), gtsam.Pose3(poses[number]))
         own = 6 * len(self.numbers)
         for _ in range(_STEPS):
             information, pull = self._graph.linearize(values).hessian(self._order)
+            if not _all_told(information[own:, own:]):
+                raise InputError(
+                    f"refine: {len(self.fixes)} fixes do not tell where the map is; leave them out"
+                )
             step = np.linalg.solve(information[own:, own:], pull[own:])
             if np.abs(step).max() < _ENOUGH:
                 break
@@ -129,3 +148,11 @@ class FixTies:
         spread = max(1.0, float(np.median(self.fixes.squared(values))) / MEDIAN)
         earth = values.atPose3(MAP_KEY).matrix()
         return GeoReference(self.reference.origin, earth, spread * covariance)
+
+
+def _all_told(information: FloatArray) -> bool:
+    """Whether an information leaves no direction free."""
+    scale = np.sqrt(np.diagonal(information))
+    if not (np.isfinite(information).all() and (scale > 0.0).all()):
+        return False
+    return bool(np.linalg.eigvalsh(information / np.outer(scale, scale))[0] > _LEAST)

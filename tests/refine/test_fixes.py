@@ -22,7 +22,7 @@ from loam_gtsam.refine.fixes import FixTies, Survey
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
 from loam_gtsam.studies.evaluation import interpolate
-from loam_gtsam.types import FloatArray
+from loam_gtsam.types import FloatArray, InputError
 
 ENU_T_WORLD = gtsam.Pose3(gtsam.Rot3.Yaw(2.2), np.array([20.0, -35.0, 4.0]))
 SIGMA = 0.02
@@ -150,6 +150,16 @@ def test_without_a_fix_on_a_frame_nothing_is_on_the_earth(surveyed, there) -> No
     elsewhere = replace(given, stamps=given.stamps + 1) if there else None
     found = surveyed.refined(elsewhere, settings=Settings(rounds=1))
     assert found.earth is None
+
+
+def test_fixes_that_tell_nothing_are_refused(surveyed) -> None:
+    given = surveyed.surveys[0]
+    with pytest.raises(InputError, match="expected fixes on the 3 places"):
+        replace(given, stamps=given.stamps[:3])
+    wild = replace(given.fixes, enu=1e200 * given.fixes.enu)
+    for fixes in (given.fixes.of(np.array([2])), given.fixes.of(np.array([2, 2])), wild):
+        with pytest.raises(InputError, match="do not tell where the map is|finite numbers"):
+            surveyed.refined(replace(given, fixes=fixes))
 
 
 def ties(up: FloatArray | None, count: int = 6) -> tuple[FixTies, FloatArray]:

@@ -158,7 +158,7 @@ def test_fixes_that_tell_nothing_are_refused(surveyed) -> None:
         replace(given, stamps=given.stamps[:3])
     wild = replace(given.fixes, enu=1e200 * given.fixes.enu)
     for fixes in (given.fixes.of(np.array([2])), given.fixes.of(np.array([2, 2])), wild):
-        with pytest.raises(InputError, match="do not tell where the map is|finite numbers"):
+        with pytest.raises(InputError, match=r"do not tell where the map is|finite numbers"):
             surveyed.refined(replace(given, fixes=fixes))
 
 

@@ -7,7 +7,7 @@ and the antenna in the frame of the lidar. Which fixes are right is found by gra
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -159,6 +159,16 @@ class PlacedFixes:
             enu=self.enu[rows],
             covariances=times * self.covariances[rows],
             receivers=self.receivers[rows],
+        )
+
+    def seen_from(self, others: Mapping[int, tuple[int, gtsam.Pose3]]) -> PlacedFixes:
+        """The fixes on some poses, as seen from others: the number of each, and its pose there."""
+        kept = self.of(np.flatnonzero(np.isin(self.poses, list(others))))
+        found = [others[number] for number in kept.poses.tolist()]
+        return replace(
+            kept,
+            poses=np.array([number for number, _ in found], np.int64),
+            pose_T_lidar=stack_poses(move.inverse() for _, move in found) @ kept.pose_T_lidar,
         )
 
     @classmethod

@@ -67,9 +67,7 @@ def execute(options: MergeOptions) -> int:
         Console().print(_table(report))
         typer.echo(f"Written to {folder}: {', '.join(files)}")
     if runs:
-        return refine_merged(
-            folder, runs, done[-1], up=maps[0].frame.up, plot=options.plot, quiet=options.quiet
-        )
+        return refine_merged(folder, runs, done[-1], plot=options.plot, quiet=options.quiet)
     return 0
 
 

@@ -19,7 +19,6 @@ from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RefineOptions
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import Dataset
-from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.truth import read_truth
 from loam_gtsam.geometry import voxel_filter
 from loam_gtsam.io.atomic import write_json
@@ -28,7 +27,6 @@ from loam_gtsam.io.run_files import write_covariances, write_ply
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.maps.map_file import SavedMap, map_of_run
-from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.merging import MergedMaps
 from loam_gtsam.refine.fixes import Survey
 from loam_gtsam.refine.map_quality import MapQuality, common_thickness, map_quality
@@ -74,30 +72,27 @@ def refine_folder(
     settings = Settings(rounds=rounds, sigma=run.config.matching.point_sigma)
     with _progress(settings, quiet=quiet) as shown:
         found = refine_run(
-            points, run.updates, trajectory=trajectory, graph=graph, survey=_survey_of_run(folder),
+            points, run.updates, trajectory=trajectory, graph=graph, survey=_survey(folder),
             settings=settings, min_aligned=run.config.solver.min_aligned,
             on_round=shown[0], on_window=shown[1],
         )  # fmt: skip
     return _write_all(folder, [run], [found], draws=draws, overwrite=overwrite, quiet=quiet)
 
 
-def _survey_of_run(folder: Path) -> Survey | None:
+def _survey(folder: Path) -> Survey | None:
+    """The fixes of the map in a folder; None if it has none."""
     if not map_of_run(folder).exists():
         return None
     with SavedMap(map_of_run(folder)) as saved:
-        return _survey(saved.graph, saved.frame.earth, saved.frame.up)
-
-
-def _survey(graph: MapGraph, earth: GeoReference | None, up: FloatArray | None) -> Survey | None:
-    """The fixes of a map; None if it has none."""
-    if graph.fixes is None or earth is None:
+        graph, frame = saved.graph, saved.frame
+    if graph.fixes is None or frame.earth is None:
         return None
     stamps = np.array([place.stamp for place in graph.places], np.int64)
-    return Survey(graph.fixes, stamps, earth, up)
+    return Survey(graph.fixes, stamps, frame.earth, frame.up)
 
 
 def refine_merged(
-    folder: Path, runs: Sequence[FinishedRun], merged: MergedMaps, *, up: FloatArray | None = None,
+    folder: Path, runs: Sequence[FinishedRun], merged: MergedMaps, *,
     plot: bool | None = None, quiet: bool = False,
 ) -> int:  # fmt: skip
     """Refine runs whose maps were merged, together; into ``folder/refined``."""
@@ -110,7 +105,7 @@ def refine_merged(
     with _progress(settings, quiet=quiet) as shown:
         found = refine_runs(
             points, updates, ways, graph=merged.graph.saved(), starts=merged.starts,
-            survey=_survey(merged.graph, merged.earth, up), settings=settings,
+            survey=_survey(folder), settings=settings,
             min_aligned=config.solver.min_aligned, on_round=shown[0], on_window=shown[1],
         )  # fmt: skip
     return _write_all(folder, runs, found, draws=draws, overwrite=True, quiet=quiet)

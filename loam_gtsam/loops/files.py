@@ -6,7 +6,7 @@ pose of keyframe ``i`` has the number ``i``.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,41 +75,32 @@ def _write_g2o(path: Path, saved: SavedGraph) -> None:
     lines = ["# made by loam_gtsam; information: translation first, then rotation (rad)"]
     stamps = {pose_number(key): stamp for key, stamp in saved.stamps.items()}
     lines += [f"{_STAMP} {number} {stamp}" for number, stamp in sorted(stamps.items())]
-    poses = {pose_number(key): saved.poses.atPose3(key) for key in _known_to_g2o(saved)}
-    lines += [f"{_POSE} {number} {_pose_text(poses[number])}" for number in sorted(poses)]
-    if poses:
-        lines.append(f"{_FIX} {min(poses)}")
-    left_out = 0
-    for place in range(saved.factors.size()):
-        factor = saved.factors.at(place)
-        if not isinstance(factor, gtsam.BetweenFactorPose3):
-            left_out += 1
-            continue
+    factors = [saved.factors.at(place) for place in range(saved.factors.size())]
+    motions = [factor for factor in factors if isinstance(factor, gtsam.BetweenFactorPose3)]
+    others = [factor for factor in factors if not isinstance(factor, gtsam.BetweenFactorPose3)]
+    loose = _keys(others) - _keys(motions)  # as the map on the earth: nothing in the file ties it
+    every = {pose_number(key): key for key in saved.keys}
+    ordered = sorted(every)
+    numbers = [*ordered[:1], *(n for n in ordered[1:] if every[n] not in loose)]
+    for number in numbers:
+        lines.append(f"{_POSE} {number} {_pose_text(saved.poses.atPose3(every[number]))}")
+    lines += [f"{_FIX} {number}" for number in numbers[:1]]
+    for factor in motions:
         noise: Any = factor.noiseModel()
         if isinstance(noise, gtsam.noiseModel.Robust):
             noise = noise.noise()
         information = noise.information()[np.ix_(_SWAP, _SWAP)][_UPPER]
         first, second = map(pose_number, factor.keys())
-        numbers = " ".join(f"{value:.17g}" for value in information.tolist())
-        lines.append(f"{_EDGE} {first} {second} {_pose_text(factor.measured())} {numbers}")
-    if left_out:
-        lines.insert(1, f"# {left_out} factors are left out, which g2o does not know")
+        entries = " ".join(f"{value:.17g}" for value in information.tolist())
+        lines.append(f"{_EDGE} {first} {second} {_pose_text(factor.measured())} {entries}")
+    if others:
+        lines.insert(1, f"# {len(others)} factors are left out, which g2o does not know")
     with atomic_file(path) as file:
         file.write(("\n".join(lines) + "\n").encode("ascii"))
 
 
-def _known_to_g2o(saved: SavedGraph) -> list[int]:
-    """Keys of the poses, without those that only factors lead to which g2o does not know.
-
-    Such a pose, as that of the map on the earth, would be in the file without anything to tie it.
-    """
-    tied: set[int] = set(sorted(saved.keys, key=pose_number)[:1])
-    others: set[int] = set()
-    for place in range(saved.factors.size()):
-        factor = saved.factors.at(place)
-        known = isinstance(factor, gtsam.BetweenFactorPose3)
-        (tied if known else others).update(factor.keys())
-    return [key for key in saved.keys if key in tied or key not in others]
+def _keys(factors: Sequence[Any]) -> set[int]:
+    return {key for factor in factors for key in factor.keys()}  # noqa: SIM118
 
 
 def _pose_text(pose: gtsam.Pose3) -> str:

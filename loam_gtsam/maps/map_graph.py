@@ -7,7 +7,7 @@ what they did to the poses is.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import gtsam
@@ -102,18 +102,7 @@ def graph_of(mapping: LoopMapping, config: Config, fixes: PlacedFixes | None = N
             links.append(_between_middles(motion, moves))
     active = zip(graph.loops, graph.active, strict=True)
     loops = [_between_middles(loop, moves) for loop, on in active if on]
-    return MapGraph(places, links, loops, None if fixes is None else _from_middles(fixes, moves))
-
-
-def _from_middles(fixes: PlacedFixes, moves: Mapping[int, tuple[int, gtsam.Pose3]]) -> PlacedFixes:
-    """Fixes on keyframes as fixes on the middles of their sweeps, those that are places."""
-    kept = fixes.of(np.isin(fixes.poses, list(moves)).nonzero()[0])
-    found = [moves[number] for number in kept.poses.tolist()]
-    return replace(
-        kept,
-        poses=np.array([place for place, _ in found], np.int64),
-        pose_T_lidar=stack_poses(move.inverse() for _, move in found) @ kept.pose_T_lidar,
-    )
+    return MapGraph(places, links, loops, None if fixes is None else fixes.seen_from(moves))
 
 
 def _to_middle(keyframe: Keyframe) -> gtsam.Pose3:

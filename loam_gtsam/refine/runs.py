@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import gtsam
 import numpy as np
@@ -298,12 +298,9 @@ def refine_runs(
     runs = [_Run.of(*one, f"trajectories[{n}]") for n, one in enumerate(given)]
     further = gtsam.NonlinearFactorGraph()
     if graph is not None:
-        first = _starts(runs)
-        frames = {}
-        for key, stamp in graph.stamps.items():
-            number = bisect_right(starts, pose_number(key)) - 1
-            if stamp in runs[number].frame:
-                frames[key] = first[number] + runs[number].frame[stamp]
+        places = {pose_number(key): stamp for key, stamp in graph.stamps.items()}
+        found = _sweeps_of(places, runs, starts)
+        frames = {key: found[pose_number(key)] for key in graph.stamps if pose_number(key) in found}
         to_middle = [step for run in runs for step in run.from_places()]
         further.push_back(loop_factors(graph, frames, to_middle, starts))
     if factors is not None:
@@ -374,23 +371,24 @@ def _starts(runs: Sequence[_Run]) -> list[int]:
     return counted
 
 
+def _sweeps_of(
+    places: Mapping[int, int], runs: Sequence[_Run], starts: Sequence[int]
+) -> dict[int, int]:
+    """Numbers of the sweeps by those of places, whose stamps are given; of what runs have."""
+    first, found = _starts(runs), {}
+    for place, stamp in places.items():
+        number = bisect_right(starts, place) - 1
+        if stamp in runs[number].frame:
+            found[place] = first[number] + runs[number].frame[stamp]
+    return found
+
+
 def _fix_ties(survey: Survey, runs: Sequence[_Run], starts: Sequence[int] = (0,)) -> FixTies | None:
     """The fixes, seen from the middles of the sweeps; None if none is on a frame of the runs."""
-    first, rows, sweeps, moves = _starts(runs), [], [], []
-    steps = [run.from_places() for run in runs]
-    for row, place in enumerate(survey.fixes.poses.tolist()):
-        number = bisect_right(starts, place) - 1
-        frame = runs[number].frame.get(int(survey.stamps[place]))
-        if frame is not None:
-            rows.append(row)
-            sweeps.append(first[number] + frame)
-            moves.append(steps[number][frame].inverse().matrix() @ survey.fixes.pose_T_lidar[row])
-    if not rows:
-        return None
-    seen = replace(
-        survey.fixes.of(np.array(rows)), poses=np.array(sweeps), pose_T_lidar=np.array(moves)
-    )
-    return FixTies.of(seen, survey.reference, survey.up)
+    to_middle = [step for run in runs for step in run.from_places()]
+    sweeps = _sweeps_of(dict(enumerate(survey.stamps.tolist())), runs, starts)
+    seen = survey.fixes.seen_from({p: (sweep, to_middle[sweep]) for p, sweep in sweeps.items()})
+    return FixTies.of(seen, survey.reference, survey.up) if len(seen) else None
 
 
 def _adjusted(

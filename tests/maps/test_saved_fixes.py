@@ -10,13 +10,10 @@ import gtsam
 import numpy as np
 import pytest
 from support.cli import loam
-from support.receiver import ORIGIN
+from support.receiver import SURVEY, SURVEY_SIGMA, off_in_enu, surveyed_parts
 
 from loam_gtsam.aiding.gnss import PlacedFixes
-from loam_gtsam.config import Config
-from loam_gtsam.datasets import ArrayDataset
-from loam_gtsam.datasets.decode.aiding import GnssFixes
-from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.loops.places import Place
 from loam_gtsam.maps.localizer import Localizer
@@ -24,11 +21,9 @@ from loam_gtsam.maps.map_file import MapFrame, SavedMap, save_map
 from loam_gtsam.maps.map_graph import graph_arrays, graph_of_arrays
 from loam_gtsam.maps.merging import merge_maps
 from loam_gtsam.pipeline import run
-from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.types import DatasetError, FloatArray, Scan
 
-ENU_T_WORLD = gtsam.Pose3(gtsam.Rot3.Yaw(2.2), np.array([20.0, -35.0, 4.0]))
-SIGMA, TOO_LONG = 0.02, 1.005
+TOO_LONG = 1.005
 CUTS = (0, 35), (25, 60)
 ASIDE = np.array([2.0, 1.0, 0.0])
 
@@ -63,14 +58,9 @@ class Surveyed:
 
     def off(self, places: list[Place], earth: GeoReference | None) -> FloatArray:
         """(K, 3) metres east, north and up that places are from where they were."""
-        assert earth is not None
         middles = np.array([place.stamp for place in places]) + 50_000_000
-        inside = middles <= self.world.truth.stamps[-1]
-        true = interpolate(self.world.truth, middles[inside]).map_T_lidar[:, :3, 3]
-        geodetic = geodetic_of(np.array([ENU_T_WORLD.transformFrom(p) for p in true]), ORIGIN)
-        enu_T_map = gtsam.Pose3(earth.enu_T_map)
-        found = [enu_T_map.transformFrom(place.map_T_middle.translation()) for place in places]
-        return np.array(found)[inside] - east_north_up(geodetic, earth.origin)
+        positions = np.array([place.map_T_middle.translation() for place in places])
+        return off_in_enu(self.world.truth, middles, positions, earth)
 
 
 @pytest.fixture(scope="module")
@@ -78,17 +68,9 @@ def surveyed(tmp_path_factory: pytest.TempPathFactory) -> Surveyed:
     world = SimulatedWorld("rooms", frames=CUTS[-1][-1], columns=300, speed=3.0, seed=1)
     sweeps = [replace(s, points=(TOO_LONG * s.points).astype(np.float32)) for s in world]
     made = Surveyed(world, sweeps, tmp_path_factory.mktemp("surveyed"))
-    truth, rng = world.truth, np.random.default_rng(0)
-    every = np.array([ENU_T_WORLD.transformFrom(p) for p in truth.map_T_lidar[:, :3, 3]])
-    config = Config().changed("pose_graph.keyframe_distance=0.5", "aiding.gnss_memory=0.0")
-    config = config.changed("aiding.gnss=true")
-    for name, cut in zip(("first", "second"), CUTS, strict=True):
-        rows = slice(*cut)
-        enu = every[rows] + rng.normal(0.0, SIGMA, every[rows].shape)
-        known = np.repeat(SIGMA**2 * np.eye(3)[None], len(enu), axis=0)
-        fixes = GnssFixes(truth.stamps[rows], geodetic_of(enu, ORIGIN), known)
-        drive = ArrayDataset(sweeps[rows], sensor=world.sensor, gnss=fixes)
-        save_map(made.folder / f"{name}.lgmap", run(drive, config).pipeline)
+    parts = surveyed_parts(world, sweeps, CUTS)
+    for name, drive in zip(("first", "second"), parts, strict=True):
+        save_map(made.folder / f"{name}.lgmap", run(drive, SURVEY).pipeline)
     return made
 
 
@@ -109,7 +91,7 @@ def test_fixes_are_in_the_file_and_seen_from_their_places(surveyed: Surveyed) ->
         values.insert(gtsam.symbol("x", number), place.map_T_middle)
     away = fixes.residuals(values)
     assert len(fixes) > 5
-    assert np.linalg.norm(away, axis=1).max() < 5.0 * SIGMA
+    assert np.linalg.norm(away, axis=1).max() < 5.0 * SURVEY_SIGMA
     # The lidar at the fix is 50 ms before the middle of the sweep, at 3 m/s.
     moved = np.linalg.norm(fixes.pose_T_lidar[:, :3, 3], axis=1)
     assert 0.05 < np.median(moved) < 0.3

@@ -7,13 +7,10 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 import pytest
-from support.receiver import ORIGIN
+from support.receiver import ORIGIN, SURVEY, SURVEY_SIGMA, off_in_enu, surveyed_parts
 
 from loam_gtsam.aiding.gnss import PlacedFixes
-from loam_gtsam.config import Config
-from loam_gtsam.datasets import ArrayDataset
-from loam_gtsam.datasets.decode.aiding import GnssFixes
-from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
+from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.maps.merging import MergedMaps, merge_maps
@@ -21,11 +18,8 @@ from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.refine.fixes import FixTies, Survey
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
-from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.types import FloatArray, InputError
 
-ENU_T_WORLD = gtsam.Pose3(gtsam.Rot3.Yaw(2.2), np.array([20.0, -35.0, 4.0]))
-SIGMA = 0.02
 CUTS = (0, 35), (25, 60)
 
 
@@ -46,13 +40,8 @@ class Surveyed:
 
     def off(self, found: RefinedRun) -> FloatArray:
         """(N, 3) metres east, north and up from where the lidar was."""
-        way, earth = found.trajectory, found.earth
-        assert earth is not None
-        inside = way.stamps <= self.world.truth.stamps[-1]
-        true = interpolate(self.world.truth, way.stamps[inside]).map_T_lidar[:, :3, 3]
-        geodetic = geodetic_of(np.array([ENU_T_WORLD.transformFrom(p) for p in true]), ORIGIN)
-        poses = earth.enu_T_map @ way.map_T_lidar[inside]
-        return poses[:, :3, 3] - east_north_up(geodetic, earth.origin)
+        way = found.trajectory
+        return off_in_enu(self.world.truth, way.stamps, way.map_T_lidar[:, :3, 3], found.earth)
 
 
 def survey_of(graph, earth: GeoReference | None, up: FloatArray | None = None) -> Survey:
@@ -63,18 +52,9 @@ def survey_of(graph, earth: GeoReference | None, up: FloatArray | None = None) -
 @pytest.fixture(scope="module")
 def surveyed(tmp_path_factory) -> Surveyed:
     world = SimulatedWorld("rooms", frames=CUTS[-1][-1], columns=300, speed=3.0, seed=2)
-    sweeps, truth, rng = list(world), world.truth, np.random.default_rng(0)
-    every = np.array([ENU_T_WORLD.transformFrom(p) for p in truth.map_T_lidar[:, :3, 3]])
-    config = Config().changed("pose_graph.keyframe_distance=0.5", "aiding.gnss_memory=0.0")
-    config = config.changed("aiding.gnss=true")
     folder, runs, points, maps = tmp_path_factory.mktemp("surveyed"), [], [], []
-    for number, cut in enumerate(CUTS):
-        rows = slice(*cut)
-        enu = every[rows] + rng.normal(0.0, SIGMA, every[rows].shape)
-        known = np.repeat(SIGMA**2 * np.eye(3)[None], len(enu), axis=0)
-        fixes = GnssFixes(truth.stamps[rows], geodetic_of(enu, ORIGIN), known)
-        drive = ArrayDataset(sweeps[rows], sensor=world.sensor, gnss=fixes)
-        runs.append(run(drive, config))
+    for number, drive in enumerate(surveyed_parts(world, list(world), CUTS)):
+        runs.append(run(drive, SURVEY))
         points.append(run_points(drive, runs[-1].updates, runs[-1].config, most=1000))
         save_map(folder / f"{number}.lgmap", runs[-1].pipeline)
         maps.append(SavedMap(folder / f"{number}.lgmap"))
@@ -116,7 +96,7 @@ def test_fixes_that_say_otherwise_bend_what_planes_leave_open(surveyed, refined)
 
 def test_fixes_worse_than_they_say_make_the_place_on_the_earth_less_sure(surveyed, refined) -> None:
     given = surveyed.surveys[0]
-    noise = np.random.default_rng(1).normal(0.0, 10.0 * SIGMA, given.fixes.enu.shape)
+    noise = np.random.default_rng(1).normal(0.0, 10.0 * SURVEY_SIGMA, given.fixes.enu.shape)
     worse = replace(given, fixes=replace(given.fixes, enu=given.fixes.enu + noise))
     found = surveyed.refined(worse)
     ratio = np.trace(found.earth.covariance[3:, 3:]) / np.trace(refined.earth.covariance[3:, 3:])

@@ -24,7 +24,12 @@ from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key,
 from loam_gtsam.registration.association import associate, trial_matching
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ScanMatches, subset
-from loam_gtsam.registration.relocalization import Fit, likely_poses, sample_features
+from loam_gtsam.registration.relocalization import (
+    Field,
+    Fit,
+    likely_poses,
+    sample_features,
+)
 from loam_gtsam.registration.solvers import GtsamSolver, Solution, trial_solver
 from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
@@ -156,7 +161,8 @@ class Verifier:
             start = gtsam.Pose3(turned, np.zeros(3))
             held = np.concatenate([cubes.points() for cubes in maps])
             sample = sample_features(edges, planes)
-            around = likely_poses(sample, held, [start], self.config.search, _STARTS)
+            field = Field.around(held, start, self.config.search)
+            around = likely_poses(sample, [field], [start], _STARTS)
             trials = [self._rough_solver.solve(matches_at, pose) for pose in (start, *around)]
             best = max(trials, key=lambda tried: fit(tried).total)
             matching = self._whole.matching

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import gtsam
 import numpy as np
@@ -23,6 +24,7 @@ from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.frame_matcher import FrameMatcher
 from loam_gtsam.registration.matches import ScanMatches, subset
 from loam_gtsam.registration.relocalization import (
+    Field,
     Fit,
     distinct,
     likely_poses,
@@ -35,12 +37,12 @@ from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import trial_solver
 from loam_gtsam.types import FloatArray
-from loam_gtsam.voxels.cubes import NO_POINTS
 from loam_gtsam.voxels.grid import CubeIndex
 
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
 _TRIES = 6  # number of places that are tried
 _STARTS = 18  # number of poses around all of these at which a registration starts
+_FIELDS = 12  # that are kept, of the places that were tried last
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
 
 
@@ -79,6 +81,7 @@ class PlaceSearch:
         keys = [heading_free_key(place.descriptor.astype(np.float64)) for place in places]
         self._tree = cKDTree(np.array(keys).reshape(-1, config.loops.rings))
         self._held: dict[tuple[CubeMap, CubeIndex], FloatArray] = {}
+        self._field = lru_cache(_FIELDS)(self._make_field)
         self._solver = trial_solver(config.solver)
 
     def find(
@@ -92,13 +95,13 @@ class PlaceSearch:
         edges, planes = posed.points
         if not self._places or not len(edges) + len(planes):
             return []
-        maps, held = self._maps, []
+        maps, fields = self._maps, []
         centres = [*self._lookalikes(np.concatenate([edges, planes])), *known]
         for centre in centres:
             maps.recenter(centre, reach)
-            held.append(self._held_around(centre))
-        radius, sample = self._config.loops.search, sample_features(edges, planes)
-        starts = likely_poses(sample, held, centres, radius, _STARTS, least=AS_WELL)
+            fields.append(self._field(tuple(centre.translation().tolist()), maps.small))
+        sample = sample_features(edges, planes)
+        starts = likely_poses(sample, fields, centres, _STARTS, least=AS_WELL)
         whole = FrameMatcher.of(posed, maps, maps.config, None, Clock(), refine=False)
         trial, found = whole.with_few_matches(), []
         # Place by place, so that each cube is read once.
@@ -116,18 +119,18 @@ class PlaceSearch:
         against = [sum(self._favoured(other, one) for other in found) for one in found]
         return [found[number] for number in np.argsort(against, kind="stable")]
 
-    def _held_around(self, centre: gtsam.Pose3) -> FloatArray:
-        """(M, 3) points of the map around a pose, in metres, as many as tell which cells hold any.
+    def _make_field(self, position: Sequence[float], small: bool) -> Field:
+        """Which cells around a position hold points of the maps in use, the ``small`` ones or not.
 
         The map does not change while a lidar is looked for.
         """
-        held = [NO_POINTS]
+        centre, held = gtsam.Pose3(gtsam.Rot3(), np.array(position)), []
         for cubes in (self._maps.edges, self._maps.planes):
             for cube in cubes.surroundings(centre.matrix()):
                 if (cubes, cube) not in self._held:
                     self._held[cubes, cube] = one_per_cell(cubes.points([cube]))
                 held.append(self._held[cubes, cube])
-        return np.concatenate(held)
+        return Field.around(np.concatenate(held), centre, self._config.loops.search)
 
     def _favoured(self, one: Candidate, other: Candidate) -> bool:
         """Whether a sweep speaks for a pose, against another one."""

@@ -30,6 +30,7 @@ from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatch
 from loam_gtsam.registration.odometry import Moment, predict
 from loam_gtsam.registration.relocalization import (
     Doubt,
+    Field,
     Fit,
     FitMonitor,
     Found,
@@ -226,6 +227,12 @@ def corner():
     return np.concatenate([long, short])
 
 
+def likely_in(held, seen, centres, radius, *options, **named):
+    """The likely poses in a map of these points."""
+    fields = [Field.around(held, centre, radius) for centre in centres]
+    return likely_poses(seen, fields, centres, *options, **named)
+
+
 @pytest.mark.parametrize(
     ("away", "turn"), [((0.0, 0.0), 0.0), ((4.0, -3.0), 0.7), ((-6.3, 2.4), -2.6)]
 )
@@ -234,17 +241,17 @@ def test_the_likeliest_place_is_the_true_one(corner, away, turn):
     step = gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.array([*away, 0.0]))
     truth = predicted.compose(step)
     seen = truth.transformTo(corner[::15].T).T
-    found = likely_poses(seen, corner, [predicted], radius=8.0, count=4)
+    found = likely_in(corner, seen, [predicted], 8.0, 4)
     assert 1 <= len(found) <= 4
     error = truth.localCoordinates(found[0])
     assert np.linalg.norm(error[3:]) < 1.0
     assert np.abs(error[:3]).max() < np.radians(6.0)
-    nearer = likely_poses(seen, corner, [predicted], radius=8.0, count=4, apart=(0.8, 0.2))
+    nearer = likely_in(corner, seen, [predicted], 8.0, 4, apart=(0.8, 0.2))
     assert nearer[0].equals(found[0], 0.0)
     assert min(nearer[0].range(pose) for pose in nearer[1:]) < 1.5
     few = one_per_cell(corner)
     assert len(few) < 0.1 * len(corner)
-    again = likely_poses(seen, few, [predicted], radius=8.0, count=4)
+    again = likely_in(few, seen, [predicted], 8.0, 4)
     assert all(one.equals(other, 0.0) for one, other in zip(found, again, strict=True))
     for i, first in enumerate(found):
         for second in found[:i]:
@@ -259,7 +266,7 @@ def test_along_a_corridor_the_nearest_of_the_poses_that_fit_alike_comes_first(as
     walls = [np.column_stack([ends, np.full(2000, y), np.zeros(2000)]) for y in (-1.0, 1.0)]
     points = np.concatenate(walls)[::25]
     known = np.concatenate(walls) - [6.0, 0.0, 0.0]
-    found = likely_poses(points, known, [gtsam.Pose3()], 8.0, 1, as_well=as_well)[0]
+    found = likely_in(known, points, [gtsam.Pose3()], 8.0, 1, as_well=as_well)[0]
     assert bool(np.linalg.norm(found.translation()[:2]) < 0.1) is nearest
 
 
@@ -267,9 +274,23 @@ def test_several_centres_are_searched(corner):
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([4.0, 3.0, 0.3]))
     seen = truth.transformTo(corner[::15].T).T
     nowhere = gtsam.Pose3(gtsam.Rot3(), np.array([300.0, 0.0, 0.0]))
-    assert likely_poses(seen, corner, [nowhere], 3.0, 4) == []
-    found = likely_poses(seen, corner, [nowhere, truth], 3.0, 4)
+    assert likely_in(corner, seen, [nowhere], 3.0, 4) == []
+    found = likely_in(corner, seen, [nowhere, truth], 3.0, 4)
     assert truth.range(found[0]) < 1.0
+
+
+@pytest.mark.parametrize("rare", [True, False])
+@pytest.mark.parametrize("radius", [3.0, 8.0])
+def test_what_is_ruled_out_unseen_would_not_have_been_likely(corner, radius, rare):
+    """Blocks of trial poses are left out by what they score at most: none of it is missed."""
+    centres = [gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.array([x, 3.0, 0.3]))
+               for turn, x in ((0.3, 4.0), (-2.0, -1.0))]  # fmt: skip
+    seen = centres[0].transformTo(corner[::15].T).T
+    apart = 0.1, 0.05  # all trial poses
+    every = likely_in(corner, seen, centres, radius, 400, rare=rare, apart=apart)
+    best = likely_in(corner, seen, centres, radius, 400, rare=rare, apart=apart, least=0.5)
+    assert 3 < len(best) < 300
+    assert all(one.equals(other, 0.0) for one, other in zip(best, every, strict=False))
 
 
 def test_of_several_places_those_are_left_out_that_fit_worse(corner):
@@ -280,7 +301,9 @@ def test_of_several_places_those_are_left_out_that_fit_worse(corner):
 
     def found(share, least):
         known = corner, corner[: int(share * len(corner))] + up
-        return likely_poses(seen, known, centres, 0.0, 9, 0.0, least=least)
+        parts = zip(known, centres, strict=True)
+        fields = [Field.around(part, centre, 0.0) for part, centre in parts]
+        return likely_poses(seen, fields, centres, 9, 0.0, least=least)
 
     assert len(found(1.0, 0.75)) == 2
     assert len(found(0.5, 0.0)) == 2
@@ -301,13 +324,9 @@ def test_what_is_rare_counts_more_than_ground(rare):
     posts = np.column_stack([posts, np.tile([-1.0, 0.0, 1.0], 6)])
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([4.0, 0.0, 0.0]))
     ground, known = seen_ground(), seen_ground()
-    around = [gtsam.Pose3()], 5.0, 1, 0.1
-    (found,) = likely_poses(
-        np.concatenate([truth.transformTo(posts.T).T, ground]),
-        np.concatenate([posts, known]),
-        *around,
-        rare=rare,
-    )
+    seen = np.concatenate([truth.transformTo(posts.T).T, ground])
+    there = np.concatenate([posts, known])
+    (found,) = likely_in(there, seen, [gtsam.Pose3()], 5.0, 1, 0.1, rare=rare)
     assert (truth.range(found) < 0.1) == rare
 
 

@@ -15,6 +15,7 @@ from loam_gtsam.registration.relocalization.fits import FitMonitor as FitMonitor
 from loam_gtsam.registration.relocalization.fits import distinct as distinct
 from loam_gtsam.registration.relocalization.fits import same as same
 from loam_gtsam.registration.relocalization.fits import same_optimum as same_optimum
+from loam_gtsam.registration.relocalization.likely_poses import Field as Field
 from loam_gtsam.registration.relocalization.likely_poses import likely_poses as likely_poses
 from loam_gtsam.registration.relocalization.likely_poses import one_per_cell as one_per_cell
 from loam_gtsam.registration.relocalization.likely_poses import sample_features as sample_features

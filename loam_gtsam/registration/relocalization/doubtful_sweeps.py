@@ -23,7 +23,7 @@ from loam_gtsam.registration.relocalization.fits import (
     same,
     step_in_map,
 )
-from loam_gtsam.registration.relocalization.likely_poses import likely_poses, sample_features
+from loam_gtsam.registration.relocalization.likely_poses import Field, likely_poses, sample_features
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, FrameStatus, MapUpdate
@@ -301,8 +301,9 @@ def _places(
     starts = [solution.map_T_lidar] if solution.solved else []
     points = sample_features(*matcher.posed.points)
     as_well = None if monitor.lost else AS_WELL
-    where = np.concatenate(known), around, monitor.radius, _PLACES
-    starts += likely_poses(points, *where, as_well=as_well)
+    held = np.concatenate(known)
+    fields = [Field.around(held, pose, monitor.radius) for pose in around]
+    starts += likely_poses(points, fields, around, _PLACES, as_well=as_well)
     matcher.clock.lap("relocalize")
     trial = replace(matcher, refine=False).with_few_matches()
     places: list[tuple[float, gtsam.Pose3]] = []

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import gtsam
@@ -16,6 +17,7 @@ from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _CELL = 0.5  # metres: half the reach of a match, which is then the neighbouring cell
 _SPACING = 2  # cells between trial positions: 1 m, from which a solve converges
+_BLOCK = 4  # trial positions along either side of a square of these that is bounded as one
 _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than a cell
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
@@ -33,16 +35,65 @@ def sample_features(
 
 
 def one_per_cell(map_points: FloatArray) -> FloatArray:
-    """(K, 3) one of the points of each cell of the field: :func:`likely_poses` needs no others."""
+    """(K, 3) one of the points of each cell of the field: :class:`Field` needs no others."""
     _, first = np.unique(voxel_keys(map_points, _CELL), return_index=True)
     return map_points[first]
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """Cells around a place, and which of them hold points of a map.
+
+    Attributes
+    ----------
+    radius : metres around the place at which trial poses are scored
+    shape : number of cells along each axis
+    corner : (3,) metres, map frame, of the cell in the middle
+    hits : what a point scores twice over in each cell: 2 if it holds map points, 1 beside, or 0
+    most : the most that it scores there and at the other trial positions of a block that begins so
+    """
+
+    radius: float
+    shape: tuple[int, int, int]
+    corner: FloatArray
+    hits: NDArray[np.uint8]
+    most: NDArray[np.uint8]
+
+    @classmethod
+    def around(cls, map_points: FloatArray, place: gtsam.Pose3, radius: float) -> Field:
+        """The field of map points (M, 3), metres, for trial poses within ``radius`` metres."""
+        # On each side there is a cell that is not scored: what grows beyond it does not matter.
+        reached = int(np.ceil((_REACH + radius) / _CELL)) + 2 + _SPACING * (_BLOCK - 1)
+        shape = (2 * reached, 2 * reached, 2 * int(_HEIGHT / _CELL) + 3)
+        corner = _CELL * np.floor(np.asarray(place.translation()) / _CELL)
+        cells = _cells(map_points - corner, shape).T
+        sides = zip(cells, shape, strict=True)
+        inside = np.logical_and.reduce([(row >= 0) & (row < end) for row, end in sides])
+        held = np.zeros(np.prod(shape), np.uint8)
+        held[np.ravel_multi_index(tuple(cells[:, inside]), shape)] = 1
+        steps = shape[1] * shape[2], shape[2], 1
+        grown = held.copy()
+        for step in steps:
+            before, after = grown[:-step].copy(), grown[step:].copy()
+            grown[step:] |= before
+            grown[:-step] |= after
+        hits = held + grown
+        most = hits.copy()
+        for step in steps[:2]:
+            for many in (_SPACING, 2 * _SPACING):  # to the end of a block
+                most[: -many * step] = np.maximum(most[: -many * step], most[many * step :])
+        return cls(radius, shape, corner, hits, most)
+
+    def shifts(self, cells: IntArray) -> IntArray:
+        """By which the cell of a point moves with so many cells (2, S) along x and y."""
+        moved: IntArray = (cells[0] * self.shape[1] + cells[1]) * self.shape[2]
+        return moved
+
+
 def likely_poses(
     points: FloatArray,
-    map_points: FloatArray | Sequence[FloatArray],
+    fields: Sequence[Field],
     around: Sequence[gtsam.Pose3],
-    radius: float,
     count: int,
     most_turn: float = np.pi,
     *,
@@ -61,8 +112,8 @@ def likely_poses(
     Parameters
     ----------
     points : (N, 3) metres, lidar frame, a few hundred of the sweep
-    map_points : (M, 3) metres, of the map; or those around each centre
-    around, radius : centres of the search, ``map_T_lidar``, and metres around each
+    fields : of the map, one around each centre
+    around : centres of the search, ``map_T_lidar``
     count : largest number of poses
     most_turn : largest rotation against the centre about the vertical axis, rad
     rare : whether a point counts minus the logarithm of the share of the trial poses at which it
@@ -73,16 +124,15 @@ def likely_poses(
     least : part of the best score that every pose must have
     apart : metres and rad, one of which at least is between any two of the poses
     """
-    held = [map_points] * len(around) if isinstance(map_points, np.ndarray) else map_points
-    places = zip(held, around, strict=True)
-    tried = [_trials(points, near, pose, radius, most_turn) for near, pose in places]
+    places = zip(fields, around, strict=True)
+    tried = [_trials(points, field, pose, most_turn) for field, pose in places]
     scored, weights = np.arange(len(points)), np.ones(len(points), np.float32)
     if rare:
         chance = np.mean([trials.chance() for trials in tried], axis=0)
         hit = np.flatnonzero(chance)
         scored = hit[np.argsort(chance[hit], kind="stable")[:_RAREST]]
         weights = -np.log(chance[scored]).astype(np.float32)
-    scores = np.concatenate([trials.scores(scored, weights) for trials in tried])
+    scores = _scores(tried, scored, weights, least)
     moves = np.concatenate([trials.moves for trials in tried])
     owner = np.repeat(np.arange(len(tried)), [len(trials.moves) for trials in tried])
     enough = scores > least * scores.max(initial=0.0)
@@ -108,76 +158,80 @@ def likely_poses(
 
 
 class _Trials(NamedTuple):
-    """Trial poses around a centre, and the field of cells that hold map points."""
+    """Trial poses around a centre: at each of R yaws the same S positions, in B blocks."""
 
-    field: NDArray[np.uint8]  # 2 in a cell that holds some, 1 beside it, 0 elsewhere
+    field: Field
     near: BoolArray  # (N,) whether a point is near enough to be scored
     bases: IntArray  # (R, N) cells of the points, for each yaw
     shifts: IntArray  # (S,) by which these move with the trial positions
+    corners: IntArray  # (B,) the same for the first position of each block
+    blocks: IntArray  # (S,) block of each position
     moves: FloatArray  # (R S, 3) offsets of the trial poses: x and y in metres, yaw in rad
 
     def chance(self) -> FloatArray:
         """Share of what each point (N,) would score if it hit at every trial pose."""
         some = self.shifts[:: max(1, len(self.moves) // _CHANCES), None]
-        hits = [self.field[base + some].mean(axis=0) for base in self.bases]
+        hits = [self.field.hits[base + some].mean(axis=0) for base in self.bases]
         share: FloatArray = 0.5 * np.mean(hits, axis=0) * self.near
         return share
 
-    def scores(self, points: IntArray, weights: NDArray[np.float32]) -> FloatArray:
-        """Score of each trial pose by some of the points."""
+    def bounds(self, points: IntArray, weights: NDArray[np.float32]) -> FloatArray:
+        """(R, B) what no trial pose of a block scores more than, by some of the points."""
         near = self.near[points]
-        points, weights = points[near], weights[near]
-        scores = np.empty((len(self.bases), len(self.shifts)))
-        for row, base in zip(scores, self.bases[:, points], strict=True):
-            row[:] = self.field[base + self.shifts[:, None]] @ weights
+        bases, weights, corners = self.bases[:, points[near]], weights[near], self.corners[:, None]
+        return np.array([self.field.most[base + corners] @ weights for base in bases])
+
+    def scores(
+        self, points: IntArray, weights: NDArray[np.float32], wanted: BoolArray
+    ) -> FloatArray:
+        """(R S,) score of the trial poses of the ``wanted`` blocks (R, B), and 0 of the others."""
+        near = self.near[points]
+        bases, weights = self.bases[:, points[near]], weights[near]
+        scores = np.zeros((len(bases), len(self.shifts)))
+        for row, base, blocks in zip(scores, bases, wanted, strict=True):
+            at = np.flatnonzero(blocks[self.blocks])
+            row[at] = self.field.hits[base + self.shifts[at, None]] @ weights
         return scores.ravel()
 
 
+def _scores(
+    tried: Sequence[_Trials], points: IntArray, weights: NDArray[np.float32], least: float
+) -> FloatArray:
+    """Scores of all trial poses, one centre after the other; 0 below ``least`` of the best one.
+
+    Branch and bound: most blocks of trial poses are ruled out at once.
+    """
+    bounds = [trials.bounds(points, weights) for trials in tried]
+    best = [bound == bound.max() for bound in bounds]
+    pairs = zip(tried, best, strict=True)
+    known = max(trials.scores(points, weights, most).max() for trials, most in pairs)
+    wanted = [bound >= least * known for bound in bounds]
+    pairs = zip(tried, wanted, strict=True)
+    return np.concatenate([trials.scores(points, weights, some) for trials, some in pairs])
+
+
 def _trials(
-    points: FloatArray,
-    map_points: FloatArray,
-    map_T_lidar: gtsam.Pose3,
-    radius: float,
-    most_turn: float,
+    points: FloatArray, field: Field, map_T_lidar: gtsam.Pose3, most_turn: float
 ) -> _Trials:
     """The trial poses around a centre."""
-    steps = int(radius / (_SPACING * _CELL))
-    size = 2 * (int(np.ceil((_REACH + radius) / _CELL)) + 2)
-    shape = (size, size, 2 * (int(_HEIGHT / _CELL) + 1))
-    centre = np.asarray(map_T_lidar.translation())
-    corner = _CELL * np.floor(centre / _CELL)
-    cells = _cells(map_points - corner, shape).T
-    sides = zip(cells, shape, strict=True)
-    inside = np.logical_and.reduce([(row >= 0) & (row < end) for row, end in sides])
-    held = np.zeros(shape, np.uint8)
-    held[tuple(cells[:, inside])] = 1
-    field = (held + _grown(held)).ravel()
-
+    steps = int(field.radius / (_SPACING * _CELL))
     level = points @ map_T_lidar.rotation().matrix().T
     near = (np.linalg.norm(level[:, :2], axis=1) < _REACH) & (np.abs(level[:, 2]) < _HEIGHT)
-    ahead, aside = np.divmod(np.arange((2 * steps + 1) ** 2), 2 * steps + 1) - np.array([[steps]])
-    close = ahead**2 + aside**2 <= (steps + 0.5) ** 2
-    ahead, aside = ahead[close], aside[close]
-    shifts = _SPACING * (ahead * shape[1] + aside) * shape[2]
-    metres = _SPACING * _CELL * np.column_stack([ahead, aside])
+    places = np.divmod(np.arange((2 * steps + 1) ** 2), 2 * steps + 1) - np.array([[steps]])
+    places = places[:, (places**2).sum(axis=0) <= (steps + 0.5) ** 2]
+    corners = places // _BLOCK * _BLOCK
+    corners, blocks = np.unique(field.shifts(_SPACING * corners), return_inverse=True)
+    metres = _SPACING * _CELL * places.T
     most = int(np.ceil(min(most_turn, np.pi) / _TURN))
     turns = _TURN * np.arange(-most, most + (most_turn < np.pi))
     yaws = [gtsam.Rot3.Yaw(turn).matrix() for turn in turns.tolist()]
     turned = np.where(near[:, None], level, 0.0) @ np.transpose(yaws, (0, 2, 1))
-    turned += centre - corner
-    bases = np.ravel_multi_index(tuple(np.moveaxis(_cells(turned, shape), -1, 0)), shape)
-    moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(shifts))])
-    return _Trials(field, near, bases, shifts, moves)
-
-
-def _grown(held: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """1 in every cell that is held, or touches one that is, by a corner at least."""
-    grown = held.copy()
-    for axis in range(held.ndim):
-        before, after = grown.copy().swapaxes(0, axis), grown.swapaxes(0, axis)
-        after[1:] |= before[:-1]
-        after[:-1] |= before[1:]
-    return grown
+    turned += np.asarray(map_T_lidar.translation()) - field.corner
+    cells = np.moveaxis(_cells(turned, field.shape), -1, 0)
+    bases = np.ravel_multi_index(tuple(cells), field.shape)
+    moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(metres))])
+    shifts = field.shifts(_SPACING * places)
+    return _Trials(field, near, bases, shifts, corners, blocks, moves)
 
 
 def _cells(points: FloatArray, shape: tuple[int, int, int]) -> IntArray:

@@ -19,6 +19,7 @@ from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker
 from loam_gtsam.registration.odometry import Prediction
 from loam_gtsam.registration.relocalization import (
+    Field,
     Found,
     any_of,
     distinct,
@@ -96,9 +97,11 @@ class Start:
             return expected
         first, middle = self._sweeps[0], frame.predicted.map_T_middle
         seconds = first.moment.seconds_to(frame.sweep.stamp)
+        held, centres = np.concatenate(_in_map(first)), _centres(middle, first.map_T_middle)
+        radius = min(_FASTEST * seconds, _FARTHEST)
         places = likely_poses(
-            sample_features(*frame.matcher.posed.points, _SAMPLE), np.concatenate(_in_map(first)),
-            _centres(middle, first.map_T_middle), min(_FASTEST * seconds, _FARTHEST), _PLACES,
+            sample_features(*frame.matcher.posed.points, _SAMPLE),
+            [Field.around(held, centre, radius) for centre in centres], centres, _PLACES,
             most_turn=_TURNING * seconds, rare=True, least=_LIKELY, apart=_NEAR,
         )  # fmt: skip
         trial = trial_solver(frame.matcher.config.solver)

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import ConvertOptions, MergeOptions
 from loam_gtsam.cli.refine import FinishedRun, refine_merged
@@ -33,8 +34,10 @@ GRAPH_FILE, PLOT_FILE = "pose_graph.g2o", "merged.png"
 def execute(options: MergeOptions) -> int:
     """Merge maps; returns the exit code."""
     paths = [map_of_run(path) for path in options.maps]
-    names = [f"trajectory_{number}.tum" for number in range(1, len(paths) + 1)]
-    known = (MAP_FILE, "map.ply", *names, GRAPH_FILE, PLOT_FILE, "summary.json")
+    numbers = range(1, len(paths) + 1)
+    names = [(f"trajectory_{number}.tum", f"trajectory_{number}_enu.tum") for number in numbers]
+    files_of_runs = [name for pair in names for name in pair]
+    known = (MAP_FILE, "map.ply", *files_of_runs, GRAPH_FILE, PLOT_FILE, "summary.json")
     datasets = options.datasets()
     draws, started = console.draws_pictures(options.plot), time.perf_counter()
     wanted = options.output or Path("loam_gtsam_output") / "merged"
@@ -49,8 +52,10 @@ def execute(options: MergeOptions) -> int:
             merged = _merge(maps, target / MAP_FILE, quiet=options.quiet)
             done.append(merged)
             ways = [merged.trajectory(*numbered) for numbered in enumerate(updates)]
-            for name, way in zip(names, ways, strict=True):
+            for (name, enu_name), way in zip(names, ways, strict=True):
                 write_tum(target / name, way, comments={"frame": f"of {paths[0]}"})
+                if merged.earth is not None:
+                    write_enu(target / enu_name, way, merged.earth)
             write_graph(target / GRAPH_FILE, merged.graph.saved())
             with SavedMap(target / MAP_FILE) as whole:
                 write_ply(target / "map.ply", *whole.points())

@@ -113,14 +113,23 @@ class CommonPlaces:
         self._keyframes = _keyframes(maps)
         self._own = [error for saved in maps for error in _own_errors(saved)]
 
+    @property
+    def stretch(self) -> float:
+        """Metres that two drives must have in common for as many loops as are asked for."""
+        return LEAST * self._apart
+
+    @property
+    def _apart(self) -> float:
+        """Metres between the places that are looked for."""
+        return _APART * self._config.pose_graph.keyframe_distance
+
     def looked_for(self) -> list[int]:
         """Places of all maps but the first, some keyframe distances apart."""
         chosen: list[int] = []
-        least = _APART * self._config.pose_graph.keyframe_distance
         last: tuple[int, gtsam.Pose3] | None = None
         for number, place in enumerate(self.places):
             own, pose = int(self.map_of[number]), place.map_T_middle
-            if own and (last is None or last[0] != own or last[1].range(pose) >= least):
+            if own and (last is None or last[0] != own or last[1].range(pose) >= self._apart):
                 chosen.append(number)
                 last = own, pose
         return chosen

@@ -134,7 +134,7 @@ def merge_maps(
         solved = whole.solve(loops)
     used = [report.active for report in solved.loops[-len(loops) :]]
     merged = whole.merged(solved, [loop for loop, on in zip(loops, used, strict=True) if on])
-    _connected(maps, list(merged.ties))
+    _connected(maps, list(merged.ties), common.stretch)
     contents = _moved(maps, merged)
     frame = replace(maps[0].frame, earth=merged.earth)
     write_map(path, contents, merged.graph, maps[0].config, frame)
@@ -170,7 +170,7 @@ def _tied(
         doubtful[pair] = len(most), otherwise
         if are_tied(*doubtful[pair]):
             ties[pair] = most
-    _connected(maps, list(ties), doubtful)
+    _connected(maps, list(ties), common.stretch, doubtful)
     return ties
 
 
@@ -181,8 +181,9 @@ def _agree(solved: OptimizedGraph) -> bool:
 
 
 def _connected(
-    maps: Sequence[SavedMap], pairs: Sequence[Pair], found: Mapping[Pair, Pair] | None = None
-) -> None:
+    maps: Sequence[SavedMap], pairs: Sequence[Pair], stretch: float,
+    found: Mapping[Pair, Pair] | None = None,
+) -> None:  # fmt: skip
     """Raise a DatasetError if some map is not tied to the first one, by way of others or not."""
     reached = _order(pairs)
     for number in range(len(maps)):
@@ -196,7 +197,7 @@ def _connected(
         raise DatasetError(
             f"{maps[number].path}: no place of it is for sure in the other maps"
             + (f" ({'; '.join(tried)})" if tried else "")
-            + "; the drives must have a stretch in common, of some ten metres or more"
+            + f"; the drives must have a stretch in common, of some {stretch:.0f} metres or more"
         )
 
 

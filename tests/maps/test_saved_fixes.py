@@ -15,6 +15,7 @@ from support.receiver import SURVEY, SURVEY_SIGMA, off_in_enu, surveyed_parts
 from loam_gtsam.aiding.gnss import PlacedFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.datasets.truth import read_truth
 from loam_gtsam.loops.places import Place
 from loam_gtsam.maps.localizer import Localizer
 from loam_gtsam.maps.map_file import MapFrame, SavedMap, save_map
@@ -202,3 +203,8 @@ def test_the_command_says_where_the_whole_is(surveyed: Surveyed, tmp_path: Path)
         assert summary["enu"] == whole.frame.earth.as_dict()
         assert whole.graph.fixes is not None
         assert summary["fixes"] == len(whole.graph.fixes)
+    for number in (1, 2):
+        enu, own = (tmp_path / "out" / f"trajectory_{number}{kind}.tum" for kind in ("_enu", ""))
+        assert enu.read_text().startswith("# origin: latitude ")
+        assert enu.name in " ".join(done.output.split())
+        assert len(read_truth(enu)) == len(read_truth(own))

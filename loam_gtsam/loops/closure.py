@@ -24,12 +24,7 @@ from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key,
 from loam_gtsam.registration.association import associate, trial_matching
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ScanMatches, subset
-from loam_gtsam.registration.relocalization import (
-    Field,
-    Fit,
-    likely_poses,
-    sample_features,
-)
+from loam_gtsam.registration.relocalization import Field, Fit, likely_poses, sample_features
 from loam_gtsam.registration.solvers import GtsamSolver, Solution, trial_solver
 from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import BoolArray, FloatArray, IntArray

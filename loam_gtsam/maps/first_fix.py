@@ -37,6 +37,7 @@ from loam_gtsam.registration.relocalization.fits import AS_WELL
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import trial_solver
 from loam_gtsam.types import FloatArray
+from loam_gtsam.voxels.cubes import NO_POINTS
 from loam_gtsam.voxels.grid import CubeIndex
 
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
@@ -124,7 +125,7 @@ class PlaceSearch:
 
         The map does not change while a lidar is looked for.
         """
-        centre, held = gtsam.Pose3(gtsam.Rot3(), np.array(position)), []
+        centre, held = gtsam.Pose3(gtsam.Rot3(), np.array(position)), [NO_POINTS]
         for cubes in (self._maps.edges, self._maps.planes):
             for cube in cubes.surroundings(centre.matrix()):
                 if (cubes, cube) not in self._held:

@@ -17,6 +17,8 @@ from support.worlds import updates as made_up
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.workers import extract
 from loam_gtsam.geometry import inverse_pose, transform
 from loam_gtsam.maps.first_fix import Candidate, PlaceSearch
 from loam_gtsam.maps.hypotheses import SWEEPS, Hypothesis
@@ -25,7 +27,7 @@ from loam_gtsam.maps.map_file import LAYERS, MapFrame, SavedMap, save_map, write
 from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import Pipeline, run
-from loam_gtsam.registration.relocalization import Fit
+from loam_gtsam.registration.relocalization import Field, Fit
 from loam_gtsam.registration.relocalization.evidence import Evidence
 from loam_gtsam.types import BadSweep, ConfigError, FrameStatus, InputError, MapUpdate
 
@@ -256,6 +258,27 @@ def test_a_pose_is_given_up_if_the_sweep_speaks_against_it_or_is_not_found_there
     assert search.refuted(found[1].map_T_middle, found)
     assert search.refuted(candidate(7.0, 0.3, 100).map_T_middle, found)
     assert len(search.rivals(candidate(7.0, 0.3, 100).map_T_middle, found, 0.75)) == 2
+
+
+def test_places_are_looked_at_once_and_a_pose_beyond_the_map_harms_no_search(
+    mapped, saved, monkeypatch
+):
+    made, around = [], Field.around
+    monkeypatch.setattr(Field, "around", lambda *args: made.append(args) or around(*args))
+    features = extract(mapped.world.sweep(10), saved.config).features
+    posed = MovingSweep(features, saved.config).at(np.zeros(6))
+    search = PlaceSearch(saved.places, SavedMaps(saved.config, saved), saved.config)
+    first = search.find(posed, features.reach)
+    looked = len(made)
+    assert first
+    assert looked
+    again = search.find(posed, features.reach)
+    assert len(made) == looked
+    beyond = gtsam.Pose3(gtsam.Rot3(), np.array([2000.0, 0.0, 0.0]))
+    with_it = search.find(posed, features.reach, [beyond])
+    assert len(made) == looked + 1
+    for other in (again, with_it):
+        assert first[0].map_T_middle.equals(other[0].map_T_middle, 0.0)
 
 
 def test_where_bays_repeat_a_lidar_is_found_only_if_it_is_surely_in_the_map(tmp_path):

@@ -97,11 +97,10 @@ class Start:
             return expected
         first, middle = self._sweeps[0], frame.predicted.map_T_middle
         seconds = first.moment.seconds_to(frame.sweep.stamp)
-        held, centres = np.concatenate(_in_map(first)), _centres(middle, first.map_T_middle)
-        radius = min(_FASTEST * seconds, _FARTHEST)
+        centres = _centres(middle, first.map_T_middle)
+        fields = _fields(first, centres, min(_FASTEST * seconds, _FARTHEST))
         places = likely_poses(
-            sample_features(*frame.matcher.posed.points, _SAMPLE),
-            [Field.around(held, centre, radius) for centre in centres], centres, _PLACES,
+            sample_features(*frame.matcher.posed.points, _SAMPLE), fields, centres, _PLACES,
             most_turn=_TURNING * seconds, rare=True, least=_LIKELY, apart=_NEAR,
         )  # fmt: skip
         trial = trial_solver(frame.matcher.config.solver)
@@ -333,10 +332,11 @@ def _centres(expected: gtsam.Pose3, first: gtsam.Pose3) -> list[gtsam.Pose3]:
     return [expected, first] if expected.range(first) > APART[0] else [expected]
 
 
-def _in_map(sweep: EarlySweep) -> tuple[FloatArray, FloatArray]:
+def _fields(sweep: EarlySweep, around: Sequence[gtsam.Pose3], radius: float) -> list[Field]:
+    """The fields of a map of one sweep."""
     pose = sweep.map_T_middle.matrix()
-    edges, planes = sweep.posed.points
-    return transform(pose, edges), transform(pose, planes)
+    held = np.concatenate([transform(pose, points) for points in sweep.posed.points])
+    return [Field.around(held, centre, radius) for centre in around]
 
 
 def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:

@@ -107,25 +107,24 @@ class Localizer:
         """Forget where the lidar is, and what was added to the map."""
         self._maps = SavedMaps(self.config, self._saved, keep=self._extend)
         self._places, self._links = list(self._saved.places), list(self._saved.graph.links)
-        self._search()
+        self._hypotheses: Hypotheses | None = self._new_search()  # None while the pose is known
         self._last: MapUpdate | None = None  # that was solved
         self._seen: MapUpdate | None = None  # the last of some that saw all directions
         self._unsolved = self._sure = 0  # sweeps in a row, and those that saw all directions
         self.fixes = 0
 
-    def _search(self) -> None:
-        """Look for the lidar in the whole map, as it is now."""
+    def _new_search(self) -> Hypotheses:
+        """A search for the lidar in the whole map, which does not grow meanwhile."""
         self._maps.grows = False
         # A fix needs to know which directions are seen, which not every solver tells.
         config = self.config.changed(solver=SolverConfig())
         search = PlaceSearch(self._places, self._maps, config, inside=self._inside)
-        self._hypotheses = Hypotheses(search, self._maps, config)
-        self._fixed = False
+        return Hypotheses(search, self._maps, config)
 
     @property
     def fixed(self) -> bool:
         """Whether the pose is known."""
-        return self._fixed
+        return self._hypotheses is None
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Localise one sweep; what it contains never raises, see the status of the result.
@@ -142,13 +141,13 @@ class Localizer:
         """
         if isinstance(sweep, Scan) and extraction is None:
             extraction = extract(sweep, self.config, self._parts.get("features"))
-        if self._fixed:
+        if self._hypotheses is None:
             update = self._tracking.process(sweep, extraction)
             if not self._given_up(update):
                 if self._extend:
                     self._add_places()
                 return self._told(update)
-            self._search()
+            self._hypotheses = self._new_search()
         features = sweep.features if isinstance(sweep, FeatureSweep) else None
         if extraction is not None:
             features = extraction.features
@@ -182,7 +181,8 @@ class Localizer:
         self._tracking.reset()
         self._tracking.mapper.maps = self._maps
         self._tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
-        self._fixed, self._unsolved, self._sure, self._seen = True, 0, 0, None
+        self._hypotheses = None
+        self._unsolved, self._sure, self._seen = 0, 0, None
         self.fixes += 1
         again = "" if self.fixes == 1 else " again"
         told = self._told(replace(fix, message=f"found in the map{again}"))

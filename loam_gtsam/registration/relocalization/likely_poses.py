@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import gtsam
@@ -40,7 +41,7 @@ def one_per_cell(map_points: FloatArray) -> FloatArray:
     return map_points[first]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Field:
     """Cells around a place, and which of them hold points of a map.
 
@@ -50,14 +51,12 @@ class Field:
     shape : number of cells along each axis
     corner : (3,) metres, map frame, of the cell in the middle
     hits : what a point scores twice over in each cell: 2 if it holds map points, 1 beside, or 0
-    most : the most that it scores there and at the other trial positions of a block that begins so
     """
 
     radius: float
     shape: tuple[int, int, int]
     corner: FloatArray
     hits: NDArray[np.uint8]
-    most: NDArray[np.uint8]
 
     @classmethod
     def around(cls, map_points: FloatArray, place: gtsam.Pose3, radius: float) -> Field:
@@ -66,26 +65,26 @@ class Field:
         reached = int(np.ceil((_REACH + radius) / _CELL)) + 2 + _SPACING * (_BLOCK - 1)
         shape = (2 * reached, 2 * reached, 2 * int(_HEIGHT / _CELL) + 3)
         corner = _CELL * np.floor(np.asarray(place.translation()) / _CELL)
-        # By component: numpy is several times slower along an axis of three.
-        axes = zip(np.ascontiguousarray(map_points.T), corner, shape, strict=True)
-        cells = [np.floor((row - start) / _CELL) + side // 2 for row, start, side in axes]
+        cells = _cells(map_points, corner, shape)
         sides = zip(cells, shape, strict=True)
         inside = np.logical_and.reduce([(row >= 0) & (row < side) for row, side in sides])
-        x, y, z = (row[inside].astype(np.int64) for row in cells)
         held = np.zeros(np.prod(shape), np.uint8)
-        held[(x * shape[1] + y) * shape[2] + z] = 1
-        steps = shape[1] * shape[2], shape[2], 1
+        held[np.ravel_multi_index(tuple(row[inside] for row in cells), shape)] = 1
         grown = held.copy()
-        for step in steps:
+        for step in (shape[1] * shape[2], shape[2], 1):
             before, after = grown[:-step].copy(), grown[step:].copy()
             grown[step:] |= before
             grown[:-step] |= after
-        hits = held + grown
-        most = hits.copy()
-        for step in steps[:2]:
+        return cls(radius, shape, corner, held + grown)
+
+    @cached_property
+    def most(self) -> NDArray[np.uint8]:
+        """The most that a point scores at the trial positions of a block, from its first one on."""
+        most = self.hits.copy()
+        for step in (self.shape[1] * self.shape[2], self.shape[2]):
             for many in (_SPACING, 2 * _SPACING):  # to the end of a block
                 most[: -many * step] = np.maximum(most[: -many * step], most[many * step :])
-        return cls(radius, shape, corner, hits, most)
+        return most
 
     def shifts(self, cells: IntArray) -> IntArray:
         """By which the cell of a point moves with so many cells (2, S) along x and y."""
@@ -180,21 +179,26 @@ class _Trials(NamedTuple):
 
     def bounds(self, points: IntArray, weights: NDArray[np.float32]) -> FloatArray:
         """(R, B) what no trial pose of a block scores more than, by some of the points."""
-        near = self.near[points]
-        bases, weights, corners = self.bases[:, points[near]], weights[near], self.corners[:, None]
-        return np.array([self.field.most[base + corners] @ weights for base in bases])
+        bases, weights = self._near(points, weights)
+        return np.array([self.field.most[base + self.corners[:, None]] @ weights for base in bases])
 
     def scores(
         self, points: IntArray, weights: NDArray[np.float32], wanted: BoolArray
     ) -> FloatArray:
         """(R S,) score of the trial poses of the ``wanted`` blocks (R, B), and 0 of the others."""
-        near = self.near[points]
-        bases, weights = self.bases[:, points[near]], weights[near]
+        bases, weights = self._near(points, weights)
         scores = np.zeros((len(bases), len(self.shifts)))
         for row, base, blocks in zip(scores, bases, wanted, strict=True):
             at = np.flatnonzero(blocks[self.blocks])
             row[at] = self.field.hits[base + self.shifts[at, None]] @ weights
         return scores.ravel()
+
+    def _near(
+        self, points: IntArray, weights: NDArray[np.float32]
+    ) -> tuple[IntArray, NDArray[np.float32]]:
+        """Cells (R, M) and weights (M,) of those of the points that are scored."""
+        near = self.near[points]
+        return self.bases[:, points[near]], weights[near]
 
 
 def _scores(
@@ -202,13 +206,15 @@ def _scores(
 ) -> FloatArray:
     """Scores of all trial poses, one centre after the other; 0 below ``least`` of the best one.
 
-    Branch and bound: most blocks of trial poses are ruled out at once.
+    Branch and bound: most blocks of trial poses are ruled out at once, if any may be.
     """
-    bounds = [trials.bounds(points, weights) for trials in tried]
-    best = [bound == bound.max() for bound in bounds]
-    pairs = zip(tried, best, strict=True)
-    known = max(trials.scores(points, weights, most).max() for trials, most in pairs)
-    wanted = [bound >= least * known for bound in bounds]
+    wanted = [np.ones((len(trials.bases), len(trials.corners)), np.bool_) for trials in tried]
+    if least > 0.0:
+        bounds = [trials.bounds(points, weights) for trials in tried]
+        best = [bound == bound.max() for bound in bounds]
+        pairs = zip(tried, best, strict=True)
+        known = max(trials.scores(points, weights, most).max() for trials, most in pairs)
+        wanted = [bound >= least * known for bound in bounds]
     pairs = zip(tried, wanted, strict=True)
     return np.concatenate([trials.scores(points, weights, some) for trials, some in pairs])
 
@@ -229,15 +235,19 @@ def _trials(
     turns = _TURN * np.arange(-most, most + (most_turn < np.pi))
     yaws = [gtsam.Rot3.Yaw(turn).matrix() for turn in turns.tolist()]
     turned = np.where(near[:, None], level, 0.0) @ np.transpose(yaws, (0, 2, 1))
-    turned += np.asarray(map_T_lidar.translation()) - field.corner
-    cells = np.moveaxis(_cells(turned, field.shape), -1, 0)
-    bases = np.ravel_multi_index(tuple(cells), field.shape)
+    from_lidar = field.corner - np.asarray(map_T_lidar.translation())
+    bases = np.ravel_multi_index(_cells(turned, from_lidar, field.shape), field.shape)
     moves = np.column_stack([np.tile(metres, (len(turns), 1)), np.repeat(turns, len(metres))])
     shifts = field.shifts(_SPACING * places)
     return _Trials(field, near, bases, shifts, corners, blocks, moves)
 
 
-def _cells(points: FloatArray, shape: tuple[int, int, int]) -> IntArray:
-    """Cells of points, counted from the middle of the field."""
-    cells: IntArray = np.floor(points / _CELL).astype(np.int64) + np.array(shape) // 2
-    return cells
+def _cells(
+    points: FloatArray, corner: FloatArray, shape: tuple[int, int, int]
+) -> tuple[IntArray, ...]:
+    """Cells of points (..., 3) along each axis of a field, in the middle of which a corner is."""
+    # By component: numpy is several times slower along an axis of three.
+    axes = zip(np.ascontiguousarray(np.moveaxis(points, -1, 0)), corner, shape, strict=True)
+    return tuple(
+        np.floor((row - start) / _CELL).astype(np.int64) + side // 2 for row, start, side in axes
+    )

@@ -98,16 +98,21 @@ def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatc
 
 
 @pytest.fixture(scope="module")
-def ahead_only():
-    """A drive whose lidar sees 70 degrees of an avenue: several first motions fit two sweeps."""
+def features_ahead():
+    """A drive whose lidar sees 70 degrees of an avenue."""
     world = SimulatedWorld("avenue", frames=9, seed=4, columns=900, start="moving")
     features = []
     for scan in world:
         ahead = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < np.radians(35.0)
         points = np.where(ahead[:, None], scan.points, np.nan).astype(np.float32)
         features.append(extract_features(replace(scan, points=points), CONFIG))
-    mapper = Mapper(CONFIG)
-    states = []
+    return world, features
+
+
+@pytest.fixture(scope="module")
+def ahead_only(features_ahead):
+    """Its updates, and the rivals after each: several first motions fit two sweeps."""
+    (world, features), mapper, states = features_ahead, Mapper(CONFIG), []
     for one in features:
         update = mapper.register(one)
         states.append((update, mapper._start and len(mapper._start._rivals)))
@@ -130,6 +135,25 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
     assert errors(world, updates)[-1] < 0.1
     assert states[4][1] < states[1][1]
     assert updates[4].covariance[3, 3] < 0.1 * updates[1].covariance[3, 3]
+
+
+def test_a_start_in_doubt_goes_on_as_it_was_if_its_last_sweep_is_not_found_anew(
+    features_ahead, monkeypatch
+):
+    mapper, made, solved = Mapper(CONFIG), [], first_sweeps.Start._solved
+    for one in features_ahead[1][:2]:
+        mapper.register(one)
+    rivals = mapper._start._rivals
+    monkeypatch.setattr(first_sweeps.Start, "_fill", lambda *_: made.append(True))
+
+    def not_in_the_map_that_is_kept(*args):
+        return replace(solved(*args), solved=not made)
+
+    monkeypatch.setattr(first_sweeps.Start, "_solved", not_in_the_map_that_is_kept)
+    assert mapper.register(features_ahead[1][2]).status.solved
+    assert made
+    assert rivals
+    assert mapper._start._rivals is rivals
 
 
 def test_one_first_motion_leaves_no_doubt():

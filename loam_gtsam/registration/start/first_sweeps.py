@@ -154,17 +154,18 @@ class Start:
         if len(sweeps) not in _TOGETHER and not self._anew:
             self._sweeps = sweeps
             return frame, found
-        self._anew, once = False, len(sweeps) in _ONCE and not self._rivals
+        before, once = self._rivals, len(sweeps) in _ONCE and not self._rivals
         sweeps = self._together(frame, sweeps, solver, 1 if once else 2)
         sweeps = self._with_motion(self._told_apart(frame, sweeps, solver))
         matcher = self._matcher(frame, sweeps, len(sweeps) - 1, to_keep=True)
         solution = self._solved(frame, sweeps[-1], matcher, solver)
         if not solution.solved:
+            self._rivals = before
             self._fill(frame, self._sweeps)
             return frame, found
         last, posed = sweeps[-2].moment, sweeps[-1].posed
         sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
-        self._sweeps = sweeps
+        self._sweeps, self._anew = sweeps, False
         if imu is not None:
             imu.registered_anew(last.map_T_lidar)
         frame = replace(

@@ -12,14 +12,14 @@ import pytest
 from loam_gtsam import Mapper, run
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.arrays import ArrayDataset
-from loam_gtsam.datasets.sim.disturbances import Disturbed, Outliers
+from loam_gtsam.datasets.sim.disturbances import Disturbed, MovingObjects, Outliers
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.relocalization import Fit, any_of, same, same_optimum
 from loam_gtsam.registration.relocalization.evidence import _AGAINST, Evidence
 from loam_gtsam.registration.solvers import GtsamSolver, Solution
-from loam_gtsam.registration.start import first_sweeps, ways
+from loam_gtsam.registration.start import early_map, first_sweeps, ways
 from loam_gtsam.types import FrameStatus
 
 CONFIG = Config().changed("imu.coupling=off")
@@ -73,7 +73,7 @@ def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatc
     found = {}
     look_again = first_sweeps.Start._told_apart
 
-    def from_behind(self, frame, sweeps, solver):
+    def from_behind(self, early, sweeps):
         if len(sweeps) == 2:
             return sweeps
         behind = gtsam.Pose3(gtsam.Rot3(), np.array([-2.5, 0.0, 0.0]))
@@ -83,7 +83,7 @@ def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatc
                 for sweep in sweeps[first:]
             ]
             given = [*sweeps[:first], *late]
-            found[first] = given, look_again(self, frame, given, solver)
+            found[first] = given, look_again(self, early, given)
         found["true"] = sweeps
         return sweeps
 
@@ -140,16 +140,16 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
 def test_a_start_in_doubt_goes_on_as_it_was_if_its_last_sweep_is_not_found_anew(
     features_ahead, monkeypatch
 ):
-    mapper, made, solved = Mapper(CONFIG), [], first_sweeps.Start._solved
+    mapper, made, solved = Mapper(CONFIG), [], early_map.EarlyMap.solved
     for one in features_ahead[1][:2]:
         mapper.register(one)
     rivals = mapper._start._rivals
-    monkeypatch.setattr(first_sweeps.Start, "_fill", lambda *_: made.append(True))
+    monkeypatch.setattr(early_map.EarlyMap, "fill", lambda *_: made.append(True))
 
     def not_in_the_map_that_is_kept(*args):
         return replace(solved(*args), solved=not made)
 
-    monkeypatch.setattr(first_sweeps.Start, "_solved", not_in_the_map_that_is_kept)
+    monkeypatch.setattr(early_map.EarlyMap, "solved", not_in_the_map_that_is_kept)
     assert mapper.register(features_ahead[1][2]).status.solved
     assert made
     assert rivals
@@ -216,6 +216,40 @@ def test_points_that_stand_nowhere_make_no_first_motion():
     disturbed = Disturbed(world, [Outliers(0.15, seed=9)])
     updates = [mapper.register(extract_features(sweep, CONFIG)) for sweep in disturbed]
     assert errors(world, updates).max() < 0.1
+
+
+def beside_traffic(share, speeds, lane, **options):
+    """Errors and updates of a run between two columns of boxes that hide a share of the sweeps."""
+    world = SimulatedWorld("trees", frames=9, columns=900, **options)
+    boxes = MovingObjects(speeds=speeds, lane=lane, bottom=-1.2).covering(share, world[0])
+    mapper = Mapper(CONFIG)
+    features = [extract_features(scan, CONFIG) for scan in Disturbed(world, [boxes])]
+    updates = [mapper.register(one) for one in features]
+    return errors(world, updates), updates
+
+
+def test_what_passes_slowly_is_told_from_what_stands_by_the_eighth_sweep():
+    """Boxes at 3 m/s, 0.3 m farther on in the second sweep: they were followed for good."""
+    off, updates = beside_traffic(0.25, (3.0, 12.0), 3.0, speed=8.0, start="moving")
+    assert off[6] > 3.0
+    assert off[7:].max() < 0.1
+    assert updates[8].status is FrameStatus.OK
+
+
+def test_a_motion_that_explains_the_sweeps_nearly_as_well_is_told():
+    off, updates = beside_traffic(0.32, (2.9, 12.7), 3.75, rate=20.0)
+    assert off[8] > 0.5  # it goes with the boxes
+    assert not updates[6].uncertainty.in_doubt
+    for update, metres in zip(updates[7:], off[7:], strict=True):
+        assert metres < 3.0 * np.sqrt(update.covariance[3, 3])
+
+
+def test_where_nothing_passes_the_eighth_sweep_leaves_no_doubt():
+    for scene in ("street_loop", "room"):
+        _, features = features_of(scene, 9)
+        mapper = Mapper(CONFIG)
+        updates = [mapper.register(one) for one in features]
+        assert not any(update.uncertainty.in_doubt for update in updates[1:])
 
 
 UP, AHEAD, ASIDE = np.eye(3)[[2, 0, 1]]
@@ -353,6 +387,25 @@ def test_what_may_move_counts_once_against_a_way_that_may_be_true():
     assert ways._favour(passed, taken).every < -3.0
 
 
+@pytest.mark.parametrize(("against", "good"), [(3, True), (5, False)])
+def test_hardly_anything_may_speak_against_a_way_that_was_looked_for(against, good):
+    taken = place(0.0 * AHEAD, [], np.arange(40) < against, AHEAD)
+    there = place(3.0 * AHEAD, [], np.zeros(40), AHEAD)
+    assert ways.as_good((there,), (taken,)) == good
+    assert ways.as_good((taken,), (there,))
+
+
+def test_a_steady_way_has_the_last_sweep_where_it_was_found():
+    stamps = [SimpleNamespace(sweep=SimpleNamespace(stamp=10**8 * n)) for n in range(3)]
+    sweeps = [ways.EarlySweep(posed, gtsam.Pose3(), False, None, 0) for posed in stamps]
+    moved = gtsam.Pose3(gtsam.Rot3.Yaw(0.2), np.array([6.0, 1.0, 0.0]))
+    first, second, last = ways.steady(sweeps, moved)
+    assert first is sweeps[0]
+    assert last.map_T_middle.equals(moved, 1e-9)
+    half = gtsam.Pose3.Expmap(0.5 * gtsam.Pose3.Logmap(moved))
+    assert second.map_T_middle.equals(half, 1e-9)
+
+
 @pytest.mark.parametrize(
     ("there", "here", "normal", "tell"),
     [
@@ -394,7 +447,7 @@ def test_the_way_that_was_taken_stays_though_no_acceleration_explains_it():
     assert ways.kept_ways([smooth, taken], CONFIG) == [smooth]
 
 
-def test_only_the_second_sweep_of_a_refined_start_is_searched_for(monkeypatch):
+def test_of_the_first_four_sweeps_of_a_refined_start_only_the_second_is_searched_for(monkeypatch):
     asked = []
     monkeypatch.setattr(first_sweeps, "likely_poses", lambda *_, **__: asked.append(1) or [])
     _, features = features_of("avenue", 4, speed=20.0, start="moving")
@@ -421,21 +474,21 @@ def test_places_that_few_matches_contradict_are_not_looked_at_closer(monkeypatch
 def test_places_that_lead_to_the_same_motion_are_tried_or_looked_at_closer_once(monkeypatch):
     _, features = features_of("rooms", 2, start="moving")
     tried, started = [], []
-    registered, look = first_sweeps.Start._registered, first_sweeps.Start._tried
+    registered, look = early_map.EarlyMap.registered, early_map.EarlyMap.tried
 
     def noted(*arguments, quickly=False):
         result = registered(*arguments, quickly=quickly)
         tried.append((quickly, result.moved))
         return result
 
-    def begun(self, frame, place, solver):
-        moved = self._sweeps[0].map_T_middle.between(place)
+    def begun(self, first, later):
+        moved = first.map_T_middle.between(later.map_T_middle)
         known = [pose for how, pose in tried if how]
         started.append(any(same(moved, pose, first_sweeps._NEAR) for pose in known))
-        return look(self, frame, place, solver)
+        return look(self, first, later)
 
-    monkeypatch.setattr(first_sweeps.Start, "_registered", noted)
-    monkeypatch.setattr(first_sweeps.Start, "_tried", begun)
+    monkeypatch.setattr(early_map.EarlyMap, "registered", noted)
+    monkeypatch.setattr(early_map.EarlyMap, "tried", begun)
     mapper = Mapper(CONFIG)
     for one in features:
         mapper.register(one)
@@ -515,19 +568,18 @@ def pushed(monkeypatch):
     push = gtsam.Pose3(gtsam.Rot3(), np.array([0.02, 0.0, 0.05]))
 
     def registered(held=False, count=3, **seen):
-        def solved(self, frame, one, matcher, solver):
+        def solved(self, one, matcher):
             pose = push.compose(one.map_T_middle)
             return replace(Solution.unsolved(pose, None, 1, 1), solved=True, **seen)
 
-        monkeypatch.setattr(first_sweeps.Start, "_matcher", lambda *_: None)
-        monkeypatch.setattr(first_sweeps.Start, "_solved", solved)
-        start = first_sweeps.Start.__new__(first_sweeps.Start)
+        monkeypatch.setattr(early_map.EarlyMap, "matcher", lambda *_: None)
+        monkeypatch.setattr(early_map.EarlyMap, "solved", solved)
         steps = [np.array([0.1 * number, 0.0, 0.0]) for number in range(count)]
         poses = [gtsam.Pose3(gtsam.Rot3.Yaw(0.1), step) for step in steps]
         sweeps = [
             ways.EarlySweep(None, pose, held or not n, None, 0) for n, pose in enumerate(poses)
         ]
-        solutions = start._at_once(None, sweeps, None)
+        solutions = early_map.EarlyMap(None, None, None).at_once(sweeps)
         if solutions is None:
             return None
         after = ways.moved_with_first(sweeps, solutions)

@@ -57,6 +57,8 @@ class Tried(NamedTuple):
         return self.sweeps[0].map_T_middle.between(self.sweeps[-1].map_T_middle)
 
 
+_HARDLY = 2.0  # standard deviations: one of twenty right ways is worse by chance
+
 Way = tuple[Tried, ...]
 """A first motion and where it led: the sweeps after the first, one after the other."""
 
@@ -79,6 +81,16 @@ def by_second_step(sweeps: Sequence[EarlySweep]) -> list[list[EarlySweep]]:
     place = advance(first.map_T_middle, mean_twist(second, third), seconds)
     led = [first, replace(second, map_T_middle=place)]
     return [] if same(place, second.map_T_middle) else [led]
+
+
+def steady(sweeps: Sequence[EarlySweep], moved: gtsam.Pose3) -> list[EarlySweep]:
+    """The sweeps at constant velocity, the last one ``moved`` from the first."""
+    first = sweeps[0].moment
+    seconds = [first.seconds_to(one.moment.stamp) for one in sweeps]
+    twist = gtsam.Pose3.Logmap(moved) / seconds[-1]
+    poses = [advance(first.map_T_lidar, twist, since) for since in seconds[1:]]
+    pairs = zip(sweeps[1:], poses, strict=True)
+    return [sweeps[0], *(replace(one, map_T_middle=pose) for one, pose in pairs)]
 
 
 def moved_with_first(
@@ -156,6 +168,15 @@ def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -
         if all(_apart(way, other, near) for other in kept):
             kept.append(way)
     return kept
+
+
+def as_good(one: Way, other: Way) -> bool:
+    """Whether a way to a place that was merely looked for is as good as another one.
+
+    It is if hardly more speaks against it, with all that it contradicts: from a place beside the
+    right one, walls and trees lead halfway there.
+    """
+    return _favour(one, other).every > -_HARDLY
 
 
 def tell_nothing(one: Way, other: Way, least: float) -> bool:

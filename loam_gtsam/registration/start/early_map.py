@@ -1,0 +1,157 @@
+"""The map of the first sweeps of a run, made anew of any of them to register the others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+
+from loam_gtsam.config import Config
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
+from loam_gtsam.registration.relocalization.evidence import Evidence
+from loam_gtsam.registration.solvers import ScanSolver, Solution, trial_solver
+from loam_gtsam.registration.start.ways import (
+    EarlySweep,
+    Tried,
+    Way,
+    continued,
+    moved_with_first,
+)
+from loam_gtsam.types import FloatArray
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EarlyMap:
+    """Registers early sweeps with maps of each other.
+
+    Attributes
+    ----------
+    frame : the newest sweep; its map is the one that is made anew
+    solver : by which the sweeps are registered
+    map_T_first : pose of the very first sweep at its reference time, which never changes
+    """
+
+    frame: Frame
+    solver: ScanSolver
+    map_T_first: gtsam.Pose3
+
+    @property
+    def config(self) -> Config:
+        """The configuration of the map."""
+        return self.frame.matcher.config
+
+    def together(self, sweeps: Sequence[EarlySweep], rounds: int) -> list[EarlySweep]:
+        """The sweeps, each registered with the map of all the others, so many times."""
+        moved = list(sweeps)
+        for _ in range(rounds):
+            moved = self.with_motion(moved)
+            if (solutions := self.at_once(moved)) is not None:
+                moved = moved_with_first(moved, solutions)
+                continue
+            for number, sweep in enumerate(moved):
+                if sweep.held and sweep.posed.sweep is not self.frame.sweep:
+                    continue
+                solution = self.solved(sweep, self.matcher(moved, number))
+                if solution.solved:
+                    moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
+        return moved
+
+    def at_once(self, sweeps: Sequence[EarlySweep]) -> list[Solution] | None:
+        """Each sweep, the first as well, registered with the map of the others as they are.
+
+        None if other factors hold some of them, or if the first one does not see all directions.
+        """
+        if len(sweeps) < 3 or any(sweep.held for sweep in sweeps[1:]):
+            return None
+        solutions: list[Solution] = []
+        for number, sweep in enumerate(sweeps):
+            solutions.append(self.solved(sweep, self.matcher(sweeps, number)))
+            if not solutions[0].solved or solutions[0].weak is not None:
+                return None
+        return solutions
+
+    def way(self, sweeps: Sequence[EarlySweep]) -> Way:
+        """Each sweep after the first, registered with the map of those before it."""
+        return tuple(
+            self.registered(self.with_motion(sweeps[:count])) for count in range(2, len(sweeps) + 1)
+        )
+
+    def followed(self, way: list[EarlySweep], sweeps: Sequence[EarlySweep]) -> Way:
+        """Further sweeps of a way, each expected at constant velocity."""
+        found: list[Tried] = []
+        for sweep in sweeps:
+            expected = replace(sweep, map_T_middle=continued(way, sweep.moment.stamp))
+            found.append(self.registered(self.with_motion([*way, expected])))
+            way = found[-1].sweeps
+        return tuple(found)
+
+    def tried(self, first: EarlySweep, later: EarlySweep) -> Tried:
+        """A later sweep, registered with the first by few matches, as a trial."""
+        moved = first.map_T_middle.between(later.map_T_middle)
+        first, later = self.with_motion([first, later])
+        later = replace(later, map_T_middle=first.map_T_middle.compose(moved))
+        trial = replace(self, solver=trial_solver(self.config.solver))
+        return trial.registered([first, later], quickly=True)
+
+    def registered(self, sweeps: Sequence[EarlySweep], *, quickly: bool = False) -> Tried:
+        """The last of some sweeps, registered with the others, and what its features say of it."""
+        matcher = self.matcher(sweeps, len(sweeps) - 1)
+        matcher = matcher.with_few_matches() if quickly else matcher
+        solution = self.solved(sweeps[-1], matcher)
+        last = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
+        return Tried(Evidence.of(matcher, solution), [*sweeps[:-1], last], solution)
+
+    def solved(self, one: EarlySweep, matcher: FrameMatcher) -> Solution:
+        """A sweep, registered with the map of a matcher."""
+        expected = replace(one.expected, map_T_lidar=one.map_T_middle)
+        priors = self.frame.priors if one.posed.sweep is self.frame.sweep else ()
+        return self.solver.solve(matcher, one.map_T_middle, priors, expected)
+
+    def matcher(
+        self, sweeps: Sequence[EarlySweep], number: int, *, to_keep: bool = False
+    ) -> FrameMatcher:
+        """The matches of one of the sweeps with a map of all the others, which may be to keep."""
+        others = [*sweeps[:number], *sweeps[number + 1 :]]
+        if to_keep:
+            self.fill(others)
+        else:
+            self._clear()
+            placed = [(one.posed, one.map_T_middle) for one in others]
+            self.frame.matcher.maps.insert_on_trial(placed)
+        old, posed = self.frame.matcher, sweeps[number].posed
+        return FrameMatcher.of(posed, old.maps, old.config, old.last, old.clock, refine=False)
+
+    def fill(self, sweeps: Sequence[EarlySweep]) -> None:
+        """Make the map of these sweeps."""
+        self._clear()
+        for sweep in sweeps:
+            self.frame.matcher.maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
+
+    def _clear(self) -> None:
+        self.frame.matcher.maps.clear()
+        self.frame.matcher.maps.recenter(self.map_T_first)
+
+    def with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
+        """The sweeps, de-skewed for the motion between their poses."""
+        moved = list(sweeps)
+        for number in range(1, len(moved)):
+            last, now = moved[number - 1].moment, moved[number]
+            sweep = now.posed.sweep
+            if sweep.stamp > last.stamp:  # not for sweeps of unlike length
+                twist = sweep.twist_since(last[:2], now.map_T_middle)
+                moved[number] = replace(now, posed=sweep.at(twist))
+        posed = moved[0].posed.sweep.at(_first_twist(*moved[:2]))
+        middle = posed.map_T_middle(self.map_T_first)
+        moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
+        return moved
+
+
+def _first_twist(first: EarlySweep, second: EarlySweep) -> FloatArray:
+    """(6,) body velocity of the first sweep: that of the second, less what was felt in between."""
+    sweep, twist = second.posed.sweep, second.posed.twist
+    velocity = sweep.velocity_at((first.moment.stamp - sweep.stamp) * 1e-9, twist)
+    if velocity is None:
+        return twist
+    moved = first.map_T_middle.rotation().between(second.map_T_middle.rotation())
+    return first.posed.sweep.twist_at_reference(twist[:3], moved.matrix() @ velocity)

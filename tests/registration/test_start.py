@@ -387,12 +387,15 @@ def test_what_may_move_counts_once_against_a_way_that_may_be_true():
     assert ways._favour(passed, taken).every < -3.0
 
 
-@pytest.mark.parametrize(("against", "good"), [(3, True), (5, False)])
-def test_hardly_anything_may_speak_against_a_way_that_was_looked_for(against, good):
-    taken = place(0.0 * AHEAD, [], np.arange(40) < against, AHEAD)
-    there = place(3.0 * AHEAD, [], np.zeros(40), AHEAD)
-    assert ways.as_good((there,), (taken,)) == good
-    assert ways.as_good((taken,), (there,))
+@pytest.mark.parametrize(
+    ("against", "told", "good"), [(3, 20, True), (10, 20, False), (1, 7, False)]
+)
+def test_hardly_anything_may_speak_against_a_way_that_was_looked_for(against, told, good):
+    """So many more features agree at the place that was taken, of those that agree at one alone."""
+    number = np.arange(400)
+    taken = place(0.0 * AHEAD, [], 2 * number < told + against, AHEAD)
+    there = place(3.0 * AHEAD, [], (2 * number >= told + against) & (number < told), AHEAD)
+    assert ways.as_good((there,), (taken,), 8.0) == good
 
 
 def test_a_steady_way_has_the_last_sweep_where_it_was_found():

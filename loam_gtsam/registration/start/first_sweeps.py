@@ -181,18 +181,19 @@ class Start:
         others += by_second_step(sweeps)
         if any(sweep.held for sweep in sweeps[1:]):
             return sweeps
-        steady = _elsewhere(early, sweeps) if len(sweeps) == _TOGETHER[-1] else []
-        if not others and not steady:
+        elsewhere = _elsewhere(early, sweeps) if len(sweeps) == _TOGETHER[-1] else []
+        if not others and not elsewhere:
             return sweeps
+        least = early.config.solver.min_aligned
         taken, telling, silent = early.way(sweeps), [], []
         for way in others:
             followed = early.followed(way, sweeps[len(way) :])
-            if tell_nothing(taken[-len(followed) :], followed, early.config.solver.min_aligned):
+            if tell_nothing(taken[-len(followed) :], followed, least):
                 silent.append(followed)
             else:
                 telling.append(early.way(early.together(followed[-1].sweeps, 1)))
-        ways = [early.way(early.together(way, 2)) for way in steady]
-        telling += [way for way in ways if as_good(way, taken)]
+        ways = [early.way(early.together(way, 2)) for way in elsewhere]
+        telling += [way for way in ways if as_good(way, taken, least)]
         best = self._best([taken, *telling], early.config, silent)
         return sweeps if best is taken else best[-1].sweeps
 
@@ -246,11 +247,12 @@ def _elsewhere(early: EarlyMap, sweeps: list[EarlySweep]) -> list[list[EarlySwee
     within = APART[0] * (len(sweeps) - 1), APART[1]
     places = _likely(first, last, [last.map_T_middle], _ELSEWHERE, within)
     here, *others = _hopeful(early, first, last, places)
-    return [
-        steady(sweeps, one.moved)
-        for one in others
-        if favour([one.evidence], [here.evidence], moving=True).every > -_LESS
-    ]
+    least, ways = early.config.solver.min_aligned, []
+    for one in others:
+        told = favour([one.evidence], [here.evidence], moving=True)
+        if told.every > -_LESS and told.said > least:
+            ways.append(steady(sweeps, one.moved))
+    return ways
 
 
 def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:

@@ -170,13 +170,15 @@ def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -
     return kept
 
 
-def as_good(one: Way, other: Way) -> bool:
+def as_good(one: Way, other: Way, least: float) -> bool:
     """Whether a way to a place that was merely looked for is as good as another one.
 
     It is if hardly more speaks against it, with all that it contradicts: from a place beside the
-    right one, walls and trees lead halfway there.
+    right one, walls and trees lead halfway there. More than ``least`` features, counted as if they
+    lay across, must tell the two apart at all.
     """
-    return _favour(one, other).every > -_HARDLY
+    told = _favour(one, other)
+    return told.every > -_HARDLY and told.said > least
 
 
 def tell_nothing(one: Way, other: Way, least: float) -> bool:

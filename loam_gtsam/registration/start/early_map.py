@@ -41,6 +41,11 @@ class EarlyMap:
         """The configuration of the map."""
         return self.frame.matcher.config
 
+    @property
+    def on_trial(self) -> EarlyMap:
+        """The same with a solver for trials, which ends early."""
+        return replace(self, solver=trial_solver(self.config.solver))
+
     def together(self, sweeps: Sequence[EarlySweep], rounds: int) -> list[EarlySweep]:
         """The sweeps, each registered with the map of all the others, so many times."""
         moved = list(sweeps)
@@ -87,12 +92,11 @@ class EarlyMap:
         return tuple(found)
 
     def tried(self, first: EarlySweep, later: EarlySweep) -> Tried:
-        """A later sweep, registered with the first by few matches, as a trial."""
+        """A later sweep, registered with the first by few matches."""
         moved = first.map_T_middle.between(later.map_T_middle)
         first, later = self.with_motion([first, later])
         later = replace(later, map_T_middle=first.map_T_middle.compose(moved))
-        trial = replace(self, solver=trial_solver(self.config.solver))
-        return trial.registered([first, later], quickly=True)
+        return self.registered([first, later], quickly=True)
 
     def registered(self, sweeps: Sequence[EarlySweep], *, quickly: bool = False) -> Tried:
         """The last of some sweeps, registered with the others, and what its features say of it."""

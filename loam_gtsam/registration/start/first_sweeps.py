@@ -227,11 +227,12 @@ def _hopeful(
     early: EarlyMap, first: EarlySweep, later: EarlySweep, places: Sequence[gtsam.Pose3]
 ) -> list[Tried]:
     """A later sweep, tried where it is, and at each place to which no try before has led."""
-    quick = [early.tried(first, later)]
+    trial = early.on_trial
+    quick = [trial.tried(first, later)]
     for place in places:
         moved = first.map_T_middle.between(place)
         if not any(same(moved, tried.moved, _NEAR) for tried in quick):
-            quick.append(early.tried(first, replace(later, map_T_middle=place)))
+            quick.append(trial.tried(first, replace(later, map_T_middle=place)))
     enough = _HOPEFUL * max(tried.evidence.share for tried in quick)
     hopeful = [quick[0], *(tried for tried in quick[1:] if tried.evidence.share >= enough)]
     return distinct(hopeful, lambda tried: tried.moved)

@@ -137,23 +137,34 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
     assert updates[4].covariance[3, 3] < 0.1 * updates[1].covariance[3, 3]
 
 
-def test_a_start_in_doubt_goes_on_as_it_was_if_its_last_sweep_is_not_found_anew(
-    features_ahead, monkeypatch
+@pytest.mark.parametrize("number", [1, 2, 7])
+def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
+    features_ahead, monkeypatch, number
 ):
+    """The second, the third and the last of those that are registered together."""
     mapper, made, solved = Mapper(CONFIG), [], early_map.EarlyMap.solved
-    for one in features_ahead[1][:2]:
+    _, features = features_ahead
+    for one in features[:number]:
         mapper.register(one)
-    rivals = mapper._start._rivals
-    monkeypatch.setattr(early_map.EarlyMap, "fill", lambda *_: made.append(True))
+    fill = early_map.EarlyMap.fill
 
     def not_in_the_map_that_is_kept(*args):
         return replace(solved(*args), solved=not made)
 
-    monkeypatch.setattr(early_map.EarlyMap, "solved", not_in_the_map_that_is_kept)
-    assert mapper.register(features_ahead[1][2]).status.solved
+    with monkeypatch.context() as patch:
+        patch.setattr(early_map.EarlyMap, "fill", lambda *args: made.append(fill(*args)))
+        patch.setattr(early_map.EarlyMap, "solved", not_in_the_map_that_is_kept)
+        assert mapper.register(features[number]).status.solved
     assert made
-    assert rivals
-    assert mapper._start._rivals is rivals
+    start = mapper._start
+    assert (start is None) == (number == 7)
+    if start is not None:
+        assert len(start._sweeps) == number + 1
+        assert all(len(rival) <= number + 1 for rival in start._rivals)
+        assert start._rivals
+        for one in features[number + 1 :]:
+            assert mapper.register(one).status.solved
+        assert mapper._start is None
 
 
 def test_one_first_motion_leaves_no_doubt():

@@ -150,18 +150,17 @@ class Start:
     ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
         new = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar, bool(frame.priors)
-        sweeps = [*self._sweeps, EarlySweep(*new, frame.predicted.motion, keyframe)]
-        if len(sweeps) not in _TOGETHER and not self._anew:
-            self._sweeps = sweeps
+        added = [*self._sweeps, EarlySweep(*new, frame.predicted.motion, keyframe)]
+        if len(added) not in _TOGETHER and not self._anew:
+            self._sweeps = added
             return frame, found
-        early, before = EarlyMap(frame, solver, self._map_T_first), self._rivals
-        once = len(sweeps) in _ONCE and not before
-        sweeps = early.together(sweeps, 1 if once else 2)
+        early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
+        sweeps = early.together(added, 1 if len(added) in _ONCE and not rivals else 2)
         sweeps = early.with_motion(self._told_apart(early, sweeps))
         solution = early.solved(sweeps[-1], early.matcher(sweeps, len(sweeps) - 1, to_keep=True))
         if not solution.solved:
-            self._rivals = before
             early.fill(self._sweeps)
+            self._sweeps, self._rivals, self._anew = added, rivals, True
             return frame, found
         last, posed = sweeps[-2].moment, sweeps[-1].posed
         sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)

@@ -254,3 +254,24 @@ def test_velocities_known_to_micrometres_beside_kilometres_stay_one_covariance()
             turned = bool(rng.integers(2))
             motion.observe(number * FRAME, moved(0), moved(1), share, raw, turned=turned)
             assert np.isfinite(motion.covariance).all()
+
+
+@pytest.mark.parametrize(("seed", "reached"), [(3, True), (5, False)])
+def test_no_velocity_is_ever_less_known_than_anything_that_moves(seed, reached):
+    """What is blind swings with the yaw: the covariance grew to kilometres a second."""
+    rng, motion = np.random.default_rng(seed), MotionFilter(CONFIG)
+    motion.begin(0)
+    most = 5.0 * np.repeat([CONFIG.start_turn, CONFIG.start_speed], 3)
+    largest = []
+    for number in range(1, 40):
+        turn = rng.uniform(0.0, 2.0 * np.pi)
+        along = np.array([0.0, 0.0, 0.0, np.cos(turn), np.sin(turn), 0.0])
+        across = along + rng.normal(size=6) * [0.0, 0.0, 0.3, 1.0, 1.0, 0.0]
+        share = np.outer(along, across) / (across @ along)
+        raw = np.diag(np.repeat([1e-6, 1e-4], 3))
+        motion.observe(number * FRAME, moved(0), moved(0), share, raw, turned=False)
+        values = np.linalg.eigvalsh(motion.covariance / np.outer(most, most))
+        assert values[0] > 0.0
+        largest.append(values[-1])
+    assert max(largest) <= 1.0 + 1e-9
+    assert (max(largest) > 0.999) == reached

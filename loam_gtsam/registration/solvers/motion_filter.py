@@ -24,6 +24,9 @@ _WHOLLY = 64
 """Power of the share that the expected motion decides, which leaves only what it decides alone: of
 a share of 0.8, beside a user's factor, nothing, and of 0.9997, by noise, nearly all."""
 _UNKNOWN = 1e2  # rad and metres: error of a solved pose along what its scan does not see
+_NO_MORE = 5.0
+"""Standard deviations of the start beyond which no velocity is unknown: 50 m/s and 2.5 rad/s. Where
+what is blind swings from frame to frame, the gain of the one error may add to the other."""
 _LEAST_SHARE = 1e-14  # of the largest variance, to which all are found to some 1e-16
 
 
@@ -68,6 +71,7 @@ class MotionFilter:
     def __init__(self, config: SolverConfig) -> None:
         self._turn, self._acceleration = config.turn_sigma**2, config.acceleration_sigma**2
         start = [config.start_turn**2, config.start_speed**2, self._acceleration]
+        self._most = _NO_MORE * np.repeat([config.start_turn, config.start_speed], 3)
         self._twist = np.zeros(6)
         self._state = np.diag(np.repeat(start, 3))
         # The last solved pose: in the map around it, and in the map before the way was blind.
@@ -150,7 +154,9 @@ class MotionFilter:
             self._correct(gain, stamp, last, now, turned=turned)
         common = gain @ seen @ here.across.T
         both = gain @ here.difference(seen, scan) @ gain.T
-        self._state = symmetric(ahead - common - common.T + both)
+        state = symmetric(ahead - common - common.T + both)
+        less = _lessening(state, self._most)
+        self._state = state if less is None else symmetric(less @ state @ less.T)
         kept = (grown - seconds * gain @ seen @ grown[:6]) @ before
         kept -= gain @ seen @ (to_unit @ self._here.across).T
         left, values, right = np.linalg.svd(_roots(self._state)[1] @ kept)
@@ -161,8 +167,8 @@ class MotionFilter:
             lasting @ (self._here.error + np.diag(seconds**2 * sudden[:6])) @ lasting.T,
             (left * np.minimum(values, 1.0)) @ right,
         )
-        self._here = _Tie(scan, gain @ scan)
-        self._there = there.solved(share, scan, gain)
+        ties = _Tie(scan, gain @ scan), there.solved(share, scan, gain)
+        self._here, self._there = (one if less is None else one.lessened(less) for one in ties)
         self._stamp, self._turned = stamp, turned
         return step
 
@@ -219,6 +225,10 @@ class _Tie:
         error = symmetric(self.error + both + seconds**2 * ahead[:6, :6])
         return _Tie(error, tied + seconds * ahead[:, :6])
 
+    def lessened(self, less: FloatArray) -> _Tie:
+        """The same with a state whose error is made less, by (9, 9)."""
+        return _Tie(self.error, less @ self.across)
+
     def difference(self, seen: FloatArray, scan: FloatArray) -> FloatArray:
         """(6, 6) of the expected pose's to the solved one, of a (6, 6) error ``scan``."""
         spread: FloatArray = seen @ (self.error + scan) @ seen.T
@@ -229,6 +239,20 @@ class _Tie:
         seen = np.eye(6) - share
         across = self.across - gain @ seen @ self.error
         return _Tie(symmetric(share @ self.error @ share.T + scan), across @ share.T + gain @ scan)
+
+
+def _lessening(state: FloatArray, most: FloatArray) -> FloatArray | None:
+    """(9, 9) that brings the velocities of a covariance to within (6,) standard deviations.
+
+    None if they are.
+    """
+    values, vectors = np.linalg.eigh(state[:6, :6] / np.outer(most, most))
+    if values[-1] <= 1.0:
+        return None
+    less = np.eye(9)
+    less[:6, :6] = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T
+    less[:6, :6] *= np.outer(most, 1.0 / most)
+    return less
 
 
 def _roots(covariance: FloatArray) -> tuple[FloatArray, FloatArray]:

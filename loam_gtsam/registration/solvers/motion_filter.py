@@ -156,7 +156,7 @@ class MotionFilter:
         both = gain @ here.difference(seen, scan) @ gain.T
         state = symmetric(ahead - common - common.T + both)
         less = _lessening(state, self._most)
-        self._state = state if less is None else symmetric(less @ state @ less.T)
+        self._state = symmetric(less @ state @ less.T)
         kept = (grown - seconds * gain @ seen @ grown[:6]) @ before
         kept -= gain @ seen @ (to_unit @ self._here.across).T
         left, values, right = np.linalg.svd(_roots(self._state)[1] @ kept)
@@ -167,8 +167,8 @@ class MotionFilter:
             lasting @ (self._here.error + np.diag(seconds**2 * sudden[:6])) @ lasting.T,
             (left * np.minimum(values, 1.0)) @ right,
         )
-        ties = _Tie(scan, gain @ scan), there.solved(share, scan, gain)
-        self._here, self._there = (one if less is None else one.lessened(less) for one in ties)
+        self._here = _Tie(scan, gain @ scan).lessened(less)
+        self._there = there.solved(share, scan, gain).lessened(less)
         self._stamp, self._turned = stamp, turned
         return step
 
@@ -241,17 +241,13 @@ class _Tie:
         return _Tie(symmetric(share @ self.error @ share.T + scan), across @ share.T + gain @ scan)
 
 
-def _lessening(state: FloatArray, most: FloatArray) -> FloatArray | None:
-    """(9, 9) that brings the velocities of a covariance to within (6,) standard deviations.
-
-    None if they are.
-    """
-    values, vectors = np.linalg.eigh(state[:6, :6] / np.outer(most, most))
-    if values[-1] <= 1.0:
-        return None
+def _lessening(state: FloatArray, most: FloatArray) -> FloatArray:
+    """(9, 9) that brings the velocities of a covariance to within (6,) standard deviations."""
     less = np.eye(9)
-    less[:6, :6] = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T
-    less[:6, :6] *= np.outer(most, 1.0 / most)
+    values, vectors = np.linalg.eigh(state[:6, :6] / np.outer(most, most))
+    if values[-1] > 1.0:
+        within = (vectors / np.sqrt(np.maximum(values, 1.0))) @ vectors.T
+        less[:6, :6] = within * np.outer(most, 1.0 / most)
     return less
 
 

@@ -28,7 +28,6 @@ from loam_gtsam.registration.relocalization import (
     same,
     sample_features,
 )
-from loam_gtsam.registration.relocalization.evidence import favour
 from loam_gtsam.registration.relocalization.fits import APART
 from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.start.early_map import EarlyMap
@@ -247,12 +246,9 @@ def _elsewhere(early: EarlyMap, sweeps: list[EarlySweep]) -> list[list[EarlySwee
     within = APART[0] * (len(sweeps) - 1), APART[1]
     places = _likely(first, last, [last.map_T_middle], _ELSEWHERE, within)
     here, *others = _hopeful(early, first, last, places)
-    least, ways = early.config.solver.min_aligned, []
-    for one in others:
-        told = favour([one.evidence], [here.evidence], moving=True)
-        if told.every > -_LESS and told.said > least:
-            ways.append(steady(sweeps, one.moved))
-    return ways
+    least = early.config.solver.min_aligned
+    good = (one for one in others if as_good((one,), (here,), least, _LESS, moving=True))
+    return [steady(sweeps, one.moved) for one in good]
 
 
 def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:

@@ -18,6 +18,8 @@ from loam_gtsam.registration.relocalization.fits import beyond_any_motion, same,
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.types import FloatArray
 
+_HARDLY = 2.0  # standard deviations: one of twenty right ways is worse by chance
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EarlySweep:
@@ -56,8 +58,6 @@ class Tried(NamedTuple):
         """The last sweep, seen from the first one."""
         return self.sweeps[0].map_T_middle.between(self.sweeps[-1].map_T_middle)
 
-
-_HARDLY = 2.0  # standard deviations: one of twenty right ways is worse by chance
 
 Way = tuple[Tried, ...]
 """A first motion and where it led: the sweeps after the first, one after the other."""
@@ -170,15 +170,18 @@ def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -
     return kept
 
 
-def as_good(one: Way, other: Way, least: float) -> bool:
+def as_good(
+    one: Way, other: Way, least: float, less: float = _HARDLY, *, moving: bool = False
+) -> bool:
     """Whether a way to a place that was merely looked for is as good as another one.
 
-    It is if hardly more speaks against it, with all that it contradicts: from a place beside the
-    right one, walls and trees lead halfway there. More than ``least`` features, counted as if they
-    lay across, must tell the two apart at all.
+    It is if hardly more speaks against it, by so many standard deviations ``less``, with all that
+    it contradicts unless that may be ``moving``: from a place beside the right one, walls and trees
+    lead halfway there. More than ``least`` features, counted as if they lay across, must tell the
+    two apart at all.
     """
-    told = _favour(one, other)
-    return told.every > -_HARDLY and told.said > least
+    told = _favour(one, other, moving=moving)
+    return told.every > -less and told.said > least
 
 
 def tell_nothing(one: Way, other: Way, least: float) -> bool:

@@ -25,6 +25,7 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.maps import Localizer, SavedMap, localise, own_settings, save_map
 from loam_gtsam.pipeline import effective_config, run
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import BoolArray, FloatArray, MapUpdate
 
 RIGHT = (0.5, np.radians(3.0))
@@ -47,6 +48,7 @@ class Row:
     starts, right, wrong : first sweeps of the second drive, and the fixes
     sweeps_to_fix, most_sweeps : median and most
     tracked : sweeps that were tracked, from a further start
+    ate_mm : ATE of these, aligned as a whole, as every ATE here is
     rms_mm, aligned_mm : error of the position in the frame of the map; less its mean, in lidar axes
     nees, nees_without : over six freedoms, with and without the map's own error
     elsewhere, elsewhere_fixes : starts in a world of another seed, and fixes, which are all wrong
@@ -60,6 +62,7 @@ class Row:
     sweeps_to_fix: float
     most_sweeps: int
     tracked: int
+    ate_mm: float
     rms_mm: float
     aligned_mm: float
     nees: float
@@ -108,7 +111,7 @@ def measure(
         start = mapped.updates[0].map_T_lidar.matrix() @ inverse_pose(first.world_T_start)
         with SavedMap(path) as saved:
             found = first_fixes(saved, second, start, starts, seed, inside=inside)
-            errors, nees, without = tracked(saved, second, start, inside=inside)
+            ate, errors, nees, without = tracked(saved, second, start, inside=inside)
             there = 0 if inside or world in _ALIKE else max(1, starts // 3)
             elsewhere = first_fixes(saved, other, start, there, seed)
     right = [sweeps for sweeps, is_right in found if is_right]
@@ -117,7 +120,7 @@ def measure(
     return Row(
         world, seed, starts, len(right), len(found) - len(right),
         float(np.median(right)) if right else np.nan, max(right, default=0),
-        len(errors), 1e3 * _rms(positions), 1e3 * _rms(spread),
+        len(errors), 1e3 * ate, 1e3 * _rms(positions), 1e3 * _rms(spread),
         nees, without, there, len(elsewhere),
     )  # fmt: skip
 
@@ -145,10 +148,11 @@ def first_fixes(
 
 def tracked(
     saved: SavedMap, drive: SimulatedWorld, map_T_world: FloatArray, *, inside: bool = False
-) -> tuple[FloatArray, float, float]:
-    """(N, 6) errors of a stretch, and NEES/6 with and without the map's own error."""
+) -> tuple[float, FloatArray, float, float]:
+    """ATE and (N, 6) errors of a stretch, and NEES/6 with and without the map's own error."""
     part = PartOf(drive, len(drive) // 3, 1, None, None)
-    updates = localise(part, saved, max_frames=min(200, len(part)), inside=inside).solved
+    result = localise(part, saved, max_frames=min(200, len(part)), inside=inside)
+    updates = result.solved
     errors = np.array([_error(u, drive, map_T_world) for u in updates]).reshape(-1, 6)
     nees = []
     for update, error in zip(updates, errors, strict=True):
@@ -156,7 +160,8 @@ def tracked(
         both = update.covariance, update.uncertainty.own
         nees.append([error @ np.linalg.solve(covariance, error) / 6.0 for covariance in both])
     with_map, without = np.mean(nees, axis=0).tolist() if nees else (np.nan, np.nan)
-    return errors, with_map, without
+    ate = absolute_error(result.trajectory, drive.truth).rmse if updates else np.nan
+    return ate, errors, with_map, without
 
 
 def with_changes(scene: Scene, share: float, seed: int) -> Scene:

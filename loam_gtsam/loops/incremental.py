@@ -6,7 +6,7 @@ updates. A graph that goes on as if never stopped is therefore built again by th
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gtsam
@@ -28,6 +28,7 @@ class IncrementalGraph:
     Attributes
     ----------
     factors, values : all but loop closures, and the estimates of all variables
+    own : positions in ``factors`` of those that are a user's own
     has_own_factors : whether there may be factors beside those of the odometry
     """
 
@@ -39,6 +40,7 @@ class IncrementalGraph:
         self._isam = _new_isam()
         self._last = -1  # place in iSAM2 of the last one of `factors`
         self._steps: list[_Step] = []
+        self.own: list[int] = []
         self.has_own_factors = False
         self._before: dict[str, Any] | None = None
         self._is_watched = False
@@ -81,7 +83,8 @@ class IncrementalGraph:
     ) -> None:
         """Add factors that are no loop closures, and start values of new variables.
 
-        ``settle`` updates until the estimate stays; a new pose at the end of a chain needs it not.
+        ``settle`` updates until the estimate stays; a new pose at the end of a chain needs it not,
+        factors of a user's own do.
 
         Raises
         ------
@@ -100,6 +103,9 @@ class IncrementalGraph:
         except Exception as error:
             self.restart(before, np.array(self.active, np.bool_))
             raise InputError(f"factor: iSAM2 cannot solve the graph with it: {error}") from error
+        if settle:
+            size = self.factors.size()
+            self.own += range(size, size + factors.size())
         self.factors.push_back(factors)
         self._steps.append(("add", factors, values, settle))
 
@@ -145,14 +151,17 @@ class IncrementalGraph:
         values: gtsam.Values,
         active: BoolArray,
         factors: gtsam.NonlinearFactorGraph | None = None,
+        own: Sequence[int] | None = None,
     ) -> None:
         """Begin anew in iSAM2, from an estimate and with the ``active`` (L,) loop closures.
 
-        ``factors`` are all but loop closures; those that the graph has if None.
+        ``factors`` are all but loop closures, and ``own`` the positions of a user's own; those that
+        the graph has if None.
         """
         self._about_to_change()
         if factors is not None:
             self.factors, self.has_own_factors = factors, True  # which there may be
+        self.own = self.own if own is None else [*own]
         graph = gtsam.NonlinearFactorGraph(self.factors)
         self._slots = [None] * len(self._loops)
         for number in np.flatnonzero(active).tolist():
@@ -165,7 +174,7 @@ class IncrementalGraph:
         # Whatever was done before need not be repeated.
         kept = gtsam.NonlinearFactorGraph(self.factors)
         self._steps = [("add_loop", factor) for factor in self._loops]
-        self._steps.append(("restart", values, active, kept))
+        self._steps.append(("restart", values, active, kept, [*self.own]))
 
     def covariance(self, key: int) -> FloatArray:
         """Marginal covariance of a variable, (6, 6) of a pose."""
@@ -185,6 +194,7 @@ class IncrementalGraph:
                 "_loops": [*self._loops],
                 "_slots": [*self._slots],
                 "_steps": [*self._steps],
+                "own": [*self.own],
             }
             self._before = vars(self) | copies
 

@@ -89,6 +89,11 @@ class FactorGraph:
         """Whether there may be factors beside those of odometry and loop closures."""
         return self._graph.has_own_factors
 
+    @property
+    def own(self) -> Sequence[int]:
+        """Which of the factors of the graph as it is saved :meth:`add_factor` added: positions."""
+        return self._graph.own
+
     def pose(self, index: int) -> gtsam.Pose3:
         """``map_T_lidar`` of a keyframe."""
         return self._graph.values.atPose3(self._key(index))

@@ -233,7 +233,7 @@ class SavedMap:
                 None if up is None else np.array(up, np.float64).reshape(3),
                 None if enu is None else GeoReference.of_dict(enu),
             )
-            sizes = {name: int(header[name]) for name in PARTS}
+            sizes = {name: int(header.get(name, 0)) for name in PARTS}
             shapes = array_shapes(sizes, self.config.loops)
             arrays = {name: self._array(f"{name}.npy", *how) for name, how in shapes.items()}
             self.graph = graph_of_arrays(arrays)

@@ -1,7 +1,6 @@
 """The pose graph of a saved map: its places, the motions between them, and loop closures.
 
-In a file motions and the fixes of GNSS receivers are arrays. Factors of a user's own are not in it;
-what they did to the poses is.
+In a file motions, the fixes of GNSS receivers and a user's own factors are arrays.
 """
 
 from __future__ import annotations
@@ -22,9 +21,10 @@ from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key, pose_num
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import scan_context
+from loam_gtsam.maps.linear_factors import FRAME, LinearFactors
 from loam_gtsam.types import FloatArray, stack_poses
 
-PARTS = "places", "links", "loops", "fixes", "receivers"
+PARTS = "places", "links", "loops", "fixes", "receivers", "own_poses", "own_blocks", "own_rows"
 """What a graph has a number of, by which :func:`array_shapes` knows its arrays."""
 _PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _MOTIONS = "ends", "motions", "covariances"
@@ -45,22 +45,25 @@ class MapGraph:
         covariances; a place that none leads to begins a run
     loops : loop closures that were used
     fixes : those of GNSS receivers that were used, by numbers of places; None if there are none
+    own : a user's own factors; None if there are none
     """
 
     places: Sequence[Place]
     links: Sequence[LoopClosure]
     loops: Sequence[LoopClosure]
     fixes: PlacedFixes | None = None
+    own: LinearFactors | None = None
 
     @property
     def sizes(self) -> dict[str, int]:
         """Numbers of its :data:`PARTS`."""
         fixes = ((), ()) if self.fixes is None else (self.fixes, self.fixes.antennas)
-        every = self.places, self.links, self.loops, *fixes
+        own = ((),) * 3 if self.own is None else (self.own.places, self.own.rows, self.own.right)
+        every = self.places, self.links, self.loops, *fixes, *own
         return dict(zip(PARTS, map(len, every), strict=True))
 
     def saved(self) -> SavedGraph:
-        """As it is written to other files, and optimised: links, then loops; without fixes."""
+        """As it is written to other files, and optimised: links, then loops, and nothing else."""
         factors, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for motion in (*self.links, *self.loops):
             factors.add(motion.factor())
@@ -87,10 +90,13 @@ def graph_of(mapping: LoopMapping, config: Config, fixes: PlacedFixes | None = N
         descriptor = scan_context(seen, config.loops).astype(np.float16)
         places.append(Place(keyframe.stamp, pose.compose(move), covariance, descriptor))
         moves[keyframe.index] = number, move
-    factors = graph.saved().factors
-    links = []
+    factors, own = graph.saved().factors, gtsam.NonlinearFactorGraph()
+    links, added = [], set(graph.own)
     for place in range(factors.size() - len(graph.loops)):
         factor: Any = factors.at(place)
+        if place in added:
+            own.add(factor)
+            continue
         if not isinstance(factor, gtsam.BetweenFactorPose3):
             continue
         (one, two), noise = map(pose_number, factor.keys()), factor.noiseModel()
@@ -102,7 +108,9 @@ def graph_of(mapping: LoopMapping, config: Config, fixes: PlacedFixes | None = N
             links.append(_between_middles(motion, moves))
     active = zip(graph.loops, graph.active, strict=True)
     loops = [_between_middles(loop, moves) for loop, on in active if on]
-    return MapGraph(places, links, loops, None if fixes is None else fixes.seen_from(moves))
+    placed = None if fixes is None else fixes.seen_from(moves)
+    linear = LinearFactors.of(own, graph.values, moves) if own.size() else None
+    return MapGraph(places, links, loops, placed, linear)
 
 
 def _to_middle(keyframe: Keyframe) -> gtsam.Pose3:
@@ -151,6 +159,16 @@ def array_shapes(
             "fixes/antennas": (real, (sizes["receivers"], 3)),
             "fixes/antenna_sigmas": (real, (sizes["receivers"],)),
         }
+    if rows := sizes["own_rows"]:
+        poses, blocks = sizes["own_poses"], sizes["own_blocks"]
+        shapes |= {
+            "own/places": (whole, (poses,)),
+            "own/at": (real, (poses, 4, 4)),
+            "own/rows": (whole, (blocks,)),
+            "own/poses": (whole, (blocks,)),
+            "own/blocks": (real, (blocks, 6)),
+            "own/right": (real, (rows,)),
+        }
     return shapes
 
 
@@ -173,7 +191,9 @@ def graph_arrays(graph: MapGraph, config: LoopConfig) -> dict[str, NDArray[Any]]
         }
     if graph.fixes is not None and len(graph.fixes):
         columns = zip(_FIXES, fields(PlacedFixes), strict=True)
-        arrays |= {f"fixes/{name}": getattr(graph.fixes, own.name) for name, own in columns}
+        arrays |= {f"fixes/{name}": getattr(graph.fixes, one.name) for name, one in columns}
+    if graph.own is not None and len(graph.own.right):
+        arrays |= {f"own/{one.name}": getattr(graph.own, one.name) for one in fields(LinearFactors)}
     return arrays
 
 
@@ -183,8 +203,8 @@ def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
     Raises
     ------
     ValueError
-        If a motion is between places that there are not, or a fix at such a place, or if what a fix
-        has for a covariance is none.
+        If a motion is between places that there are not, or a fix or a factor is on such a place,
+        or if what a fix has for a covariance is none.
     """
     columns = (arrays[f"places/{name}"] for name in _PLACES)
     places = [
@@ -199,11 +219,15 @@ def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
         rows = zip(*ends.T.tolist(), map(gtsam.Pose3, motions), covariances, strict=True)
         found.append([LoopClosure(*row) for row in rows])
     links, loops = found
-    if "fixes/places" not in arrays:
-        return MapGraph(places, links, loops)
+    fixes = _fixes_of_arrays(arrays, len(places)) if "fixes/places" in arrays else None
+    own = _own_of_arrays(arrays, len(places)) if "own/places" in arrays else None
+    return MapGraph(places, links, loops, fixes, own)
+
+
+def _fixes_of_arrays(arrays: Mapping[str, NDArray[Any]], places: int) -> PlacedFixes:
     fixes = PlacedFixes(*(arrays[f"fixes/{name}"] for name in _FIXES))
     for name, numbers, count in (
-        ("places", fixes.poses, len(places)),
+        ("places", fixes.poses, places),
         ("receivers", fixes.receivers, len(fixes.antennas)),
     ):
         if ((numbers < 0) | (numbers >= count)).any():
@@ -211,7 +235,22 @@ def graph_of_arrays(arrays: Mapping[str, NDArray[Any]]) -> MapGraph:
     spreads = np.linalg.eigvalsh(fixes.covariances)
     if not ((spreads > 0.0).all() and (fixes.antenna_sigmas > 0.0).all()):
         raise ValueError("fixes/covariances.npy, antenna_sigmas.npy: expected variances above 0")
-    return MapGraph(places, links, loops, fixes)
+    return fixes
+
+
+def _own_of_arrays(arrays: Mapping[str, NDArray[Any]], places: int) -> LinearFactors:
+    own = LinearFactors(*(arrays[f"own/{one.name}"] for one in fields(LinearFactors)))
+    for name, numbers, first, count in (
+        ("places", own.places, FRAME, places),
+        ("poses", own.poses, 0, len(own.places)),
+    ):
+        if ((numbers < first) | (numbers >= count)).any():
+            raise ValueError(f"own/{name}.npy: expected numbers from {first} to {count - 1}")
+    if not np.array_equal(np.unique(own.rows), np.arange(len(own.right))):
+        raise ValueError(f"own/rows.npy: expected numbers of all {len(own.right)} rows")
+    if (np.diff(own.rows) < 0).any():
+        raise ValueError("own/rows.npy: expected numbers of rows in their order")
+    return own
 
 
 def _matrices(given: Sequence[FloatArray]) -> FloatArray:

@@ -23,6 +23,7 @@ from loam_gtsam.loops.keyframes import LoopClosure, noise_model, pose_key
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.pose_graph import corrected_trajectory
 from loam_gtsam.maps.common_places import CommonPlaces, are_tied, walked
+from loam_gtsam.maps.linear_factors import LinearFactors
 from loam_gtsam.maps.map_file import SavedMap, grids, write_map
 from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory
@@ -249,6 +250,9 @@ class _Whole:
         graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), first.map_T_middle, noise))
         if self._fixes is not None:
             self._add(self._fixes, graph, frames)
+        if (own := self._own(frames)) is not None:
+            graph.factors.push_back(own.factors())
+            graph.poses.insert(own.start())
         most = self._config.pose_graph.max_chi2
         return optimize_graph(graph, max_chi2=most, loops=loops)
 
@@ -282,6 +286,15 @@ class _Whole:
         enu_T_map = gtsam.Pose3(earth.enu_T_map).compose(frames[number].inverse())
         graph.factors.push_back(fixes.factors(self._maps[0].frame.up))
         graph.poses.insert(fixes.start(enu_T_map))
+
+    def _own(self, frames: Mapping[int, gtsam.Pose3]) -> LinearFactors | None:
+        """A user's own factors in all maps, whose frames are about there in that of the first."""
+        found = [
+            own if number == 0 else own.within(frames[number], saved.places, start)
+            for number, (saved, start) in enumerate(zip(self._maps, self._starts, strict=True))
+            if (own := saved.graph.own) is not None
+        ]
+        return LinearFactors.joined(found) if found else None
 
     def fixes_agree(self, solved: OptimizedGraph) -> bool:
         """Whether the fixes, if there are any, are off by no more than their covariances say."""
@@ -340,7 +353,12 @@ class _Whole:
         for tie in ties:
             pair = int(map_of[tie.earlier]), int(map_of[tie.later])
             counts[pair] = counts.get(pair, 0) + 1
-        graph = MapGraph(places, self._links, [*own, *ties], self._fixes)
+        frames = {
+            number: places[start].map_T_middle.compose(self._before[start].map_T_middle.inverse())
+            for number, start in enumerate(self._starts)
+        }
+        added = self._own(frames)
+        graph = MapGraph(places, self._links, [*own, *ties], self._fixes, added)
         earth = None
         if self._fixes is not None:
             origin, enu_T_map = _on_earth(self._maps)[0][1].origin, solved.poses.atPose3(MAP_KEY)

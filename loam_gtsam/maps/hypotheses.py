@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
+from loam_gtsam.loops.keyframes import surely_placed
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.maps.first_fix import Candidate, PlaceSearch, standing_fit
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.registration.association import trial_matching
 from loam_gtsam.registration.odometry import advance
-from loam_gtsam.registration.relocalization import Fit, distinct, same_optimum
-from loam_gtsam.registration.relocalization.fits import AS_WELL
+from loam_gtsam.registration.relocalization import Fit, distinct, same, same_optimum
+from loam_gtsam.registration.relocalization.fits import APART, AS_WELL
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
+_TURNED, _MOVED = slice(3), slice(3, 6)
 SWEEPS = 3
 """Sweeps in a row that must fit before a fix is believed."""
 _HYPOTHESES = 3  # that a search adds at most; twice as many are followed at a time
@@ -73,11 +77,74 @@ class Hypothesis:
         return next((share for least, share in _CLEARLY if agreement >= least), 0.0)
 
 
+class _Motion:
+    """How a lidar moves while it is looked for, by a map of its own of the sweeps since then.
+
+    Where it was tracked before, that map begins with the last of those sweeps. As long as each one
+    fits it, the lidar has moved there from where it was, and a place elsewhere that fits the saved
+    map only looks the same.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        few = trial_matching(config.matching)
+        self._mapper = Mapper(config.changed({"map.archive_megabytes": 0.0}, matching=few))
+        self._map_T_own: gtsam.Pose3 | None = None  # frame of this map in the saved one, if known
+        self._apart = APART  # metres and rad by which that may be wrong
+        self._last, self._way = gtsam.Pose3(), 0.0
+
+    def begin(self, sweeps: Sequence[Features], known: MapUpdate) -> None:
+        """Begin with tracked sweeps, and others after these; ``known`` is the last tracked one."""
+        metres, rad = within(known)
+        self._apart = APART[0] + metres, APART[1] + rad
+        self._map_T_own = gtsam.Pose3()
+        for features in sweeps:
+            own = self.register(features)
+            if features.stamp == known.stamp and self._map_T_own is not None:
+                self._map_T_own = known.map_T_lidar.compose(own.map_T_lidar.inverse())
+        if self._map_T_own is None:
+            self._mapper.reset()
+
+    def register(self, features: Features) -> MapUpdate:
+        """Where the next sweep was taken in this map, which begins anew where it is not found."""
+        moved = self._mapper.register(features)
+        if moved.status is FrameStatus.FIRST:
+            return moved
+        if not moved.status.solved or not self._fits(moved):
+            self._mapper.reset()  # it may be anywhere now
+            moved, self._map_T_own = self._mapper.register(features), None
+        self._way += self._last.range(moved.map_T_lidar)
+        self._last = moved.map_T_lidar
+        if self._way * self._config.loops.gate_drift > APART[0]:
+            self._map_T_own = None
+        return moved
+
+    def _fits(self, moved: MapUpdate) -> bool:
+        """Whether a sweep is for sure where it was found; asked only while that matters."""
+        seen = self._mapper.registered
+        if self._map_T_own is None:
+            return True
+        if surely_placed(moved) is None or seen is None or seen.matches is None:
+            return False
+        offered = _offered(moved, self._config)
+        fit = standing_fit(seen.matches, offered, seen.map_T_middle)
+        return fit.agreement >= self._config.loops.min_agreement
+
+    @property
+    def map_T_lidar(self) -> gtsam.Pose3 | None:
+        """Where the motion has led in the saved map; None if that is not known."""
+        return None if self._map_T_own is None else self._map_T_own.compose(self._last)
+
+    def leads_to(self, pose: gtsam.Pose3) -> bool:
+        """Whether the lidar may be at a pose in the saved map."""
+        expected = self.map_T_lidar
+        return expected is None or same(expected, pose, self._apart)
+
+
 class Hypotheses:
     """All hypotheses about where a lidar is in a saved map.
 
-    How it moves is told by a map of its own, of the sweeps since the search began: a sweep that is
-    not de-skewed fits badly anywhere.
+    A sweep that is not de-skewed fits badly anywhere, so how the lidar moves must be known.
 
     Parameters
     ----------
@@ -88,9 +155,12 @@ class Hypotheses:
 
     def __init__(self, search: PlaceSearch, maps: SavedMaps, config: Config) -> None:
         self._search, self._maps, self._config = search, maps, config
-        few = trial_matching(config.matching)
-        self._motion = Mapper(config.changed({"map.archive_megabytes": 0.0}, matching=few))
+        self._motion = _Motion(config)
         self._held: list[Hypothesis] = []
+
+    def begin(self, sweeps: Sequence[Features], known: MapUpdate) -> None:
+        """Know the last sweeps before the search; the last one that was tracked is ``known``."""
+        self._motion.begin(sweeps, known)
 
     def add(
         self, features: Features, near: gtsam.Pose3 | None = None
@@ -102,9 +172,6 @@ class Hypotheses:
         moved = self._motion.register(features)
         if not moved.status.solved:
             self._held.clear()
-            if moved.status is not FrameStatus.FIRST:  # it may be anywhere now
-                self._motion.reset()
-                self._motion.register(features)
             return None, "how the lidar moves is not known before the next sweep"
         twist = moved.twist
         followed = [held for held in self._held if held.follow(features, twist)]
@@ -114,6 +181,7 @@ class Hypotheses:
             best = max((held.fits[-1] for held in self._held), key=lambda fit: fit.margin)
             return None, f"{len(self._held)} poses are followed; the best: {_told(best)}"
         posed = MovingSweep(features, self._config).at(twist)
+        near = self._motion.map_T_lidar or near
         known = [held.pose for held in standing] + ([] if near is None else [near])
         found = self._search.find(posed, features.reach, known)
         if not found:
@@ -121,6 +189,9 @@ class Hypotheses:
         message = f"the best pose: {_told(found[0].fit)}"
         for held in standing:
             rivals = self._search.rivals(held.pose, found, held.rivals_below())
+            if not (rivals or self._motion.leads_to(held.last.map_T_lidar)):
+                message = "a pose fits to which the motion does not lead, so it only looks the same"
+                continue
             if not rivals:
                 return held.last, ""
             fit = "pose fits" if len(rivals) == 1 else "poses fit"
@@ -138,6 +209,13 @@ class Hypotheses:
                 mapper = Mapper(self._config)
                 mapper.maps = self._maps
                 self._held.append(Hypothesis(posed, features, candidate, mapper))
+
+
+def within(update: MapUpdate) -> tuple[float, float]:
+    """Three standard deviations of a pose, in the worst direction: metres and rad."""
+    worst = [np.linalg.eigvalsh(update.covariance[part, part])[-1] for part in (_MOVED, _TURNED)]
+    metres, rad = (3.0 * np.sqrt(worst)).tolist()
+    return metres, rad
 
 
 def _told(fit: Fit) -> str:

@@ -26,13 +26,14 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
-from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, within
 from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.registration.relocalization import RELOCALISED, same
+from loam_gtsam.registration.relocalization.fits import APART
 from loam_gtsam.types import (
     BadSweep,
     Features,
@@ -46,6 +47,8 @@ from loam_gtsam.types import (
     Trajectory,
 )
 
+_LONGEST = 50
+"""Sweeps without a sure pose until it is forgotten how the lidar came there."""
 _BEYOND = 1  # cubes that are read on each side of those around the sensor
 _AROUND = 10.0
 """Metres around a pose in which the earliest place tells the map's error: voxels keep the points
@@ -111,6 +114,7 @@ class Localizer:
         self._last: MapUpdate | None = None  # that was solved
         self._seen: MapUpdate | None = None  # the last of some that saw all directions
         self._unsolved = self._sure = 0  # sweeps in a row, and those that saw all directions
+        self._recent: list[tuple[Features, MapUpdate]] = []  # tracked since it was surely known
         self.fixes = 0
 
     def _new_search(self) -> Hypotheses:
@@ -141,16 +145,20 @@ class Localizer:
         """
         if isinstance(sweep, Scan) and extraction is None:
             extraction = extract(sweep, self.config, self._parts.get("features"))
+        features = sweep.features if isinstance(sweep, FeatureSweep) else None
+        if extraction is not None:
+            features = extraction.features
         if self._hypotheses is None:
             update = self._tracking.process(sweep, extraction)
             if not self._given_up(update):
+                if features is not None:
+                    self._remember(features, update)
                 if self._extend:
                     self._add_places()
                 return self._told(update)
             self._hypotheses = self._new_search()
-        features = sweep.features if isinstance(sweep, FeatureSweep) else None
-        if extraction is not None:
-            features = extraction.features
+            if sure := [update for _, update in self._recent if _is_sure(update)]:
+                self._hypotheses.begin([one for one, _ in self._recent], sure[-1])
         if features is None:
             problem = sweep.message if isinstance(sweep, BadSweep) else ""
             problem = problem if extraction is None else extraction.problem
@@ -162,9 +170,10 @@ class Localizer:
         return self._begin(features, fix)
 
     def _given_up(self, update: MapUpdate) -> bool:
-        """Whether tracking has ended: nothing fits, or only a place where no motion leads.
+        """Whether tracking has ended: nothing fits, or another place may be the right one.
 
-        Another place of the map may look the same as that one, so the whole map has to be asked.
+        No motion has led to this one, or the scans before it had left so much open that others were
+        within reach. One of these may look the same, so the whole map has to be asked.
         """
         self._unsolved = 0 if update.status.solved else self._unsolved + 1
         patience = self.config.relocalization.memory
@@ -172,7 +181,18 @@ class Localizer:
             last, seconds = self._last, (update.stamp - self._last.stamp) * 1e-9
             if not same(advance(last.map_T_lidar, last.twist, seconds), update.map_T_lidar):
                 return True
+        is_again_seen = update.status is FrameStatus.OK and not self._extend
+        if is_again_seen and self._last is not None and not _is_alone(self._last):
+            return True
         return update.status is FrameStatus.LOST or self._unsolved >= patience
+
+    def _remember(self, features: Features, update: MapUpdate) -> None:
+        """Keep the last sweeps whose poses are sure, and those after them."""
+        self._recent.append((features, update))
+        sure = [number for number, (_, one) in enumerate(self._recent) if _is_sure(one)]
+        del self._recent[: sure[-SWEEPS] if len(sure) >= SWEEPS else 0]
+        if len(self._recent) > _LONGEST:
+            self._recent.clear()
 
     def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:
         """Track from a fix on."""
@@ -181,7 +201,7 @@ class Localizer:
         self._tracking.reset()
         self._tracking.mapper.maps = self._maps
         self._tracking.mapper.register(features, fix.map_T_lidar, fix.twist)
-        self._hypotheses = None
+        self._hypotheses, self._recent = None, [(features, fix)]
         self._unsolved, self._sure, self._seen = 0, 0, None
         self.fixes += 1
         again = "" if self.fixes == 1 else " again"
@@ -244,6 +264,16 @@ class Localizer:
         near = self._tree.query_ball_point(position, _AROUND)
         number = min(near) if near else int(self._tree.query(position)[1])
         return self._saved.places[number].covariance
+
+
+def _is_alone(update: MapUpdate) -> bool:
+    """Whether no other place is within three standard deviations of a solved pose."""
+    return all(told < apart for told, apart in zip(within(update), APART, strict=True))
+
+
+def _is_sure(update: MapUpdate) -> bool:
+    """Whether a scan has seen all directions, and no other place is meant."""
+    return update.status is FrameStatus.OK and _is_alone(update)
 
 
 def own_settings(saved: SavedMap) -> Config:

@@ -77,7 +77,7 @@ class Hypothesis:
         return next((share for least, share in _CLEARLY if agreement >= least), 0.0)
 
 
-class _Motion:
+class Motion:
     """How a lidar moves while it is looked for, by a map of its own of the sweeps since then.
 
     Where it was tracked before, that map begins with the last of those sweeps. As long as each one
@@ -155,7 +155,7 @@ class Hypotheses:
 
     def __init__(self, search: PlaceSearch, maps: SavedMaps, config: Config) -> None:
         self._search, self._maps, self._config = search, maps, config
-        self._motion = _Motion(config)
+        self._motion = Motion(config)
         self._held: list[Hypothesis] = []
 
     def begin(self, sweeps: Sequence[Features], known: MapUpdate) -> None:

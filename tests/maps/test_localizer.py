@@ -21,7 +21,7 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.workers import extract
 from loam_gtsam.geometry import inverse_pose, transform
 from loam_gtsam.maps.first_fix import Candidate, PlaceSearch
-from loam_gtsam.maps.hypotheses import SWEEPS, Hypothesis
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypothesis, Motion
 from loam_gtsam.maps.localizer import Localizer, localise
 from loam_gtsam.maps.map_file import LAYERS, MapFrame, SavedMap, save_map, write_map
 from loam_gtsam.maps.map_graph import MapGraph
@@ -131,6 +131,60 @@ def test_a_lidar_that_is_carried_into_the_map_while_it_is_looked_for_is_found(ma
     assert after[-1].status is FrameStatus.OK
     off = errors(mapped, drive, [replace(after[-1], stamp=sweeps[-1].stamp)])
     assert np.linalg.norm(off[0][3:]) < NEAR
+
+
+@pytest.mark.parametrize(
+    ("sigma", "carried", "reach"), [(0.01, 0, 1.0), (1.0, 0, 4.0), (0.01, 15, None)]
+)
+def test_a_place_to_which_no_motion_leads_only_looks_the_same(mapped, saved, sigma, carried, reach):
+    """As long as the sweeps fit each other; within three standard deviations more than 1.5 m."""
+    drive = other_drive(mapped)
+    sweeps = [extract(drive.sweep(n), saved.config).features for n in range(14, 18)]
+    known = MapUpdate(
+        sweeps[2].stamp, gtsam.Pose3(gtsam.Rot3.Yaw(1.0), np.array([30.0, 5.0, 0.0])),
+        FrameStatus.OK, covariance=sigma**2 * np.diag([0, 0, 0, 1.0, 1.0, 1.0]),
+    )  # fmt: skip
+    motion = Motion(saved.config)
+    motion.begin(sweeps, known)
+    features = extract(drive.sweep(18 - carried), saved.config).features
+    motion.register(replace(features, stamp=sweeps[-1].stamp + 100_000_000))
+    true = [gtsam.Pose3(drive.truth.map_T_lidar[n]) for n in (16, 18)]
+    here = known.map_T_lidar.compose(true[0].between(true[1]))
+    assert motion.leads_to(here)
+    for metres in (1.0, 4.0, 5.0):
+        aside = here.compose(gtsam.Pose3(gtsam.Rot3(), np.array([metres, 0.0, 0.0])))
+        assert motion.leads_to(aside) == (reach is None or metres <= reach)
+    assert (motion.map_T_lidar is None) == (reach is None)
+    assert reach is None or motion.map_T_lidar.equals(here, NEAR)
+
+
+def test_that_motion_is_known_for_as_long_as_it_drifts_by_less_than_places_are_apart(mapped, saved):
+    """75 metres, if it drifts by 2 %."""
+    features = [extract(mapped.world.sweep(n), saved.config).features for n in range(14, 18)]
+    known = MapUpdate(features[0].stamp, gtsam.Pose3(), FrameStatus.OK, covariance=np.eye(6) * 1e-4)
+    for share in (0.02, 20.0):
+        motion = Motion(saved.config.changed({"loops.gate_drift": share}))
+        motion.begin(features, known)
+        assert (motion.map_T_lidar is None) == (share > 1.0)  # of 0.2 m
+
+
+@pytest.mark.parametrize(
+    ("sigma", "status", "extend", "asked"),
+    [
+        (0.4, FrameStatus.OK, False, False),
+        (0.6, FrameStatus.OK, False, True),
+        (0.6, FrameStatus.DEGENERATE, False, False),
+        (0.6, FrameStatus.OK, True, False),  # new ground has led there
+    ],
+)
+def test_the_whole_map_is_asked_where_a_pose_was_open_by_more_than_places_are_apart(
+    saved, sigma, status, extend, asked
+):
+    localizer = Localizer(saved, extend=extend)
+    spread = np.diag([1e-6, 1e-6, 1e-6, 1e-4, 1e-4, sigma**2])
+    localizer._last = MapUpdate(0, gtsam.Pose3(), FrameStatus.DEGENERATE, covariance=spread)
+    now = MapUpdate(100_000_000, gtsam.Pose3(), status, covariance=1e-4 * np.eye(6))
+    assert localizer._given_up(now) == asked
 
 
 def test_sweeps_that_cannot_be_used_cost_no_fix_and_a_reset_forgets(mapped, saved):

@@ -139,9 +139,9 @@ def _refined(
     found = refine_runs(points, updates, ways, graph=graph, starts=merged.starts)
     seconds = time.perf_counter() - started
     error = absolute_error(_joined([one.trajectory for one in found]), world.truth).rmse
-    began, last = ways[0], found[-1].trajectory
-    true = world.truth_at(np.append(began.stamps[:1], last.stamps)).map_T_lidar
-    there = began.map_T_lidar[0] @ inverse_pose(true[0]) @ true[1:]
+    last, held = found[-1].trajectory, found[0].refined  # the middle of the first sweep is exact
+    true = world.truth_at(np.append(held.sweeps[0].stamp, last.stamps)).map_T_lidar
+    there = held.path.map_T_middle[0] @ inverse_pose(true[0]) @ true[1:]
     squared = []
     for pose, right, covariance in zip(last.map_T_lidar, there, found[-1].covariances, strict=True):
         off = gtsam.Pose3.Logmap(gtsam.Pose3(right).between(gtsam.Pose3(pose)))

@@ -114,7 +114,8 @@ class Localizer:
         self._last: MapUpdate | None = None  # that was solved
         self._seen: MapUpdate | None = None  # the last of some that saw all directions
         self._unsolved = self._sure = 0  # sweeps in a row, and those that saw all directions
-        self._recent: list[tuple[Features, MapUpdate]] = []  # tracked since it was surely known
+        # Sweeps that were tracked since the pose was sure, with the result for each where it was.
+        self._recent: list[tuple[Features, MapUpdate | None]] = []
         self.fixes = 0
 
     def _new_search(self) -> Hypotheses:
@@ -157,8 +158,8 @@ class Localizer:
                     self._add_places()
                 return self._told(update)
             self._hypotheses = self._new_search()
-            if sure := [update for _, update in self._recent if _is_sure(update)]:
-                self._hypotheses.begin([one for one, _ in self._recent], sure[-1])
+            if sure := [one for _, one in self._recent if one is not None]:
+                self._hypotheses.begin([swept for swept, _ in self._recent], sure[-1])
         if features is None:
             problem = sweep.message if isinstance(sweep, BadSweep) else ""
             problem = problem if extraction is None else extraction.problem
@@ -188,8 +189,8 @@ class Localizer:
 
     def _remember(self, features: Features, update: MapUpdate) -> None:
         """Keep the last sweeps whose poses are sure, and those after them."""
-        self._recent.append((features, update))
-        sure = [number for number, (_, one) in enumerate(self._recent) if _is_sure(one)]
+        self._recent.append((features, update if _is_sure(update) else None))
+        sure = [number for number, (_, one) in enumerate(self._recent) if one is not None]
         del self._recent[: sure[-SWEEPS] if len(sure) >= SWEEPS else 0]
         if len(self._recent) > _LONGEST:
             self._recent.clear()

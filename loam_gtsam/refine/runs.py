@@ -149,7 +149,7 @@ class RefinedRun:
 
     @property
     def covariances(self) -> FloatArray:
-        """(N, 6, 6) of the poses, the first one of the first run being exact.
+        """(N, 6, 6) of the poses, that of the middle of the very first sweep being exact.
 
         From the first sweep on of which the run did not see all directions they are those of the
         run, on top of that of its first pose, or NaN if it has none: where nothing tells, planes

@@ -95,7 +95,7 @@ class Motion:
 
     def begin(self, sweeps: Sequence[Features], known: MapUpdate) -> None:
         """Begin with tracked sweeps, and others after these; ``known`` is the last tracked one."""
-        metres, rad = within(known)
+        metres, rad = three_sigma(known)
         self._apart = APART[0] + metres, APART[1] + rad
         self._map_T_own = gtsam.Pose3()
         for features in sweeps:
@@ -211,7 +211,7 @@ class Hypotheses:
                 self._held.append(Hypothesis(posed, features, candidate, mapper))
 
 
-def within(update: MapUpdate) -> tuple[float, float]:
+def three_sigma(update: MapUpdate) -> tuple[float, float]:
     """Three standard deviations of a pose, in the worst direction: metres and rad."""
     worst = [np.linalg.eigvalsh(update.covariance[part, part])[-1] for part in (_MOVED, _TURNED)]
     metres, rad = (3.0 * np.sqrt(worst)).tolist()

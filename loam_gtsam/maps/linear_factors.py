@@ -2,7 +2,7 @@
 
 GTSAM cannot write every factor, and nothing that is read from a map may run code. Near the poses
 with which a run has ended a factor is its linearisation, and that is numbers, whatever the factor
-was. Variables of a user's own are eliminated.
+was.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ from itertools import groupby, pairwise
 
 import gtsam
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.geometry import symmetric
@@ -22,27 +20,29 @@ from loam_gtsam.loops.keyframes import is_pose_key, noise_model, pose_key, pose_
 from loam_gtsam.loops.places import Place
 from loam_gtsam.types import FloatArray, IntArray, stack_poses
 
-FRAME = -1
-"""What stands for the frame of a map where places have numbers."""
-_FRAME_KEY: int = gtsam.symbol("f", 0)
+FRAME, NUMBER = -1, -2
+"""What stands for the frame of a map, and for a number, where places have numbers."""
+_KEYS: dict[int, int] = {FRAME: gtsam.symbol("f", 0), NUMBER: gtsam.symbol("n", 0)}
 
 _Part = tuple[Sequence[int], FloatArray, FloatArray]
-"""A factor: numbers of its V poses, blocks (R, V, 6), right side (R,)."""
+"""A factor: numbers of its V variables, blocks (R, V, 6), right side (R,)."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearFactors:
-    """Factors ``sum_v A_v Logmap(at_v^-1 x_v) - b`` on poses ``x_v``, with a sigma of 1 each row.
+    """Rows ``sum_v A_v e_v = b``, each with a standard deviation of 1.
 
-    The poses are those of places, and the frames of maps that were merged into this one: what a
-    factor says in the frame of its run is true there, wherever that frame is found to be.
+    ``e_v`` is ``Logmap(at_v^-1 x_v)`` of a pose ``x_v``, or a number, of which the block ``A_v``
+    has one column. The poses are those of places, and the frames of maps that were merged into this
+    one: what a factor says in the frame of its run is true there, wherever that frame is found to
+    be. Numbers are the tangent directions of a user's own variables.
 
     Attributes
     ----------
-    places : (V,) number of the place of each pose; -1 is the frame of a map
-    at : (V, 4, 4) the poses for which the factors were made
-    rows, poses : (B,) numbers of the row and of the pose of each block, one row after the other;
-        rows on the same poses that follow one another are one factor
+    places : (V,) number of the place of each variable; -1 is the frame of a map, -2 a number
+    at : (V, 4, 4) the poses for which the rows were made
+    rows, variables : (B,) numbers of the row and of the variable of each block, one row after the
+        other; rows on the same variables that follow one another are one factor
     blocks : (B, 6) the blocks ``A_v``, rotation first
     right : (R,) right sides ``b``
     """
@@ -50,7 +50,7 @@ class LinearFactors:
     places: IntArray
     at: FloatArray
     rows: IntArray
-    poses: IntArray
+    variables: IntArray
     blocks: FloatArray
     right: FloatArray
 
@@ -68,24 +68,28 @@ class LinearFactors:
         moves : by the number of a keyframe: number of its place, and the pose of the place, seen
             from the keyframe
         """
-        found = [_linear(group, values, moves) for group in _groups(factors)]
-        keyframes = sorted({keyframe for used, _, _ in found for keyframe in used})
-        pose = {keyframe: number for number, keyframe in enumerate(keyframes)}
-        parts: list[_Part] = [
-            ([pose[keyframe] for keyframe in used], blocks, right) for used, blocks, right in found
-        ]
-        return cls._of_parts(
-            [moves[keyframe][0] for keyframe in keyframes],
-            [values.atPose3(pose_key(k)).compose(moves[k][1]) for k in keyframes],
-            parts,
-        )
+        sizes, variables = values.zeroVectors(), _Variables(values, moves)
+        parts: list[_Part] = []
+        for position in range(factors.size()):
+            factor, alone = factors.at(position), gtsam.NonlinearFactorGraph()
+            alone.add(factor)
+            keys, ordering = list(factor.keys()), gtsam.Ordering()
+            for key in keys:
+                ordering.push_back(key)
+            matrix, right = alone.linearize(values).jacobian(ordering)
+            ends = np.cumsum([len(sizes.at(key)) for key in keys])[:-1]
+            columns = zip(keys, np.split(matrix, ends, axis=1), strict=True)
+            found = [one for key, block in columns for one in variables.of(key, block)]
+            blocks = np.stack([block for _, block in found], axis=1)
+            parts.append(([number for number, _ in found], blocks, right))
+        return cls._of_parts(variables.places, variables.at, parts)
 
     @classmethod
     def _of_parts(
         cls, places: Sequence[int], at: Sequence[gtsam.Pose3], parts: Sequence[_Part]
     ) -> LinearFactors:
-        widths = [len(poses) for poses, _, right in parts for _ in right]
-        numbers = [number for poses, _, right in parts for _ in right for number in poses]
+        widths = [len(variables) for variables, _, right in parts for _ in right]
+        numbers = [n for variables, _, right in parts for _ in right for n in variables]
         return cls(
             np.array(places, np.int64),
             stack_poses(at),
@@ -97,7 +101,7 @@ class LinearFactors:
 
     def _parts(self) -> Iterator[_Part]:
         starts = np.searchsorted(self.rows, np.arange(len(self.right) + 1)).tolist()
-        of_row = [self.poses[start:end].tolist() for start, end in pairwise(starts)]
+        of_row = [self.variables[start:end].tolist() for start, end in pairwise(starts)]
         for numbers, group in groupby(range(len(of_row)), key=of_row.__getitem__):
             rows = list(group)
             blocks = self.blocks[starts[rows[0]] : starts[rows[-1] + 1]]
@@ -107,23 +111,26 @@ class LinearFactors:
         return [gtsam.Pose3(pose) for pose in self.at]
 
     def factors(self) -> gtsam.NonlinearFactorGraph:
-        """As factors of GTSAM, on poses of places, and on those of :meth:`start`."""
+        """As factors of GTSAM, on poses of places, and on the variables of :meth:`start`."""
         graph, at = gtsam.NonlinearFactorGraph(), self._at()
         for numbers, blocks, right in self._parts():
-            graph.add(_factor([self._key(n) for n in numbers], [at[n] for n in numbers],
-                              blocks.swapaxes(0, 1), right))  # fmt: skip
+            keys = [self._key(number) for number in numbers]
+            poses = [None if self.places[n] == NUMBER else at[n] for n in numbers]
+            graph.add(_factor(keys, poses, blocks.swapaxes(0, 1), right))
         return graph
 
     def start(self) -> gtsam.Values:
-        """Where the frames begin."""
+        """Where the frames and the numbers begin."""
         values = gtsam.Values()
         for number in np.flatnonzero(self.places == FRAME).tolist():
             values.insert(self._key(number), gtsam.Pose3(self.at[number]))
+        for number in np.flatnonzero(self.places == NUMBER).tolist():
+            values.insert(self._key(number), np.zeros(1))
         return values
 
-    def _key(self, pose: int) -> int:
-        place = int(self.places[pose])
-        return _FRAME_KEY + pose if place == FRAME else pose_key(place)
+    def _key(self, variable: int) -> int:
+        place = int(self.places[variable])
+        return pose_key(place) if place >= 0 else _KEYS[place] + variable
 
     def within(
         self, whole_T_map: gtsam.Pose3, places: Sequence[Place], first: int
@@ -142,8 +149,9 @@ class LinearFactors:
             if (self.places[numbers] == FRAME).any():  # of a map that this one was merged from
                 parts.append((numbers, blocks, right))
                 continue
+            on_poses = self.places[numbers] >= 0
             to_frame = np.stack([at[number].inverse().AdjointMap() for number in numbers])
-            turned = -np.einsum("rvi,vij->rj", blocks, to_frame)
+            turned = -np.einsum("rvi,vij->rj", blocks[:, on_poses], to_frame[on_poses])
             parts.append(([*numbers, frame], np.concatenate([blocks, turned[:, None]], 1), right))
         # The frame is where its run began.
         begin = places[0].map_T_middle
@@ -153,8 +161,8 @@ class LinearFactors:
         tie = np.stack([whiten, -whiten @ here], axis=1)
         parts.append(([frame + 1, frame], tie, np.zeros(6)))
         moved = [whole_T_map.compose(pose) for pose in (*at, gtsam.Pose3(), begin)]
-        numbers = np.where(self.places == FRAME, FRAME, self.places + first).tolist()
-        return self._of_parts([*numbers, FRAME, first], moved, parts)
+        numbered = np.where(self.places >= 0, self.places + first, self.places).tolist()
+        return self._of_parts([*numbered, FRAME, first], moved, parts)
 
     @classmethod
     def joined(cls, several: Sequence[LinearFactors]) -> LinearFactors:
@@ -171,59 +179,48 @@ class LinearFactors:
         return cls._of_parts(places, at, parts)
 
 
-def _groups(factors: gtsam.NonlinearFactorGraph) -> Iterator[gtsam.NonlinearFactorGraph]:
-    """The factors, together if they share a variable of a user's own."""
-    count, links = factors.size(), []
-    others: dict[int, int] = {}
-    for number in range(count):
-        keys: list[int] = factors.at(number).keys()
-        links += [(number, others.setdefault(key, count + len(others)))
-                  for key in keys if not is_pose_key(key)]  # fmt: skip
-    ends, size = np.array(links, np.int64).reshape(-1, 2).T, count + len(others)
-    graph = coo_array((np.ones(ends.shape[1]), tuple(ends)), shape=(size, size))
-    label = connected_components(graph, directed=False)[1][:count]
-    for group in dict.fromkeys(label.tolist()):
-        together = gtsam.NonlinearFactorGraph()
-        for number in np.flatnonzero(label == group).tolist():
-            together.add(factors.at(number))
-        yield together
+class _Variables:
+    """Variables of linear factors, numbered as they come."""
 
+    def __init__(self, values: gtsam.Values, moves: Mapping[int, tuple[int, gtsam.Pose3]]) -> None:
+        self._values, self._moves = values, moves
+        self._first: dict[int, int] = {}  # number of the first variable of each key
+        self.places: list[int] = []
+        self.at: list[gtsam.Pose3] = []
 
-def _linear(
-    group: gtsam.NonlinearFactorGraph, values: gtsam.Values,
-    moves: Mapping[int, tuple[int, gtsam.Pose3]],
-) -> _Part:  # fmt: skip
-    """Factors as one on places; its poses are given by the numbers of their keyframes."""
-    linear = group.linearize(values)
-    keys = list(linear.keys())
-    used = sorted(pose_number(key) for key in keys if is_pose_key(key))
-    ordering = gtsam.Ordering()
-    for key in [*(key for key in keys if not is_pose_key(key)), *map(pose_key, used)]:
-        ordering.push_back(key)
-    matrix, right = linear.jacobian(ordering)
-    own = matrix.shape[1] - 6 * len(used)
-    if own:  # rows in which the variables of a user's own do not appear
-        rest = np.linalg.qr(matrix[:, :own], mode="complete")[0][:, own:].T
-        matrix, right = rest @ matrix[:, own:], rest @ right
-    if len(right) > 6 * len(used):  # as many as there are freedoms say the same
-        turned, matrix = np.linalg.qr(matrix)
-        right = turned.T @ right
-    blocks = matrix.reshape(len(right), len(used), 6)
-    to_keyframe = np.stack([moves[keyframe][1].AdjointMap() for keyframe in used])
-    return used, np.einsum("rvi,vij->rvj", blocks, to_keyframe), right
+    def of(self, key: int, block: FloatArray) -> list[tuple[int, FloatArray]]:
+        """Numbers and blocks (R, 6) of a variable of the graph with the block (R, d)."""
+        move = self._moves[pose_number(key)] if is_pose_key(key) else None
+        is_new = self._first.setdefault(key, len(self.places)) == len(self.places)
+        if is_new and move is None:
+            self.places += [NUMBER] * block.shape[1]
+            self.at += [gtsam.Pose3()] * block.shape[1]
+        elif is_new and move is not None:
+            self.places.append(move[0])
+            self.at.append(self._values.atPose3(key).compose(move[1]))
+        first = self._first[key]
+        if move is not None:
+            return [(first, block @ move[1].AdjointMap())]
+        padding = [(0, 0), (0, 5)]
+        columns = np.split(block, block.shape[1], axis=1)
+        return [(first + n, np.pad(column, padding)) for n, column in enumerate(columns)]
 
 
 def _factor(
-    keys: Sequence[int], at: Sequence[gtsam.Pose3], blocks: FloatArray, right: FloatArray
+    keys: Sequence[int], at: Sequence[gtsam.Pose3 | None], blocks: FloatArray, right: FloatArray
 ) -> gtsam.CustomFactor:
-    """A factor on poses, from its blocks (V, R, 6)."""
+    """A factor from its blocks (V, R, 6): on poses near ``at``, on a number where that is None."""
 
     def residual(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
-        steps = [pose.between(values.atPose3(key)) for key, pose in zip(keys, at, strict=True)]
-        error = -right
-        for block, step in zip(blocks, steps, strict=True):
-            error = error + block @ gtsam.Pose3.Logmap(step)
-        columns = [gtsam.Pose3.LogmapDerivative(step) for step in steps]
-        return error, [block @ column for block, column in zip(blocks, columns, strict=True)]
+        error, jacobians = -right, []
+        for key, pose, block in zip(keys, at, blocks, strict=True):
+            if pose is None:
+                jacobians.append(block[:, :1])
+                error = error + block[:, :1] @ values.atVector(key)
+            else:
+                step = pose.between(values.atPose3(key))
+                jacobians.append(block @ gtsam.Pose3.LogmapDerivative(step))
+                error = error + block @ gtsam.Pose3.Logmap(step)
+        return error, jacobians
 
     return checked_factor(gtsam.noiseModel.Unit.Create(len(right)), keys, residual)

@@ -26,7 +26,7 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
-from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, within
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, three_sigma
 from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
@@ -269,7 +269,7 @@ class Localizer:
 
 def _is_alone(update: MapUpdate) -> bool:
     """Whether no other place is within three standard deviations of a solved pose."""
-    return all(told < apart for told, apart in zip(within(update), APART, strict=True))
+    return all(told < apart for told, apart in zip(three_sigma(update), APART, strict=True))
 
 
 def _is_sure(update: MapUpdate) -> bool:

@@ -21,10 +21,10 @@ from loam_gtsam.loops.keyframes import Keyframe, LoopClosure, pose_key, pose_num
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.scan_context import scan_context
-from loam_gtsam.maps.linear_factors import FRAME, LinearFactors
+from loam_gtsam.maps.linear_factors import NUMBER, LinearFactors
 from loam_gtsam.types import FloatArray, stack_poses
 
-PARTS = "places", "links", "loops", "fixes", "receivers", "own_poses", "own_blocks", "own_rows"
+PARTS = "places", "links", "loops", "fixes", "receivers", "own_variables", "own_blocks", "own_rows"
 """What a graph has a number of, by which :func:`array_shapes` knows its arrays."""
 _PLACES = "stamps", "map_T_middle", "covariances", "descriptors"
 _MOTIONS = "ends", "motions", "covariances"
@@ -160,12 +160,12 @@ def array_shapes(
             "fixes/antenna_sigmas": (real, (sizes["receivers"],)),
         }
     if rows := sizes["own_rows"]:
-        poses, blocks = sizes["own_poses"], sizes["own_blocks"]
+        variables, blocks = sizes["own_variables"], sizes["own_blocks"]
         shapes |= {
-            "own/places": (whole, (poses,)),
-            "own/at": (real, (poses, 4, 4)),
+            "own/places": (whole, (variables,)),
+            "own/at": (real, (variables, 4, 4)),
             "own/rows": (whole, (blocks,)),
-            "own/poses": (whole, (blocks,)),
+            "own/variables": (whole, (blocks,)),
             "own/blocks": (real, (blocks, 6)),
             "own/right": (real, (rows,)),
         }
@@ -241,8 +241,8 @@ def _fixes_of_arrays(arrays: Mapping[str, NDArray[Any]], places: int) -> PlacedF
 def _own_of_arrays(arrays: Mapping[str, NDArray[Any]], places: int) -> LinearFactors:
     own = LinearFactors(*(arrays[f"own/{one.name}"] for one in fields(LinearFactors)))
     for name, numbers, first, count in (
-        ("places", own.places, FRAME, places),
-        ("poses", own.poses, 0, len(own.places)),
+        ("places", own.places, NUMBER, places),
+        ("variables", own.variables, 0, len(own.places)),
     ):
         if ((numbers < first) | (numbers >= count)).any():
             raise ValueError(f"own/{name}.npy: expected numbers from {first} to {count - 1}")

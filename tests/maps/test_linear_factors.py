@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,7 +18,7 @@ from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.loops.batch import optimize_graph
-from loam_gtsam.loops.keyframes import noise_model, pose_key
+from loam_gtsam.loops.keyframes import is_pose, noise_model, pose_key
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.maps.linear_factors import LinearFactors
 from loam_gtsam.maps.localizer import Localizer
@@ -128,22 +127,32 @@ def test_the_jacobians_are_those_of_the_factors(driven: Driven) -> None:
     for number, place in enumerate(driven.saved.places):
         values.insert(pose_key(number), MOVED.compose(place.map_T_middle))
     for size in (1e-3, 0.5):
-        away = gtsam.Values(values)
-        for key in values.keys():  # noqa: SIM118
-            away.update(key, values.atPose3(key).retract(size * rng.normal(size=6)))
+        away = moved(values, {key: size * rng.normal(size=6) for key in values.keys()})  # noqa: SIM118
         for number in range(factors.size()):
             _check_jacobian(factors.at(number), away)
 
 
-def _check_jacobian(factor: Any, values: gtsam.Values) -> None:
-    def error(key: int, pose: gtsam.Pose3) -> FloatArray:
-        there = gtsam.Values(values)
-        there.update(key, pose)
-        return np.asarray(factor.unwhitenedError(there))
+def moved(values: gtsam.Values, steps: dict[int, FloatArray]) -> gtsam.Values:
+    """Poses, and numbers, changed by steps, of which a number takes the first entry."""
+    there = gtsam.Values(values)
+    for key, step in steps.items():
+        if is_pose(values, key):
+            there.update(key, values.atPose3(key).retract(step))
+        else:
+            there.update(key, values.atVector(key) + step[:1])
+    return there
 
-    keys, matrix = list(factor.keys()), factor.linearize(values).jacobian()[0]
-    for key, block in zip(keys, np.split(matrix, len(keys), axis=1), strict=True):
-        expected = numerical(partial(error, key), values.atPose3(key))
+
+def _check_jacobian(factor: Any, values: gtsam.Values) -> None:
+    matrix = factor.linearize(values).jacobian()[0]
+    for key in factor.keys():  # noqa: SIM118
+        width = 6 if is_pose(values, key) else 1
+        block, matrix = matrix[:, :width], matrix[:, width:]
+
+        def error(step: FloatArray, key: int = key) -> FloatArray:
+            return np.asarray(factor.unwhitenedError(moved(values, {key: step})))
+
+        expected = numerical(error)[:, :width]
         np.testing.assert_allclose(block, expected, atol=1e-4 * (1.0 + np.abs(block).max()))
 
 
@@ -152,16 +161,17 @@ def test_what_is_said_in_the_frame_of_a_map_is_true_wherever_that_frame_is(drive
     assert own is not None
     first = 7
     held = own.within(MOVED, places, first)
-    values = gtsam.Values()
+    values = own.start()
     for number, place in enumerate(places):
         values.insert(pose_key(number), place.map_T_middle.retract(np.full(6, 0.01 * number)))
     said = own.factors().error(values)
     assert said > 100.0
     beside = MOVED.retract(np.array([0.01, 0.02, -0.01, 0.2, 0.1, -0.1]))
     for frame, almost in ((MOVED, 1e-6), (beside, 0.05)):  # to first order of the difference
-        there = gtsam.Values()
-        for key in held.start().keys():  # noqa: SIM118
-            there.insert(key, frame)
+        there = held.start()
+        for key in there.keys():  # noqa: SIM118
+            if is_pose(there, key):
+                there.update(key, frame)
         for number in range(len(places)):
             pose = values.atPose3(pose_key(number))
             there.insert(pose_key(number + first), frame.compose(pose))
@@ -173,12 +183,14 @@ def test_factors_of_several_maps_are_joined(driven: Driven) -> None:
     assert own is not None
     both = LinearFactors.joined([own, own.within(MOVED, driven.saved.places, 100)])
     assert both.factors().size() == 2 * own.factors().size() + 1  # the frame is tied
-    assert both.start().size() == 1
+    assert both.start().size() == 1 + 2 * 3  # and the point of each map
     again = both.within(MOVED, driven.saved.places, 0)
-    assert again.start().size() == 2  # what has a frame keeps it
+    assert again.start().size() == 2 + 2 * 3  # what has a frame keeps it
 
 
-@pytest.mark.parametrize(("name", "wrong"), [("places", 99), ("poses", -1), ("rows", 0)])
+@pytest.mark.parametrize(
+    ("name", "wrong"), [("places", 99), ("places", -3), ("variables", -1), ("rows", 0)]
+)
 def test_factors_on_what_is_not_there_are_refused(driven: Driven, name: str, wrong: int) -> None:
     arrays = graph_arrays(driven.saved, Config().loops)
     arrays[f"own/{name}"] = np.full_like(arrays[f"own/{name}"], wrong)

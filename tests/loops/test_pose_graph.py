@@ -301,6 +301,7 @@ def play(events):
 def assert_same(one, two):
     """To the last bit."""
     assert one.active == two.active
+    assert one.own == two.own != []
     np.testing.assert_array_equal(one.poses(), two.poses())
     np.testing.assert_array_equal(one.covariance(len(one) - 1), two.covariance(len(two) - 1))
     np.testing.assert_array_equal(one.estimate(L(0)), two.estimate(L(0)))

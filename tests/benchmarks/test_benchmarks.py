@@ -17,6 +17,7 @@ import pytest
 from benchmarks import __main__ as tool
 from benchmarks import (
     cases,
+    drawn,
     growth,
     history,
     loops,
@@ -61,7 +62,7 @@ class InProcess:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
-    for module in (growth, refining, refining_growth, robustness, soak, worlds, loops):
+    for module in (drawn, growth, refining, refining_growth, robustness, soak, worlds, loops):
         if hasattr(module, "ProcessPoolExecutor"):
             monkeypatch.setattr(module, "ProcessPoolExecutor", InProcess)
     return monkeypatch
@@ -360,3 +361,17 @@ def test_tilts_are_those_of_made_up_poses() -> None:
     yawed = gtsam.Pose3(gtsam.Rot3.Yaw(0.5), np.zeros(3)).matrix()
     assert np.degrees(worlds.tilts(yawed @ truth, truth)) == pytest.approx(0.0, abs=1e-9)
     assert np.degrees(worlds.tilts(truth @ pitched, truth)) == pytest.approx(3.0)
+
+
+def test_a_drawn_run_tells_what_is_wrong_with_it(tmp_path: Path, here: pytest.MonkeyPatch) -> None:
+    """An exception is in the row of its seed, and in the exit code."""
+    command = ["--first", "1", "--seeds", "1", "--frames", "12", "--output", str(tmp_path)]
+    assert drawn.main(command) == 0
+    here.setattr(drawn, "run", lambda *_, **__: 1 / 0)
+    assert drawn.main(command) == 1
+    (row,) = table(tmp_path / "drawn.csv")
+    assert "division by zero" in row["problem"]
+    covariance = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, -1e-3])
+    told = MapUpdate(0, gtsam.Pose3(), FrameStatus.OK, covariance=covariance)
+    judged = drawn._judged([told], SimulatedWorld("room", frames=1, columns=60), np.eye(4))
+    assert (judged.solved, judged.ok, judged.bad) == (1, 0, 1)

@@ -51,8 +51,8 @@ _LONGEST = 50
 """Sweeps without a sure pose until it is forgotten how the lidar came there."""
 _BEYOND = 1  # cubes that are read on each side of those around the sensor
 _AROUND = 10.0
-"""Metres around a pose in which the earliest place tells the map's error: voxels keep the points
-that were first in them, and a later visit was registered to these."""
+"""Metres around a pose in which the first visit tells the map's error, by its nearest place: voxels
+keep the points that were first in them, and a later visit was registered to these."""
 
 
 class Localizer:
@@ -262,9 +262,12 @@ class Localizer:
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6, 6) of the saved map's own error at a pose, along its axes, about its origin."""
         position = map_T_lidar.translation()
-        near = self._tree.query_ball_point(position, _AROUND)
-        number = min(near) if near else int(self._tree.query(position)[1])
-        return self._saved.places[number].covariance
+        near = np.sort(self._tree.query_ball_point(position, _AROUND))
+        if not len(near):
+            return self._saved.places[int(self._tree.query(position)[1])].covariance
+        visit = near[near - np.arange(len(near)) == near[0]]
+        away = np.linalg.norm(self._tree.data[visit] - position, axis=1)
+        return self._saved.places[int(visit[away.argmin()])].covariance
 
 
 def _is_alone(update: MapUpdate) -> bool:

@@ -241,12 +241,20 @@ def test_what_a_hypothesis_has_drifted_until_the_fix_does_not_count(mapped, save
     np.testing.assert_allclose(told.covariance, update.uncertainty.own + of_map, atol=1e-12)
 
 
-def test_the_maps_error_is_that_of_the_first_visit_near_by(saved):
-    localizer = Localizer(saved)
-    first, last = saved.places[0], saved.places[-1]
-    assert first.map_T_middle.range(last.map_T_middle) < 10.0
-    found = localizer.map_covariance(last.map_T_middle)
-    np.testing.assert_array_equal(found, first.covariance)
+@pytest.mark.parametrize(("x", "number"), [(4.6, 1), (0.0, 0), (9.0, 2), (12.0, 2), (40.0, 3)])
+def test_the_maps_error_is_that_of_the_first_visit_near_by(saved, x, number):
+    """By its nearest place: 0, 4 and 8 m, then far away, then back beside the first ones."""
+
+    def at(metres: float) -> gtsam.Pose3:
+        return gtsam.Pose3(gtsam.Rot3(), np.array([metres, 0.0, 0.0]))
+
+    places = [
+        replace(saved.places[0], map_T_middle=at(metres), covariance=n * np.eye(6))
+        for n, metres in enumerate([0.0, 4.0, 8.0, 50.0, 9.5, 4.5])
+    ]
+    saved.graph = replace(saved.graph, places=places)
+    found = Localizer(saved).map_covariance(at(x))
+    np.testing.assert_array_equal(found, number * np.eye(6))
 
 
 class Held:

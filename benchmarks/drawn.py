@@ -21,10 +21,9 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import gtsam
 import numpy as np
 
-from benchmarks.localisation import with_changes
+from benchmarks.localisation import error_in_map, with_changes
 from benchmarks.tables import write_rows
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import PartOf
@@ -246,9 +245,7 @@ def _judged(
     good = [u for u in solved if u.status is FrameStatus.OK and _is_positive(u.covariance)]
     beyond = 0
     for update in good:
-        stamp = np.array([update.stamp], np.int64)
-        true = map_T_world @ world.world_T_start @ world.truth_at(stamp).map_T_lidar[0]
-        error = update.map_T_lidar.localCoordinates(gtsam.Pose3(true))
+        error = error_in_map(update, world, map_T_world)
         beyond += error @ np.linalg.solve(update.covariance, error) > FIVE_SIGMA
     bad = sum(not _is_positive(update.covariance) for update in solved)
     return _Judged(len(solved), len(good), int(beyond), bad)

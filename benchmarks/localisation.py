@@ -138,7 +138,7 @@ def first_fixes(
         for number in range(start, start + SWEEPS):
             update = localizer.process(drive.sweep(number))
             if update.status.solved:
-                error = _error(update, drive, map_T_world)
+                error = error_in_map(update, drive, map_T_world)
                 right = np.linalg.norm(error[3:]) < RIGHT[0]
                 right &= np.linalg.norm(error[:3]) < RIGHT[1]
                 fixes.append((number - start + 1, bool(right)))
@@ -153,7 +153,7 @@ def tracked(
     part = PartOf(drive, len(drive) // 3, 1, None, None)
     result = localise(part, saved, max_frames=min(200, len(part)), inside=inside)
     updates = result.solved
-    errors = np.array([_error(u, drive, map_T_world) for u in updates]).reshape(-1, 6)
+    errors = np.array([error_in_map(u, drive, map_T_world) for u in updates]).reshape(-1, 6)
     nees = []
     for update, error in zip(updates, errors, strict=True):
         assert update.uncertainty is not None
@@ -185,7 +185,7 @@ def with_changes(scene: Scene, share: float, seed: int) -> Scene:
     return replace(scene, solids=changed)
 
 
-def _error(update: MapUpdate, drive: SimulatedWorld, map_T_world: FloatArray) -> FloatArray:
+def error_in_map(update: MapUpdate, drive: SimulatedWorld, map_T_world: FloatArray) -> FloatArray:
     """(6,) tangent from the pose to the true one, in the frame of the map."""
     stamp = np.array([update.stamp], np.int64)
     true = map_T_world @ drive.world_T_start @ drive.truth_at(stamp).map_T_lidar[0]

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from loam_gtsam.config import Config
-from loam_gtsam.geometry import nearest_positive
-from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe, surely_placed
+from loam_gtsam.geometry import nearest_positive, symmetric
+from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe, noise_model, surely_placed
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.mapper import Registered
 from loam_gtsam.registration.pose_errors import relative_covariance
@@ -37,6 +37,12 @@ class Place:
     map_T_middle: gtsam.Pose3
     covariance: FloatArray
     descriptor: Descriptor
+
+    @property
+    def noise(self) -> gtsam.noiseModel.Gaussian:
+        """The map's error as that of the pose, along its own axes."""
+        here = self.map_T_middle.inverse().AdjointMap()
+        return noise_model(symmetric(here @ self.covariance @ here.T))
 
 
 class Places:

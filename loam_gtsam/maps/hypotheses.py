@@ -189,13 +189,13 @@ class Hypotheses:
         message = f"the best pose: {_told(found[0].fit)}"
         for held in standing:
             rivals = self._search.rivals(held.pose, found, held.rivals_below())
-            if not (rivals or self._motion.leads_to(held.last.map_T_lidar)):
-                message = "a pose fits to which the motion does not lead, so it only looks the same"
-                continue
-            if not rivals:
+            if rivals:
+                fit = "pose fits" if len(rivals) == 1 else "poses fit"
+                message = f"{len(rivals)} other {fit} the map nearly as well as the best"
+            elif self._motion.leads_to(held.last.map_T_lidar):
                 return held.last, ""
-            fit = "pose fits" if len(rivals) == 1 else "poses fit"
-            message = f"{len(rivals)} other {fit} the map nearly as well as the best"
+            else:
+                message = "a pose fits to which the motion does not lead, so it only looks the same"
         self._held = [h for h in self._held if not self._search.refuted(h.pose, found)]
         self._begin(posed, features, found)
         return None, message

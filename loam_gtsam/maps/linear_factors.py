@@ -15,8 +15,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.factors import checked_factor
-from loam_gtsam.geometry import symmetric
-from loam_gtsam.loops.keyframes import is_pose_key, noise_model, pose_key, pose_number
+from loam_gtsam.loops.keyframes import is_pose_key, pose_key, pose_number
 from loam_gtsam.loops.places import Place
 from loam_gtsam.types import FloatArray, IntArray, stack_poses
 
@@ -156,8 +155,7 @@ class LinearFactors:
         # The frame is where its run began.
         begin = places[0].map_T_middle
         here = begin.inverse().AdjointMap()
-        noise = noise_model(symmetric(here @ places[0].covariance @ here.T))
-        whiten = noise.R()
+        whiten = places[0].noise.R()
         tie = np.stack([whiten, -whiten @ here], axis=1)
         parts.append(([frame + 1, frame], tie, np.zeros(6)))
         moved = [whole_T_map.compose(pose) for pose in (*at, gtsam.Pose3(), begin)]

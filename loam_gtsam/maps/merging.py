@@ -19,7 +19,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
 from loam_gtsam.geometry import symmetric, transform_each
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
-from loam_gtsam.loops.keyframes import LoopClosure, noise_model, pose_key
+from loam_gtsam.loops.keyframes import LoopClosure, pose_key
 from loam_gtsam.loops.places import Place
 from loam_gtsam.loops.pose_graph import corrected_trajectory
 from loam_gtsam.maps.common_places import CommonPlaces, are_tied, walked
@@ -245,9 +245,7 @@ class _Whole:
         graph = MapGraph(places, links, [*self._loops, *ties]).saved()
         loops = range(len(links), graph.factors.size())
         first = places[0]
-        to_place = first.map_T_middle.inverse().AdjointMap()
-        noise = noise_model(symmetric(to_place @ first.covariance @ to_place.T))
-        graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), first.map_T_middle, noise))
+        graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), first.map_T_middle, first.noise))
         if self._fixes is not None:
             self._add(self._fixes, graph, frames)
         if (own := self._own(frames)) is not None:
@@ -357,8 +355,7 @@ class _Whole:
             number: places[start].map_T_middle.compose(self._before[start].map_T_middle.inverse())
             for number, start in enumerate(self._starts)
         }
-        added = self._own(frames)
-        graph = MapGraph(places, self._links, [*own, *ties], self._fixes, added)
+        graph = MapGraph(places, self._links, [*own, *ties], self._fixes, self._own(frames))
         earth = None
         if self._fixes is not None:
             origin, enu_T_map = _on_earth(self._maps)[0][1].origin, solved.poses.atPose3(MAP_KEY)

@@ -12,7 +12,7 @@ from loam_gtsam.refine.runs import refine_run, run_points
 world = SimulatedWorld("room", frames=25, columns=900)
 result = run(world, Config().changed("imu.coupling=off"))
 
-# The whole run: all planes of the map adjusted together with all poses.
+# The whole run: all planes and lines of the map adjusted together with all poses.
 points = run_points(world, result.updates, result.config, most=1500)
 refined = refine_run(points, result.updates)
 before, after = (map_quality(*refined.held_out(refined=on)) for on in (False, True))
@@ -25,16 +25,18 @@ print("motion from frame 5 to 15, standard deviations (rad, m):", np.round(sigma
 
 # A graph of your own: planes of one sweep (the target), seen in another, both poses free.
 TARGET, SOURCE = gtsam.symbol("x", 0), gtsam.symbol("x", 1)
-planes, path = refined.refined.planes, refined.refined.path
+landmarks, path = refined.refined.landmarks, refined.refined.path
+planes, sweep = ~landmarks.is_line, points.used[15]
 first, second = (gtsam.Pose3(path.map_T_middle[n]) for n in (5, 15))
-seen = path.deskewed(15, points.used[15])
+seen = path.deskewed(15, sweep)[sweep.edges :]  # those on surfaces
 in_map = second.transformFrom(seen.T).T
-nearest = np.linalg.norm(in_map[:, None] - planes.centres, axis=2).argmin(axis=1)
-normals = planes.axes[nearest, :, 0]
-on_it = np.abs(np.einsum("ni,ni->n", normals, in_map - planes.centres[nearest])) < 0.05
+centres = landmarks.centres[planes]
+nearest = np.linalg.norm(in_map[:, None] - centres, axis=2).argmin(axis=1)
+normals = landmarks.axes[planes][nearest, :, 0]
+on_it = np.abs(np.einsum("ni,ni->n", normals, in_map - centres[nearest])) < 0.05
 to_first = first.rotation().matrix()
 target_normals = normals[on_it] @ to_first
-centres = first.transformTo(planes.centres[nearest][on_it].T).T
+centres = first.transformTo(centres[nearest][on_it].T).T
 offsets = -np.einsum("ni,ni->n", target_normals, centres)
 ones = np.ones(len(offsets))
 rows = plane_rows(seen[on_it], target_normals, offsets, ones, 0.03)

@@ -182,10 +182,10 @@ def convert(options: ConvertOptions) -> int:
     return convert_map(options)
 
 
-@app.command(short_help="Adjust planes and poses of a finished run.")
+@app.command(short_help="Adjust map and poses of a finished run.")
 @command
 def refine(options: RefineOptions) -> int:
-    """Adjust all planes of the map of a finished run together with its poses.
+    """Adjust all planes and lines of the map of a finished run together with its poses.
 
     PATH is the data set that was run: it is read once more. Trajectory, covariances, map, report
     and a cross-section go to RUN/refined.

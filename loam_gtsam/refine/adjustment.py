@@ -1,4 +1,4 @@
-"""The adjustment: planes of the map and poses of the sweeps together.
+"""The adjustment: planes and lines of the map and poses of the sweeps together.
 
 Sweeps are de-skewed along the adjusted path, anew in each round
 (:mod:`loam_gtsam.refine.rounds`). A long drive is adjusted in windows, and then as a whole
@@ -17,8 +17,9 @@ from scipy.sparse import csc_array
 
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.geometry import as_array, symmetric
-from loam_gtsam.refine.elimination import Sightings, about_planes, transformed_moments
+from loam_gtsam.refine.elimination import Sightings, about_landmarks, transformed_moments
 from loam_gtsam.refine.fixes import FixTies
+from loam_gtsam.refine.landmarks import Landmarks
 from loam_gtsam.refine.rounds import (
     OtherFactors,
     Round,
@@ -28,10 +29,9 @@ from loam_gtsam.refine.rounds import (
     equations,
     factorised,
 )
-from loam_gtsam.refine.surfaces import Planes
-from loam_gtsam.refine.sweeps import Path, SweepPoints, stacked
+from loam_gtsam.refine.sweeps import Path, Stack, SweepPoints, stacked
 from loam_gtsam.refine.windows import in_windows
-from loam_gtsam.types import FloatArray, InputError, IntArray, Trajectory
+from loam_gtsam.types import FloatArray, InputError, Trajectory
 
 _TOGETHER = 20
 """Poses of which covariances are found in one solve."""
@@ -39,21 +39,21 @@ _TOGETHER = 20
 
 @dataclass(frozen=True, eq=False)
 class Refined:
-    """Adjusted poses and planes.
+    """Adjusted poses, planes and lines.
 
     Attributes
     ----------
     path : poses of the middles of the sweeps, and the motion about them
-    planes : of the last round
+    landmarks : planes and lines of the last round
     sightings : which sweep saw which of them
-    information : (6 N, 6 N) of the poses, planes eliminated, other factors included
+    information : (6 N, 6 N) of the poses, landmarks eliminated, other factors included
     rounds : what each round did
     fixes : those of a GNSS receiver that took part
     """
 
     path: Path
     sweeps: Sequence[SweepPoints]
-    planes: Planes
+    landmarks: Landmarks
     sightings: Sightings
     information: csc_array
     rounds: tuple[Round, ...] = field(default=())
@@ -131,17 +131,20 @@ class Refined:
         both = np.hstack([-motion.AdjointMap(), np.eye(6)])
         return symmetric(both @ joint @ both.T)
 
-    def plane_covariances(self) -> FloatArray:
-        """(L, 3) variances of the planes, poses given: turns about both axes (rad^2), offset."""
-        seen, planes = self.sightings, self.planes
-        information = np.zeros((len(planes), 3))
-        relative = about_planes(self.path.map_T_middle, planes, seen)
-        moments = transformed_moments(relative, planes, seen)
-        for column in range(2):
-            axis = planes.axes[:, :, 1 + column]
-            information[:, column] = np.einsum("ni,nij,nj->n", axis, moments[:, :3, :3], axis)
-        information[:, 2] = moments[:, 3, 3]
-        return 1.0 / np.maximum(information, 1e-300)
+    def landmark_covariances(self) -> FloatArray:
+        """(L, 3) variances of the planes and lines, poses given.
+
+        Turns of a normal towards the second and the third axis, rad^2, and offset along it, m^2.
+        Both normals of a line have the same, and a line no turn towards the second axis: 0.
+        """
+        seen, landmarks = self.sightings, self.landmarks
+        relative = about_landmarks(self.path.map_T_middle, landmarks, seen)
+        moments = transformed_moments(relative, landmarks, seen)
+        across = landmarks.axes[:, :, 1:]
+        turns = np.einsum("nik,nij,njk->nk", across, moments[:, :3, :3], across)
+        found: FloatArray = 1.0 / np.maximum(np.column_stack([turns, moments[:, 3, 3]]), 1e-300)
+        found[landmarks.is_line, 0] = 0.0
+        return found
 
 
 def refine(
@@ -157,17 +160,17 @@ def refine(
     on_round: Callable[[Round], None] | None = None,
     on_window: Callable[[int, int], None] | None = None,
 ) -> Refined:
-    """Adjust the poses of sweeps so that the planes that they see become thin.
+    """Adjust the poses of sweeps so that the planes and lines that they see become thin.
 
     Parameters
     ----------
     sweeps : in the order of their stamps, run after run
-    map_T_middle : (N, 4, 4) poses of the middles of the sweeps, where the search starts: planes
-        that sweeps see farther apart than about ``settings.sigma`` tie nothing
+    map_T_middle : (N, 4, 4) poses of the middles of the sweeps, where the search starts: what
+        sweeps see farther apart than about ``settings.sigma`` ties nothing
     factors : further factors on the poses, whose keys are ``gtsam.symbol("x", n)``: odometry,
         loops, positions. The first pose is held if no factor is on one pose alone.
-    keep : (N, 6, 6) projectors of the poses onto the directions about which the planes are asked,
-        all if None; those that drown in noise are left out anyway
+    keep : (N, 6, 6) projectors of the poses onto the directions about which planes and lines are
+        asked, all if None; those that drown in noise are left out anyway
         (:func:`~loam_gtsam.refine.elimination.seen_directions`)
     for_covariances : factors that stand for ``factors`` in the covariances, if those are less
         sure than they are given weight
@@ -179,8 +182,8 @@ def refine(
     Raises
     ------
     InputError
-        If no plane is seen by three sweeps, some sweep is tied to no other, or a direction of the
-        poses is free.
+        If no plane or line is seen by three sweeps, some sweep is tied to no other, or a direction
+        of the poses is free.
     """
     settings = settings or Settings()
     poses = as_array(map_T_middle, "map_T_middle", (len(sweeps), 4, 4)).copy()
@@ -193,12 +196,12 @@ def refine(
     if keep is not None:
         asked = as_array(keep, "keep", (len(sweeps), 6, 6))
 
-    def points_at(poses: FloatArray) -> tuple[FloatArray, IntArray]:
+    def points_at(poses: FloatArray) -> Stack:
         return stacked(Path.through(stamps, poses, starts), sweeps)
 
     views = 3
     if len(sweeps) > settings.whole:
-        views = 2  # of stretches, each of which saw a plane from many places
+        views = 2  # of stretches, each of which saw it from many places
         windows = in_windows(sweeps, poses, others, asked, settings, starts, on_window)
         poses, points_at = windows.map_T_middle, windows.points_at
         known = (*windows.ties, *known)
@@ -207,8 +210,8 @@ def refine(
     poses = found.map_T_middle
     if for_covariances is not None:
         others = OtherFactors(for_covariances, poses, known=known)
-    information, _ = equations(poses, found.planes, found.seen, found.clear, others)
+    information, _ = equations(poses, found.landmarks, found.seen, found.clear, others)
     factorised(information)
     path = Path.through(stamps, poses, starts)
-    parts = found.planes, found.seen, information, found.rounds, fixes
+    parts = found.landmarks, found.seen, information, found.rounds, fixes
     return Refined(path, tuple(sweeps), *parts)

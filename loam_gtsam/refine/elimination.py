@@ -1,9 +1,9 @@
-"""Planes eliminated from the normal equations of all poses.
+"""Planes and lines eliminated from the normal equations of all poses.
 
 With ``q = [p, 1]`` a point as seen from its sweep, ``T`` the pose of the sweep and
 ``pi = [n, d]`` a plane, a residual is ``pi^T T q``: linear in ``q``. All points that a sweep has on
 a plane therefore count by the 4 x 4 sum of ``w q q^T`` alone, however many they are, at every
-pose and for every plane. Equations: docs/maths/refine.md.
+pose and for every plane. A line is where two planes meet. Equations: docs/maths/refine.md.
 """
 
 from __future__ import annotations
@@ -15,11 +15,13 @@ import gtsam
 import numpy as np
 from scipy.sparse import bsr_array, csc_array, csr_array
 
-from loam_gtsam.refine.surfaces import Planes, weighted_moments
+from loam_gtsam.refine.landmarks import Landmarks, weighted_moments
 from loam_gtsam.types import FloatArray, IntArray
 
 _CHUNK = 200
 """Planes that are eliminated together, by one product of matrices."""
+_LEAST_VIEWS = 4
+"""Sightings of a line, of which the two halves are held against each other."""
 _RIDGE = 1e-9
 """Share of its own information by which each freedom of a plane is held where it is."""
 _NOISE = 0.5
@@ -31,25 +33,27 @@ that of chi-squared, times what the kernel takes from the mean of normal residua
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sightings:
-    """What each sweep saw of each plane: M pairs, as sums over their points.
+    """What each sweep saw of each plane and line: M pairs, as sums over their points.
 
     Attributes
     ----------
-    sweeps, planes : (M,) numbers of both
-    moments : (M, 4, 4) sums of ``w q q^T`` over variance, 1 / m^2, in the frame of the sweep, about
-        the plane's scatter and what the points of a pair have in common
-    counts : (M,) sums of the weights
-    shared : metres, standard deviation of the error that all points of a pair have in common
+    sweeps, landmarks : (M,) numbers of both
+    moments : (M, 4, 4) sums of ``w q q^T`` over variance, 1 / m^2, in the frame of the sweep
+    shared : metres, standard deviation of the error that all points have in common which a sweep
+        has on a plane
+    shared_on_lines : metres, the same on a line
+    lasting : metres, of the error that the sightings of a line have in common
     """
 
     sweeps: IntArray
-    planes: IntArray
+    landmarks: IntArray
     moments: FloatArray
-    counts: FloatArray
     shared: float
+    shared_on_lines: float
+    lasting: float
 
 
-def sightings(points: FloatArray, sweeps: IntArray, planes: Planes) -> Sightings:
+def sightings(points: FloatArray, sweeps: IntArray, landmarks: Landmarks) -> Sightings:
     """Compress points to pairs, and find what the points of a pair have in common.
 
     A surface is not the plane it is taken for, and the motion within a sweep not what it is thought
@@ -58,31 +62,65 @@ def sightings(points: FloatArray, sweeps: IntArray, planes: Planes) -> Sightings
     not explain, found from the median over all pairs, a pair of n points of scatter ``c`` has the
     information ``1 / (s^2 + c^2 / n)`` in place of ``n / c^2``.
 
+    An edge, as that of a step, may be taken to be too near for as long as it is seen from one side.
+    So with ``l^2`` the variance that halves of the sightings of a line have beyond that, each of m
+    sightings has another ``m l^2``.
+
     Parameters
     ----------
     points : (N, 3) metres, as seen from the middle of each sweep
     sweeps : (N,) numbers of the sweeps
     """
-    mine, seen = points[planes.rows], sweeps[planes.rows]
+    mine, seen = points[landmarks.rows], sweeps[landmarks.rows]
     size = int(sweeps.max(initial=0)) + 1
-    keys, pair = np.unique(planes.labels * size + seen, return_inverse=True)
-    of_plane, of_sweep = keys // size, keys % size
-    counts = np.bincount(pair, planes.weights, minlength=len(keys)).astype(np.float64)
-    sums = np.bincount(pair, planes.weights * planes.residuals, minlength=len(keys))
-    variances = planes.scatters[of_plane] ** 2
-    means = sums / np.maximum(counts, 1e-9)
-    shared = _common_variance(means, variances / np.maximum(counts, 1e-9))
-    by = planes.weights / variances[pair] / (1.0 + counts * shared / variances)[pair]
-    moments = weighted_moments(mine, by, pair, len(keys))
-    return Sightings(of_sweep, of_plane, moments, counts, float(np.sqrt(shared)))
+    keys, pair = np.unique(landmarks.labels * size + seen, return_inverse=True)
+    of_landmark, of_sweep = keys // size, keys % size
+    weights = landmarks.weights
+    counts = np.maximum(np.bincount(pair, weights, minlength=len(keys)), 1e-9)
+    sums = [
+        np.bincount(pair, weights * away, minlength=len(keys)) for away in landmarks.residuals.T
+    ]
+    means = np.stack(sums, axis=1) / counts[:, None]
+    variances = landmarks.scatters[of_landmark] ** 2 / counts
+    on_line = landmarks.is_line[of_landmark]
+    shared = _common_variance(means[~on_line, :1], variances[~on_line])
+    on_lines = _common_variance(means[on_line], variances[on_line])
+    variances += np.where(on_line, on_lines, shared)
+    lasting = _lasting_variance(means[on_line], variances[on_line], of_landmark[on_line])
+    variances += lasting * np.bincount(of_landmark, minlength=len(landmarks))[of_landmark] * on_line
+    moments = weighted_moments(mine, weights / (counts * variances)[pair], pair, len(keys))
+    told = (float(np.sqrt(one)) for one in (shared, on_lines, lasting))
+    return Sightings(of_sweep, of_landmark, moments, *told)
+
+
+def _lasting_variance(means: FloatArray, variances: FloatArray, lines: IntArray) -> float:
+    """Variance l^2 of the mean of half the sightings of a line, beyond that by chance.
+
+    Parameters
+    ----------
+    means, variances : (M, 2) and (M,) of the sightings along each normal
+    lines : (M,) of which line, ascending; the sightings of a line are in the order of the sweeps
+    """
+    _, line, views = np.unique(lines, return_inverse=True, return_counts=True)
+    place = np.arange(len(lines)) - (np.cumsum(views) - views)[line]
+    half, count = 2 * line + (2 * place >= views[line]), 2 * len(views)
+    sums = [np.bincount(half, some / variances, minlength=count) for some in (1.0, *means.T)]
+    enough = views >= _LEAST_VIEWS
+    information, *both = (column.reshape(-1, 2)[enough] for column in sums)
+    halves = np.stack(both) / information
+    apart = halves[..., 1] - halves[..., 0]
+    return 0.5 * _common_variance(apart.T, (1.0 / information).sum(axis=1))
 
 
 def _common_variance(means: FloatArray, expected: FloatArray) -> float:
-    """Variance s^2 for which the median of ``means^2 / (s^2 + expected)`` is that of chance."""
+    """Variance s^2 for which the median of ``means^2 / (s^2 + expected)`` is that of chance.
+
+    The means are (M, K), along K normals each, and the expected variances (M,).
+    """
     squared = means**2
 
     def excess(common: float) -> float:
-        return float(np.median(squared / (common + expected))) - _MEDIAN
+        return float(np.median(squared / (common + expected)[:, None])) - _MEDIAN
 
     if not len(means) or excess(0.0) <= 0.0:
         return 0.0
@@ -108,10 +146,10 @@ class Reduced:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class PlaneTies:
-    """What planes that were eliminated tell of the poses that saw them.
+class LandmarkTies:
+    """What planes and lines that were eliminated tell of the poses that saw them.
 
-    It is known about poses at which the planes were found, up to a motion of all together: a
+    It is known about poses at which these were found, up to a motion of all together: a
     quadratic form of where the others are, seen from one of them.
 
     Attributes
@@ -141,7 +179,7 @@ class PlaneTies:
         return np.concatenate(moved)
 
     def cost(self, poses: FloatArray) -> float:
-        """Cost at poses (N, 4, 4) of all sweeps, above that where the planes were found."""
+        """Cost at poses (N, 4, 4) of all sweeps, above that where the landmarks were found."""
         moved = self._moved(poses)
         return float((self.gradient + 0.5 * self.hessian @ moved) @ moved)
 
@@ -150,30 +188,70 @@ class PlaneTies:
         return self.hessian, self.gradient + self.hessian @ self._moved(poses)
 
 
-def refitted(map_T_middle: FloatArray, planes: Planes, seen: Sightings) -> tuple[Planes, float]:
-    """Each plane where it fits the poses best, the weights kept, and the cost.
+def refitted(
+    map_T_middle: FloatArray, landmarks: Landmarks, seen: Sightings
+) -> tuple[Landmarks, float]:
+    """Each plane and line where it fits the poses best, the weights kept, and the cost.
 
     The cost is half the squared, whitened residuals: a function of the poses alone.
     """
-    relative = about_planes(map_T_middle, planes, seen)
-    total = transformed_moments(relative, planes, seen)
+    relative = about_landmarks(map_T_middle, landmarks, seen)
+    total = transformed_moments(relative, landmarks, seen)
     weight = np.maximum(total[:, 3, 3], 1e-300)
     means = total[:, :3, 3] / weight[:, None]
     spread = total[:, :3, :3] - weight[:, None, None] * means[:, :, None] * means[:, None, :]
     values, axes = np.linalg.eigh(spread)
-    now = replace(planes, centres=planes.centres + means, axes=axes)
-    return now, 0.5 * float(np.maximum(values[:, 0], 0.0).sum())
+    now = replace(landmarks, centres=landmarks.centres + means, axes=axes)
+    across = np.append(values[:, 0], values[landmarks.is_line, 1])
+    return now, 0.5 * float(np.maximum(across, 0.0).sum())
 
 
-def about_planes(map_T_middle: FloatArray, planes: Planes, seen: Sightings) -> FloatArray:
-    """Poses (M, 4, 4) of the sweeps about the centres of the planes, the axes of the map kept."""
+def about_landmarks(map_T_middle: FloatArray, landmarks: Landmarks, seen: Sightings) -> FloatArray:
+    """Poses (M, 4, 4) of the sweeps about the centres of what they saw, the map's axes kept."""
     relative = map_T_middle[seen.sweeps].copy()
-    relative[:, :3, 3] -= planes.centres[seen.planes]
+    relative[:, :3, 3] -= landmarks.centres[seen.landmarks]
     return relative
 
 
-def seen_directions(map_T_middle: FloatArray, planes: Planes, seen: Sightings) -> FloatArray:
-    """Projectors (N, 6, 6) of the poses onto what their planes tell, noise apart.
+def transformed_moments(relative: FloatArray, landmarks: Landmarks, seen: Sightings) -> FloatArray:
+    """(L, 4, 4) sums of the moments of each plane or line, about its centre, in the map's axes."""
+    moments = relative @ seen.moments @ np.swapaxes(relative, 1, 2)
+    return summed(moments, seen.landmarks, len(landmarks))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Faces:
+    """Landmarks as F planes: a line is where two meet, each of which turns along it alone.
+
+    Attributes
+    ----------
+    normals : (F, 3)
+    turns : (F, 3, 2) axes of the map towards which a normal may turn; zero where it may not
+    landmarks : (F,) of which each is
+    pairs, faces : (P,) which sighting it is, and of which face
+    """
+
+    normals: FloatArray
+    turns: FloatArray
+    landmarks: IntArray
+    pairs: IntArray
+    faces: IntArray
+
+    @classmethod
+    def of(cls, landmarks: Landmarks, seen: Sightings) -> _Faces:
+        count, lines = len(landmarks), np.flatnonzero(landmarks.is_line)
+        axes = np.concatenate([landmarks.axes, landmarks.axes[lines][:, :, [1, 0, 2]]])
+        numbers = np.append(np.arange(count), lines)
+        turns = axes[:, :, 1:].copy()
+        turns[landmarks.is_line[numbers], :, 0] = 0.0
+        again = np.flatnonzero(landmarks.is_line[seen.landmarks])
+        second = count + np.searchsorted(lines, seen.landmarks[again])
+        pairs = np.append(np.arange(len(seen.landmarks)), again)
+        return cls(axes[:, :, 0], turns, numbers, pairs, np.append(seen.landmarks, second))
+
+
+def seen_directions(map_T_middle: FloatArray, landmarks: Landmarks, seen: Sightings) -> FloatArray:
+    """Projectors (N, 6, 6) of the poses onto what their planes and lines tell, noise apart.
 
     Normals are known to their noise: a thousand patches of flat ground, each tilted by a little of
     that, tell of every horizontal motion, and what they tell is wrong. With ``A`` the information
@@ -181,17 +259,18 @@ def seen_directions(map_T_middle: FloatArray, planes: Planes, seen: Sightings) -
     direction in which ``B`` is more than half of ``A`` is not seen, and is left to other factors.
     """
     count = len(map_T_middle)
-    relative = about_planes(map_T_middle, planes, seen)
-    spread = transformed_moments(relative, planes, seen)
+    faces = _Faces.of(landmarks, seen)
+    relative = about_landmarks(map_T_middle, landmarks, seen)
+    spread = transformed_moments(relative, landmarks, seen)[faces.landmarks, :3, :3]
+    relative, moments = relative[faces.pairs], seen.moments[faces.pairs]
     parts = []
-    for column in range(3):
-        axis = planes.axes[:, :, column]
-        by_pose = _by_pose(relative, axis[seen.planes])
-        own = by_pose @ seen.moments @ np.swapaxes(by_pose, 1, 2)
-        if column > 0:
-            known = np.einsum("ni,nij,nj->n", axis, spread[:, :3, :3], axis)
-            own *= (1.0 / np.maximum(known, 1e-12))[seen.planes, None, None]
-        parts.append(summed(own, seen.sweeps, count))
+    for axis in (faces.normals, faces.turns[:, :, 0], faces.turns[:, :, 1]):
+        by_pose = _by_pose(relative, axis[faces.faces])
+        own = by_pose @ moments @ np.swapaxes(by_pose, 1, 2)
+        if axis is not faces.normals:
+            known = np.einsum("ni,nij,nj->n", axis, spread, axis)
+            own *= (1.0 / np.maximum(known, 1e-12))[faces.faces, None, None]
+        parts.append(summed(own, seen.sweeps[faces.pairs], count))
     whole, noise = parts[0], parts[1] + parts[2]
     values, vectors = np.linalg.eigh(whole)
     least = 1e-12 * np.maximum(values[:, -1:], 1e-12)
@@ -216,12 +295,6 @@ def _by_pose(relative: FloatArray, normals: FloatArray) -> FloatArray:
     return by_pose
 
 
-def transformed_moments(relative: FloatArray, planes: Planes, seen: Sightings) -> FloatArray:
-    """(L, 4, 4) sums of the moments of each plane, about its centre, in the axes of the map."""
-    moments = relative @ seen.moments @ np.swapaxes(relative, 1, 2)
-    return summed(moments, seen.planes, len(planes))
-
-
 def summed(values: FloatArray, groups: IntArray, count: int) -> FloatArray:
     """Sums (count, ...) of the values (M, ...) of each group."""
     rows = np.ones(len(groups)), groups, np.arange(len(groups) + 1)
@@ -232,53 +305,57 @@ def summed(values: FloatArray, groups: IntArray, count: int) -> FloatArray:
 
 
 def eliminated(
-    map_T_middle: FloatArray, planes: Planes, seen: Sightings, keep: FloatArray | None = None
+    map_T_middle: FloatArray,
+    landmarks: Landmarks,
+    seen: Sightings,
+    keep: FloatArray | None = None,
 ) -> Reduced:
-    """Gauss-Newton's equations of the poses, by the Schur complement of every plane.
+    """Gauss-Newton's equations of the poses, by the Schur complement of every plane and line.
 
     Parameters
     ----------
     map_T_middle : (N, 4, 4)
-    planes : fitted at these poses
+    landmarks : fitted at these poses
     keep : (N, 6, 6) of :func:`seen_directions`; None keeps all
     """
-    count = len(map_T_middle)
-    normals = planes.axes[:, :, 0]
-    relative = about_planes(map_T_middle, planes, seen)
-    local = np.einsum("nji,nj->ni", relative[:, :3, :3], normals[seen.planes])
-    by_pose = _by_pose(relative, normals[seen.planes])
+    count, faces = len(map_T_middle), _Faces.of(landmarks, seen)
+    relative = about_landmarks(map_T_middle, landmarks, seen)[faces.pairs]
+    moments, sweeps = seen.moments[faces.pairs], seen.sweeps[faces.pairs]
+    normals, planes = faces.normals[faces.faces], len(faces.normals)
+    local = np.einsum("nji,nj->ni", relative[:, :3, :3], normals)
+    by_pose = _by_pose(relative, normals)
     if keep is not None:
-        by_pose = np.swapaxes(keep, 1, 2)[seen.sweeps] @ by_pose
-    basis = np.zeros((len(planes), 4, 3))  # two turns of the normal, and the offset
-    basis[:, :3, :2] = planes.axes[:, :, 1:]
+        by_pose = np.swapaxes(keep, 1, 2)[sweeps] @ by_pose
+    basis = np.zeros((planes, 4, 3))  # two turns of the normal, and the offset
+    basis[:, :3, :2] = faces.turns
     basis[:, 3, 2] = 1.0
-    by_plane = np.einsum("nji,njk->nik", relative, basis[seen.planes])
-    plane = np.concatenate(
-        [local, np.einsum("ni,ni->n", normals[seen.planes], relative[:, :3, 3])[:, None]], axis=1
-    )
-    weighted = by_pose @ seen.moments
+    by_plane = np.einsum("nji,njk->nik", relative, basis[faces.faces])
+    plane = np.column_stack([local, np.einsum("ni,ni->n", normals, relative[:, :3, 3])])
+    weighted = by_pose @ moments
     own = weighted @ np.swapaxes(by_pose, 1, 2)
     across = weighted @ by_plane
     pull = np.einsum("nij,nj->ni", weighted, plane)
-    on_plane = seen.moments @ by_plane
-    of_planes = summed(np.swapaxes(by_plane, 1, 2) @ on_plane, seen.planes, len(planes))
-    their_pull = summed(np.einsum("nji,nj->ni", on_plane, plane), seen.planes, len(planes))
+    on_plane = moments @ by_plane
+    of_planes = summed(np.swapaxes(by_plane, 1, 2) @ on_plane, faces.faces, planes)
+    their_pull = summed(np.einsum("nji,nj->ni", on_plane, plane), faces.faces, planes)
     diagonal = np.arange(3)
     of_planes[:, diagonal, diagonal] *= 1.0 + _RIDGE
     of_planes[:, diagonal, diagonal] += 1e-12
     root = np.linalg.inv(np.linalg.cholesky(of_planes))
-    across = across @ np.swapaxes(root, 1, 2)[seen.planes]
+    across = across @ np.swapaxes(root, 1, 2)[faces.faces]
     their_pull = np.einsum("nij,nj->ni", root, their_pull)
 
-    pull -= np.einsum("nij,nj->ni", across, their_pull[seen.planes])
-    gradient = summed(pull, seen.sweeps, count)
-    blocks = summed(own, seen.sweeps, count)
+    pull -= np.einsum("nij,nj->ni", across, their_pull[faces.faces])
+    gradient = summed(pull, sweeps, count)
+    blocks = summed(own, sweeps, count)
     hessian = bsr_array((blocks, np.arange(count), np.arange(count + 1)), shape=(6 * count,) * 2)
-    hessian = hessian - _outer_products(across, seen, count, len(planes))
+    hessian = hessian - _outer_products(across, sweeps, faces.faces, count, planes)
     return Reduced(csc_array(hessian), gradient.ravel())
 
 
-def _outer_products(across: FloatArray, seen: Sightings, count: int, planes: int) -> bsr_array:
+def _outer_products(
+    across: FloatArray, sweeps: IntArray, faces: IntArray, count: int, planes: int
+) -> bsr_array:
     """Sum over the planes of the outer products of what ties them to the poses.
 
     Planes that were first seen at about the same time go together into one dense product, whose
@@ -286,10 +363,10 @@ def _outer_products(across: FloatArray, seen: Sightings, count: int, planes: int
     drive, not with its square.
     """
     first = np.full(planes, count)
-    np.minimum.at(first, seen.planes, seen.sweeps)
+    np.minimum.at(first, faces, sweeps)
     rank = np.empty(planes, np.int64)
     rank[np.argsort(first, kind="stable")] = np.arange(planes)
-    place = rank[seen.planes]
+    place = rank[faces]
     order = np.argsort(place, kind="stable")
     bounds = np.searchsorted(place[order], np.arange(0, planes + _CHUNK, _CHUNK))
     parts = [bsr_array((6 * count,) * 2, blocksize=(6, 6))]
@@ -297,7 +374,7 @@ def _outer_products(across: FloatArray, seen: Sightings, count: int, planes: int
         some = order[begin:end]
         if not len(some):
             continue
-        poses, row = np.unique(seen.sweeps[some], return_inverse=True)
+        poses, row = np.unique(sweeps[some], return_inverse=True)
         dense = np.zeros((len(poses), 6, _CHUNK, 3))
         dense[row, :, place[some] % _CHUNK] = across[some]
         flat = dense.reshape(6 * len(poses), 3 * _CHUNK)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from loam_gtsam.geometry import as_points, voxel_keys
-from loam_gtsam.refine.surfaces import principal_axes
+from loam_gtsam.refine.landmarks import principal_axes
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray
 
 _LEAST_POINTS, _LEAST_SWEEPS = 10, 3

@@ -1,7 +1,7 @@
-"""Rounds of an adjustment: planes are found anew, and the poses solved by Levenberg-Marquardt.
+"""Rounds of an adjustment: landmarks are found anew, and poses solved by Levenberg-Marquardt.
 
-The planes are eliminated (:mod:`loam_gtsam.refine.elimination`); all other factors come as GTSAM
-linearises them.
+Planes and lines are eliminated (:mod:`loam_gtsam.refine.elimination`); all other factors come as
+GTSAM linearises them.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ from loam_gtsam.refine.elimination import (
     seen_directions,
     sightings,
 )
-from loam_gtsam.refine.surfaces import Planes, find_planes, voxel_sizes
+from loam_gtsam.refine.landmarks import Landmarks, find_landmarks, voxel_sizes
+from loam_gtsam.refine.sweeps import Stack
 from loam_gtsam.types import FloatArray, InputError, IntArray
 
 _GOLDEN: FloatArray = np.array([0.8191725, 0.6710436, 0.5497005])
@@ -45,9 +46,9 @@ class Settings:
 
     Attributes
     ----------
-    rounds : times that planes are searched for
+    rounds : times that planes and lines are searched for
     steps : steps of Levenberg-Marquardt at most in each
-    sigma : metres, that a point may have across a surface (``matching.point_sigma``)
+    sigma : metres, that a point may have across a surface or edge (``matching.point_sigma``)
     largest, least : metres, edge lengths of the voxels of the first and the last level
     enough : metres and radians; a round that moves no pose by more is the last
     whole : sweeps up to which all are adjusted at once; more are first adjusted in windows
@@ -76,14 +77,16 @@ class Round:
 
     Attributes
     ----------
-    planes, pairs, points : planes, pairs of a sweep and a plane, and points on planes
-    scatter : metres, weighted root mean square of the points across their planes
+    planes, lines : how many
+    pairs, points : pairs of a sweep and a plane or line, and points on them
+    scatter : metres, weighted root mean square distance of the points from them
     shared : metres, see :class:`~loam_gtsam.refine.elimination.Sightings`
     moved : metres, largest step of a pose
-    cost_before, cost_after : with the planes of this round
+    cost_before, cost_after : with the planes and lines of this round
     """
 
     planes: int
+    lines: int
     pairs: int
     points: int
     scatter: float
@@ -100,20 +103,20 @@ class Adjusted:
     Attributes
     ----------
     map_T_middle : (N, 4, 4) poses of the middles of the sweeps
-    planes, seen : of the last round, and which sweep saw which of them
-    clear : (N, 6, 6) projectors onto the directions about which the planes were asked
+    landmarks, seen : of the last round, and which sweep saw which of them
+    clear : (N, 6, 6) projectors onto the directions about which these were asked
     rounds : what each round did
     """
 
     map_T_middle: FloatArray
-    planes: Planes
+    landmarks: Landmarks
     seen: Sightings
     clear: FloatArray
     rounds: tuple[Round, ...]
 
 
 def adjusted(
-    points_at: Callable[[FloatArray], tuple[FloatArray, IntArray]],
+    points_at: Callable[[FloatArray], Stack],
     map_T_middle: FloatArray,
     others: OtherFactors,
     asked: FloatArray,
@@ -125,46 +128,48 @@ def adjusted(
 
     Parameters
     ----------
-    points_at : the points as seen from the middles of the sweeps, and the sweeps' numbers,
-        ascending, when these have some poses
+    points_at : the points, when the sweeps have some poses
     map_T_middle : (N, 4, 4) poses at which the search starts
-    others : factors beside the planes
-    asked : (N, 6, 6) projectors onto the directions about which the planes are asked
-    views : sweeps that must see a plane at least
+    others : factors beside the planes and lines
+    asked : (N, 6, 6) projectors onto the directions about which these are asked
+    views : sweeps that must see a plane or line at least
 
     Raises
     ------
     InputError
-        If no plane is seen by so many sweeps, or some sweep is tied to no other.
+        If none is seen by so many sweeps, or some sweep is tied to no other.
     """
     poses, sizes = map_T_middle, voxel_sizes(settings.largest, settings.least)
     rounds: list[Round] = []
     for number in range(settings.rounds):
-        points, numbers = points_at(poses)
+        stack = points_at(poses)
         shift = settings.largest * np.modf(number * _GOLDEN)[0]
-        in_map = _placed(points, numbers, poses)
-        planes = find_planes(in_map, numbers, settings.sigma, sizes, shift, views)
-        seen = sightings(points, numbers, planes)
+        in_map = _placed(stack.points, stack.sweeps, poses)
+        landmarks = find_landmarks(
+            in_map, stack.sweeps, stack.is_edge, settings.sigma, sizes, shift, views
+        )
+        seen = sightings(stack.points, stack.sweeps, landmarks)
         _check_ties(seen, others, len(poses))
-        clear = seen_directions(poses, planes, seen) @ asked
+        clear = seen_directions(poses, landmarks, seen) @ asked
         before, poses_before = None, poses
         damping = _DAMPING[0]
         for _ in range(settings.steps):
-            poses, planes, costs, damping = _step(poses, planes, seen, clear, others, damping)
+            poses, landmarks, costs, damping = _step(poses, landmarks, seen, clear, others, damping)
             before = costs[0] if before is None else before
             if costs[0] - costs[1] <= 1e-4 * costs[0]:
                 break
-        weights = np.maximum(planes.weights, 1e-12)
-        scatter = float(np.sqrt(weights @ planes.residuals**2 / max(weights.sum(), 1e-12)))
+        weights, squared = landmarks.weights, (landmarks.residuals**2).sum(axis=1)
+        scatter = float(np.sqrt(weights @ squared / max(weights.sum(), 1e-12)))
         moved = float(np.linalg.norm(poses[:, :3, 3] - poses_before[:, :3, 3], axis=1).max())
-        counts = len(planes), len(seen.sweeps), len(planes.rows)
+        lines = int(np.count_nonzero(landmarks.is_line))
+        counts = len(landmarks) - lines, lines, len(seen.sweeps), len(landmarks.rows)
         assert before is not None
         rounds.append(Round(*counts, scatter, seen.shared, moved, before, costs[1]))
         if on_round is not None:
             on_round(rounds[-1])
         if moved < settings.enough:
             break
-    return Adjusted(poses, planes, seen, clear, tuple(rounds))
+    return Adjusted(poses, landmarks, seen, clear, tuple(rounds))
 
 
 def _placed(points: FloatArray, numbers: IntArray, poses: FloatArray) -> FloatArray:
@@ -191,14 +196,14 @@ class Ties(Protocol):
 
 
 class OtherFactors:
-    """What ties the poses beside the planes that are looked for, and the anchor they may need.
+    """What ties the poses beside what the sweeps see, and the anchor they may need.
 
     Parameters
     ----------
     factors : on the poses ``gtsam.symbol("x", n)`` of N sweeps in a row
     map_T_middle : (N, 4, 4) their poses
     first : number ``n`` of the first of them
-    known : what planes that were eliminated before, and fixes, tell of the poses
+    known : what landmarks that were eliminated before, and fixes, tell of the poses
     """
 
     def __init__(
@@ -279,44 +284,45 @@ def _check_ties(seen: Sightings, others: OtherFactors, count: int) -> None:
     """InputError unless every pose is tied to one that is held."""
     if not len(seen.sweeps) and not others.known:
         raise InputError(
-            "refine: no plane is seen by three sweeps; are the poses those of the sweeps, and does "
-            "Settings.sigma allow for their errors?"
+            "refine: no plane or line is seen by three sweeps; are the poses those of the sweeps, "
+            "and does Settings.sigma allow for their errors?"
         )
     one = [number for tie in others.ties for number in tie[:-1]]
     two = [number for tie in others.ties for number in tie[1:]]
-    planes = int(seen.planes.max(initial=-1)) + 1
-    ends = np.append(seen.sweeps, one), np.append(count + seen.planes, two)
-    links = coo_array((np.ones(len(ends[0])), ends), shape=(count + planes,) * 2)
+    landmarks = int(seen.landmarks.max(initial=-1)) + 1
+    ends = np.append(seen.sweeps, one), np.append(count + seen.landmarks, two)
+    links = coo_array((np.ones(len(ends[0])), ends), shape=(count + landmarks,) * 2)
     group = connected_components(links, directed=False)[1]
     loose = np.flatnonzero(~np.isin(group[:count], group[others.held]))
     if len(loose):
         raise InputError(
-            f"refine: {len(loose)} sweeps, number {loose[0]} the first, share no plane and no "
-            "factor with those that are held; leave them out, or give factors that tie them"
+            f"refine: {len(loose)} sweeps, number {loose[0]} the first, share no plane, line "
+            "or factor with those that are held; leave them out, or give factors that tie them"
         )
 
 
 def equations(
-    poses: FloatArray, planes: Planes, seen: Sightings, keep: FloatArray, others: OtherFactors
-) -> tuple[csc_array, FloatArray]:
-    """Information (6 N, 6 N) and gradient (6 N,) of the poses, planes eliminated."""
-    reduced = eliminated(poses, planes, seen, keep)
+    poses: FloatArray, landmarks: Landmarks, seen: Sightings, keep: FloatArray,
+    others: OtherFactors,
+) -> tuple[csc_array, FloatArray]:  # fmt: skip
+    """Information (6 N, 6 N) and gradient (6 N,) of the poses, planes and lines eliminated."""
+    reduced = eliminated(poses, landmarks, seen, keep)
     information, gradient = others.equations(poses)
     return csc_array(reduced.hessian + information), reduced.gradient + gradient
 
 
 def _step(
     poses: FloatArray,
-    planes: Planes,
+    landmarks: Landmarks,
     seen: Sightings,
     keep: FloatArray,
     others: OtherFactors,
     damping: float,
-) -> tuple[FloatArray, Planes, tuple[float, float], float]:
-    """One step of Levenberg-Marquardt: poses, planes, cost before and after, damping."""
-    planes, before = refitted(poses, planes, seen)
+) -> tuple[FloatArray, Landmarks, tuple[float, float], float]:
+    """One step of Levenberg-Marquardt: poses, landmarks, cost before and after, damping."""
+    landmarks, before = refitted(poses, landmarks, seen)
     before += others.error(poses)
-    hessian, gradient = equations(poses, planes, seen, keep, others)
+    hessian, gradient = equations(poses, landmarks, seen, keep, others)
     slack = 1.0 + (0.0 if (keep == np.eye(6)).all() else _SLACK)
     diagonal = hessian.diagonal()
     while damping <= _DAMPING[2]:
@@ -328,12 +334,12 @@ def _step(
                 for pose, delta in zip(poses, step, strict=True)
             ]
         )
-        fitted, after = refitted(moved, planes, seen)
+        fitted, after = refitted(moved, landmarks, seen)
         after += others.error(moved)
         if np.isfinite(after) and after <= slack * before:
             return moved, fitted, (before, after), max(0.1 * damping, _DAMPING[1])
         damping = max(10.0 * damping, 1e-9)
-    return poses, planes, (before, before), damping
+    return poses, landmarks, (before, before), damping
 
 
 _SYMMETRIC: dict[str, Any] = {
@@ -353,7 +359,7 @@ def factorised(information: csc_array) -> Any:
         smallest = 0.0
     if not smallest > _LEAST_PIVOT:
         raise InputError(
-            "refine: planes and factors leave a direction of the poses free; give factors that fix "
-            "it, as the odometry does"
+            "refine: planes, lines and factors leave a direction of the poses free; give factors "
+            "that fix it, as the odometry does"
         )
     return factors

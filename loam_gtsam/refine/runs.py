@@ -42,7 +42,7 @@ _SEEN = (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
 _AT_REST = 0.03
 """Metres and radians: what the second sweep may tell of the first one's half before that moved."""
 _HELD = 5
-"""Of so many points of a sweep one is held out, to judge the map by."""
+"""Of so many points of a sweep on surfaces one is held out, to judge the map by."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,8 +52,8 @@ class RunPoints:
     Attributes
     ----------
     frames : (N,) numbers of the frames, all that have a pose
-    used, held : N sweeps each: points for the adjustment, and others to judge the map by; none of
-        frames that are not in the map
+    used, held : N sweeps each: points for the adjustment, and others, on surfaces, to judge the map
+        by; none of frames that are not in the map
     """
 
     frames: IntArray
@@ -106,10 +106,10 @@ def run_points(
                     f"{points.stamp + round(points.reference * 1e9)}; give the data set of the run"
                 )
         frames.append(number)
-        out = np.arange(len(points.points)) % _HELD == _HELD - 1
-        for part, chosen in ((used, ~out), (held, out)):
-            rows = points.points[chosen], points.seconds[chosen]
-            part.append(SweepPoints(points.stamp, *rows, points.reference))
+        place = np.arange(len(points.points)) - points.edges
+        out = (place >= 0) & (place % _HELD == _HELD - 1)
+        used.append(points.chosen(~out))
+        held.append(points.chosen(out))
     if not frames:
         raise InputError(f"{dataset.name}: expected frames with a pose, got none")
     return RunPoints(np.array(frames, np.int64), tuple(used), tuple(held))
@@ -188,7 +188,7 @@ class RefinedRun:
         return voxel_filter(np.concatenate(self.all_points()), size)
 
     def all_points(self) -> tuple[FloatArray, FloatArray]:
-        """Points of all sweeps, metres in the refined map: used and held out."""
+        """Points of all sweeps on surfaces, metres in the refined map: used and held out."""
         path, points = self.refined.path, self.points
         return self._in_map(path, points.used)[0], self._in_map(path, points.held)[0]
 
@@ -199,7 +199,7 @@ class RefinedRun:
     def _in_map(self, path: Path, sweeps: Sequence[SweepPoints]) -> tuple[FloatArray, IntArray]:
         numbers = np.arange(self.first, self.first + len(sweeps))
         parts = [
-            transform(path.map_T_middle[number], path.deskewed(number, sweep))
+            transform(path.map_T_middle[number], path.deskewed(number, sweep)[sweep.edges :])
             for number, sweep in zip(numbers.tolist(), sweeps, strict=True)
         ]
         return np.concatenate(parts), np.repeat(numbers, [len(part) for part in parts])

@@ -1,23 +1,25 @@
 """The points of the sweeps, and where they were measured: a path that follows the adjusted poses.
 
-Unlike the mapper's features, these points are no centroids: the mean of the points in a voxel of
-the lidar's frame moves with the lidar, and an adjustment of all sweeps would take that for a
+Unlike the mapper's features, points on surfaces are no centroids: the mean of the points in a voxel
+of the lidar's frame moves with the lidar, and an adjustment of all sweeps would take that for a
 motion (in a corridor 0.7 mm a sweep).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config
+from loam_gtsam.config import Config, FeatureConfig
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.geometry import as_array, as_points, as_vector, cross
 from loam_gtsam.types import (
+    BoolArray,
     Features,
     FeatureSweep,
     FloatArray,
@@ -27,6 +29,9 @@ from loam_gtsam.types import (
     Sweep,
 )
 
+_NEAR_EDGES = 20.0
+"""Metres from the lidar within which edges are used: a post that is farther away is met by a beam
+or two, and the guess of its width puts its axis some millimetres too near, for every post."""
 _NEAR = 10
 """Sweeps before and after one over which errors of the path are averaged."""
 _MISSED, _AT_END = 0.3, 5.0
@@ -38,7 +43,7 @@ _GAP = 2.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepPoints:
-    """Points of one sweep on smooth surfaces, as they were measured.
+    """Points of one sweep on edges and smooth surfaces, as they were measured.
 
     Attributes
     ----------
@@ -46,35 +51,58 @@ class SweepPoints:
     points : (N, 3) metres, lidar frame, each at its own time
     seconds : (N,) from the middle; all zero if the points are de-skewed already
     reference : seconds from the middle to the reference time, for which poses are reported
+    edges : so many of the points, the first ones, are on edges, and the others on surfaces
     """
 
     stamp: int
     points: FloatArray
     seconds: FloatArray
     reference: float = 0.0
+    edges: int = 0
 
     def __post_init__(self) -> None:
         points = as_points(self.points, "SweepPoints.points")
+        if not 0 <= self.edges <= len(points):
+            raise InputError(
+                f"SweepPoints.edges: expected 0 to {len(points)}, the number of points, got "
+                f"{self.edges}"
+            )
         object.__setattr__(self, "points", points)
         seconds = as_vector(self.seconds, "SweepPoints.seconds", len(points))
         object.__setattr__(self, "seconds", seconds)
 
+    @property
+    def is_edge(self) -> BoolArray:
+        """(N,) whether points are on edges."""
+        return np.arange(len(self.points)) < self.edges
+
+    def chosen(self, rows: BoolArray) -> SweepPoints:
+        """Some of the points (N,)."""
+        edges = int(np.count_nonzero(rows[: self.edges]))
+        return replace(self, points=self.points[rows], seconds=self.seconds[rows], edges=edges)
+
 
 def sweep_points(features: Features, config: Config, most: int = 3000) -> SweepPoints:
-    """The plane points of a sweep, at most ``most`` of them, evenly spread over the sweep."""
+    """Edges near the lidar, and at most ``most`` plane points, evenly spread over the sweep."""
     first, end = features.span
     moving = config.deskew.enabled and end > first
     middle = 0.5 * (first + end) if moving else 0.0
     count = len(features.planes)
     order = np.argsort(features.plane_times, kind="stable")
     rows = order[np.linspace(0, count - 1, min(most, count)).astype(int)]
-    seconds = features.plane_times[rows] - middle if moving else np.zeros(len(rows))
+    near = np.linalg.norm(features.edges, axis=1) < _NEAR_EDGES
+    points = np.concatenate([features.edges[near], features.planes[rows]])
+    times = np.concatenate([features.edge_times[near], features.plane_times[rows]])
+    seconds = times - middle if moving else np.zeros(len(times))
     stamp = features.stamp + round(middle * 1e9)
-    return SweepPoints(stamp, features.planes[rows], seconds, -middle)
+    return SweepPoints(stamp, points, seconds, -middle, int(np.count_nonzero(near)))
 
 
 def extract_points(sweep: Sweep, config: Config, most: int = 3000) -> SweepPoints:
     """The points of a sweep of a data set, not averaged.
+
+    Of sweeps that come as features, only those on surfaces: LOAM's edges show up to a beam too
+    late, always to one side. For the same reason ``features.edge_reach`` is that of the default.
 
     Raises
     ------
@@ -84,10 +112,13 @@ def extract_points(sweep: Sweep, config: Config, most: int = 3000) -> SweepPoint
         If the sweep could not be read.
     """
     if isinstance(sweep, FeatureSweep):
-        return sweep_points(sweep.features, config, most)
+        points = sweep_points(sweep.features, config, most)
+        return points.chosen(~points.is_edge)
     if not isinstance(sweep, Scan):
         raise InputError(f"sweep: expected a Scan or a FeatureSweep, got {type(sweep).__name__}")
-    every = config.changed("features.plane_voxel=0.0")
+    every = config.changed(
+        {"features.plane_voxel": 0.0, "features.edge_reach": FeatureConfig().edge_reach}
+    )
     return sweep_points(extract_features(sweep, every), config, most)
 
 
@@ -225,8 +256,29 @@ def _moved(points: FloatArray, motions: FloatArray) -> FloatArray:
     return result
 
 
-def stacked(path: Path, sweeps: Sequence[SweepPoints]) -> tuple[FloatArray, IntArray]:
-    """Points of all sweeps, each as seen from the middle of its sweep, and the sweeps' numbers."""
-    points = [path.deskewed(number, sweep) for number, sweep in enumerate(sweeps)]
-    numbers = np.repeat(np.arange(len(sweeps)), [len(part) for part in points])
-    return np.concatenate([np.empty((0, 3)), *points]), numbers
+class Stack(NamedTuple):
+    """Points of many sweeps.
+
+    Attributes
+    ----------
+    points : (N, 3) metres, as seen from the middles of the sweeps
+    sweeps : (N,) numbers of these, ascending
+    is_edge : (N,) whether they are on edges, and not on smooth surfaces
+    """
+
+    points: FloatArray
+    sweeps: IntArray
+    is_edge: BoolArray
+
+    @classmethod
+    def of(cls, parts: Sequence[tuple[int, FloatArray, BoolArray]]) -> Stack:
+        """Of the number, the points and ``is_edge`` of each sweep."""
+        numbers = np.repeat([part[0] for part in parts], [len(part[1]) for part in parts])
+        points = np.concatenate([np.empty((0, 3)), *(part[1] for part in parts)])
+        is_edge = np.concatenate([np.zeros(0, np.bool_), *(part[2] for part in parts)])
+        return cls(points, numbers.astype(np.int64), is_edge)
+
+
+def stacked(path: Path, sweeps: Sequence[SweepPoints]) -> Stack:
+    """Points of all sweeps, each as seen from the middle of its sweep."""
+    return Stack.of([(n, path.deskewed(n, one), one.is_edge) for n, one in enumerate(sweeps)])

@@ -3,9 +3,9 @@
 The cost of an adjustment grows with the square of the sweeps that see the same planes, and its
 memory with all points. So a long drive is cut into stretches. Each is adjusted together with half
 of the stretch before it and half of the one after (as in HBA: Liu et al., Large-scale lidar
-consistent mapping using hierarchical lidar bundle adjustment, RA-L 2023). What the planes of such a
-window tell of its poses is kept as a quadratic form, and a stretch counts from then on as a single
-large sweep, from its middle. All poses remain free.
+consistent mapping using hierarchical lidar bundle adjustment, RA-L 2023). What the planes
+and lines of such a window tell of its poses is kept as a quadratic form, and a stretch counts from
+then on as a single large sweep, from its middle. All poses remain free.
 """
 
 from __future__ import annotations
@@ -17,10 +17,10 @@ from itertools import pairwise
 import numpy as np
 
 from loam_gtsam.geometry import transform
-from loam_gtsam.refine.elimination import PlaneTies, eliminated
+from loam_gtsam.refine.elimination import LandmarkTies, eliminated
 from loam_gtsam.refine.rounds import Adjusted, OtherFactors, Settings, adjusted
-from loam_gtsam.refine.sweeps import Path, SweepPoints, stacked
-from loam_gtsam.types import FloatArray, InputError, IntArray
+from loam_gtsam.refine.sweeps import Path, Stack, SweepPoints, stacked
+from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray
 
 _STRETCH = 24
 """Sweeps of a stretch; a window has twice as many."""
@@ -37,20 +37,18 @@ class Windows:
     Attributes
     ----------
     map_T_middle : (N, 4, 4) poses of the middles of all sweeps
-    ties : what the planes of each window tell of its poses
-    points, numbers : (M, 3) metres and (M,) points of the stretches, as seen from the middle of one
-        sweep of each, and the number of that sweep
+    ties : what the planes and lines of each window tell of its poses
+    points : of the stretches, each as seen from the middle of one of its sweeps
     """
 
     map_T_middle: FloatArray
-    ties: tuple[PlaneTies, ...]
-    points: FloatArray
-    numbers: IntArray
+    ties: tuple[LandmarkTies, ...]
+    points: Stack
 
-    def points_at(self, poses: FloatArray) -> tuple[FloatArray, IntArray]:
-        """Points and numbers, whatever the poses (N, 4, 4) are: a stretch is rigid."""
+    def points_at(self, poses: FloatArray) -> Stack:
+        """The points, whatever the poses (N, 4, 4) are: a stretch is rigid."""
         del poses
-        return self.points, self.numbers
+        return self.points
 
 
 def in_windows(
@@ -72,8 +70,8 @@ def in_windows(
     """
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
     poses, stretches = map_T_middle.copy(), _stretches(starts, len(sweeps))
-    ties: list[PlaneTies] = []
-    points, numbers = [np.empty((0, 3))], [np.empty(0, np.int64)]
+    ties: list[LandmarkTies] = []
+    points: list[tuple[int, FloatArray, BoolArray]] = []
     for done, (stretch, window) in enumerate(stretches, 1):
         base = _base(stretch, asked)
         one = _Window(stamps[window], sweeps[window], window.start)
@@ -86,11 +84,10 @@ def in_windows(
         inside = slice(stretch.start - window.start, stretch.stop - window.start)
         poses[stretch.start : stretch.stop] = map_T_middle[base] @ base_T_middle[inside]
         seen = [n - window.start for n in stretch if asked[n].any()]
-        points.append(one.points(base_T_middle, seen))
-        numbers.append(np.full(len(points[-1]), base))
+        points.append((base, *one.points(base_T_middle, seen)))
         if on_window is not None:
             on_window(done, len(stretches))
-    return Windows(poses, tuple(ties), np.concatenate(points), np.concatenate(numbers))
+    return Windows(poses, tuple(ties), Stack.of(points))
 
 
 def _stretches(starts: Sequence[int], count: int) -> list[tuple[range, slice]]:
@@ -121,9 +118,9 @@ class _Window:
     def adjusted(
         self, poses: FloatArray, others: OtherFactors, asked: FloatArray, settings: Settings
     ) -> Adjusted | None:
-        """The window, adjusted; None if its sweeps share too few planes."""
+        """The window, adjusted; None if its sweeps share too little."""
 
-        def points_at(poses: FloatArray) -> tuple[FloatArray, IntArray]:
+        def points_at(poses: FloatArray) -> Stack:
             return stacked(Path.through(self.stamps, poses), self.sweeps)
 
         try:
@@ -131,17 +128,22 @@ class _Window:
         except InputError:
             return None  # whether all are tied is known when the whole is adjusted
 
-    def ties(self, found: Adjusted, base: int) -> PlaneTies:
-        """What the planes tell, as seen from the sweep of a number."""
-        told = eliminated(found.map_T_middle, found.planes, found.seen, found.clear)
+    def ties(self, found: Adjusted, base: int) -> LandmarkTies:
+        """What the planes and lines tell, as seen from the sweep of a number."""
+        told = eliminated(found.map_T_middle, found.landmarks, found.seen, found.clear)
         form = _SHARE * told.hessian.toarray(), _SHARE * told.gradient
         numbers = self.first + np.arange(len(self.sweeps))
-        return PlaneTies(numbers, found.map_T_middle, base - self.first, *form)
+        return LandmarkTies(numbers, found.map_T_middle, base - self.first, *form)
 
-    def points(self, base_T_middle: FloatArray, rows: Sequence[int]) -> FloatArray:
-        """Points (M, 3) of some sweeps as seen from the base, evenly thinned."""
+    def points(
+        self, base_T_middle: FloatArray, rows: Sequence[int]
+    ) -> tuple[FloatArray, BoolArray]:
+        """Points (M, 3) of some sweeps as seen from the base, evenly thinned; whether on edges."""
         path = Path.through(self.stamps, base_T_middle)
-        parts = [transform(base_T_middle[n], path.deskewed(n, self.sweeps[n])) for n in rows]
-        every: FloatArray = np.concatenate([np.empty((0, 3)), *parts])
-        chosen = np.linspace(0, len(every), min(_MOST, len(every)), endpoint=False)
-        return every[chosen.astype(np.int64)]
+        every = Stack.of([
+            (n, transform(base_T_middle[n], path.deskewed(n, one)), one.is_edge)
+            for n, one in ((n, self.sweeps[n]) for n in rows)
+        ])  # fmt: skip
+        count = len(every.points)
+        chosen = np.linspace(0, count, min(_MOST, count), endpoint=False).astype(np.int64)
+        return every.points[chosen], every.is_edge[chosen]

@@ -8,16 +8,17 @@ import pytest
 from support.jacobians import numerical
 
 from loam_gtsam import Config, SimulatedWorld, absolute_error, run
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.refine.adjustment import refine
 from loam_gtsam.refine.elimination import eliminated, refitted, sightings
+from loam_gtsam.refine.landmarks import find_landmarks, voxel_sizes
 from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.refine.motion_factors import told_directions
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import refine_run, run_points
-from loam_gtsam.refine.surfaces import find_planes, voxel_sizes
-from loam_gtsam.refine.sweeps import Path, SweepPoints
+from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points, stacked, sweep_points
 from loam_gtsam.registration.pose_errors import relative_covariance
-from loam_gtsam.types import InputError, Trajectory
+from loam_gtsam.types import FeatureSweep, InputError, Trajectory
 
 SIZES = voxel_sizes(3.2, 0.4)
 SECOND = 1_000_000_000
@@ -32,8 +33,21 @@ def _room(rng, count):
     return points, wall
 
 
-def _scene(sweeps=6, count=900, noise=0.01, off=0.01, seed=0, extra=None):
-    """Sweeps of the room that stand still while they are taken, true poses and wrong ones."""
+POSTS = np.array([[-2.0, -1.5], [2.0, -1.0], [1.5, 1.8], [-1.0, 2.0], [0.3, -2.1]])
+
+
+def _posts(rng, count=40):
+    """Points on the axes of posts, from floor to ceiling."""
+    points = np.repeat(np.column_stack([POSTS, np.zeros(len(POSTS))]), count, axis=0)
+    points[:, 2] = rng.uniform(0.0, 3.0, len(points))
+    return points
+
+
+def _scene(sweeps=6, count=900, noise=0.01, off=0.01, seed=0, extra=None, edges=None):
+    """Sweeps of the room that stand still while they are taken, true poses and wrong ones.
+
+    Of each sweep ``extra`` and ``edges`` make more points, on surfaces and on edges.
+    """
     rng = np.random.default_rng(seed)
     poses, found = [], []
     for number in range(sweeps):
@@ -43,8 +57,14 @@ def _scene(sweeps=6, count=900, noise=0.01, off=0.01, seed=0, extra=None):
         points += rng.normal(size=points.shape) * noise
         if extra is not None:
             points = np.vstack([points, extra(np.random.default_rng(number), number)])
-        local = (points - pose.translation()) @ pose.rotation().matrix()
-        found.append(SweepPoints(number * SECOND, local, np.zeros(len(local))))
+        lines = np.empty((0, 3))
+        if edges is not None:
+            own = np.random.default_rng([seed, number])
+            lines = edges(own)
+            lines += own.normal(size=lines.shape) * noise
+        local = np.vstack([lines, points]) - pose.translation()
+        local = local @ pose.rotation().matrix()
+        found.append(SweepPoints(number * SECOND, local, np.zeros(len(local)), edges=len(lines)))
         poses.append(pose)
     steps = rng.normal(size=(sweeps, 6)) * off * np.array([0.3, 0.3, 0.3, 1.0, 1.0, 1.0])
     steps[0] = 0.0
@@ -58,16 +78,18 @@ def _errors(poses, truth):
 
 
 def _seen(sweeps, poses):
-    points = np.concatenate([sweep.points for sweep in sweeps])
-    numbers = np.repeat(np.arange(len(sweeps)), [len(sweep.points) for sweep in sweeps])
+    """Planes and lines of the sweeps, placed at some poses, and what these saw of them."""
+    points, numbers, is_edge = stacked(Path.through(np.arange(len(sweeps)), poses), sweeps)
     placed = np.einsum("nij,nj->ni", poses[numbers, :3, :3], points) + poses[numbers, :3, 3]
-    planes = find_planes(placed, numbers, 0.03, SIZES)
-    return planes, sightings(points, numbers, planes)
+    landmarks = find_landmarks(placed, numbers, is_edge, 0.03, SIZES)
+    return landmarks, sightings(points, numbers, landmarks)
 
 
-def test_the_gradient_is_the_derivative_of_the_cost_with_every_plane_at_its_best() -> None:
-    sweeps, _, poses = _scene()
+@pytest.mark.parametrize("off", [1e-6, 0.01])
+def test_the_gradient_is_the_derivative_of_the_cost_with_all_at_their_best(off) -> None:
+    sweeps, _, poses = _scene(edges=_posts, off=off)
     planes, seen = _seen(sweeps, poses)
+    assert planes.is_line.sum() > 4
     planes, _ = refitted(poses, planes, seen)
     gradient = eliminated(poses, planes, seen).gradient
     scale = np.abs(gradient).max()
@@ -83,7 +105,7 @@ def test_the_gradient_is_the_derivative_of_the_cost_with_every_plane_at_its_best
 
 
 def test_the_whole_map_can_move_without_cost() -> None:
-    sweeps, poses, _ = _scene()
+    sweeps, poses, _ = _scene(edges=_posts)
     planes, seen = _seen(sweeps, poses)
     reduced = eliminated(poses, refitted(poses, planes, seen)[0], seen).hessian
     together = np.vstack([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses])
@@ -105,13 +127,121 @@ def test_poses_and_walls_are_found_and_as_well_as_they_are_told_to_be() -> None:
             covariance = result.relative_covariance(0, number)
             squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
     assert 0.5 < np.mean(squared) < 2.0
-    offsets = np.abs(result.planes.axes[:, :, 0]).max(axis=1)
+    offsets = np.abs(result.landmarks.axes[:, :, 0]).max(axis=1)
     assert (offsets > 0.99).mean() > 0.9  # walls, seen from the first pose which is nearly level
-    assert (np.sqrt(result.plane_covariances()[:, 2]) < 0.01).all()
+    assert (np.sqrt(result.landmark_covariances()[:, 2]) < 0.01).all()
+
+
+def test_posts_fix_what_the_floor_leaves_open_and_as_well_as_they_are_told_to() -> None:
+    def on_floor(sweep, pose):
+        height = sweep.points @ pose[2, :3] + pose[2, 3]
+        return sweep.chosen(sweep.is_edge | (height < 0.05))
+
+    squared, offsets = [], []
+    for seed in range(4):
+        sweeps, truth, wrong = _scene(count=4500, seed=seed, edges=_posts)
+        floor = [on_floor(*one) for one in zip(sweeps, truth, strict=True)]
+        result = refine(floor, wrong)
+        assert result.rounds[-1].lines >= len(POSTS)
+        assert _errors(result.path.map_T_middle, truth).max() < 0.5 * _errors(wrong, truth).max()
+        poses = [gtsam.Pose3(pose) for pose in result.path.map_T_middle]
+        for number in range(1, 6):
+            true = gtsam.Pose3(truth[0]).between(gtsam.Pose3(truth[number]))
+            error = poses[0].between(poses[number]).localCoordinates(true)
+            covariance = result.relative_covariance(0, number)
+            squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
+        lines, told = result.landmarks.is_line, result.landmark_covariances()
+        first = result.path.map_T_middle[0] @ np.linalg.inv(truth[0])
+        away = (result.landmarks.centres[lines] - first[:3, 3]) @ first[:3, :3]
+        nearest = np.linalg.norm(away[:, None, :2] - POSTS, axis=2).min(axis=1)
+        offsets += [nearest, np.sqrt(told[lines, 2])]
+        assert (told[lines, 0] == 0.0).all()
+        assert (told[~lines] > 0.0).all()
+    assert 0.5 < np.mean(squared) < 2.0
+    assert max(off.max() for off in offsets) < 0.01
+
+
+def test_a_line_is_straight_and_alone() -> None:
+    rng = np.random.default_rng(4)
+    along, sweeps = rng.uniform(0.0, 1.5, 300), np.repeat(np.arange(6), 50)
+
+    def found(x, y=0.0):
+        points = np.column_stack([1.6 + x + 0.0 * along, 1.6 + y + 0.0 * along, 1.6 + along])
+        points += 0.008 * rng.normal(size=points.shape)
+        return find_landmarks(points, sweeps, np.ones(300, np.bool_), 0.03, (3.2,))
+
+    straight = found(0.0)
+    assert straight.is_line.tolist() == [True]
+    assert np.abs(straight.axes[0, 2, 2]) > 0.9999
+    assert straight.scatters[0] == pytest.approx(0.008, rel=0.2)
+    assert len(found(0.05 * (along - 0.75) ** 2 / 0.75**2)) == 0  # bent by 5 cm
+    assert len(found(0.1 * rng.integers(0, 2, 300))) == 0  # one of two, 10 cm apart
+    few = find_landmarks(np.zeros((40, 3)), np.arange(40) % 2, np.ones(40, np.bool_), 0.03, (3.2,))
+    assert len(few) == 0  # two sweeps
+
+
+def test_what_lasts_as_long_as_an_edge_is_seen_from_one_side_is_found() -> None:
+    def half_told(aside):
+        """Information of the lines, of twenty sweeps of which the later ones see them aside."""
+        number = iter(range(20))
+
+        def edges(rng):
+            way = np.linspace(-2.5, 2.5, 30)
+            posts = np.column_stack([np.repeat(way, 4), np.full(120, 2.0), np.zeros(120)])
+            posts[:, 2] = rng.uniform(0.0, 1.5, 120)
+            # Another error of every post: no motion explains it.
+            wrong = aside * np.random.default_rng(9).normal(size=30) * (next(number) >= 10)
+            return posts + np.column_stack([np.repeat(wrong, 4), np.zeros((120, 2))])
+
+        sweeps, truth, _ = _scene(sweeps=20, count=300, edges=edges)
+        landmarks, seen = _seen(sweeps, truth)
+        on_lines = landmarks.is_line[seen.landmarks]
+        return seen.lasting, seen.moments[on_lines, 3, 3].sum()
+
+    still, told = half_told(0.0)
+    lasting, less = half_told(0.01)
+    assert still < 0.001
+    assert 0.002 < lasting < 0.01
+    assert less < 0.5 * told
+
+
+def test_something_that_moves_is_no_line() -> None:
+    def with_pedestrian(rng):
+        walks = np.column_stack([np.full((30, 2), 0.5), rng.uniform(0.0, 1.7, 30)])
+        walks[:, 0] += 0.1 * next(number)
+        return np.vstack([_posts(rng), walks])
+
+    number = iter(range(6))
+    sweeps, truth, wrong = _scene(edges=with_pedestrian)
+    still = _errors(refine(_scene(edges=_posts)[0], wrong).path.map_T_middle, truth).max()
+    moving = _errors(refine(sweeps, wrong).path.map_T_middle, truth).max()
+    assert moving < still + 0.001
+
+
+def test_edges_are_those_near_by_and_none_of_features_that_were_made_elsewhere(room) -> None:
+    world, result, _ = room
+    scan = next(iter(world))
+    points = extract_points(scan, result.config)
+    features = extract_features(scan, result.config)
+    assert points.edges == len(features.edges) > 50
+    assert np.array_equal(points.points[: points.edges], features.edges)
+    moved = features.edges.copy()
+    moved[:7] *= 20.0 / np.linalg.norm(moved[:7], axis=1, keepdims=True)
+    far = sweep_points(replace(features, edges=moved), result.config)
+    assert np.array_equal(far.points[: far.edges], features.edges[7:])
+    made = extract_points(FeatureSweep(features, gtsam.Pose3()), result.config)
+    assert made.edges == 0
+    assert len(made.points) == 3000 < len(features.planes)
+    late = result.config.changed("features.edge_reach=0.0")  # as LOAM has them
+    assert np.array_equal(extract_points(scan, late).points, points.points)
+    some = points.chosen(np.arange(len(points.points)) % 2 == 0)
+    assert some.edges == (points.edges + 1) // 2
+    with pytest.raises(InputError, match=r"edges: expected 0 to 3, .* got 4"):
+        SweepPoints(0, np.zeros((3, 3)), np.zeros(3), edges=4)
 
 
 def test_the_same_input_gives_the_same_bits() -> None:
-    sweeps, _, wrong = _scene(sweeps=4, count=500)
+    sweeps, _, wrong = _scene(sweeps=4, count=500, edges=_posts)
     first, second = (refine(sweeps, wrong, settings=Settings(rounds=2)) for _ in range(2))
     assert np.array_equal(first.path.map_T_middle, second.path.map_T_middle)
 
@@ -154,11 +284,13 @@ def test_what_cannot_be_adjusted_is_refused() -> None:
         refine(sweeps[:2], poses[:2])
     apart = poses.copy()
     apart[:, 0, 3] += 100.0 * np.arange(4)
-    with pytest.raises(InputError, match="no plane is seen by three sweeps"):
+    with pytest.raises(InputError, match="no plane or line is seen by three sweeps"):
         refine(sweeps, apart)
     loose = poses.copy()
     loose[3, 0, 3] += 100.0
-    with pytest.raises(InputError, match="1 sweeps, number 3 the first, share no plane"):
+    with pytest.raises(
+        InputError, match="1 sweeps, number 3 the first, share no plane, line or factor"
+    ):
         refine(sweeps, loose)
     foreign = gtsam.NonlinearFactorGraph()
     unit = gtsam.noiseModel.Unit.Create(6)
@@ -166,7 +298,7 @@ def test_what_cannot_be_adjusted_is_refused() -> None:
     with pytest.raises(InputError, match="factor 0 has a key that is not x0 to x3"):
         refine(sweeps, poses, foreign)
     sweeps, _, poses = _scene(sweeps=4, count=6000)
-    floor = [replace(s, points=s.points[p[:, 2] < 0.05], seconds=s.seconds[p[:, 2] < 0.05])
+    floor = [s.chosen(p[:, 2] < 0.05)
              for s, p in ((s, s.points @ t[:3, :3].T + t[:3, 3])
                           for s, t in zip(sweeps, poses, strict=True))]  # fmt: skip
     with pytest.raises(InputError, match="leave a direction of the poses free"):

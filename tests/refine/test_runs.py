@@ -185,7 +185,9 @@ def test_runs_that_do_not_belong_together_are_refused(two) -> None:
     far = two.ways[1].map_T_lidar.copy()
     far[:, 0, 3] += 500.0
     ways = [two.ways[0], Trajectory(two.ways[1].stamps, far)]
-    with pytest.raises(InputError, match="35 sweeps, number 35 the first, share no plane"):
+    with pytest.raises(
+        InputError, match="35 sweeps, number 35 the first, share no plane, line or factor"
+    ):
         refine_runs(two.points, updates, ways)
 
 

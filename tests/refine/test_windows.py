@@ -8,7 +8,7 @@ import pytest
 from support.jacobians import numerical
 
 from loam_gtsam.refine.adjustment import refine
-from loam_gtsam.refine.elimination import PlaneTies
+from loam_gtsam.refine.elimination import LandmarkTies
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.sweeps import SweepPoints
 from loam_gtsam.types import InputError
@@ -77,7 +77,7 @@ def test_what_a_window_tells_is_a_quadratic_form_about_its_poses() -> None:
     # As of planes: nothing changes if all move together.
     together = np.vstack([gtsam.Pose3(pose).inverse().AdjointMap() for pose in poses[numbers]])
     free = np.eye(24) - together @ np.linalg.pinv(together)
-    ties = PlaneTies(numbers, poses[numbers], 1, free @ form @ free, free @ rng.normal(size=24))
+    ties = LandmarkTies(numbers, poses[numbers], 1, free @ form @ free, free @ rng.normal(size=24))
     moved = gtsam.Pose3.Expmap(rng.normal(size=6)).matrix() @ poses
     assert ties.cost(moved) == pytest.approx(0.0, abs=1e-9)
     for scale in (0.0, 1e-3):  # exact about the poses, and nearly so near them

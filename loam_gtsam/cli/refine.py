@@ -211,7 +211,9 @@ def corrected_trajectory(folder: Path, updates: list[MapUpdate]) -> Trajectory:
 
 def _write_trajectory(folder: Path, found: RefinedRun, names: Sequence[str]) -> None:
     trajectory = found.trajectory
-    write_tum(folder / names[0], trajectory, comments={"refined": "planes, lines and poses adjusted"})
+    write_tum(
+        folder / names[0], trajectory, comments={"refined": "planes, lines and poses adjusted"}
+    )
     write_kitti(folder / names[1], trajectory)
     told = zip(trajectory.stamps, trajectory.map_T_lidar, found.covariances, strict=True)
     poses = [MapUpdate(int(s), gtsam.Pose3(p), FrameStatus.OK, covariance=c) for s, p, c in told]

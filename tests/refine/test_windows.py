@@ -1,7 +1,5 @@
 """Long drives in windows: what a window tells, and the whole beside an adjustment at once."""
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 import pytest
@@ -18,7 +16,10 @@ SWEEPS = 60
 
 
 def _street(noise=0.01, off=0.01, seed=0):
-    """Sweeps along a street with houses: 1.5 m apart, each sees 12 m; true poses and wrong ones."""
+    """Sweeps along a street with houses and posts, 1.5 m apart; true poses and wrong ones.
+
+    Each sees 12 m.
+    """
     rng = np.random.default_rng(seed)
     places = np.arange(SWEEPS) * 1.5
     found, poses, wrong = [], [], []
@@ -30,11 +31,16 @@ def _street(noise=0.01, off=0.01, seed=0):
         points[rest, 1] = np.where(points[rest, 1] > 0.0, 5.0, -5.0)
         house = ~ground & front  # a wall across every six metres
         points[house, 0] = 6.0 * np.round(points[house, 0] / 6.0)
+        posts = np.arange(np.ceil((way - 12.0) / 7.5), (way + 12.0) / 7.5) * 7.5
+        edges = np.column_stack([np.repeat(posts, 12), np.full((12 * len(posts), 2), 3.0)])
+        edges[:, 2] = rng.uniform(0.0, 4.0, len(edges))
+        points = np.vstack([edges, points])
         points += noise * rng.normal(size=points.shape)
         pose = gtsam.Pose3.Expmap(0.1 * rng.normal(size=6) * [1, 1, 1, 0, 0, 0])
         pose = gtsam.Pose3(pose.rotation(), np.array([way, 0.0, 1.5]))
         local = (points - pose.translation()) @ pose.rotation().matrix()
-        found.append(SweepPoints(number * SECOND, local, np.zeros(len(local))))
+        seconds = np.zeros(len(local))
+        found.append(SweepPoints(number * SECOND, local, seconds, edges=len(edges)))
         step = off * rng.normal(size=6) * [0.3, 0.3, 0.3, 1.0, 1.0, 1.0]
         poses.append(pose.matrix())
         wrong.append(pose.retract(step * (number > 0)).matrix())
@@ -101,6 +107,7 @@ def test_windows_find_what_an_adjustment_of_all_at_once_finds(street) -> None:
     off = [_errors(found.path.map_T_middle, truth) for found in (whole, windows)]
     steps = [_steps(poses, truth) for poses in (wrong, windows.path.map_T_middle)]
     assert np.median(steps[1]) < 0.2 * np.median(steps[0])
+    assert min(found.rounds[-1].lines for found in (whole, windows)) > 10  # of 16 posts
     assert off[1].mean() < 1.3 * off[0].mean() + 0.001
     squared = []
     poses = [gtsam.Pose3(pose) for pose in windows.path.map_T_middle]
@@ -122,11 +129,9 @@ def test_windows_give_the_same_bits_and_tell_how_far_they_are(street) -> None:
 
 def test_sweeps_without_planes_stay_where_the_odometry_has_them() -> None:
     sweeps, truth, wrong = _street()
-    empty = np.empty((0, 3))
     blind = range(14, 50)  # more than a stretch
     thin = [
-        replace(sweep, points=empty, seconds=empty[:, 0]) if n in blind else sweep
-        for n, sweep in enumerate(sweeps)
+        sweep.chosen(np.full(len(sweep.points), n not in blind)) for n, sweep in enumerate(sweeps)
     ]
     with pytest.raises(InputError, match="no plane"):
         refine(thin, wrong, settings=Settings(whole=20))

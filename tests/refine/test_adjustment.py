@@ -77,6 +77,17 @@ def _errors(poses, truth):
     return np.linalg.norm(relative[0][:, :3, 3] - relative[1][:, :3, 3], axis=1)
 
 
+def _squared(result, truth):
+    """Squared Mahalanobis distances over the freedoms of the motions from the first sweep."""
+    squared, poses = [], [gtsam.Pose3(pose) for pose in result.path.map_T_middle]
+    for number in range(1, len(truth)):
+        true = gtsam.Pose3(truth[0]).between(gtsam.Pose3(truth[number]))
+        error = poses[0].between(poses[number]).localCoordinates(true)
+        covariance = result.relative_covariance(0, number)
+        squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
+    return squared
+
+
 def _seen(sweeps, poses):
     """Planes and lines of the sweeps, placed at some poses, and what these saw of them."""
     points, numbers, is_edge = stacked(Path.through(np.arange(len(sweeps)), poses), sweeps)
@@ -120,12 +131,7 @@ def test_poses_and_walls_are_found_and_as_well_as_they_are_told_to_be() -> None:
         sweeps, truth, wrong = _scene(seed=seed)
         result = refine(sweeps, wrong)
         assert _errors(result.path.map_T_middle, truth).max() < 0.3 * _errors(wrong, truth).max()
-        poses = [gtsam.Pose3(pose) for pose in result.path.map_T_middle]
-        for number in range(1, 6):
-            true = gtsam.Pose3(truth[0]).between(gtsam.Pose3(truth[number]))
-            error = poses[0].between(poses[number]).localCoordinates(true)
-            covariance = result.relative_covariance(0, number)
-            squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
+        squared += _squared(result, truth)
     assert 0.5 < np.mean(squared) < 2.0
     offsets = np.abs(result.landmarks.axes[:, :, 0]).max(axis=1)
     assert (offsets > 0.99).mean() > 0.9  # walls, seen from the first pose which is nearly level
@@ -144,12 +150,7 @@ def test_posts_fix_what_the_floor_leaves_open_and_as_well_as_they_are_told_to() 
         result = refine(floor, wrong)
         assert result.rounds[-1].lines >= len(POSTS)
         assert _errors(result.path.map_T_middle, truth).max() < 0.5 * _errors(wrong, truth).max()
-        poses = [gtsam.Pose3(pose) for pose in result.path.map_T_middle]
-        for number in range(1, 6):
-            true = gtsam.Pose3(truth[0]).between(gtsam.Pose3(truth[number]))
-            error = poses[0].between(poses[number]).localCoordinates(true)
-            covariance = result.relative_covariance(0, number)
-            squared.append(error @ np.linalg.solve(covariance, error) / 6.0)
+        squared += _squared(result, truth)
         lines, told = result.landmarks.is_line, result.landmark_covariances()
         first = result.path.map_T_middle[0] @ np.linalg.inv(truth[0])
         away = (result.landmarks.centres[lines] - first[:3, 3]) @ first[:3, :3]

@@ -41,7 +41,6 @@ class Sightings:
     moments : (M, 4, 4) sums of ``w q q^T`` over variance, 1 / m^2, in the frame of the sweep
     shared : metres, standard deviation of the error that all points have in common which a sweep
         has on a plane
-    shared_on_lines : metres, the same on a line
     lasting : metres, of the error that the sightings of a line have in common
     """
 
@@ -49,7 +48,6 @@ class Sightings:
     landmarks: IntArray
     moments: FloatArray
     shared: float
-    shared_on_lines: float
     lasting: float
 
 
@@ -89,8 +87,9 @@ def sightings(points: FloatArray, sweeps: IntArray, landmarks: Landmarks) -> Sig
     lasting = _lasting_variance(means[on_line], variances[on_line], of_landmark[on_line])
     variances += lasting * np.bincount(of_landmark, minlength=len(landmarks))[of_landmark] * on_line
     moments = weighted_moments(mine, weights / (counts * variances)[pair], pair, len(keys))
-    told = (float(np.sqrt(one)) for one in (shared, on_lines, lasting))
-    return Sightings(of_sweep, of_landmark, moments, *told)
+    return Sightings(
+        of_sweep, of_landmark, moments, float(np.sqrt(shared)), float(np.sqrt(lasting))
+    )
 
 
 def _lasting_variance(means: FloatArray, variances: FloatArray, lines: IntArray) -> float:

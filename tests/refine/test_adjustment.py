@@ -166,8 +166,8 @@ def test_a_line_is_straight_and_alone() -> None:
     rng = np.random.default_rng(4)
     along, sweeps = rng.uniform(0.0, 1.5, 300), np.repeat(np.arange(6), 50)
 
-    def found(x, y=0.0):
-        points = np.column_stack([1.6 + x + 0.0 * along, 1.6 + y + 0.0 * along, 1.6 + along])
+    def found(aside):
+        points = 1.6 + np.column_stack([aside + 0.0 * along, 0.0 * along, along])
         points += 0.008 * rng.normal(size=points.shape)
         return find_landmarks(points, sweeps, np.ones(300, np.bool_), 0.03, (3.2,))
 

@@ -201,7 +201,7 @@ class Mapper:
                         self._start = None
                         self._insert(*placed, update.status, update.message, clock)
         if not update.status.solved:
-            self.errors.skipped(sweep)
+            self.errors.skipped(predicted.posed)
         self.last = replace(update, timings=clock.seconds)
         return self.last
 

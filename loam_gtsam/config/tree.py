@@ -145,6 +145,8 @@ _CLASSICAL = {
     },
     "solver": {"step_sigmas": 0.0, "min_map_edges": 11, "shorten_steps": False},
     "relocalization.enabled": False,
+    # Fitted (docs/classical.md): lines through points of a feature's own ring go along with it.
+    "covariance.drift": 300.0,
 }
 
 PRESETS: dict[str, Config] = {

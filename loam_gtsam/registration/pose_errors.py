@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import nearest_positive, positive_root, symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
@@ -98,7 +98,7 @@ class _Middle:
 class PoseErrors:
     """Calibrates the covariances of a run, frame by frame.
 
-    Of ``config``, ``covariance`` is used, with ``solver``, ``imu.gyro_noise`` and ``imu.lag``.
+    Of ``config``, ``covariance``, ``solver``, ``deskew.model`` and parts of ``imu`` are used.
     """
 
     def __init__(self, config: Config) -> None:
@@ -107,10 +107,8 @@ class PoseErrors:
             for place in (config, config.of_small_places())
         ]
         self._drift_factor = config.covariance.drift
-        self._small = False
-        self._scans = 0  # that :meth:`of_scan` was given
-        graph = config.solver.method == "gtsam"
-        self._kernel = config.solver.kernel
+        self._small, self._scans = False, 0  # scans that :meth:`of_scan` was given
+        self._kernel, graph = config.solver.kernel, config.solver.method == "gtsam"
         self._kernel_width = config.solver.kernel_width if graph else np.inf
         # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
         self._with_priors = graph
@@ -120,7 +118,8 @@ class PoseErrors:
         self._expected = MotionFilter(config.solver)
         self._drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
         self._rivals, self._moved = _Rivals(), np.zeros((6, 6))
-        self._first: MovingSweep | None = None
+        self._first: PosedSweep | None = None
+        self._searches = config.deskew.model != "predicted"  # for the first motion
         self._origin, self._paused = _Origin(), False
         self._last: _Middle | None = None
 
@@ -194,7 +193,8 @@ class PoseErrors:
             root = np.sqrt(_LASTING) * positive_root(lasting)
             own, shared, now = self._own_of(update, sweep, middle, by_imu, to_reference, root)
         if first and self._first is not None:
-            self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance)
+            velocity = None if self._searches else update.twist
+            self._origin = _Origin.of(self._first, sweep, to_map, scan.covariance, velocity)
         drifted = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
         self._drift = self._drift + self._rivals.told(self._first, sweep.stamp, doubt, parting)
         own = own + drifted @ self._rivals.doubt @ drifted.T
@@ -280,11 +280,11 @@ class PoseErrors:
         self._blind = blind @ step.kept.T
         self._forgotten = self._forgotten - np.log(np.clip(np.diag(step.kept), _LEAST_KEPT, 1.0))
 
-    def skipped(self, sweep: MovingSweep) -> None:
+    def skipped(self, posed: PosedSweep) -> None:
         """Account for a sweep whose pose is the expected one; the very first begins the map."""
         if self._first is None and not self._scans:
-            self._first = sweep
-            self._expected.begin(sweep.stamp)
+            self._first = posed
+            self._expected.begin(posed.sweep.stamp)
 
     def _own_of(
         self, update: MapUpdate, sweep: MovingSweep, middle: gtsam.Pose3,
@@ -377,14 +377,14 @@ class _Rivals:
         self._told = 0.0  # seconds after the first sweep
 
     def told(
-        self, first: MovingSweep | None, stamp: int,
+        self, first: PosedSweep | None, stamp: int,
         doubt: FloatArray | None, parting: FloatArray | None,
     ) -> FloatArray:  # fmt: skip
         """What the map's error (6, 6) grows by, with a frame of this stamp of the middle.
 
         ``doubt`` and ``parting`` are as in :meth:`PoseErrors.calibrated`.
         """
-        seconds = 0.0 if first is None else (stamp - first.stamp) * 1e-9
+        seconds = 0.0 if first is None else (stamp - first.sweep.stamp) * 1e-9
         if parting is not None:  # still in doubt: nothing has grown since
             self._parting, self._told = parting, seconds
         grown = max(seconds**2 - self._told**2, 0.0) * self._parting
@@ -408,18 +408,27 @@ class _Origin:
 
     @classmethod
     def of(
-        cls, first: MovingSweep, second: MovingSweep, to_map: FloatArray, covariance: FloatArray
-    ) -> _Origin:
-        """``covariance`` (6, 6) is that of the second sweep, ``to_map`` its adjoint to the map."""
-        seconds = (second.stamp - first.stamp) * 1e-9
+        cls, first: PosedSweep, second: MovingSweep, to_map: FloatArray, covariance: FloatArray,
+        velocity: FloatArray | None,
+    ) -> _Origin:  # fmt: skip
+        """``covariance`` (6, 6) is that of the second sweep, ``to_map`` its adjoint to the map.
+
+        ``velocity`` (6,) is that of the second sweep, rad/s and m/s, if the first one stays
+        de-skewed for its own; None if it is de-skewed anew.
+        """
+        seconds, middle = (second.stamp - first.sweep.stamp) * 1e-9, first.sweep.middle
         if seconds <= 0.0:  # sweeps of different length
             return cls()
-        share = np.full(6, first.middle / seconds)
         # From the middle between both sweeps back to the reference time.
-        bend = np.full(6, 0.5 * abs(first.middle) * (seconds + first.middle))
-        if _turned(first):
-            share[:3] = bend[:3] = 0.0
-        return cls(to_map, share[:, None] * covariance * share, bend)
+        bend = np.full(6, 0.5 * abs(middle) * (seconds + middle))
+        back = np.full(6, middle)
+        if _turned(first.sweep):
+            back[:3] = bend[:3] = 0.0
+        own = (back / seconds)[:, None] * covariance * (back / seconds)
+        if velocity is not None:
+            aside = back * (velocity - first.twist)
+            own = own + np.outer(aside, aside)
+        return cls(to_map, own, bend)
 
     def error(self, accelerations: FloatArray) -> FloatArray:
         """(6, 6) in the map, from the (6,) mean squared accelerations."""

@@ -12,12 +12,14 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration import pose_errors as covariance_module
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.pose_errors import PoseErrors, ScanError, relative_covariance
 from loam_gtsam.registration.solvers import POSE_KEY, Solution
+from loam_gtsam.studies.evaluation import nees
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 
 FRAME = 100_000_000
@@ -203,6 +205,16 @@ def test_classical_solvers_have_covariances_of_the_same_size(name):
     assert ratio.max() < 5.0
 
 
+def test_a_preset_that_begins_on_the_way_tells_where_its_map_lies():
+    """Half a sweep's way beside the first pose, for its first sweep is not de-skewed anew."""
+    world = SimulatedWorld("street_loop", frames=8, columns=450, speed=8.0, start="moving")
+    result = run(world, preset("loam").changed("imu.coupling=off"))
+    found = nees(result.updates, world.truth)
+    assert np.abs(found.errors[:, 3]).min() > 0.25
+    assert found.mean < 2.0
+    assert len(found.beyond) == 0
+
+
 @pytest.mark.parametrize(("reference", "share"), [("start", 0.5), ("middle", 0.0), ("end", -0.5)])
 def test_the_reference_has_its_share_in_two_sweeps(reference, share):
     config = no_imu().changed({"deskew.reference": reference})
@@ -291,7 +303,7 @@ def test_the_error_of_the_origin_is_that_of_the_first_motion(monkeypatch):
 
     def told(accelerations):
         errors, speed, x, found = PoseErrors(Config()), 0.0, 0.0, []
-        errors.skipped(_Sweep(0, SweepMotion.CONSTANT_VELOCITY))
+        errors.skipped(PosedSweep(_Sweep(0, SweepMotion.CONSTANT_VELOCITY), np.zeros(6)))
         for number, acceleration in enumerate(accelerations, start=1):
             speed += 0.1 * acceleration
             x += 0.1 * speed
@@ -404,6 +416,24 @@ def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatc
     np.testing.assert_array_equal(updates[3].uncertainty.shared, 0.0)
 
 
+def test_a_first_sweep_that_is_not_de_skewed_anew_leaves_the_origin_aside(monkeypatch):
+    """By the way to the middle of the sweep, if the run begins on the way."""
+    good = ScanError(1e-10 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    speed = np.array([0.0, 0.0, 0.0, 8.0, 0.0, 0.0])
+
+    def told(model, first):
+        errors = PoseErrors(Config().changed({"deskew.model": model}))
+        errors.skipped(PosedSweep(_Sweep(0, SweepMotion.CONSTANT_VELOCITY), first))
+        update = calibrated(errors, 1, x=0.8, last=None, twist=speed)
+        return update.covariance[3, 3]
+
+    aside = 8.0 * 0.05
+    known = told("linear", np.zeros(6))
+    assert told("predicted", np.zeros(6)) == pytest.approx(known + aside**2, rel=1e-6)
+    assert told("predicted", speed) == pytest.approx(known, rel=1e-6)
+
+
 def test_a_rival_that_parts_from_the_motion_goes_on_being_an_error_of_the_map(monkeypatch):
     good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
     monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
@@ -411,7 +441,7 @@ def test_a_rival_that_parts_from_the_motion_goes_on_being_an_error_of_the_map(mo
     told = []
     for parting in (velocity, 0.0 * velocity):
         errors, seconds = PoseErrors(Config()), 1e-9 * FRAME * np.arange(1, 7)
-        errors.skipped(_Sweep(0, SweepMotion.CONSTANT_VELOCITY))
+        errors.skipped(PosedSweep(_Sweep(0, SweepMotion.CONSTANT_VELOCITY), np.zeros(6)))
         doubt = seconds[1] ** 2 * velocity  # as far as it has come with the second frame
         rivals = [
             (doubt, None),

@@ -17,6 +17,7 @@ from rich.table import Table
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RefineOptions
+from loam_gtsam.cli.results import LOOP_FILES
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.truth import read_truth
@@ -25,13 +26,12 @@ from loam_gtsam.io.atomic import write_json
 from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_covariances, write_ply
 from loam_gtsam.io.trajectories import write_kitti, write_tum
-from loam_gtsam.loops.files import read_graph
 from loam_gtsam.maps.map_file import SavedMap, map_of_run
 from loam_gtsam.maps.merging import MergedMaps
-from loam_gtsam.refine.fixes import Survey
 from loam_gtsam.refine.map_quality import MapQuality, common_thickness, map_quality
 from loam_gtsam.refine.rounds import Round, Settings
-from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
+from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_runs, run_points
+from loam_gtsam.refine.ties import Survey
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
     DatasetError,
@@ -64,31 +64,9 @@ def refine_folder(
     """Refine the run in a folder, whose data set is read once more; into ``folder/refined``."""
     draws = console.draws_pictures(plot)
     run = FinishedRun.read(folder, dataset)
-    graph, trajectory = None, None
-    if (folder / "pose_graph.g2o").exists():
-        graph = read_graph(folder / "pose_graph.g2o")
-        trajectory = corrected_trajectory(folder, run.updates)
-    points = run.points(most, quiet=quiet)
     settings = Settings(rounds=rounds, sigma=run.config.matching.point_sigma)
-    with _progress(settings, quiet=quiet) as shown:
-        found = refine_run(
-            points, run.updates, trajectory=trajectory, graph=graph, survey=_survey(folder),
-            settings=settings, min_aligned=run.config.solver.min_aligned,
-            on_round=shown[0], on_window=shown[1],
-        )  # fmt: skip
-    return _write_all(folder, [run], [found], draws=draws, overwrite=overwrite, quiet=quiet)
-
-
-def _survey(folder: Path) -> Survey | None:
-    """The fixes of the map in a folder; None if it has none."""
-    if not map_of_run(folder).exists():
-        return None
-    with SavedMap(map_of_run(folder)) as saved:
-        graph, frame = saved.graph, saved.frame
-    if graph.fixes is None or frame.earth is None:
-        return None
-    stamps = np.array([place.stamp for place in graph.places], np.int64)
-    return Survey(graph.fixes, stamps, frame.earth, frame.up)
+    found = _refined(folder, [run], [run.trajectory], (0,), settings, most, quiet=quiet)
+    return _write_all(folder, [run], found, draws=draws, overwrite=overwrite, quiet=quiet)
 
 
 def refine_merged(
@@ -97,18 +75,37 @@ def refine_merged(
 ) -> int:  # fmt: skip
     """Refine runs whose maps were merged, together; into ``folder/refined``."""
     draws = console.draws_pictures(plot)
-    points = [run.points(3000, quiet=quiet) for run in runs]
-    updates = [run.updates for run in runs]
-    ways = [merged.trajectory(*numbered) for numbered in enumerate(updates)]
-    config = runs[0].config
-    settings = Settings(sigma=config.matching.point_sigma)
-    with _progress(settings, quiet=quiet) as shown:
-        found = refine_runs(
-            points, updates, ways, graph=merged.graph.saved(), starts=merged.starts,
-            survey=_survey(folder), settings=settings,
-            min_aligned=config.solver.min_aligned, on_round=shown[0], on_window=shown[1],
-        )  # fmt: skip
+    ways = [merged.trajectory(number, run.updates) for number, run in enumerate(runs)]
+    settings = Settings(sigma=runs[0].config.matching.point_sigma)
+    found = _refined(folder, runs, ways, merged.starts, settings, 3000, quiet=quiet)
     return _write_all(folder, runs, found, draws=draws, overwrite=True, quiet=quiet)
+
+
+def _refined(
+    folder: Path, runs: Sequence[FinishedRun], ways: Sequence[Trajectory], starts: Sequence[int],
+    settings: Settings, most: int, *, quiet: bool,
+) -> tuple[RefinedRun, ...]:  # fmt: skip
+    """Runs refined, with what the map in a folder knows: loops, fixes, a user's own factors."""
+    points = [run.points(most, quiet=quiet) for run in runs]
+    graph = survey = None
+    if map_of_run(folder).exists():
+        with SavedMap(map_of_run(folder)) as saved:
+            graph, survey = saved.graph.held(), _survey(saved)
+    with _progress(settings, quiet=quiet) as shown:
+        return refine_runs(
+            points, [run.updates for run in runs], ways, graph=graph, survey=survey,
+            starts=starts, settings=settings, min_aligned=runs[0].config.solver.min_aligned,
+            on_round=shown[0], on_window=shown[1],
+        )  # fmt: skip
+
+
+def _survey(saved: SavedMap) -> Survey | None:
+    """The fixes of a map; None if it has none."""
+    graph, frame = saved.graph, saved.frame
+    if graph.fixes is None or frame.earth is None:
+        return None
+    stamps = np.array([place.stamp for place in graph.places], np.int64)
+    return Survey(graph.fixes, stamps, frame.earth, frame.up)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,6 +128,19 @@ class FinishedRun:
         if updates is None:
             updates = read_updates(folder / "run.npz")
         return FinishedRun(folder, dataset, updates, load_config(folder / "config.yaml"))
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Its poses, as loops have corrected them; a DatasetError if the files contradict."""
+        frames = [update for update in self.updates if update.status.has_pose]
+        stamps = [update.stamp for update in frames]
+        as_run = Trajectory.from_poses(stamps, (update.map_T_lidar for update in frames))
+        if not (self.folder / LOOP_FILES[1]).exists():
+            return as_run
+        corrected = read_truth(self.folder / "trajectory.tum")
+        if len(corrected) != len(as_run):
+            raise DatasetError(f"{self.folder}: trajectory.tum and run.npz are not of the same run")
+        return Trajectory(as_run.stamps, corrected.map_T_lidar)
 
     def points(self, most: int, *, quiet: bool) -> RunPoints:
         """The points of the data set; an InputError that names the folder if it is of another."""
@@ -198,15 +208,6 @@ def _held_out(found: Sequence[RefinedRun], *, refined: bool) -> tuple[FloatArray
     parts = [run.held_out(refined=refined) for run in found]
     points, sweeps = zip(*parts, strict=True)
     return np.concatenate(points), np.concatenate(sweeps)
-
-
-def corrected_trajectory(folder: Path, updates: list[MapUpdate]) -> Trajectory:
-    """The trajectory of a run with loops, with the stamps of its frames."""
-    read = read_truth(folder / "trajectory.tum")
-    stamps = np.array([u.stamp for u in updates if u.status.has_pose], np.int64)
-    if len(read) != len(stamps):
-        raise DatasetError(f"{folder}: trajectory.tum and run.npz are not of the same run")
-    return Trajectory(stamps, read.map_T_lidar)
 
 
 def _write_trajectory(folder: Path, found: RefinedRun, names: Sequence[str]) -> None:

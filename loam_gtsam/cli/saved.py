@@ -16,13 +16,12 @@ from rich.table import Table
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import CleanOptions, LocaliseOptions, OptimizeOptions
-from loam_gtsam.cli.refine import corrected_trajectory
+from loam_gtsam.cli.refine import FinishedRun
 from loam_gtsam.cli.results import ENU_FILE
 from loam_gtsam.cli.run import worker_count
-from loam_gtsam.config import Config, dump_config, load_config
+from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.atomic import file_name, write_json, write_text
-from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.run_files import write_covariances, write_npz, write_ply
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
@@ -181,31 +180,20 @@ def _write(
 
 def clean_run(options: CleanOptions) -> int:
     """Clean the map of a finished run; returns the exit code."""
-    folder, dataset = options.run, options.dataset()
-    for name in ("run.npz", "config.yaml", MAP_FILE):
-        if not (folder / name).exists():
-            raise DatasetError(
-                f"{folder}: expected the folder of a finished run, with {name}; make one with "
-                "loam-gtsam run PATH --output FOLDER"
-            )
-    updates = read_updates(folder / "run.npz")
-    config = load_config(folder / "config.yaml")
-    placed = [update for update in updates if update.status.has_pose]
-    poses = stack_poses(update.map_T_lidar for update in updates)
-    if (folder / "pose_graph.g2o").exists():
-        where = corrected_trajectory(folder, updates).map_T_lidar
-        poses[[update.status.has_pose for update in updates]] = where
+    run = FinishedRun.read(options.run, options.dataset())
+    folder, updates, config = run.folder, run.updates, run.config
+    poses, way = stack_poses(u.map_T_lidar for u in updates), run.trajectory.map_T_lidar
+    poses[[update.status.has_pose for update in updates]] = way
     draws, report = console.draws_pictures(options.plot), dict[str, dict[str, int]]()
     with SavedMap(folder / MAP_FILE) as saved:
 
         def write(target: Path) -> list[str]:
             with console.progress_bar("votes", len(updates), quiet=options.quiet) as show:
-                shown = _shown_views(views(dataset, updates, poses, config), updates, show)
+                shown = _shown_views(views(run.dataset, updates, poses, config), updates, show)
                 cleaned = clean_map(saved, shown, config, target / MAP_FILE)
             gone, kept = cleaned.points[cleaned.moved], cleaned.points[~cleaned.moved]
             write_ply(target / "removed.ply", np.empty((0, 3)), gone)
             if draws:
-                way = stack_poses(update.map_T_lidar for update in placed)
                 plot_cleaned(target / CLEANED_FILES[2], kept, gone, way[:, :3, 3])
             for layer, (points, removed) in cleaned.counts.items():
                 report[layer] = {"points": points, "removed": removed}

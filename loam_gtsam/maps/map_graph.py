@@ -63,7 +63,7 @@ class MapGraph:
         return dict(zip(PARTS, map(len, every), strict=True))
 
     def saved(self) -> SavedGraph:
-        """As it is written to other files, and optimised: links, then loops, and nothing else."""
+        """As it is written to other files: links, then loops, and nothing else."""
         factors, poses = gtsam.NonlinearFactorGraph(), gtsam.Values()
         for motion in (*self.links, *self.loops):
             factors.add(motion.factor())
@@ -71,6 +71,17 @@ class MapGraph:
             poses.insert(pose_key(number), place.map_T_middle)
         stamps = {pose_key(number): place.stamp for number, place in enumerate(self.places)}
         return SavedGraph(factors, poses, stamps)
+
+    def held(self) -> SavedGraph:
+        """As it is optimised: the first place is held, and a user's own factors are there."""
+        graph = self.saved()
+        if self.places:
+            begin = self.places[0]
+            graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), begin.map_T_middle, begin.noise))
+        if self.own is not None:
+            graph.factors.push_back(self.own.factors())
+            graph.poses.insert(self.own.start())
+        return graph
 
 
 def graph_of(mapping: LoopMapping, config: Config, fixes: PlacedFixes | None = None) -> MapGraph:

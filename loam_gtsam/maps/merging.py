@@ -242,17 +242,13 @@ class _Whole:
         frames = self._frames(ties)
         of_map = zip(self._common.map_of.tolist(), self._before, strict=True)
         places = [replace(p, map_T_middle=frames[of].compose(p.map_T_middle)) for of, p in of_map]
-        graph = MapGraph(places, links, [*self._loops, *ties]).saved()
-        loops = range(len(links), graph.factors.size())
-        first = places[0]
-        graph.factors.add(gtsam.PriorFactorPose3(pose_key(0), first.map_T_middle, first.noise))
+        loops = [*self._loops, *ties]
+        graph = MapGraph(places, links, loops, own=self._own(frames)).held()
         if self._fixes is not None:
             self._add(self._fixes, graph, frames)
-        if (own := self._own(frames)) is not None:
-            graph.factors.push_back(own.factors())
-            graph.poses.insert(own.start())
+        chosen = range(len(links), len(links) + len(loops))
         most = self._config.pose_graph.max_chi2
-        return optimize_graph(graph, max_chi2=most, loops=loops)
+        return optimize_graph(graph, max_chi2=most, loops=chosen)
 
     def take_fixes(self, solved: OptimizedGraph, ties: Sequence[LoopClosure]) -> None:
         """Use the fixes from now on, with offsets of receivers that contradict each other.

@@ -18,7 +18,6 @@ from scipy.sparse import csc_array
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.geometry import as_array, symmetric
 from loam_gtsam.refine.elimination import Sightings, about_landmarks, transformed_moments
-from loam_gtsam.refine.fixes import FixTies
 from loam_gtsam.refine.landmarks import Landmarks
 from loam_gtsam.refine.rounds import (
     OtherFactors,
@@ -30,6 +29,7 @@ from loam_gtsam.refine.rounds import (
     factorised,
 )
 from loam_gtsam.refine.sweeps import Path, Stack, SweepPoints, stacked
+from loam_gtsam.refine.ties import FixTies
 from loam_gtsam.refine.windows import in_windows
 from loam_gtsam.types import FloatArray, InputError, Trajectory
 
@@ -156,6 +156,7 @@ def refine(
     keep: FloatArray | None = None,
     for_covariances: gtsam.NonlinearFactorGraph | None = None,
     fixes: FixTies | None = None,
+    ties: Sequence[Ties] = (),
     starts: Sequence[int] = (0,),
     on_round: Callable[[Round], None] | None = None,
     on_window: Callable[[int, int], None] | None = None,
@@ -175,6 +176,7 @@ def refine(
     for_covariances : factors that stand for ``factors`` in the covariances, if those are less
         sure than they are given weight
     fixes : of a GNSS receiver, on the poses
+    ties : what else is known of them, with other variables
     starts : numbers of the first sweeps of the runs, if there are several
     on_round : called after each round of the whole, to show progress
     on_window : called after each window of a long drive with the number of those done, and of all
@@ -189,7 +191,7 @@ def refine(
     poses = as_array(map_T_middle, "map_T_middle", (len(sweeps), 4, 4)).copy()
     if len(sweeps) < 3:
         raise InputError(f"refine: expected 3 or more sweeps, got {len(sweeps)}")
-    known: tuple[Ties, ...] = () if fixes is None else (fixes,)
+    known: tuple[Ties, ...] = (*ties, *(() if fixes is None else (fixes,)))
     others = OtherFactors(factors, poses, known=known)
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
     asked = np.tile(np.eye(6), (len(sweeps), 1, 1))

@@ -16,7 +16,6 @@ from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import pose_number
 from loam_gtsam.refine.adjustment import Refined, refine
-from loam_gtsam.refine.fixes import FixTies, Survey
 from loam_gtsam.refine.motion_factors import (
     long_motion_factors,
     loop_factors,
@@ -25,6 +24,7 @@ from loam_gtsam.refine.motion_factors import (
 )
 from loam_gtsam.refine.rounds import Round, Settings
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
+from loam_gtsam.refine.ties import FactorTies, FixTies, Survey, own_ties
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import (
     BoolArray,
@@ -226,7 +226,8 @@ def refine_run(
     updates : of the run
     trajectory : where the adjustment begins, if loops corrected the run; else the poses of
         ``updates``
-    graph : pose graph of the run, whose loop closures are used unless they contradict the others
+    graph : pose graph of the run. Its loop closures are used unless they contradict the others;
+        what is neither that nor a motion, a user's own factors, stays in the graph.
     survey : fixes of the run, as its map has them
     factors : further ones, on the poses of the middles of the sweeps: ``gtsam.symbol("x", n)`` is
         that of frame ``points.frames[n]``
@@ -240,14 +241,15 @@ def refine_run(
         As :func:`~loam_gtsam.refine.adjustment.refine` does, or if the trajectory has other stamps.
     """
     run = _Run.of(points, updates, trajectory, "trajectory")
-    further = gtsam.NonlinearFactorGraph()
+    further, own = gtsam.NonlinearFactorGraph(), list[FactorTies]()
     if graph is not None:
         frames = {key: run.frame[s] for key, s in graph.stamps.items() if s in run.frame}
         further.push_back(loop_factors(graph, frames, run.to_middle))
+        own = own_ties(graph, frames, run.to_middle)
     if factors is not None:
         further.push_back(factors)
     ties = None if survey is None else _fix_ties(survey, [run])
-    return _adjusted([run], further, ties, settings, min_aligned, on_round, on_window)[0]
+    return _adjusted([run], further, ties, own, settings, min_aligned, on_round, on_window)[0]
 
 
 def refine_runs(
@@ -274,8 +276,7 @@ def refine_runs(
     points, updates : of each run, as of :func:`refine_run`
     trajectories : of each, in one frame: ``MergedMaps.trajectory(number, updates)``
     graph : places of the runs, at the middles of sweeps, one run after the other, with the motions
-        between them: ``MergedMaps.graph.saved()``. Loop closures are used unless they contradict
-        the others.
+        between them: ``MergedMaps.graph.held()``, of which is used what :func:`refine_run` uses
     survey : fixes on these places
     starts : number of the first place of each run: ``MergedMaps.starts``
     factors, settings, min_aligned, on_round, on_window : as of :func:`refine_run`; factors count
@@ -296,17 +297,18 @@ def refine_runs(
         )
     given = zip(points, updates, trajectories, strict=True)
     runs = [_Run.of(*one, f"trajectories[{n}]") for n, one in enumerate(given)]
-    further = gtsam.NonlinearFactorGraph()
+    further, own = gtsam.NonlinearFactorGraph(), list[FactorTies]()
     if graph is not None:
         places = {pose_number(key): stamp for key, stamp in graph.stamps.items()}
         found = _sweeps_of(places, runs, starts)
         frames = {key: found[pose_number(key)] for key in graph.stamps if pose_number(key) in found}
         to_middle = [step for run in runs for step in run.from_places()]
         further.push_back(loop_factors(graph, frames, to_middle, starts))
+        own = own_ties(graph, frames, to_middle)
     if factors is not None:
         further.push_back(factors)
     ties = None if survey is None else _fix_ties(survey, runs, starts)
-    return _adjusted(runs, further, ties, settings, min_aligned, on_round, on_window)
+    return _adjusted(runs, further, ties, own, settings, min_aligned, on_round, on_window)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -393,7 +395,7 @@ def _fix_ties(survey: Survey, runs: Sequence[_Run], starts: Sequence[int] = (0,)
 
 def _adjusted(
     runs: Sequence[_Run], further: gtsam.NonlinearFactorGraph, fixes: FixTies | None,
-    settings: Settings | None, min_aligned: float,
+    ties: Sequence[FactorTies], settings: Settings | None, min_aligned: float,
     on_round: Callable[[Round], None] | None, on_window: Callable[[int, int], None] | None,
 ) -> tuple[RefinedRun, ...]:  # fmt: skip
     """Runs adjusted with their odometry and further factors."""
@@ -419,7 +421,7 @@ def _adjusted(
     ])  # fmt: skip
     found = refine(
         sweeps, before.map_T_middle, every, settings,
-        keep=asked, for_covariances=told, fixes=fixes, starts=starts,
+        keep=asked, for_covariances=told, fixes=fixes, ties=ties, starts=starts,
         on_round=on_round, on_window=on_window,
     )  # fmt: skip
     refined = []

@@ -15,9 +15,9 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.maps.merging import MergedMaps, merge_maps
 from loam_gtsam.pipeline import RunResult, run
-from loam_gtsam.refine.fixes import FixTies, Survey
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
+from loam_gtsam.refine.ties import FixTies, Survey
 from loam_gtsam.types import FloatArray, InputError
 
 CUTS = (0, 35), (25, 60)

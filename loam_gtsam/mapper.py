@@ -22,6 +22,7 @@ from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, MapPair
 from loam_gtsam.registration.imu_tracker import ImuTracker, with_imu
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
+from loam_gtsam.registration.point_times import PointTimes
 from loam_gtsam.registration.pose_errors import PoseErrors
 from loam_gtsam.registration.relocalization import (
     Fit,
@@ -91,7 +92,7 @@ class Mapper:
     registered : the last sweep as it went into the map; None if it did not
     imu : what the mapper makes of the IMU; None without one
     monitor : tells whether sweeps fit the map
-    errors : calibrates the covariances
+    errors, point_times : calibrate the covariances, and ask whether points move as the lidar does
     maps : the map of edges and that of planes
     keyframe : number of the keyframe to which the points of the next frames belong
 
@@ -117,14 +118,13 @@ class Mapper:
         self._forget()
 
     def _forget(self) -> None:
-        self.keyframe = 0
+        self.keyframe, self.maps = 0, MapPair(self.config)
         self.last: MapUpdate | None = None
         self.registered: Registered | None = None
         self.monitor, self.errors = FitMonitor(self.config.relocalization), PoseErrors(self.config)
-        self._stamps = StampCheck()
+        self._stamps, self.point_times = StampCheck(), PointTimes(self.config)
         self._start: Start | None = None
         self._moment: Moment | None = None
-        self.maps = MapPair(self.config)
 
     def __getstate__(self) -> dict[str, Any]:
         # For checkpoints: no frame depends on what is only there to be looked at.
@@ -287,16 +287,17 @@ class Mapper:
         if self._start is not None:
             frame, found = self._start.add(frame, found, self.keyframe, self._named, self.imu)
             self._start = None if self._start.complete else self._start
-        solution, rivals = found.solution, (found.doubt, found.parting)
+        solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
         self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
-        posed = found.posed
         scan = self.errors.of_scan(solution, small=self.maps.small)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike = with_imu(self.imu, posed, *told)
         if found.message or unlike:
             self.errors.jumped(frame.predicted, solution.map_T_lidar, unlike=unlike)
-        status, message = status_of(solution, found.message)
+        if self._start is None and not found.message:
+            self.point_times.add(posed, solution)
+        status, message = status_of(solution, found.message or self.point_times.problem)
         update = self._insert(posed, pose, status, message, clock, solution, tilt)
         last = None if found.message else frame.matcher.last
         update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)

@@ -98,6 +98,11 @@ class RunResult:
         return Trajectory.from_poses([u.stamp for u in good], [u.map_T_lidar for u in good])
 
     @property
+    def times_problem(self) -> str:
+        """What is wrong with the times of the points, by how these move; empty if nothing is."""
+        return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
+
+    @property
     def status_counts(self) -> dict[str, int]:
         """How many frames ended in which status."""
         return dict(Counter(str(u.status) for u in self.updates))

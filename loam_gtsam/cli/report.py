@@ -46,6 +46,8 @@ _ADVICE = {
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _MESSAGES, _TRIED_SWEEPS = 3, 5
 _MAPPED = 50  # sweeps from which the turns of the scans are told; a word needs 20
+_TIGHTER = 0.85
+"""Share of the scatter: sweeps that were de-skewed before have 0.2 to 0.7 as they are."""
 _SOUGHT, _STEP = 30.0, 1.0  # seconds in which a start for them is sought, and between such starts
 _VOXELS = 4  # of the map along the edge of a cell in which a plane is looked for
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
@@ -82,6 +84,8 @@ def summary(
         notes += _imu_problems(result.imu)
     notes += _odd_frames(result.updates)
     texts = [Text(f"  {note}", style="yellow") for note in notes]
+    if result.times_problem:
+        texts.append(Text(f"  DO NOT TRUST THIS RUN: {result.times_problem}", style="bold red"))
     warning, doubted = _warning(result.updates)
     if warning:
         texts.append(Text(f"  {warning}", style="bold red" if doubted else "yellow"))
@@ -236,8 +240,10 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     if imu is not None:
         used = f"{imu.report.samples} samples at {imu.report.rate:.0f} Hz"
         rows["IMU, used"] = f"{used}, orientation {_ORIENTATIONS[imu.report.orientation]}"
-        rows["IMU, by the scans"], found = _by_scans(dataset, asked) if facts else ("", [])
-        problems += found or imu.report.problems
+        problems += imu.report.problems if not facts else []
+    if facts and (imu is not None or config.sensor.times != "none"):
+        rows["by the scans"], found = _by_scans(dataset, asked)
+        problems += found
     tables = [_table(info.kind, rows), *([_table("First usable sweep", facts)] if facts else [])]
     notes = [Text(f"problem: {problem}", style="yellow") for problem in problems]
     verdict = "can be run" if facts else "cannot be run: no usable sweep among the first few"
@@ -260,7 +266,7 @@ def _imu_beside(dataset: Dataset, config: Config, sweep: Sweep) -> list[str]:
 
 
 def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
-    """What a short run says of an IMU: how much was mapped, and problems with the IMU.
+    """What a short run says: how much was mapped, and problems with times of points and an IMU.
 
     The sweeps are the first, of the first half minute, over which the gyro's rates vary at least
     half as much as over any: where nothing turns, clock and mounting cannot be told.
@@ -276,10 +282,20 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         begin = where_it_turns(seconds, imu.gyro[order], _MAPPED * period, len(dataset) * period)
     part = PartOf(dataset, 0, 1, begin)
     result = run(part, config, max_frames=_MAPPED, keep_partial=True)
-    if result.imu is None:
-        return "", []
-    said = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
-    return said, _imu_problems(result.imu)
+    problems = [] if result.imu is None else _imu_problems(result.imu)
+    if result.times_problem:
+        problems.insert(0, result.times_problem)
+        as_is = config.changed("sensor.times=none")
+        without = run(part, as_is, max_frames=_MAPPED, keep_partial=True)
+        if _scatter(without) < _TIGHTER * _scatter(result):
+            problems[0] = "the sweeps are de-skewed already: they fit better with sensor.times=none"
+    return f"{len(result.updates)} sweeps mapped, from {begin:g} s on", problems
+
+
+def _scatter(result: RunResult) -> float:
+    """Median variance of the whitened residuals of a run; infinite if no sweep was solved."""
+    known = [u.uncertainty.residual_variance for u in result.updates if u.uncertainty is not None]
+    return float(np.median(known)) if known else np.inf
 
 
 def where_it_turns(seconds: FloatArray, gyro: FloatArray, length: float, duration: float) -> float:

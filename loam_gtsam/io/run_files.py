@@ -209,7 +209,8 @@ def summarise(result: RunResult) -> dict[str, Any]:
     """What ``summary.json`` says about a run; lengths in metres, times in the unit of the name."""
     trajectory = result.trajectory
     seconds = np.nansum(stage_seconds(result.updates)[1], axis=1)
-    told = [(n, u) for n, u in enumerate(result.updates) if u.message]
+    before = ["", *(update.message for update in result.updates)]
+    told = [(n, u) for n, u in enumerate(result.updates) if u.message not in ("", before[n])]
     return {
         "loam_gtsam": installed_version(),
         "frames": len(result.updates),
@@ -232,6 +233,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "plane_points": len(result.plane_points),
         "map_stats": {name: dict(stats) for name, stats in result.map_stats.items()},
         "localizability": _axes_part(result),
+        "point_times": result.times_problem or None,
         "imu": None if result.imu is None else _imu_part(result.imu),
         "loops": None if result.loops is None else result.loops.counts(),
         "gnss": None if result.fixes is None else result.fixes.as_dict(),

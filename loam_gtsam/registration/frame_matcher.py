@@ -10,7 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, MatchingConfig
+from loam_gtsam.config import Config, MatchingConfig, SolverConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
@@ -305,7 +305,7 @@ class FrameMatcher(Matcher):
             return False
         if self.told is not None:
             return self.told
-        return self.tells_motion(localizability(matches, map_T_lidar))
+        return tells_motion(localizability(matches, map_T_lidar), self.config.solver)
 
     def _solved_twist(
         self, map_T_lidar: gtsam.Pose3, matches: ScanMatches, expected: FloatArray, span: float
@@ -330,10 +330,6 @@ class FrameMatcher(Matcher):
         velocities = matches.search.posed.twist, expected, missed
         noise = config.features.range_noise
         return solved_twist(rows, matches.tilts, seconds, map_T_lidar, *velocities, noise)
-
-    def tells_motion(self, seen: Localizability) -> bool:
-        """Whether a sweep of some localizability tells how fast its pose changes."""
-        return bool(seen.aligned[0] >= _PARTS * self.config.solver.min_aligned)
 
     def moving_at(self, twist: FloatArray) -> FrameMatcher:
         """The matcher of the sweep de-skewed for a (6,) body velocity, and for no other."""
@@ -384,6 +380,11 @@ class FrameMatcher(Matcher):
         return replace(matches, planes=both) if few or closed.any() else matches
 
 
+def tells_motion(seen: Localizability, config: SolverConfig) -> bool:
+    """Whether a sweep of some localizability tells how fast its pose changes."""
+    return bool(seen.aligned[0] >= _PARTS * config.min_aligned)
+
+
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
     return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct, sweep.alone)
 
@@ -410,6 +411,6 @@ class Frame:
         """The sweep, de-skewed with the motion that belongs to a solution."""
         matcher, seen = self.matcher, solution.localizability
         if seen is not None and matcher.motion_is_free:  # saves looking again
-            matcher = replace(matcher, told=matcher.tells_motion(seen))
+            matcher = replace(matcher, told=tells_motion(seen, matcher.config.solver))
         matches = solution.matches if solution.solved else None
         return matcher.posed_at(solution.map_T_lidar, matches)

@@ -270,7 +270,7 @@ def solved_twist(
     step = alone @ (pull[6:] - followed @ pull[:6])
     noise = displacements(rows.points, (rows.scales * tilts * seconds) ** 2)
     information = nearest_positive(information - noise)
-    wrong = max(_UNEVEN * range_noise, _STEADIEST) / max(np.abs(seconds).max(), _SHORTEST)
+    wrong = unseen_velocity(seconds, range_noise)
     far = float(np.median(np.sqrt(squared_norm(rows.points.T))))
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
     # The inverse of information^-1 + limit^-1, without that of the information.
@@ -279,6 +279,14 @@ def solved_twist(
     change = np.linalg.solve(believed + seen, believed @ (mean - twist) + seen @ step)
     solved: FloatArray = twist + change
     return solved
+
+
+def unseen_velocity(seconds: FloatArray, range_noise: float) -> float:
+    """m/s of a motion within a sweep that the error of one side of the sensor looks like.
+
+    ``seconds`` (R,) of the points are from the middle of the sweep; ``range_noise`` is in metres.
+    """
+    return max(_UNEVEN * range_noise, _STEADIEST) / max(float(np.abs(seconds).max()), _SHORTEST)
 
 
 class ScanToScan(Odometry):

@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.receiver import ORIGIN, SURVEY, SURVEY_SIGMA, off_in_enu, surveyed_parts
+from support.ties import check_gradient
 
 from loam_gtsam.aiding.gnss import PlacedFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference
@@ -162,19 +163,7 @@ def ties(up: FloatArray | None, count: int = 6) -> tuple[FixTies, FloatArray]:
 
 @pytest.mark.parametrize("up", [None, np.array([0.0, 0.1, 1.0])])
 def test_the_gradient_is_that_of_the_cost(up) -> None:
-    known, poses = ties(up)
-    _, gradient = known.equations(poses)
-    assert gradient.shape == (6 * len(known.numbers),)
-    for place, number in enumerate(known.numbers):
-        for axis in range(6):
-            costs = []
-            for step in (1e-5, -1e-5):
-                moved = poses.copy()
-                delta = step * np.eye(6)[axis]
-                moved[number] = gtsam.Pose3(poses[number]).retract(delta).matrix()
-                costs.append(known.cost(moved))
-            slope = (costs[0] - costs[1]) / 2e-5
-            assert gradient[6 * place + axis] == pytest.approx(slope, rel=1e-4, abs=1e-3)
+    check_gradient(*ties(up))
 
 
 def test_poses_that_move_together_cost_nothing_but_their_lean() -> None:

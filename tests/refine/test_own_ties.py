@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 import pytest
+from support.ties import check_gradient
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -18,7 +19,7 @@ from loam_gtsam.maps.map_graph import MapGraph
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
-from loam_gtsam.refine.ties import FactorTies, own_ties
+from loam_gtsam.refine.ties import own_ties
 from loam_gtsam.types import FloatArray, InputError
 
 N = gtsam.symbol("n", 0)
@@ -155,21 +156,8 @@ def test_what_is_no_motion_stays_in_groups_that_share_no_variable() -> None:
 def test_the_gradient_is_that_of_the_cost(factors) -> None:
     for ties in own_ties(graph_of(*factors), FRAMES, STEPS):
         check_gradient(ties, middles())
-
-
-def check_gradient(ties: FactorTies, poses: FloatArray) -> None:
-    information, gradient = ties.equations(poses)
-    assert np.linalg.eigvalsh(information).min() > -1e-9 * np.abs(information).max()
-    for place, number in enumerate(ties.numbers):
-        for axis in range(6):
-            costs = []
-            for step in (1e-5, -1e-5):
-                moved = poses.copy()
-                delta = step * np.eye(6)[axis]
-                moved[number] = gtsam.Pose3(poses[number]).retract(delta).matrix()
-                costs.append(ties.cost(moved))
-            slope = (costs[0] - costs[1]) / 2e-5
-            assert gradient[6 * place + axis] == pytest.approx(slope, rel=1e-4, abs=1e-2)
+        information, _ = ties.equations(middles())
+        assert np.linalg.eigvalsh(information).min() > -1e-9 * np.abs(information).max()
 
 
 def test_a_variable_that_is_left_open_is_named() -> None:

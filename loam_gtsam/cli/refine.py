@@ -85,12 +85,18 @@ def _refined(
     folder: Path, runs: Sequence[FinishedRun], ways: Sequence[Trajectory], starts: Sequence[int],
     settings: Settings, most: int, *, quiet: bool,
 ) -> tuple[RefinedRun, ...]:  # fmt: skip
-    """Runs refined, with what the map in a folder knows: loops, fixes, a user's own factors."""
+    """Runs refined, with what the map in a folder knows: loops, fixes, a user's own factors.
+
+    Without loops and own factors its graph is the odometry once more, back to places that were
+    visited before: these motions are no loops.
+    """
     points = [run.points(most, quiet=quiet) for run in runs]
     graph = survey = None
     if map_of_run(folder).exists():
         with SavedMap(map_of_run(folder)) as saved:
-            graph, survey = saved.graph.held(), _survey(saved)
+            survey = _survey(saved)
+            if saved.graph.loops or saved.graph.own is not None:
+                graph = saved.graph.held()
     with _progress(settings, quiet=quiet) as shown:
         return refine_runs(
             points, [run.updates for run in runs], ways, graph=graph, survey=survey,

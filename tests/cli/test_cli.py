@@ -24,10 +24,16 @@ from loam_gtsam.cli.console import stop_requests
 from loam_gtsam.cli.report import where_it_turns
 from loam_gtsam.cli.results import BASE_FILES, ERROR_PLOT, PLOT_FILES
 from loam_gtsam.config import Config, load_config
-from loam_gtsam.datasets.base import DatasetInfo
+from loam_gtsam.datasets import open_dataset
+from loam_gtsam.datasets.base import DatasetInfo, PartOf
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.datasets.truth import read_truth
 from loam_gtsam.loops.files import read_graph
+from loam_gtsam.maps.map_file import SavedMap
+from loam_gtsam.pipeline import run
+from loam_gtsam.refine.rounds import Settings
+from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
 from loam_gtsam.view import plots as visualization
 
@@ -586,3 +592,19 @@ def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
     missing = loam("refine", spec, "nothing")
     assert missing.exit_code == 1
     assert "expected the folder of a finished run" in missing.output
+
+
+def test_odometry_back_to_places_visited_before_is_no_loop_for_refine() -> None:
+    often = "pose_graph.keyframe_distance=1", "pose_graph.visits=1"
+    spec = "sim:room?frames=300&columns=200&speed=3", "--every", "5"
+    settings = [word for setting in often for word in ("--set", setting)]
+    assert loam("run", *spec, "--output", "out", "--no-plot", "-q", *settings).exit_code == 0
+    with SavedMap("out/map.lgmap") as saved:
+        assert any(abs(link.later - link.earlier) > 1 for link in saved.graph.links)
+    assert loam("refine", *spec, "out", "--rounds", "1", "--no-plot", "-q").exit_code == 0
+    dataset = PartOf(open_dataset(spec[0]), 0, 5)
+    result = run(dataset, Config().changed(*often))
+    points = run_points(dataset, result.updates, result.config)
+    alone = refine_run(points, result.updates, settings=Settings(rounds=1)).trajectory
+    refined = read_truth("out/refined/trajectory.tum")
+    np.testing.assert_allclose(refined.map_T_lidar, alone.map_T_lidar, atol=1e-8)

@@ -240,10 +240,10 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     if imu is not None:
         used = f"{imu.report.samples} samples at {imu.report.rate:.0f} Hz"
         rows["IMU, used"] = f"{used}, orientation {_ORIENTATIONS[imu.report.orientation]}"
-        problems += imu.report.problems if not facts else []
+    found: list[str] = []
     if facts and (imu is not None or config.sensor.times != "none"):
         rows["by the scans"], found = _by_scans(dataset, asked)
-        problems += found
+    problems += found or ([] if imu is None else imu.report.problems)
     tables = [_table(info.kind, rows), *([_table("First usable sweep", facts)] if facts else [])]
     notes = [Text(f"problem: {problem}", style="yellow") for problem in problems]
     verdict = "can be run" if facts else "cannot be run: no usable sweep among the first few"
@@ -282,14 +282,14 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         begin = where_it_turns(seconds, imu.gyro[order], _MAPPED * period, len(dataset) * period)
     part = PartOf(dataset, 0, 1, begin)
     result = run(part, config, max_frames=_MAPPED, keep_partial=True)
-    problems = [] if result.imu is None else _imu_problems(result.imu)
-    if result.times_problem:
-        problems.insert(0, result.times_problem)
+    said, of_imu = result.times_problem, [] if result.imu is None else _imu_problems(result.imu)
+    if said:
         as_is = config.changed("sensor.times=none")
         without = run(part, as_is, max_frames=_MAPPED, keep_partial=True)
         if _scatter(without) < _TIGHTER * _scatter(result):
-            problems[0] = "the sweeps are de-skewed already: they fit better with sensor.times=none"
-    return f"{len(result.updates)} sweeps mapped, from {begin:g} s on", problems
+            said = "the sweeps are de-skewed already: they fit better with sensor.times=none"
+    mapped = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
+    return mapped, [said, *of_imu] if said else of_imu
 
 
 def _scatter(result: RunResult) -> float:

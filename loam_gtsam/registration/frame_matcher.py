@@ -12,6 +12,7 @@ import numpy as np
 
 from loam_gtsam.config import Config, MatchingConfig, SolverConfig
 from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
@@ -318,9 +319,7 @@ class FrameMatcher(Matcher):
         assert self.accelerations is not None
         assert matches.search is not None
         config, sweep = self.config, self.posed.sweep
-        rows = match_rows(matches, config.solver.kernel_width, config.solver.kernel)
-        edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
-        seconds = np.concatenate([np.repeat(edges, 2), planes])
+        rows, seconds = timed_rows(matches, sweep, config.solver)
         # A change of the velocity is one of the acceleration: the last middle stays on the path.
         seconds = seconds + seconds**2 / span
         # A jump of the pose is no acceleration to believe in.
@@ -383,6 +382,15 @@ class FrameMatcher(Matcher):
 def tells_motion(seen: Localizability, config: SolverConfig) -> bool:
     """Whether a sweep of some localizability tells how fast its pose changes."""
     return bool(seen.aligned[0] >= _PARTS * config.min_aligned)
+
+
+def timed_rows(
+    matches: ScanMatches, sweep: MovingSweep, config: SolverConfig
+) -> tuple[MatchRows, FloatArray]:
+    """The rows of the matches of a sweep, and seconds (R,) from its middle to their points."""
+    edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
+    seconds = np.concatenate([np.repeat(edges, 2), planes])
+    return match_rows(matches, config.kernel_width, config.kernel), seconds
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:

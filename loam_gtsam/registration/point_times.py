@@ -12,9 +12,9 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
-from loam_gtsam.registration.frame_matcher import tells_motion
+from loam_gtsam.registration.frame_matcher import tells_motion, timed_rows
 from loam_gtsam.registration.odometry import unseen_velocity
-from loam_gtsam.registration.solvers import Solution, match_rows
+from loam_gtsam.registration.solvers import Solution
 
 _LEAST = 1.0
 """Information of a sweep about the share of the motion below which it tells nothing."""
@@ -45,14 +45,12 @@ class PointTimes:
 
         ``posed`` has the final motion, ``solution`` the pose of its middle.
         """
-        seen, matches = solution.localizability, solution.matches
+        seen = solution.localizability
         if not self._asks or solution.weak is not None or not posed.sweep.duration:
             return
         if seen is None or not tells_motion(seen, self._solver):
             return
-        rows = match_rows(matches, self._solver.kernel_width, self._solver.kernel)
-        edges, planes = posed.sweep.seconds(matches.edges.indices, matches.planes.indices)
-        seconds = np.concatenate([np.repeat(edges, 2), planes])
+        rows, seconds = timed_rows(solution.matches, posed.sweep, self._solver)
         residuals, by_pose = rows.residuals(solution.map_T_lidar)
         velocity = by_pose @ posed.twist  # of the points, along their normals, and whitened
         moved = seconds * velocity

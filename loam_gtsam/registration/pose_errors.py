@@ -283,7 +283,7 @@ class PoseErrors:
     def skipped(self, posed: PosedSweep) -> None:
         """Account for a sweep whose pose is the expected one; the very first begins the map."""
         if self._first is None and not self._scans:
-            self._first = posed
+            self._first = PosedSweep(posed.sweep, posed.twist)  # without the points it has made
             self._expected.begin(posed.sweep.stamp)
 
     def _own_of(

@@ -85,18 +85,12 @@ def _refined(
     folder: Path, runs: Sequence[FinishedRun], ways: Sequence[Trajectory], starts: Sequence[int],
     settings: Settings, most: int, *, quiet: bool,
 ) -> tuple[RefinedRun, ...]:  # fmt: skip
-    """Runs refined, with what the map in a folder knows: loops, fixes, a user's own factors.
-
-    Without loops and own factors its graph is the odometry once more, back to places that were
-    visited before: these motions are no loops.
-    """
+    """Runs refined, with what the map in a folder knows: loops, fixes, a user's own factors."""
     points = [run.points(most, quiet=quiet) for run in runs]
     graph = survey = None
     if map_of_run(folder).exists():
         with SavedMap(map_of_run(folder)) as saved:
-            survey = _survey(saved)
-            if saved.graph.loops or saved.graph.own is not None:
-                graph = saved.graph.held()
+            survey, graph = _survey(saved), saved.graph.held()
     with _progress(settings, quiet=quiet) as shown:
         return refine_runs(
             points, [run.updates for run in runs], ways, graph=graph, survey=survey,

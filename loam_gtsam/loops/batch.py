@@ -32,14 +32,16 @@ class SavedGraph:
 
     Attributes
     ----------
-    factors : between factors are loop closures unless their poses follow one another
+    factors : of GTSAM, on the poses
     poses : Pose3 by key; a user's own variables may be among them
     stamps : nanoseconds by key, as far as known
+    closures : positions of the loop closures in ``factors``; None, as of a file, if it is not known
     """
 
     factors: gtsam.NonlinearFactorGraph
     poses: gtsam.Values
     stamps: Mapping[int, int] = field(default_factory=dict)
+    closures: Sequence[int] | None = None
 
     @property
     def keys(self) -> list[int]:
@@ -48,7 +50,12 @@ class SavedGraph:
 
     @property
     def loops(self) -> tuple[int, ...]:
-        """Positions of the loop closures in ``factors``."""
+        """Positions of the loop closures in ``factors``.
+
+        If it is not known: the between factors whose poses do not follow one another.
+        """
+        if self.closures is not None:
+            return tuple(self.closures)
         rank = {key: place for place, key in enumerate(self.keys)}
         found = []
         for place in range(self.factors.size()):
@@ -105,7 +112,6 @@ def optimize_graph(
     *,
     robust: bool = True,
     max_chi2: float = PoseGraphConfig().max_chi2,
-    loops: Sequence[int] | None = None,
 ) -> OptimizedGraph:
     """Find the poses that fit all factors best, without loop closures that contradict the others.
 
@@ -115,7 +121,6 @@ def optimize_graph(
         off. If there is no unary factor, the first pose is held where it is.
     robust : False uses all loop closures
     max_chi2 : largest squared Mahalanobis distance of a loop closure that agrees with the others
-    loops : positions of the loop closures in ``saved.factors``; ``saved.loops`` if None
 
     Raises
     ------
@@ -123,7 +128,7 @@ def optimize_graph(
         If there is nothing to optimise, or the factors do not determine the poses.
     """
     _check(saved)
-    problem = _Problem(saved, saved.loops if loops is None else loops)
+    problem = _Problem(saved)
     active = np.ones(len(problem.loops), np.bool_)
     try:
         graph, poses, distances = problem.solve(active)
@@ -179,10 +184,10 @@ def _check(saved: SavedGraph) -> None:
 
 
 class _Problem:
-    """Factors of a graph, of which the loop closures (positions ``loops``) can be left out."""
+    """Factors of a graph, of which the loop closures can be left out."""
 
-    def __init__(self, saved: SavedGraph, loops: Sequence[int]) -> None:
-        self.saved, self.loops = saved, tuple(loops)
+    def __init__(self, saved: SavedGraph) -> None:
+        self.saved, self.loops = saved, saved.loops
 
     def factors(self, active: BoolArray) -> gtsam.NonlinearFactorGraph:
         """Factors with plain noise, the active loop closures among them, and a needed anchor."""

@@ -7,6 +7,7 @@ Frames and keys: :mod:`loam_gtsam.loops.keyframes`.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -191,12 +192,18 @@ class PoseGraph(FactorGraph):
         return np.concatenate(edges), np.concatenate(planes)
 
     def saved(self) -> SavedGraph:
-        """The graph as it is written to files: all loop closures, inactive ones too, no kernels."""
+        """The graph as it is written to files: all loop closures, inactive ones too, no kernels.
+
+        Motions of a user's own are loop closures there: they can be wrong, which odometry is not.
+        """
         graph = gtsam.NonlinearFactorGraph(self._graph.factors)
+        motion = gtsam.BetweenFactorPose3
+        loops = [place for place in self.own if isinstance(graph.at(place), motion)]
         for loop in self.loops:
+            loops.append(graph.size())
             graph.add(loop.factor())
         stamps = {keyframe.key: keyframe.stamp for keyframe in self.keyframes}
-        return SavedGraph(graph, self.values, stamps)
+        return SavedGraph(graph, self.values, stamps, loops)
 
     def active_factors(self) -> gtsam.NonlinearFactorGraph:
         """All factors that are in the graph now, those of inactive loop closures left out."""
@@ -224,9 +231,9 @@ class PoseGraph(FactorGraph):
         InputError
             If there are no keyframes. The graph is then as it was before.
         """
-        saved, first = self.saved(), self._graph.factors.size()
-        loops = range(first, first + len(self.loops))
-        result = optimize_graph(saved, max_chi2=self.config.max_chi2, loops=loops)
+        saved = self.saved()
+        loops = saved.loops[len(saved.loops) - len(self.loops) :]  # a user's own are believed
+        result = optimize_graph(replace(saved, closures=loops), max_chi2=self.config.max_chi2)
         active = np.array([report.active for report in result.loops], np.bool_)
         self._graph.restart(result.poses, active)
         return result

@@ -70,7 +70,8 @@ class MapGraph:
         for number, place in enumerate(self.places):
             poses.insert(pose_key(number), place.map_T_middle)
         stamps = {pose_key(number): place.stamp for number, place in enumerate(self.places)}
-        return SavedGraph(factors, poses, stamps)
+        first = len(self.links)
+        return SavedGraph(factors, poses, stamps, range(first, first + len(self.loops)))
 
     def held(self) -> SavedGraph:
         """As it is optimised: the first place is held, and a user's own factors are there."""

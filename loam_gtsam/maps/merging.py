@@ -246,9 +246,7 @@ class _Whole:
         graph = MapGraph(places, links, loops, own=self._own(frames)).held()
         if self._fixes is not None:
             self._add(self._fixes, graph, frames)
-        chosen = range(len(links), len(links) + len(loops))
-        most = self._config.pose_graph.max_chi2
-        return optimize_graph(graph, max_chi2=most, loops=chosen)
+        return optimize_graph(graph, max_chi2=self._config.pose_graph.max_chi2)
 
     def take_fixes(self, solved: OptimizedGraph, ties: Sequence[LoopClosure]) -> None:
         """Use the fixes from now on, with offsets of receivers that contradict each other.
@@ -259,9 +257,10 @@ class _Whole:
         fixes = _fixes_of(self._maps, self._starts)
         if fixes is None:
             return
-        graph = SavedGraph(gtsam.NonlinearFactorGraph(solved.factors), gtsam.Values(solved.poses))
+        factors = gtsam.NonlinearFactorGraph(solved.factors)
+        graph = SavedGraph(factors, gtsam.Values(solved.poses), closures=())
         self._add(fixes, graph, self._frames(ties))
-        offsets = fixes.offsets(optimize_graph(graph, robust=False, loops=()).poses)
+        offsets = fixes.offsets(optimize_graph(graph).poses)
         metres = np.linalg.norm(offsets, axis=1)
         if metres.max() > _ASIDE:
             pose = fixes.poses[fixes.receivers == metres.argmax()][0]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
-from loam_gtsam.loops.keyframes import noise_model, pose_number
+from loam_gtsam.loops.keyframes import noise_model
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate
 
@@ -112,25 +111,19 @@ def loop_factors(
     graph: SavedGraph,
     frames: Mapping[int, int],
     to_middle: Sequence[gtsam.Pose3],
-    starts: Sequence[int] = (0,),
 ) -> gtsam.NonlinearFactorGraph:
     """The loop closures that agree with the others, between the middles of the sweeps.
 
     Parameters
     ----------
-    graph : pose graph of a run, or of several, which loops alone tie
+    graph : pose graph of a run, or of several
     frames : numbers of the sweeps by the keys of the graph; loops on other keys are left out
     to_middle : pose of the middle of each sweep, seen from where the graph has its pose
-    starts : numbers of the first poses of the runs in the graph
     """
-    run = {key: bisect_right(starts, pose_number(key)) for key in graph.keys}
-    loops = set(graph.loops)
-    for place in range(graph.factors.size()):
-        ends = [run[key] for key in graph.factors.at(place).keys() if key in run]  # noqa: SIM118
-        loops |= {place} if len(set(ends)) > 1 else set()
-    solved = optimize_graph(graph, loops=sorted(loops))
     found = gtsam.NonlinearFactorGraph()
-    for place, report in zip(sorted(loops), solved.loops, strict=True):
+    if not graph.loops:
+        return found
+    for place, report in zip(graph.loops, optimize_graph(graph).loops, strict=True):
         factor: Any = graph.factors.at(place)
         first, second = (frames.get(key) for key in factor.keys())  # noqa: SIM118
         if not report.active or first is None or second is None:

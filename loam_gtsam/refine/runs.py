@@ -303,7 +303,7 @@ def refine_runs(
         found = _sweeps_of(places, runs, starts)
         frames = {key: found[pose_number(key)] for key in graph.stamps if pose_number(key) in found}
         to_middle = [step for run in runs for step in run.from_places()]
-        further.push_back(loop_factors(graph, frames, to_middle, starts))
+        further.push_back(loop_factors(graph, frames, to_middle))
         own = own_ties(graph, frames, to_middle)
     if factors is not None:
         further.push_back(factors)

@@ -335,6 +335,13 @@ def test_a_place_that_is_visited_again_and_again_takes_no_more_room():
     assert steps <= 4 * (counts["keyframes"] + counts["loops"]) + 101
 
 
+def test_odometry_back_to_a_known_place_is_no_loop():
+    """Its keyframes do not follow one another, as the one before was forgotten."""
+    _, loops, _ = driven_round(4, visits=1)
+    saved = loops.graph.saved()
+    assert len(saved.loops) == len(loops.graph.loops) < len(replace(saved, closures=None).loops)
+
+
 def test_points_seen_from_a_forgotten_keyframe_belong_to_its_place():
     mapper, loops, _ = driven_round(4, visits=1)
     assert loops.counts()["forgotten"] == 2 * len(PLACES) - 1

@@ -9,6 +9,7 @@ from support.pose_graphs import SIGMAS, drifted, filled, off, right_loops, squar
 
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.io.state import freeze
+from loam_gtsam.loops.batch import optimize_graph
 from loam_gtsam.loops.files import read_graph, write_graph
 from loam_gtsam.types import InputError, OutputError
 
@@ -157,6 +158,16 @@ def test_factors_written_in_python_go_with_loops_and_into_the_batch_solution():
     result = graph.optimize()  # with graduated non-convexity, which copies factors
     assert tuple(loop.active for loop in result.loops) == graph.active == active
     assert off(graph.poses(), TRUTH) < 0.5 * off(filled(odometry).poses(), TRUTH)
+
+
+def test_a_motion_of_ones_own_is_believed_in_the_run_and_tested_in_a_graph_of_its_own():
+    graph = filled(TRUTH[:10])
+    graph.add_factor(gtsam.BetweenFactorPose3(X(3), X(4), gtsam.Pose3(), UNIT))
+    for loop in wrong_loops(2, 10, np.random.default_rng(2)):
+        graph.add_loop(loop)
+    assert graph.saved().loops == tuple(graph.own) + (11, 12)
+    assert len(optimize_graph(graph.saved()).loops) == 3
+    assert len(graph.optimize().loops) == 2
 
 
 def test_factors_written_in_python_cannot_be_kept(tmp_path):

@@ -92,7 +92,7 @@ def solved(graph: MapGraph) -> tuple[gtsam.Values, gtsam.Marginals]:
     if graph.own is not None:
         saved.factors.push_back(graph.own.factors())
         saved.poses.insert(graph.own.start())
-    found = optimize_graph(saved, loops=())
+    found = optimize_graph(replace(saved, closures=()))
     return found.poses, gtsam.Marginals(found.factors, found.poses)
 
 

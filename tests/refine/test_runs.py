@@ -116,7 +116,7 @@ def with_loop(graph: SavedGraph, earlier: int, later: int, beside: float) -> Sav
     factors = gtsam.NonlinearFactorGraph(graph.factors)
     motion = poses[0].between(poses[1]).compose(aside)
     factors.add(gtsam.BetweenFactorPose3(X(earlier), X(later), motion, noise))
-    return replace(graph, factors=factors)
+    return replace(graph, factors=factors, closures=[*graph.loops, factors.size() - 1])
 
 
 @pytest.mark.parametrize("neighbours", [True, False])

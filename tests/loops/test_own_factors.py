@@ -165,7 +165,7 @@ def test_a_motion_of_ones_own_is_believed_in_the_run_and_tested_in_a_graph_of_it
     graph.add_factor(gtsam.BetweenFactorPose3(X(3), X(4), gtsam.Pose3(), UNIT))
     for loop in wrong_loops(2, 10, np.random.default_rng(2)):
         graph.add_loop(loop)
-    assert graph.saved().loops == tuple(graph.own) + (11, 12)
+    assert graph.saved().loops == (*graph.own, 11, 12)
     assert len(optimize_graph(graph.saved()).loops) == 3
     assert len(graph.optimize().loops) == 2
 

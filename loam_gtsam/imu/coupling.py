@@ -10,7 +10,7 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.preintegration import Fused, InertialOdometry, Prediction
+from loam_gtsam.imu.preintegration import NO_STEP, Fused, InertialOdometry, Prediction
 from loam_gtsam.imu.preintegration_window import VELOCITY
 from loam_gtsam.types import FloatArray, SweepError
 
@@ -172,6 +172,7 @@ class TightCoupling:
     def observe(
         self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3],
         information: FloatArray, gravity: FloatArray, buffer: ImuBuffer,
+        step: FloatArray = NO_STEP,
     ) -> Fused | None:  # fmt: skip
         """Take in what the scan alone said about a moment; the pose by both.
 
@@ -182,6 +183,7 @@ class TightCoupling:
         last, now : stamp, nanoseconds, and ``map_T_lidar`` of the frame before and of this one
         information : (6, 6) of the second pose, zero where the scan is not believed
         gravity : (3,) m/s^2, map frame, with which the estimate begins, as with the buffer's bias
+        step : (6,) from the second pose to where the scan has it
         """
         stamp, pose = now
         self.contradicted, self.turn_surprise = False, 0.0
@@ -189,7 +191,7 @@ class TightCoupling:
             return None
         try:
             if self._odometry is not None and self._predicted == stamp:
-                fused = self._odometry.update(pose, information)
+                fused = self._odometry.update(pose, information, step)
                 self.turn_surprise = self._odometry.turn_surprise
                 unlikely = self._odometry.surprise >= _UNLIKELY
                 self.contradicted = unlikely and self.trusted

@@ -35,6 +35,7 @@ _JUMP = 30.0
 wrong match, a map put elsewhere). An information ten times too large in sigma stays below it."""
 _LEAST_SIGMA = 1e-6
 """rad and m: keeps a covariance regular after a scan that claims more."""
+NO_STEP = np.zeros(6)
 _UNSOLVABLE = RuntimeError, np.linalg.LinAlgError
 """What GTSAM and numpy raise where there is no finite solution."""
 
@@ -186,7 +187,9 @@ class InertialOdometry:
         velocity: FloatArray = state.velocity - map_T_imu.rotation().matrix() @ lever
         return map_T_imu.compose(self._lidar_T_imu.inverse()), velocity
 
-    def update(self, measured: gtsam.Pose3, information: FloatArray) -> Fused | None:
+    def update(
+        self, measured: gtsam.Pose3, information: FloatArray, step: FloatArray = NO_STEP
+    ) -> Fused | None:
         """Take in what the scan said about the predicted frame; None if a new window began.
 
         InputError if a value is wrong, or nothing has been predicted. SweepError if no window can
@@ -194,10 +197,12 @@ class InertialOdometry:
 
         Parameters
         ----------
-        measured : ``map_T_lidar`` at the optimum of the scan alone
+        measured : ``map_T_lidar`` of the scan
         information : (6, 6) of the tangent there, positive semi-definite; singular or zero where
             the scan says nothing. It is believed; errors that last over frames are to be allowed
             for.
+        step : (6,) of the tangent there, to the optimum of the scan. That may be far away along
+            what it hardly knows, and all this is linear near ``measured`` only.
         """
         root = information_root(as_array(information, "information", (6, 6)))
         if self._pending is None:
@@ -208,6 +213,7 @@ class InertialOdometry:
         left = np.eye(STATE)  # share of the predicted state's error that the scan leaves
         if len(root):
             error, derivative = scan_residual(predicted.map_T_imu, self._lidar_T_imu, measured)
+            error = error - step
             surprise, rows = root @ error, root @ derivative
             spread = predicted.covariance[:, POSE]
             covariance = spread[POSE]
@@ -224,12 +230,12 @@ class InertialOdometry:
                 # A velocity that was wrong looks like this too: it is free along the jump, and
                 # kept across it, where the scan may be blind.
                 seconds = (predicted.stamp - self.state.stamp) * 1e-9
-                jump = measured.rotation().matrix() @ error[3:] / seconds
+                jump = measured.rotation().matrix() @ (error + step)[3:] / seconds
                 free = predicted.covariance[VELOCITY, VELOCITY] + np.outer(jump, jump)
                 moved = replace(predicted, map_T_imu=measured.compose(self._lidar_T_imu))
                 self._start(_uncorrelated(moved, known, free), 1)
                 return None
-            frame.add_scan(self._lidar_T_imu, measured, root)
+            frame.add_scan(self._lidar_T_imu, measured, root, step)
             left[:, POSE] -= spread @ rows.T @ np.linalg.solve(expected, rows)
         try:
             self.state = self._window.append(frame)

@@ -105,7 +105,7 @@ class WindowFrame:
         if state[1]:
             self.add_scan(*state[1])
 
-    def add_scan(self, *scan: *tuple[gtsam.Pose3, gtsam.Pose3, FloatArray]) -> None:
+    def add_scan(self, *scan: *tuple[gtsam.Pose3, gtsam.Pose3, FloatArray, FloatArray]) -> None:
         """Add what the scan says."""
         self.scan = scan
         self.graph.add(scan_factor(X(self.number), *scan))
@@ -208,9 +208,12 @@ def scan_residual(
 
 
 def scan_factor(
-    key: int, lidar_T_imu: gtsam.Pose3, measured: gtsam.Pose3, root: FloatArray
+    key: int, lidar_T_imu: gtsam.Pose3, measured: gtsam.Pose3, root: FloatArray, step: FloatArray
 ) -> gtsam.CustomFactor:
-    """``root e`` on the IMU's pose ``key``, with ``e`` of :func:`scan_residual`; root is (M, 6)."""
+    """``root (e - step)`` on the IMU's pose ``key``, with ``e`` of :func:`scan_residual`.
+
+    ``root`` is (M, 6), and ``step`` (6,) leads from ``measured`` to the optimum of the scan.
+    """
 
     def call(
         this: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -218,7 +221,7 @@ def scan_factor(
         error, derivative = scan_residual(values.atPose3(key), lidar_T_imu, measured)
         if jacobians is not None:
             jacobians[0] = np.asfortranarray(root @ derivative)
-        whitened: FloatArray = root @ error
+        whitened: FloatArray = root @ (error - step)
         return whitened
 
     return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(len(root)), [key], call)

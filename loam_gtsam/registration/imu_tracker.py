@@ -16,7 +16,7 @@ from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.coupling import GyroTrust, TightCoupling
 from loam_gtsam.imu.diagnosis import LATEST, scans_problems
 from loam_gtsam.imu.level import Level, find_level, mean_orientation
-from loam_gtsam.imu.preintegration import Fused, Prediction
+from loam_gtsam.imu.preintegration import NO_STEP, Fused, Prediction
 from loam_gtsam.imu_prior import (
     blend,
     blend_direction,
@@ -240,20 +240,20 @@ class ImuTracker:
         posed: PosedSweep,
         last: Moment | None,
         solution: Solution,
-        alone: tuple[gtsam.Pose3, FloatArray] | None = None,
+        alone: tuple[FloatArray, FloatArray] | None = None,
     ) -> Registration:
         """Learn from a solved sweep, and bring the IMU into its pose.
 
         ``posed`` has the final motion; ``solution`` and ``last`` are of the middles of this and the
-        last sweep, of which a predicted pose says nothing about the IMU. ``alone`` is the pose
-        without the IMU and its (6, 6) information; None if nothing is known of it.
+        last sweep, of which a predicted pose says nothing about the IMU. ``alone`` is what is known
+        without the IMU: (6, 6) information, and the step (6,) to its optimum; None if nothing is.
         """
         stamp, reference_stamp = posed.sweep.stamp, posed.sweep.reference_stamp
         fused, contradicted = None, False
         if last is not None and last.solved:
             self.compare_gyro(last[:2], (stamp, solution.map_T_lidar))
             if alone is not None:
-                fused = self.observe(last[:2], (stamp, alone[0]), alone[1])
+                fused = self.observe(last[:2], (stamp, solution.map_T_lidar), *alone)
                 contradicted = self._coupling.contradicted
         if fused is not None:
             self.buffer.gyro_bias = fused.gyro_bias
@@ -288,15 +288,17 @@ class ImuTracker:
         return self._coupling.bend(stamp, seconds, map_R_lidar, self._down(), self.buffer)
 
     def observe(
-        self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3], information: FloatArray
-    ) -> Fused | None:
+        self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3],
+        information: FloatArray, step: FloatArray = NO_STEP,
+    ) -> Fused | None:  # fmt: skip
         """Take in what the scan alone said about a moment; the pose by both, None if by none.
 
-        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed.
+        ``information`` is (6, 6), of the second sweep, and zero where the scan is not believed;
+        ``step`` (6,) leads from the second pose to where the scan has it.
         """
         if self.config.coupling != "tight" or self.level is None:
             return None
-        fused = self._coupling.observe(last, now, information, self._down(), self.buffer)
+        fused = self._coupling.observe(last, now, information, self._down(), self.buffer, step)
         self._gyro.surprised(self._coupling.turn_surprise)
         return fused
 

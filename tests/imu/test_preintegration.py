@@ -181,7 +181,7 @@ def test_a_blind_direction_stays_blind_at_every_estimate():
     measured = gtsam.Pose3().retract(rng.standard_normal(6))
     root = information_root(blind(measured.rotation().matrix(), axis))
     assert len(root) == 5
-    factor = scan_factor(0, gtsam.Pose3(), measured, root)
+    factor = scan_factor(0, gtsam.Pose3(), measured, root, np.zeros(6))
     here = measured.retract(0.01 * rng.standard_normal(6))
     values, shifted = gtsam.Values(), gtsam.Values()
     values.insert(0, here)
@@ -438,6 +438,25 @@ def test_a_jump_with_information_of_any_size(claimed):
     assert np.isfinite(found.covariance).all()
     odo.update(found.map_T_lidar, KNOWN)
     assert odo.restarts == 1
+
+
+def test_what_hardly_knows_a_way_may_have_it_far_away():
+    """As height and tilt along a corridor: 50 m off, which is one standard deviation."""
+    rng = np.random.default_rng(4)
+    across, along = rng.normal(size=(5, 6)), np.array([1e-3, 0.0, 0.0, 1.0, 4e-3, 0.0])
+    across -= np.outer(across @ along, along) / (along @ along)
+    known = 1e6 * across.T @ across + 50.0**-2 * np.outer(along, along) / (along @ along) ** 2
+    found = []
+    for step in (50.0 * along, np.zeros(6)):
+        odo = odometry()
+        for k in range(1, 20):
+            odo.predict(START + k * FRAME, samples(seconds=3.0))
+            odo.update(gtsam.Pose3(), known, step)
+        assert odo.restarts == 0
+        assert odo.surprise < 1.0
+        found.append(odo.state)
+    off = found[0].map_T_imu.localCoordinates(found[1].map_T_imu)
+    assert np.abs(off).max() < 0.1 < np.sqrt(found[0].covariance[3, 3])
 
 
 def test_a_disagreement_within_reason_does_not():

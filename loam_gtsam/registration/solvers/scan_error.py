@@ -79,14 +79,16 @@ class ScanError:
 
     def with_factors(
         self, map_T_lidar: gtsam.Pose3, factors: Sequence[gtsam.NonlinearFactor]
-    ) -> tuple[gtsam.Pose3, FloatArray]:
-        """Pose and (6, 6) information of the scan and further factors, each by its true share.
+    ) -> tuple[FloatArray, FloatArray]:
+        """What scan and further factors, each by its true share, say of the pose.
 
         ``map_T_lidar`` is the pose that was solved with these factors on
-        :data:`~loam_gtsam.registration.solvers.POSE_KEY`. Where nothing tells, it stays.
+        :data:`~loam_gtsam.registration.solvers.POSE_KEY`. Returned is the (6, 6) information there,
+        and the step (6,) to the optimum, none where nothing tells. It may be far, along what a tilt
+        and a height tell of the way: the pose is not moved, for all this is linear near it only.
         """
         if not factors:
-            return map_T_lidar, self.information
+            return self.information, np.zeros(6)
         values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
         values.insert(POSE_KEY, map_T_lidar)
         for factor in factors:
@@ -94,7 +96,7 @@ class ScanError:
         theirs, pull = graph.linearize(values).hessian()
         information: FloatArray = self.information + theirs
         step = np.linalg.lstsq(information, self.information @ self.step + pull, rcond=None)[0]
-        return map_T_lidar.retract(step), information
+        return information, step.astype(np.float64, copy=False)
 
 
 class SeenGround:

@@ -40,6 +40,7 @@ from loam_gtsam.registration.solvers import POSE_KEY, ScanSolver, Solution, make
 from loam_gtsam.registration.solvers.own_factors import (
     ExtraFactors,
     NamedSolver,
+    OwnFactors,
     PoseContext,
     own_factors,
     own_priors,
@@ -252,16 +253,15 @@ class Mapper:
         self, predicted: Prediction, priors: Sequence[gtsam.NonlinearFactor], clock: Clock
     ) -> Frame:
         """What the solve starts from: matches, the caller's factors, the IMU's and the user's."""
-        stamp, factors = predicted.posed.sweep.stamp, [*priors]
-        if self.imu is not None:
-            factors += self.imu.factors(stamp)
+        stamp, own = predicted.posed.sweep.stamp, OwnFactors()
         if self.extra_factors is not None and self._moment is not None:
             context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
-            factors += own_factors(self.extra_factors, context)
+            own = own_factors(self.extra_factors, context)
+        factors = [*priors, *(self.imu.factors(stamp) if self.imu else ()), *own.alone]
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
         steady = self.errors.accelerations
         matcher = FrameMatcher.of(*args, inertial=predicted.inertial, accelerations=steady)
-        return Frame(matcher, predicted, factors)
+        return Frame(matcher, predicted, factors, own.since_last)
 
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""

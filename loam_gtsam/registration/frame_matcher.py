@@ -403,7 +403,15 @@ class Frame:
 
     matcher: FrameMatcher  # de-skewed with the predicted motion
     predicted: Prediction
-    priors: Sequence[gtsam.NonlinearFactor]  # on the pose at the middle of the sweep
+    lasting: Sequence[gtsam.NonlinearFactor] = ()
+    """On the pose at the middle of the sweep, wherever the sweep before was."""
+    since_last: Sequence[gtsam.NonlinearFactor] = ()
+    """On the same pose, by that of the sweep before."""
+
+    @property
+    def priors(self) -> list[gtsam.NonlinearFactor]:
+        """All factors on the pose at the middle of the sweep."""
+        return [*self.lasting, *self.since_last]
 
     @property
     def sweep(self) -> MovingSweep:

@@ -111,8 +111,7 @@ class ImuTracker:
         if not len(self._spans):
             return ()
         more = round((LATEST + 1.0) * 1e9)
-        first, last = int(self._spans.min()) - more, int(self._spans.max()) + more
-        samples = self.buffer.samples_between(first, last)
+        samples = self.buffer.samples_between(self._spans.min() - more, self._spans.max() + more)
         turns = self._turns[:, :3], self._turns[:, 3:]
         return scans_problems(self._spans, *turns, samples, self.config)
 
@@ -196,10 +195,8 @@ class ImuTracker:
         if last is None or not last.solved or not solution.solved or self.trusted_gyro is None:
             return False
         turned = self.buffer.rotation_between(last.stamp, stamp)
-        if turned is None:
-            return False
         scan = last.map_T_lidar.rotation().between(solution.map_T_lidar.rotation())
-        return _disagree(scan, turned, *_DISAGREEMENT)
+        return turned is not None and _disagree(scan, turned, *_DISAGREEMENT)
 
     def compare_gyro(self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3]) -> None:
         """Learn the gyro's bias from two solved sweeps; distrust a gyro that contradicts them."""

@@ -65,7 +65,7 @@ def at(pose):
 @pytest.mark.parametrize("step", [np.zeros(6), np.full(6, 0.01), np.full(6, 0.4)])
 def test_with_the_last_pose_held_a_factor_is_a_prior(make, step):
     """Error and information are those of a prior at the last pose moved by the increment."""
-    (factor,) = own_factors(lambda context: [make()], CONTEXT)
+    (factor,) = own_factors(lambda context: [make()], CONTEXT).since_last
     assert list(factor.keys()) == [POSE_KEY]
     pose = LAST.compose(MOVED).retract(step)
     both = at(pose)
@@ -82,8 +82,8 @@ def test_with_the_last_pose_held_a_factor_is_a_prior(make, step):
 def test_a_robust_kernel_still_lets_go_of_what_is_wrong():
     huber = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(1.0), NOISE)
     far = LAST.compose(MOVED).retract(np.array([0, 0, 0, 10.0, 0, 0]))
-    (factor,) = own_factors(lambda context: [between(huber)], CONTEXT)
-    (firm,) = own_factors(lambda context: [between()], CONTEXT)
+    (factor,) = own_factors(lambda context: [between(huber)], CONTEXT).since_last
+    (firm,) = own_factors(lambda context: [between()], CONTEXT).since_last
     pulls = []
     for one in (factor, firm):
         jacobian, right = one.linearize(at(far)).jacobian()

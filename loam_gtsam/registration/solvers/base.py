@@ -146,6 +146,17 @@ class MotionPrior:
     information: FloatArray
     measured: bool = False
 
+    @classmethod
+    def of_factors(
+        cls, factors: Sequence[gtsam.NonlinearFactor], near: gtsam.Pose3
+    ) -> MotionPrior | None:
+        """What factors on :data:`POSE_KEY` say of a pose near this one; None without any."""
+        if not factors:
+            return None
+        information, pull = linearized(factors, near)
+        step = np.linalg.lstsq(information, pull, rcond=None)[0]
+        return cls(near.retract(step), information)
+
     def along(self, directions: FloatArray) -> MotionPrior:
         """The expected pose along directions alone, given by their (6, 6) projector."""
         return replace(self, information=directions.T @ self.information @ directions)
@@ -160,6 +171,20 @@ class MotionPrior:
         expected.insert(POSE_KEY, self.map_T_lidar)
         hessian = gtsam.HessianFactor(POSE_KEY, information, np.zeros(6), 0.0)
         return gtsam.LinearContainerFactor(hessian, expected)
+
+
+def linearized(
+    factors: Sequence[gtsam.NonlinearFactor], map_T_lidar: gtsam.Pose3
+) -> tuple[FloatArray, FloatArray]:
+    """Information (6, 6) of factors on :data:`POSE_KEY` at a pose, and pull (6,) to their optimum.
+
+    The optimum is at ``solve(information, pull)``, in the tangent order of the package.
+    """
+    values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
+    values.insert(POSE_KEY, map_T_lidar)
+    for factor in factors:
+        graph.add(factor)
+    return graph.linearize(values).hessian()
 
 
 class ScanSolver(Protocol):

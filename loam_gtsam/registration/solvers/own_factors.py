@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import gtsam
 import numpy as np
@@ -68,8 +69,15 @@ ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
 ``context.last_key``; the mapper calls the function once for every sweep that is solved."""
 
 
-def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.NonlinearFactor]:
-    """Ask for a user's factors, and turn them into factors on the unknown pose alone.
+class OwnFactors(NamedTuple):
+    """A user's factors for a frame, all turned into factors on the unknown pose alone."""
+
+    alone: Sequence[gtsam.NonlinearFactor] = ()  # on that pose from the beginning
+    since_last: Sequence[gtsam.NonlinearFactor] = ()  # between the last pose and that one
+
+
+def own_factors(extra: ExtraFactors, context: PoseContext) -> OwnFactors:
+    """Ask for a user's factors.
 
     Raises
     ------
@@ -86,20 +94,21 @@ def own_factors(extra: ExtraFactors, context: PoseContext) -> list[gtsam.Nonline
             "extra_factors: expected a list of factors, empty if there are none; got "
             f"{type(factors).__name__}"
         )
-    ready: list[gtsam.NonlinearFactor] = []
+    alone: list[gtsam.NonlinearFactor] = []
+    since_last: list[gtsam.NonlinearFactor] = []
     for factor in factors:
         keys = list(factor.keys()) if isinstance(factor, gtsam.NonlinearFactor) else []
         if keys == [context.key]:
-            ready.append(factor)
+            alone.append(factor)
         elif sorted(keys) == sorted([context.key, context.last_key]):
-            ready.append(_with_last_held(factor, context))
+            since_last.append(_with_last_held(factor, context))
         else:
             raise InputError(
                 "extra_factors: expected GTSAM factors on context.key, or on context.key and "
                 f"context.last_key ({context.key} and {context.last_key}); got "
                 f"{type(factor).__name__} on the keys {keys}"
             )
-    return ready
+    return OwnFactors(alone, since_last)
 
 
 @contextmanager
@@ -133,7 +142,7 @@ def own_priors(priors: object) -> Iterator[None]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NamedSolver(ScanSolver):
-    """A solver whose exceptions name the part of a user's own that raised them.
+    """A solver, and factors, whose exceptions name the part of a user's own that raised them.
 
     ``factors`` is where a user's factors come from; None if there are none.
     """
@@ -158,6 +167,14 @@ class NamedSolver(ScanSolver):
         part, code = ("solver", self.solver) if own else ("extra_factors", self.factors)
         with own_code(part, code):
             return self.solver.solve(associate, guess, priors, motion)
+
+
+    def told(
+        self, factors: Sequence[gtsam.NonlinearFactor], near: gtsam.Pose3
+    ) -> MotionPrior | None:
+        """See :meth:`MotionPrior.of_factors`."""
+        with own_code("extra_factors", self.factors):
+            return MotionPrior.of_factors(factors, near)
 
 
 def _with_last_held(factor: gtsam.NonlinearFactor, context: PoseContext) -> gtsam.NonlinearFactor:

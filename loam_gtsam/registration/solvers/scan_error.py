@@ -10,7 +10,7 @@ import numpy as np
 
 from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.geometry import nearest_positive, symmetric, transform, voxel_keys
-from loam_gtsam.registration.solvers.base import POSE_KEY, SCAN_VARIANCE, Solution
+from loam_gtsam.registration.solvers.base import SCAN_VARIANCE, Solution, linearized
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.key_table import KeyTable
@@ -89,11 +89,7 @@ class ScanError:
         """
         if not factors:
             return self.information, np.zeros(6)
-        values, graph = gtsam.Values(), gtsam.NonlinearFactorGraph()
-        values.insert(POSE_KEY, map_T_lidar)
-        for factor in factors:
-            graph.add(factor)
-        theirs, pull = graph.linearize(values).hessian()
+        theirs, pull = linearized(factors, map_T_lidar)
         information: FloatArray = self.information + theirs
         step = np.linalg.lstsq(information, self.information @ self.step + pull, rcond=None)[0]
         return information, step.astype(np.float64, copy=False)

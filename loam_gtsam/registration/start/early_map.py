@@ -54,10 +54,8 @@ class EarlyMap:
             if (solutions := self.at_once(moved)) is not None:
                 moved = moved_with_first(moved, solutions)
                 continue
-            for number, sweep in enumerate(moved):
-                if sweep.held and sweep.posed.sweep is not self.frame.sweep:
-                    continue
-                solution = self.solved(sweep, self.matcher(moved, number))
+            for number in range(1, len(moved)):
+                solution = self.solved(moved[number], self.matcher(moved, number))
                 if solution.solved:
                     moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
         return moved
@@ -65,9 +63,9 @@ class EarlyMap:
     def at_once(self, sweeps: Sequence[EarlySweep]) -> list[Solution] | None:
         """Each sweep, the first as well, registered with the map of the others as they are.
 
-        None if other factors hold some of them, or if the first one does not see all directions.
+        None if there are less than three, or if the first one does not see all directions.
         """
-        if len(sweeps) < 3 or any(sweep.held for sweep in sweeps[1:]):
+        if len(sweeps) < 3:
             return None
         solutions: list[Solution] = []
         for number, sweep in enumerate(sweeps):
@@ -109,7 +107,7 @@ class EarlyMap:
     def solved(self, one: EarlySweep, matcher: FrameMatcher) -> Solution:
         """A sweep, registered with the map of a matcher."""
         expected = replace(one.expected, map_T_lidar=one.map_T_middle)
-        priors = self.frame.priors if one.posed.sweep is self.frame.sweep else ()
+        priors = () if one.told is None else (one.told.factor(),)
         return self.solver.solve(matcher, one.map_T_middle, priors, expected)
 
     def matcher(

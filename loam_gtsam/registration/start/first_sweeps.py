@@ -29,7 +29,7 @@ from loam_gtsam.registration.relocalization import (
     sample_features,
 )
 from loam_gtsam.registration.relocalization.fits import APART
-from loam_gtsam.registration.solvers import ScanSolver
+from loam_gtsam.registration.solvers.own_factors import NamedSolver
 from loam_gtsam.registration.start.early_map import EarlyMap
 from loam_gtsam.registration.start.ways import (
     EarlySweep,
@@ -78,7 +78,7 @@ class Start:
 
     def __init__(self, first: Prediction, keyframe: int) -> None:
         self._map_T_first = first.map_T_lidar
-        self._sweeps = [EarlySweep(first.posed, first.map_T_middle, True, first.motion, keyframe)]
+        self._sweeps = [EarlySweep(first.posed, first.map_T_middle, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
         self._anew = False  # whether the sweeps are to be registered anew with the next one
@@ -94,7 +94,7 @@ class Start:
         """Whether all sweeps of the start are there."""
         return len(self._sweeps) >= _TOGETHER[-1]
 
-    def first_motion(self, frame: Frame, expected: Found, solver: ScanSolver) -> Found:
+    def first_motion(self, frame: Frame, expected: Found, solver: NamedSolver) -> Found:
         """Search for the motion between the first two sweeps; returns ``expected`` for later ones.
 
         The places where the second sweep may have been taken are tried, each with both sweeps
@@ -105,7 +105,8 @@ class Start:
             return expected
         early, first = EarlyMap(frame, solver, self._map_T_first), self._sweeps[0]
         predicted, found = frame.predicted, expected.solution.map_T_lidar
-        second = EarlySweep(frame.matcher.posed, found, False, predicted.motion, 0)
+        told = solver.told(frame.lasting, found)
+        second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, told)
         seconds = first.moment.seconds_to(frame.sweep.stamp)
         centres = _centres(predicted.map_T_middle, first.map_T_middle)
         within = min(_FASTEST * seconds, _FARTHEST), _TURNING * seconds
@@ -120,7 +121,7 @@ class Start:
         return replace(expected, solution=best.solution, posed=best.sweeps[1].posed)
 
     def add(
-        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver,
+        self, frame: Frame, found: Found, keyframe: int, solver: NamedSolver,
         imu: ImuTracker | None = None,
     ) -> tuple[Frame, Found]:  # fmt: skip
         """Add a solved sweep; after some, all are registered anew and the map is made of them.
@@ -144,12 +145,14 @@ class Start:
             self._anew = True
 
     def _added(
-        self, frame: Frame, found: Found, keyframe: int, solver: ScanSolver,
+        self, frame: Frame, found: Found, keyframe: int, solver: NamedSolver,
         imu: ImuTracker | None,
     ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
-        new = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar, bool(frame.priors)
-        added = [*self._sweeps, EarlySweep(*new, frame.predicted.motion, keyframe)]
+        posed, pose = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar
+        told = solver.told(frame.lasting, pose)
+        new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, told)
+        added = [*self._sweeps, new]
         if len(added) not in _TOGETHER and not self._anew:
             self._sweeps = added
             return frame, found
@@ -177,8 +180,6 @@ class Start:
             return sweeps
         others, self._rivals = [_moved(sweeps, rival) for rival in self._rivals], []
         others += by_second_step(sweeps)
-        if any(sweep.held for sweep in sweeps[1:]):
-            return sweeps
         elsewhere = _elsewhere(early, sweeps) if len(sweeps) == _TOGETHER[-1] else []
         if not others and not elsewhere:
             return sweeps

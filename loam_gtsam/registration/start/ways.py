@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
+from scipy.special import chdtri, ndtr
 
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.frontend.deskew import PosedSweep
@@ -18,6 +19,8 @@ from loam_gtsam.registration.relocalization.fits import beyond_any_motion, same,
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.types import FloatArray
 
+_UNLIKELY = float(chdtri(6, 2.0 * ndtr(-5.0)))
+"""Squared Mahalanobis distance from which a pose contradicts factors: as five sigmas."""
 _HARDLY = 2.0  # standard deviations: one of twenty right ways is worse by chance
 
 
@@ -29,16 +32,16 @@ class EarlySweep:
     ----------
     posed : the sweep, de-skewed
     map_T_middle : pose at the middle of the sweep
-    held : whether further factors decided on the pose, which is then left as it is
     expected : the expected motion, for directions that the scan does not fix
     keyframe : number of the keyframe to which the points belong
+    told : what further factors say of the pose, whichever way leads there; None without any
     """
 
     posed: PosedSweep
     map_T_middle: gtsam.Pose3
-    held: bool
     expected: MotionPrior
     keyframe: int
+    told: MotionPrior | None = None
 
     @property
     def moment(self) -> Moment:
@@ -153,9 +156,12 @@ def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -
     """The best of some ways, and after it those that are as good, but for chance.
 
     The first one is the way that was taken. If some acceleration explains it, others that none
-    explains are no ways. Of ``silent`` ones no scan tells whether they are as good.
+    explains are no ways; nor are those that further factors contradict, unless they contradict
+    all. Of ``silent`` ones no scan tells whether they are as good.
     """
     least, near = config.solver.min_aligned, config.map.plane_voxel
+    ways = [way for way in ways if _as_told(way)] or ways
+    silent = [way for way in silent if _as_told(way)]
     if _drivable(ways[0], config.relocalization):
         ways = [way for way in ways if _drivable(way, config.relocalization)]
     best = ways[0]
@@ -187,6 +193,16 @@ def as_good(
 def tell_nothing(one: Way, other: Way, least: float) -> bool:
     """Whether fewer than ``least`` features, counted as if they lay across, tell two ways apart."""
     return _favour(one, other).said < least
+
+
+def _as_told(way: Way) -> bool:
+    """Whether further factors contradict no pose of a way, by their covariances."""
+    for sweep in way[-1].sweeps:
+        if sweep.told is not None:
+            away = sweep.told.map_T_lidar.localCoordinates(sweep.map_T_middle)
+            if away @ sweep.told.information @ away > _UNLIKELY:
+                return False
+    return True
 
 
 def _drivable(way: Way, config: RelocalizationConfig) -> bool:

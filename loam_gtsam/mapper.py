@@ -45,6 +45,7 @@ from loam_gtsam.registration.solvers.own_factors import (
     own_factors,
     own_priors,
 )
+from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.registration.start import Start
 from loam_gtsam.types import (
     ConfigError,
@@ -80,8 +81,7 @@ class Mapper:
 
     Parameters
     ----------
-    config : the whole configuration; ``map``, ``matching``, ``solver``, ``deskew`` and ``imu``
-        are used
+    config : ``map``, ``matching``, ``solver``, ``deskew`` and ``imu`` of it are used
     solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`;
         :func:`make_solver` makes it from the configuration if None
     imu : samples may be added to it while the mapper runs
@@ -256,7 +256,7 @@ class Mapper:
         stamp, own = predicted.posed.sweep.stamp, OwnFactors()
         if self.extra_factors is not None and self._moment is not None:
             context = PoseContext(POSE_KEY, stamp, predicted.map_T_middle, self._moment[:2])
-            own = own_factors(self.extra_factors, context)
+            own = own_factors(self.extra_factors, context, self._moment.error)
         factors = [*priors, *(self.imu.factors(stamp) if self.imu else ()), *own.alone]
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
         steady = self.errors.accelerations
@@ -298,7 +298,7 @@ class Mapper:
         if self._start is None and not found.message:
             self.point_times.add(posed, solution)
         status, message = status_of(solution, found.message or self.point_times.problem)
-        update = self._insert(posed, pose, status, message, clock, solution, tilt)
+        update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last
         update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)
         clock.lap("covariance")
@@ -313,6 +313,7 @@ class Mapper:
         clock: Clock,
         solution: Solution | None = None,
         tilt: TiltPrior = TiltPrior.NONE,
+        scan: ScanError | None = None,
     ) -> MapUpdate:
         """Add the sweep to the map; its update."""
         clock.lap("solve")
@@ -320,7 +321,8 @@ class Mapper:
         matches = None if solution is None else solution.matches
         self.maps.insert(posed, middle, self.keyframe, matches)
         known = status.solved or status is FrameStatus.FIRST
-        self._moment = Moment(posed.sweep.stamp, middle, known)
+        error = None if scan is None or solution is None else scan.seen(solution.weak)
+        self._moment = Moment(posed.sweep.stamp, middle, known, error)
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")
         return make_update(posed, map_T_lidar, status, message, solution, tilt)

@@ -110,6 +110,7 @@ class Moment(NamedTuple):
     stamp: int  # nanoseconds
     map_T_lidar: gtsam.Pose3
     solved: bool  # or given for the first sweep; else the pose was predicted
+    error: FloatArray | None = None  # (6, 6) covariance in the map as the scans see it, if known
 
     def seconds_to(self, stamp: int) -> float:
         """Seconds to the middle of a later sweep."""

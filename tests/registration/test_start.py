@@ -15,7 +15,6 @@ from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.disturbances import Disturbed, MovingObjects, Outliers
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
-from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.relocalization import Fit, any_of, same, same_optimum
 from loam_gtsam.registration.relocalization.evidence import _AGAINST, Evidence
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
@@ -348,21 +347,21 @@ def first_sweep():
     return SimpleNamespace(map_T_lidar=at, map_T_middle=at, posed=posed, motion=None), 0
 
 
-def way_of(*steps, lines=0, planes=0, told=None):
+def way_of(*steps, lines=0, planes=0, told=None, of="told"):
     """A way by steps of these metres ahead, a tenth of a second each.
 
-    Factors have the last sweep ``told`` metres ahead, known to 1 cm.
+    Factors have the last sweep, or its motion if ``moved``, ``told`` metres ahead, known to 1 cm.
     """
     at, sweeps = 0.0, []
     for number, step in enumerate((0.0, *steps)):
         at += step
         stamp = 100_000_000 * number
         pose = gtsam.Pose3(gtsam.Rot3(), np.array([at, 0.0, 0.0]))
-        moment = Moment(stamp, pose, True)
-        sweeps.append(SimpleNamespace(map_T_middle=pose, moment=moment, told=None))
+        posed = SimpleNamespace(sweep=SimpleNamespace(stamp=stamp))
+        sweeps.append(ways.EarlySweep(posed, pose, None, 0))
     if told is not None:
         where = gtsam.Pose3(gtsam.Rot3(), np.array([told, 0.0, 0.0]))
-        sweeps[-1].told = MotionPrior(where, 1e4 * np.eye(6))
+        sweeps[-1] = replace(sweeps[-1], **{of: MotionPrior(where, 1e4 * np.eye(6))})
     tried = place(at * AHEAD, np.full(40, lines), np.full(40, planes), AHEAD)
     return tuple(tried._replace(sweeps=sweeps[: k + 2]) for k in range(len(steps)))
 
@@ -468,15 +467,16 @@ def test_the_way_that_was_taken_stays_though_no_acceleration_explains_it():
     assert ways.kept_ways([smooth, taken], CONFIG) == [smooth]
 
 
-def test_a_way_that_further_factors_contradict_is_none_unless_they_contradict_all():
-    near, far = way_of(2.0, 2.0, told=4.0), way_of(3.0, 3.0, told=6.0)
-    assert ways.kept_ways([near, far], CONFIG) == [near, far]
-    not_far = way_of(3.0, 3.0, told=4.0)
-    assert ways.kept_ways([near, not_far], CONFIG) == [near]
-    assert ways.kept_ways([not_far, near], CONFIG) == [near]
-    assert ways.kept_ways([near], CONFIG, silent=[not_far]) == [near]
-    neither = way_of(2.0, 2.0, told=9.0)
-    assert ways.kept_ways([not_far, neither], CONFIG) == [not_far, neither]
+@pytest.mark.parametrize(("of", "near", "far"), [("told", 4.0, 6.0), ("moved", 2.0, 3.0)])
+def test_a_way_that_further_factors_contradict_is_none_unless_they_contradict_all(of, near, far):
+    here, there = way_of(2.0, 2.0, told=near, of=of), way_of(3.0, 3.0, told=far, of=of)
+    assert ways.kept_ways([here, there], CONFIG) == [here, there]
+    wrong = way_of(3.0, 3.0, told=near, of=of)
+    assert ways.kept_ways([here, wrong], CONFIG) == [here]
+    assert ways.kept_ways([wrong, here], CONFIG) == [here]
+    assert ways.kept_ways([here], CONFIG, silent=[wrong]) == [here]
+    too = way_of(2.0, 2.0, told=far, of=of)
+    assert ways.kept_ways([wrong, too], CONFIG) == [wrong, too]
 
 
 def test_a_run_with_a_factor_of_ones_own_begins_as_well_as_without():
@@ -617,8 +617,8 @@ def pushed(monkeypatch):
     push = gtsam.Pose3(gtsam.Rot3(), np.array([0.02, 0.0, 0.05]))
 
     def registered(count=3, **seen):
-        def solved(self, one, matcher):
-            pose = push.compose(one.map_T_middle)
+        def solved(self, sweeps, number, matcher):
+            pose = push.compose(sweeps[number].map_T_middle)
             return replace(Solution.unsolved(pose, None, 1, 1), solved=True, **seen)
 
         monkeypatch.setattr(early_map.EarlyMap, "matcher", lambda *_: None)

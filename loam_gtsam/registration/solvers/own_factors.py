@@ -36,8 +36,8 @@ class PoseContext:
     middle_stamp, map_T_middle : nanoseconds, and the predicted pose; for a measurement of another
         moment, as the start of the sweep, ask for it at this one
     last : stamp, nanoseconds, and pose of the middle of the last sweep
-    last_key : key of the pose in ``last``, for factors between the two sweeps; that pose is known
-        and does not change
+    last_key : key of the pose in ``last``, for factors between the two sweeps; that pose does not
+        change any more, and is as well known as the covariance of its scan says
     """
 
     key: int
@@ -76,8 +76,17 @@ class OwnFactors(NamedTuple):
     since_last: Sequence[gtsam.NonlinearFactor] = ()  # between the last pose and that one
 
 
-def own_factors(extra: ExtraFactors, context: PoseContext) -> OwnFactors:
+def own_factors(
+    extra: ExtraFactors, context: PoseContext, error: FloatArray | None = None
+) -> OwnFactors:
     """Ask for a user's factors.
+
+    Parameters
+    ----------
+    extra : the user's
+    context : of the frame
+    error : (6, 6) covariance of the last pose in the map as the scans see it; None if it is not
+        known, and taken to be exact
 
     Raises
     ------
@@ -101,7 +110,8 @@ def own_factors(extra: ExtraFactors, context: PoseContext) -> OwnFactors:
         if keys == [context.key]:
             alone.append(factor)
         elif sorted(keys) == sorted([context.key, context.last_key]):
-            since_last.append(_with_last_held(factor, context))
+            with own_code("extra_factors", extra):
+                since_last.append(_with_last_held(factor, context, error))
         else:
             raise InputError(
                 "extra_factors: expected GTSAM factors on context.key, or on context.key and "
@@ -168,7 +178,6 @@ class NamedSolver(ScanSolver):
         with own_code(part, code):
             return self.solver.solve(associate, guess, priors, motion)
 
-
     def told(
         self, factors: Sequence[gtsam.NonlinearFactor], near: gtsam.Pose3
     ) -> MotionPrior | None:
@@ -177,16 +186,31 @@ class NamedSolver(ScanSolver):
             return MotionPrior.of_factors(factors, near)
 
 
-def _with_last_held(factor: gtsam.NonlinearFactor, context: PoseContext) -> gtsam.NonlinearFactor:
-    """The whitened factor, robust kernel included, with the last pose held at its value."""
+def _with_last_held(
+    factor: gtsam.NonlinearFactor, context: PoseContext, error: FloatArray | None
+) -> gtsam.NonlinearFactor:
+    """The whitened factor, robust kernel included, with the last pose held at its value.
 
-    def error(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
+    Its noise is larger by the ``error`` (6, 6) of the last pose, as the factor sees that where the
+    sweep is expected.
+    """
+
+    def whitened(pose: gtsam.Pose3) -> tuple[FloatArray, dict[int, FloatArray]]:
         both = gtsam.Values()
-        both.insert(context.key, values.atPose3(POSE_KEY))
+        both.insert(context.key, pose)
         both.insert(context.last_key, context.last[1])
         linear = factor.linearize(both)
         jacobian, right = linear.jacobian()
-        first = 6 * list(linear.keys()).index(context.key)
-        return -np.asarray(right), [np.ascontiguousarray(jacobian[:, first : first + 6])]
+        parts = np.split(np.asarray(jacobian), 2, axis=1)
+        return -np.asarray(right), dict(zip(linear.keys(), parts, strict=True))
 
-    return checked_factor(gtsam.noiseModel.Unit.Create(factor.dim()), [POSE_KEY], error)
+    weight = np.eye(factor.dim())
+    if error is not None:
+        by_last = whitened(context.map_T_middle)[1][context.last_key]
+        weight = np.linalg.inv(np.linalg.cholesky(weight + by_last @ error @ by_last.T))
+
+    def held(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
+        residual, jacobians = whitened(values.atPose3(POSE_KEY))
+        return weight @ residual, [np.ascontiguousarray(weight @ jacobians[context.key])]
+
+    return checked_factor(gtsam.noiseModel.Unit.Create(factor.dim()), [POSE_KEY], held)

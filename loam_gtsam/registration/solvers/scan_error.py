@@ -54,6 +54,11 @@ class ScanError:
     residual_variance: float
     effective_matches: float
 
+    def seen(self, weak: FloatArray | None) -> FloatArray:
+        """(6, 6) the part of ``covariance`` across the degenerate directions, a projector."""
+        keep = np.eye(6) if weak is None else np.eye(6) - weak
+        return symmetric(_through(keep, self.covariance))
+
     def drift(self, factor: float, fused: FloatArray | None) -> FloatArray:
         """(6, 6) what new ground adds to the map's error: docs/maths/covariance.md, (6), (10).
 

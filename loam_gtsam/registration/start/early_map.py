@@ -55,7 +55,7 @@ class EarlyMap:
                 moved = moved_with_first(moved, solutions)
                 continue
             for number in range(1, len(moved)):
-                solution = self.solved(moved[number], self.matcher(moved, number))
+                solution = self.solved(moved, number, self.matcher(moved, number))
                 if solution.solved:
                     moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
         return moved
@@ -68,8 +68,8 @@ class EarlyMap:
         if len(sweeps) < 3:
             return None
         solutions: list[Solution] = []
-        for number, sweep in enumerate(sweeps):
-            solutions.append(self.solved(sweep, self.matcher(sweeps, number)))
+        for number in range(len(sweeps)):
+            solutions.append(self.solved(sweeps, number, self.matcher(sweeps, number)))
             if not solutions[0].solved or solutions[0].weak is not None:
                 return None
         return solutions
@@ -100,14 +100,16 @@ class EarlyMap:
         """The last of some sweeps, registered with the others, and what its features say of it."""
         matcher = self.matcher(sweeps, len(sweeps) - 1)
         matcher = matcher.with_few_matches() if quickly else matcher
-        solution = self.solved(sweeps[-1], matcher)
+        solution = self.solved(sweeps, len(sweeps) - 1, matcher)
         last = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
         return Tried(Evidence.of(matcher, solution), [*sweeps[:-1], last], solution)
 
-    def solved(self, one: EarlySweep, matcher: FrameMatcher) -> Solution:
-        """A sweep, registered with the map of a matcher."""
+    def solved(self, sweeps: Sequence[EarlySweep], number: int, matcher: FrameMatcher) -> Solution:
+        """One of the sweeps, registered with the map of a matcher."""
+        one = sweeps[number]
         expected = replace(one.expected, map_T_lidar=one.map_T_middle)
-        priors = () if one.told is None else (one.told.factor(),)
+        told = one.factors(sweeps[number - 1]) if number else []
+        priors = [prior.factor() for prior in told]
         return self.solver.solve(matcher, one.map_T_middle, priors, expected)
 
     def matcher(

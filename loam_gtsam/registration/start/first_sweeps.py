@@ -29,6 +29,7 @@ from loam_gtsam.registration.relocalization import (
     sample_features,
 )
 from loam_gtsam.registration.relocalization.fits import APART
+from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.registration.solvers.own_factors import NamedSolver
 from loam_gtsam.registration.start.early_map import EarlyMap
 from loam_gtsam.registration.start.ways import (
@@ -105,8 +106,8 @@ class Start:
             return expected
         early, first = EarlyMap(frame, solver, self._map_T_first), self._sweeps[0]
         predicted, found = frame.predicted, expected.solution.map_T_lidar
-        told = solver.told(frame.lasting, found)
-        second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, told)
+        told = _told(frame, found, first, solver)
+        second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, *told)
         seconds = first.moment.seconds_to(frame.sweep.stamp)
         centres = _centres(predicted.map_T_middle, first.map_T_middle)
         within = min(_FASTEST * seconds, _FARTHEST), _TURNING * seconds
@@ -150,8 +151,8 @@ class Start:
     ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
         posed, pose = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar
-        told = solver.told(frame.lasting, pose)
-        new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, told)
+        told = _told(frame, pose, self._sweeps[-1], solver)
+        new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, *told)
         added = [*self._sweeps, new]
         if len(added) not in _TOGETHER and not self._anew:
             self._sweeps = added
@@ -159,7 +160,8 @@ class Start:
         early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
         sweeps = early.together(added, 1 if len(added) in _ONCE and not rivals else 2)
         sweeps = early.with_motion(self._told_apart(early, sweeps))
-        solution = early.solved(sweeps[-1], early.matcher(sweeps, len(sweeps) - 1, to_keep=True))
+        number = len(sweeps) - 1
+        solution = early.solved(sweeps, number, early.matcher(sweeps, number, to_keep=True))
         if not solution.solved:
             early.fill(self._sweeps)
             self._sweeps, self._rivals, self._anew = added, rivals, True
@@ -201,6 +203,19 @@ class Start:
         best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best
+
+
+def _told(
+    frame: Frame, pose: gtsam.Pose3, before: EarlySweep, solver: NamedSolver
+) -> tuple[MotionPrior | None, MotionPrior | None]:
+    """What further factors say of the pose of a sweep, and of it seen from the sweep before."""
+    told, last = solver.told(frame.lasting, pose), frame.matcher.last
+    if last is None or last.stamp != before.moment.stamp:  # a sweep in between was not solved
+        return told, None
+    moved = solver.told(frame.since_last, pose)
+    if moved is not None:
+        moved = replace(moved, map_T_lidar=last.map_T_lidar.between(moved.map_T_lidar))
+    return told, moved
 
 
 def _centres(expected: gtsam.Pose3, first: gtsam.Pose3) -> list[gtsam.Pose3]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import NamedTuple
 
 import gtsam
@@ -35,6 +36,7 @@ class EarlySweep:
     expected : the expected motion, for directions that the scan does not fix
     keyframe : number of the keyframe to which the points belong
     told : what further factors say of the pose, whichever way leads there; None without any
+    moved : what they say of the pose seen from the sweep before; None without any
     """
 
     posed: PosedSweep
@@ -42,11 +44,20 @@ class EarlySweep:
     expected: MotionPrior
     keyframe: int
     told: MotionPrior | None = None
+    moved: MotionPrior | None = None
 
     @property
     def moment(self) -> Moment:
         """The middle of the sweep."""
         return Moment(self.posed.sweep.stamp, self.map_T_middle, True)
+
+    def factors(self, before: EarlySweep) -> list[MotionPrior]:
+        """What further factors say of the pose, with the sweep before where it is."""
+        found = [] if self.told is None else [self.told]
+        if self.moved is not None:
+            place = before.map_T_middle.compose(self.moved.map_T_lidar)
+            found.append(replace(self.moved, map_T_lidar=place))
+        return found
 
 
 class Tried(NamedTuple):
@@ -197,10 +208,10 @@ def tell_nothing(one: Way, other: Way, least: float) -> bool:
 
 def _as_told(way: Way) -> bool:
     """Whether further factors contradict no pose of a way, by their covariances."""
-    for sweep in way[-1].sweeps:
-        if sweep.told is not None:
-            away = sweep.told.map_T_lidar.localCoordinates(sweep.map_T_middle)
-            if away @ sweep.told.information @ away > _UNLIKELY:
+    for before, sweep in pairwise(way[-1].sweeps):
+        for told in sweep.factors(before):
+            away = told.map_T_lidar.localCoordinates(sweep.map_T_middle)
+            if away @ told.information @ away > _UNLIKELY:
                 return False
     return True
 

@@ -72,9 +72,10 @@ class NearestPlace:
 
 
 def held_near_the_start(context):
-    """Own factors of a user."""
+    """Own factors of a user, on the pose and between it and the last one."""
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 1.0)
-    return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)]
+    slow = gtsam.BetweenFactorPose3(context.last_key, context.key, gtsam.Pose3(), noise)
+    return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise), slow]
 
 
 LOOPS = PREDICTED.changed(
@@ -94,7 +95,7 @@ CASES = {
     "classical": ("room?frames=8&columns=400", preset("aloam"), [4]),
     "loops": ("room?frames=30&columns=240&speed=4&start=moving", LOOPS, [12, 24]),
     "own closer": ("room?frames=28&columns=240&speed=4&start=moving", DENSE, [9, 25]),
-    "own factors": ("room?frames=6&columns=400", PREDICTED, [3]),
+    "own factors": ("room?frames=9&columns=400", Config(), [2, 6]),
     "workers": ("room?frames=6&columns=300", PREDICTED, [4]),
 }
 OPTIONS = {

@@ -69,7 +69,7 @@ class Hypothesis:
     def rivals_below(self) -> float:
         """Share of its own fit that no other place may reach; 0 if it does not stand anyway."""
         last = self.fits[-SWEEPS:]
-        if len(last) < SWEEPS or self.last.status is not FrameStatus.OK:
+        if len(last) < SWEEPS or self.last.status is not FrameStatus.OK or not is_alone(self.last):
             return 0.0
         if not self.last.localizability[0] >= self._config.loops.min_aligned:
             return 0.0  # a direction is hardly seen, or it is not known
@@ -216,6 +216,13 @@ def three_sigma(update: MapUpdate) -> tuple[float, float]:
     worst = [np.linalg.eigvalsh(update.covariance[part, part])[-1] for part in (_MOVED, _TURNED)]
     metres, rad = (3.0 * np.sqrt(worst)).tolist()
     return metres, rad
+
+
+def is_alone(update: MapUpdate) -> bool:
+    """Whether no other place is within three standard deviations of a pose, if they are known."""
+    if not np.isfinite(update.covariance).all():
+        return False
+    return all(told < apart for told, apart in zip(three_sigma(update), APART, strict=True))
 
 
 def _told(fit: Fit) -> str:

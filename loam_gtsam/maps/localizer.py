@@ -26,14 +26,13 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
-from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, three_sigma
+from loam_gtsam.maps.hypotheses import SWEEPS, Hypotheses, is_alone
 from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import advance
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.registration.relocalization import RELOCALISED, same
-from loam_gtsam.registration.relocalization.fits import APART
 from loam_gtsam.types import (
     BadSweep,
     Features,
@@ -183,7 +182,7 @@ class Localizer:
             if not same(advance(last.map_T_lidar, last.twist, seconds), update.map_T_lidar):
                 return True
         is_again_seen = update.status is FrameStatus.OK and not self._extend
-        if is_again_seen and self._last is not None and not _is_alone(self._last):
+        if is_again_seen and self._last is not None and not is_alone(self._last):
             return True
         return update.status is FrameStatus.LOST or self._unsolved >= patience
 
@@ -270,14 +269,9 @@ class Localizer:
         return self._saved.places[int(visit[away.argmin()])].covariance
 
 
-def _is_alone(update: MapUpdate) -> bool:
-    """Whether no other place is within three standard deviations of a solved pose."""
-    return all(told < apart for told, apart in zip(three_sigma(update), APART, strict=True))
-
-
 def _is_sure(update: MapUpdate) -> bool:
     """Whether a scan has seen all directions, and no other place is meant."""
-    return update.status is FrameStatus.OK and _is_alone(update)
+    return update.status is FrameStatus.OK and is_alone(update)
 
 
 def own_settings(saved: SavedMap) -> Config:

@@ -260,12 +260,15 @@ def test_the_maps_error_is_that_of_the_first_visit_near_by(saved, x, number):
 class Held:
     """A hypothesis with made-up fits."""
 
-    def __init__(self, agreement, status=FrameStatus.OK, seen=100.0, count=SWEEPS, share=0.3):
+    def __init__(
+        self, agreement, status=FrameStatus.OK, seen=100.0, count=SWEEPS, share=0.3, metres=0.01
+    ):
         config = Pipeline().config
         self.held = Hypothesis.__new__(Hypothesis)
         self.held._config = config
         self.held.fits = [Fit(share, agreement)] * count
-        self.held.last = MapUpdate(0, gtsam.Pose3(), status, localizability=np.full(6, seen))
+        told = {"localizability": np.full(6, seen), "covariance": metres**2 * np.eye(6)}
+        self.held.last = MapUpdate(0, gtsam.Pose3(), status, **told)
 
 
 @pytest.mark.parametrize(
@@ -278,6 +281,8 @@ class Held:
         (Held(0.95, FrameStatus.DEGENERATE), 0.0),
         (Held(0.95, seen=29.0), 0.0),
         (Held(0.95, seen=np.nan), 0.0),
+        (Held(0.95, metres=0.6), 0.0),  # other places are within three of these
+        (Held(0.95, metres=np.nan), 0.0),
     ],
 )
 def test_a_hypothesis_stands_if_it_fits_and_sees_all_directions(held, below):

@@ -36,6 +36,7 @@ wrong match, a map put elsewhere). An information ten times too large in sigma s
 _LEAST_SIGMA = 1e-6
 """rad and m: keeps a covariance regular after a scan that claims more."""
 NO_STEP = np.zeros(6)
+"""To the optimum of a scan that is where its pose is."""
 _UNSOLVABLE = RuntimeError, np.linalg.LinAlgError
 """What GTSAM and numpy raise where there is no finite solution."""
 
@@ -212,8 +213,8 @@ class InertialOdometry:
         self.surprise = self.turn_surprise = 0.0
         left = np.eye(STATE)  # share of the predicted state's error that the scan leaves
         if len(root):
-            error, derivative = scan_residual(predicted.map_T_imu, self._lidar_T_imu, measured)
-            error = error - step
+            apart, derivative = scan_residual(predicted.map_T_imu, self._lidar_T_imu, measured)
+            error = apart - step
             surprise, rows = root @ error, root @ derivative
             spread = predicted.covariance[:, POSE]
             covariance = spread[POSE]
@@ -230,7 +231,7 @@ class InertialOdometry:
                 # A velocity that was wrong looks like this too: it is free along the jump, and
                 # kept across it, where the scan may be blind.
                 seconds = (predicted.stamp - self.state.stamp) * 1e-9
-                jump = measured.rotation().matrix() @ (error + step)[3:] / seconds
+                jump = measured.rotation().matrix() @ apart[3:] / seconds
                 free = predicted.covariance[VELOCITY, VELOCITY] + np.outer(jump, jump)
                 moved = replace(predicted, map_T_imu=measured.compose(self._lidar_T_imu))
                 self._start(_uncorrelated(moved, known, free), 1)

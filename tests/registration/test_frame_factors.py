@@ -2,6 +2,7 @@
 
 import re
 import runpy
+from dataclasses import replace
 from pathlib import Path
 
 import gtsam
@@ -77,6 +78,31 @@ def test_with_the_last_pose_held_a_factor_is_a_prior(make, step):
         rows = [-np.asarray(factor.linearize(values).jacobian()[1]) for values in (ahead, back)]
         numerical[:, column] = (rows[0] - rows[1]) / 2e-6
     np.testing.assert_allclose(factor.linearize(at(pose)).jacobian()[0], numerical, atol=1e-4)
+
+
+@pytest.mark.parametrize("make", [between, lambda: between(turned=True), own_between])
+@pytest.mark.parametrize("step", [np.zeros(6), np.full(6, 0.3)])
+def test_the_last_pose_is_as_well_known_as_it_is_told(make, step):
+    """The information is what is left of both poses without the last one."""
+    error = np.diag(np.array([0.02, 0.01, 0.03, 0.2, 0.1, 0.4]) ** 2)
+    pose = LAST.compose(MOVED).retract(step)
+    context = replace(CONTEXT, map_T_middle=pose)
+    (factor,) = own_factors(lambda context: [make()], context, error).since_last
+    jacobian, right = factor.linearize(at(pose)).jacobian()
+    both = at(pose)
+    both.insert(LAST_KEY, LAST)
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(make())
+    graph.add(gtsam.PriorFactorPose3(LAST_KEY, LAST, gtsam.noiseModel.Gaussian.Covariance(error)))
+    ordering = gtsam.Ordering()
+    for key in (LAST_KEY, POSE_KEY):
+        ordering.push_back(key)
+    whole, pull = graph.linearize(both).hessian(ordering)
+    gain = whole[6:, :6] @ np.linalg.inv(whole[:6, :6])
+    np.testing.assert_allclose(
+        jacobian.T @ jacobian, whole[6:, 6:] - gain @ whole[:6, 6:], rtol=1e-6
+    )
+    np.testing.assert_allclose(jacobian.T @ right, pull[6:] - gain @ pull[:6], atol=1e-6)
 
 
 def test_a_robust_kernel_still_lets_go_of_what_is_wrong():

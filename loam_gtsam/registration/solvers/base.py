@@ -132,7 +132,9 @@ class Solution:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MotionPrior:
-    """The expected pose, which is used along the directions that a scan does not fix.
+    """A pose that is known beside the scan: that which further factors tell, or the expected one.
+
+    The expected one is used along the directions that a scan does not fix.
 
     Attributes
     ----------

@@ -88,9 +88,13 @@ class ScanError:
         """What scan and further factors, each by its true share, say of the pose.
 
         ``map_T_lidar`` is the pose that was solved with these factors on
-        :data:`~loam_gtsam.registration.solvers.POSE_KEY`. Returned is the (6, 6) information there,
-        and the step (6,) to the optimum, none where nothing tells. It may be far, along what a tilt
-        and a height tell of the way: the pose is not moved, for all this is linear near it only.
+        :data:`~loam_gtsam.registration.solvers.POSE_KEY`.
+
+        Returns
+        -------
+        information, step : (6, 6) at that pose, and (6,) from there to the optimum; no step where
+            nothing tells. It may be far, as along what a tilt and a height tell of the way: all
+            this is linear near the pose only, which is therefore not moved there.
         """
         if not factors:
             return self.information, np.zeros(6)

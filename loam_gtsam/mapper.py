@@ -292,12 +292,12 @@ class Mapper:
         scan = self.errors.of_scan(solution, small=self.maps.small)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
-            posed, solution, pose, tilt, fused, unlike = with_imu(self.imu, posed, *told)
+            posed, solution, pose, tilt, fused, unlike, of_imu = with_imu(self.imu, posed, *told)
         if found.message or unlike:
             self.errors.jumped(frame.predicted, solution.map_T_lidar, unlike=unlike)
         if self._start is None and not found.message:
             self.point_times.add(posed, solution)
-        status, message = status_of(solution, found.message or self.point_times.problem)
+        status, message = status_of(solution, found.message or self.point_times.problem or of_imu)
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last
         update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)

@@ -23,6 +23,7 @@ class ImuSummary:
     gyro_bias : (3,) rad/s, lidar frame, as learnt in the end
     sweep_motions, tilt_priors : how many frames had which
     gyro_trusted : whether the gyro still agreed with the scans in the end
+    gyro_left_out : number of frames in which it did not
     problems : sentences on what the turns of the scans say about clock, unit and mounting
     """
 
@@ -32,6 +33,7 @@ class ImuSummary:
     sweep_motions: Mapping[str, int]
     tilt_priors: Mapping[str, int]
     gyro_trusted: bool
+    gyro_left_out: int
     problems: tuple[str, ...]
 
 
@@ -43,6 +45,7 @@ def imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
         gyro_bias=aid.buffer.gyro_bias,
         sweep_motions=Counter(str(update.sweep_motion) for update in updates),
         tilt_priors=Counter(str(update.tilt_prior) for update in updates),
-        gyro_trusted=aid.trusted_gyro is not None,
+        gyro_trusted=aid.gyro.holds,
+        gyro_left_out=aid.gyro.left_out,
         problems=aid.problems,
     )

@@ -190,10 +190,11 @@ def _imu_problems(imu: ImuSummary) -> list[str]:
         at = f"{dropped} of {sum(imu.tilt_priors.values())} sweeps"
         why = "gaps longer than imu.max_gap, or another clock than that of the sweeps"
         problems.append(f"IMU: no orientation at {at}: {why}")
-    if not imu.gyro_trusted:
+    if imu.gyro_left_out:
         problems.append(
-            "IMU: its gyro turned unlike the scans and was given up; check imu.lidar_R_imu_deg, "
-            "units and stamps"
+            f"IMU: its gyro turned unlike the scans and was given up for {imu.gyro_left_out} "
+            "sweeps; check imu.lidar_R_imu_deg, units and stamps; if the gyro is right, the poses "
+            "are wrong"
         )
     return [*problems, *imu.problems]
 

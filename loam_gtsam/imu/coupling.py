@@ -56,19 +56,30 @@ class GyroTrust:
 
     Both kinds are needed: a difference that is beyond all noise whatever is believed of the scan,
     and one beyond what prediction and scan say of themselves, which is seen much sooner.
+
+    Attributes
+    ----------
+    left_out : number of frames in which the gyro was not used
     """
 
     def __init__(self) -> None:
         self._frames, self._given_up = 0.0, 0
+        self.left_out = 0
 
     @property
     def holds(self) -> bool:
         """Whether the gyro is to be used."""
         return self._frames < _GIVEN_UP
 
+    @property
+    def problem(self) -> str:
+        """Sentence for the user while the gyro is given up; empty if it is not."""
+        return "" if self.holds else "the gyro turns unlike the scans: one of the two is wrong"
+
     def compared(self, *, agree: bool) -> None:
         """Take in a frame in which scan and gyro agree or not."""
         self._count(-1.0 if agree else 1.0)
+        self.left_out += not self.holds
 
     def surprised(self, distance: float) -> None:
         """Take in the squared Mahalanobis distance of a turn from its prediction."""

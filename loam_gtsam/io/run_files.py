@@ -280,5 +280,6 @@ def _imu_part(imu: ImuSummary) -> dict[str, Any]:
         "sweep_motions": dict(imu.sweep_motions),
         "gyro_bias_rad_s": imu.gyro_bias.tolist(),
         "gyro_trusted": imu.gyro_trusted,
+        "gyro_left_out": imu.gyro_left_out,
         "problems": [*report.problems, *imu.problems],
     }

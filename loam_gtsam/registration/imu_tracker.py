@@ -47,6 +47,7 @@ class Registration(NamedTuple):
     tilt: TiltPrior = TiltPrior.NONE  # how roll and pitch acted
     fused: Fused | None = None  # scan, gyro and accelerometer together; None if not
     contradicted: bool = False  # whether they predicted another pose
+    problem: str = ""  # sentence for the user
 
 
 def with_imu(
@@ -75,7 +76,7 @@ class ImuTracker:
 
     Attributes
     ----------
-    level : up in the map; None until there is an orientation
+    level, gyro : up in the map, None until there is an orientation; whether the gyro is trusted
     """
 
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
@@ -88,7 +89,7 @@ class ImuTracker:
         """Forget all frames: as a new tracker on the same buffer, with the bias it was given."""
         self.buffer.gyro_bias = self._given_bias
         self.level: Level | None = None
-        self._gyro = GyroTrust()
+        self.gyro = GyroTrust()
         self._spans, self._turns = np.zeros((0, 2), np.int64), np.zeros((0, 6))
         self._coupling = TightCoupling(self.config)
 
@@ -103,7 +104,7 @@ class ImuTracker:
     @property
     def trusted_gyro(self) -> ImuBuffer | None:
         """The buffer, while its gyro agrees with the scans."""
-        return self.buffer if self._gyro.holds else None
+        return self.buffer if self.gyro.holds else None
 
     @property
     def problems(self) -> tuple[str, ...]:
@@ -208,7 +209,7 @@ class ImuTracker:
         self._turns = np.vstack([self._turns, np.hstack([by_scan, by_gyro])])[-_PAIRS:]
         self._spans = np.vstack([self._spans, [last[0], now[0]]])[-_PAIRS:]
         agree = not _disagree(scan, turned, *_DISAGREEMENT)
-        self._gyro.compared(agree=agree)
+        self.gyro.compared(agree=agree)
         if agree:
             rate = gtsam.Rot3.Logmap(scan.between(turned)) / ((now[0] - last[0]) * 1e-9)
             self.buffer.gyro_bias = self.buffer.gyro_bias + _BIAS_GAIN * rate
@@ -262,7 +263,7 @@ class ImuTracker:
         if tilt is TiltPrior.NONE:
             pose, tilt = self.blend_tilt(reference_stamp, pose)
         self.find_level(reference_stamp, pose)  # for the frames to come
-        return Registration(posed, solution, pose, tilt, fused, contradicted)
+        return Registration(posed, solution, pose, tilt, fused, contradicted, self.gyro.problem)
 
     def predict(self, stamp: int) -> Prediction | None:
         """Pose, velocity and covariance of a moment by gyro and accelerometer; None if not known.
@@ -296,7 +297,7 @@ class ImuTracker:
         if self.config.coupling != "tight" or self.level is None:
             return None
         fused = self._coupling.observe(last, now, information, self._down(), self.buffer, step)
-        self._gyro.surprised(self._coupling.turn_surprise)
+        self.gyro.surprised(self._coupling.turn_surprise)
         return fused
 
     def _down(self) -> FloatArray:

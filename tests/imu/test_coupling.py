@@ -12,7 +12,7 @@ from loam_gtsam.config import Config, ImuConfig
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.coupling import TightCoupling
+from loam_gtsam.imu.coupling import GyroTrust, TightCoupling
 from loam_gtsam.imu.preintegration import InertialOdometry
 from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.registration.solvers.scan_error import ScanError
@@ -286,6 +286,21 @@ def test_the_velocity_of_a_pose_follows_from_how_far_it_is_from_the_expected_one
         odometry.update(gtsam.Pose3(), np.diag([1e6] * 3 + [1e5] * 3))
     later = odometry.predict(NOW + 20 * FRAME, data)
     assert abs(later.velocity_at(away)[0]) < 0.2
+
+
+def test_while_a_gyro_is_given_up_that_is_said_and_counted():
+    gyro = GyroTrust()
+    for _ in range(4):
+        gyro.compared(agree=False)
+    assert (gyro.problem, gyro.left_out) == ("", 0)
+    for _ in range(3):
+        gyro.compared(agree=False)
+    assert "one of the two is wrong" in gyro.problem
+    assert gyro.left_out == 3
+    while not gyro.holds:
+        gyro.compared(agree=True)
+    assert gyro.problem == ""
+    assert gyro.left_out < 20
 
 
 # -- the scan beside further factors ---------------------------------------------------------------

@@ -17,6 +17,7 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.registration.solvers.own_factors import LAST_KEY, PoseContext, own_factors
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import Features, FrameStatus, InputError
 
 LAST = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.2, 0.1), np.array([3.0, -1.0, 0.5]))
@@ -159,6 +160,27 @@ def test_a_height_in_a_corridor_leaves_the_way_along_it_alone():
     for update in run(PartOf(world, 0, 1, end_s=5.5), config, extra_factors=height).updates:
         assert update.map_T_lidar.range(true_at(update.stamp)) < 0.1
         assert update.status.solved or update.status is FrameStatus.FIRST
+
+
+def test_a_sweep_that_is_lost_by_factors_says_so():
+    """Positions that jump by 10 m for three sweeps; the run goes on as before."""
+    world = SimulatedWorld("room", frames=20, columns=300)
+    map_T_world = gtsam.Pose3(world.truth.map_T_lidar[0]).inverse()
+    noise, wrong = gtsam.noiseModel.Isotropic.Sigma(3, 0.02), world.truth.stamps[12:15]
+
+    def receiver(context):
+        where = world.truth_at(np.array([context.middle_stamp])).map_T_lidar[0, :3, 3]
+        jump = 10.0 * bool(wrong[0] < context.middle_stamp < wrong[-1] + 10**8)
+        return [gtsam.GPSFactor(context.key, map_T_world.transformFrom(where) + jump, noise)]
+
+    config = Config().changed("imu.level=false")
+    result = run(world, config, extra_factors=receiver)
+    updates = result.updates
+    lost = [update.status is FrameStatus.LOST for update in updates]
+    assert np.flatnonzero(lost).tolist() == [13, 14]  # the first one has too few matches
+    said = ["without the factors beside the scan" in update.message for update in updates]
+    assert said == lost
+    assert absolute_error(result.trajectory, world.truth).translations[-1] < 0.02
 
 
 @pytest.mark.parametrize(

@@ -138,7 +138,7 @@ def search(
     if doubt is Doubt.MISFIT:
         found = _elsewhere(frame, solution, monitor, solver)
         matcher.clock.lap("relocalize")
-        return _lost(frame, solution, monitor) if found is None else found
+        return _lost(frame, solution, monitor, solver) if found is None else found
     stays = found_at(frame, solution)
     if doubt is Doubt.JUMP:
         twists = [matcher.posed.twist, stays.posed.twist]
@@ -151,15 +151,21 @@ def search(
     return stays if found is None else found
 
 
-def _lost(frame: Frame, solution: Solution, monitor: FitMonitor) -> Lost:
+def _lost(frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSolver) -> Lost:
     """The sweep, that fits nowhere, with its solution at the expected pose."""
     guess, usual = frame.predicted.map_T_middle, monitor.usual
     before = Fit.of(solution.matches, frame.matcher.offered)
     nowhere = Solution.unsolved(guess, solution.matches, solution.iterations, 0)
+    further = ""
+    if frame.priors:
+        alone = replace(frame, lasting=(), since_last=()).solve(solver)
+        if alone.solved and monitor.fits_again(Fit.of(alone.matches, frame.matcher.offered)):
+            further = "; without the factors beside the scan, which contradict the map, it fits"
     return Lost(
         nowhere,
         f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
-        f"usual; nothing fits within {monitor.radius:g} m; lost for {monitor.lost + 1} sweeps",
+        f"usual; nothing fits within {monitor.radius:g} m{further}; "
+        f"lost for {monitor.lost + 1} sweeps",
     )
 
 

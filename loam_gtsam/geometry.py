@@ -10,6 +10,7 @@ from typing import TypeVar
 import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri, ndtr
 
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array, check_kind
 
@@ -22,6 +23,11 @@ _GRID = 1 << 20
 OBLIQUE_EDGE = float(np.sqrt(1.5))
 """Edges of oblique voxels over the size asked for. In the mean over all attitudes a plane crosses
 1.5 times as many voxels as one along their borders does, so oblique ones are as much larger."""
+
+
+def five_sigma(freedoms: int) -> float:
+    """Squared Mahalanobis distance, of so many, that is as unlikely as five standard deviations."""
+    return float(chdtri(freedoms, 2.0 * ndtr(-5.0)))
 
 
 def as_array(value: ArrayLike, name: str, shape: tuple[int | str, ...]) -> FloatArray:

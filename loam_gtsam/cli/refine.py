@@ -90,7 +90,7 @@ def _refined(
     graph = survey = None
     if map_of_run(folder).exists():
         with SavedMap(map_of_run(folder)) as saved:
-            survey, graph = _survey(saved), saved.graph.held()
+            graph, survey = saved.graph.held(), _survey(saved)
     with _progress(settings, quiet=quiet) as shown:
         return refine_runs(
             points, [run.updates for run in runs], ways, graph=graph, survey=survey,

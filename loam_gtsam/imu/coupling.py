@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from scipy.special import chdtri, ndtr
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.geometry import symmetric
+from loam_gtsam.geometry import five_sigma, symmetric
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.preintegration import NO_STEP, Fused, InertialOdometry, Prediction
@@ -24,14 +23,14 @@ _HARDEST = 1.0
 """Largest acceleration over a sweep, in multiples of gravity, with which the estimate may begin. If
 it seems larger, down is not where the orientation has it."""
 _FASTEST = 20.0  # m/s: standard deviation of a speed that nothing told
-_UNLIKELY = float(chdtri(6, 2.0 * ndtr(-5.0)))
+_UNLIKELY = five_sigma(6)
 """Squared Mahalanobis distance from which a pose contradicts its prediction: as unlikely as five
 standard deviations."""
 _UNFELT = 2.0  # m/s^2: standard deviation of an acceleration that nothing told, as of the solver
 _OUTWEIGHS = 5  # frames that agree and one that contradicts: the one after it knows no velocity
 _DISTRUST = 3 * _OUTWEIGHS  # from which, less agreements, the accelerometer is not used
 _GIVEN_UP = 5.0  # frames of disagreement less those of agreement from which a gyro is not used
-_TURNED = float(chdtri(3, 2.0 * ndtr(-5.0)))
+_TURNED = five_sigma(3)
 """As ``_UNLIKELY``, of a rotation."""
 _CLEAR = 3.0  # frames of disagreement for which a rotation far beyond that counts
 _LONGER = 6  # times that a gyro which is given up again is given up for twice as long

@@ -231,9 +231,10 @@ class PoseGraph(FactorGraph):
         InputError
             If there are no keyframes. The graph is then as it was before.
         """
-        saved = self.saved()
-        loops = saved.loops[len(saved.loops) - len(self.loops) :]  # a user's own are believed
-        result = optimize_graph(replace(saved, closures=loops), max_chi2=self.config.max_chi2)
+        first = self._graph.factors.size()
+        loops = range(first, first + len(self.loops))  # motions of a user's own are believed
+        saved = replace(self.saved(), closures=loops)
+        result = optimize_graph(saved, max_chi2=self.config.max_chi2)
         active = np.array([report.active for report in result.loops], np.bool_)
         self._graph.restart(result.poses, active)
         return result

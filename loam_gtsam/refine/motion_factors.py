@@ -120,10 +120,10 @@ def loop_factors(
     frames : numbers of the sweeps by the keys of the graph; loops on other keys are left out
     to_middle : pose of the middle of each sweep, seen from where the graph has its pose
     """
-    found = gtsam.NonlinearFactorGraph()
-    if not graph.loops:
+    found, loops = gtsam.NonlinearFactorGraph(), graph.loops
+    if not loops:
         return found
-    for place, report in zip(graph.loops, optimize_graph(graph).loops, strict=True):
+    for place, report in zip(loops, optimize_graph(graph).loops, strict=True):
         factor: Any = graph.factors.at(place)
         first, second = (frames.get(key) for key in factor.keys())  # noqa: SIM118
         if not report.active or first is None or second is None:

@@ -13,10 +13,9 @@ from typing import Literal
 import gtsam
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
-from scipy.special import chdtri, ndtr
 
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
-from loam_gtsam.geometry import interpolated, inverse_pose, transform
+from loam_gtsam.geometry import five_sigma, interpolated, inverse_pose, transform
 from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory, check_kind
 
@@ -28,7 +27,7 @@ _LENGTH_UNITS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 _SPARSE_NS = 1_000_000_000  # between the poses of a reference that is not interpolated
 FREEDOM = 6
 """Degrees of freedom of a pose."""
-FIVE_SIGMA = float(chdtri(FREEDOM, 2.0 * ndtr(-5.0)))
+FIVE_SIGMA = five_sigma(FREEDOM)
 """Squared Mahalanobis distance of a pose that is as unlikely as five standard deviations."""
 
 

@@ -9,6 +9,12 @@ OWN = np.diag(np.repeat([2e-4, 3e-3], 3) ** 2)
 STEP = np.diag(np.repeat([5e-4, 5e-3], 3) ** 2)
 
 
+def seen_from_first(world, stamp):
+    """True pose at a stamp, nanoseconds, seen from that of the first sweep."""
+    first, now = world.truth.map_T_lidar[0], world.truth_at(np.array([stamp])).map_T_lidar[0]
+    return gtsam.Pose3(first).between(gtsam.Pose3(now))
+
+
 def room_features(map_T_lidar, stamp, rng, count=6000, noise=0.0):
     """Features of a 12 x 8 x 4 m room with six poles, seen exactly from a pose."""
     sides = np.array([6.0, 4.0, 2.0])

@@ -9,19 +9,17 @@ from typing import NamedTuple
 
 import gtsam
 import numpy as np
-from scipy.special import chdtri, ndtr
 
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.frontend.deskew import PosedSweep
-from loam_gtsam.geometry import transform
+from loam_gtsam.geometry import five_sigma, transform
 from loam_gtsam.registration.odometry import Moment, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, Favour, favour
 from loam_gtsam.registration.relocalization.fits import beyond_any_motion, same, step_in_map
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.types import FloatArray
 
-_UNLIKELY = float(chdtri(6, 2.0 * ndtr(-5.0)))
-"""Squared Mahalanobis distance from which a pose contradicts factors: as five sigmas."""
+_UNLIKELY = five_sigma(6)  # from which on a pose contradicts factors
 _HARDLY = 2.0  # standard deviations: one of twenty right ways is worse by chance
 
 

@@ -44,13 +44,13 @@ if TYPE_CHECKING:
     from loam_gtsam.pipeline import run as run
     from loam_gtsam.registration.alignment import align as align
     from loam_gtsam.registration.association import associate as associate
-    from loam_gtsam.registration.pose_errors import relative_covariance as relative_covariance
     from loam_gtsam.registration.solvers import POSE_KEY as POSE_KEY
     from loam_gtsam.registration.solvers import GtsamSolver as GtsamSolver
     from loam_gtsam.registration.solvers import Solution as Solution
     from loam_gtsam.registration.solvers import make_solver as make_solver
     from loam_gtsam.registration.solvers import match_rows as match_rows
     from loam_gtsam.registration.solvers.own_factors import PoseContext as PoseContext
+    from loam_gtsam.registration.uncertainty import relative_covariance as relative_covariance
     from loam_gtsam.studies.evaluation import absolute_error as absolute_error
     from loam_gtsam.types import Features as Features
     from loam_gtsam.types import FeatureSweep as FeatureSweep
@@ -81,7 +81,7 @@ _HOMES = {
     "pipeline": "Pipeline RunResult run",
     "registration.alignment": "align",
     "registration.association": "associate",
-    "registration.pose_errors": "relative_covariance",
+    "registration.uncertainty": "relative_covariance",
     "registration.solvers": "GtsamSolver POSE_KEY Solution make_solver match_rows",
     "registration.solvers.own_factors": "PoseContext",
     "studies.evaluation": "absolute_error",

@@ -23,7 +23,6 @@ from loam_gtsam.registration.imu_tracker import ImuTracker, with_imu
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
 from loam_gtsam.registration.point_times import PointTimes
-from loam_gtsam.registration.pose_errors import PoseErrors
 from loam_gtsam.registration.relocalization import (
     Fit,
     FitMonitor,
@@ -47,6 +46,7 @@ from loam_gtsam.registration.solvers.own_factors import (
 )
 from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.registration.start import Start
+from loam_gtsam.registration.uncertainty import PoseErrors
 from loam_gtsam.types import (
     ConfigError,
     Features,

@@ -334,7 +334,7 @@ class TiltPrior(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Uncertainty:
-    """The parts of a solved pose's error (:mod:`loam_gtsam.registration.pose_errors`).
+    """The parts of a solved pose's error (:mod:`loam_gtsam.registration.uncertainty`).
 
     Attributes
     ----------

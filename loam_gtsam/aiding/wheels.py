@@ -10,7 +10,7 @@ import numpy as np
 from loam_gtsam.config import AidingConfig, Config
 from loam_gtsam.datasets.decode.aiding import WheelSamples
 from loam_gtsam.registration.odometry import ConstantVelocity, Guess, Odometry, Turns
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import ConfigError, Features, FrameStatus, MapUpdate
 
 _GAP = 500_000_000  # nanoseconds between samples that are still interpolated

@@ -18,7 +18,7 @@ from loam_gtsam.config import Config, PoseGraphConfig
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import as_array, symmetric, transform
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate, Uncertainty
 
 _LEAST_SIGMAS = np.repeat([1e-6, 1e-5], 3)  # rad and m: no factor may be infinitely sure

@@ -13,7 +13,7 @@ from loam_gtsam.geometry import nearest_positive, symmetric
 from loam_gtsam.loops.keyframes import LoopClosure, leads_to_keyframe, noise_model, surely_placed
 from loam_gtsam.loops.scan_context import scan_context
 from loam_gtsam.mapper import Registered
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import FloatArray, MapUpdate
 
 Descriptor = NDArray[np.float16]

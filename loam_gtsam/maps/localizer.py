@@ -31,8 +31,8 @@ from loam_gtsam.maps.map_file import SavedMap, whole, write_map
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import advance
-from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.registration.relocalization import RELOCALISED, same
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import (
     BadSweep,
     Features,

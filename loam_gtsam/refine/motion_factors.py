@@ -12,7 +12,7 @@ import numpy as np
 from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import noise_model
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate
 
 _UNKNOWN: FloatArray = np.diag(np.repeat([0.1, 1.0], 3) ** 2)

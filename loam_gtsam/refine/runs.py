@@ -25,7 +25,7 @@ from loam_gtsam.refine.motion_factors import (
 from loam_gtsam.refine.rounds import Round, Settings
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
 from loam_gtsam.refine.ties import FactorTies, FixTies, Survey, own_ties
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import (
     BoolArray,
     FloatArray,

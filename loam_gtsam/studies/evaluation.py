@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.geometry import five_sigma, interpolated, inverse_pose, transform
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory, check_kind
 
 _NO_SPREAD = 1e-9

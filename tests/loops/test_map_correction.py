@@ -16,8 +16,8 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.maps.map_graph import graph_arrays, graph_of, graph_of_arrays
 from loam_gtsam.pipeline import Pipeline, imu_buffer
 from loam_gtsam.registration.frame_matcher import MapPair
-from loam_gtsam.registration.pose_errors import PoseErrors
 from loam_gtsam.registration.solvers import GtsamSolver
+from loam_gtsam.registration.uncertainty import PoseErrors
 from loam_gtsam.types import InputError
 
 UP = np.array([0.0, 0.0, 3.0])

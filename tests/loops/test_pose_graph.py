@@ -26,7 +26,7 @@ from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.loops.places import Places
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.mapper import Registered
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate
 
 

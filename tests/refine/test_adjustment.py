@@ -17,7 +17,7 @@ from loam_gtsam.refine.motion_factors import told_directions
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points, stacked, sweep_points
-from loam_gtsam.registration.pose_errors import relative_covariance
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import FeatureSweep, InputError, Trajectory
 
 SIZES = voxel_sizes(3.2, 0.4)

@@ -18,7 +18,6 @@ from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.mapper import Mapper, make_solver
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.pose_errors import SeenGround, scan_error
 from loam_gtsam.registration.report import status_of
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, MotionPrior, match_rows
 from loam_gtsam.registration.solvers.classical import (
@@ -29,6 +28,7 @@ from loam_gtsam.registration.solvers.classical import (
     euler_jacobian,
     loam_rows,
 )
+from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import FrameStatus, InputError
 
 OFFSET = np.array([0.02, -0.01, 0.02, 0.07, 0.13, -0.13])

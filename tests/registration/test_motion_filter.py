@@ -10,8 +10,8 @@ from support.list_dataset import ListDataset
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import run
-from loam_gtsam.registration.pose_errors import relative_covariance
 from loam_gtsam.registration.solvers import MotionFilter
+from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import FrameStatus
 
 FRAME = 100_000_000

@@ -15,10 +15,13 @@ from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import run
-from loam_gtsam.registration import pose_errors as covariance_module
+from loam_gtsam.registration.acceleration import Accelerations
 from loam_gtsam.registration.odometry import Moment
-from loam_gtsam.registration.pose_errors import PoseErrors, ScanError, relative_covariance
 from loam_gtsam.registration.solvers import POSE_KEY, Solution
+from loam_gtsam.registration.solvers.scan_error import ScanError
+from loam_gtsam.registration.uncertainty import PoseErrors, relative_covariance
+from loam_gtsam.registration.uncertainty import pose_errors as covariance_module
+from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
 from loam_gtsam.studies.evaluation import nees
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 
@@ -241,16 +244,19 @@ def own_errors(
     acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30, begins=0, known=None
 ):
     """Own error at the start of the last of many sweeps along x, accelerated after some."""
-    errors = PoseErrors(Config())
+    config = Config()
+    expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
+    accelerations = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
+    errors = OwnErrors(config.imu.gyro_noise)
     for k in range(frames):
         x = 0.5 * acceleration * (0.1 * max(k - begins, 0)) ** 2
         middle = gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
         sweep = _Sweep(k * FRAME, motion)
         sweep.acceleration = known
-        if errors._last is not None:
-            before = errors._last.stamp, errors._last.map_T_lidar
-            errors._motion.add(*before, sweep.stamp, middle, covariance)
-        own, _, errors._last = errors._own(sweep.stamp, sweep, middle, covariance, np.eye(6))
+        if errors.last is not None:
+            accelerations.add(*errors.last, sweep.stamp, middle, covariance)
+        update = MapUpdate(sweep.stamp, middle, FrameStatus.OK)
+        own = errors.of(update, sweep, middle, covariance, accelerations, None).covariance
     return own
 
 

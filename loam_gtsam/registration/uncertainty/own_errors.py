@@ -1,0 +1,180 @@
+"""The errors that a pose has for itself: docs/maths/covariance.md, "At the reference time"."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.frontend.deskew import MovingSweep
+from loam_gtsam.geometry import positive_root, symmetric
+from loam_gtsam.imu.preintegration import Fused
+from loam_gtsam.registration.acceleration import Accelerations
+from loam_gtsam.types import FloatArray, MapUpdate, SweepMotion
+
+_LASTING = 0.3
+"""Share of a scan's covariance that stays for some frames and that no filter averages: consecutive
+innovations correlate by 0 to 0.5, by axis and place (street, park, room, garage, trees)."""
+_PAUSE = 1.0
+"""Seconds for which a velocity may have changed where a clock was set: nothing tells how long the
+sweeps took that were on neither clock."""
+
+
+class OwnError(NamedTuple):
+    """Of a frame, at its reference time.
+
+    Attributes
+    ----------
+    covariance : (6, 6)
+    shared : (6, 6) its covariance with that of the frame before; zero if it follows none
+    follows : reference time of the frame before; None if it follows none
+    """
+
+    covariance: FloatArray
+    shared: FloatArray
+    follows: int | None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Middle:
+    """A solved frame at the middle of its sweep."""
+
+    stamp: int  # nanoseconds of the middle
+    map_T_lidar: gtsam.Pose3
+    covariance: FloatArray  # (6, 6) of the scan's own error
+    kept: FloatArray  # (6,) share of the scan's own error in the pose at the reference time
+    to_reference: FloatArray  # (6, 6) adjoint from the middle to the reference time
+    reference_stamp: int
+    of_state: FloatArray | None = None  # (6, 9) by which errors of pose and velocity get there
+    lasting: FloatArray | None = None  # (6, 6) root of what its scan shares with the next one's
+
+
+class OwnErrors:
+    """Brings the errors of scans, which are at the middles of sweeps, to the reference times.
+
+    ``gyro_noise`` is a density, rad/s/sqrt(Hz).
+    """
+
+    def __init__(self, gyro_noise: float) -> None:
+        self._gyro_noise = gyro_noise
+        self._last: _Middle | None = None
+        self._paused = False
+
+    @property
+    def last(self) -> tuple[int, gtsam.Pose3] | None:
+        """The last frame: nanoseconds of its middle, and the pose there; None if there is none."""
+        return None if self._last is None else (self._last.stamp, self._last.map_T_lidar)
+
+    def cut(self, *, paused: bool = False) -> None:
+        """The next frame follows none; if ``paused``, it is on another clock."""
+        self._last, self._paused = None, self._paused or paused
+
+    def of(
+        self,
+        update: MapUpdate,
+        sweep: MovingSweep,
+        middle: gtsam.Pose3,
+        covariance: FloatArray,
+        motion: Accelerations,
+        fused: Fused | None,
+    ) -> OwnError:
+        """The own error of a frame, each in turn.
+
+        ``covariance`` (6, 6) is that of its scan, at the pose of the ``middle``; ``fused`` is the
+        pose by scan and IMU together, None if there is none.
+        """
+        last = self._last
+        to_reference = update.map_T_lidar.between(middle).AdjointMap()
+        now = _Middle(sweep.stamp, middle, covariance, np.ones(6), to_reference, update.stamp)
+        if fused is None:
+            now, own, shared = self._by_scan(now, sweep, motion)
+            if self._paused:
+                own = own + _changed(update.twist, sweep, motion.variances)
+        else:
+            now, own, shared = self._by_imu(now, sweep, motion, fused, update)
+        self._last, self._paused = now, False
+        return OwnError(symmetric(own), shared, None if last is None else last.reference_stamp)
+
+    def _by_scan(
+        self, now: _Middle, sweep: MovingSweep, motion: Accelerations
+    ) -> tuple[_Middle, FloatArray, FloatArray]:
+        """The frame, and its own and shared error, of a pose by its scan alone."""
+        # The pose at the reference time follows from that at the middle by the velocity since the
+        # last middle, and so has a share in the errors of both.
+        last = self._last
+        if last is not None and sweep.stamp <= last.stamp:  # sweeps of different length
+            last = None
+        seconds = np.inf if last is None else (sweep.stamp - last.stamp) * 1e-9
+        share = np.full(6, sweep.middle / seconds)
+        if rotation_is_known(sweep):
+            share[:3] = 0.0
+        kept, to_reference = 1.0 - share, now.to_reference
+        own = kept[:, None] * now.covariance * kept
+        shared = np.zeros((6, 6))
+        if last is not None:
+            across = share[:, None] * now.map_T_lidar.between(last.map_T_lidar).AdjointMap()
+            own = own + across @ last.covariance @ across.T
+            shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
+        own = to_reference @ (own + np.diag(self._missed(sweep, motion))) @ to_reference.T
+        return replace(now, kept=kept), own, shared
+
+    def _by_imu(
+        self,
+        now: _Middle,
+        sweep: MovingSweep,
+        motion: Accelerations,
+        fused: Fused,
+        update: MapUpdate,
+    ) -> tuple[_Middle, FloatArray, FloatArray]:
+        """As :meth:`_by_scan`, of a frame whose velocity is known too."""
+        last, to_reference = self._last, now.to_reference
+        # What consecutive scans have in common
+        of_scan = symmetric(to_reference @ now.covariance @ to_reference.T)
+        lasting = np.sqrt(_LASTING) * positive_root(of_scan)
+        back = -sweep.middle * update.map_T_lidar.rotation().matrix().T
+        of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
+        turned = np.concatenate([self._missed(sweep, motion)[:3], np.zeros(3)])
+        own = of_state @ fused.covariance @ of_state.T + np.diag(turned) + lasting @ lasting.T
+        shared = np.zeros((6, 6))
+        if last is not None and last.of_state is not None and last.lasting is not None:
+            shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
+        covariance = fused.covariance[:6, :6]
+        return (
+            replace(now, covariance=covariance, of_state=of_state, lasting=lasting),
+            own,
+            shared,
+        )
+
+    def _missed(self, sweep: MovingSweep, motion: Accelerations) -> FloatArray:
+        """(6,) variances of what the mean velocity misses from the middle to the reference time."""
+        # The acceleration times this is the distance of an arc from its chord: at the reference
+        # time, between the last two middles, and in the mean over the sweep.
+        bend = sweep.duration**2 / 24.0
+        if self._last is not None and sweep.stamp > self._last.stamp:
+            seconds = (sweep.stamp - self._last.stamp) * 1e-9
+            bend += 0.5 * sweep.middle * (seconds - sweep.middle)
+        missed = bend**2 * motion.missed(steady=sweep.acceleration is None)
+        if rotation_is_known(sweep):
+            missed[:3] = 0.0
+        if sweep.motion is SweepMotion.GYRO:
+            missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
+        return missed
+
+
+def rotation_is_known(sweep: MovingSweep) -> bool:
+    """Whether an IMU has measured how a sweep turned."""
+    return sweep.motion in (SweepMotion.GYRO, SweepMotion.ORIENTATION)
+
+
+def _changed(twist: FloatArray, sweep: MovingSweep, accelerations: FloatArray) -> FloatArray:
+    """(6, 6) covariance of what a velocity from before a pause misses at the reference time.
+
+    ``twist`` (6,) is that velocity, rad/s and m/s, which may have turned as well;
+    ``accelerations`` are (6,) mean squares.
+    """
+    squares = accelerations.copy()
+    squares[:3] *= not rotation_is_known(sweep)
+    squares[3:] += np.sum(np.cross(twist[:3], twist[3:]) ** 2)
+    return np.diag((sweep.middle * _PAUSE) ** 2 * squares)

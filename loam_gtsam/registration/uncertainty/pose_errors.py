@@ -1,0 +1,205 @@
+"""How wrong a pose may be: covariances of poses in the map, and of the motion between two poses.
+
+Unlike in the inverse of the information, the scatter is that of the residuals, matches close
+together count as one, and two errors are added: docs/maths/covariance.md.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.config import Config
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
+from loam_gtsam.geometry import symmetric, transform
+from loam_gtsam.imu.preintegration import Fused
+from loam_gtsam.registration.acceleration import Accelerations, Expected
+from loam_gtsam.registration.odometry import Moment, Prediction, Turns
+from loam_gtsam.registration.relocalization import same
+from loam_gtsam.registration.solvers import Solution
+from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
+from loam_gtsam.registration.uncertainty.map_error import MapError
+from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
+from loam_gtsam.types import FloatArray, FrameStatus, InputError, MapUpdate, Uncertainty
+
+
+def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
+    """Covariance of ``earlier.map_T_lidar.between(later.map_T_lidar)``.
+
+    The covariance for a factor between two poses: the own errors of both frames and the drift of
+    the map between them. The drift before is common to both poses and cancels.
+
+    Both are frames of one run, the later one solved, the earlier one too or the first: the map
+    begins there, and its pose has no error in it. Returns (6, 6), tangent order of the package,
+    perturbation on the right: along the axes of the later frame.
+
+    Raises
+    ------
+    InputError
+        If a frame was not solved, or ``later`` is not later than ``earlier``.
+    """
+    begins = earlier.status is FrameStatus.FIRST
+    for name, update in (("earlier", earlier), ("later", later)):
+        if update.uncertainty is None and not (begins and update is earlier):
+            raise InputError(
+                f"{name}: expected a frame that was solved, got one with status {update.status}; "
+                "choose another one"
+            )
+    if later.stamp <= earlier.stamp:
+        raise InputError(
+            f"later: expected a stamp after {earlier.stamp}, got {later.stamp}; swap the two"
+        )
+    if begins:
+        return later.covariance.copy()
+    first, second = earlier.uncertainty, later.uncertainty
+    assert first is not None
+    assert second is not None
+    to_later = later.map_T_lidar.between(earlier.map_T_lidar).AdjointMap()
+    from_map = later.map_T_lidar.inverse().AdjointMap()
+    covariance = second.own + to_later @ first.own @ to_later.T
+    # The error of the velocity was the same in both, but for what was forgotten in between.
+    blind = second.blind - first.blind * np.exp(first.forgotten - second.forgotten)
+    covariance += from_map @ (second.drift - first.drift + blind @ blind.T) @ from_map.T
+    if second.follows == earlier.stamp:
+        common = second.shared @ to_later.T
+        covariance -= common + common.T
+    return symmetric(covariance)
+
+
+class PoseErrors:
+    """Calibrates the covariances of a run, frame by frame.
+
+    Of ``config``, ``covariance``, ``solver``, ``deskew.model`` and parts of ``imu`` are used.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self._places = [
+            (place.covariance, SeenGround(place.covariance.ground_cell))
+            for place in (config, config.of_small_places())
+        ]
+        self._small, self._scans = False, 0  # scans that :meth:`of_scan` was given
+        self._kernel, graph = config.solver.kernel, config.solver.method == "gtsam"
+        self._kernel_width = config.solver.kernel_width if graph else np.inf
+        # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
+        self._with_priors = graph
+        expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
+        self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
+        self._map, self._own = MapError(config), OwnErrors(config.imu.gyro_noise)
+
+    @property
+    def accelerations(self) -> Expected | None:
+        """What the poses so far tell of the next acceleration; None at first."""
+        return self._motion.next
+
+    def expected(self, stamp: int, last: Moment | None, imu: Turns | None) -> gtsam.Pose3 | None:
+        """As :meth:`MapError.expected`."""
+        return self._map.expected(stamp, last, imu)
+
+    def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
+        """The error of a solved scan; to be called once for each, in order.
+
+        ``small`` tells whether the place is small.
+        """
+        self._scans += 1
+        config, seen = self._places[small]
+        if small != self._small and self._scans > 1:
+            # The ground is the same, only in other cells.
+            found = solution.matches
+            points = np.concatenate([found.edges.points, found.planes.points])
+            seen.cells(transform(solution.map_T_lidar.matrix(), points))
+        self._small = small
+        return scan_error(
+            solution, self._kernel_width, seen, config,
+            kernel=self._kernel, with_priors=self._with_priors,
+        )  # fmt: skip
+
+    def calibrated(
+        self,
+        update: MapUpdate,
+        sweep: MovingSweep,
+        solution: Solution,
+        scan: ScanError | None,
+        last: Moment | None,
+        fused: Fused | None = None,
+        doubt: FloatArray | None = None,
+        parting: FloatArray | None = None,
+    ) -> MapUpdate:
+        """The update of a solved frame with its covariance; to be called after :meth:`of_scan`.
+
+        The sweep has the motion of the solution, which is at its middle; ``last`` is the middle of
+        the last sweep, None if the sweep did not get here from there; ``fused`` is the pose by scan
+        and IMU together; ``doubt`` is a further covariance (6, 6) of the pose, map frame, until the
+        start of the run is over, and None from then on; ``parting`` is the mean square (6, 6) of a
+        velocity at which the pose may go on elsewhere, rad/s and m/s, told with these.
+        """
+        if scan is None:
+            self._own.cut()
+            return update
+        middle = solution.map_T_lidar
+        by_imu = fused if solution.weak is None else None
+        known = scan.covariance if by_imu is None else by_imu.covariance[:6, :6]
+        settled = None if by_imu is None else known
+        self._map.add_scan(self._scans, sweep, solution, scan, last, settled)
+        if fused is not None:
+            self._map.set_velocity(middle.rotation().unrotate(fused.velocity))
+        self._add_acceleration(sweep, middle, known, last)
+        own = self._own.of(update, sweep, middle, scan.covariance, self._motion, by_imu)
+        if self._scans == 1:
+            self._map.set_origin(sweep, middle.AdjointMap(), scan.covariance, update.twist)
+        self._map.add_rivals(sweep.stamp, doubt, parting)
+        # A pose that own factors tell shares less of the map's error.
+        to_reference = update.map_T_lidar.between(middle).AdjointMap()
+        from_map = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
+        covariance = own.covariance + from_map @ self._map.doubt @ from_map.T
+        uncertainty = Uncertainty(
+            own=covariance,
+            shared=own.shared,
+            follows=own.follows,
+            drift=self._map.drift,
+            blind=self._map.blind,
+            forgotten=self._map.forgotten,
+            residual_variance=scan.residual_variance,
+            effective_matches=scan.effective_matches,
+            in_doubt=bool(self._map.doubt.any()),
+        )
+        total = self._map.total(self._motion.at_first)
+        covariance = symmetric(covariance + from_map @ total @ from_map.T)
+        return replace(update, covariance=covariance, uncertainty=uncertainty)
+
+    def _add_acceleration(
+        self, sweep: MovingSweep, middle: gtsam.Pose3, known: FloatArray, last: Moment | None
+    ) -> None:
+        """What the pose of a sweep, of covariance ``known`` (6, 6), tells of the acceleration."""
+        before = self._own.last
+        if self._scans == 1 and last is not None:
+            before = last.stamp, last.map_T_lidar
+        # A pose in doubt tells no acceleration; that of the very first sweep does.
+        if before is not None and not self._map.doubt.any() and sweep.stamp > before[0]:
+            self._motion.add(*before, sweep.stamp, middle, known)
+
+    def jumped(self, expected: Prediction, pose: gtsam.Pose3, *, unlike: bool) -> None:
+        """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
+
+        If no usual acceleration leads there, it may only look alike. An IMU to which it is
+        ``unlike`` knew better.
+        """
+        before, now = expected.map_T_middle, expected.posed.sweep.stamp
+        step = before.localCoordinates(pose)
+        if unlike or not (same(before, pose) or self._motion.explains(step, now)):
+            self._map.add_jump(pose, step)
+
+    def moved(self, step: gtsam.Pose3) -> None:
+        """As :meth:`MapError.add_move`."""
+        self._map.add_move(step)
+
+    def skipped(self, posed: PosedSweep) -> None:
+        """Account for a sweep whose pose is the expected one; the very first begins the map."""
+        if not self._scans:
+            self._map.begin(posed)
+
+    def cut(self) -> None:
+        """Start anew in time: the next frame is on another clock."""
+        self._own.cut(paused=True)
+        self._map.cut()

@@ -115,6 +115,7 @@ MODES = (
     Mode("lidar"),
     Mode("imu", "white"),
     Mode("mems", "mems"),
+    Mode("six", "six_axis"),
     Mode("loose", "mems", {"imu.coupling": "loose"}),
     Mode("project", None, {"solver.degeneracy": "project"}),
 )
@@ -453,7 +454,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not world.recorded or (data_folder() / world.scene).is_dir()
         for mode in modes
         for seed in range(options.first_seed, options.first_seed + options.seeds)
-        if not (world.recorded and (seed > options.first_seed or mode.imu == "mems"))
+        if not (world.recorded and (seed > options.first_seed or mode.imu in ("mems", "six_axis")))
     ]
     if options.workers > 1:
         with ProcessPoolExecutor(options.workers) as pool:

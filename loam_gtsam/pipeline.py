@@ -308,7 +308,7 @@ class Pipeline:
         if self.loops is None:
             return
         aid = self.mapper.imu
-        up = None if aid is None or aid.level is None else aid.level.map_up
+        up = None if aid is None else aid.map_up
         self.fixes = tie(self.loops.graph, updates, fixes, self.config.aiding, up)
 
     def map_points(self) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,8 @@ class ImuSummary:
     Attributes
     ----------
     report : on the samples
-    level : which way is up in the map, and how it was found; None if unknown
+    level : which way was up in the map, and how it was found; None if unknown
+    map_up : (3,) unit vector, map frame, up as estimated in the end; None if unknown
     gyro_bias : (3,) rad/s, lidar frame, as learnt in the end
     sweep_motions, tilt_priors : how many frames had which
     gyro_trusted : whether the gyro still agreed with the scans in the end
@@ -29,6 +30,7 @@ class ImuSummary:
 
     report: ImuReport
     level: Level | None
+    map_up: FloatArray | None
     gyro_bias: FloatArray
     sweep_motions: Mapping[str, int]
     tilt_priors: Mapping[str, int]
@@ -42,6 +44,7 @@ def imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
     return ImuSummary(
         report=aid.buffer.report,
         level=aid.level,
+        map_up=aid.map_up,
         gyro_bias=aid.buffer.gyro_bias,
         sweep_motions=Counter(str(update.sweep_motion) for update in updates),
         tilt_priors=Counter(str(update.tilt_prior) for update in updates),

@@ -162,6 +162,9 @@ def _imu_facts(imu: ImuSummary) -> dict[str, str]:
         angles = f"roll {np.degrees(level.roll):.2f}, pitch {np.degrees(level.pitch):.2f} deg"
         state = "at rest" if level.source == "still" else "moving"
         up = f"{angles}, from {level.samples} samples, {state}"
+        if level.felt and imu.map_up is not None:
+            off = np.degrees(np.arccos(np.clip(imu.map_up @ level.map_up, -1.0, 1.0)))
+            up += f": {off:.1f} deg off, as the scans tell"
     rates = " ".join(f"{1e3 * rate:+.2f}" for rate in imu.gyro_bias)
     return {
         "IMU, level": up,

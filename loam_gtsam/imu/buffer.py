@@ -216,7 +216,7 @@ class ImuBuffer:
         count -= count % BLOCK
         if count <= 0:
             return
-        self._rest, self._start_is_held = self._rest_at_start(), False
+        self._rest, self._start_is_held = self.first_rest(), False
         if self._quality.constant:  # then the filter is in use, or may be later
             self._filter.orientations(store.samples)
             self._filter.drop(count)
@@ -232,11 +232,16 @@ class ImuBuffer:
     def report(self) -> ImuReport:
         """Numbers of all samples so far, and what was wrong with them."""
         filtered = self._orientations() is not None
-        samples, rest = self._store.samples, self._rest_at_start()
+        samples, rest = self._store.samples, self.first_rest()
         if not self._quality.measured:
             samples = replace(samples, orientation=None)
         wrong = samples_problems(samples, self._config, rest)
         return self._quality.report(samples.stamps, rest, filtered, wrong)
+
+    @property
+    def measures_attitude(self) -> bool:
+        """Whether :meth:`orientation` is the sensor's own, not made of gyro and acceleration."""
+        return self._quality.measured
 
     def orientation(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar`` (world z up), interpolated between the neighbours.
@@ -319,6 +324,13 @@ class ImuBuffer:
         first = stamp - round(self._config.still_seconds * 1e9)
         return find_rest(self._config, self.samples_between(first, stamp + round(REST_AHEAD * 1e9)))
 
+    def first_rest(self) -> RestWindow | None:
+        """The rest at the start of all samples, dropped ones included; None if none."""
+        self._merge()
+        samples = self._store.samples
+        held = self._start_is_held and len(samples.stamps)
+        return rest_at_start(self._config, samples) if held else self._rest
+
     def _merge(self) -> None:
         changed = self._store.merge()
         if changed is not None:
@@ -337,12 +349,6 @@ class ImuBuffer:
             return None
         rates = self._store.samples.gyro[low : high + 1] - self._bias
         return (inside - origin).astype(np.float64) * 1e-9, rates.T
-
-    def _rest_at_start(self) -> RestWindow | None:
-        """The rest at the start of all samples, dropped ones included."""
-        samples = self._store.samples
-        held = self._start_is_held and len(samples.stamps)
-        return rest_at_start(self._config, samples) if held else self._rest
 
     def _orientations(self) -> FloatArray | None:
         """(N, 4) quaternions of ``world_R_lidar``, NaN where unknown; None if all are."""

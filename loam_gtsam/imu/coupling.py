@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 
@@ -9,8 +11,15 @@ from loam_gtsam.config import ImuConfig
 from loam_gtsam.geometry import five_sigma, symmetric
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.imu.preintegration import NO_STEP, Fused, InertialOdometry, Prediction
-from loam_gtsam.imu.preintegration_window import VELOCITY
+from loam_gtsam.imu.level import Level
+from loam_gtsam.imu.preintegration import (
+    NO_STEP,
+    Fused,
+    InertialOdometry,
+    Prediction,
+    StartSigmas,
+)
+from loam_gtsam.imu.preintegration_window import GRAVITY, VELOCITY
 from loam_gtsam.types import FloatArray, SweepError
 
 _FORCE = 0.2, 3.0
@@ -116,8 +125,27 @@ class TightCoupling:
 
     @property
     def trusted(self) -> bool:
-        """Whether the scans agree with gyro and accelerometer."""
-        return self._contradictions < _DISTRUST
+        """Whether gyro and accelerometer tell where the lidar is, and the scans agree."""
+        return self._contradictions < _DISTRUST and not self._gravity_is_open
+
+    @property
+    def _gravity_is_open(self) -> bool:
+        """Whether gravity is no better known than the acceleration that a constant velocity misses.
+
+        So it is after a start on the way with an IMU that has no attitude of its own.
+        """
+        if self._odometry is None:
+            return False
+        variances = np.diag(self._odometry.state.covariance)[GRAVITY]
+        return bool(variances.sum() > _UNFELT**2)
+
+    def up(self, level: Level) -> FloatArray:
+        """(3,) unit vector, map frame: as estimated, or by the ``level`` until it is."""
+        if self._odometry is None:
+            return level.map_up
+        gravity = self._odometry.state.map_gravity
+        up: FloatArray = -gravity / np.linalg.norm(gravity)
+        return up
 
     def predict(self, stamp: int, buffer: ImuBuffer) -> Prediction | None:
         """Pose, velocity and covariance of a moment; None if not known.
@@ -159,29 +187,30 @@ class TightCoupling:
 
     def bend(
         self, stamp: int, seconds: FloatArray, map_R_lidar: FloatArray,
-        gravity: FloatArray, buffer: ImuBuffer,
+        level: Level, buffer: ImuBuffer,
     ) -> FloatArray | None:  # fmt: skip
         """See :func:`loam_gtsam.imu.bend.bend`; None if the samples do not tell.
 
-        ``map_R_lidar`` (3, 3) is the rotation at ``stamp``; ``gravity`` (3,) m/s^2, map frame,
-        stands for it until it is estimated.
+        ``map_R_lidar`` (3, 3) is the rotation at ``stamp``; ``level`` tells gravity until it is
+        estimated.
         """
         if not self.trusted:
             return None
-        bias = np.zeros(3)
+        gravity, bias = level.down(self.config.gravity), np.zeros(3)
         first, last = (stamp + round(float(end) * 1e9) for end in (seconds[0], seconds[-1]))
         if not self._believable(first, last, buffer):
             return None
         if self._odometry is not None:
-            gravity, bias = self._odometry.state.map_gravity, self._odometry.state.acceleration_bias
-        elif not self._is_down(gravity @ map_R_lidar, first, last, buffer):
+            state = self._odometry.state
+            gravity, bias = state.map_gravity, state.acceleration_bias
+        elif level.felt or not self._is_down(gravity @ map_R_lidar, first, last, buffer):
             return None
         lever = np.asarray(self.config.lidar_t_imu, np.float64)
         return bend(buffer, stamp, seconds, gravity @ map_R_lidar, bias, lever)
 
     def observe(
         self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3],
-        information: FloatArray, gravity: FloatArray, buffer: ImuBuffer,
+        information: FloatArray, level: Level, buffer: ImuBuffer,
         step: FloatArray = NO_STEP,
     ) -> Fused | None:  # fmt: skip
         """Take in what the scan alone said about a moment; the pose by both.
@@ -192,7 +221,7 @@ class TightCoupling:
         ----------
         last, now : stamp, nanoseconds, and ``map_T_lidar`` of the frame before and of this one
         information : (6, 6) of the second pose, zero where the scan is not believed
-        gravity : (3,) m/s^2, map frame, with which the estimate begins, as with the buffer's bias
+        level : tells gravity where the estimate begins, as the buffer does the bias of the gyro
         step : (6,) from the second pose to where the scan has it
         """
         stamp, pose = now
@@ -211,6 +240,9 @@ class TightCoupling:
                 return fused if agree and self.trusted else None
             seconds = (stamp - last[0]) * 1e-9
             velocity = (pose.translation() - last[1].translation()) / seconds
+            gravity, sigmas = level.down(self.config.gravity), StartSigmas()
+            if level.felt:
+                sigmas = replace(sigmas, gravity=_UNFELT / self.config.gravity)
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
                 if not self._rejected:  # but samples were missing, or absurd
@@ -218,7 +250,7 @@ class TightCoupling:
                 self._odometry.restart(stamp, pose, velocity, spread)
             elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):
                 self._odometry = InertialOdometry(
-                    self.config, gravity, stamp, pose, velocity, buffer.gyro_bias, spread=spread
+                    self.config, gravity, stamp, pose, velocity, buffer.gyro_bias, sigmas, spread
                 )
         except SweepError:  # no window can begin here: with the next frame, then
             self._odometry = None

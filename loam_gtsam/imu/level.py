@@ -23,6 +23,7 @@ class Level:
     roll, pitch : angles of the lidar when the direction was found, rad
     samples : number of IMU samples behind it
     source : "still" if the platform was at rest, else "moving"
+    felt : whether it was made of acceleration on the way, and has that of the motion in it
     """
 
     level_R_map: gtsam.Rot3
@@ -30,11 +31,16 @@ class Level:
     pitch: float
     samples: int
     source: str
+    felt: bool
 
     @property
     def map_up(self) -> FloatArray:
         """(3,) unit vector, map frame."""
         return np.array(self.level_R_map.matrix()[2])
+
+    def down(self, gravity: float) -> FloatArray:
+        """(3,) gravity of this size, m/s^2, in the map frame."""
+        return -gravity * self.map_up
 
 
 def find_level(
@@ -54,7 +60,10 @@ def find_level(
     level_R_lidar = gtsam.Rot3.RzRyRx(roll, pitch, 0.0)
     level_R_map = level_R_lidar.compose(map_T_lidar.rotation().inverse())
     source = "moving" if buffer.rest_at(stamp) is None else "still"
-    return Level(gtsam.Rot3() if levelled else level_R_map, roll, pitch, count, source)
+    rested = source == "still" or buffer.first_rest() is not None
+    felt = not (buffer.measures_attitude or rested)
+    level_R_map = gtsam.Rot3() if levelled else level_R_map
+    return Level(level_R_map, roll, pitch, count, source, felt)
 
 
 def mean_orientation(buffer: ImuBuffer, stamp: int, reach: float) -> tuple[gtsam.Rot3, int] | None:

@@ -157,7 +157,9 @@ class InertialOdometry:
         covariance[BIASES, BIASES] = np.diag(biases)
         along = np.outer(gravity, gravity) / size**2
         across = (size * sigmas.gravity) ** 2 * (np.eye(3) - along)
-        covariance[GRAVITY, GRAVITY] = _MAGNITUDE_SIGMA**2 * along + across
+        # A vector of known length that points elsewhere is shorter along where it was thought to.
+        length = _MAGNITUDE_SIGMA**2 + (size * sigmas.gravity**2) ** 2
+        covariance[GRAVITY, GRAVITY] = length * along + across
         bias, still = as_vector(gyro_bias, "gyro_bias"), np.zeros(3)
         state = InertialState(stamp, gtsam.Pose3(), still, still, bias, gravity, covariance)
         self._start_at(state, map_T_lidar, velocity, spread)

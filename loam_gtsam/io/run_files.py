@@ -272,7 +272,7 @@ def _imu_part(imu: ImuSummary) -> dict[str, Any]:
         and {
             "roll_deg": float(np.degrees(level.roll)),
             "pitch_deg": float(np.degrees(level.pitch)),
-            "map_up": level.map_up.tolist(),
+            "map_up": None if imu.map_up is None else imu.map_up.tolist(),
             "source": level.source,
             "samples": level.samples,
         },

@@ -87,10 +87,9 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
         If the file cannot be written; an old one is then as it was.
     """
     aid = pipeline.mapper.imu
-    level = None if aid is None else aid.level
     tied = pipeline.fixes
     earth, fixes = (None, None) if tied is None else (tied.reference, tied.placed)
-    frame = MapFrame(None if level is None else level.map_up, earth)
+    frame = MapFrame(None if aid is None else aid.map_up, earth)
     if pipeline.loops is not None:
         points = whole(pipeline.loops.corrected_maps())
         graph = graph_of(pipeline.loops, pipeline.config, fixes)

@@ -107,6 +107,11 @@ class ImuTracker:
         return self.buffer if self.gyro.holds else None
 
     @property
+    def map_up(self) -> FloatArray | None:
+        """(3,) unit vector, map frame: as estimated, else as found at first; None if it was not."""
+        return None if self.level is None else self._coupling.up(self.level)
+
+    @property
     def problems(self) -> tuple[str, ...]:
         """What :func:`loam_gtsam.imu.diagnosis.scans_problems` says of the frames so far."""
         if not len(self._spans):
@@ -162,7 +167,9 @@ class ImuTracker:
             return solution, TiltPrior.DROPPED
         if config.prior == "sigma":
             return solution, TiltPrior.GRAVITY  # it was in the solve
-        if not self._attitude_turned(last, stamp, solution.map_T_lidar):
+        if config.coupling == "tight" and not self.buffer.measures_attitude:
+            return solution, TiltPrior.NONE  # made of acceleration, which counts already
+        if not _turned_alike(self.buffer, config.sigma_deg, last, stamp, solution.map_T_lidar):
             return solution, TiltPrior.DROPPED
         pose, information = solution.map_T_lidar, solution.information
         level_R_lidar = self.level.level_R_map.compose(pose.rotation())
@@ -222,17 +229,6 @@ class ImuTracker:
         """Take the last sweep to be at another pose, by the sweeps that followed."""
         self._coupling.moved(map_T_lidar, self.buffer)
 
-    def _attitude_turned(self, last: Moment | None, stamp: int, map_T_lidar: gtsam.Pose3) -> bool:
-        """Whether the IMU's attitude turned as the scans did since ``last``, as far as is known."""
-        if last is None or not last.solved:
-            return True
-        before, now = self.buffer.orientation(last.stamp), self.buffer.orientation(stamp)
-        if before is None or now is None:
-            return True
-        scan = last.map_T_lidar.rotation().between(map_T_lidar.rotation())
-        noise = _SURE * float(np.radians(self.config.sigma_deg))
-        return not _disagree(scan, before.between(now), noise, _DISAGREEMENT[1])
-
     def add_scan(
         self,
         posed: PosedSweep,
@@ -283,7 +279,7 @@ class ImuTracker:
         """
         if self.config.coupling != "tight" or self.level is None or self.trusted_gyro is None:
             return None
-        return self._coupling.bend(stamp, seconds, map_R_lidar, self._down(), self.buffer)
+        return self._coupling.bend(stamp, seconds, map_R_lidar, self.level, self.buffer)
 
     def observe(
         self, last: tuple[int, gtsam.Pose3], now: tuple[int, gtsam.Pose3],
@@ -296,13 +292,9 @@ class ImuTracker:
         """
         if self.config.coupling != "tight" or self.level is None:
             return None
-        fused = self._coupling.observe(last, now, information, self._down(), self.buffer, step)
+        fused = self._coupling.observe(last, now, information, self.level, self.buffer, step)
         self.gyro.surprised(self._coupling.turn_surprise)
         return fused
-
-    def _down(self) -> FloatArray:
-        assert self.level is not None
-        return -self.config.gravity * self.level.map_up
 
     def _attitude(self, stamp: int) -> gtsam.Rot3 | None:
         """``world_R_lidar``; None if unknown, or up is unknown in the map."""
@@ -317,6 +309,20 @@ class ImuTracker:
         assert self.level is not None
         sigma = float(np.radians(self.config.sigma_deg))
         return gravity_factor(POSE_KEY, measured, sigma, self.level.map_up)
+
+
+def _turned_alike(
+    buffer: ImuBuffer, sigma_deg: float, last: Moment | None, stamp: int, map_T_lidar: gtsam.Pose3
+) -> bool:
+    """Whether the IMU's attitude turned as the scans did since ``last``, as far as is known."""
+    if last is None or not last.solved:
+        return True
+    before, now = buffer.orientation(last.stamp), buffer.orientation(stamp)
+    if before is None or now is None:
+        return True
+    scan = last.map_T_lidar.rotation().between(map_T_lidar.rotation())
+    noise = _SURE * float(np.radians(sigma_deg))
+    return not _disagree(scan, before.between(now), noise, _DISAGREEMENT[1])
 
 
 def _tilt_is_unknown(solution: Solution, level_R_lidar: gtsam.Rot3, degrees: float) -> bool:

@@ -13,6 +13,7 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.imu.bend import bend
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.imu.coupling import GyroTrust, TightCoupling
+from loam_gtsam.imu.level import Level
 from loam_gtsam.imu.preintegration import InertialOdometry
 from loam_gtsam.registration.solvers import POSE_KEY
 from loam_gtsam.registration.solvers.scan_error import ScanError
@@ -23,6 +24,14 @@ FRAME = 100_000_000
 NOW = START + 500_000_000
 SECONDS = np.linspace(-0.15, 0.06, 41)
 RATE, TURN = np.array([0.3, -0.2, 0.9]), np.array([0.5, 1.0, -0.8])
+
+
+def level_of(down, felt=False):
+    turned = gtsam.Rot3(Rotation.align_vectors([[0.0, 0.0, -1.0]], [down])[0].as_matrix())
+    return Level(turned, 0.0, 0.0, 1, "moving", felt)
+
+
+LEVEL = level_of(DOWN)
 
 
 def buffer(config=None, acceleration=(1.5, -0.5, 0.2), arm=(0.0, 0.0, 0.0), scale=1.0):
@@ -110,7 +119,7 @@ def drive(coupling, data, frames, errors=None, information=None):
         if errors is not None:
             now = now[0], gtsam.Pose3().retract(errors[number])
         predicted = coupling.predict(now[0], data)
-        found.append((predicted, coupling.observe(last, now, information, DOWN, data)))
+        found.append((predicted, coupling.observe(last, now, information, LEVEL, data)))
     return found
 
 
@@ -162,9 +171,9 @@ def test_a_pose_by_both_is_better_than_by_either():
 def test_no_gravity_other_units_and_nonsense_are_not_used(felt):
     coupling, data = TightCoupling(ImuConfig()), resting(felt)
     assert all(predicted is None for predicted, _ in drive(coupling, data, range(1, 8)))
-    assert coupling.bend(NOW, SECONDS, np.eye(3), DOWN, data) is None
+    assert coupling.bend(NOW, SECONDS, np.eye(3), LEVEL, data) is None
     good = resting()
-    assert coupling.bend(NOW, SECONDS, np.eye(3), DOWN, good) is not None
+    assert coupling.bend(NOW, SECONDS, np.eye(3), LEVEL, good) is not None
 
 
 @pytest.mark.parametrize(("gravity", "believed"), [(0.0, False), (9.81, True)])
@@ -175,19 +184,48 @@ def test_without_gravity_a_lidar_that_jerks_is_not_believed_either(gravity, beli
     stamps = ns(np.arange(1000) / 200.0)
     data = ImuBuffer(ImuConfig(), ImuSamples(stamps, None, np.zeros_like(felt), felt))
     at, seconds = START + 4_100_000_000, np.linspace(-0.05, 0.05, 5)
-    path = TightCoupling(ImuConfig()).bend(at, seconds, np.eye(3), DOWN, data)
+    path = TightCoupling(ImuConfig()).bend(at, seconds, np.eye(3), LEVEL, data)
     assert (path is not None) is believed
 
 
 @pytest.mark.parametrize(("tilt", "begins"), [(0.0, True), (55.0, True), (65.0, False)])
 def test_the_estimate_begins_only_where_down_may_be_down(tilt, begins):
     """At rest, down 60 degrees off is an acceleration of g."""
-    wrong = Rotation.from_euler("x", tilt, degrees=True).apply(DOWN)
+    wrong = level_of(Rotation.from_euler("x", tilt, degrees=True).apply(DOWN))
     coupling, data = TightCoupling(ImuConfig()), resting()
     assert (coupling.bend(NOW, SECONDS, np.eye(3), wrong, data) is not None) is begins
     last, now = ((NOW + k * FRAME, gtsam.Pose3()) for k in (0, 1))
     coupling.observe(last, now, np.eye(6), wrong, data)
     assert (coupling.predict(NOW + 2 * FRAME, data) is not None) is begins
+
+
+@pytest.mark.parametrize("felt", [True, False])
+def test_a_start_in_a_bend_learns_what_down_is_if_it_knows_that_it_does_not(felt):
+    """Round a bend of 0.6 rad/s at 6 m/s an IMU without an attitude takes 20 degrees for level."""
+    speed, rate, number = 6.0, 0.6, 41
+
+    def pose(seconds):
+        heading = rate * seconds
+        way = speed / rate * np.array([np.sin(heading), 1.0 - np.cos(heading), 0.0])
+        return gtsam.Pose3(gtsam.Rot3.Rz(heading), way)
+
+    times = np.arange(-100, 1000) / 200.0
+    force = np.array([0.0, speed * rate, 9.81])
+    stamps = NOW + np.round(times * 1e9).astype(np.int64)
+    gyro, force_there = (np.tile(row, (len(times), 1)) for row in ([0.0, 0.0, rate], force))
+    data = ImuBuffer(ImuConfig(), ImuSamples(stamps, None, gyro, force_there))
+    level, coupling = level_of(-force, felt), TightCoupling(ImuConfig())
+    assert (coupling.bend(NOW, SECONDS, np.eye(3), level, data) is None) is felt
+    said = []
+    for k in range(1, number):
+        last, now = ((NOW + i * FRAME, pose(0.1 * i)) for i in (k - 1, k))
+        said.append(coupling.predict(now[0], data))
+        coupling.observe(last, now, np.diag([1e6] * 3 + [1e4] * 3), level, data)
+    assert (said[1] is None) is felt  # there is no telling before gravity is known
+    assert said[-1] is not None or not felt
+    off = np.degrees(np.arccos(coupling.up(level)[2]))
+    assert bool(off < 0.2) is felt
+    assert np.degrees(np.arccos(level.map_up[2])) == pytest.approx(20.2, abs=0.1)
 
 
 def test_an_accelerometer_that_contradicts_the_scans_is_left_out_until_it_agrees_again():
@@ -209,7 +247,7 @@ def test_a_rejected_prediction_is_not_fused():
     assert coupling.predict(NOW + 6 * FRAME, data) is not None
     coupling.reject()
     last, now = ((NOW + k * FRAME, gtsam.Pose3()) for k in (5, 6))
-    assert coupling.observe(last, now, np.eye(6), DOWN, data) is None
+    assert coupling.observe(last, now, np.eye(6), LEVEL, data) is None
 
 
 @pytest.mark.parametrize("metres", [0.001, 0.5])
@@ -223,7 +261,7 @@ def test_a_frame_that_was_registered_elsewhere_is_no_motion(metres):
     coupling.moved(there, data)
     known = np.diag([1e6] * 3 + [1e4] * 3)
     last, now = ((NOW + k * FRAME, there) for k in (19, 20))
-    fused = coupling.observe(last, now, known, DOWN, data)
+    fused = coupling.observe(last, now, known, LEVEL, data)
     assert fused is not None
     assert not coupling.contradicted
     assert np.abs(fused.velocity).max() < 0.01
@@ -254,7 +292,7 @@ def test_a_speed_goes_on_through_a_gap_in_the_samples_where_no_scan_sees_it(gap)
         assert (predicted is None) == (number == 1 or (gap and number > 10))
         if not gap and number > 10:  # nor does one go on that the scans have refuted
             coupling.reject()
-        coupling.observe(last, now, seen if number <= 10 else blind, DOWN, data)
+        coupling.observe(last, now, seen if number <= 10 else blind, LEVEL, data)
     predicted = coupling.predict(NOW + 14 * FRAME, data)
     assert predicted.velocity[0] == pytest.approx(5.0 if gap else 0.0, abs=0.3)
     if gap:  # known to an acceleration of 2 m/s^2 for 0.3 s, and to 0.5 m/s where a window begins
@@ -268,7 +306,7 @@ def test_a_speed_along_which_no_scan_sees_may_be_any():
     information = np.diag([1e6] * 3 + [0.0, 1e4, 1e4])
     coupling, data = TightCoupling(ImuConfig()), resting()
     last, now = ((NOW + k * FRAME, turned) for k in (0, 1))
-    coupling.observe(last, now, information, DOWN, data)
+    coupling.observe(last, now, information, LEVEL, data)
     predicted = coupling.predict(NOW + 2 * FRAME, data)
     body = turned.rotation().matrix().T @ predicted.across[:, 3:] / 0.1  # along the lidar's axes
     np.testing.assert_allclose(np.diag(body), [20.0**2, 0.27, 0.27], rtol=0.1)

@@ -52,6 +52,26 @@ def test_a_second_of_samples_is_averaged_though_the_lidar_turns(rate):
     assert alone.samples == 1
 
 
+@pytest.mark.parametrize(
+    ("attitude", "rest", "felt"),
+    [(True, False, False), (False, False, True), (False, True, False)],
+)
+def test_an_attitude_made_on_the_way_has_felt_the_motion(attitude, rest, felt):
+    """But for a sensor's own, or where a rest before has told down."""
+    samples = samples_of(rot3(12, -7, 130), (0.3, -0.2, 0.8))
+    if rest:
+        still = samples_of(rot3(12, -7, 130))
+        samples = replace(
+            samples,
+            stamps=np.concatenate([still.stamps - 2 * 10**9, samples.stamps]),
+            gyro=np.concatenate([still.gyro, samples.gyro]),
+            acceleration=np.concatenate([still.acceleration, samples.acceleration]),
+            orientation=np.concatenate([still.orientation, samples.orientation]),
+        )
+    level = level_of(samples if attitude else replace(samples, orientation=None))
+    assert (level.felt, level.source) == (felt, "moving")
+
+
 def test_samples_without_orientation_do_not_spoil_the_level():
     samples = samples_of(rot3(12, -7, 130))
     samples.orientation[180:190] = np.nan

@@ -29,7 +29,7 @@ def tracker_for(measured, level_R_map=None, **config):
     """A tracker that knows up in the map; ``measured`` is the IMU's rotation or its samples."""
     samples = turning(measured) if isinstance(measured, gtsam.Rot3) else measured
     tracker = new_tracker(samples, **config)
-    tracker.level = Level(level_R_map or FLAT, 0.0, 0.0, 1, "still")
+    tracker.level = Level(level_R_map or FLAT, 0.0, 0.0, 1, "still", felt=False)
     return tracker
 
 
@@ -235,6 +235,23 @@ def test_in_a_gap_the_prior_is_dropped(prior, gap):
     assert len(tracker.factors(NOW)) == (prior == "sigma" and not dropped)
     if prior != "sigma":
         assert pose.equals(solution.map_T_lidar, 1e-12) is dropped
+
+
+@pytest.mark.parametrize(
+    ("coupling", "attitude", "tilt"),
+    [
+        ("tight", False, TiltPrior.NONE),  # the accelerometer counts already
+        ("tight", True, TiltPrior.EQUIVALENT),
+        ("loose", False, TiltPrior.EQUIVALENT),
+    ],
+)
+def test_an_attitude_made_of_acceleration_does_not_count_beside_it(coupling, attitude, tilt):
+    samples = turning(rot3(1, 0, 0))
+    samples = samples if attitude else dataclasses.replace(samples, orientation=None)
+    tracker, solution = tracker_for(samples, coupling=coupling), solve(7, gtsam.Pose3())
+    found, how = tracker.add_tilt(NOW, solution)
+    assert how is tilt
+    assert found.map_T_lidar.equals(solution.map_T_lidar, 1e-12) is (tilt is TiltPrior.NONE)
 
 
 def test_without_up_in_the_map_there_is_no_prior_and_the_next_orientation_gives_it():

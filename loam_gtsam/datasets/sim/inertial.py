@@ -13,7 +13,7 @@ from loam_gtsam.datasets.decode.extrinsics import rigid_transform
 from loam_gtsam.datasets.sim.motion import Motion
 from loam_gtsam.types import FloatArray, ImuSamples, IntArray
 
-IMUS = "white", "mems"
+IMUS = "white", "mems", "six_axis"
 Axes = tuple[float, float, float]
 
 _DRIFT_PERIODS = 20.0, 30.0, 45.0  # seconds
@@ -34,6 +34,7 @@ class ImuErrors:
     gyro_noise, gyro_bias : rad/s per axis, white and constant
     acceleration_noise, acceleration_bias : m/s^2 per axis, white and constant
     attitude_drift : rad per axis, the root mean square of what changes over half a minute
+    six_axis : whether it measures no attitude, but rate and acceleration only
     """
 
     lever: Axes = (0.0, 0.0, 0.0)
@@ -43,15 +44,16 @@ class ImuErrors:
     acceleration_noise: float = 0.03
     acceleration_bias: Axes = (0.03, -0.02, 0.04)
     attitude_drift: float = 0.0
+    six_axis: bool = False
 
     @classmethod
     def of(cls, kind: str, seed: int, own: Mapping[str, Any]) -> ImuErrors:
         """Those of a kind of IMU, but for those of one's ``own`` that are not None.
 
-        The biases of ``mems`` have a size, 0.3 deg/s and 0.05 m/s^2, and a random direction.
+        The biases have a size, 0.3 deg/s and 0.05 m/s^2, and a random direction, but for ``white``.
         """
         errors = cls()
-        if kind == "mems":
+        if kind != "white":
             rng = np.random.default_rng([seed, 0, 201])
             turns = rng.standard_normal((2, 3))
             gyro, pull = turns / np.linalg.norm(turns, axis=1, keepdims=True)
@@ -61,6 +63,7 @@ class ImuErrors:
                 gyro_bias=tuple((_GYRO_BIAS * gyro).tolist()),
                 acceleration_bias=tuple((_ACCELERATION_BIAS * pull).tolist()),
                 attitude_drift=_DRIFT,
+                six_axis=kind == "six_axis",
             )
         return replace(errors, **{name: own[name] for name in own if own[name] is not None})
 
@@ -74,7 +77,8 @@ class ImuErrors:
         shape = gyro.shape
         wrong = self.attitude_noise * rng.standard_normal(shape) + self._drift(times, seed)
         exact = Rotation.from_matrix(poses[:, :3, :3])
-        orientation = (exact * Rotation.from_rotvec(wrong)).as_quat()
+        measured = (exact * Rotation.from_rotvec(wrong)).as_quat()
+        orientation = None if self.six_axis else measured
         gyro = gyro + self.gyro_bias + self.gyro_noise * rng.standard_normal(shape)
         noise = self.acceleration_noise * rng.standard_normal(shape)
         acceleration = acceleration + self.acceleration_bias + noise

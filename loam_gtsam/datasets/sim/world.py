@@ -82,7 +82,7 @@ class SimulatedWorld(Loader):
     start : ``rest``, or ``moving``: the same way, its first sweep taken at full speed
     imu : ``white``, at the lidar's origin with white noise and constant biases; or ``mems``, beside
         it, with an attitude wrong by 0.4 degrees per axis that changes over half a minute, and
-        biases of 0.3 deg/s and 0.05 m/s^2
+        biases of 0.3 deg/s and 0.05 m/s^2; or ``six_axis``, which is that one without an attitude
     imu_noise : orientation, white, rad per axis; this and the next are the IMU's own if None
     gyro_noise, gyro_bias : rad/s per axis, white and constant
     acceleration_noise, acceleration_bias : m/s^2 per axis, white and constant

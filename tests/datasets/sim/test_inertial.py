@@ -56,6 +56,14 @@ def test_biases_of_mems_have_their_size_and_a_direction_by_seed():
     assert not np.allclose(*directions)
 
 
+def test_six_axes_are_those_of_mems():
+    options = {"columns": 30, "frames": 3, "seed": 4}
+    mems, six = (SimulatedWorld("room", imu=kind, **options).imu for kind in ("mems", "six_axis"))
+    assert six.orientation is None
+    np.testing.assert_array_equal(six.gyro, mems.gyro)
+    np.testing.assert_array_equal(six.acceleration, mems.acceleration)
+
+
 @pytest.mark.parametrize("start", ["rest", "moving"])
 def test_samples_are_those_at_the_place_of_the_imu(start):
     world = SimulatedWorld("shaken", imu="mems", start=start, frames=40, **PERFECT, **NO_BIAS)
@@ -78,5 +86,5 @@ def test_a_run_is_told_where_the_imu_is():
     plain = open_dataset("sim:room?frames=3&columns=90")
     assert effective_config(Config(), plain).imu.lidar_t_imu == (0.0, 0.0, 0.0)
     assert "mems" in world.info().facts["imu"]
-    with pytest.raises(ConfigError, match="imu: expected one of white, mems; got 'fog'"):
+    with pytest.raises(ConfigError, match="imu: expected one of white, mems, six_axis; got 'fog'"):
         SimulatedWorld("room", imu="fog")

@@ -6,6 +6,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from inspect import signature
 from itertools import islice
 from typing import Any, TypedDict, Unpack
 
@@ -17,7 +18,7 @@ from loam_gtsam.aiding.wheels import aided_odometry
 from loam_gtsam.config import Config, Section, as_config, with_implied
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
-from loam_gtsam.errors import PartFaults, is_own, own_code
+from loam_gtsam.errors import PartFaults, is_own, nearest, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint, Progress
@@ -167,6 +168,7 @@ class Pipeline:
         wheels: WheelSamples | None = None,
         **parts: Unpack[Parts],
     ) -> None:
+        _check_parts(parts)
         self.config = as_config(config)
         self.faults = PartFaults(self.config.parts.on_error)
         solver, factors = parts.get("solver"), parts.get("extra_factors")
@@ -368,6 +370,16 @@ def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
     """The data set's IMU, None if there is none or it is not to be used."""
     samples = dataset.imu if config.imu.coupling != "off" else None
     return None if samples is None else ImuBuffer(config.imu, samples)
+
+
+def _check_parts(parts: Mapping[str, object]) -> None:
+    """TypeError for a keyword that is none, which a TypedDict lets pass."""
+    for name, part in parts.items():
+        if name not in Parts.__annotations__:
+            hint = nearest(name, [*Parts.__annotations__, *signature(run).parameters])
+            raise TypeError(f"unexpected keyword argument {name!r}{hint}")
+        if isinstance(part, type) and name in ("odometry", "loop_closer"):
+            raise InputError(f"{name}: expected an object, got the class {part.__name__}")
 
 
 def run(

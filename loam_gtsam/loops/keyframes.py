@@ -16,7 +16,7 @@ import numpy as np
 
 from loam_gtsam.config import Config, PoseGraphConfig
 from loam_gtsam.frontend.deskew import MovingSweep
-from loam_gtsam.geometry import as_array, symmetric, transform
+from loam_gtsam.geometry import as_array, checked_pose, symmetric, transform
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import BoolArray, Features, FloatArray, InputError, MapUpdate, Uncertainty
@@ -170,6 +170,9 @@ class LoopClosure:
     covariance: FloatArray
     share: float = np.nan
     agreement: float = np.nan
+
+    def __post_init__(self) -> None:
+        checked_pose(self.earlier_T_later, "earlier_T_later")
 
     def factor(self, kernel_width: float = np.inf) -> gtsam.BetweenFactorPose3:
         """The loop closure as a factor, with a Huber kernel of that width on its whitened norm."""

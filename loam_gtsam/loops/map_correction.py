@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config, as_config
-from loam_gtsam.errors import PartFaults, is_own, own_code
+from loam_gtsam.errors import PartFaults, check_kind, is_own, own_code
 from loam_gtsam.geometry import transform
 from loam_gtsam.loops.closure import LoopCloser, LoopStatistics, NoLoops, ScanLoopCloser
 from loam_gtsam.loops.keyframes import LoopClosure
@@ -80,7 +80,10 @@ class LoopMapping:
         self._mapper.keyframe = keyframe.index
         loop: LoopClosure | None = None
         with self._faults.forgiven(), own_code("loop_closer", self.closer):
-            loop = self.closer.detect(keyframe, self.graph)
+            found = self.closer.detect(keyframe, self.graph)
+            if found is not None:
+                check_kind(found, LoopClosure, "what detect returns", "None if there is no loop")
+            loop = found
         is_closed = loop is not None and self.graph.add_loop(loop)
         if is_closed:
             config = self._config.pose_graph

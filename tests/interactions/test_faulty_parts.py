@@ -182,6 +182,40 @@ def test_a_run_goes_on_without_a_part_that_fails_and_says_so_once(place, used, c
     assert result.faults == ({} if used else {"part_failed": len(SWEEPS) - first})
 
 
+@pytest.mark.parametrize(
+    ("part", "returned", "said"),
+    [
+        ("features", None, "expected a Features, got NoneType"),
+        ("loop_closer", (0, 1), "expected a LoopClosure, got tuple"),
+    ],
+)
+def test_a_part_that_returns_something_else_is_named(part, returned, said, caplog):
+    own = Faulty()
+    parts = {
+        "features": lambda scan: returned,
+        "loop_closer": SimpleNamespace(detect=lambda *_: returned, reset=own.reset),
+    }
+    with pytest.raises(InputError, match=said) as caught:
+        run(DATA, CONFIG, **{part: parts[part]})
+    assert any(f"raised in {part} of your own" in note for note in caught.value.__notes__)
+    result = run(DATA, GOES_ON, **{part: parts[part]})
+    assert len(result.updates) == len(SWEEPS)
+    assert said in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("keywords", "error", "said"),
+    [
+        ({"extra_factor": None}, TypeError, "'extra_factor'; did you mean 'extra_factors'?"),
+        ({"max_frame": 2}, TypeError, "'max_frame'; did you mean 'max_frames'?"),
+        ({"loop_closer": ScanLoopCloser}, InputError, "expected an object, got the class"),
+    ],
+)
+def test_a_keyword_that_is_none_and_a_class_for_an_object_are_refused(keywords, error, said):
+    with pytest.raises(error, match=said):
+        run(DATA, CONFIG, **keywords)
+
+
 @pytest.mark.parametrize("name", ["observe", "on_frame"])
 def test_an_observer_that_fails_costs_the_run_or_nothing(name, caplog):
     def broken(*_):

@@ -70,6 +70,7 @@ SPOILT: Mapping[str, tuple[str, Callable[[Scan, Rng], Sweep]]] = {
 
 DELIVERY: Mapping[str, tuple[int, Mapping[str, int], int]] = {
     "delivered twice": (1, {"duplicate_stamp": 1}, 0),
+    "too soon after the last": (1, {"too_soon": 1}, 1),
     "two in the wrong order": (2, {"late": 1}, 1),
     "three sweeps late": (4, {"late": 1}, 1),
     "two missing": (2, {}, 1),
@@ -175,6 +176,8 @@ class FaultyDrive:
         off = 0
         if kind.startswith("stamp"):
             off = int(rng.integers(HOUR, 3650 * DAY)) * (1 if "ahead" in kind else -1)
+        elif kind == "too soon after the last":
+            off = -int(rng.integers(80_000_000, 99_000_000))  # of 100 ms
         elif kind == "clock back for eight sweeps":
             off = -int(rng.integers(HOUR, DAY))
         for number in (first + step for step in order):

@@ -164,6 +164,8 @@ class SweepFault(StrEnum):
     BAD_RINGS = "bad_rings"
     """The beams cannot be told apart."""
     NO_FEATURES = "no_features"
+    TOO_SOON = "too_soon"
+    """The stamp follows the one before within a quarter of the usual interval, or of a sweep."""
     DUPLICATE_STAMP = "duplicate_stamp"
     """The stamp is that of the sweep before (:mod:`loam_gtsam.frontend.stamp_check`)."""
     LATE = "late"

@@ -226,12 +226,13 @@ class Mapper:
         """The update of a sweep that cannot be used; None if it can."""
         check_kind(features, Features, "features", "extract_features makes them of a Scan")
         problem = problem_of(features)
-        return self._refused(features.stamp) or (problem and self._unused(features.stamp, *problem))
+        refused = self._refused(features.stamp, features.span[1] - features.span[0])
+        return refused or (problem and self._unused(features.stamp, *problem))
 
-    def _refused(self, stamp: int) -> MapUpdate | None:
+    def _refused(self, stamp: int, seconds: float = 0.0) -> MapUpdate | None:
         """The update of a sweep whose stamp cannot be used; None if it can."""
         last = self.last
-        refusal = None if last is None else self._stamps.refuse(stamp, last.stamp)
+        refusal = None if last is None else self._stamps.refuse(stamp, last.stamp, seconds)
         if last is None or refusal is None:
             return None
         if refusal.clock_step:

@@ -172,7 +172,9 @@ def test_duplicate_and_earlier_stamps_are_skipped(mapped, rng):
         assert update.map_T_lidar.equals(before.map_T_lidar, 0.0)
     assert mapped.last is before
     assert mapped.maps.planes.count() == points
-    assert mapped.register(room_features(gtsam.Pose3(), before.stamp + 1, rng)).status.solved
+    assert mapped.register(
+        room_features(gtsam.Pose3(), before.stamp + 100_000_000, rng)
+    ).status.solved
 
 
 def test_no_features_predict_the_pose_and_leave_the_map(rng):
@@ -422,7 +424,7 @@ def test_sweeps_of_unlike_length_may_share_their_middle():
     sweeps = [extract_features(scan, mapper.config) for scan in world]
     for features in sweeps[:3]:
         mapper.register(features)
-    long = replace(sweeps[2], stamp=sweeps[2].stamp + 1, span=(0.0, 0.3))
+    long = replace(sweeps[2], stamp=sweeps[2].stamp + 40_000_000, span=(0.0, 0.3))
     middle = mapper.register(long)
     after = replace(sweeps[3], stamp=long.stamp + 100_000_000, span=(0.0, 0.1))
     assert long.stamp + 150_000_000 == after.stamp + 50_000_000

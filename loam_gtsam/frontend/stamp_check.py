@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
+from statistics import median
 
 from loam_gtsam.types import SweepFault
 
@@ -12,6 +14,13 @@ leads 50 m away from the prediction. For a slow sensor the limit is ten of its o
 IN_A_ROW = 5
 """Number of consecutive doubted sweeps with consistent stamps that shows that the clock was set."""
 _STEPS = 10  # intervals of the sensor between two sweeps above which a stamp is doubted
+_SHORTEST = 1_000_000
+"""Nanoseconds between two sweeps below which a stamp is none: no lidar makes a thousand sweeps a
+second, and stamps that are no nanoseconds are as close."""
+_SOON = 0.25
+"""Share of the usual interval, or of the time that a sweep takes, below which a stamp is wrong: the
+velocity would be four times the true one."""
+_USUAL = 5  # number of intervals whose median is the usual one
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,24 +39,33 @@ class Refusal:
 class StampCheck:
     """Comparison of each stamp with the stamp of the last sweep that was used.
 
-    A stamp must be later than the last one, by at most :data:`LARGEST_STEP`; one wrong stamp costs
-    one sweep. :data:`IN_A_ROW` of them that are consistent show that the clock was set. If ahead,
-    the run continues as if no time had passed; if back, it cannot, since trajectories ascend.
+    A stamp must be later than the last one, by a quarter of the usual interval at least and by at
+    most :data:`LARGEST_STEP`; one wrong stamp costs one sweep. :data:`IN_A_ROW` of those that are
+    far off and consistent show that the clock was set. If ahead, the run continues as if no time
+    had passed; if back, it cannot, since trajectories ascend.
     """
 
     def __init__(self) -> None:
-        self._step = 0
+        self._steps: deque[int] = deque(maxlen=_USUAL)  # between the last sweeps that were used
         self._doubted: tuple[int, int, int] | None = None  # first and newest stamp, and count
 
-    def refuse(self, stamp: int, last: int) -> Refusal | None:
+    def refuse(self, stamp: int, last: int, seconds: float = 0.0) -> Refusal | None:
         """The reason why a sweep cannot be used, by its stamp and that of the last one used, ns.
 
-        None for a sweep that counts as used from now on.
+        None for a sweep that counts as used from now on. ``seconds`` is how long it took, 0 if that
+        is not known.
         """
-        step = stamp - last
-        largest = max(round(LARGEST_STEP * 1e9), _STEPS * self._step)
-        if step > 0 and (step <= largest or not self._step):
-            self._step = step
+        step, before = stamp - last, self._steps[-1] if self._steps else 0
+        largest = max(round(LARGEST_STEP * 1e9), _STEPS * before)
+        usual = median(self._steps) if self._steps else seconds * 1e9
+        if 0 < step < max(_SHORTEST, _SOON * usual):
+            message = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
+            due = "expected nanoseconds"
+            if step >= _SHORTEST:
+                due = f"{usual * 1e-9:.3g} s are usual"
+            return Refusal(SweepFault.TOO_SOON, f"{message}; {due}")
+        if step > 0 and (step <= largest or not before):
+            self._steps.append(step)
             self._doubted = None
             return None
         earlier = f"stamp {stamp} ns is not later than the last one, {last} ns"
@@ -68,7 +86,7 @@ class StampCheck:
             message = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
             return Refusal(SweepFault.STAMP_AHEAD, message)
         # The first doubted sweep is taken to be one interval later than the last used sweep.
-        ahead = first - self._step - last
+        ahead = first - before - last
         self._doubted = None
         return Refusal(
             SweepFault.CLOCK_SET_AHEAD,

@@ -44,13 +44,16 @@ def steps(first: int, count: int, step: int = TENTH) -> list[int]:
 
 def test_stamps_that_ascend_are_used():
     assert judged(steps(START, 20)) == [""] * 19
-    assert judged([START, START + 1, START + 10 * SECOND]) == ["", ""]
+    assert judged([START, START + 1_000_000, START + 10 * SECOND]) == ["", ""]
 
 
 @pytest.mark.parametrize(
     ("off", "fault"),
     [
         (0, "duplicate_stamp"),
+        (1, "too_soon"),
+        (TENTH // 4 - 1, "too_soon"),
+        (TENTH // 4, ""),
         (-1, "late"),
         (-10 * SECOND, "late"),
         (-10 * SECOND - 1, "stamp_back"),
@@ -64,6 +67,24 @@ def test_one_stamp_that_is_off_costs_one_sweep(off, fault):
     good = steps(START, 5)
     after = steps(good[-1] + (off if not fault else 0) + TENTH, 3)
     assert judged([*good, good[-1] + off, *after]) == ["", "", "", "", fault, "", "", ""]
+
+
+def test_before_an_interval_is_known_the_time_of_a_sweep_tells_what_is_too_soon():
+    """Without either, stamps that are no nanoseconds are found."""
+    for seconds, least in ((0.1, 25_000_000), (0.0, 1_000_000)):
+        early = StampCheck().refuse(START + least - 1, START, seconds)
+        assert early is not None
+        assert early.fault is SweepFault.TOO_SOON
+        assert StampCheck().refuse(START + least, START, seconds) is None
+    assert "expected nanoseconds" in early.message
+
+
+def test_a_sensor_may_become_faster_and_a_gap_is_no_usual_interval():
+    faults = judged([*steps(START, 6), *steps(START + 6 * TENTH, 40, TENTH // 5)])
+    assert set(faults[:6]) == {""}
+    assert faults[6:].count("too_soon") < 6
+    assert set(faults[-20:]) == {""}
+    assert judged([*steps(START, 4), *steps(START + 9 * SECOND, 4)]) == [""] * 7
 
 
 def test_a_slow_sensor_may_take_ten_of_its_steps():

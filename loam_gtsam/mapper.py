@@ -165,8 +165,7 @@ class Mapper:
             Never raises for what a sweep contains: see its ``status``. What a part of a user's own
             raises is a PartError, and the mapper is as before the call.
         """
-        clock = Clock()
-        self.registered = None
+        clock, self.registered = Clock(), None
         if (refused := self._check(features)) is not None:
             return refused
         if self.last is None and self.imu is not None:

@@ -17,7 +17,7 @@ from rich.table import Table
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RefineOptions
-from loam_gtsam.cli.results import LOOP_FILES
+from loam_gtsam.cli.results import LOOP_FILES, check_data
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.truth import read_truth
@@ -119,12 +119,16 @@ class FinishedRun:
 
     @staticmethod
     def read(folder: Path, dataset: Dataset, updates: list[MapUpdate] | None = None) -> FinishedRun:
-        """Read a run, but for ``updates`` that are known; a DatasetError if the folder has none."""
+        """Read a run, but for ``updates`` that are known.
+
+        A DatasetError if the folder has none, or one of other data.
+        """
         if not (folder / "run.npz").exists() or not (folder / "config.yaml").exists():
             raise DatasetError(
                 f"{folder}: expected the folder of a finished run, with run.npz and config.yaml; "
                 "make one with loam-gtsam run PATH --output FOLDER"
             )
+        check_data(folder, dataset)
         if updates is None:
             updates = read_updates(folder / "run.npz")
         return FinishedRun(folder, dataset, updates, load_config(folder / "config.yaml"))

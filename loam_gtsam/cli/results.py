@@ -21,6 +21,7 @@ from loam_gtsam.maps.map_file import MAP_FILE, save_map
 from loam_gtsam.pipeline import RunResult, effective_config
 from loam_gtsam.studies import evaluation
 from loam_gtsam.types import (
+    DatasetError,
     FloatArray,
     FrameStatus,
     InputError,
@@ -170,7 +171,7 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
         return False
     if not isinstance(summary, dict) or summary.get("interrupted") or summary.get("error"):
         return False
-    now = _described(_input_info(dataset)), dump_config(effective_config(config, dataset))
+    now = described(dataset), dump_config(effective_config(config, dataset))
     frames, same = summary.get("frames", 0), (summary.get("dataset"), written) == now
     if same and frames < total and not summary.get("whole", True):
         return False
@@ -180,6 +181,26 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
             "sweeps); choose another folder, or --overwrite without --resume"
         )
     return True
+
+
+def check_data(folder: Path, dataset: Dataset) -> None:
+    """DatasetError if the run in a folder was made of another data set, by kind and name."""
+    try:
+        made_of = str(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["dataset"])
+    except (OSError, ValueError, LookupError, TypeError):
+        return
+    info = _input_info(dataset)
+    names = {Path(path).name for path in (made_of.removeprefix(f"{info.kind} "), info.path)}
+    if len(names) > 1 and "" not in names:
+        raise DatasetError(
+            f"{folder}: its run was made of {made_of!r}, got {described(dataset)!r}; give the data "
+            "set that was run"
+        )
+
+
+def described(dataset: Dataset) -> str:
+    """Kind and path of a data set, as the summary of a run has them."""
+    return _described(_input_info(dataset))
 
 
 def _input_info(dataset: Dataset) -> DatasetInfo:

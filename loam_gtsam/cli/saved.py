@@ -17,7 +17,7 @@ from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import CleanOptions, LocaliseOptions, OptimizeOptions
 from loam_gtsam.cli.refine import FinishedRun
-from loam_gtsam.cli.results import ENU_FILE
+from loam_gtsam.cli.results import ENU_FILE, described
 from loam_gtsam.cli.run import worker_count
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset
@@ -150,7 +150,7 @@ def _summary(found: Localisation, dataset: Dataset, path: Path) -> dict[str, Any
             accuracy = {"ate_rmse_m": error.rmse, "ate_max_m": error.maximum}
     return {
         "map": str(path),
-        "dataset": dataset.name,
+        "dataset": described(dataset),
         "frames": len(found.updates),
         "localised": len(numbers),
         "fixes": found.fixes,

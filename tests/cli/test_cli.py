@@ -157,7 +157,9 @@ def test_text_of_the_data_is_never_taken_for_markup_and_quiet_prints_nothing(ope
 
 
 def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
-    opens([*scans[:3], *[BadSweep(scans[2].stamp + n, f"damaged {n}") for n in range(1, 7)]])
+    opens(
+        [*scans[:3], *[BadSweep(scans[2].stamp + n * 10**8, f"damaged {n}") for n in range(1, 7)]]
+    )
     text = mapped()
     assert "1 first, 2 ok, 6 unusable_scan" in text
     assert [n for n in range(1, 7) if f"damaged {n}" in text] == [1, 2, 3]
@@ -183,7 +185,7 @@ def test_poses_that_no_scan_fixes_are_told_in_one_line():
 
 def test_a_few_odd_frames_leave_a_run_in_trust(opens):
     world = SimulatedWorld("room", frames=21, columns=200)
-    opens([*world, BadSweep(world[20].stamp + 1, "damaged")])
+    opens([*world, BadSweep(world[20].stamp + 10**8, "damaged")])
     text = mapped()
     assert "1 of 22 poses (5 %) are not fixed by their scans (1 unusable_scan)" in text
     assert "DO NOT TRUST" not in text
@@ -589,6 +591,9 @@ def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
     assert told.exit_code == 0
     assert "thickness of common planes" in told.output
     assert Path("out/refined-2/section.png").stat().st_size > 1000
+    for command in ("refine", "clean"):
+        other = said(command, spec.replace("room", "trees"), "out", "--overwrite", code=1)
+        assert "made of 'simulated world room', got 'simulated world trees'" in other
     missing = loam("refine", spec, "nothing")
     assert missing.exit_code == 1
     assert "expected the folder of a finished run" in missing.output

@@ -4,8 +4,8 @@ Three ways in, from one call to every step:
 
 * :func:`run` maps a data set, which :func:`open_dataset` opens;
 * :class:`Pipeline` takes one sweep at a time;
-* :func:`extract_features`, :class:`ConstantVelocity` and :class:`Mapper` are the steps themselves,
-  and :mod:`loam_gtsam.factors` has the factors for a graph of your own.
+* :func:`extract_features` and :class:`Mapper` are the steps themselves, and
+  :mod:`loam_gtsam.factors` has the factors for a graph of your own.
 
 Conventions are in :mod:`loam_gtsam.types`.
 """

@@ -41,7 +41,6 @@ _ADVICE = {
     "of the points",
     FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",
     FrameStatus.BAD_STAMP: "the stamps of the sweeps are wrong: see loam-gtsam inspect",
-    FrameStatus.NOT_CONVERGED: "try --set solver.iterations=20",
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _MESSAGES, _TRIED_SWEEPS = 3, 5
@@ -94,9 +93,14 @@ def summary(
 
 def _warning(updates: Sequence[MapUpdate]) -> tuple[str, bool]:
     """One line on the frames that are not trustworthy, "" if there are none; whether too many."""
-    odd = [number for number, update in enumerate(updates) if update.status not in _EXPECTED]
+    fixed = *_EXPECTED, FrameStatus.NOT_CONVERGED
+    odd = [number for number, update in enumerate(updates) if update.status not in fixed]
     if not odd:
-        return "", False
+        moving = sum(update.status is FrameStatus.NOT_CONVERGED for update in updates)
+        if moving <= _TOO_MANY * len(updates):
+            return "", False
+        share = f"{moving} of {len(updates)} poses still moved"
+        return f"{share} when solver.iterations ended: try more (not_converged)", False
     doubted = len(odd) > _TOO_MANY * len(updates)
     counts = Counter[str](updates[number].status for number in odd)
     advice = _ADVICE[FrameStatus(counts.most_common(1)[0][0])]
@@ -286,6 +290,8 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         begin = where_it_turns(seconds, imu.gyro[order], _MAPPED * period, len(dataset) * period)
     part = PartOf(dataset, 0, 1, begin)
     result = run(part, config, max_frames=_MAPPED, keep_partial=True)
+    if result.interrupted:
+        raise KeyboardInterrupt
     said, of_imu = result.times_problem, [] if result.imu is None else _imu_problems(result.imu)
     if said:
         as_is = config.changed("sensor.times=none")
@@ -293,7 +299,17 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         if _scatter(without) < _TIGHTER * _scatter(result):
             said = "the sweeps are de-skewed already: they fit better with sensor.times=none"
     mapped = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
-    return mapped, [said, *of_imu] if said else of_imu
+    return mapped, [*_not_placed(result.updates), *([said] if said else []), *of_imu]
+
+
+def _not_placed(updates: Sequence[MapUpdate]) -> list[str]:
+    """A sentence on sweeps that were not placed in the map, if there are any."""
+    first = FrameStatus.FIRST
+    left = [u for u in updates if not u.status.solved and u.status is not first]
+    if not left:
+        return []
+    counts = _counts(Counter(str(update.status) for update in left))
+    return [f"{len(left)} of {len(updates)} sweeps: {counts}, the first: {left[0].message}"]
 
 
 def _scatter(result: RunResult) -> float:

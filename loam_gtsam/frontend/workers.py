@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import cycle
-from multiprocessing import get_context
+from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.heap import Arena
 from multiprocessing.reduction import ForkingPickler
@@ -161,7 +161,8 @@ class _Worker:
         self._outgoing, self._incoming = _slots(memory), _slots(memory)
         self._process = context.Process(target=_serve, args=(far, memory, config), daemon=True)
         try:
-            self._process.start()
+            with _deaf():
+                self._process.start()
         except OSError:
             self._pipe.close()
             raise
@@ -212,6 +213,17 @@ class _Worker:
             )
 
 
+@contextmanager
+def _deaf() -> Iterator[None]:
+    """A process that starts here hears no interrupt: that is for the caller to handle."""
+    resource_tracker.ensure_running()  # which would hear for both, once it starts
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT,))
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _memory(size: int) -> Arena:
     """Shared memory that is there: a file that is full when it is written kills the process."""
     arena = Arena(size)
@@ -228,7 +240,6 @@ def _slots(memory: Arena) -> Iterator[memoryview]:
 
 def _serve(pipe: Connection, memory: Arena, config: Config) -> None:
     """In the process: answer each sweep, until the caller closes the pipe."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # an interrupt is for the caller to handle
     with suppress(EOFError, OSError):
         for slot in _slots(memory):
             scan = ForkingPickler.loads(slot[: pipe.recv()])

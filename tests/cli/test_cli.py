@@ -156,6 +156,12 @@ def test_text_of_the_data_is_never_taken_for_markup_and_quiet_prints_nothing(ope
     assert "a [red]small[/red] problem" in text
 
 
+def test_inspect_tells_sweeps_that_cannot_be_used(opens, scans):
+    opens([*scans[:3], BadSweep(scans[2].stamp + 10**8, "damaged")])
+    text = said("inspect", "x")
+    assert "1 of 4 sweeps: 1 unusable_scan, the first: damaged" in text
+
+
 def test_odd_frames_are_counted_and_only_the_first_few_told(opens, scans):
     opens(
         [*scans[:3], *[BadSweep(scans[2].stamp + n * 10**8, f"damaged {n}") for n in range(1, 7)]]
@@ -181,6 +187,14 @@ def test_poses_that_no_scan_fixes_are_told_in_one_line():
     assert f"{told}, first that of frame 1; another sensor" in text
     assert "weakly constrained: x, y, rz (3 directions)" in text
     assert "rz in 3 frames, x in 3 frames, y in 3 frames (axes of the lidar)" in text
+
+
+def test_poses_that_still_moved_when_the_iterations_ended_are_no_reason_to_distrust():
+    spec = "sim:street_loop?frames=12&columns=450"
+    text = said("run", spec, "--output", "out", "--no-plot", "--preset", "aloam")
+    assert "not_converged" in text
+    assert "poses still moved when solver.iterations ended" in text
+    assert "DO NOT TRUST" not in text
 
 
 def test_a_few_odd_frames_leave_a_run_in_trust(opens):

@@ -268,7 +268,7 @@ class Mapper:
         assert self.last is not None
         found, twist = found_at(frame, frame.solve(self._named)), self.last.twist
         if self._start is not None:
-            found = self._start.first_motion(frame, found, self._named)
+            found = self._start.first_motion(frame, found, self._named, self.imu)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
         now = self._moment, found.solution, frame.sweep.stamp
         if self.imu is not None and (doubt is not None or self.imu.contradicted(*now)):

@@ -107,6 +107,11 @@ class ImuTracker:
         return self.buffer if self.gyro.holds else None
 
     @property
+    def was_still(self) -> bool:
+        """Whether gyro and accelerometer were at rest when the run began."""
+        return self.level is not None and self.level.source == "still"
+
+    @property
     def map_up(self) -> FloatArray | None:
         """(3,) unit vector, map frame: as estimated, else as found at first; None if it was not."""
         return None if self.level is None else self._coupling.up(self.level)

@@ -16,6 +16,7 @@ from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.sim.disturbances import Disturbed, MovingObjects, Outliers
 from loam_gtsam.datasets.sim.world import Scene, SimulatedWorld, Solids
 from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.relocalization import Fit, any_of, same, same_optimum
 from loam_gtsam.registration.relocalization.evidence import _AGAINST, Evidence
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
@@ -165,6 +166,18 @@ def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
         for one in features[number + 1 :]:
             assert mapper.register(one).status.solved
         assert mapper._start is None
+
+
+@pytest.mark.parametrize("with_imu", [True, False])
+def test_an_imu_at_rest_settles_first_motions_that_fit_as_well(with_imu):
+    """Along a tunnel any motion fits two sweeps from rest."""
+    world = SimulatedWorld("tunnel_pilasters", frames=2, seed=1, columns=450)
+    mapper = Mapper(CONFIG, imu=ImuBuffer(CONFIG.imu, world.imu) if with_imu else None)
+    for scan in world:
+        update = mapper.register(extract_features(scan, CONFIG))
+    assert bool(mapper._start._rivals) is not with_imu
+    assert bool(update.uncertainty.in_doubt) is not with_imu
+    assert update.map_T_lidar.range(gtsam.Pose3(world.truth.map_T_lidar[1])) < 0.1
 
 
 def test_one_first_motion_leaves_no_doubt():
@@ -403,6 +416,16 @@ def test_what_may_move_counts_once_against_a_way_that_may_be_true():
     assert ways.kept_ways([taken, passed], CONFIG) == [taken, passed]
     assert ways.kept_ways([taken, unlike], CONFIG) == [taken]
     assert ways._favour(passed, taken).every < -3.0
+
+
+@pytest.mark.parametrize(("count", "stays"), [(16, True), (36, False)])
+def test_what_an_imu_tells_stands_unless_the_scans_are_sure(count, stays):
+    """Of so many features, each agrees at the other place alone: 4 and 6 standard deviations."""
+    still = place(0.0 * AHEAD, [], np.zeros(count), AHEAD)
+    there = place(2.0 * AHEAD, [], np.ones(count), AHEAD)
+    tried = [(still,), (there,)]
+    assert ways._better(tried[1], tried[0], 8.0)
+    assert list(ways.unless_beaten(tried)) == tried[: 1 if stays else 2]
 
 
 @pytest.mark.parametrize(

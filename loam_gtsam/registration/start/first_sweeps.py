@@ -43,6 +43,7 @@ from loam_gtsam.registration.start.ways import (
     parting,
     steady,
     tell_nothing,
+    unless_beaten,
     without_turns,
 )
 from loam_gtsam.types import SweepMotion
@@ -82,6 +83,7 @@ class Start:
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
+        self._still = False  # whether an IMU was at rest when the run began
         self._anew = False  # whether the sweeps are to be registered anew with the next one
 
     @classmethod
@@ -95,7 +97,9 @@ class Start:
         """Whether all sweeps of the start are there."""
         return len(self._sweeps) >= _TOGETHER[-1]
 
-    def first_motion(self, frame: Frame, expected: Found, solver: NamedSolver) -> Found:
+    def first_motion(
+        self, frame: Frame, expected: Found, solver: NamedSolver, imu: ImuTracker | None = None
+    ) -> Found:
         """Search for the motion between the first two sweeps; returns ``expected`` for later ones.
 
         The places where the second sweep may have been taken are tried, each with both sweeps
@@ -104,6 +108,7 @@ class Start:
         """
         if len(self._sweeps) > 1:
             return expected
+        self._still = imu is not None and imu.was_still
         early, first = EarlyMap(frame, solver, self._map_T_first), self._sweeps[0]
         predicted, found = frame.predicted, expected.solution.map_T_lidar
         told = _told(frame, found, first, solver)
@@ -200,6 +205,8 @@ class Start:
 
     def _best(self, ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -> Way:
         """The best of some ways; those that are as good, or of which no scan tells, are rivals."""
+        if self._still:
+            ways, silent = unless_beaten(ways), ()
         best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best

@@ -20,6 +20,7 @@ from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.types import FloatArray
 
 _UNLIKELY = five_sigma(6)  # from which on a pose contradicts factors
+_SURELY = 5.0  # standard deviations beyond which the scans alone tell
 _HARDLY = 2.0  # standard deviations: one of twenty right ways is worse by chance
 
 
@@ -183,6 +184,15 @@ def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -
         if all(_apart(way, other, near) for other in kept):
             kept.append(way)
     return kept
+
+
+def unless_beaten(ways: Sequence[Way]) -> Sequence[Way]:
+    """The first way alone, if something else tells it, and no scan that it is another one.
+
+    Surely, that is: of some places where posts repeat, one is better by more than chance alone.
+    """
+    beaten = any(_favour(way, ways[0]).every > _SURELY for way in ways[1:])
+    return ways if beaten else ways[:1]
 
 
 def as_good(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
+from loam_gtsam.datasets.decode.point_times import shorter_period
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
@@ -67,6 +68,7 @@ class ArrayDataset(Loader):
                     "objects and none of stamps, stamps_s, times, rings"
                 )
             self._scans = ready
+            self._shorten_period()
             return
         nanoseconds = _stamps(stamps, stamps_s)
         for label, column in (("stamps", nanoseconds), ("times", times), ("rings", rings)):
@@ -81,6 +83,13 @@ class ArrayDataset(Loader):
                 self._scans.append(Scan(entry[:, :3], int(nanoseconds[index]), *own))
             except InputError as error:
                 raise InputError(f"scans[{index}]: {error}") from error
+        self._shorten_period()
+
+    def _shorten_period(self) -> None:
+        """Sweeps without times that follow each other sooner than the default take no longer."""
+        stamps = [scan.stamp for scan in self._scans]
+        if any(scan.times is None for scan in self._scans):
+            self.sensor = dict(shorter_period(stamps)) | dict(self.sensor)
 
     def __len__(self) -> int:
         return len(self._scans)

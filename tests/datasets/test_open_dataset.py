@@ -54,6 +54,27 @@ def test_options_reach_the_loader_they_belong_to(tmp_path: Path) -> None:
         open_dataset(folder, topic="/points")
 
 
+@pytest.mark.parametrize(
+    ("hertz", "more", "period"),
+    [
+        (20.0, {}, 0.05),
+        (10.0, {}, None),
+        (2.0, {}, None),  # some sweeps may be left out
+        (100.0, {}, None),  # no lidar: stamps of another unit
+        (20.0, {"sensor": {"period": 0.04}}, 0.04),
+        (20.0, {"times": np.linspace(0.0, 0.05, 300)}, None),  # they say it all
+    ],
+)
+def test_sweeps_without_times_take_no_longer_than_until_the_next(
+    hertz: float, more: dict[str, Any], period: float | None
+) -> None:
+    clouds = [sweep_points(number) for number in range(4)]
+    times = None if "times" not in more else [more["times"][: len(cloud)] for cloud in clouds]
+    stamps = [START + round(number * 1e9 / hertz) for number in range(4)]
+    data = ArrayDataset(clouds, stamps, times=times, sensor=more.get("sensor"))
+    assert data.sensor.get("period") == (None if period is None else pytest.approx(period))
+
+
 def test_built_in_world() -> None:
     world = open_dataset("sim:room?frames=2&seed=3")
     assert len(world) == 2

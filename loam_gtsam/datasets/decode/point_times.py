@@ -5,14 +5,16 @@ Velodyne writes seconds from the stamp, Ouster nanoseconds, Hesai and Robosense 
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from loam_gtsam.config import SensorConfig
 from loam_gtsam.errors import nearest
-from loam_gtsam.types import BoolArray, DatasetError, FloatArray
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray, IntArray
 
 SWEEP_SECONDS = (0.02, 1.0)
 """Shortest and longest plausible sweep: spinning sensors run at 5 to 20 Hz, with room to spare.
@@ -23,6 +25,18 @@ _NANOSECONDS: dict[str, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _FOREIGN = "absolute, in another clock than the stamp"
 _CLOCKS = {"offset": "relative to the stamp", "stamp": "absolute", "own": _FOREIGN}
 _TRIM = 100  # one value in this many is set aside at either end before the span is measured
+_SHORTER = 0.75  # share of the usual time between two sweeps below which it is another
+
+
+def shorter_period(stamps: Sequence[int] | IntArray) -> Mapping[str, float]:
+    """``sensor.period`` of sweeps that follow each other sooner than its default says.
+
+    None takes longer than until the next one begins. Empty for slower sweeps: some may be left out.
+    """
+    steps = np.diff(np.asarray(stamps, np.int64))
+    seconds = float(np.median(steps)) * 1e-9 if len(steps) else 0.0
+    most = _SHORTER * SensorConfig().period
+    return {"period": seconds} if SWEEP_SECONDS[0] <= seconds < most else {}
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,12 @@ from loam_gtsam.datasets.decode.packed_points import (
     read_ply,
     read_records,
 )
-from loam_gtsam.datasets.decode.point_times import TimeDecision, apply_times, decide_times
+from loam_gtsam.datasets.decode.point_times import (
+    TimeDecision,
+    apply_times,
+    decide_times,
+    shorter_period,
+)
 from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
 from loam_gtsam.datasets.kitti import drive
 from loam_gtsam.datasets.known.layouts import first_existing
@@ -190,6 +195,8 @@ class KittiDataset(SweepFiles):
         elif folder.name == "velodyne" or folder.parent.name == "velodyne_points":
             period = drive.turn_seconds(self._root, self._files, self.stamps, self._problems)
             sensor = dict(KITTI_SENSOR) | ({} if period is None else {"period": period})
+        else:
+            sensor = dict(shorter_period(self.stamps))
         if self._lidar_T_imu is not None and self._imu_file is None:
             sensor.update(extrinsic_settings(self._lidar_T_imu))
         return sensor

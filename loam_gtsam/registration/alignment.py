@@ -14,6 +14,7 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import as_points, checked_pose, voxel_filter
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
 from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
 from loam_gtsam.types import FloatArray, InputError
@@ -36,6 +37,9 @@ class Alignment:
     solved : whether enough points found a plane of the target
     converged : whether the last association still moved the pose by less than the stop rule
     overlap : share of the source points, one a voxel, that found a plane of the target
+    agreement : share of these within three standard deviations of the plane; 0 without any. It
+        tells a right pose from one that is merely solved: in seven built-in worlds 0.94 to 1 from
+        a good guess, and at most 0.9 from one 3 to 6 m off, where ``weak`` is None
     weak : (6, 6) projector onto the directions that the clouds do not fix; None if all are fixed
     matches : matches of the last association
     """
@@ -45,6 +49,7 @@ class Alignment:
     solved: bool
     converged: bool
     overlap: float
+    agreement: float
     weak: FloatArray | None
     matches: ScanMatches
 
@@ -101,12 +106,14 @@ def align(
         match = partial(associate, _NONE, points, edge_map=edges, plane_map=planes, config=matching)
         solution = solver.solve(match, pose, (), prior)
         pose = solution.map_T_lidar
+    fit = Fit.of(solution.matches, len(points))
     return Alignment(
         pose,
         _covariance(solution, config),
         solution.solved,
         solution.converged,
-        len(solution.matches) / len(points),
+        fit.share,
+        fit.agreement,
         solution.weak,
         solution.matches,
     )

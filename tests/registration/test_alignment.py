@@ -4,6 +4,7 @@ import gtsam
 import numpy as np
 import pytest
 
+from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.registration.alignment import align
 from loam_gtsam.types import InputError
 
@@ -32,6 +33,7 @@ def test_a_known_pose_is_found_within_what_is_told():
     assert found.converged
     assert found.weak is None
     assert found.overlap > 0.65
+    assert found.agreement > 0.98
     assert np.abs(error).max() < 2e-3
     assert error @ np.linalg.solve(found.covariance, error) / 6.0 < 4.0
 
@@ -55,6 +57,17 @@ def test_what_the_clouds_do_not_fix_is_said():
     assert along @ found.covariance[3:, 3:] @ along > 1.0
     aside = np.linalg.eigvalsh(found.covariance[3:, 3:])[:2]
     assert np.sqrt(aside).max() < 0.01
+
+
+@pytest.mark.parametrize(("aside", "right"), [(0.0, True), (3.0, False)])
+def test_agreement_tells_a_right_pose_from_one_that_is_merely_solved(aside, right):
+    world = SimulatedWorld("garage", seed=1, frames=7, columns=450)
+    truth = gtsam.Pose3(world.truth.map_T_lidar[6])
+    guess = truth.compose(gtsam.Pose3(gtsam.Rot3(), np.array([0.0, aside, 0.0])))
+    found = align(world.sweep(6).points, world.sweep(0).points, guess)
+    assert found.solved
+    assert (found.target_T_source.range(truth) < 0.1) is right
+    assert (found.agreement > 0.9) is right
 
 
 def test_clouds_that_do_not_meet_are_not_solved():

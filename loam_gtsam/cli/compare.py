@@ -22,7 +22,7 @@ from loam_gtsam.studies import same_matches
 from loam_gtsam.studies.comparison import compare_solvers
 from loam_gtsam.studies.contenders import Contender
 from loam_gtsam.studies.report_html import TextTable
-from loam_gtsam.types import MapUpdate
+from loam_gtsam.types import ConfigError, MapUpdate
 
 
 def execute(options: CompareOptions) -> int:
@@ -72,6 +72,8 @@ def _compare(
     on_frame: OnFrame,
     plot: bool,
 ) -> _Done:
+    if options.driver and not options.same_matches:
+        raise ConfigError("--driver: it leads --same-matches, which is not given")
     if options.same_matches:
         updates: list[MapUpdate] = []
 

@@ -44,6 +44,7 @@ from loam_gtsam.types import (
     Scan,
     Sweep,
     Trajectory,
+    check_kind,
 )
 
 _LONGEST = 50
@@ -92,6 +93,7 @@ class Localizer:
         inside: bool = False,
         **parts: Unpack[Parts],
     ) -> None:
+        check_kind(saved, SavedMap, "saved", "SavedMap(path) opens one")
         if not saved.places:
             raise InputError(
                 f"{saved.path}: the map has no places at which it can be recognised: its run was "

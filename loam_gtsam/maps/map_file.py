@@ -36,7 +36,7 @@ from loam_gtsam.maps.map_graph import (
 )
 from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.registration.frame_matcher import MapPair
-from loam_gtsam.types import BoolArray, DatasetError, FloatArray
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray, InputError
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex, Grid
 
@@ -73,7 +73,7 @@ def map_of_run(path: str | Path) -> Path:
     return path / MAP_FILE if path.is_dir() else path
 
 
-def save_map(path: str | Path, pipeline: Pipeline) -> None:
+def save_map(path: str | Path, pipeline: Pipeline | None) -> None:
     """Write the map of a run, corrected by its loops if there are any.
 
     Parameters
@@ -83,9 +83,13 @@ def save_map(path: str | Path, pipeline: Pipeline) -> None:
 
     Raises
     ------
+    InputError
+        If there is no pipeline.
     OutputError
         If the file cannot be written; an old one is then as it was.
     """
+    if pipeline is None:
+        raise InputError("pipeline: expected that of a run, got None; run makes one")
     aid = pipeline.mapper.imu
     tied = pipeline.fixes
     earth, fixes = (None, None) if tied is None else (tied.reference, tied.placed)

@@ -26,7 +26,7 @@ from loam_gtsam.maps.common_places import CommonPlaces, are_tied, walked
 from loam_gtsam.maps.linear_factors import LinearFactors
 from loam_gtsam.maps.map_file import SavedMap, grids, write_map
 from loam_gtsam.maps.map_graph import MapGraph
-from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory
+from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory, check_kind
 from loam_gtsam.voxels.archive import Archive
 from loam_gtsam.voxels.cubes import CubePoints, joined
 from loam_gtsam.voxels.grid import CubeIndex
@@ -120,6 +120,8 @@ def merge_maps(
     """
     if len(maps) < 2:
         raise InputError(f"merge: expected two maps or more, got {len(maps)}")
+    for number, saved in enumerate(maps):
+        check_kind(saved, SavedMap, f"maps[{number}]", "SavedMap(path) opens one")
     config = config or maps[0].config
     _check(maps)
     common = CommonPlaces(maps, config)

@@ -205,7 +205,7 @@ _CONFIG = Config().changed("pose_graph.keyframe_distance=0.5", "loops.enabled=tr
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory) -> tuple[SimulatedWorld, list[Path]]:
     """Two parts of a drive; the end of each is said to lie half a metre aside."""
-    world = SimulatedWorld("rooms", frames=CUTS[-1][-1], columns=300, speed=3.0, seed=1)
+    world = SimulatedWorld("rooms", frames=CUTS[-1][-1], columns=450, speed=3.0, seed=1)
     files = []
     for start, end in CUTS:
         done = run(PartOf(world, start, 1, None, None), _CONFIG, max_frames=end - start)

@@ -25,6 +25,7 @@ from loam_gtsam.maps.hypotheses import SWEEPS, Hypothesis, Motion
 from loam_gtsam.maps.localizer import Localizer, localise
 from loam_gtsam.maps.map_file import LAYERS, MapFrame, SavedMap, save_map, write_map
 from loam_gtsam.maps.map_graph import MapGraph
+from loam_gtsam.maps.merging import merge_maps
 from loam_gtsam.maps.saved_maps import SavedMaps
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.relocalization import Field, Fit
@@ -446,6 +447,15 @@ def test_the_command_localises_in_the_map_that_a_run_wrote(mapped, tmp_path, mon
     missing = loam("localise", spec, "nothing.lgmap")
     assert missing.exit_code == 1
     assert "there is no such file" in missing.output
+
+
+def test_a_path_is_no_map_and_nothing_no_pipeline():
+    with pytest.raises(InputError, match="saved: expected a SavedMap, got str"):
+        Localizer("map.lgmap")
+    with pytest.raises(InputError, match=r"maps\[0\]: expected a SavedMap, got str"):
+        merge_maps(["a.lgmap", "b.lgmap"], "whole.lgmap")
+    with pytest.raises(InputError, match="pipeline: expected that of a run, got None"):
+        save_map("none.lgmap", None)
 
 
 def test_what_is_gone_since_the_map_was_made_is_cleaned_out_of_the_larger_map(

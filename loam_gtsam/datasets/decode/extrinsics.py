@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from loam_gtsam.geometry import inverse_pose
+from loam_gtsam.geometry import as_array, inverse_pose
 from loam_gtsam.types import FloatArray, Trajectory
 
 
@@ -46,6 +46,7 @@ def moved_to_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
 
     Positions alone stay where they are, and are told to be of the origin of that frame.
     """
+    body_T_lidar = as_array(body_T_lidar, "body_T_lidar", (4, 4))
     if np.isfinite(truth.map_T_lidar).all():
         return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
     return Trajectory(truth.stamps, truth.map_T_lidar, inverse_pose(body_T_lidar)[:3, 3])

@@ -18,7 +18,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset, PartOf
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
-from loam_gtsam.io.run_files import stage_seconds
+from loam_gtsam.io.run_files import position_sigmas, stage_seconds
 from loam_gtsam.pipeline import RunResult, effective_config, imu_buffer, run
 from loam_gtsam.refine.map_quality import map_quality
 from loam_gtsam.types import (
@@ -49,6 +49,7 @@ _TIGHTER = 0.85
 """Share of the scatter: sweeps that were de-skewed before have 0.2 to 0.7 as they are."""
 _SOUGHT, _STEP = 30.0, 1.0  # seconds in which a start for them is sought, and between such starts
 _VOXELS = 4  # of the map along the edge of a cell in which a plane is looked for
+_VAGUE = 1.0  # metres of standard deviation, and more than a hundredth of the path, that are said
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
 
@@ -74,10 +75,15 @@ def summary(
         "map, planes": _thickness(result),
         "map, dropped": _dropped(result),
         "accuracy": _accuracy(accuracy),
+        "positions": _told(result),
         "loops": _loops(result),
         "GNSS": "" if result.fixes is None else str(result.fixes),
     }
     notes = [f"input: {problem}" for problem in problems]
+    worst = (position_sigmas(result.updates) or {}).get("largest", 0.0)
+    if worst > max(_VAGUE, 0.01 * path):
+        told = f"positions are told to {worst:.2g} m at worst (sigma)"
+        notes.append(f"{told}: other first motions fit as well, or the way was blind")
     if result.imu is not None:
         rows |= _imu_facts(result.imu)
         notes += _imu_problems(result.imu)
@@ -89,6 +95,14 @@ def summary(
     if warning:
         texts.append(Text(f"  {warning}", style="bold red" if doubted else "yellow"))
     return Group(_table(name, rows), *texts)
+
+
+def _told(result: RunResult) -> str:
+    """How well the positions are known, by what is told with them."""
+    sigmas = position_sigmas(result.updates)
+    if sigmas is None:
+        return ""
+    return f"told to {sigmas['median']:.2g} m (sigma, median), {sigmas['largest']:.2g} m at worst"
 
 
 def _warning(updates: Sequence[MapUpdate]) -> tuple[str, bool]:

@@ -227,6 +227,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
         },
         "messages": [f"frame {n}: {u.status}: {u.message}" for n, u in told[:_MAX_MESSAGES]],
         "path_length_m": trajectory.path_length,
+        "position_sigma_m": position_sigmas(result.updates),
         "duration_s": float(np.ptp(trajectory.stamps)) / _NS if len(trajectory) else 0.0,
         "frame_ms_median": 1e3 * float(np.median(seconds)) if len(seconds) else None,
         "edge_points": len(result.edge_points),
@@ -238,6 +239,15 @@ def summarise(result: RunResult) -> dict[str, Any]:
         "loops": None if result.loops is None else result.loops.counts(),
         "gnss": None if result.fixes is None else result.fixes.as_dict(),
     }
+
+
+def position_sigmas(updates: Sequence[MapUpdate]) -> dict[str, float] | None:
+    """Median and largest standard deviation of the positions that scans gave, as told, metres."""
+    squares = [np.trace(u.covariance[3:, 3:]) for u in updates if u.status.solved]
+    known = np.sqrt([square for square in squares if np.isfinite(square)])
+    if not len(known):
+        return None
+    return {"median": float(np.median(known)), "largest": float(known.max())}
 
 
 def _gaps(stamps: IntArray) -> int:

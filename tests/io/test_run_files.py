@@ -212,6 +212,9 @@ def test_write_run_writes_all_files(result, tmp_path):
     assert (summary["frames"], summary["status_counts"]) == (FRAMES, {"first": 1, "ok": FRAMES - 1})
     assert (summary["ate"], summary["n"], summary["error"]) == (None, 3, None)
     assert summary["path_length_m"] == pytest.approx(result.trajectory.path_length)
+    known = [np.sqrt(np.trace(u.covariance[3:, 3:])) for u in result.updates if u.status.solved]
+    sigmas = summary["position_sigma_m"]
+    assert sigmas == {"median": np.median(known), "largest": np.max(known)}
     assert "incomplete" not in (folder / "trajectory.tum").read_text()
 
 

@@ -594,7 +594,7 @@ def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
     assert np.isnan(first.covariance).all()
     assert not first.information.any()
     assert np.allclose(first.twist, updates[AT - 1].twist)  # predicted
-    assert "of the matches agree" in first.message
+    assert "of the features match" in first.message
     back = updates[AT + len(lost)]
     assert back.status.solved
     assert f"after {len(lost)} lost sweeps" in back.message

@@ -163,8 +163,9 @@ def _lost(frame: Frame, solution: Solution, monitor: FitMonitor, solver: ScanSol
             further = "; without the factors beside the scan, which contradict the map, it fits"
     return Lost(
         nowhere,
-        f"{before.agreement:.0%} of the matches agree with the map, {usual.agreement:.0%} is "
-        f"usual; nothing fits within {monitor.radius:g} m{further}; "
+        f"{before.share:.0%} of the features match, and {before.agreement:.0%} of these agree "
+        f"({usual.share:.0%} and {usual.agreement:.0%} are usual); nothing fits within "
+        f"{monitor.radius:g} m{further}; "
         f"lost for {monitor.lost + 1} sweeps",
     )
 

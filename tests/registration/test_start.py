@@ -423,9 +423,15 @@ def test_what_an_imu_tells_stands_unless_the_scans_are_sure(count, stays):
     """Of so many features, each agrees at the other place alone: 4 and 6 standard deviations."""
     still = place(0.0 * AHEAD, [], np.zeros(count), AHEAD)
     there = place(2.0 * AHEAD, [], np.ones(count), AHEAD)
-    tried = [(still,), (there,)]
+    tried = [
+        (one._replace(sweeps=way_of(at)[0].sweeps),) for one, at in ((still, 0.0), (there, 2.0))
+    ]
     assert ways._better(tried[1], tried[0], 8.0)
-    assert list(ways.unless_beaten(tried)) == tried[: 1 if stays else 2]
+    assert ways.is_surely_beaten(tried) is not stays
+    start = first_sweeps.Start(*first_sweep())
+    start._still = True
+    assert start._best(tried, CONFIG) is tried[0 if stays else 1]
+    assert start._still is stays
 
 
 @pytest.mark.parametrize(

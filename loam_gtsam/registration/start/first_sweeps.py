@@ -39,11 +39,11 @@ from loam_gtsam.registration.start.ways import (
     as_good,
     by_second_step,
     continued,
+    is_surely_beaten,
     kept_ways,
     parting,
     steady,
     tell_nothing,
-    unless_beaten,
     without_turns,
 )
 from loam_gtsam.types import SweepMotion
@@ -83,7 +83,7 @@ class Start:
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
-        self._still = False  # whether an IMU was at rest when the run began
+        self._still = False  # whether an IMU was at rest when the run began, as far as scans tell
         self._anew = False  # whether the sweeps are to be registered anew with the next one
 
     @classmethod
@@ -205,8 +205,9 @@ class Start:
 
     def _best(self, ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -> Way:
         """The best of some ways; those that are as good, or of which no scan tells, are rivals."""
-        if self._still:
-            ways, silent = unless_beaten(ways), ()
+        self._still = self._still and not is_surely_beaten(ways)
+        if self._still:  # which the IMU tells, and the scans do not deny
+            ways, silent = ways[:1], ()
         best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best

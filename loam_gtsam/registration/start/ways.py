@@ -186,13 +186,12 @@ def kept_ways(ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -
     return kept
 
 
-def unless_beaten(ways: Sequence[Way]) -> Sequence[Way]:
-    """The first way alone, if something else tells it, and no scan that it is another one.
+def is_surely_beaten(ways: Sequence[Way]) -> bool:
+    """Whether some way is better than the first one, by more than chance among many.
 
-    Surely, that is: of some places where posts repeat, one is better by more than chance alone.
+    Of ten places along a row of posts one may be better by three standard deviations.
     """
-    beaten = any(_favour(way, ways[0]).every > _SURELY for way in ways[1:])
-    return ways if beaten else ways[:1]
+    return any(_favour(way, ways[0]).every > _SURELY for way in ways[1:])
 
 
 def as_good(

@@ -454,7 +454,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not world.recorded or (data_folder() / world.scene).is_dir()
         for mode in modes
         for seed in range(options.first_seed, options.first_seed + options.seeds)
-        if not (world.recorded and (seed > options.first_seed or mode.imu in ("mems", "six_axis")))
+        if not (world.recorded and (seed > options.first_seed or mode.imu not in (None, "white")))
     ]
     if options.workers > 1:
         with ProcessPoolExecutor(options.workers) as pool:

@@ -65,6 +65,7 @@ def summary(
     The name and the ``problems`` are those of the data set, the accuracy is as in ``summary.json``.
     """
     frames, path = len(result.updates), result.trajectory.path_length
+    sigmas = position_sigmas(result.updates)
     rows = {
         "frames": f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)",
         "status": _counts(result.status_counts),
@@ -75,14 +76,13 @@ def summary(
         "map, planes": _thickness(result),
         "map, dropped": _dropped(result),
         "accuracy": _accuracy(accuracy),
-        "positions": _told(result),
+        "positions": _told(sigmas),
         "loops": _loops(result),
         "GNSS": "" if result.fixes is None else str(result.fixes),
     }
     notes = [f"input: {problem}" for problem in problems]
-    worst = (position_sigmas(result.updates) or {}).get("largest", 0.0)
-    if worst > max(_VAGUE, 0.01 * path):
-        told = f"positions are told to {worst:.2g} m at worst (sigma)"
+    if sigmas is not None and sigmas["largest"] > max(_VAGUE, 0.01 * path):
+        told = f"positions are told to {sigmas['largest']:.2g} m at worst (sigma)"
         notes.append(f"{told}: other first motions fit as well, or the way was blind")
     if result.imu is not None:
         rows |= _imu_facts(result.imu)
@@ -97,9 +97,8 @@ def summary(
     return Group(_table(name, rows), *texts)
 
 
-def _told(result: RunResult) -> str:
+def _told(sigmas: Mapping[str, float] | None) -> str:
     """How well the positions are known, by what is told with them."""
-    sigmas = position_sigmas(result.updates)
     if sigmas is None:
         return ""
     return f"told to {sigmas['median']:.2g} m (sigma, median), {sigmas['largest']:.2g} m at worst"
@@ -313,17 +312,17 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         if _scatter(without) < _TIGHTER * _scatter(result):
             said = "the sweeps are de-skewed already: they fit better with sensor.times=none"
     mapped = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
-    return mapped, [*_not_placed(result.updates), *([said] if said else []), *of_imu]
+    return mapped, [*filter(None, (_not_placed(result.updates), said)), *of_imu]
 
 
-def _not_placed(updates: Sequence[MapUpdate]) -> list[str]:
-    """A sentence on sweeps that were not placed in the map, if there are any."""
+def _not_placed(updates: Sequence[MapUpdate]) -> str:
+    """A sentence on sweeps that were not placed in the map; empty if there are none."""
     first = FrameStatus.FIRST
     left = [u for u in updates if not u.status.solved and u.status is not first]
     if not left:
-        return []
+        return ""
     counts = _counts(Counter(str(update.status) for update in left))
-    return [f"{len(left)} of {len(updates)} sweeps: {counts}, the first: {left[0].message}"]
+    return f"{len(left)} of {len(updates)} sweeps: {counts}, the first: {left[0].message}"
 
 
 def _scatter(result: RunResult) -> float:

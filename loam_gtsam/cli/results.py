@@ -164,12 +164,12 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
 
     Results that end earlier because fewer frames were asked for are not complete.
     """
+    summary = _summary_in(folder)
     try:
-        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
         written = (folder / "config.yaml").read_text(encoding="utf-8")
     except (OSError, ValueError):
         return False
-    if not isinstance(summary, dict) or summary.get("interrupted") or summary.get("error"):
+    if not summary or summary.get("interrupted") or summary.get("error"):
         return False
     now = described(dataset), dump_config(effective_config(config, dataset))
     frames, same = summary.get("frames", 0), (summary.get("dataset"), written) == now
@@ -185,17 +185,22 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
 
 def check_data(folder: Path, dataset: Dataset) -> None:
     """DatasetError if the run in a folder was made of another data set, by kind and name."""
-    try:
-        made_of = str(json.loads((folder / "summary.json").read_text(encoding="utf-8"))["dataset"])
-    except (OSError, ValueError, LookupError, TypeError):
-        return
-    info = _input_info(dataset)
+    made_of, info = str(_summary_in(folder).get("dataset", "")), _input_info(dataset)
     names = {Path(path).name for path in (made_of.removeprefix(f"{info.kind} "), info.path)}
     if len(names) > 1 and "" not in names:
         raise DatasetError(
-            f"{folder}: its run was made of {made_of!r}, got {described(dataset)!r}; give the data "
+            f"{folder}: its run was made of {made_of!r}, got {_described(info)!r}; give the data "
             "set that was run"
         )
+
+
+def _summary_in(folder: Path) -> dict[str, Any]:
+    """The summary of the run in a folder; empty if there is none that can be read."""
+    try:
+        summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return summary if isinstance(summary, dict) else {}
 
 
 def described(dataset: Dataset) -> str:

@@ -59,37 +59,13 @@ class ArrayDataset(Loader):
         self.name, self.imu, self.truth = name, imu, truth
         self.gnss, self.wheels = gnss, wheels
         self.sensor: Mapping[str, Any] = dict(sensor or {})
-        self._scans: list[Scan] = []
-        if ready := [entry for entry in entries if isinstance(entry, Scan)]:
-            columns = (stamps, stamps_s, times, rings)
-            if len(ready) != len(entries) or any(column is not None for column in columns):
-                raise InputError(
-                    "scans: Scan objects carry their own stamps, times and rings; give only Scan "
-                    "objects and none of stamps, stamps_s, times, rings"
-                )
-            self._scans = ready
-            self._shorten_period()
-            return
-        nanoseconds = _stamps(stamps, stamps_s)
-        for label, column in (("stamps", nanoseconds), ("times", times), ("rings", rings)):
-            if column is not None and len(column) != len(entries):
-                raise InputError(f"{label}: expected {len(entries)} entries, got {len(column)}")
-        for index, entry in enumerate(entries):
-            if not isinstance(entry, np.ndarray) or entry.ndim != 2 or entry.shape[1] not in (3, 4):
-                got = entry.shape if isinstance(entry, np.ndarray) else type(entry).__name__
-                raise InputError(f"scans[{index}]: expected an (N, 3) or (N, 4) array, got {got}")
-            own = None if times is None else times[index], None if rings is None else rings[index]
-            try:
-                self._scans.append(Scan(entry[:, :3], int(nanoseconds[index]), *own))
-            except InputError as error:
-                raise InputError(f"scans[{index}]: {error}") from error
-        self._shorten_period()
-
-    def _shorten_period(self) -> None:
-        """Sweeps without times that follow each other sooner than the default take no longer."""
-        stamps = [scan.stamp for scan in self._scans]
+        if any(isinstance(entry, Scan) for entry in entries):
+            self._scans = _ready(entries, (stamps, stamps_s, times, rings))
+        else:
+            self._scans = _made(entries, _stamps(stamps, stamps_s), times, rings)
         if any(scan.times is None for scan in self._scans):
-            self.sensor = dict(shorter_period(stamps)) | dict(self.sensor)
+            period = shorter_period([scan.stamp for scan in self._scans])
+            self.sensor = {**period, **self.sensor}
 
     def __len__(self) -> int:
         return len(self._scans)
@@ -111,6 +87,40 @@ class ArrayDataset(Loader):
         if not self._scans:
             info.problems.append("no sweeps")
         return info
+
+
+def _ready(entries: Sequence[Any], columns: Sequence[Any]) -> list[Scan]:
+    """Scans as they are given."""
+    scans = [entry for entry in entries if isinstance(entry, Scan)]
+    if len(scans) != len(entries) or any(column is not None for column in columns):
+        raise InputError(
+            "scans: Scan objects carry their own stamps, times and rings; give only Scan "
+            "objects and none of stamps, stamps_s, times, rings"
+        )
+    return scans
+
+
+def _made(
+    entries: Sequence[Any],
+    stamps: IntArray,
+    times: Sequence[NDArray[np.floating]] | None,
+    rings: Sequence[NDArray[np.integer]] | None,
+) -> list[Scan]:
+    """Scans of arrays."""
+    for label, column in (("stamps", stamps), ("times", times), ("rings", rings)):
+        if column is not None and len(column) != len(entries):
+            raise InputError(f"{label}: expected {len(entries)} entries, got {len(column)}")
+    scans: list[Scan] = []
+    for index, entry in enumerate(entries):
+        if not isinstance(entry, np.ndarray) or entry.ndim != 2 or entry.shape[1] not in (3, 4):
+            got = entry.shape if isinstance(entry, np.ndarray) else type(entry).__name__
+            raise InputError(f"scans[{index}]: expected an (N, 3) or (N, 4) array, got {got}")
+        own = None if times is None else times[index], None if rings is None else rings[index]
+        try:
+            scans.append(Scan(entry[:, :3], int(stamps[index]), *own))
+        except InputError as error:
+            raise InputError(f"scans[{index}]: {error}") from error
+    return scans
 
 
 def _stamps(stamps: Any, stamps_s: Any) -> IntArray:

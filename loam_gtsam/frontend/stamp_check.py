@@ -58,12 +58,11 @@ class StampCheck:
         step, before = stamp - last, self._steps[-1] if self._steps else 0
         largest = max(round(LARGEST_STEP * 1e9), _STEPS * before)
         usual = median(self._steps) if self._steps else seconds * 1e9
-        if 0 < step < max(_SHORTEST, _SOON * usual):
-            message = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
-            due = "expected nanoseconds"
-            if step >= _SHORTEST:
-                due = f"{usual * 1e-9:.3g} s are usual"
-            return Refusal(SweepFault.TOO_SOON, f"{message}; {due}")
+        later = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
+        if 0 < step < _SHORTEST:
+            return Refusal(SweepFault.TOO_SOON, f"{later}; expected nanoseconds")
+        if 0 < step < _SOON * usual:
+            return Refusal(SweepFault.TOO_SOON, f"{later}; {usual * 1e-9:.3g} s are usual")
         if step > 0 and (step <= largest or not before):
             self._steps.append(step)
             self._doubted = None
@@ -83,8 +82,7 @@ class StampCheck:
                 "the mapper, or map what follows as a run of its own",
             )
         if agree < IN_A_ROW:
-            message = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
-            return Refusal(SweepFault.STAMP_AHEAD, message)
+            return Refusal(SweepFault.STAMP_AHEAD, later)
         # The first doubted sweep is taken to be one interval later than the last used sweep.
         ahead = first - before - last
         self._doubted = None

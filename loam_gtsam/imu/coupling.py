@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import gtsam
 import numpy as np
 
@@ -240,15 +238,14 @@ class TightCoupling:
                 return fused if agree and self.trusted else None
             seconds = (stamp - last[0]) * 1e-9
             velocity = (pose.translation() - last[1].translation()) / seconds
-            gravity, sigmas = level.down(self.config.gravity), StartSigmas()
-            if level.felt:
-                sigmas = replace(sigmas, gravity=_UNFELT / self.config.gravity)
+            gravity = level.down(self.config.gravity)
             spread = _spread(pose, information, seconds)
             if self._odometry is not None:
                 if not self._rejected:  # but samples were missing, or absurd
                     velocity, spread = self._gone_on(stamp, velocity, spread)
                 self._odometry.restart(stamp, pose, velocity, spread)
             elif self._is_down(gravity @ pose.rotation().matrix(), last[0], stamp, buffer):
+                sigmas = StartSigmas(gravity=_UNFELT / self.config.gravity) if level.felt else None
                 self._odometry = InertialOdometry(
                     self.config, gravity, stamp, pose, velocity, buffer.gyro_bias, sigmas, spread
                 )

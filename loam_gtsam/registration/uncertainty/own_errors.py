@@ -28,11 +28,13 @@ class OwnError(NamedTuple):
     Attributes
     ----------
     covariance : (6, 6)
+    to_reference : (6, 6) adjoint from the middle of its sweep to there
     shared : (6, 6) its covariance with that of the frame before; zero if it follows none
     follows : reference time of the frame before; None if it follows none
     """
 
     covariance: FloatArray
+    to_reference: FloatArray
     shared: FloatArray
     follows: int | None
 
@@ -95,7 +97,8 @@ class OwnErrors:
         else:
             now, own, shared = self._by_imu(now, sweep, motion, fused, update)
         self._last, self._paused = now, False
-        return OwnError(symmetric(own), shared, None if last is None else last.reference_stamp)
+        follows = None if last is None else last.reference_stamp
+        return OwnError(symmetric(own), to_reference, shared, follows)
 
     def _by_scan(
         self, now: _Middle, sweep: MovingSweep, motion: Accelerations

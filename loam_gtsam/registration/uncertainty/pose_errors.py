@@ -150,8 +150,7 @@ class PoseErrors:
             self._map.set_origin(sweep, middle.AdjointMap(), scan.covariance, update.twist)
         self._map.add_rivals(sweep.stamp, doubt, parting)
         # A pose that own factors tell shares less of the map's error.
-        to_reference = update.map_T_lidar.between(middle).AdjointMap()
-        from_map = to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
+        from_map = own.to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
         covariance = own.covariance + from_map @ self._map.doubt @ from_map.T
         uncertainty = Uncertainty(
             own=covariance,

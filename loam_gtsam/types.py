@@ -121,6 +121,8 @@ class Features:
     edge_prominence : (E,) metres by which an edge stands out of its ring, scaled so that range
         noise alone gives it the standard deviation of the noise
         (:func:`loam_gtsam.frontend.curvature.prominence`); None if unknown: all edges are real
+    edge_sigmas : (E,) metres, standard deviation of the place of an edge along its ring, for beams
+        are apart, and pass beside the edge itself; None if unknown: edges are where they were met
     not_finite : points of the sweep that were NaN or infinite
     voxel_sizes : edge lengths in metres of the voxels of which ``edges`` and ``planes`` hold one
         point each (:func:`loam_gtsam.frontend.features.thinned`). None if they hold all points, or
@@ -140,6 +142,7 @@ class Features:
     flat: IntArray
     span: tuple[float, float] = (0.0, 0.0)
     edge_prominence: FloatArray | None = None
+    edge_sigmas: FloatArray | None = None
     not_finite: int = 0
     voxel_sizes: tuple[float, float] | None = None
     reach: float = np.inf

@@ -487,6 +487,7 @@ def test_a_predicted_pose_teaches_nothing_about_the_gyro():
         edge_times=features.edge_times[:5],
         edge_rings=features.edge_rings[:5],
         edge_prominence=None,
+        edge_sigmas=None,
         planes=features.planes[:20],
         plane_times=features.plane_times[:20],
         plane_rings=features.plane_rings[:20],

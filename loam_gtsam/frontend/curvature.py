@@ -18,6 +18,8 @@ LINKED_BEAMS = 2.5
 EMPTY_BEAMS = 5.5
 """Beam spacings without a point at least, for there to be nothing: four beams in a row are lost by
 chance where one in four returns nothing, as on dark ground."""
+UNIFORM_SIGMA = 12.0**-0.5
+"""Standard deviation of what is anywhere within a metre: where an edge is between two beams."""
 _NEARER = 2.0
 """A surface that is continued comes nearer by less than this factor."""
 _LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
@@ -113,7 +115,7 @@ def prominence(xyz: NDArray[np.float32], half_window: int, chosen: IntArray) -> 
 
 def ends_of_surfaces(
     xyz: NDArray[np.float32], half_window: int, chosen: IntArray, drop: float, beams: float
-) -> FloatArray:
+) -> tuple[FloatArray, FloatArray]:
     """Where the surfaces end on which some points are the last ones before a drop.
 
     The last beam that meets a surface passes its end by anything up to the spacing of the beams,
@@ -132,10 +134,12 @@ def ends_of_surfaces(
 
     Returns
     -------
-    (M, 3) metres, the points that were measured where there is no drop, or one on both sides. A
-    beam that returned nothing is a drop as well, if its neighbours did not either.
+    points : (M, 3) metres, those that were measured where there is no drop, or one on both sides. A
+        beam that returned nothing is a drop as well, if its neighbours did not either
+    apart : (M,) metres from one beam to the next at these points, across the beams
     """
     ended = xyz.take(chosen, axis=1).T.astype(np.float64)
+    apart = np.full(len(chosen), np.inf)
     for side in (-1, 1):  # of the surface, seen from its last point
         rows = chosen[:, None] + side * np.arange(-1, half_window + 1)
         window = xyz.take(rows, axis=1).astype(np.float64)
@@ -143,6 +147,7 @@ def ends_of_surfaces(
         rays = np.concatenate((window / ranges, [1.0 / ranges]))
         turn = np.sqrt(squared_norm(np.diff(rays[:3], axis=2)))
         spacing = _medians(turn)
+        np.minimum(apart, spacing * ranges[:, 1], out=apart)
         most = np.maximum(drop, LINKED_BEAMS * spacing * ranges[:, 1])
         linked = np.abs(np.diff(ranges[:, 1:], axis=1)) < most[:, None]
         count = np.logical_and.accumulate(linked, axis=1).sum(axis=1)
@@ -155,7 +160,7 @@ def ends_of_surfaces(
         inverse = np.maximum(beyond[3], last[3, here] / _NEARER)
         inverse *= np.sqrt(squared_norm(beyond[:3]))
         ended[here] = (beyond[:3] / inverse).T
-    return ended
+    return ended, apart
 
 
 def _medians(rows: FloatArray) -> FloatArray:

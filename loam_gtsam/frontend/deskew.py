@@ -46,6 +46,7 @@ class MovingSweep:
     n_edges, n_planes : numbers of features
     distinct : (E,) whether an edge stands out of its ring by more than range noise
     alone : (E,) whether it is a pole, which stands before all that is beside it; None if unknown
+    edge_sigmas : (E,) metres, standard deviation of its place along its ring; None if unknown
     motion : source of the rotation within the sweep
     acceleration : (6,) rad/s^2 and m/s^2, of the body velocity; None if that is constant
     not_finite : number of points of the sweep that were NaN or infinite
@@ -69,6 +70,7 @@ class MovingSweep:
         )
         depth = config.features.post_depth or np.inf
         self.alone: BoolArray | None = None if prominence is None else prominence > depth
+        self.edge_sigmas = features.edge_sigmas
         self._points = features.edges, features.planes
         times = features.edge_times, features.plane_times
         self._seconds = times[0] - self.middle, times[1] - self.middle

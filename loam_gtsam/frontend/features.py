@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.config import SMALL, Config, MapConfig
 from loam_gtsam.frontend.curvature import (
+    UNIFORM_SIGMA,
     curvature,
     ends_of_surfaces,
     prominence,
@@ -149,8 +150,9 @@ def thinned(features: Features, config: MapConfig) -> Features:
     sizes = scale * config.edge_voxel, scale * config.plane_voxel
     if features.voxel_sizes == sizes:
         return features
-    stands_out = () if features.edge_prominence is None else (features.edge_prominence,)
-    edges = np.column_stack([features.edges, features.edge_times, *stands_out])
+    told = {name: getattr(features, name) for name in ("edge_prominence", "edge_sigmas")}
+    told = {name: column for name, column in told.items() if column is not None}
+    edges = np.column_stack([features.edges, features.edge_times, *told.values()])
     planes = np.column_stack([features.planes, features.plane_times])
     oblique = config.insertion == "settled"
     edges, planes = (
@@ -167,8 +169,8 @@ def thinned(features: Features, config: MapConfig) -> Features:
         plane_rings=np.zeros(len(planes), np.int64),
         sharp=np.empty(0, np.int64),
         flat=np.empty(0, np.int64),
-        edge_prominence=edges[:, 4].copy() if stands_out else None,
         voxel_sizes=sizes,
+        **dict(zip(told, edges[:, 4:].T.copy(), strict=True)),
     )
 
 
@@ -292,11 +294,9 @@ def _assemble(
         flat = np.arange(len(flat))
     points, plane_times, plane_rings = planes
     stands_out = prominence(sweep.xyz, settings.half_window, edges)
-    if settings.edge_reach > 0.0:
-        drop, beams = math.sqrt(settings.occlusion_gap), settings.edge_reach
-        edge_points = ends_of_surfaces(sweep.xyz, settings.half_window, edges, drop, beams)
-    else:
-        edge_points = measured(edges)[0]
+    drop, beams = math.sqrt(settings.occlusion_gap), settings.edge_reach
+    ends, apart = ends_of_surfaces(sweep.xyz, settings.half_window, edges, drop, beams)
+    edge_points = ends if beams > 0.0 else measured(edges)[0]
     with_poles = np.concatenate((edges, poles.middles))
     return Features(
         stamp=scan.stamp + round(reference * 1e9),
@@ -310,6 +310,7 @@ def _assemble(
         flat=flat,
         span=(span[0] - reference, span[1] - reference),
         edge_prominence=np.concatenate((stands_out, poles.depths)),
+        edge_sigmas=np.concatenate((UNIFORM_SIGMA * apart, poles.sigmas)),
         not_finite=sweep.not_finite,
         reach=reach,
     )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from loam_gtsam.frontend.curvature import EMPTY_BEAMS, LINKED_BEAMS
+from loam_gtsam.frontend.curvature import EMPTY_BEAMS, LINKED_BEAMS, UNIFORM_SIGMA
 from loam_gtsam.geometry import squared_norm
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
@@ -47,12 +47,14 @@ class Poles:
     points : (M, 3) metres, on the axis of a round pole through the points of the run
     first, last : (M,) first and last point of each run
     depths : (M,) metres by which a pole stands before what is beside it; infinite if nothing is
+    sigmas : (M,) metres, standard deviation of its place along the ring
     """
 
     points: FloatArray
     first: IntArray
     last: IntArray
     depths: FloatArray
+    sigmas: FloatArray
 
     def __len__(self) -> int:
         return len(self.points)
@@ -96,7 +98,7 @@ def find_poles(
     """
     if depth <= 0.0:
         nothing = np.zeros(0, np.int64)
-        return Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0))
+        return Poles(np.zeros((0, 3)), nothing, nothing, np.zeros(0), np.zeros(0))
     own = ring_starts[1:] > ring_starts[:-1]
     heads, tails = ring_starts[:-1][own], ring_starts[1:][own] - 1
     ranges = np.sqrt(squared_norm(xyz))
@@ -134,7 +136,9 @@ def find_poles(
     radii = 0.5 * _likely_widths(widths, apart, length == 1, upright)
     narrow = 2.0 * radii <= width
     points = means * (1.0 + _ROUND * radii / distance)[:, None]
-    return Poles(points[narrow], first[narrow], last[narrow], depths[narrow])
+    # What one beam met is not farther from it than its own width, nor than the next beam.
+    sigmas = UNIFORM_SIGMA * np.minimum(2.0 * radii, apart)
+    return Poles(*(column[narrow] for column in (points, first, last, depths, sigmas)))
 
 
 def _upright(rings: IntArray, beams: FloatArray, distances: FloatArray) -> BoolArray:

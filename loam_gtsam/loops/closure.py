@@ -21,9 +21,9 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.loops.keyframes import Keyframe, LoopClosure
 from loam_gtsam.loops.pose_graph import PoseGraph
 from loam_gtsam.loops.scan_context import compare_descriptors, heading_free_key, scan_context
-from loam_gtsam.registration.association import associate, trial_matching
+from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.degeneracy import localizability
-from loam_gtsam.registration.matches import ScanMatches, subset
+from loam_gtsam.registration.matches import ScanMatches, subset, trial_matching
 from loam_gtsam.registration.relocalization import Field, Fit, likely_poses, sample_features
 from loam_gtsam.registration.solvers import GtsamSolver, Solution, trial_solver
 from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error

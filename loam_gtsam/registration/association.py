@@ -105,6 +105,11 @@ def match_features(
                 lines = joined(lines, replace(more, indices=chosen[more.indices]))
                 left[lines.indices] = False
         lines = replace(lines, distinct=distinct[lines.indices])
+    if rows.sigmas is not None and config.fit_uncertainty:
+        # The points of the line missed the edge as the feature did, and all rings alike.
+        variances = 2.0 * rows.sigmas[lines.indices] ** 2 - config.point_sigma**2
+        sigmas = np.sqrt(lines.sigmas**2 + np.maximum(variances, 0.0))
+        lines = replace(lines, sigmas=sigmas)
     return ScanMatches(
         replace(lines, indices=rows.edges[lines.indices]),
         replace(surfaces, indices=rows.planes[surfaces.indices]),
@@ -197,18 +202,6 @@ def translations_fixed(planes: PlaneMatches) -> FloatArray:
 def leaves_open(planes: PlaneMatches, config: MatchingConfig) -> bool:
     """Whether planes leave a translation open, so that edges are searched for more widely."""
     return config.wide_search > 1.0 and bool(translations_fixed(planes)[0] < config.wide_below)
-
-
-def trial_matching(config: MatchingConfig) -> MatchingConfig:
-    """The configuration for few matches, with which a pose is tried quickly."""
-
-    def at_most(limit: int, most: int) -> int:
-        return min(limit, most) if most else limit
-
-    return config.changed(
-        max_edges=at_most(config.trial_edges, config.max_edges),
-        max_planes=at_most(config.trial_planes, config.max_planes),
-    )
 
 
 def rematched(

@@ -22,10 +22,16 @@ from loam_gtsam.registration.association import (
     match_surfaces,
     rematched,
     translations_fixed,
-    trial_matching,
 )
 from loam_gtsam.registration.degeneracy import Localizability, localizability
-from loam_gtsam.registration.matches import ChosenRows, ScanMatches, Search, chosen_rows, joined
+from loam_gtsam.registration.matches import (
+    ChosenRows,
+    ScanMatches,
+    Search,
+    chosen_rows,
+    joined,
+    trial_matching,
+)
 from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
@@ -394,7 +400,8 @@ def timed_rows(
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
-    return chosen_rows(sweep.n_edges, sweep.n_planes, matching, sweep.distinct, sweep.alone)
+    known = sweep.distinct, sweep.alone, sweep.edge_sigmas
+    return chosen_rows(sweep.n_edges, sweep.n_planes, matching, *known)
 
 
 @dataclass(frozen=True, eq=False)

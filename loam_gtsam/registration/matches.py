@@ -111,6 +111,7 @@ class ChosenRows:
     planes: IntArray  # rows among its planes
     distinct: BoolArray | None  # mask of ``edges``; None if all are distinct
     alone: BoolArray | None = None  # mask of those that are poles; None if none is known to be
+    sigmas: FloatArray | None = None  # metres, of the places of ``edges``; None if these are exact
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
@@ -119,13 +120,31 @@ class ChosenRows:
 def chosen_rows(
     edges: int, planes: int, config: MatchingConfig,
     distinct: BoolArray | None = None, alone: BoolArray | None = None,
+    sigmas: FloatArray | None = None,
 ) -> ChosenRows:  # fmt: skip
     """Choose the features that are matched, evenly spread: those that stand out first."""
     if distinct is not None and alone is None and distinct.all():
         distinct = None
     edge_rows = spread_rows(edges, config.max_edges, distinct)
-    known = [None if mask is None else mask[edge_rows] for mask in (distinct, alone)]
-    return ChosenRows(edge_rows, spread_rows(planes, config.max_planes), *known)
+    return ChosenRows(
+        edge_rows,
+        spread_rows(planes, config.max_planes),
+        None if distinct is None else distinct[edge_rows],
+        None if alone is None else alone[edge_rows],
+        None if sigmas is None else sigmas[edge_rows],
+    )
+
+
+def trial_matching(config: MatchingConfig) -> MatchingConfig:
+    """The configuration for few matches, with which a pose is tried quickly."""
+
+    def at_most(limit: int, most: int) -> int:
+        return min(limit, most) if most else limit
+
+    return config.changed(
+        max_edges=at_most(config.trial_edges, config.max_edges),
+        max_planes=at_most(config.trial_planes, config.max_planes),
+    )
 
 
 def spread_rows(count: int, limit: int, first: BoolArray | None = None) -> IntArray:

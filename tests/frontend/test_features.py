@@ -434,7 +434,7 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
     raw = Features.from_points(7, points, points[:300])
     raw = replace(raw, edge_times=times, plane_times=times[:300], span=(0.0, 0.1), not_finite=3)
     if known:
-        raw = replace(raw, edge_prominence=times + 1.0)
+        raw = replace(raw, edge_prominence=times + 1.0, edge_sigmas=times + 2.0)
     config = Config().map.changed(edge_voxel=0.5, plane_voxel=1.0, insertion="centroid")
     thin = thinned(raw, config)
     for size, held, moments, all_points in (
@@ -448,9 +448,10 @@ def test_thinned_features_are_the_centroids_of_their_voxels(known: bool) -> None
             np.testing.assert_allclose(point, all_points[inside].mean(axis=0), atol=1e-12)
             assert moment == pytest.approx(times[: len(inside)][inside].mean(), abs=1e-12)
     assert (thin.stamp, thin.span, thin.not_finite) == (7, (0.0, 0.1), 3)
-    assert (thin.edge_prominence is not None) is known
-    if thin.edge_prominence is not None:
-        np.testing.assert_allclose(thin.edge_prominence, thin.edge_times + 1.0)
+    for column, more in ((thin.edge_prominence, 1.0), (thin.edge_sigmas, 2.0)):
+        assert (column is not None) is known
+        if column is not None:
+            np.testing.assert_allclose(column, thin.edge_times + more)
     assert len(thin.edge_rings) == len(thin.edges)
     assert len(thin.plane_rings) == len(thin.planes)
     assert thinned(thin, config) is thin

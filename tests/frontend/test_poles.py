@@ -137,16 +137,18 @@ def test_poles_become_edges_near_their_axes_and_stay_out_of_the_planes():
     assert with_poles.sharp.max(initial=-1) < len(with_poles.edges)
 
 
-def posts(widths, distances, step):
-    """A ring, one beam every ``step``, that meets one flat post of each width, 3 degrees apart.
+def begins(count, step):
+    """Where so many posts begin, rad: 3 degrees apart, anywhere between two beams."""
+    return np.deg2rad(3.0) * (np.arange(count) + 0.3) + step * np.random.default_rng(0).random(
+        count
+    )
 
-    The posts begin anywhere between two beams; a wall is 300 m away.
-    """
-    rng = np.random.default_rng(0)
+
+def posts(widths, distances, step):
+    """A ring, one beam every ``step``, that meets flat posts (``begins``); a wall is 300 m away."""
     beams = np.arange(int(np.deg2rad(3.0) * len(widths) / step) + 20) * step
     ranges = np.full(len(beams), 300.0)
-    for number, (width, metres) in enumerate(zip(widths, distances, strict=True)):
-        begin = np.deg2rad(3.0) * (number + 0.3) + step * rng.random()
+    for begin, width, metres in zip(begins(len(widths), step), widths, distances, strict=True):
         ranges[(beams >= begin) & (beams < begin + width / metres)] = metres
     return ring_of(beams, ranges)
 
@@ -178,6 +180,21 @@ def test_what_one_beam_met_is_as_wide_as_what_more_beams_met(width):
     )
     assert radii[~single].mean() == pytest.approx(0.5 * width, rel=0.15)
     assert radii[single].mean() == pytest.approx(0.5 * width, rel=0.15)  # not 1.0, the beams' gap
+
+
+@pytest.mark.parametrize("beams", [0.4, 0.7, 1.3, 2.5, 4.0])
+def test_the_place_of_a_pole_is_known_as_well_as_it_says(beams):
+    """Of a wide one to the gap between two beams, of a thin one to its width."""
+    count, step, width = 110, np.deg2rad(0.2), 0.2
+    distances = np.where(np.arange(count) % 4, width / (beams * step), width / (3.3 * step))
+    poles, _ = found_in_two_rings(posts(np.full(count, width), distances, step))
+    middles = begins(count, step) + 0.5 * width / distances
+    turned = np.arctan2(poles.points[:, 1], poles.points[:, 0]) % (2.0 * np.pi)
+    post = np.abs(turned[:, None] - middles).argmin(axis=1)
+    off = np.sin(turned - middles[post]) * np.linalg.norm(poles.points, axis=1)
+    meant = post % 4 > 0
+    assert meant.sum() > 30
+    assert np.sqrt(np.mean((off / poles.sigmas)[meant] ** 2)) == pytest.approx(1.0, rel=0.5)
 
 
 def found_in_two_rings(points):

@@ -15,9 +15,8 @@ from loam_gtsam.registration.association import (
     match_lines,
     match_planes,
     rematched,
-    trial_matching,
 )
-from loam_gtsam.registration.matches import ScanMatches, chosen_rows, spread_rows
+from loam_gtsam.registration.matches import ScanMatches, chosen_rows, spread_rows, trial_matching
 
 CONFIG = MatchingConfig(plane_tolerance=0.2)  # groups may be rough
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
@@ -101,6 +100,18 @@ def test_sigmas_of_a_perfect_fit_in_closed_form(sigma):
     both = 1 + (1 + 1 / 0.2 + 4 / 0.128) / 5
     assert plane(1.0, 2.0) == pytest.approx(sigma * np.sqrt(both), rel=1e-6)
     assert line(0.0) < line(0.1) < line(1.0)
+
+
+@pytest.mark.parametrize("uncertain", [True, False])
+def test_an_edge_between_two_beams_is_somewhere_between_them(uncertain):
+    """And so is the line of the map; what is less than the noise of a point is in that."""
+    config, held = changed(fit_uncertainty=uncertain), map_of(line_group())
+    sigmas, features = np.array([0.0, 0.02, 0.2]), np.tile(AHEAD, (3, 1))
+    rows = chosen_rows(3, 0, config, sigmas=sigmas)
+    none = np.empty((0, 3))
+    found = match_features(features, none, gtsam.Pose3(), held, held, config, rows).edges
+    expected = 1.2 * 0.03**2 + np.array([0.0, 0.0, 2.0 * 0.2**2 - 0.03**2])
+    assert found.sigmas == pytest.approx(np.sqrt(expected) if uncertain else np.full(3, 0.03))
 
 
 def test_scatter_of_the_neighbours_raises_the_sigma():

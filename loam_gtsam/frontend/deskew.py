@@ -79,9 +79,9 @@ class MovingSweep:
         self._turned: tuple[FloatArray, FloatArray] | None = None
         self._bend: tuple[FloatArray, FloatArray] | None = None
         self.acceleration: FloatArray | None = None
-        span = np.array([first, 0.0, end]) - self.middle
+        self._span = np.array([first, 0.0, end]) - self.middle
         if moving and imu is not None and config.deskew.rotation != "constant_velocity":
-            moments = np.concatenate([span, *self._seconds])
+            moments = np.concatenate([self._span, *self._seconds])
             if config.deskew.rotation == "orientation":
                 turns = _turns_by_orientation(imu, self.stamp, moments, config.imu.max_gap)
                 motion = SweepMotion.ORIENTATION
@@ -90,12 +90,27 @@ class MovingSweep:
                 motion = SweepMotion.GYRO
             if turns is not None:
                 self.motion = motion
-                before, reference, after = turns[:3]
-                self._rate = (after - before) / (span[2] - span[0])
-                self._middle_R_reference: FloatArray = Rotation.from_rotvec(reference).as_matrix()
-                split = 3 + self.n_edges
-                edges, planes = self._points
-                self._turned = _rotated(edges, turns[3:split]), _rotated(planes, turns[split:])
+                self._turn(turns)
+
+    def _turn(self, turns: FloatArray) -> None:
+        """Turn the points by rotation vectors of the start, the reference, the end and them."""
+        before, reference, after = turns[:3]
+        self._rate = (after - before) / (self._span[2] - self._span[0])
+        self._middle_R_reference: FloatArray = Rotation.from_rotvec(reference).as_matrix()
+        split = 3 + self.n_edges
+        edges, planes = self._points
+        self._turned = _rotated(edges, turns[3:split]), _rotated(planes, turns[split:])
+
+    def turned_anew(self, imu: ImuBuffer) -> MovingSweep:
+        """The sweep with its rotation as the gyro knows it by now, with the bias of today."""
+        if self.motion is not SweepMotion.GYRO:
+            return self
+        turns = imu.rotations_since(self.stamp, np.concatenate([self._span, *self._seconds]))
+        if turns is None:
+            return self
+        sweep = copy(self)
+        sweep._turn(turns)
+        return sweep if self._bend is None else sweep.bent(*self._bend)
 
     def bent(self, seconds: FloatArray, path: FloatArray) -> MovingSweep:
         """The sweep of a lidar whose path bends.

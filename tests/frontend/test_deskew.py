@@ -152,6 +152,21 @@ def test_a_bias_of_the_gyro_is_taken_off():
     assert errors[1] < LIMITS["auto"]
 
 
+def test_a_sweep_may_be_turned_anew_once_the_bias_is_known():
+    imu = buffer()
+    features, _ = sweep()
+    path = np.array([-0.1, 0.0, 0.1]), np.array([[0.0, 0.1, 0.0], [0.0] * 3, [0.1, 0.0, 0.2]])
+    before, alone = MovingSweep(features, config(), imu), MovingSweep(features, config())
+    imu.gyro_bias = np.array([0.05, -0.1, 0.2])
+    known, twist = MovingSweep(features, config(), imu), twist_at(0.5)
+    assert not same(before, known, twist)
+    assert same(before.turned_anew(imu), known, twist)
+    assert same(before.bent(*path).turned_anew(imu), known.bent(*path), twist)
+    here, there = (one.middle_T_reference(twist) for one in (before.turned_anew(imu), known))
+    assert here.equals(there, 0.0)
+    assert alone.turned_anew(imu) is alone
+
+
 def without_imu(features, wanted=None):
     return MovingSweep(features, wanted or config())
 

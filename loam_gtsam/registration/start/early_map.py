@@ -108,7 +108,8 @@ class EarlyMap:
         """One of the sweeps, registered with the map of a matcher."""
         one = sweeps[number]
         expected = replace(one.expected, map_T_lidar=one.map_T_middle)
-        told = one.factors(sweeps[number - 1]) if number else []
+        last = sweeps[number - 1]
+        told = [*one.factors(last), *one.turn(last)] if number else []
         priors = [prior.factor() for prior in told]
         return self.solver.solve(matcher, one.map_T_middle, priors, expected)
 

@@ -37,6 +37,7 @@ from loam_gtsam.registration.start.ways import (
     Tried,
     Way,
     as_good,
+    as_turned,
     by_second_step,
     continued,
     is_surely_beaten,
@@ -44,6 +45,7 @@ from loam_gtsam.registration.start.ways import (
     parting,
     steady,
     tell_nothing,
+    turned_anew,
     without_turns,
 )
 from loam_gtsam.types import SweepMotion
@@ -72,6 +74,8 @@ _LESS = 1.0
 followed what stood had 0.4 less at most; in the right map places a metre off have one to three."""
 _FASTEST = 50.0  # m/s, 180 km/h: largest speed of a first motion
 _FARTHEST = 30.0  # metres: largest distance between the first two sweeps
+_KNOWN_TURN = np.diag(np.repeat([np.radians(0.3) ** -2, 0.0], 3))
+"""Information of the rotation between two sweeps by a gyro: above its noise and its bias."""
 _TURNING = 3.0  # rad/s: largest turn rate of a first motion about the vertical axis
 
 
@@ -83,7 +87,8 @@ class Start:
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
-        self._still = False  # whether an IMU was at rest when the run began, as far as scans tell
+        self._still = False  # whether an IMU was at rest when the run began
+        self._denied = False  # whether the scans deny what an IMU tells
         self._anew = False  # whether the sweeps are to be registered anew with the next one
 
     @classmethod
@@ -111,7 +116,7 @@ class Start:
         self._still = imu is not None and imu.was_still
         early, first = EarlyMap(frame, solver, self._map_T_first), self._sweeps[0]
         predicted, found = frame.predicted, expected.solution.map_T_lidar
-        told = _told(frame, found, first, solver)
+        told = _told(frame, found, first, solver, imu)
         second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, *told)
         seconds = first.moment.seconds_to(frame.sweep.stamp)
         centres = _centres(predicted.map_T_middle, first.map_T_middle)
@@ -156,12 +161,15 @@ class Start:
     ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
         posed, pose = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar
-        told = _told(frame, pose, self._sweeps[-1], solver)
+        told = _told(frame, pose, self._sweeps[-1], solver, imu)
         new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, *told)
         added = [*self._sweeps, new]
         if len(added) not in _TOGETHER and not self._anew:
             self._sweeps = added
             return frame, found
+        gyro = None if imu is None else imu.trusted_gyro
+        if gyro is not None:
+            added, *self._rivals = (turned_anew(way, gyro) for way in (added, *self._rivals))
         early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
         sweeps = early.together(added, 1 if len(added) in _ONCE and not rivals else 2)
         sweeps = early.with_motion(self._told_apart(early, sweeps))
@@ -203,27 +211,43 @@ class Start:
         best = self._best([taken, *telling], early.config, silent)
         return sweeps if best is taken else best[-1].sweeps
 
+    def _is_felt(self, way: Way, taken: Way) -> bool:
+        """Whether an IMU allows for a way: at rest for the one alone that was taken."""
+        return way is taken if self._still else as_turned(way)
+
     def _best(self, ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -> Way:
-        """The best of some ways; those that are as good, or of which no scan tells, are rivals."""
-        self._still = self._still and not is_surely_beaten(ways)
-        if self._still:  # which the IMU tells, and the scans do not deny
-            ways, silent = ways[:1], ()
+        """The best of some ways; those that are as good, or of which no scan tells, are rivals.
+
+        What an IMU does not allow for is no way, unless the scans are sure of it.
+        """
+        felt = [] if self._denied else [way for way in ways if self._is_felt(way, ways[0])]
+        if 0 < len(felt) < len(ways):
+            best, *_ = kept_ways(felt, config)
+            self._denied = is_surely_beaten([best, *ways])
+            if not self._denied:
+                ways, silent = felt, [way for way in silent if self._is_felt(way, ways[0])]
         best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best
 
 
 def _told(
-    frame: Frame, pose: gtsam.Pose3, before: EarlySweep, solver: NamedSolver
-) -> tuple[MotionPrior | None, MotionPrior | None]:
-    """What further factors say of the pose of a sweep, and of it seen from the sweep before."""
-    told, last = solver.told(frame.lasting, pose), frame.matcher.last
+    frame: Frame, pose: gtsam.Pose3, before: EarlySweep, solver: NamedSolver,
+    imu: ImuTracker | None,
+) -> tuple[MotionPrior | None, MotionPrior | None, MotionPrior | None]:  # fmt: skip
+    """What further factors say of a sweep; they, and a gyro, of it seen from the sweep before."""
+    told, last, turned = solver.told(frame.lasting, pose), frame.matcher.last, None
+    # The classical solvers have no place for factors.
+    if imu is not None and frame.matcher.config.solver.method == "gtsam":
+        rotation = imu.rotation_between(before.moment.stamp, frame.sweep.stamp)
+        if rotation is not None:
+            turned = MotionPrior(gtsam.Pose3(rotation, np.zeros(3)), _KNOWN_TURN)
     if last is None or last.stamp != before.moment.stamp:  # a sweep in between was not solved
-        return told, None
+        return told, None, turned
     moved = solver.told(frame.since_last, pose)
     if moved is not None:
         moved = replace(moved, map_T_lidar=last.map_T_lidar.between(moved.map_T_lidar))
-    return told, moved
+    return told, moved, turned
 
 
 def _centres(expected: gtsam.Pose3, first: gtsam.Pose3) -> list[gtsam.Pose3]:

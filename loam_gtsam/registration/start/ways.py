@@ -13,6 +13,7 @@ import numpy as np
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import five_sigma, transform
+from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.registration.odometry import Moment, advance
 from loam_gtsam.registration.relocalization.evidence import CHANCE, Evidence, Favour, favour
 from loam_gtsam.registration.relocalization.fits import beyond_any_motion, same, step_in_map
@@ -36,6 +37,7 @@ class EarlySweep:
     keyframe : number of the keyframe to which the points belong
     told : what further factors say of the pose, whichever way leads there; None without any
     moved : what they say of the pose seen from the sweep before; None without any
+    turned : what a gyro says of that pose, the rotation; None without one
     """
 
     posed: PosedSweep
@@ -44,6 +46,7 @@ class EarlySweep:
     keyframe: int
     told: MotionPrior | None = None
     moved: MotionPrior | None = None
+    turned: MotionPrior | None = None
 
     @property
     def moment(self) -> Moment:
@@ -52,11 +55,19 @@ class EarlySweep:
 
     def factors(self, before: EarlySweep) -> list[MotionPrior]:
         """What further factors say of the pose, with the sweep before where it is."""
-        found = [] if self.told is None else [self.told]
-        if self.moved is not None:
-            place = before.map_T_middle.compose(self.moved.map_T_lidar)
-            found.append(replace(self.moved, map_T_lidar=place))
-        return found
+        told = () if self.told is None else (self.told,)
+        return [*told, *_seen_from(before, self.moved)]
+
+    def turn(self, before: EarlySweep) -> list[MotionPrior]:
+        """What a gyro says of it."""
+        return _seen_from(before, self.turned)
+
+
+def _seen_from(before: EarlySweep, moved: MotionPrior | None) -> list[MotionPrior]:
+    """What is known of a pose seen from the sweep before, with that where it is; if anything is."""
+    if moved is None:
+        return []
+    return [replace(moved, map_T_lidar=before.map_T_middle.compose(moved.map_T_lidar))]
 
 
 class Tried(NamedTuple):
@@ -154,10 +165,18 @@ def mean_twist(one: EarlySweep, other: EarlySweep) -> FloatArray:
     return twist
 
 
+def turned_anew(sweeps: Sequence[EarlySweep], imu: ImuBuffer) -> list[EarlySweep]:
+    """The sweeps, turned by a gyro whose bias is better known by now."""
+    return [
+        replace(sweep, posed=sweep.posed.sweep.turned_anew(imu).at(sweep.posed.twist))
+        for sweep in sweeps
+    ]
+
+
 def without_turns(sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
     """The sweeps, de-skewed as if no IMU had been there."""
     return [
-        replace(sweep, posed=sweep.posed.sweep.without_turns().at(sweep.posed.twist))
+        replace(sweep, posed=sweep.posed.sweep.without_turns().at(sweep.posed.twist), turned=None)
         for sweep in sweeps
     ]
 
@@ -215,12 +234,19 @@ def tell_nothing(one: Way, other: Way, least: float) -> bool:
 
 def _as_told(way: Way) -> bool:
     """Whether further factors contradict no pose of a way, by their covariances."""
-    for before, sweep in pairwise(way[-1].sweeps):
-        for told in sweep.factors(before):
-            away = told.map_T_lidar.localCoordinates(sweep.map_T_middle)
-            if away @ told.information @ away > _UNLIKELY:
-                return False
-    return True
+    pairs = pairwise(way[-1].sweeps)
+    return not any(_contradicts(told, now) for last, now in pairs for told in now.factors(last))
+
+
+def as_turned(way: Way) -> bool:
+    """Whether a gyro contradicts no pose of a way."""
+    pairs = pairwise(way[-1].sweeps)
+    return not any(_contradicts(told, now) for last, now in pairs for told in now.turn(last))
+
+
+def _contradicts(told: MotionPrior, sweep: EarlySweep) -> bool:
+    away = told.map_T_lidar.localCoordinates(sweep.map_T_middle)
+    return bool(away @ told.information @ away > _UNLIKELY)
 
 
 def _drivable(way: Way, config: RelocalizationConfig) -> bool:

@@ -294,7 +294,7 @@ class Mapper:
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike, of_imu = with_imu(self.imu, posed, *told)
         if found.message or unlike:
-            self.errors.jumped(frame.predicted, solution.map_T_lidar, unlike=unlike)
+            self.errors.jumped(frame.predicted, posed, solution.map_T_lidar, unlike=unlike)
         if self._start is None and not found.message:
             self.point_times.add(posed, solution)
         status, message = status_of(solution, found.message or self.point_times.problem or of_imu)

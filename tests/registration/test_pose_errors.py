@@ -397,9 +397,9 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     found = gtsam.Pose3().retract(np.array(step))
     errors._motion._mean[:] = [0.0, 0.0, usual**2, usual**2, 0.0, 0.0]
     stamp = before.stamp + round(seconds * 1e9)
-    posed = SimpleNamespace(sweep=SimpleNamespace(stamp=stamp))
+    posed = PosedSweep(SimpleNamespace(stamp=stamp), np.zeros(6))
     expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed)
-    errors.jumped(expected, found, unlike=unlike)
+    errors.jumped(expected, replace(posed, twist=np.ones(6)), found, unlike=unlike)
     after = calibrated(errors, 6, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
     expected = 0.5 * np.square(step) if told else np.zeros(6)
@@ -407,6 +407,28 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     # The motion after it is as well known as ever.
     later = calibrated(errors, 7, found)
     assert np.abs(relative_covariance(after, later)).max() < 0.1
+
+
+@pytest.mark.parametrize("kept", [True, False])
+def test_a_sweep_that_was_moved_but_keeps_its_motion_was_hardly_taken_in_that(kept, monkeypatch):
+    """At its start, half of the time since the last one away, it may be off by half of the step."""
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    step, own = np.array([0.0, 0.1, 0.0, 0.2, 0.0, 0.0]), []
+    found = gtsam.Pose3().retract(step)
+    for moved in (False, True):
+        errors = PoseErrors(Config())
+        for k in range(6):
+            calibrated(errors, k)
+        before = PosedSweep(SimpleNamespace(stamp=6 * FRAME), np.zeros(6))
+        after = before if kept else replace(before, twist=np.ones(6))
+        expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=before)
+        if moved:
+            errors.jumped(expected, after, found, unlike=False)
+        own.append(calibrated(errors, 6).uncertainty.own)
+        later = calibrated(errors, 7).uncertainty.own
+    np.testing.assert_allclose(own[1] - own[0], kept * np.outer(step, step) / 4.0, atol=1e-9)
+    assert later[4, 4] == pytest.approx(own[0][4, 4], rel=0.1)
 
 
 def test_a_singular_frame_has_no_covariance_and_the_next_follows_none(monkeypatch):

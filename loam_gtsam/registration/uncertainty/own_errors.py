@@ -63,6 +63,7 @@ class OwnErrors:
         self._gyro_noise = gyro_noise
         self._last: _Middle | None = None
         self._paused = False
+        self._strayed = np.zeros(6)  # how far the next frame is from where the motion leads
 
     @property
     def last(self) -> tuple[int, gtsam.Pose3] | None:
@@ -72,6 +73,10 @@ class OwnErrors:
     def cut(self, *, paused: bool = False) -> None:
         """The next frame follows none; if ``paused``, it is on another clock."""
         self._last, self._paused = None, self._paused or paused
+
+    def stray(self, step: FloatArray) -> None:
+        """The next frame is a step (6,) from where the motion leads, which it has kept."""
+        self._strayed = step
 
     def of(
         self,
@@ -96,7 +101,7 @@ class OwnErrors:
                 own = own + _changed(update.twist, sweep, motion.variances)
         else:
             now, own, shared = self._by_imu(now, sweep, motion, fused, update)
-        self._last, self._paused = now, False
+        self._last, self._paused, self._strayed = now, False, np.zeros(6)
         follows = None if last is None else last.reference_stamp
         return OwnError(symmetric(own), to_reference, shared, follows)
 
@@ -120,7 +125,9 @@ class OwnErrors:
             across = share[:, None] * now.map_T_lidar.between(last.map_T_lidar).AdjointMap()
             own = own + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
-        own = to_reference @ (own + np.diag(self._missed(sweep, motion))) @ to_reference.T
+        strayed = share * self._strayed
+        own = own + np.diag(self._missed(sweep, motion)) + np.outer(strayed, strayed)
+        own = to_reference @ own @ to_reference.T
         return replace(now, kept=kept), own, shared
 
     def _by_imu(

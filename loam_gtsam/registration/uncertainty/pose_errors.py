@@ -178,16 +178,21 @@ class PoseErrors:
         if before is not None and not self._map.doubt.any() and sweep.stamp > before[0]:
             self._motion.add(*before, sweep.stamp, middle, known)
 
-    def jumped(self, expected: Prediction, pose: gtsam.Pose3, *, unlike: bool) -> None:
+    def jumped(
+        self, expected: Prediction, posed: PosedSweep, pose: gtsam.Pose3, *, unlike: bool
+    ) -> None:
         """Account for a pose elsewhere than the motion had led to expect the middle of a sweep.
 
         If no usual acceleration leads there, it may only look alike. An IMU to which it is
-        ``unlike`` knew better.
+        ``unlike`` knew better. A sweep that is ``posed`` with the expected motion was hardly taken
+        in that.
         """
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step = before.localCoordinates(pose)
         if unlike or not (same(before, pose) or self._motion.explains(step, now)):
             self._map.add_jump(pose, step)
+        elif np.array_equal(posed.twist, expected.posed.twist):
+            self._own.stray(step)
 
     def moved(self, step: gtsam.Pose3) -> None:
         """As :meth:`MapError.add_move`."""

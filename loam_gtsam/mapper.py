@@ -24,10 +24,10 @@ from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
 from loam_gtsam.registration.point_times import PointTimes
 from loam_gtsam.registration.relocalization import (
-    Fit,
     FitMonitor,
     Found,
     Lost,
+    accept,
     doubtful,
     found_at,
     search,
@@ -288,7 +288,7 @@ class Mapper:
             frame, found = self._start.add(frame, found, self.keyframe, self._named, self.imu)
             self._start = None if self._start.complete else self._start
         solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
-        self.monitor.accept(Fit.of(solution.matches, frame.matcher.offered), solution.map_T_lidar)
+        accept(frame, found, self.monitor)
         scan = self.errors.of_scan(solution, small=self.maps.small)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):

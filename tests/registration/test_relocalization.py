@@ -35,6 +35,7 @@ from loam_gtsam.registration.relocalization import (
     FitMonitor,
     Found,
     Lost,
+    accept,
     any_of,
     doubtful,
     doubtful_sweeps,
@@ -419,6 +420,24 @@ def test_of_places_that_fit_as_well_the_nearest_comes_first(
     watch = SimpleNamespace(lost=lost, radius=10.0, around=lambda pose: [pose])
     found = doubtful_sweeps._places(frame, unsolved, watch, solver)
     assert [id(pose) for pose in found] == [id(places[k]) for k in order]
+
+
+def test_a_velocity_that_lasts_is_no_jump_from_the_second_sweep_on(before, calm, monkeypatch):
+    """A sweep that keeps another one than led to it tells it: who brakes hard does not jump on."""
+    frame, monitor = frame_of(before, list(calm)[AT]), deepcopy(before.monitor)
+    solution, last = frame.solve(before.solver), frame.matcher.last
+    way = last.map_T_lidar.between(solution.map_T_lidar)
+    led = gtsam.Pose3.Logmap(way) / last.seconds_to(frame.sweep.stamp)
+    kept = led + np.array([0.0, 0.0, 0.0, 8.0, 0.0, 0.0])
+    found = Found(solution, frame.sweep.at(kept), "moved by 0.80 m")
+    monkeypatch.setattr(doubtful_sweeps, "_with_motion", lambda *_: found)
+    assert doubtful(frame, solution, monitor, kept) is Doubt.JUMP
+    accept(frame, search(frame, solution, monitor, before.solver, Doubt.JUMP), monitor)
+    np.testing.assert_array_equal(monitor.led, led)
+    assert doubtful(frame, solution, monitor, kept) is None
+    accept(frame, doubtful_sweeps.found_at(frame, solution), monitor)
+    assert monitor.led is None
+    assert doubtful(frame, solution, monitor, kept) is Doubt.JUMP
 
 
 @pytest.mark.parametrize(("metres", "doubt"), [(0.3, None), (0.8, Doubt.OPTIMUM)])

@@ -4,6 +4,7 @@ from loam_gtsam.registration.relocalization.doubtful_sweeps import RELOCALISED a
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Doubt as Doubt
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Found as Found
 from loam_gtsam.registration.relocalization.doubtful_sweeps import Lost as Lost
+from loam_gtsam.registration.relocalization.doubtful_sweeps import accept as accept
 from loam_gtsam.registration.relocalization.doubtful_sweeps import any_of as any_of
 from loam_gtsam.registration.relocalization.doubtful_sweeps import doubtful as doubtful
 from loam_gtsam.registration.relocalization.doubtful_sweeps import found_at as found_at

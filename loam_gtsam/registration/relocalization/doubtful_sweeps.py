@@ -53,6 +53,7 @@ class Found:
     message: str = ""  # sentence for the user if the search moved the sweep
     doubt: FloatArray | None = None  # (6, 6) covariance, map frame, if other places may be right
     parting: FloatArray | None = None  # (6, 6) mean square velocity at which these go elsewhere
+    led: FloatArray | None = None  # (6,) velocity that led to the pose, if the sweep keeps another
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -84,8 +85,10 @@ def doubtful(
     if monitor.misfit(fit):
         return Doubt.MISFIT
     seconds = moment.seconds_to(frame.sweep.stamp)
-    expected = advance(moment.map_T_lidar, last_twist, seconds)
-    if monitor.jumped(expected.localCoordinates(solution.map_T_lidar), seconds):
+    twists = [last_twist] if monitor.led is None else [last_twist, monitor.led]
+    expected = [advance(moment.map_T_lidar, twist, seconds) for twist in twists]
+    steps = [pose.localCoordinates(solution.map_T_lidar) for pose in expected]
+    if all(monitor.jumped(step, seconds) for step in steps):
         return Doubt.JUMP
     return Doubt.OPTIMUM if _another_optimum(frame, solution, monitor, fit) else None
 
@@ -145,6 +148,10 @@ def search(
         found = _with_motion(frame, solution.map_T_lidar, twists, monitor, solver)
         if found is not None and found.posed.twist is stays.posed.twist:
             found = None
+        if found is not None and matcher.last is not None:
+            way = matcher.last.map_T_lidar.between(found.solution.map_T_lidar)
+            seconds = matcher.last.seconds_to(frame.sweep.stamp)
+            found = replace(found, led=gtsam.Pose3.Logmap(way) / seconds)
     else:
         found = _elsewhere(frame, solution, monitor, solver, stays)
     matcher.clock.lap("relocalize")
@@ -273,6 +280,13 @@ def any_of(pose: gtsam.Pose3, rivals: Sequence[gtsam.Pose3]) -> FloatArray | Non
     steps = np.array([step_in_map(pose, rival) for rival in rivals])
     total: FloatArray = steps.T @ steps / (1 + len(rivals))
     return total
+
+
+def accept(frame: Frame, found: Found, monitor: FitMonitor) -> None:
+    """Tell the monitor of a sweep that goes into the map where it was found."""
+    solution = found.solution
+    fit = Fit.of(solution.matches, frame.matcher.offered)
+    monitor.accept(fit, solution.map_T_lidar, found.led)
 
 
 def unplaced(frame: Frame, outcome: Found | Lost, monitor: FitMonitor) -> MapUpdate:

@@ -107,6 +107,7 @@ class FitMonitor:
         self.config = config
         self.lost = 0  # sweeps in a row that did not fit
         self.last: gtsam.Pose3 | None = None  # pose of the last sweep that fitted
+        self.led: FloatArray | None = None  # velocity (6,) that led there, if it kept another one
         self._past: deque[Fit] = deque(maxlen=config.memory)
 
     @property
@@ -121,9 +122,9 @@ class FitMonitor:
         share, agreement = np.median(past, axis=0).tolist() if len(past) else (0.0, 0.0)
         return Fit(share, agreement)
 
-    def accept(self, fit: Fit, map_T_lidar: gtsam.Pose3) -> None:
+    def accept(self, fit: Fit, map_T_lidar: gtsam.Pose3, led: FloatArray | None = None) -> None:
         """Add the fit of a sweep that went into the map."""
-        self.lost, self.last = 0, map_T_lidar
+        self.lost, self.last, self.led = 0, map_T_lidar, led
         self._past.append(fit)
 
     def misfit(self, fit: Fit) -> bool:

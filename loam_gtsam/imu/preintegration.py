@@ -12,7 +12,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.geometry import as_array, as_vector, cross
+from loam_gtsam.geometry import as_array, as_vector, cross, positive_root, symmetric
 from loam_gtsam.imu.preintegration_window import (
     BIASES,
     GRAVITY,
@@ -349,9 +349,11 @@ def _surprise_of_turn(error: FloatArray, told: FloatArray, information: FloatArr
     """
     across, shifts = information[:3, 3:], information[3:, 3:]
     turns = information[:3, :3] - across @ np.linalg.pinv(shifts, hermitian=True) @ across.T
-    # The inverse of both covariances' sum; that of the scan may be infinite.
-    both = np.linalg.solve(np.eye(3) + turns @ told, turns)
-    return float(error @ both @ error)
+    # By the inverse of both covariances' sum, of which either may be beyond all bounds.
+    root = positive_root(turns)
+    variances, axes = np.linalg.eigh(symmetric(root @ told @ root))
+    seen = axes.T @ root @ error
+    return float(np.sum(seen**2 / (1.0 + np.maximum(variances, 0.0))))
 
 
 def _has_inverse(matrix: FloatArray) -> bool:

@@ -8,7 +8,7 @@ from support.jacobians import numerical
 
 from loam_gtsam.config import ImuConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
-from loam_gtsam.imu.preintegration import InertialOdometry, StartSigmas
+from loam_gtsam.imu.preintegration import InertialOdometry, StartSigmas, _surprise_of_turn
 from loam_gtsam.imu.preintegration_window import information_root, scan_factor, scan_residual
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ImuSamples, InputError, SweepError
@@ -515,6 +515,18 @@ def test_a_frame_that_is_put_elsewhere_in_the_map_tells_no_bias():
         found[knows] = np.abs(odo.state.gyro_bias - before.gyro_bias).max(), odo.turn_surprise
     assert found[True][0] < 1e-6 < 1e-3 < found[False][0]
     assert found[True][1] < 1e-3 < 9.0 < found[False][1]
+
+
+@pytest.mark.parametrize("far", [1.0, 1e12])
+def test_a_turn_is_as_surprising_as_both_covariances_say(far):
+    """However little is known of the prediction, as with a gyro in degrees."""
+    told, error = np.diag([1e-4, 4e-4, far]), np.array([0.02, 0.0, 0.1])
+    information = np.zeros((6, 6))
+    information[0, 0], information[2, 2] = 1e4, 1e12  # nothing of the second axis
+    found = _surprise_of_turn(error, told, information)
+    assert found == pytest.approx(0.02**2 / 2e-4 + 0.1**2 / (far + 1e-12))
+    one = np.outer(np.ones(3), np.ones(3))
+    assert _surprise_of_turn(error, 1e25 * one, 1e12 * np.eye(6)) >= 0.0
 
 
 def test_a_frame_that_was_put_elsewhere_has_to_be_predicted_from_there():

@@ -92,6 +92,10 @@ class GyroTrust:
         if distance > _TURNED:
             self._count(min(distance / _TURNED, _CLEAR))
 
+    def denied(self) -> None:
+        """Take in that the scans are sure of another turn: it is not to be used."""
+        self._count(_GIVEN_UP)
+
     def _count(self, frames: float) -> None:
         held, most = self.holds, _GIVEN_UP * 2.0 ** (self._given_up + 1)
         self._frames = min(max(self._frames + frames, 0.0), most)

@@ -437,27 +437,61 @@ def test_what_may_move_counts_once_against_a_way_that_may_be_true():
     assert ways._favour(passed, taken).every < -3.0
 
 
-@pytest.mark.parametrize("at_rest", [True, False])
 @pytest.mark.parametrize(("count", "stays"), [(16, True), (36, False)])
-def test_what_an_imu_tells_stands_unless_the_scans_are_sure(count, stays, at_rest):
-    """Of so many features, each agrees at the other place alone: 4 and 6 standard deviations.
-
-    The IMU was at rest, or its gyro did not turn as on the way there.
-    """
-    turned = {} if at_rest else {"told": 0.0, "of": "turned"}
+def test_what_an_imu_tells_stands_unless_the_scans_are_sure(count, stays):
+    """Of so many features, each agrees at the other place alone: 4 and 6 standard deviations."""
     still = place(0.0 * AHEAD, [], np.zeros(count), AHEAD)
     there = place(2.0 * AHEAD, [], np.ones(count), AHEAD)
     tried = [
-        (one._replace(sweeps=way_of(at, **turned)[0].sweeps),)
-        for one, at in ((still, 0.0), (there, 2.0))
+        (one._replace(sweeps=way_of(at)[0].sweeps),) for one, at in ((still, 0.0), (there, 2.0))
     ]
     assert ways._better(tried[1], tried[0], 8.0)
     assert ways.is_surely_beaten(tried) is not stays
     start = first_sweeps.Start(*first_sweep())
-    start._still = at_rest
+    start._still = True
     assert start._best(tried, CONFIG) is tried[0 if stays else 1]
-    assert start._denied is not stays
-    assert start._best([*tried, tried[0]], CONFIG) is tried[0 if stays else 1]
+    assert start._still is stays
+
+
+def parking_deck(seed):
+    """Floor and ceiling, pillars and beams every 7.5 m, and cars: little tells how one turns."""
+    rng, x = np.random.default_rng(seed), np.arange(-35.0, 76.0, 7.5)
+    pillars = [[a, b, 1.25, 0.2, 0.3, 1.25, 0.0] for a in x for b in (-24.0, -8.0, 8.0, 24.0)]
+    beams = [[a, 0.0, 2.35, 0.15, 40.0, 0.15, 0.0] for a in x]
+    cars = [
+        [a, b + rng.normal(0.0, 0.3), 0.7, 0.9, 2.1, 0.55, 0.0]
+        for b in (-12.0, 12.0)
+        for a in np.arange(-33.0, 70.0, 2.6)
+        if rng.random() < 0.5
+    ]
+    ceiling = [[20.0, 0.0, 2.6, 60.0, 40.0, 0.1, 0.0]]
+    way = np.stack([np.arange(-20.0, 40.0, 5.0), np.zeros(12)], axis=1)
+    solids = Solids(boxes=np.array([*pillars, *beams, *cars, *ceiling]))
+    return Scene("parking deck", solids, way, speed=4.0, height=1.6)
+
+
+@pytest.mark.parametrize(
+    ("scene", "sensor", "unit", "heeded", "trusted"),
+    [
+        ("shaken", "vlp16", 1.0, False, True),  # the scans alone turn as it does
+        ("shaken", "vlp16", np.rad2deg(1.0), False, False),  # they are sure that it is wrong
+        (parking_deck(3), "mid360", 1.0, True, True),
+    ],
+)
+def test_a_gyro_is_heeded_where_the_scans_alone_turn_otherwise_unless_they_are_sure(
+    scene, sensor, unit, heeded, trusted
+):
+    options = {"start": "moving", "imu": "mems", "columns": 600, "seed": 2}
+    world = SimulatedWorld(scene, sensor=sensor, frames=3, **options)
+    samples = replace(world.imu, gyro=unit * world.imu.gyro)
+    mapper = Mapper(Config(), imu=ImuBuffer(Config().imu, samples))
+    updates = [mapper.register(extract_features(scan, Config())) for scan in world]
+    assert mapper._start._heeds_gyro is heeded
+    assert (mapper.imu.trusted_gyro is not None) is trusted
+    moved = updates[0].map_T_lidar.between(updates[2].map_T_lidar)
+    before, _, now = map(gtsam.Pose3, world.truth.map_T_lidar)
+    turn = gtsam.Rot3.Logmap(before.between(now).between(moved).rotation())
+    assert np.linalg.norm(turn) < np.radians(1.0)
 
 
 @pytest.mark.parametrize(

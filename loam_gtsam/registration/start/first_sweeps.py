@@ -87,8 +87,8 @@ class Start:
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
-        self._still = False  # whether an IMU was at rest when the run began
-        self._denied = False  # whether the scans deny what an IMU tells
+        self._still = False  # whether an IMU was at rest when the run began, as far as scans tell
+        self._heeds_gyro = False  # whether its rotation is a factor: the scans alone did not agree
         self._anew = False  # whether the sweeps are to be registered anew with the next one
 
     @classmethod
@@ -116,20 +116,42 @@ class Start:
         self._still = imu is not None and imu.was_still
         early, first = EarlyMap(frame, solver, self._map_T_first), self._sweeps[0]
         predicted, found = frame.predicted, expected.solution.map_T_lidar
-        told = _told(frame, found, first, solver, imu)
+        told = _told(frame, found, first, solver)
         second = EarlySweep(frame.matcher.posed, found, predicted.motion, 0, *told)
         seconds = first.moment.seconds_to(frame.sweep.stamp)
         centres = _centres(predicted.map_T_middle, first.map_T_middle)
         within = min(_FASTEST * seconds, _FARTHEST), _TURNING * seconds
         places = _likely(first, second, centres, _PLACES, within)
-        ways = [
-            (early.registered(early.with_motion(tried.sweeps)),)
-            for tried in _hopeful(early, first, second, places)
-        ]
+        ways = _ways(early, first, second, places)
+        turned = _turned(frame, first, imu)
+        if imu is not None and turned is not None:
+            ways = self._by_gyro(early, replace(second, turned=turned), within, places, ways, imu)
         (best,) = self._best(ways, early.config)
         self._sweeps = best.sweeps[:1]
         early.fill(self._sweeps)
         return replace(expected, solution=best.solution, posed=best.sweeps[1].posed)
+
+    def _by_gyro(
+        self, early: EarlyMap, second: EarlySweep, within: tuple[float, float],
+        places: Sequence[gtsam.Pose3], ways: list[Way], imu: ImuTracker,
+    ) -> list[Way]:  # fmt: skip
+        """The ways themselves, if all that may be true turn as a gyro did; else those with it.
+
+        If one that knows nothing of the gyro is surely better than these, the gyro is wrong.
+        """
+        first, config = self._sweeps[0], early.config
+        if all(as_turned(way, second) for way in kept_ways(ways, config)):
+            return ways
+        felt = _ways(early, first, second, places)
+        start = first.map_T_middle
+        first, second = without_turns([first, replace(second, map_T_middle=start)])
+        places = _likely(first, second, [start], _PLACES, within)
+        without = _ways(early, first, second, places)
+        self._heeds_gyro = not is_surely_beaten([kept_ways(felt, config)[0], *without])
+        if self._heeds_gyro:
+            return felt
+        imu.gyro.denied()
+        return without
 
     def add(
         self, frame: Frame, found: Found, keyframe: int, solver: NamedSolver,
@@ -161,13 +183,16 @@ class Start:
     ) -> tuple[Frame, Found]:  # fmt: skip
         """As :meth:`add`, without what is in doubt."""
         posed, pose = frame.sweep.at(found.posed.twist), found.solution.map_T_lidar
-        told = _told(frame, pose, self._sweeps[-1], solver, imu)
-        new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, *told)
+        told = _told(frame, pose, self._sweeps[-1], solver)
+        turned = _turned(frame, self._sweeps[-1], imu) if self._heeds_gyro else None
+        new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, *told, turned)
         added = [*self._sweeps, new]
+        gyro = None if imu is None else imu.trusted_gyro
+        if imu is not None and gyro is None:
+            added = without_turns(added)
         if len(added) not in _TOGETHER and not self._anew:
             self._sweeps = added
             return frame, found
-        gyro = None if imu is None else imu.trusted_gyro
         if gyro is not None:
             added, *self._rivals = (turned_anew(way, gyro) for way in (added, *self._rivals))
         early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
@@ -211,43 +236,45 @@ class Start:
         best = self._best([taken, *telling], early.config, silent)
         return sweeps if best is taken else best[-1].sweeps
 
-    def _is_felt(self, way: Way, taken: Way) -> bool:
-        """Whether an IMU allows for a way: at rest for the one alone that was taken."""
-        return way is taken if self._still else as_turned(way)
-
     def _best(self, ways: Sequence[Way], config: Config, silent: Sequence[Way] = ()) -> Way:
-        """The best of some ways; those that are as good, or of which no scan tells, are rivals.
-
-        What an IMU does not allow for is no way, unless the scans are sure of it.
-        """
-        felt = [] if self._denied else [way for way in ways if self._is_felt(way, ways[0])]
-        if 0 < len(felt) < len(ways):
-            best, *_ = kept_ways(felt, config)
-            self._denied = is_surely_beaten([best, *ways])
-            if not self._denied:
-                ways, silent = felt, [way for way in silent if self._is_felt(way, ways[0])]
+        """The best of some ways; those that are as good, or of which no scan tells, are rivals."""
+        self._still = self._still and not is_surely_beaten(ways)
+        if self._still:  # which the IMU tells, and the scans do not deny
+            ways, silent = ways[:1], ()
         best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
         return best
 
 
 def _told(
-    frame: Frame, pose: gtsam.Pose3, before: EarlySweep, solver: NamedSolver,
-    imu: ImuTracker | None,
-) -> tuple[MotionPrior | None, MotionPrior | None, MotionPrior | None]:  # fmt: skip
-    """What further factors say of a sweep; they, and a gyro, of it seen from the sweep before."""
-    told, last, turned = solver.told(frame.lasting, pose), frame.matcher.last, None
-    # The classical solvers have no place for factors.
-    if imu is not None and frame.matcher.config.solver.method == "gtsam":
-        rotation = imu.rotation_between(before.moment.stamp, frame.sweep.stamp)
-        if rotation is not None:
-            turned = MotionPrior(gtsam.Pose3(rotation, np.zeros(3)), _KNOWN_TURN)
+    frame: Frame, pose: gtsam.Pose3, before: EarlySweep, solver: NamedSolver
+) -> tuple[MotionPrior | None, MotionPrior | None]:
+    """What further factors say of the pose of a sweep, and of it seen from the sweep before."""
+    told, last = solver.told(frame.lasting, pose), frame.matcher.last
     if last is None or last.stamp != before.moment.stamp:  # a sweep in between was not solved
-        return told, None, turned
+        return told, None
     moved = solver.told(frame.since_last, pose)
     if moved is not None:
         moved = replace(moved, map_T_lidar=last.map_T_lidar.between(moved.map_T_lidar))
-    return told, moved, turned
+    return told, moved
+
+
+def _turned(frame: Frame, before: EarlySweep, imu: ImuTracker | None) -> MotionPrior | None:
+    """What a gyro says of a sweep seen from the one before; None for a solver without factors."""
+    if imu is None or frame.matcher.config.solver.method != "gtsam":
+        return None
+    rotation = imu.rotation_between(before.moment.stamp, frame.sweep.stamp)
+    if rotation is None:
+        return None
+    return MotionPrior(gtsam.Pose3(rotation, np.zeros(3)), _KNOWN_TURN)
+
+
+def _ways(
+    early: EarlyMap, first: EarlySweep, second: EarlySweep, places: Sequence[gtsam.Pose3]
+) -> list[Way]:
+    """The first two sweeps, from where they are and from places of the second one."""
+    hopeful = _hopeful(early, first, second, places)
+    return [(early.registered(early.with_motion(tried.sweeps)),) for tried in hopeful]
 
 
 def _centres(expected: gtsam.Pose3, first: gtsam.Pose3) -> list[gtsam.Pose3]:

@@ -238,10 +238,10 @@ def _as_told(way: Way) -> bool:
     return not any(_contradicts(told, now) for last, now in pairs for told in now.factors(last))
 
 
-def as_turned(way: Way) -> bool:
-    """Whether a gyro contradicts no pose of a way."""
-    pairs = pairwise(way[-1].sweeps)
-    return not any(_contradicts(told, now) for last, now in pairs for told in now.turn(last))
+def as_turned(way: Way, felt: EarlySweep) -> bool:
+    """Whether what a gyro says of the second sweep does not contradict it where a way has it."""
+    first, second = way[0].sweeps
+    return not any(_contradicts(told, second) for told in felt.turn(first))
 
 
 def _contradicts(told: MotionPrior, sweep: EarlySweep) -> bool:

@@ -81,19 +81,23 @@ class MovingSweep:
         self.acceleration: FloatArray | None = None
         self._span = np.array([first, 0.0, end]) - self.middle
         if moving and imu is not None and config.deskew.rotation != "constant_velocity":
-            moments = np.concatenate([self._span, *self._seconds])
             if config.deskew.rotation == "orientation":
-                turns = _turns_by_orientation(imu, self.stamp, moments, config.imu.max_gap)
+                turns = _turns_by_orientation(imu, self.stamp, self._moments, config.imu.max_gap)
                 motion = SweepMotion.ORIENTATION
             else:
-                turns = imu.rotations_since(self.stamp, moments)
+                turns = imu.rotations_since(self.stamp, self._moments)
                 motion = SweepMotion.GYRO
             if turns is not None:
                 self.motion = motion
                 self._turn(turns)
 
+    @property
+    def _moments(self) -> FloatArray:
+        """Seconds from the middle to the start, the reference, the end, and all points."""
+        return np.concatenate([self._span, *self._seconds])
+
     def _turn(self, turns: FloatArray) -> None:
-        """Turn the points by rotation vectors of the start, the reference, the end and them."""
+        """Turn the points by the rotation vectors (3 + N, 3) of these moments."""
         before, reference, after = turns[:3]
         self._rate = (after - before) / (self._span[2] - self._span[0])
         self._middle_R_reference: FloatArray = Rotation.from_rotvec(reference).as_matrix()
@@ -105,7 +109,7 @@ class MovingSweep:
         """The sweep with its rotation as the gyro knows it by now, with the bias of today."""
         if self.motion is not SweepMotion.GYRO:
             return self
-        turns = imu.rotations_since(self.stamp, np.concatenate([self._span, *self._seconds]))
+        turns = imu.rotations_since(self.stamp, self._moments)
         if turns is None:
             return self
         sweep = copy(self)

@@ -117,6 +117,12 @@ class Moment(NamedTuple):
         # The middles of two sweeps of different length may coincide.
         return max((stamp - self.stamp) * 1e-9, _SHORTEST)
 
+    def twist_to(self, stamp: int, map_T_lidar: gtsam.Pose3) -> FloatArray:
+        """(6,) mean body velocity, rad/s and m/s, that leads to the middle of a later sweep."""
+        way = gtsam.Pose3.Logmap(self.map_T_lidar.between(map_T_lidar))
+        twist: FloatArray = way / self.seconds_to(stamp)
+        return twist
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Prediction:

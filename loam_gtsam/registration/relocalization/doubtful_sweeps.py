@@ -149,9 +149,8 @@ def search(
         if found is not None and found.posed.twist is stays.posed.twist:
             found = None
         if found is not None and matcher.last is not None:
-            way = matcher.last.map_T_lidar.between(found.solution.map_T_lidar)
-            seconds = matcher.last.seconds_to(frame.sweep.stamp)
-            found = replace(found, led=gtsam.Pose3.Logmap(way) / seconds)
+            led = matcher.last.twist_to(frame.sweep.stamp, found.solution.map_T_lidar)
+            found = replace(found, led=led)
     else:
         found = _elsewhere(frame, solution, monitor, solver, stays)
     matcher.clock.lap("relocalize")

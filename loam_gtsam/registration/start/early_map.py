@@ -108,9 +108,10 @@ class EarlyMap:
         """One of the sweeps, registered with the map of a matcher."""
         one = sweeps[number]
         expected = replace(one.expected, map_T_lidar=one.map_T_middle)
-        last = sweeps[number - 1]
-        told = [*one.factors(last), *one.turn(last)] if number else []
-        priors = [prior.factor() for prior in told]
+        priors: list[gtsam.NonlinearFactor] = []
+        if number:
+            last = sweeps[number - 1]
+            priors = [told.factor() for told in (*one.factors(last), *one.turn(last))]
         return self.solver.solve(matcher, one.map_T_middle, priors, expected)
 
     def matcher(

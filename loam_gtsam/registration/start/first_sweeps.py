@@ -186,10 +186,10 @@ class Start:
         told = _told(frame, pose, self._sweeps[-1], solver)
         turned = _turned(frame, self._sweeps[-1], imu) if self._heeds_gyro else None
         new = EarlySweep(posed, pose, frame.predicted.motion, keyframe, *told, turned)
-        added = [*self._sweeps, new]
         gyro = None if imu is None else imu.trusted_gyro
         if imu is not None and gyro is None:
-            added = without_turns(added)
+            (new,) = without_turns([new])
+        added = [*self._sweeps, new]
         if len(added) not in _TOGETHER and not self._anew:
             self._sweeps = added
             return frame, found

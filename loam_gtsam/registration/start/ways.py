@@ -160,9 +160,7 @@ def parting(
 
 def mean_twist(one: EarlySweep, other: EarlySweep) -> FloatArray:
     """Mean body velocity (6,) from one sweep to the next, rad/s and m/s."""
-    moved = gtsam.Pose3.Logmap(one.map_T_middle.between(other.map_T_middle))
-    twist: FloatArray = moved / one.moment.seconds_to(other.moment.stamp)
-    return twist
+    return one.moment.twist_to(other.moment.stamp, other.map_T_middle)
 
 
 def turned_anew(sweeps: Sequence[EarlySweep], imu: ImuBuffer) -> list[EarlySweep]:

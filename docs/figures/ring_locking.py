@@ -53,8 +53,10 @@ def exact_sweep(number: int) -> tuple[gtsam.Pose3, np.ndarray, np.ndarray]:
 def gate(matches: ScanMatches, map_T_lidar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Which edge and plane matches the gates keep: the conditions of ``matching.py``."""
     up, rotation = map_T_lidar[:3, 2], map_T_lidar[:3, :3]
-    ring = np.cross(up, matches.edges.points @ rotation.T)
-    cosine = np.abs((matches.edges.directions * ring).sum(1)) / np.linalg.norm(ring, axis=1)
+    rays, lines = matches.edges.points @ rotation.T, matches.edges.directions
+    ring, seen = np.cross(up, rays), np.linalg.norm(np.cross(lines, rays), axis=1)
+    cosine = np.abs((lines * ring).sum(1)) * np.linalg.norm(rays, axis=1)
+    cosine /= seen * np.linalg.norm(ring, axis=1)
     rays = matches.planes.points @ rotation.T
     sine = np.abs((matches.planes.normals * rays).sum(1)) / np.linalg.norm(rays, axis=1)
     return cosine <= gates.max_ring_cosine, sine >= gates.min_incidence_sine

@@ -22,7 +22,7 @@ from loam_gtsam.cli.run import worker_count
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.io.atomic import file_name, write_json, write_text
-from loam_gtsam.io.run_files import write_covariances, write_npz, write_ply
+from loam_gtsam.io.run_files import position_sigmas, write_covariances, write_npz, write_ply
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.batch import OptimizedGraph, SavedGraph, optimize_graph
 from loam_gtsam.loops.files import GTSAM_SUFFIXES, read_graph, write_graph
@@ -142,7 +142,6 @@ def localise_in_map(options: LocaliseOptions) -> int:
 
 def _summary(found: Localisation, dataset: Dataset, path: Path) -> dict[str, Any]:
     numbers = [n for n, update in enumerate(found.updates) if update.status.solved]
-    positions = np.array([u.covariance[3:, 3:].trace() for u in found.solved])
     accuracy = None
     if dataset.truth is not None and numbers:
         with suppress(InputError, ValueError):
@@ -158,7 +157,7 @@ def _summary(found: Localisation, dataset: Dataset, path: Path) -> dict[str, Any
         "interrupted": found.interrupted,
         "status_counts": found.status_counts,
         "last_message": found.updates[-1].message,
-        "position_sigma_m": float(np.sqrt(np.median(positions))) if numbers else None,
+        "position_sigma_m": position_sigmas(found.updates),
         "accuracy": accuracy,
     }
 
@@ -222,15 +221,16 @@ def _shown_views(
 
 
 def _localised(summary: dict[str, Any]) -> Table:
-    first, sigma, accuracy = (
+    first, sigmas, accuracy = (
         summary[k] for k in ("first_fix_frame", "position_sigma_m", "accuracy")
     )
     table = Table(show_header=False, box=None)
     table.add_row("frames", f"{summary['frames']} in {summary['seconds']:.1f} s")
     table.add_row("localised", f"{summary['localised']}, found {summary['fixes']} times")
     table.add_row("first fix", "none" if first is None else f"frame {first}")
-    if sigma is not None:
-        table.add_row("position", f"{sigma:.3f} m (standard deviation, median, with the map's)")
+    if sigmas is not None:
+        told = f"{sigmas['median']:.3f} m (standard deviation, median, with the map's)"
+        table.add_row("position", told)
     if accuracy is not None:
         table.add_row("accuracy", f"ATE {accuracy['ate_rmse_m']:.3f} m")
     if summary["localised"] < summary["frames"] and summary["last_message"]:

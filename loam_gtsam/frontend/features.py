@@ -345,6 +345,7 @@ def _without_rings(scan: Scan, config: Config, sweep: OrganisedSweep) -> Feature
         sharp=none,
         flat=none,
         span=(span[0] - reference, span[1] - reference),
+        rings_known=False,
         not_finite=sweep.not_finite,
         reach=reach,
     )

@@ -83,14 +83,21 @@ def views(
     DatasetError
         If the sweeps are not those of the frames, or have no rings.
     """
-    for number, (sweep, update, pose) in enumerate(zip(dataset, updates, poses, strict=False)):
+    sweeps = iter(dataset)
+    for number, (update, pose) in enumerate(zip(updates, poses, strict=True)):
+        sweep = next(sweeps, None)
+        if sweep is None:
+            raise DatasetError(
+                f"expected the {len(updates)} sweeps of the run, got {number}; give the data set "
+                "of the run"
+            )
+        if not update.status.solved:
+            continue
         if not isinstance(sweep, Scan):
             raise DatasetError(
                 f"sweep {number}: expected one of raw points, got {type(sweep).__name__}, which "
                 "says nothing of what its beams passed"
             )
-        if not update.status.solved:
-            continue
         try:
             found = organise(sweep, config)
         except SweepError as error:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 
 import gtsam
@@ -26,7 +27,14 @@ from loam_gtsam.maps.common_places import CommonPlaces, are_tied, walked
 from loam_gtsam.maps.linear_factors import LinearFactors
 from loam_gtsam.maps.map_file import SavedMap, grids, write_map
 from loam_gtsam.maps.map_graph import MapGraph
-from loam_gtsam.types import DatasetError, InputError, MapUpdate, Trajectory, check_kind
+from loam_gtsam.types import (
+    DatasetError,
+    InputError,
+    MapUpdate,
+    Trajectory,
+    check_kind,
+    stack_poses,
+)
 from loam_gtsam.voxels.archive import Archive
 from loam_gtsam.voxels.cubes import CubePoints, joined
 from loam_gtsam.voxels.grid import CubeIndex
@@ -113,8 +121,8 @@ def merge_maps(
     InputError
         If there are less than two maps.
     DatasetError
-        If a map has no place in common with the others, its descriptors are of another shape, or
-        its fixes are somewhere else on the earth.
+        If a map has no place in common with the others or is one of them, its descriptors are of
+        another shape, or its fixes are somewhere else on the earth.
     OutputError
         If the file cannot be written.
     """
@@ -154,6 +162,20 @@ def _check(maps: Sequence[SavedMap]) -> None:
             )
         if not saved.places:
             raise DatasetError(f"{saved.path}: the map has no places; map more of the ground")
+    for one, other in combinations(maps, 2):
+        if _are_one(one, other):
+            raise DatasetError(
+                f"{other.path}: expected another map, got that of {one.path} once more; its drift "
+                "would count as confirmed"
+            )
+
+
+def _are_one(one: SavedMap, other: SavedMap) -> bool:
+    """Whether two maps are of the same sweeps at the same places."""
+    if [place.stamp for place in one.places] != [place.stamp for place in other.places]:
+        return False
+    ours, theirs = (stack_poses(p.map_T_middle for p in m.places) for m in (one, other))
+    return np.array_equal(ours, theirs) and one.layers == other.layers
 
 
 def _tied(

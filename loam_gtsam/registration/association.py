@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import gtsam
@@ -86,7 +87,8 @@ def match_features(
     distinct = rows.distinct
     around = edge_map.neighbourhood(pose)
     near_edges = edge_map.nearest(edges_map, k, limit, around)
-    lines = match_lines(edges, edges_map, *near_edges[:2], pose, config, limit)
+    in_map = partial(match_lines, rings_known=rows.rings_known)
+    lines = in_map(edges, edges_map, *near_edges[:2], pose, config, limit)
     surfaces, faces = match_surfaces(planes, pose, plane_map, config, limit)
     if distinct is not None:
         left = distinct.copy()
@@ -94,7 +96,7 @@ def match_features(
         if left.any() and leaves_open(surfaces, config):
             # A pole that few beams met has no five points within max_distance, or only these.
             poles = rows.alone is not None and rows.alone
-            ways = (match_lines, True, config.wide_search * limit), (match_uprights, poles, limit)
+            ways = (in_map, True, config.wide_search * limit), (match_uprights, poles, limit)
             for match, among, far in ways:
                 chosen = np.flatnonzero(left & among)
                 if not len(chosen):
@@ -246,19 +248,21 @@ def match_lines(
     map_T_lidar: FloatArray,
     config: MatchingConfig,
     reach: float | None = None,
+    *,
+    rings_known: bool = True,
 ) -> EdgeMatches:
     """Lines through the neighbours of edge features (LOAM, Section VI; constants in the config).
 
-    An edge is a break along its ring, so that its line crosses the ring. Neighbours along a ring
-    are not an edge but the trace of one beam on rough ground or foliage. That trace moves with the
-    sensor and would hold the pose at the last one; such lines are rejected.
+    An edge is a break along its ring, so that its line, as the lidar sees it, crosses the ring.
+    Neighbours along a ring are the trace of one beam on rough ground, foliage or a wall beside the
+    way. It moves with the sensor and would hold the pose at the last one: such lines are rejected.
 
     Parameters
     ----------
     points, points_map : (N, 3) features in the lidar frame and in the map frame
     neighbours : (N, k, 3) their nearest map points
     squared_distances : (N, k) m^2, ascending, inf where missing
-    map_T_lidar : (4, 4) pose; its z axis is the axis of the rings
+    map_T_lidar : (4, 4) pose; its z axis is the axis of the rings, if there are (``rings_known``)
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
     reach = config.max_distance if reach is None else reach
@@ -266,8 +270,11 @@ def match_lines(
     here = np.ascontiguousarray(points_map.take(near, axis=0).T)
     centres, directions, eigenvalues = fit_lines(neighbours.take(near, axis=0))
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
-    ring = cross(map_T_lidar[:3, 2], here - map_T_lidar[:3, 3:])
-    is_line &= np.abs(_dot(directions, ring)) <= (config.max_ring_cosine + _TINY) * _norm(ring)
+    if rings_known:
+        rays = here - map_T_lidar[:3, 3:]
+        ring = cross(map_T_lidar[:3, 2], rays)
+        along_ring, seen = _dot(directions, ring) * _norm(rays), _norm(cross(directions, rays))
+        is_line &= np.abs(along_ring) <= (config.max_ring_cosine + _TINY) * seen * _norm(ring)
     away = here - centres
     along = _dot(away, directions)
     distances = np.sqrt(np.maximum(_dot(away, away) - along**2, 0.0))

@@ -92,5 +92,8 @@ def test_the_command_writes_a_clean_map(tmp_path):
     other = loam("clean", "sim:square?frames=8&columns=300&rate=5", tmp_path, "--overwrite")
     assert other.exit_code == 1
     assert "give the data set of the run" in " ".join(other.output.split())
+    fewer = loam("clean", "sim:square?frames=6&columns=300", tmp_path, "--overwrite")
+    assert fewer.exit_code == 1
+    assert "expected the 8 sweeps of the run, got 6" in " ".join(fewer.output.split())
     nothing = loam("clean", world, tmp_path / "cleaned")
     assert "expected the folder of a finished run" in " ".join(nothing.output.split())

@@ -179,6 +179,8 @@ def test_maps_without_a_common_place_are_not_merged(halves, tmp_path):
         merge_maps([first, saved], tmp_path / "none.lgmap")
     with pytest.raises(InputError, match="two maps or more"):
         merge_maps([first], tmp_path / "none.lgmap")
+    with pytest.raises(DatasetError, match=r"expected another map, got that of .*park\.lgmap"):
+        merge_maps([first, saved, SavedMap(path)], tmp_path / "none.lgmap")
     saved.config = saved.config.changed("loops.rings=10")
     with pytest.raises(DatasetError, match=r"expected place descriptors as those"):
         merge_maps([first, saved], tmp_path / "none.lgmap")

@@ -1,6 +1,7 @@
 """Association: closed forms, every gate from both sides, brute force, frames."""
 
 import dataclasses
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -210,6 +211,18 @@ def test_a_line_may_not_run_along_the_ring(seed):
 
     assert [count(a) for a in (0, 30, 59.9, 60.1, 90, 119.9, 120.1)] == [0, 0, 0, 1, 1, 1, 0]
     assert count(0, changed(max_ring_cosine=2.0)) == 1
+
+
+@pytest.mark.parametrize(("height", "kept"), [(0.0, 0), (2.0, 0), (-2.0, 0), (3.0, 1), (-3.0, 1)])
+def test_what_a_beam_traces_on_a_wall_along_the_way_is_no_line(height, kept):
+    """Seen from 1.5 m beside a wall, a line along it converges with the rings: 60 degrees at 2.6 m.
+
+    Its direction in space is nearly that of the ray, far from that of the ring.
+    """
+    here = 12.0 * X + 1.5 * Y + height * Z
+    group = line_group(0.4 * X, centre=here)
+    assert len(one(match_lines, here, group)) == kept
+    assert len(one(partial(match_lines, rings_known=False), here, group)) == 1
 
 
 def test_a_limit_of_one_keeps_lines_along_the_ring_and_no_limit_is_needed_above_the_sensor():

@@ -61,12 +61,14 @@ def expected_line(query: Any, pose: Any, points: Any, config: MatchingConfig) ->
         return None
     _, centre, values, vectors = found
     direction = vectors[:, 2]
-    ring = np.cross(pose[:3, 2], query - pose[:3, 3])
+    ray = query - pose[:3, 3]
+    ring = np.cross(pose[:3, 2], ray)
+    seen = direction - (direction @ ray) * ray / (ray @ ray)
     distance = np.linalg.norm(np.cross(query - centre, direction))
     weight = 1.0 - config.weight_slope * distance
     margins = [
         values[2] / max(config.line_ratio * values[1], 1e-12) - 1.0,
-        config.max_ring_cosine - abs(direction @ ring) / np.linalg.norm(ring),
+        config.max_ring_cosine * np.linalg.norm(seen) - abs(seen @ ring) / np.linalg.norm(ring),
         weight - config.min_weight,
     ]
     return direction, centre, distance, weight, margins

@@ -211,6 +211,9 @@ def test_the_search_grows_and_remembers_where_it_fitted_last():
     monitor.accept(Fit(0.6, 1.0), here)
     assert monitor.around(here) == [here]
     assert monitor.around(far) == [far, here]
+    # A turn from before may have led to a tilt that no search changes.
+    tilted = gtsam.Pose3(gtsam.Rot3.Pitch(np.radians(20.0)), np.zeros(3))
+    assert monitor.around(tilted) == [tilted, here]
     radii = []
     for monitor.lost in range(4):
         radii.append(monitor.radius)

@@ -168,7 +168,10 @@ class FitMonitor:
         return min(config.radius + config.radius_growth * self.lost, config.max_radius)
 
     def around(self, predicted: gtsam.Pose3) -> list[gtsam.Pose3]:
-        """Centres of the search: the prediction, and the pose of the last sweep that fitted."""
-        if self.last is None or predicted.range(self.last) < self.radius:
+        """Centres of the search: the prediction, and the pose of the last sweep that fitted.
+
+        No trial pose has another height or tilt than its centre has, and turns do not last.
+        """
+        if self.last is None or same(predicted, self.last):
             return [predicted]
         return [predicted, self.last]

@@ -115,8 +115,8 @@ class Features:
     edges, planes : (E, 3) and (P, 3) float64, metres, lidar frame at each point's own time.
     edge_times, plane_times : seconds from ``stamp``; all zero if already de-skewed.
     edge_rings, plane_rings : integer beam numbers.
-    rings_known : whether beams sweep rings about the lidar's z axis; if not, edges are the middles
-        of posts, and no beam traces lines
+    level_rings : whether beams sweep rings about the lidar's z axis, which edges cross. Those of a
+        Livox swing up and down, and a lidar that is mounted askew has others
     sharp, flat : indices into ``edges`` and ``planes`` of the most pronounced ones
         (used by scan-to-scan odometry).
     span : (first, last) seconds from ``stamp`` covered by the sweep.
@@ -145,7 +145,7 @@ class Features:
     span: tuple[float, float] = (0.0, 0.0)
     edge_prominence: FloatArray | None = None
     edge_sigmas: FloatArray | None = None
-    rings_known: bool = True
+    level_rings: bool = True
     not_finite: int = 0
     voxel_sizes: tuple[float, float] | None = None
     reach: float = np.inf

@@ -47,7 +47,7 @@ class MovingSweep:
     distinct : (E,) whether an edge stands out of its ring by more than range noise
     alone : (E,) whether it is a pole, which stands before all that is beside it; None if unknown
     edge_sigmas : (E,) metres, standard deviation of its place along its ring; None if unknown
-    rings_known : whether beams sweep rings about the lidar's z axis
+    level_rings : whether beams sweep rings about the lidar's z axis
     motion : source of the rotation within the sweep
     acceleration : (6,) rad/s^2 and m/s^2, of the body velocity; None if that is constant
     not_finite : number of points of the sweep that were NaN or infinite
@@ -71,7 +71,7 @@ class MovingSweep:
         )
         depth = config.features.post_depth or np.inf
         self.alone: BoolArray | None = None if prominence is None else prominence > depth
-        self.edge_sigmas, self.rings_known = features.edge_sigmas, features.rings_known
+        self.edge_sigmas, self.level_rings = features.edge_sigmas, features.level_rings
         self._points = features.edges, features.planes
         times = features.edge_times, features.plane_times
         self._seconds = times[0] - self.middle, times[1] - self.middle

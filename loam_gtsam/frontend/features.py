@@ -41,6 +41,7 @@ from loam_gtsam.frontend.curvature import (
 )
 from loam_gtsam.frontend.organise import OrganisedSweep, organise
 from loam_gtsam.frontend.poles import Poles, find_poles
+from loam_gtsam.frontend.rings import are_level
 from loam_gtsam.frontend.unorganised import on_flat_patches, posts
 from loam_gtsam.geometry import run_starts, squared_norm, voxel_filter
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, Scan, SweepError, SweepFault
@@ -311,6 +312,7 @@ def _assemble(
         span=(span[0] - reference, span[1] - reference),
         edge_prominence=np.concatenate((stands_out, poles.depths)),
         edge_sigmas=np.concatenate((UNIFORM_SIGMA * apart, poles.sigmas)),
+        level_rings=are_level(sweep.xyz, sweep.ring_starts),
         not_finite=sweep.not_finite,
         reach=reach,
     )
@@ -345,7 +347,7 @@ def _without_rings(scan: Scan, config: Config, sweep: OrganisedSweep) -> Feature
         sharp=none,
         flat=none,
         span=(span[0] - reference, span[1] - reference),
-        rings_known=False,
+        level_rings=False,
         not_finite=sweep.not_finite,
         reach=reach,
     )

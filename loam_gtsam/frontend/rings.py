@@ -36,6 +36,9 @@ _CORE_SHARE = 0.9
 """Least share of points on the beams for a set of beams to be believed."""
 _SMOOTH = np.deg2rad(2.0)
 """Radians by which neighbours on a ring differ in elevation at most, by the median."""
+_LEVEL = np.deg2rad(10.0)
+"""Radians by which points of a ring differ from its elevation at most, by the median, for it to lie
+around the z axis: it is tilted by 14 degrees then, and lines are told from it by 60 degrees."""
 _STRAY = 0.1
 """A peak in the histogram of elevations is a beam if it has this share of the height of the
 typical peak (the one the median point belongs to); lower ones are stray returns."""
@@ -89,6 +92,17 @@ def are_rings(found: RingAssignment, xyz: NDArray[np.float32]) -> bool:
     around = np.argsort(np.arctan2(y, x))
     elevation = np.arctan2(z, np.hypot(x, y))[around]
     return len(around) < 2 or float(np.median(np.abs(np.diff(elevation)))) < _SMOOTH
+
+
+def are_level(xyz: NDArray[np.float32], ring_starts: IntArray) -> bool:
+    """Whether the fullest of rings in a row lies around the z axis, as far as it matters.
+
+    That of a lidar that is mounted askew does not, nor do beams that swing up and down.
+    """
+    fullest = int(np.argmax(np.diff(ring_starts)))
+    x, y, z = xyz[:, ring_starts[fullest] : ring_starts[fullest + 1]]
+    elevation = np.arctan2(z, np.hypot(x, y))
+    return bool(np.median(np.abs(elevation - np.median(elevation))) < _LEVEL)
 
 
 def _assignment(rings: NDArray[np.integer], count: int, method: str, note: str) -> RingAssignment:

@@ -87,7 +87,7 @@ def match_features(
     distinct = rows.distinct
     around = edge_map.neighbourhood(pose)
     near_edges = edge_map.nearest(edges_map, k, limit, around)
-    in_map = partial(match_lines, rings_known=rows.rings_known)
+    in_map = partial(match_lines, level_rings=rows.level_rings)
     lines = in_map(edges, edges_map, *near_edges[:2], pose, config, limit)
     surfaces, faces = match_surfaces(planes, pose, plane_map, config, limit)
     if distinct is not None:
@@ -249,7 +249,7 @@ def match_lines(
     config: MatchingConfig,
     reach: float | None = None,
     *,
-    rings_known: bool = True,
+    level_rings: bool = True,
 ) -> EdgeMatches:
     """Lines through the neighbours of edge features (LOAM, Section VI; constants in the config).
 
@@ -262,7 +262,7 @@ def match_lines(
     points, points_map : (N, 3) features in the lidar frame and in the map frame
     neighbours : (N, k, 3) their nearest map points
     squared_distances : (N, k) m^2, ascending, inf where missing
-    map_T_lidar : (4, 4) pose; its z axis is the axis of the rings, if there are (``rings_known``)
+    map_T_lidar : (4, 4) pose; its z axis is the axis of the rings, if there are (``level_rings``)
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
     """
     reach = config.max_distance if reach is None else reach
@@ -270,7 +270,7 @@ def match_lines(
     here = np.ascontiguousarray(points_map.take(near, axis=0).T)
     centres, directions, eigenvalues = fit_lines(neighbours.take(near, axis=0))
     is_line = eigenvalues[2] > config.line_ratio * eigenvalues[1]
-    if rings_known:
+    if level_rings:
         rays = here - map_T_lidar[:3, 3:]
         ring = cross(map_T_lidar[:3, 2], rays)
         along_ring, seen = _dot(directions, ring) * _norm(rays), _norm(cross(directions, rays))

@@ -400,7 +400,7 @@ def timed_rows(
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:
-    known = sweep.distinct, sweep.alone, sweep.edge_sigmas, sweep.rings_known
+    known = sweep.distinct, sweep.alone, sweep.edge_sigmas, sweep.level_rings
     return chosen_rows(sweep.n_edges, sweep.n_planes, matching, *known)
 
 

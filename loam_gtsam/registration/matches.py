@@ -112,7 +112,7 @@ class ChosenRows:
     distinct: BoolArray | None  # mask of ``edges``; None if all are distinct
     alone: BoolArray | None = None  # mask of those that are poles; None if none is known to be
     sigmas: FloatArray | None = None  # metres, of the places of ``edges``; None if these are exact
-    rings_known: bool = True  # whether a beam may have traced a line, which is no edge then
+    level_rings: bool = True  # whether a beam may have traced a line, which is no edge then
 
     def __len__(self) -> int:
         return len(self.edges) + len(self.planes)
@@ -121,7 +121,7 @@ class ChosenRows:
 def chosen_rows(
     edges: int, planes: int, config: MatchingConfig,
     distinct: BoolArray | None = None, alone: BoolArray | None = None,
-    sigmas: FloatArray | None = None, rings_known: bool = True,
+    sigmas: FloatArray | None = None, level_rings: bool = True,
 ) -> ChosenRows:  # fmt: skip
     """Choose the features that are matched, evenly spread: those that stand out first."""
     if distinct is not None and alone is None and distinct.all():
@@ -133,7 +133,7 @@ def chosen_rows(
         None if distinct is None else distinct[edge_rows],
         None if alone is None else alone[edge_rows],
         None if sigmas is None else sigmas[edge_rows],
-        rings_known,
+        level_rings,
     )
 
 

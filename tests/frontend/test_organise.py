@@ -11,7 +11,7 @@ from loam_gtsam.config import Config, DeskewConfig, SensorConfig
 from loam_gtsam.datasets.sim.patterns import PATTERNS
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.organise import assign_rings, organise, usable_columns
-from loam_gtsam.frontend.rings import ELEVATIONS, rings_from_file_order
+from loam_gtsam.frontend.rings import ELEVATIONS, are_level, rings_from_file_order
 from loam_gtsam.types import Scan, SweepError
 
 VLP16 = ELEVATIONS["vlp16"]
@@ -252,6 +252,26 @@ def test_rings_of_a_lidar_that_is_mounted_askew_are_rings() -> None:
     points, rings, _ = firing(VLP16)
     askew = points @ gtsam.Rot3.Ypr(0.3, 0.7, -0.5).matrix().T
     assert organise(Scan(askew, 0, rings=rings), Config()).rings.count == 16
+
+
+@pytest.mark.parametrize(("pitch", "level"), [(0.0, True), (12.0, True), (17.0, False)])
+def test_rings_about_another_axis_than_z_are_not_level(pitch: float, level: bool) -> None:
+    points, rings, _ = firing(VLP16)
+    sweep = organise(
+        Scan(points @ gtsam.Rot3.Pitch(np.radians(pitch)).matrix().T, 0, rings=rings), Config()
+    )
+    assert are_level(sweep.xyz, sweep.ring_starts) is level
+
+
+def test_a_beam_that_swings_up_and_down_sweeps_no_level_ring() -> None:
+    """As that of a Mid-360 whose points are in their order, which runs around."""
+    azimuth = np.linspace(0.0, 4.0 * np.pi, 8000, endpoint=False)
+    elevation = np.radians(22.0 + 29.0 * np.sin(40.3 * azimuth))
+    flat = np.cos(elevation)
+    points = 10.0 * np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], 1)
+    sweep = organise(Scan(points, 0, times=np.linspace(0.0, 0.1, 8000)), Config())
+    assert sweep.rings.method == "file order"
+    assert not are_level(sweep.xyz, sweep.ring_starts)
 
 
 @pytest.mark.parametrize("count", [1, 300])

@@ -222,7 +222,7 @@ def test_what_a_beam_traces_on_a_wall_along_the_way_is_no_line(height, kept):
     here = 12.0 * X + 1.5 * Y + height * Z
     group = line_group(0.4 * X, centre=here)
     assert len(one(match_lines, here, group)) == kept
-    assert len(one(partial(match_lines, rings_known=False), here, group)) == 1
+    assert len(one(partial(match_lines, level_rings=False), here, group)) == 1
 
 
 def test_a_limit_of_one_keeps_lines_along_the_ring_and_no_limit_is_needed_above_the_sensor():

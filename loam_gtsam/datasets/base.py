@@ -6,6 +6,7 @@ import importlib
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any, Protocol, cast, runtime_checkable
 
@@ -89,6 +90,22 @@ class Dataset(Protocol):
     def truth(self) -> Trajectory | None:
         """Reference poses if the data comes with them."""
         ...
+
+
+def sweeps_of_run(dataset: Dataset, count: int) -> Iterator[Sweep]:
+    """The sweeps of so many frames of a run, from the data set that was run.
+
+    A DatasetError follows the last one if there are fewer.
+    """
+    found = 0
+    for sweep in islice(dataset, count):
+        found += 1
+        yield sweep
+    if found < count:
+        raise DatasetError(
+            f"{dataset.name}: expected the {count} sweeps of the run, got {found}; give the data "
+            "set of the run"
+        )
 
 
 class Loader:

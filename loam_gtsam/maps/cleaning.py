@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import Config
-from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.base import Dataset, sweeps_of_run
 from loam_gtsam.errors import SweepError
 from loam_gtsam.frontend.organise import organise
 from loam_gtsam.geometry import as_points, move_points, squared_norm
@@ -83,14 +83,8 @@ def views(
     DatasetError
         If the sweeps are not those of the frames, or have no rings.
     """
-    sweeps = iter(dataset)
-    for number, (update, pose) in enumerate(zip(updates, poses, strict=True)):
-        sweep = next(sweeps, None)
-        if sweep is None:
-            raise DatasetError(
-                f"expected the {len(updates)} sweeps of the run, got {number}; give the data set "
-                "of the run"
-            )
+    sweeps = sweeps_of_run(dataset, len(updates))
+    for number, (sweep, update, pose) in enumerate(zip(sweeps, updates, poses, strict=True)):
         if not update.status.solved:
             continue
         if not isinstance(sweep, Scan):

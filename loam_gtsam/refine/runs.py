@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config, SolverConfig
-from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.base import Dataset, sweeps_of_run
 from loam_gtsam.datasets.decode.geodesy import GeoReference
 from loam_gtsam.geometry import transform, voxel_filter
 from loam_gtsam.loops.batch import SavedGraph
@@ -82,11 +82,14 @@ def run_points(
     ------
     InputError
         If the sweeps are not those of the frames, by their stamps.
+    DatasetError
+        If there are fewer of them.
     """
     frames: list[int] = []
     used: list[SweepPoints] = []
     held: list[SweepPoints] = []
-    for number, (sweep, update) in enumerate(zip(dataset, updates, strict=False)):
+    sweeps = sweeps_of_run(dataset, len(updates))
+    for number, (sweep, update) in enumerate(zip(sweeps, updates, strict=True)):
         if on_sweep is not None:
             on_sweep(number)
         if not update.status.has_pose:

@@ -18,7 +18,7 @@ from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points, stacked, sweep_points
 from loam_gtsam.registration.uncertainty import relative_covariance
-from loam_gtsam.types import FeatureSweep, InputError, Trajectory
+from loam_gtsam.types import DatasetError, FeatureSweep, InputError, Trajectory
 
 SIZES = voxel_sizes(3.2, 0.4)
 SECOND = 1_000_000_000
@@ -382,8 +382,10 @@ def test_the_data_set_of_another_run_is_refused(room) -> None:
     updates = [replace(update, stamp=update.stamp + 7) for update in result.updates]
     with pytest.raises(InputError, match=r"expected the stamp .* give the data set of the run"):
         run_points(world, updates, result.config)
-    points = run_points(SimulatedWorld("room", frames=3, columns=400), result.updates[:3],
-                        result.config, most=300)  # fmt: skip
+    fewer = SimulatedWorld("room", frames=3, columns=400)
+    with pytest.raises(DatasetError, match="expected the 4 sweeps of the run, got 3"):
+        run_points(fewer, result.updates[:4], result.config, most=300)
+    points = run_points(fewer, result.updates[:3], result.config, most=300)
     other = Trajectory.from_poses([1, 2, 3], [gtsam.Pose3()] * 3)
     with pytest.raises(InputError, match="stamps of the run's poses"):
         refine_run(points, result.updates[:3], trajectory=other)

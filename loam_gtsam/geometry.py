@@ -159,6 +159,18 @@ def squared_norm(xyz: NDArray[_Real]) -> NDArray[_Real]:
     return squared
 
 
+def dot(a: FloatArray, b: FloatArray) -> FloatArray:
+    """(...,) scalar products of vectors (3, ...)."""
+    product: FloatArray = a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    return product
+
+
+def norm(vectors: FloatArray) -> FloatArray:
+    """(...,) lengths of vectors (3, ...)."""
+    length: FloatArray = np.sqrt(dot(vectors, vectors))
+    return length
+
+
 def moments(neighbours: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean (3, N) and covariance (6, N: xx, yy, zz, xy, yz, xz) of (N, k, 3) groups of points."""
     axes = np.ascontiguousarray(neighbours.transpose(2, 1, 0), dtype=np.float64)

@@ -2,8 +2,8 @@
 
 Two sweeps of the built-in woodland, 0.1 s apart, de-skewed with the exact motion. The map holds the
 first one only. The second is matched at poses between and beyond the two exact ones, without the
-two gates of ``loam_gtsam.registration.association``; the residuals of the matches that the gates
-would keep and of those they would reject are drawn apart.
+gates of ``registration.association`` and ``registration.planes``; the residuals of the matches that
+the gates would keep and of those they would reject are drawn apart.
 
     python docs/figures/ring_locking.py
 """

@@ -17,12 +17,7 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.acceleration import Expected
-from loam_gtsam.registration.association import (
-    match_features,
-    match_surfaces,
-    rematched,
-    translations_fixed,
-)
+from loam_gtsam.registration.association import match_features, rematched
 from loam_gtsam.registration.degeneracy import Localizability, localizability
 from loam_gtsam.registration.matches import (
     ChosenRows,
@@ -33,6 +28,7 @@ from loam_gtsam.registration.matches import (
     trial_matching,
 )
 from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
+from loam_gtsam.registration.planes import match_surfaces, translations_fixed
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
 from loam_gtsam.types import FloatArray, SweepMotion

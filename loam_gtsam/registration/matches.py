@@ -13,6 +13,8 @@ from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.tags import Faces
 
+_TINY = 1e-9
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EdgeMatches:
@@ -181,3 +183,32 @@ def joined(first: _Matches, second: _Matches) -> _Matches:
         missing = parts[0] is None or parts[1] is None
         columns[item.name] = None if missing else np.concatenate(parts)[order]
     return replace(first, **columns)
+
+
+def deviations(
+    roughness: FloatArray,
+    spread: FloatArray,
+    leverage: FloatArray,
+    parameters: int,
+    neighbours: int,
+    config: MatchingConfig,
+) -> tuple[FloatArray, FloatArray]:
+    """Standard deviations (M,) of the distance of a new point, m, and of the tilt of a fit, rad.
+
+    The variance of prediction of a regression: Draper and Smith, Applied Regression Analysis, 3rd
+    ed., section 3.1.
+
+    Parameters
+    ----------
+    roughness, spread : (M,) m^2, variances of the neighbours across and along the line or plane
+    leverage : (M,) squared distance of the point from their centre, along the fit, over the spread
+    parameters : that a line or a plane has
+    neighbours : through which each is fitted
+    """
+    least = config.point_sigma**2
+    scatter, variance = np.full((2, len(roughness)), least)
+    if config.fit_uncertainty:
+        freedom = max(neighbours - parameters, 1)
+        scatter = np.maximum(roughness * neighbours / freedom, least)
+        variance = scatter * (1.0 + (1.0 + leverage) / neighbours)
+    return np.sqrt(variance), np.sqrt(scatter / (neighbours * np.maximum(spread, _TINY)))

@@ -14,10 +14,10 @@ from loam_gtsam.registration.association import (
     associate,
     match_features,
     match_lines,
-    match_planes,
     rematched,
 )
 from loam_gtsam.registration.matches import ScanMatches, chosen_rows, spread_rows, trial_matching
+from loam_gtsam.registration.planes import match_planes
 
 CONFIG = MatchingConfig(plane_tolerance=0.2)  # groups may be rough
 STEPS = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])

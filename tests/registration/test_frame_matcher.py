@@ -15,10 +15,10 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as Inertial
 from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.acceleration import Expected
-from loam_gtsam.registration.association import match_planes, translations_fixed
 from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.frame_matcher import FrameMatcher, MapPair
 from loam_gtsam.registration.odometry import Moment
+from loam_gtsam.registration.planes import match_planes, translations_fixed
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.types import Features
 

@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from loam_gtsam.geometry import transform
-from loam_gtsam.registration.association import leaves_open
 from loam_gtsam.registration.frame_matcher import FrameMatcher
+from loam_gtsam.registration.planes import leaves_open
 from loam_gtsam.registration.relocalization.fits import AGREE, agreeing
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.types import BoolArray, FloatArray

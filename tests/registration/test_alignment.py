@@ -70,6 +70,17 @@ def test_agreement_tells_a_right_pose_from_one_that_is_merely_solved(aside, righ
     assert (found.agreement > 0.9) is right
 
 
+@pytest.mark.parametrize("halves", [False, True])
+def test_a_cloud_lies_on_itself_within_what_is_told(halves):
+    cloud = SimulatedWorld("room", frames=1).sweep(0).points
+    half = np.random.default_rng(4).random(len(cloud)) < 0.5
+    source, target = (cloud[half], cloud[~half]) if halves else (cloud, cloud)
+    found = align(source, target)
+    error = gtsam.Pose3.Logmap(found.target_T_source)
+    assert error @ np.linalg.solve(found.covariance, error) < 6.0
+    assert np.linalg.norm(error[3:]) < 4e-3
+
+
 def test_clouds_that_do_not_meet_are_not_solved():
     rng = np.random.default_rng(3)
     guess = gtsam.Pose3(gtsam.Rot3(), np.array([70.0, 0.0, 0.0]))

@@ -12,7 +12,7 @@ from typing import Any
 
 import gtsam
 
-from loam_gtsam.config import Config, as_config
+from loam_gtsam.config import Config, SolverConfig, as_config
 from loam_gtsam.errors import check_kind, own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
@@ -82,8 +82,8 @@ class Mapper:
     Parameters
     ----------
     config : ``map``, ``matching``, ``solver``, ``deskew`` and ``imu`` of it are used
-    solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`;
-        :func:`make_solver` makes it from the configuration if None
+    solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`; its settings,
+        ``solver.config``, replace ``config.solver``. If None, :func:`make_solver` makes it
     imu : samples may be added to it while the mapper runs
     extra_factors : a user's own factors for every sweep: GPS, ground level, wheels, ...
 
@@ -111,7 +111,7 @@ class Mapper:
         imu: ImuBuffer | None = None,
         extra_factors: ExtraFactors | None = None,
     ) -> None:
-        self.config = as_config(config)
+        self.config = _with_settings_of(solver, as_config(config))
         self.solver = solver or make_solver(self.config.solver)
         _check_factors_have_a_place(self.config, imu, extra_factors, own_solver=solver is not None)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)
@@ -326,6 +326,12 @@ class Mapper:
         self.registered = Registered(*posed.points, middle, matches)
         clock.lap("insert")
         return make_update(posed, map_T_lidar, status, message, solution, tilt)
+
+
+def _with_settings_of(solver: ScanSolver | None, config: Config) -> Config:
+    """The configuration with the settings that a solver brings, by which its results are judged."""
+    settings = getattr(solver, "config", None)
+    return config.changed(solver=settings) if isinstance(settings, SolverConfig) else config
 
 
 def _check_factors_have_a_place(

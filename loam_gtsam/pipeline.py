@@ -173,6 +173,7 @@ class Pipeline:
         self.faults = PartFaults(self.config.parts.on_error)
         solver, factors = parts.get("solver"), parts.get("extra_factors")
         self.mapper = Mapper(self.config, solver, imu=imu, extra_factors=factors)
+        self.config = self.mapper.config
         # By way of the mapper, which gives up a gyro that turns unlike the scans.
         own = parts.get("odometry") or aided_odometry(self.config, wheels, self.mapper.imu)
         self.odometry = own or make_odometry(self.config.odometry, self.mapper.imu)

@@ -18,7 +18,7 @@ from loam_gtsam.geometry import move_points
 from loam_gtsam.imu_prior import roll_pitch
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
 from loam_gtsam.registration.odometry import ConstantVelocity
-from loam_gtsam.registration.solvers import POSE_KEY
+from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.studies.evaluation import absolute_error, squared_errors
 from loam_gtsam.types import (
     BadSweep,
@@ -409,6 +409,16 @@ def test_a_solver_without_a_graph_cannot_have_a_prior(shaken, sweeps, method, pr
             run(data_of(shaken, sweeps[:2]), config)
     without = ArrayDataset(sweeps[:2])  # nobody asks
     assert run(without, config).updates[1].status.solved
+
+
+@pytest.mark.parametrize("name", ["loam", "aloam", "default"])
+def test_a_solver_that_was_made_brings_its_settings(sweeps, name):
+    settings = preset(name).solver
+    result = run(ArrayDataset(sweeps[:4]), solver=make_solver(settings))
+    assert result.config.solver == settings
+    for update in result.updates[1:]:
+        assert update.status.solved
+        assert np.isfinite(update.covariance).all()
 
 
 def test_recorded_features_are_levelled_too(shaken, sweeps):

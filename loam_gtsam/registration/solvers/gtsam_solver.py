@@ -106,6 +106,13 @@ class GtsamSolver:
         lost = self._returns(associate, found, doubted, sight, expected) < _COMES_BACK
         if not lost.any():
             return found
+        if sight.unseen is not None:  # many planes may see together what none sees alone
+            lines, sight = sight, replace(sight, unseen=None)
+            whole = rematch(associate, guess, self.config, optimise)
+            returned = self._returns(associate, whole, doubted, sight, expected)
+            if whole.solved and (returned >= _COMES_BACK).all():
+                return whole
+            sight = lines
         return sight.without(lost, self.config.min_aligned).told_of(found, expected)
 
     def _returns(

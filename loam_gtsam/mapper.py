@@ -55,6 +55,7 @@ from loam_gtsam.types import (
     InputError,
     MapUpdate,
     SweepFault,
+    SweepMotion,
     TiltPrior,
 )
 
@@ -270,8 +271,8 @@ class Mapper:
         if self._start is not None:
             found = self._start.first_motion(frame, found, self._named, self.imu)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
-        now = self._moment, found.solution, frame.sweep.stamp
-        if self.imu is not None and (doubt is not None or self.imu.contradicted(*now)):
+        now = self.last, self._moment, found.solution, frame.sweep
+        if self.imu is not None and (doubt is not None or _may_mislead(self.imu, *now)):
             sweep, before = MovingSweep(features, self.config), (self.last, self._moment, None)
             alone = predict(sweep, *before, self.config.solver)
             frame, found = second_opinion(frame, found, alone, self._named)
@@ -332,6 +333,17 @@ def _with_settings_of(solver: ScanSolver | None, config: Config) -> Config:
     """The configuration with the settings that a solver brings, by which its results are judged."""
     settings = getattr(solver, "config", None)
     return config.changed(solver=settings) if isinstance(settings, SolverConfig) else config
+
+
+def _may_mislead(
+    imu: ImuTracker, update: MapUpdate, last: Moment | None, solution: Solution, sweep: MovingSweep
+) -> bool:
+    """Whether a gyro contradicts a solved sweep, or turned it and not the one before.
+
+    A sweep that a wrong gyro has bent is solved with the turn that bent it, if no sweep before was.
+    """
+    begins = sweep.motion is SweepMotion.GYRO and update.sweep_motion is not SweepMotion.GYRO
+    return begins or imu.contradicted(last, solution, sweep.stamp)
 
 
 def _check_factors_have_a_place(

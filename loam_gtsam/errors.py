@@ -13,6 +13,8 @@ from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 
+import numpy as np
+
 _log = logging.getLogger(__name__)
 DAMAGED: tuple[type[Exception], ...] = (
     OSError, EOFError, ValueError, LookupError, TypeError, ArithmeticError, MemoryError,
@@ -49,6 +51,25 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         wanted = ("gtsam." if kind.__module__.startswith("gtsam.") else "") + kind.__name__
         wanted = f"an {wanted}" if wanted[0] in "AEIOU" else f"a {wanted}"
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
+
+
+def check_array(
+    value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
+) -> None:
+    """Raise InputError, ``name: expected (N, 3) floats, got ...``, unless an array has a shape.
+
+    A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
+    integers or floats, the array must hold these.
+    """
+    kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
+    got = type(value).__name__
+    if isinstance(value, np.ndarray):
+        same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]
+        if value.dtype.kind in kinds and value.ndim == len(shape) and all(same):
+            return
+        got = f"shape {value.shape} of {value.dtype}"
+    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+    raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
 
 
 def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:

@@ -11,7 +11,7 @@ Conventions (the same everywhere):
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -28,7 +28,10 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
+from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
+from loam_gtsam.trajectory import Trajectory as Trajectory
+from loam_gtsam.trajectory import stack_poses as stack_poses
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -39,25 +42,6 @@ MAX_STAMP = 1 << 62
 """Nanoseconds up to which a stamp makes sense: the year 2116, and differences fit 64 bits."""
 _FARTHEST = 1e5
 """Metres, of a feature; far beyond any lidar, and within the grid of voxels."""
-
-
-def check_array(
-    value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
-) -> None:
-    """Raise InputError, ``name: expected (N, 3) floats, got ...``, unless an array has a shape.
-
-    A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
-    integers or floats, the array must hold these.
-    """
-    kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
-    got = type(value).__name__
-    if isinstance(value, np.ndarray):
-        same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]
-        if value.dtype.kind in kinds and value.ndim == len(shape) and all(same):
-            return
-        got = f"shape {value.shape} of {value.dtype}"
-    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-    raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -233,47 +217,6 @@ class ImuSamples:
     orientation: FloatArray | None
     gyro: FloatArray
     acceleration: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Poses over time.
-
-    Attributes
-    ----------
-    stamps : (N,) int64 nanoseconds
-    map_T_lidar : (N, 4, 4) float64; NaN as orientations where positions alone are known
-    point : (3,) metres along the axes of the lidar: the point, such as a prism, whose positions a
-        reference has; None if they are the lidar's
-    """
-
-    stamps: IntArray
-    map_T_lidar: FloatArray
-    point: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        check_array(self.map_T_lidar, "Trajectory.map_T_lidar", (len(self.stamps), 4, 4), "numbers")
-
-    @classmethod
-    def from_poses(
-        cls, stamps: Sequence[int] | IntArray, poses: Iterable[gtsam.Pose3]
-    ) -> Trajectory:
-        """N poses at N stamps in nanoseconds."""
-        return cls(np.array(stamps, np.int64), stack_poses(poses))
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    @property
-    def path_length(self) -> float:
-        """Metres travelled."""
-        steps = np.diff(self.map_T_lidar[:, :3, 3], axis=0)
-        return float(np.linalg.norm(steps, axis=1).sum())
-
-
-def stack_poses(poses: Iterable[gtsam.Pose3]) -> FloatArray:
-    """(N, 4, 4) matrices of N poses; (0, 4, 4) if there are none."""
-    return np.array([pose.matrix() for pose in poses], np.float64).reshape(-1, 4, 4)
 
 
 class FrameStatus(StrEnum):

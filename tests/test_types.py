@@ -59,6 +59,40 @@ def test_a_trajectory_is_made_of_poses_and_knows_the_length_of_its_path():
     assert Trajectory.from_poses([], []).map_T_lidar.shape == (0, 4, 4)
 
 
+def test_a_trajectory_is_indexed_iterated_and_asked_for_other_times():
+    poses = [gtsam.Pose3(gtsam.Rot3.Rz(0.2 * n), np.array([n, 0.0, 1.0])) for n in range(4)]
+    way = Trajectory.from_poses([10, 20, 30, 40], poses)
+    np.testing.assert_array_equal(way.positions[:, 0], [0, 1, 2, 3])
+    assert all(one.equals(other, 1e-12) for one, other in zip(way, poses, strict=True))
+    assert way[-1].equals(poses[3], 1e-12)
+    assert way[np.int64(1)].equals(poses[1], 1e-12)
+    for which in (slice(1, 3), way.positions[:, 0] % 3 > 0, [1, 2], np.array([1, 2])):
+        assert way[which].stamps.tolist() == [20, 30]
+    assert way.at(25).equals(gtsam.Pose3(gtsam.Rot3.Rz(0.3), np.array([1.5, 0.0, 1.0])), 1e-9)
+    assert way.at([40, 10]).stamps.tolist() == [40, 10]
+    assert len(way.at([])) == 0
+    with pytest.raises(IndexError):
+        way[4]
+
+
+def test_what_is_no_trajectory_or_no_time_of_it_is_refused():
+    way = Trajectory.from_poses([10, 20], [gtsam.Pose3()] * 2)
+    with pytest.raises(InputError, match=r"expected stamps from 10 to 20 ns, .* got 21 to 21"):
+        way.at(21)
+    with pytest.raises(InputError, match=r"Trajectory.at: expected .* integer nanoseconds"):
+        way.at(15.0)
+    with pytest.raises(InputError, match=r"poses\[0\]: expected a gtsam.Pose3, got ndarray"):
+        Trajectory.from_poses([10], [np.eye(4)])
+    with pytest.raises(InputError, match=r"Trajectory.stamps: expected .* integer nanoseconds"):
+        Trajectory(np.array([0.1]), np.eye(4)[None])
+
+
+def test_a_trajectory_is_shown_in_a_line():
+    way = Trajectory.from_poses([0, 10**9], [gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), [3, 4, 0])])
+    assert repr(way) == "Trajectory(2 poses: 1.00 s from 0 ns, 5.00 m)"
+    assert repr(way[:0]) == "Trajectory(0 poses)"
+
+
 def test_values_that_hold_arrays_can_be_compared_and_are_equal_only_to_themselves():
     def values():
         poses = Trajectory.from_poses([1, 2], [gtsam.Pose3()] * 2)

@@ -14,6 +14,7 @@ from enum import StrEnum
 from functools import partial
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 _log = logging.getLogger(__name__)
 DAMAGED: tuple[type[Exception], ...] = (
@@ -53,6 +54,16 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
 
 
+def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
+    """InputError for a part of a user's own that is a class, or lacks methods; None is no part."""
+    if isinstance(part, type):
+        raise InputError(f"{name}: expected {wanted}, got the class {part.__name__}")
+    missing = [method for method in methods if not callable(getattr(part, method, None))]
+    if part is not None and missing:
+        lacks = "" if "__call__" in missing else f" without {' and '.join(missing)}"
+        raise InputError(f"{name}: expected {wanted}, got {type(part).__name__}{lacks}")
+
+
 def check_array(
     value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
 ) -> None:
@@ -70,6 +81,20 @@ def check_array(
         got = f"shape {value.shape} of {value.dtype}"
     wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
     raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
+
+
+def as_stamps(value: ArrayLike, name: str) -> NDArray[np.int64]:
+    """(N,) int64 nanoseconds; InputError for anything but integers."""
+    stamps = np.asarray(value)
+    if not stamps.size:
+        stamps = stamps.astype(np.int64)
+    try:
+        check_array(stamps, name, ("N",), "integer nanoseconds")
+    except InputError as error:
+        raise InputError(
+            f"{error}; np.round(seconds * 1e9).astype(np.int64) makes them of seconds"
+        ) from None
+    return stamps.astype(np.int64, copy=False)
 
 
 def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:

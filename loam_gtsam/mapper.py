@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 
 from loam_gtsam.config import Config, as_config
-from loam_gtsam.errors import check_kind, own_code
+from loam_gtsam.errors import check_kind, check_part, own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -99,6 +99,8 @@ class Mapper:
 
     Raises
     ------
+    InputError
+        If ``solver``, ``imu`` or ``extra_factors`` is none.
     ConfigError
         If the configured solver has no place for factors of the IMU, or of a user's own.
     """
@@ -112,6 +114,8 @@ class Mapper:
         extra_factors: ExtraFactors | None = None,
     ) -> None:
         self.config = as_config(config)
+        check_part(solver, "solver", "a solver, as make_solver(config.solver)", "solve")
+        check_part(extra_factors, "extra_factors", "a function", "__call__")
         self.solver = solver or make_solver(self.config.solver)
         _check_factors_have_a_place(self.config, imu, extra_factors, own_solver=solver is not None)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)

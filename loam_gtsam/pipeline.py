@@ -18,7 +18,7 @@ from loam_gtsam.aiding.wheels import aided_odometry
 from loam_gtsam.config import Config, Section, as_config, with_implied
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
-from loam_gtsam.errors import PartFaults, is_own, nearest, own_code
+from loam_gtsam.errors import PartFaults, check_part, is_own, nearest, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint, Progress
@@ -373,13 +373,14 @@ def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
 
 
 def _check_parts(parts: Mapping[str, object]) -> None:
-    """TypeError for a keyword that is none, which a TypedDict lets pass."""
-    for name, part in parts.items():
+    """TypeError for a keyword that is none, which a TypedDict lets pass; InputError for a part."""
+    for name in parts:
         if name not in Parts.__annotations__:
             hint = nearest(name, [*Parts.__annotations__, *signature(run).parameters])
             raise TypeError(f"unexpected keyword argument {name!r}{hint}")
-        if isinstance(part, type) and name in ("odometry", "loop_closer"):
-            raise InputError(f"{name}: expected an object, got the class {part.__name__}")
+    check_part(parts.get("features"), "features", "a function", "__call__")
+    check_part(parts.get("odometry"), "odometry", "an object", "guess", "remember")
+    check_part(parts.get("loop_closer"), "loop_closer", "an object", "detect")
 
 
 def run(

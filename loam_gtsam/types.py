@@ -28,6 +28,7 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
+from loam_gtsam.errors import as_stamps as as_stamps
 from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
 from loam_gtsam.trajectory import Trajectory as Trajectory
@@ -210,13 +211,32 @@ class ImuSamples:
     orientation : (N, 4) quaternions x y z w of ``world_R_imu`` (world z up), or None if the IMU
         has no attitude output
     gyro : (N, 3) rad/s, imu frame
-    acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest
+    acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest; zero for an IMU without an
+        accelerometer, which None or nothing stands for
+
+    Raises
+    ------
+    InputError
+        If a shape or a dtype is wrong.
     """
 
     stamps: IntArray
     orientation: FloatArray | None
     gyro: FloatArray
-    acceleration: FloatArray
+    acceleration: FloatArray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        stamps = as_stamps(self.stamps, "ImuSamples.stamps")
+        object.__setattr__(self, "stamps", stamps)
+        if self.acceleration is None:
+            object.__setattr__(self, "acceleration", np.zeros((len(stamps), 3)))
+        columns = {"orientation": 4, "gyro": 3, "acceleration": 3}
+        if self.orientation is None:
+            del columns["orientation"]
+        for name, width in columns.items():
+            column = np.asarray(getattr(self, name))
+            check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
+            object.__setattr__(self, name, column)
 
 
 class FrameStatus(StrEnum):

@@ -4,7 +4,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, Scan, Trajectory
+from loam_gtsam.types import (
+    Features,
+    FrameStatus,
+    ImuSamples,
+    InputError,
+    MapUpdate,
+    Scan,
+    Trajectory,
+)
 
 POINTS = np.zeros((6, 3), np.float32)
 
@@ -33,6 +41,24 @@ def test_a_scan_takes_what_fits():
     scan = Scan(POINTS, 5, np.zeros(6), np.zeros(6, np.uint16), rows=3)
     assert scan.stamp == 5
     assert len(Scan(POINTS[:0], 0).points) == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"stamps": np.arange(5)}, r"ImuSamples.gyro: expected \(5, 3\) numbers, got .*\(6, 3\)"),
+        ({"stamps": np.zeros(6)}, r"ImuSamples.stamps: expected .*seconds \* 1e9"),
+        ({"orientation": np.zeros((6, 3))}, r"ImuSamples.orientation: expected \(6, 4\)"),
+        ({"gyro": None}, r"ImuSamples.gyro: expected \(6, 3\) numbers"),
+        ({"acceleration": np.zeros(6)}, r"ImuSamples.acceleration: expected \(6, 3\)"),
+    ],
+)
+def test_imu_samples_of_wrong_shape_or_dtype_are_refused(fields, message):
+    good = {"stamps": np.arange(6), "orientation": None, "gyro": np.zeros((6, 3))}
+    for none in ({}, {"acceleration": None}):
+        assert ImuSamples(**(good | none)).acceleration.tolist() == [[0.0, 0.0, 0.0]] * 6
+    with pytest.raises(InputError, match=message):
+        ImuSamples(**(good | fields))
 
 
 @pytest.mark.parametrize("bad", [np.zeros((4, 2)), np.zeros((4, 3), np.int32), [[0.0, 0.0, 0.0]]])

@@ -160,11 +160,6 @@ class NamedSolver(ScanSolver):
     solver: ScanSolver
     factors: object
 
-    def __post_init__(self) -> None:
-        if isinstance(self.solver, type):
-            name = self.solver.__name__
-            raise InputError(f"solver: expected a solver, got the class; {name}(config.solver)")
-
     def solve(
         self,
         associate: Associate,

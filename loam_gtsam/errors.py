@@ -79,6 +79,8 @@ def check_array(
         if value.dtype.kind in kinds and value.ndim == len(shape) and all(same):
             return
         got = f"shape {value.shape} of {value.dtype}"
+        if shape[1:] == (3,) and value.ndim == 2 and value.shape[1] > 3:
+            got += "; [:, :3] takes the first three columns"
     wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
     raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
 

@@ -51,7 +51,7 @@ class Scan:
 
     Parameters
     ----------
-    points : (N, 3) float array, metres, lidar frame. NaN and infinite rows are allowed.
+    points : (N, 3) floats, metres, lidar frame. NaN and infinite rows are allowed.
     stamp : nanoseconds; ``times`` count from here.
     times : (N,) seconds from ``stamp`` at which each point was measured, or None if unknown.
     rings : (N,) integer beam number of each point, or None if unknown. Any consistent order.
@@ -74,6 +74,9 @@ class Scan:
     rows: int = 0
 
     def __post_init__(self) -> None:
+        for name in ("points", "times", "rings"):
+            if isinstance(given := getattr(self, name), (list, tuple)):
+                object.__setattr__(self, name, np.array(given))
         check_array(self.points, "Scan.points", ("N", 3))
         if not (isinstance(self.stamp, (int, np.integer)) and abs(int(self.stamp)) <= MAX_STAMP):
             raise InputError(
@@ -352,7 +355,7 @@ class Timings(Mapping[str, float]):
         return len(self._seconds)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.
 
@@ -423,6 +426,12 @@ class MapUpdate:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timings", Timings(self.timings))
+
+    def __repr__(self) -> str:
+        position = self.map_T_lidar.translation().round(3).tolist()
+        matches = f"{self.n_edge_matches} edge and {self.n_plane_matches} plane matches"
+        said = f": {self.message}" if self.message else ""
+        return f"MapUpdate({self.status} at {self.stamp} ns, {position} m, {matches}{said})"
 
     @property
     def raw_covariance(self) -> FloatArray:

@@ -22,7 +22,8 @@ POINTS = np.zeros((6, 3), np.float32)
     [
         ({"points": np.zeros((6, 4))}, r"Scan.points: expected \(N, 3\) floats.*\(6, 4\)"),
         ({"points": np.zeros(3)}, r"Scan.points.*\(3,\)"),
-        ({"points": [[0.0, 0.0, 0.0]]}, "Scan.points.*list"),
+        ({"points": "cloud"}, "Scan.points.*str"),
+        ({"points": np.zeros((6, 4))}, r"Scan.points: .*; \[:, :3\] takes the first three columns"),
         ({"points": np.zeros((6, 3), np.int64)}, "Scan.points: expected .* floats, got .*int64"),
         ({"times": np.zeros(5)}, r"Scan.times: expected \(6,\) floats.*\(5,\)"),
         ({"times": np.zeros(6, np.int32)}, "Scan.times: expected .* floats, got .*int32"),
@@ -41,6 +42,12 @@ def test_a_scan_takes_what_fits():
     scan = Scan(POINTS, 5, np.zeros(6), np.zeros(6, np.uint16), rows=3)
     assert scan.stamp == 5
     assert len(Scan(POINTS[:0], 0).points) == 0
+    listed = Scan([[1.0, 2.0, 3.0]], 0, [0.05], [7])
+    assert (listed.points.shape, listed.times.tolist(), listed.rings.tolist()) == (
+        (1, 3),
+        [0.05],
+        [7],
+    )
 
 
 @pytest.mark.parametrize(
@@ -130,6 +137,13 @@ def test_values_that_hold_arrays_can_be_compared_and_are_equal_only_to_themselve
         assert one == one
         assert one != other
         assert len({one, other}) == 2
+
+
+def test_a_frame_is_shown_in_a_line():
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 2.0, 0.1234]))
+    update = MapUpdate(7, pose, FrameStatus.LOST, "no fit", n_edges=9, n_plane_matches=3)
+    shown = "lost at 7 ns, [1.0, 2.0, 0.123] m, 0 edge and 3 plane matches: no fit"
+    assert repr(update) == f"MapUpdate({shown})"
 
 
 def test_a_frame_has_a_pose_unless_its_stamp_is_bad():

@@ -75,6 +75,10 @@ class PoseGraph(FactorGraph):
         self._session, self.keyframes, self.loops, self._graph, self._added, self.visits = state
         self._selection = LoopSelection(self.config, self._graph, self.keyframes, self.loops)
 
+    def __repr__(self) -> str:
+        loops = f"{sum(self.active)} of {len(self.loops)} loops active"
+        return f"PoseGraph({len(self)} keyframes, {loops})"
+
     def __len__(self) -> int:
         return len(self.keyframes)
 

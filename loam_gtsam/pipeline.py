@@ -148,7 +148,7 @@ class Pipeline:
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
     wheels : predict the sweeps, if ``aiding.wheels``
-    parts : solver, front end and others of a user's own, see :class:`Parts`
+    parts : as of :func:`run`
 
     Attributes
     ----------
@@ -401,18 +401,19 @@ def run(
     ----------
     dataset : see :mod:`loam_gtsam.datasets`
     max_frames : stop after so many sweeps
-    on_frame : e.g. to show progress
+    on_frame : called as ``on_frame(number, update)`` after each frame, e.g. to show progress
     keep_partial : if an error ends the run after some sweeps, return what was computed until
         then, with ``error`` set, instead of raising
-    observe : e.g. :func:`loam_gtsam.view.observers.record`, for a bag
+    observe : called as ``observe(sweep, update, pipeline)`` after each frame, to look, not to
+        change; e.g. :func:`loam_gtsam.view.observers.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
         needs the usual ``if __name__ == "__main__":``.
     checkpoint : keeps the state of the run, and may begin with that of one that was stopped;
         ``on_frame`` and ``observe`` are then called for the frames that follow. With parts of your
         own, give the same ones again.
-    parts : solver, front end and others of your own, see :class:`Parts`; a front end of your own
-        is called in this process
+    parts : ``solver``, ``features``, ``odometry``, ``extra_factors``, ``loop_closer`` of your own,
+        see :class:`loam_gtsam.pipeline.Parts`; ``features`` is called in this process
 
     Returns
     -------

@@ -99,10 +99,8 @@ class Mapper:
 
     Raises
     ------
-    InputError
-        If ``solver``, ``imu`` or ``extra_factors`` is none.
-    ConfigError
-        If the configured solver has no place for factors of the IMU, or of a user's own.
+    InputError, ConfigError
+        If a part is none; if the configured solver has no place for factors of the IMU or your own.
     """
 
     def __init__(
@@ -114,10 +112,8 @@ class Mapper:
         extra_factors: ExtraFactors | None = None,
     ) -> None:
         self.config = as_config(config)
-        check_part(solver, "solver", "a solver, as make_solver(config.solver)", "solve")
-        check_part(extra_factors, "extra_factors", "a function", "__call__")
         self.solver = solver or make_solver(self.config.solver)
-        _check_factors_have_a_place(self.config, imu, extra_factors, own_solver=solver is not None)
+        _check_parts(self.config, solver, imu, extra_factors)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)
         self.extra_factors = extra_factors
         self._forget()
@@ -332,12 +328,14 @@ class Mapper:
         return make_update(posed, map_T_lidar, status, message, solution, tilt)
 
 
-def _check_factors_have_a_place(
-    config: Config, imu: ImuBuffer | None, extra: ExtraFactors | None, *, own_solver: bool
+def _check_parts(
+    config: Config, solver: ScanSolver | None, imu: ImuBuffer | None, extra: ExtraFactors | None
 ) -> None:
-    """ConfigError if a classical solver is to be given factors."""
+    """InputError for a part that is none; ConfigError if a classical solver is to get factors."""
+    check_part(solver, "solver", "a solver, as make_solver(config.solver)", "solve")
+    check_part(extra, "extra_factors", "a function", "__call__")
     method, prior = config.solver.method, config.imu.prior
-    if own_solver or method == "gtsam":
+    if solver is not None or method == "gtsam":
         return
     if imu is not None and prior in ("equivalent", "sigma"):
         raise ConfigError(

@@ -76,8 +76,7 @@ class PoseGraph(FactorGraph):
         self._selection = LoopSelection(self.config, self._graph, self.keyframes, self.loops)
 
     def __repr__(self) -> str:
-        loops = f"{sum(self.active)} of {len(self.loops)} loops active"
-        return f"PoseGraph({len(self)} keyframes, {loops})"
+        return f"PoseGraph({len(self)} keyframes, {sum(self.active)} of {len(self.loops)} loops)"
 
     def __len__(self) -> int:
         return len(self.keyframes)

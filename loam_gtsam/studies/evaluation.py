@@ -43,8 +43,8 @@ class AbsoluteError:
         rotation that fits the positions leaves the roll about a straight path to their noise.
     translations : (N,) metres, error of each pose
     stamps : (N,) nanoseconds of the poses that were compared
-    aligned : the N poses as they were compared, in the frame of the reference and of its ``point``,
-        to be drawn beside ``reference.at(stamps)``
+    aligned : the N poses as they were compared, to be drawn beside ``reference.at(stamps)``; those
+        of the ``point`` of the reference, if it has one
     """
 
     rmse: float

@@ -121,8 +121,8 @@ def own_factors(
                 f"{type(factor).__name__} on the keys {keys}"
             )
         with own_code("extra_factors", extra):
-            linear = factor.linearize(near)
-            if not all(np.isfinite(part).all() for part in linear.jacobian()):
+            linear = factor.linearize(near)  # None if the factor does not act there
+            if linear is not None and not np.isfinite(np.column_stack(linear.jacobian())).all():
                 raise InputError(
                     "extra_factors: expected factors that are finite at the predicted pose, got "
                     f"{type(factor).__name__} with NaN in its error, Jacobian or noise (sigma 0?)"

@@ -21,7 +21,7 @@ from loam_gtsam.datasets.bags.loam_topics import LoamTopicsDataset
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.io.run_files import stage_seconds
 from loam_gtsam.pipeline import RunResult, effective_config, run
-from loam_gtsam.studies.evaluation import absolute_error, interpolate
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import DatasetError, FloatArray, MapUpdate, Scan, Trajectory
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -294,7 +294,7 @@ def run_case(case: Case, peers: bool = True) -> CaseResult:
         case.name,
         case.note,
         sweeps=len(result.updates),
-        path=interpolate(truth, error.stamps).path_length,
+        path=truth.at(error.stamps).path_length,
         ate=error.rmse,
         peers=(*found, *(PeerResult(f"{label} (known)", ate) for label, ate in case.known)),
         stages=stages,

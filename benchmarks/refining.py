@@ -31,7 +31,7 @@ from loam_gtsam.pipeline import run
 from loam_gtsam.refine.map_quality import common_thickness, map_quality
 from loam_gtsam.refine.runs import RefinedRun, refine_run, run_points
 from loam_gtsam.refine.sweeps import Path as Way
-from loam_gtsam.studies.evaluation import FREEDOM, absolute_error, align_rotations, interpolate
+from loam_gtsam.studies.evaluation import FREEDOM, absolute_error, align_rotations
 from loam_gtsam.types import FloatArray, InputError, LoamError, Trajectory
 
 _GROUPS = ("worlds", "degenerate")
@@ -145,7 +145,7 @@ def squared_errors(found: RefinedRun, truth: Trajectory, window: int) -> FloatAr
     """
     ours = found.trajectory
     inside = np.flatnonzero((ours.stamps >= truth.stamps[0]) & (ours.stamps <= truth.stamps[-1]))
-    exact = interpolate(truth, ours.stamps[inside])
+    exact = truth.at(ours.stamps[inside])
     poses = [gtsam.Pose3(pose) for pose in ours.map_T_lidar[inside]]
     true = [gtsam.Pose3(pose) for pose in exact.map_T_lidar]
     squared = []
@@ -174,7 +174,7 @@ def _moved(found: RefinedRun, given: Trajectory) -> RefinedRun:
     ours = found.refined.path.map_T_middle
     stamps = np.array([sweep.stamp for sweep in found.points.held], np.int64)
     inside = np.clip(stamps, given.stamps[0], given.stamps[-1])
-    poses = interpolate(given, inside).map_T_lidar
+    poses = given.at(inside).map_T_lidar
     move = np.eye(4)
     move[:3, :3] = align_rotations(poses[:, :3, :3], ours[:, :3, :3])
     move[:3, 3] = (ours[:, :3, 3] - transform(move, poses[:, :3, 3])).mean(axis=0)

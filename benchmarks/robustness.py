@@ -36,7 +36,7 @@ from loam_gtsam.datasets.sim.disturbances import (
     SkippedAhead,
 )
 from loam_gtsam.pipeline import effective_config, run
-from loam_gtsam.studies.evaluation import absolute_error, interpolate
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, Scan, Trajectory
 
 OURS, KISS = "loam_gtsam", "KISS-ICP"
@@ -290,7 +290,7 @@ def _others(counts: Mapping[str, int]) -> list[tuple[str, int]]:
 
 def _from_the_start(trajectory: Trajectory, truth: Trajectory) -> FloatArray:
     """(N,) metres of position error, the first poses laid on top of each other."""
-    reference = interpolate(truth, trajectory.stamps).map_T_lidar
+    reference = truth.at(trajectory.stamps).map_T_lidar
     poses = reference[0] @ np.linalg.inv(trajectory.map_T_lidar[0]) @ trajectory.map_T_lidar
     errors: FloatArray = np.linalg.norm(poses[:, :3, 3] - reference[:, :3, 3], axis=1)
     return errors

@@ -34,7 +34,7 @@ from loam_gtsam.datasets.base import PartOf
 from loam_gtsam.datasets.sim.patterns import PATTERNS
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies import evaluation
-from loam_gtsam.studies.evaluation import FIVE_SIGMA, FREEDOM, absolute_error, interpolate
+from loam_gtsam.studies.evaluation import FIVE_SIGMA, FREEDOM, absolute_error
 from loam_gtsam.types import FloatArray, FrameStatus, LoamError, MapUpdate, Trajectory
 
 WINDOWS = (1, 10, 50)
@@ -259,7 +259,7 @@ def judge(row: Row, result: RunResult, truth: Trajectory) -> Row:
     """The row with what a run gave."""
     first, last = truth.stamps[0], truth.stamps[-1]
     updates = [update for update in result.updates if first <= update.stamp <= last]
-    exact_at = interpolate(truth, np.array([update.stamp for update in updates], np.int64))
+    exact_at = truth.at([update.stamp for update in updates])
     true = [gtsam.Pose3(pose) for pose in exact_at.map_T_lidar]
     moved = [updates[0].map_T_lidar.between(update.map_T_lidar) for update in updates]
     exact = [true[0].between(pose) for pose in true]

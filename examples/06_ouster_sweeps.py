@@ -15,6 +15,6 @@ for label, value in {"kind": info.kind, **info.facts}.items():
     print(f"{label}: {value}")
 
 result = run(dataset)
-positions = result.trajectory.map_T_lidar[:, :3, 3]
+positions = result.trajectory.positions
 for update, step in zip(result.updates[1:], np.diff(positions, axis=0), strict=True):
     print(f"{update.status}: step {step.round(3)} m, {np.linalg.norm(step):.3f} m")

@@ -21,7 +21,7 @@ world = SimulatedWorld("corridor_bare", frames=60, columns=450, max_range=6.0)
 # positions are in the frame of the first pose: so is the map, if it is not levelled.
 rng = np.random.default_rng(0)
 stamps = world.truth.stamps[[*range(0, 28, 3), *range(33, 60, 3)]]
-positions = world.truth_at(stamps).map_T_lidar[:, :3, 3]
+positions = world.truth_at(stamps).positions
 positions = positions + rng.normal(0.0, SIGMA, positions.shape)
 config = Config().changed("imu.coupling=loose", "imu.level=false")  # no accelerometer
 had_one: list[int] = []
@@ -40,12 +40,12 @@ def gps(context: PoseContext) -> Sequence[gtsam.NonlinearFactor]:
 
 def off_along(result_positions: np.ndarray) -> np.ndarray:
     """Metres from the truth along the road, of every sweep."""
-    return np.abs(result_positions[:, 0] - world.truth.map_T_lidar[:, 0, 3])
+    return np.abs(result_positions[:, 0] - world.truth.positions[:, 0])
 
 
-alone = off_along(run(world, config).trajectory.map_T_lidar[:, :3, 3])
+alone = off_along(run(world, config).trajectory.positions)
 result = run(world, config, extra_factors=gps)
-with_gps = off_along(result.trajectory.map_T_lidar[:, :3, 3])
+with_gps = off_along(result.trajectory.positions)
 print(f"scans alone: off by {alone.max():.2f} m of {world.truth.path_length:.1f} m")
 print(
     f"with GPS: {np.median(with_gps[had_one]):.2f} m in the {len(had_one)} sweeps with a position"

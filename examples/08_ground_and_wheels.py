@@ -56,7 +56,7 @@ errors = {}
 travelled = world.truth.path_length
 for name, factors in (("scans alone", None), ("with floor and wheels", both)):
     result = run(world, off, extra_factors=factors)
-    away = result.trajectory.map_T_lidar[:, :3, 3] - world.truth.map_T_lidar[:, :3, 3]
+    away = result.trajectory.positions - world.truth.positions
     errors[name] = np.abs(away[-1, 0]), np.abs(away @ floor_up).max()
     print(f"{name}: {errors[name][0]:.3f} m along after {travelled:.1f} m, "
           f"{1e3 * errors[name][1]:.1f} mm in height")  # fmt: skip

@@ -63,8 +63,8 @@ for scan in world:
     if loop is not None:
         graph.add_loop(loop)
 
-closed = graph.trajectory(drifting).map_T_lidar[:, :3, 3]
-truth = world.truth.map_T_lidar[:, :3, 3]
+closed = graph.trajectory(drifting).positions
+truth = world.truth.positions
 before = np.linalg.norm(odometry.translation() - truth[-1])
 after = np.linalg.norm(closed[-1] - truth[-1])
 print(f"{len(graph)} keyframes, {len(graph.loops)} loops, {sum(graph.active)} of them used")

@@ -19,7 +19,7 @@ parts = {"first": (0, 28), "second": (20, 50)}
 runs = []
 for name, (start, end) in parts.items():  # a job for each, with as many cores as there are
     runs.append(run(PartOf(world, start, 1, None, None), config, max_frames=end - start))
-    save_map(f"{name}.lgmap", runs[-1].pipeline)
+    save_map(f"{name}.lgmap", runs[-1])
 
 with SavedMap("first.lgmap") as first, SavedMap("second.lgmap") as second:
     merged = merge_maps([first, second], "both.lgmap")

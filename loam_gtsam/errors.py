@@ -13,6 +13,9 @@ from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 _log = logging.getLogger(__name__)
 DAMAGED: tuple[type[Exception], ...] = (
     OSError, EOFError, ValueError, LookupError, TypeError, ArithmeticError, MemoryError,
@@ -49,6 +52,51 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         wanted = ("gtsam." if kind.__module__.startswith("gtsam.") else "") + kind.__name__
         wanted = f"an {wanted}" if wanted[0] in "AEIOU" else f"a {wanted}"
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
+
+
+def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
+    """InputError for a part of a user's own that is a class, or lacks methods; None is no part."""
+    if isinstance(part, type):
+        raise InputError(f"{name}: expected {wanted}, got the class {part.__name__}")
+    missing = [method for method in methods if not callable(getattr(part, method, None))]
+    if part is not None and missing:
+        lacks = "" if "__call__" in missing else f" without {' and '.join(missing)}"
+        raise InputError(f"{name}: expected {wanted}, got {type(part).__name__}{lacks}")
+
+
+def check_array(
+    value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
+) -> None:
+    """Raise InputError, ``name: expected (N, 3) floats, got ...``, unless an array has a shape.
+
+    A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
+    integers or floats, the array must hold these.
+    """
+    kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
+    got = type(value).__name__
+    if isinstance(value, np.ndarray):
+        same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]
+        if value.dtype.kind in kinds and value.ndim == len(shape) and all(same):
+            return
+        got = f"shape {value.shape} of {value.dtype}"
+        if shape[1:] == (3,) and value.ndim == 2 and value.shape[1] > 3:
+            got += "; [:, :3] takes the first three columns"
+    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
+    raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
+
+
+def as_stamps(value: ArrayLike, name: str) -> NDArray[np.int64]:
+    """(N,) int64 nanoseconds; InputError for anything but integers."""
+    stamps = np.asarray(value)
+    if not stamps.size:
+        stamps = stamps.astype(np.int64)
+    try:
+        check_array(stamps, name, ("N",), "integer nanoseconds")
+    except InputError as error:
+        raise InputError(
+            f"{error}; np.round(seconds * 1e9).astype(np.int64) makes them of seconds"
+        ) from None
+    return stamps.astype(np.int64, copy=False)
 
 
 def nearest(name: object, known: Iterable[str], listing: bool = True) -> str:

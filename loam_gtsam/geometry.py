@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, ndtr
 
+from loam_gtsam.errors import as_stamps as as_stamps
 from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array, check_kind
 
 _Real = TypeVar("_Real", np.float32, np.float64)
@@ -58,20 +59,6 @@ def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
     """The pose itself; InputError for anything else."""
     check_kind(value, gtsam.Pose3, name, "gtsam.Pose3(matrix) makes one of a (4, 4) matrix")
     return value
-
-
-def as_stamps(value: ArrayLike, name: str) -> IntArray:
-    """(N,) int64 nanoseconds; InputError for anything but integers."""
-    stamps = np.asarray(value)
-    if not stamps.size:
-        stamps = stamps.astype(np.int64)
-    try:
-        check_array(stamps, name, ("N",), "integer nanoseconds")
-    except InputError as error:
-        raise InputError(
-            f"{error}; np.round(seconds * 1e9).astype(np.int64) makes them of seconds"
-        ) from None
-    return stamps.astype(np.int64, copy=False)
 
 
 def transform(a_T_b: FloatArray, points: NDArray[np.floating]) -> FloatArray:

@@ -13,7 +13,7 @@ from typing import Any
 import gtsam
 
 from loam_gtsam.config import Config, SolverConfig, as_config
-from loam_gtsam.errors import check_kind, own_code
+from loam_gtsam.errors import check_kind, check_part, own_code
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.frontend.stamp_check import StampCheck
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -100,8 +100,8 @@ class Mapper:
 
     Raises
     ------
-    ConfigError
-        If the configured solver has no place for factors of the IMU, or of a user's own.
+    InputError, ConfigError
+        If a part is none; if the configured solver has no place for factors of the IMU or your own.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class Mapper:
     ) -> None:
         self.config = _with_settings_of(solver, as_config(config))
         self.solver = solver or make_solver(self.config.solver)
-        _check_factors_have_a_place(self.config, imu, extra_factors, own_solver=solver is not None)
+        _check_parts(self.config, solver, imu, extra_factors)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)
         self.extra_factors = extra_factors
         self._forget()
@@ -346,12 +346,14 @@ def _may_mislead(
     return begins or imu.contradicted(last, solution, sweep.stamp)
 
 
-def _check_factors_have_a_place(
-    config: Config, imu: ImuBuffer | None, extra: ExtraFactors | None, *, own_solver: bool
+def _check_parts(
+    config: Config, solver: ScanSolver | None, imu: ImuBuffer | None, extra: ExtraFactors | None
 ) -> None:
-    """ConfigError if a classical solver is to be given factors."""
+    """InputError for a part that is none; ConfigError if a classical solver is to get factors."""
+    check_part(solver, "solver", "a solver, as make_solver(config.solver)", "solve")
+    check_part(extra, "extra_factors", "a function", "__call__")
     method, prior = config.solver.method, config.imu.prior
-    if own_solver or method == "gtsam":
+    if solver is not None or method == "gtsam":
         return
     if imu is not None and prior in ("equivalent", "sigma"):
         raise ConfigError(

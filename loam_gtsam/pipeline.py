@@ -18,7 +18,7 @@ from loam_gtsam.aiding.wheels import aided_odometry
 from loam_gtsam.config import Config, Section, as_config, with_implied
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
-from loam_gtsam.errors import PartFaults, is_own, nearest, own_code
+from loam_gtsam.errors import PartFaults, check_part, is_own, nearest, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint, Progress
@@ -148,7 +148,7 @@ class Pipeline:
     ----------
     imu : samples must be in it before the sweeps they belong to; None does without
     wheels : predict the sweeps, if ``aiding.wheels``
-    parts : solver, front end and others of a user's own, see :class:`Parts`
+    parts : as of :func:`run`
 
     Attributes
     ----------
@@ -374,13 +374,14 @@ def imu_buffer(dataset: Dataset, config: Config) -> ImuBuffer | None:
 
 
 def _check_parts(parts: Mapping[str, object]) -> None:
-    """TypeError for a keyword that is none, which a TypedDict lets pass."""
-    for name, part in parts.items():
+    """TypeError for a keyword that is none, which a TypedDict lets pass; InputError for a part."""
+    for name in parts:
         if name not in Parts.__annotations__:
             hint = nearest(name, [*Parts.__annotations__, *signature(run).parameters])
             raise TypeError(f"unexpected keyword argument {name!r}{hint}")
-        if isinstance(part, type) and name in ("odometry", "loop_closer"):
-            raise InputError(f"{name}: expected an object, got the class {part.__name__}")
+    check_part(parts.get("features"), "features", "a function", "__call__")
+    check_part(parts.get("odometry"), "odometry", "an object", "guess", "remember")
+    check_part(parts.get("loop_closer"), "loop_closer", "an object", "detect")
 
 
 def run(
@@ -401,18 +402,19 @@ def run(
     ----------
     dataset : see :mod:`loam_gtsam.datasets`
     max_frames : stop after so many sweeps
-    on_frame : e.g. to show progress
+    on_frame : called as ``on_frame(number, update)`` after each frame, e.g. to show progress
     keep_partial : if an error ends the run after some sweeps, return what was computed until
         then, with ``error`` set, instead of raising
-    observe : e.g. :func:`loam_gtsam.view.observers.record`, for a bag
+    observe : called as ``observe(sweep, update, pipeline)`` after each frame, to look, not to
+        change; e.g. :func:`loam_gtsam.view.observers.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then
         count beside the others, not on top). The result is the same. A script that asks for any
         needs the usual ``if __name__ == "__main__":``.
     checkpoint : keeps the state of the run, and may begin with that of one that was stopped;
         ``on_frame`` and ``observe`` are then called for the frames that follow. With parts of your
         own, give the same ones again.
-    parts : solver, front end and others of your own, see :class:`Parts`; a front end of your own
-        is called in this process
+    parts : ``solver``, ``features``, ``odometry``, ``extra_factors``, ``loop_closer`` of your own,
+        see :class:`loam_gtsam.pipeline.Parts`; ``features`` is called in this process
 
     Returns
     -------

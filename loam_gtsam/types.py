@@ -11,7 +11,7 @@ Conventions (the same everywhere):
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -28,7 +28,11 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
+from loam_gtsam.errors import as_stamps as as_stamps
+from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
+from loam_gtsam.trajectory import Trajectory as Trajectory
+from loam_gtsam.trajectory import stack_poses as stack_poses
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -41,32 +45,13 @@ _FARTHEST = 1e5
 """Metres, of a feature; far beyond any lidar, and within the grid of voxels."""
 
 
-def check_array(
-    value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
-) -> None:
-    """Raise InputError, ``name: expected (N, 3) floats, got ...``, unless an array has a shape.
-
-    A letter in ``shape`` stands for any length, as in ``("N", 3)``. If the text ``numbers`` names
-    integers or floats, the array must hold these.
-    """
-    kinds = "iu" if "integer" in numbers else "f" if "float" in numbers else "fiu"
-    got = type(value).__name__
-    if isinstance(value, np.ndarray):
-        same = [n == m for n, m in zip(shape, value.shape, strict=False) if not isinstance(n, str)]
-        if value.dtype.kind in kinds and value.ndim == len(shape) and all(same):
-            return
-        got = f"shape {value.shape} of {value.dtype}"
-    wanted = ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "")
-    raise InputError(f"{name}: expected ({wanted}) {numbers}, got {got}")
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class Scan:
     """One sweep of the sensor, as it was measured (not de-skewed).
 
     Parameters
     ----------
-    points : (N, 3) float array, metres, lidar frame. NaN and infinite rows are allowed.
+    points : (N, 3) floats, metres, lidar frame. NaN and infinite rows are allowed.
     stamp : nanoseconds; ``times`` count from here.
     times : (N,) seconds from ``stamp`` at which each point was measured, or None if unknown.
     rings : (N,) integer beam number of each point, or None if unknown. Any consistent order.
@@ -89,6 +74,9 @@ class Scan:
     rows: int = 0
 
     def __post_init__(self) -> None:
+        for name in ("points", "times", "rings"):
+            if isinstance(given := getattr(self, name), (list, tuple)):
+                object.__setattr__(self, name, np.array(given))
         check_array(self.points, "Scan.points", ("N", 3))
         if not (isinstance(self.stamp, (int, np.integer)) and abs(int(self.stamp)) <= MAX_STAMP):
             raise InputError(
@@ -226,54 +214,32 @@ class ImuSamples:
     orientation : (N, 4) quaternions x y z w of ``world_R_imu`` (world z up), or None if the IMU
         has no attitude output
     gyro : (N, 3) rad/s, imu frame
-    acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest
+    acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest; zero for an IMU without an
+        accelerometer, which None or nothing stands for
+
+    Raises
+    ------
+    InputError
+        If a shape or a dtype is wrong.
     """
 
     stamps: IntArray
     orientation: FloatArray | None
     gyro: FloatArray
-    acceleration: FloatArray
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
-    """Poses over time.
-
-    Attributes
-    ----------
-    stamps : (N,) int64 nanoseconds
-    map_T_lidar : (N, 4, 4) float64; NaN as orientations where positions alone are known
-    point : (3,) metres along the axes of the lidar: the point, such as a prism, whose positions a
-        reference has; None if they are the lidar's
-    """
-
-    stamps: IntArray
-    map_T_lidar: FloatArray
-    point: FloatArray | None = None
+    acceleration: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
-        check_array(self.map_T_lidar, "Trajectory.map_T_lidar", (len(self.stamps), 4, 4), "numbers")
-
-    @classmethod
-    def from_poses(
-        cls, stamps: Sequence[int] | IntArray, poses: Iterable[gtsam.Pose3]
-    ) -> Trajectory:
-        """N poses at N stamps in nanoseconds."""
-        return cls(np.array(stamps, np.int64), stack_poses(poses))
-
-    def __len__(self) -> int:
-        return len(self.stamps)
-
-    @property
-    def path_length(self) -> float:
-        """Metres travelled."""
-        steps = np.diff(self.map_T_lidar[:, :3, 3], axis=0)
-        return float(np.linalg.norm(steps, axis=1).sum())
-
-
-def stack_poses(poses: Iterable[gtsam.Pose3]) -> FloatArray:
-    """(N, 4, 4) matrices of N poses; (0, 4, 4) if there are none."""
-    return np.array([pose.matrix() for pose in poses], np.float64).reshape(-1, 4, 4)
+        stamps = as_stamps(self.stamps, "ImuSamples.stamps")
+        object.__setattr__(self, "stamps", stamps)
+        if self.acceleration is None:
+            object.__setattr__(self, "acceleration", np.zeros((len(stamps), 3)))
+        columns = {"orientation": 4, "gyro": 3, "acceleration": 3}
+        if self.orientation is None:
+            del columns["orientation"]
+        for name, width in columns.items():
+            column = np.asarray(getattr(self, name))
+            check_array(column, f"ImuSamples.{name}", (len(stamps), width), "numbers")
+            object.__setattr__(self, name, column)
 
 
 class FrameStatus(StrEnum):
@@ -389,7 +355,7 @@ class Timings(Mapping[str, float]):
         return len(self._seconds)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class MapUpdate:
     """What :meth:`loam_gtsam.Mapper.register` says about one frame.
 
@@ -460,6 +426,12 @@ class MapUpdate:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timings", Timings(self.timings))
+
+    def __repr__(self) -> str:
+        position = self.map_T_lidar.translation().round(3).tolist()
+        matches = f"{self.n_edge_matches} edge and {self.n_plane_matches} plane matches"
+        said = f": {self.message}" if self.message else ""
+        return f"MapUpdate({self.status} at {self.stamp} ns, {position} m, {matches}{said})"
 
     @property
     def raw_covariance(self) -> FloatArray:

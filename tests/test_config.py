@@ -4,6 +4,7 @@ import math
 import re
 import typing
 
+import numpy as np
 import pytest
 from pydantic.fields import FieldInfo
 from ruamel.yaml import YAML
@@ -255,6 +256,15 @@ def test_in_small_places_values_are_scaled_only_as_far_as_their_bounds():
 def test_a_constructor_refuses_too(section, values, message):
     with pytest.raises(ConfigError, match=message):
         section(**values)
+
+
+def test_numbers_of_numpy_are_numbers():
+    config = Config().changed({"solver.iterations": np.int64(5), "imu.level": np.bool_(False)})
+    assert (config.solver.iterations, config.imu.level) == (5, False)
+    assert config.solver.changed(iterations=np.int32(4)).iterations == 4
+    assert config.imu.changed(lidar_t_imu=np.array([1.0, 2.0, 3.0])).lidar_t_imu == (1.0, 2.0, 3.0)
+    with pytest.raises(ConfigError, match=r"expected int, got 5\.0"):
+        Config().changed({"solver.iterations": np.float32(5.0)})
 
 
 PAIRS = [(owner, *pair) for owner in dict.fromkeys(f[0] for f in FIELDS) for pair in owner.in_order]

@@ -1,5 +1,7 @@
 """Whole runs on the built-in world: accuracy, interruption, determinism, recorded odometry."""
 
+import pickle
+from copy import deepcopy
 from dataclasses import replace
 from itertools import pairwise
 
@@ -63,6 +65,19 @@ def test_scan_to_scan_guess_maps_as_well():
     result = run(world, config)
     assert absolute_error(result.trajectory, world.truth).rmse < 0.03
     assert result.updates[5].timings["odometry"] > 0.0
+
+
+@pytest.mark.parametrize("copied", [deepcopy, lambda result: pickle.loads(pickle.dumps(result))])
+@pytest.mark.parametrize("loops", ["true", "false"])
+def test_a_copy_of_a_result_goes_on_as_the_result_does(copied, loops):
+    world = SimulatedWorld("room", frames=6, columns=300, imu="six_axis")
+    result = run(world, Config().changed(f"loops.enabled={loops}"), max_frames=5)
+    copy = copied(result)
+    before = copy.trajectory.map_T_lidar
+    np.testing.assert_array_equal(before, result.trajectory.map_T_lidar)
+    poses = [each.pipeline.process(world[5]).map_T_lidar.matrix() for each in (copy, result)]
+    np.testing.assert_array_equal(*poses)
+    assert copy.pipeline.mapper.imu.buffer is not result.pipeline.mapper.imu.buffer
 
 
 def test_max_frames_and_on_frame():

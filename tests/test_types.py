@@ -4,7 +4,15 @@ import gtsam
 import numpy as np
 import pytest
 
-from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, Scan, Trajectory
+from loam_gtsam.types import (
+    Features,
+    FrameStatus,
+    ImuSamples,
+    InputError,
+    MapUpdate,
+    Scan,
+    Trajectory,
+)
 
 POINTS = np.zeros((6, 3), np.float32)
 
@@ -14,7 +22,8 @@ POINTS = np.zeros((6, 3), np.float32)
     [
         ({"points": np.zeros((6, 4))}, r"Scan.points: expected \(N, 3\) floats.*\(6, 4\)"),
         ({"points": np.zeros(3)}, r"Scan.points.*\(3,\)"),
-        ({"points": [[0.0, 0.0, 0.0]]}, "Scan.points.*list"),
+        ({"points": "cloud"}, "Scan.points.*str"),
+        ({"points": np.zeros((6, 4))}, r"Scan.points: .*; \[:, :3\] takes the first three columns"),
         ({"points": np.zeros((6, 3), np.int64)}, "Scan.points: expected .* floats, got .*int64"),
         ({"times": np.zeros(5)}, r"Scan.times: expected \(6,\) floats.*\(5,\)"),
         ({"times": np.zeros(6, np.int32)}, "Scan.times: expected .* floats, got .*int32"),
@@ -33,6 +42,30 @@ def test_a_scan_takes_what_fits():
     scan = Scan(POINTS, 5, np.zeros(6), np.zeros(6, np.uint16), rows=3)
     assert scan.stamp == 5
     assert len(Scan(POINTS[:0], 0).points) == 0
+    listed = Scan([[1.0, 2.0, 3.0]], 0, [0.05], [7])
+    assert (listed.points.shape, listed.times.tolist(), listed.rings.tolist()) == (
+        (1, 3),
+        [0.05],
+        [7],
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"stamps": np.arange(5)}, r"ImuSamples.gyro: expected \(5, 3\) numbers, got .*\(6, 3\)"),
+        ({"stamps": np.zeros(6)}, r"ImuSamples.stamps: expected .*seconds \* 1e9"),
+        ({"orientation": np.zeros((6, 3))}, r"ImuSamples.orientation: expected \(6, 4\)"),
+        ({"gyro": None}, r"ImuSamples.gyro: expected \(6, 3\) numbers"),
+        ({"acceleration": np.zeros(6)}, r"ImuSamples.acceleration: expected \(6, 3\)"),
+    ],
+)
+def test_imu_samples_of_wrong_shape_or_dtype_are_refused(fields, message):
+    good = {"stamps": np.arange(6), "orientation": None, "gyro": np.zeros((6, 3))}
+    for none in ({}, {"acceleration": None}):
+        assert ImuSamples(**(good | none)).acceleration.tolist() == [[0.0, 0.0, 0.0]] * 6
+    with pytest.raises(InputError, match=message):
+        ImuSamples(**(good | fields))
 
 
 @pytest.mark.parametrize("bad", [np.zeros((4, 2)), np.zeros((4, 3), np.int32), [[0.0, 0.0, 0.0]]])
@@ -59,6 +92,40 @@ def test_a_trajectory_is_made_of_poses_and_knows_the_length_of_its_path():
     assert Trajectory.from_poses([], []).map_T_lidar.shape == (0, 4, 4)
 
 
+def test_a_trajectory_is_indexed_iterated_and_asked_for_other_times():
+    poses = [gtsam.Pose3(gtsam.Rot3.Rz(0.2 * n), np.array([n, 0.0, 1.0])) for n in range(4)]
+    way = Trajectory.from_poses([10, 20, 30, 40], poses)
+    np.testing.assert_array_equal(way.positions[:, 0], [0, 1, 2, 3])
+    assert all(one.equals(other, 1e-12) for one, other in zip(way, poses, strict=True))
+    assert way[-1].equals(poses[3], 1e-12)
+    assert way[np.int64(1)].equals(poses[1], 1e-12)
+    for which in (slice(1, 3), way.positions[:, 0] % 3 > 0, [1, 2], np.array([1, 2])):
+        assert way[which].stamps.tolist() == [20, 30]
+    assert way.at(25).equals(gtsam.Pose3(gtsam.Rot3.Rz(0.3), np.array([1.5, 0.0, 1.0])), 1e-9)
+    assert way.at([40, 10]).stamps.tolist() == [40, 10]
+    assert len(way.at([])) == 0
+    with pytest.raises(IndexError):
+        way[4]
+
+
+def test_what_is_no_trajectory_or_no_time_of_it_is_refused():
+    way = Trajectory.from_poses([10, 20], [gtsam.Pose3()] * 2)
+    with pytest.raises(InputError, match=r"expected stamps from 10 to 20 ns, .* got 21 to 21"):
+        way.at(21)
+    with pytest.raises(InputError, match=r"Trajectory.at: expected .* integer nanoseconds"):
+        way.at(15.0)
+    with pytest.raises(InputError, match=r"poses\[0\]: expected a gtsam.Pose3, got ndarray"):
+        Trajectory.from_poses([10], [np.eye(4)])
+    with pytest.raises(InputError, match=r"Trajectory.stamps: expected .* integer nanoseconds"):
+        Trajectory(np.array([0.1]), np.eye(4)[None])
+
+
+def test_a_trajectory_is_shown_in_a_line():
+    way = Trajectory.from_poses([0, 10**9], [gtsam.Pose3(), gtsam.Pose3(gtsam.Rot3(), [3, 4, 0])])
+    assert repr(way) == "Trajectory(2 poses: 1.00 s from 0 ns, 5.00 m)"
+    assert repr(way[:0]) == "Trajectory(0 poses)"
+
+
 def test_values_that_hold_arrays_can_be_compared_and_are_equal_only_to_themselves():
     def values():
         poses = Trajectory.from_poses([1, 2], [gtsam.Pose3()] * 2)
@@ -70,6 +137,13 @@ def test_values_that_hold_arrays_can_be_compared_and_are_equal_only_to_themselve
         assert one == one
         assert one != other
         assert len({one, other}) == 2
+
+
+def test_a_frame_is_shown_in_a_line():
+    pose = gtsam.Pose3(gtsam.Rot3(), np.array([1.0, 2.0, 0.1234]))
+    update = MapUpdate(7, pose, FrameStatus.LOST, "no fit", n_edges=9, n_plane_matches=3)
+    shown = "lost at 7 ns, [1.0, 2.0, 0.123] m, 0 edge and 3 plane matches: no fit"
+    assert repr(update) == f"MapUpdate({shown})"
 
 
 def test_a_frame_has_a_pose_unless_its_stamp_is_bad():

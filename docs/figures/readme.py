@@ -152,7 +152,7 @@ def town_loops(path: Path, frames: int) -> None:
             transform(pose, np.concatenate([keyframe.edges, keyframe.planes]))
             for pose, keyframe in zip(poses, graph.keyframes, strict=True)
         ]
-        way = trajectory.map_T_lidar[:, :3, 3]
+        way = trajectory.positions
         panels[f"{name}: {error:.2f} m off"] = np.concatenate(parts), way
     plot_loops(path, panels, np.array(ends).reshape(-1, 2, 3)[list(graph.active)])
 

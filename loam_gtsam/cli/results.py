@@ -78,15 +78,15 @@ class Results:
             error = evaluation.absolute_error(trajectory, truth)
         except ValueError as problem:  # no overlap in time, or stamps of the truth that repeat
             return replace(results, accuracy={"problem": str(problem)})
-        there = evaluation.interpolate(truth, error.stamps)
+        there = truth.at(error.stamps)
         inside = (trajectory.stamps >= truth.stamps[0]) & (trajectory.stamps <= truth.stamps[-1])
         here = trajectory.map_T_lidar[inside]
         if len(here) != len(error.stamps):  # a sparse reference
-            here = evaluation.interpolate(trajectory, error.stamps).map_T_lidar
+            here = trajectory.at(error.stamps).map_T_lidar
         turn = None
         if np.isfinite(there.map_T_lidar).all():
             turn = evaluation.align_rotations(there.map_T_lidar[:, :3, :3], here[:, :3, :3])
-        map_T_truth = evaluation.align_positions(there.map_T_lidar[:, :3, 3], here[:, :3, 3], turn)
+        map_T_truth = evaluation.align_positions(there.positions, here[:, :3, 3], turn)
         accuracy = {
             "ate_rmse_m": error.rmse,
             "ate_max_m": error.maximum,

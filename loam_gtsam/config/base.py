@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, get_args, get_origin
 
+import numpy as np
 from annotated_types import Ge, Le
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 from pydantic.fields import FieldInfo
@@ -103,7 +104,7 @@ class Section(BaseModel):
 
     def __init__(self, /, **values: Any) -> None:
         try:
-            super().__init__(**values)
+            super().__init__(**{name: _plain(value) for name, value in values.items()})
         except ValidationError as error:
             keys, reason = self._refusal(error.errors()[0])
             raise RefusedError(type(self).__name__, keys, reason) from None
@@ -195,7 +196,7 @@ def override(
         if isinstance(current, Section) and isinstance(value, Mapping):
             values[name] = override(current, value, where, (*above, name))
         else:
-            values[name] = _plain(value)
+            values[name] = value
         keys[name] = key
     try:
         return Section.changed(section, **values)
@@ -206,7 +207,9 @@ def override(
 
 
 def _plain(value: Any) -> Any:
-    """A value whose booleans are bools, not what the parser makes to keep their looks."""
+    """A value of Python: no array or number of numpy, no bool that keeps the looks of its file."""
+    if isinstance(value, (np.generic, np.ndarray)):
+        return value.tolist()
     if isinstance(value, list):
         return [_plain(entry) if isinstance(entry, ScalarBoolean) else entry for entry in value]
     return bool(value) if isinstance(value, ScalarBoolean) else value

@@ -13,10 +13,18 @@ from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import shorter_period
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.geometry import as_array, as_stamps
-from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory
+from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory, check_kind
 
 _SHORTEST = 1_000_000
 """Nanoseconds between sweeps; no spinning lidar turns a thousand times a second."""
+
+_PARTS: dict[str, tuple[type, str]] = {
+    "imu": (ImuSamples, "stamps, orientation, gyro, acceleration"),
+    "truth": (Trajectory, "stamps, map_T_lidar"),
+    "gnss": (GnssFixes, "stamps, geodetic, covariances"),
+    "wheels": (WheelSamples, "stamps, start_T_body"),
+}
+"""What a data set has beside its sweeps: the classes, and of what they are made."""
 
 
 class ArrayDataset(Loader):
@@ -37,7 +45,7 @@ class ArrayDataset(Loader):
     Raises
     ------
     InputError
-        If a shape, a dtype or a number of entries is wrong.
+        If a shape, a dtype, a number of entries or the class of a part is wrong.
     """
 
     def __init__(
@@ -56,6 +64,10 @@ class ArrayDataset(Loader):
         sensor: Mapping[str, Any] | None = None,
     ) -> None:
         entries = list(scans)
+        for part, given in {"imu": imu, "truth": truth, "gnss": gnss, "wheels": wheels}.items():
+            if given is not None:
+                kind, fields = _PARTS[part]
+                check_kind(given, kind, part, f"{kind.__name__}({fields}) makes one")
         self.name, self.imu, self.truth = name, imu, truth
         self.gnss, self.wheels = gnss, wheels
         self.sensor: Mapping[str, Any] = dict(sensor or {})

@@ -109,7 +109,11 @@ def sweeps_of_run(dataset: Dataset, count: int) -> Iterator[Sweep]:
 
 
 class Loader:
-    """What every loader can do besides: be cut, and be given reference poses."""
+    """What every loader can do besides: be cut, be given reference poses, and show itself."""
+
+    def __repr__(self) -> str:
+        shown = cast(Dataset, self)
+        return f"{type(self).__name__}({shown.name!r}: {len(shown)} sweeps)"
 
     def part(
         self,

@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import ImuConfig
-from loam_gtsam.geometry import as_array, as_stamps, as_vector
+from loam_gtsam.geometry import as_array, as_vector
 from loam_gtsam.imu.at_rest import RestWindow, find_rest, rest_at_start
 from loam_gtsam.imu.attitude_filter import BLOCK, GravityFilter
 from loam_gtsam.imu.diagnosis import samples_problems
@@ -31,7 +31,7 @@ from loam_gtsam.imu.quaternions import (
     rotation_steps,
     running_product,
 )
-from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_array, check_kind
+from loam_gtsam.types import MAX_STAMP, FloatArray, ImuSamples, IntArray, check_kind
 
 REST_AHEAD = 0.1
 """Seconds after the asked stamp that still count to its rest: one sweep."""
@@ -174,10 +174,11 @@ class ImuBuffer:
     def add(self, samples: ImuSamples) -> None:
         """Put in one or many samples, in any order, overlapping others or not.
 
-        InputError if an array has the wrong shape or dtype.
+        InputError if it is anything but :class:`ImuSamples`.
         """
+        check_kind(samples, ImuSamples, "samples", "ImuSamples(stamps, None, gyro) makes one")
         counts = self._counts
-        stamps, values = _checked(samples)
+        stamps, values = _columns(samples)
         finite = (np.abs(values[:, 4:]) < _ABSURD).all(axis=1)  # NaN compares false
         finite &= (stamps >= -MAX_STAMP) & (stamps <= MAX_STAMP)
         stamps = stamps + round(self._config.time_offset * 1e9)
@@ -359,16 +360,13 @@ class ImuBuffer:
         return samples.orientation if self._quality.measured else self._filter.orientations(samples)
 
 
-def _checked(samples: ImuSamples) -> tuple[IntArray, FloatArray]:
+def _columns(samples: ImuSamples) -> tuple[IntArray, FloatArray]:
     """Stamps (N,) and values (N, 10): quaternion (zero where unknown), gyro, acceleration."""
-    stamps = as_stamps(samples.stamps, "ImuSamples.stamps")
-    count, orientation = len(stamps), samples.orientation
-    quaternions = np.zeros((count, 4)) if orientation is None else np.asarray(orientation)
-    gyro, acceleration = np.asarray(samples.gyro), np.asarray(samples.acceleration)
-    check_array(quaternions, "ImuSamples.orientation", (count, 4), "numbers")
-    check_array(gyro, "ImuSamples.gyro", (count, 3), "numbers")
-    check_array(acceleration, "ImuSamples.acceleration", (count, 3), "numbers")
-    return stamps, np.hstack([quaternions, gyro, acceleration]).astype(np.float64)
+    quaternions = samples.orientation
+    if quaternions is None:
+        quaternions = np.zeros((len(samples.stamps), 4))
+    values = np.hstack([quaternions, samples.gyro, samples.acceleration])
+    return samples.stamps, values.astype(np.float64)
 
 
 def _rotation_vectors(

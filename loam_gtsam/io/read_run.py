@@ -23,12 +23,18 @@ from loam_gtsam.types import (
 def read_updates(path: str | Path) -> list[MapUpdate]:
     """The frames of a run, but for their faults and counts of points that are not finite.
 
+    Parameters
+    ----------
+    path : the folder of the run, or its ``run.npz``
+
     Raises
     ------
     DatasetError
         If the file cannot be read, or is not one of
         :func:`~loam_gtsam.io.run_files.write_npz`.
     """
+    path = Path(path)
+    path = path / "run.npz" if path.is_dir() else path
     try:
         with np.load(path, allow_pickle=False) as file:
             columns = {name: file[name] for name in _NEEDED}

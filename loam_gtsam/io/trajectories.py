@@ -11,9 +11,10 @@ from pathlib import Path
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.io.atomic import write_text
-from loam_gtsam.types import Trajectory
+from loam_gtsam.types import Trajectory, check_kind
 
 _NS = 10**9
+_ORDER = "the path comes first, and RunResult.trajectory is one"
 
 
 def write_tum(
@@ -31,6 +32,7 @@ def write_tum(
     comments : written as ``# key: value`` at the top
     pose : what the poses are called there
     """
+    check_kind(trajectory, Trajectory, "trajectory", _ORDER)
     notes = dict(comments or {}) | {"columns": f"stamp_s x y z qx qy qz qw ({pose})"}
     lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
     poses = trajectory.map_T_lidar
@@ -48,6 +50,7 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
 
     The axes are those of the lidar, not KITTI's camera.
     """
+    check_kind(trajectory, Trajectory, "trajectory", _ORDER)
     rows = trajectory.map_T_lidar[:, :3, :].reshape(-1, 12).tolist()
     write_text(path, "".join(" ".join(f"{value:.12g}" for value in row) + "\n" for row in rows))
 

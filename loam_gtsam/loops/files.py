@@ -17,7 +17,15 @@ from loam_gtsam.datasets.decode.tables import whole_number
 from loam_gtsam.io.atomic import atomic_file
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import is_pose, pose_key, pose_number
-from loam_gtsam.types import MAX_STAMP, DatasetError, FloatArray, InputError, OutputError
+from loam_gtsam.loops.pose_graph import PoseGraph
+from loam_gtsam.types import (
+    MAX_STAMP,
+    DatasetError,
+    FloatArray,
+    InputError,
+    OutputError,
+    check_kind,
+)
 
 G2O_SUFFIX, GTSAM_SUFFIXES = ".g2o", (".graph", ".values", ".stamps")
 """Suffixes of the files; GTSAM's format takes three files side by side."""
@@ -30,7 +38,7 @@ _FIXED_SIGMA = 1e-4
 _NUMBERS_END = 1 << 56  # keys from here on are of ``gtsam.symbol``, smaller ones numbers of poses
 
 
-def write_graph(path: str | Path, saved: SavedGraph) -> None:
+def write_graph(path: str | Path, saved: SavedGraph | PoseGraph) -> None:
     """Write a graph: ``NAME.g2o``, or ``NAME.graph``, ``.values`` and ``.stamps`` for GTSAM.
 
     g2o holds poses and the motions between them only. Other factors and variables are left out, and
@@ -40,11 +48,13 @@ def write_graph(path: str | Path, saved: SavedGraph) -> None:
     Raises
     ------
     InputError
-        If the suffix is neither.
+        If the suffix is neither, or ``saved`` is no graph.
     OutputError
         If a file cannot be written, or the graph holds a factor that GTSAM cannot serialise.
     """
     path = Path(path)
+    saved = saved.saved() if isinstance(saved, PoseGraph) else saved
+    check_kind(saved, SavedGraph, "saved", "RunResult.loops.graph is a PoseGraph, which will do")
     (_write_g2o if _is_g2o(path) else _write_gtsam)(path, saved)
 
 

@@ -59,7 +59,8 @@ class IncrementalGraph:
         except RuntimeError as error:
             raise OutputError(
                 "pose graph: GTSAM cannot serialise a factor or a variable that was added (a "
-                f"factor written in Python?), so the graph cannot be in a checkpoint: {error}"
+                "factor written in Python?), so the graph cannot be in a checkpoint, nor be "
+                f"pickled: {error}"
             ) from error
 
     def __setstate__(self, state: list[_Step]) -> None:

@@ -47,6 +47,9 @@ class LoopMapping:
         # odom_T_lidar of the keyframes, to which their map points are fixed.
         self._placed: dict[int, gtsam.Pose3] = {}
 
+    def __repr__(self) -> str:
+        return f"LoopMapping({self.graph}, {self.points_moved} map points moved)"
+
     def reset(self) -> None:
         """Forget everything, as the mapper's reset does; a ``reset()`` of the closer is called."""
         self.graph.reset()

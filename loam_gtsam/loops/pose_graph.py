@@ -61,6 +61,10 @@ class PoseGraph(FactorGraph):
         """Forget everything: the graph is then as a new one."""
         self.__setstate__((0, [], [], IncrementalGraph(), 0, Visits()))
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _empty_graph, (self._whole, self.imu), self.__getstate__()
+
+    # For checkpoints: of a graph that is there again, with its configuration.
     def __getstate__(self) -> tuple[Any, ...]:
         return self._session, self.keyframes, self.loops, self._graph, self._added, self.visits
 
@@ -70,6 +74,9 @@ class PoseGraph(FactorGraph):
         self.visits: Visits
         self._session, self.keyframes, self.loops, self._graph, self._added, self.visits = state
         self._selection = LoopSelection(self.config, self._graph, self.keyframes, self.loops)
+
+    def __repr__(self) -> str:
+        return f"PoseGraph({len(self)} keyframes, {sum(self.active)} of {len(self.loops)} loops)"
 
     def __len__(self) -> int:
         return len(self.keyframes)
@@ -281,6 +288,10 @@ class PoseGraph(FactorGraph):
         tie = Tie(tie.base, tie.base_T_lidar.compose(motion), covariance, tie.way + way)
         self.visits.ties[new.index] = tie.base, tie.way
         return tie
+
+
+def _empty_graph(config: Config, imu: ImuBuffer | None) -> PoseGraph:
+    return PoseGraph(config, imu=imu)
 
 
 def _corrections(graph: PoseGraph, session: int) -> list[tuple[int, gtsam.Pose3]]:

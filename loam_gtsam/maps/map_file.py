@@ -34,7 +34,7 @@ from loam_gtsam.maps.map_graph import (
     graph_of,
     graph_of_arrays,
 )
-from loam_gtsam.pipeline import Pipeline
+from loam_gtsam.pipeline import Pipeline, RunResult
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.types import BoolArray, DatasetError, FloatArray, InputError
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
@@ -73,23 +73,26 @@ def map_of_run(path: str | Path) -> Path:
     return path / MAP_FILE if path.is_dir() else path
 
 
-def save_map(path: str | Path, pipeline: Pipeline | None) -> None:
+def save_map(path: str | Path, pipeline: Pipeline | RunResult | None) -> None:
     """Write the map of a run, corrected by its loops if there are any.
 
     Parameters
     ----------
     path : a file, whose name should end in ``.lgmap``; replaced if it is there
-    pipeline : that made the map, ``RunResult.pipeline`` for example
+    pipeline : that made the map, or the result of a run, which has one
 
     Raises
     ------
     InputError
-        If there is no pipeline.
+        If ``pipeline`` is none, or the result has none.
     OutputError
         If the file cannot be written; an old one is then as it was.
     """
-    if pipeline is None:
-        raise InputError("pipeline: expected that of a run, got None; run makes one")
+    if isinstance(pipeline, RunResult):
+        pipeline = pipeline.pipeline
+    if not isinstance(pipeline, Pipeline):
+        got = type(pipeline).__name__
+        raise InputError(f"pipeline: expected that of a run, got {got}; run makes one")
     aid = pipeline.mapper.imu
     tied = pipeline.fixes
     earth, fixes = (None, None) if tied is None else (tied.reference, tied.placed)
@@ -177,7 +180,8 @@ class SavedMap:
 
     Parameters
     ----------
-    path : a file that :func:`save_map` wrote; it must not change while it is open
+    path : a file that :func:`save_map` wrote, or the folder of a run, which has one; the file must
+        not change while it is open
 
     Attributes
     ----------
@@ -193,17 +197,17 @@ class SavedMap:
     """
 
     def __init__(self, path: str | Path) -> None:
-        self.path = Path(path)
+        self.path = map_of_run(path)
         try:
             self._archive = zipfile.ZipFile(self.path)
         except FileNotFoundError:
             raise DatasetError(
-                f"{path}: there is no such file; loam-gtsam run PATH writes map{SUFFIX}"
+                f"{self.path}: there is no such file; loam-gtsam run PATH writes map{SUFFIX}"
             ) from None
         except DAMAGED as error:
             raise DatasetError(
-                f"{path}: expected a map ({SUFFIX}) that loam-gtsam run wrote, got another file, "
-                f"or a part of one: {error}"
+                f"{self.path}: expected a map ({SUFFIX}) that loam-gtsam run wrote, got another "
+                f"file, or a part of one: {error}"
             ) from error
         try:
             self._open()
@@ -258,6 +262,9 @@ class SavedMap:
         """Close the file."""
         self._archive.close()
 
+    def __repr__(self) -> str:
+        return f"SavedMap({str(self.path)!r}: {len(self)} points, {len(self.places)} places)"
+
     def __len__(self) -> int:
         """Number of points, those of small places counted once more."""
         return sum(sum(cubes.values()) for cubes in self.layers.values())
@@ -274,7 +281,10 @@ class SavedMap:
         ------
         DatasetError
             If it cannot be read, or its checksum does not fit.
+        InputError
+            If the map was closed.
         """
+        self._check_open()
         name = _cube_name(layer, index)
         try:
             rows = self._array(name, _POINT, (self.layers[layer][index],))
@@ -304,9 +314,12 @@ class SavedMap:
         ------
         DatasetError
             If a cube cannot be read.
+        InputError
+            If the map was closed.
         OutputError
             If the file cannot be written.
         """
+        self._check_open()
         header = json.loads(self._read(_HEADER))
         header["layers"] = {
             layer: [
@@ -325,6 +338,12 @@ class SavedMap:
                     index = (cube[0], cube[1], cube[2])
                     rows = _rows(self.cube(layer, index).chosen(keep[layer][index]))
                     _add(archive, _cube_name(layer, index), _bytes_of(rows))
+
+    def _check_open(self) -> None:
+        if self._archive.fp is None:
+            raise InputError(
+                f"{self.path}: this map was closed; use it inside its with block, or open it again"
+            )
 
     def _array(self, name: str, kind: np.dtype[Any], shape: tuple[int, ...]) -> NDArray[Any]:
         array = np.load(io.BytesIO(self._read(name)), allow_pickle=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -22,7 +23,7 @@ from loam_gtsam.types import FloatArray, InputError
 _NONE = np.empty((0, 3))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Alignment:
     """The outcome of :func:`align`.
 
@@ -53,6 +54,12 @@ class Alignment:
     weak: FloatArray | None
     matches: ScanMatches
 
+    def __repr__(self) -> str:
+        found = ("converged" if self.converged else "not converged") if self.solved else "unsolved"
+        position = self.target_T_source.translation().round(3).tolist()
+        fit = f"overlap {self.overlap:.2f}, agreement {self.agreement:.2f}"
+        return f"Alignment({found}, at {position} m, {fit})"
+
 
 def align(
     source: ArrayLike,
@@ -67,7 +74,8 @@ def align(
     Parameters
     ----------
     source, target : (N, 3) and (M, 3) metres, each in its own frame, de-skewed; the source was
-        seen from its origin, with z up along the axis of the lidar
+        seen from its origin, with z up along the axis of the lidar. Points that are not finite are
+        left out, and so is a fourth column
     guess : ``target_T_source`` to start from; the identity if None
     config : ``map``, ``matching``, ``solver`` and ``covariance`` are used
     max_distance : metres to the farthest neighbour at first; the solve then starts again with
@@ -76,7 +84,8 @@ def align(
     Raises
     ------
     InputError
-        If a cloud is no (N, 3) array of finite numbers, or has too few points to match.
+        If a cloud is no array of points, or has too few to match, or ``max_distance`` is no
+        distance.
 
     Examples
     --------
@@ -84,11 +93,13 @@ def align(
     >>> found.target_T_source, np.sqrt(np.diag(found.covariance))  # doctest: +SKIP
     """
     config = as_config(config)
-    source, target = as_points(source, "source"), as_points(target, "target")
+    if not max_distance > 0.0:
+        raise InputError(f"max_distance: expected metres above 0, got {max_distance!r}")
+    source, target = _finite_points(source, "source"), _finite_points(target, "target")
     least = config.solver.min_matches
     for name, cloud in (("source", source), ("target", target)):
         if len(cloud) < least:
-            raise InputError(f"{name}: expected at least {least} points, got {len(cloud)}")
+            raise InputError(f"{name}: expected at least {least} finite points, got {len(cloud)}")
     # Thinned alike, so that what voxels do to edges and curved ground is the same in both.
     points, surfaces = (
         voxel_filter(cloud, config.map.plane_voxel, oblique=True) for cloud in (source, target)
@@ -120,6 +131,14 @@ def align(
         solution.weak,
         solution.matches,
     )
+
+
+def _finite_points(cloud: ArrayLike, name: str) -> FloatArray:
+    with suppress(ValueError):  # rows of different lengths, which as_points refuses
+        cloud = np.asarray(cloud)
+        if cloud.ndim == 2 and cloud.shape[1] in (3, 4) and cloud.dtype.kind == "f":
+            cloud = cloud[np.isfinite(cloud[:, :3]).all(axis=1), :3]
+    return as_points(cloud, name)
 
 
 def _covariance(solution: Solution, config: Config) -> FloatArray:

@@ -93,6 +93,10 @@ class ImuTracker:
         self._spans, self._turns = np.zeros((0, 2), np.int64), np.zeros((0, 6))
         self._coupling = TightCoupling(self.config)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        return type(self), (self.config, self.buffer), self.__getstate__()
+
+    # For checkpoints: of a tracker that is there again, with its buffer.
     def __getstate__(self) -> dict[str, Any]:
         learnt = {"gyro_bias": self.buffer.gyro_bias}
         return learnt | {k: v for k, v in vars(self).items() if k not in ("buffer", "config")}

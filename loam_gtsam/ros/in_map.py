@@ -15,7 +15,6 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.maps import Localizer, SavedMap
-from loam_gtsam.maps.map_file import map_of_run
 from loam_gtsam.registration.odometry import Guess, Odometry, advance
 from loam_gtsam.types import Features, MapUpdate, Sweep
 
@@ -43,7 +42,7 @@ class InMap(Odometry):
     """
 
     def __init__(self, path: str | Path, config: Config, *, inside: bool = False) -> None:
-        self._saved = SavedMap(map_of_run(path))
+        self._saved = SavedMap(path)
         self._localizer = Localizer(self._saved, config, inside=inside, odometry=self)
         self._past: deque[MapUpdate] = deque(maxlen=_KEPT)
         self.map_T_odom: gtsam.Pose3 | None = None

@@ -40,7 +40,7 @@ from loam_gtsam.types import DatasetError, ImuSamples, InputError, MapUpdate, Sc
 _POLL = 0.02  # seconds after which a worker looks whether a sweep has waited for long enough
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class LiveResult:
     """One sweep, mapped; ``received`` to ``published`` are in nanoseconds of the clock."""
 
@@ -50,6 +50,9 @@ class LiveResult:
     started: int
     mapped: int
     published: int
+
+    def __repr__(self) -> str:
+        return f"LiveResult({self.update}, {self.seconds[-1]:.3f} s after it came)"
 
     @property
     def seconds(self) -> tuple[float, ...]:

@@ -315,7 +315,7 @@ def _absolute(run: SolverRun, reference: Trajectory) -> dict[str, Any]:
         "ate_m": absolute.rmse,
         "ate_max_m": absolute.maximum,
         "rotation_deg": absolute.rotation_rmse_deg,
-        "path_m": evaluation.interpolate(reference, absolute.stamps).path_length,
+        "path_m": reference.at(absolute.stamps).path_length,
     }
     with suppress(InputError):  # positions alone, which the relative error says
         values["start_m"] = evaluation.absolute_error(trajectory, reference, aligned="start").rmse

@@ -326,7 +326,7 @@ def _draw(results: ScoredComparison, folder: Path) -> list[str]:
         except InputError:  # too few poses
             continue
         here = trajectory.map_T_lidar[np.isin(trajectory.stamps, found.stamps)]
-        there = evaluation.interpolate(reference, found.stamps).map_T_lidar[:, :3, 3]
+        there = reference.at(found.stamps).positions
         reference_T_map = evaluation.align_positions(here[:, :3, 3], there)
         aligned[run.name] = Trajectory(trajectory.stamps, reference_T_map @ trajectory.map_T_lidar)
         errors[run.name] = evaluation.distance_travelled(there), found.translations

@@ -24,7 +24,6 @@ from loam_gtsam.pipeline import Parts, Pipeline, RunResult
 from loam_gtsam.refine.map_quality import MapQuality, map_quality
 from loam_gtsam.registration.matches import spread_rows
 from loam_gtsam.registration.odometry import Guess, Odometry
-from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.studies.factories import is_factory, make_parts
 from loam_gtsam.studies.peers import Inertial, Peer, TimedPoints, make_peer
 from loam_gtsam.types import (
@@ -270,7 +269,7 @@ class MapSample:
         inside = (stamps >= trajectory.stamps[0]) & (stamps <= trajectory.stamps[-1])
         rows = np.flatnonzero(inside)
         rows = rows[spread_rows(len(rows), _MAP_SAMPLE)]
-        map_T_lidar = interpolate(trajectory, stamps[rows]).map_T_lidar
+        map_T_lidar = trajectory.at(stamps[rows]).map_T_lidar
         return map_quality(transform_each(map_T_lidar, points[rows]), numbers[rows])
 
     def sharpness(self, run: SolverRun) -> dict[str, Any]:

@@ -12,11 +12,12 @@ from typing import Literal
 
 import gtsam
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
+from scipy.spatial.transform import Rotation
 
 from loam_gtsam.datasets.decode.extrinsics import rigid_transform
-from loam_gtsam.geometry import five_sigma, interpolated, inverse_pose, transform
+from loam_gtsam.geometry import five_sigma, inverse_pose, transform
 from loam_gtsam.registration.uncertainty import relative_covariance
+from loam_gtsam.trajectory import check_increasing
 from loam_gtsam.types import FloatArray, InputError, IntArray, MapUpdate, Trajectory, check_kind
 
 _NO_SPREAD = 1e-9
@@ -42,6 +43,8 @@ class AbsoluteError:
         rotation that fits the positions leaves the roll about a straight path to their noise.
     translations : (N,) metres, error of each pose
     stamps : (N,) nanoseconds of the poses that were compared
+    aligned : the N poses as they were compared, to be drawn beside ``reference.at(stamps)``; those
+        of the ``point`` of the reference, if it has one
     """
 
     rmse: float
@@ -50,6 +53,7 @@ class AbsoluteError:
     rotation_rmse_deg: float
     translations: FloatArray
     stamps: IntArray
+    aligned: Trajectory
 
 
 def align_positions(
@@ -92,42 +96,17 @@ def _nearest_rotation(matrix: FloatArray) -> FloatArray:
     return rotation
 
 
-def interpolate(trajectory: Trajectory, stamps: IntArray) -> Trajectory:
-    """Poses of a trajectory at other times: linear in position, spherical linear in orientation.
-
-    Raises InputError if a stamp lies outside the trajectory, or the trajectory's own stamps do not
-    increase.
-    """
-    _check_stamps("interpolate", trajectory)
-    if len(stamps) and (
-        stamps.min() < trajectory.stamps[0] or stamps.max() > trajectory.stamps[-1]
-    ):
-        raise InputError(
-            f"interpolate: stamps {stamps.min()} to {stamps.max()} leave the trajectory "
-            f"{trajectory.stamps[0]} to {trajectory.stamps[-1]}"
-        )
-    times, queries = ((some - trajectory.stamps[0]) * 1e-9 for some in (trajectory.stamps, stamps))
-    poses = np.tile(np.eye(4), (len(stamps), 1, 1))
-    rotations = trajectory.map_T_lidar[:, :3, :3]
-    if np.isfinite(rotations).all():
-        turned = Slerp(times, Rotation.from_matrix(rotations))(queries)
-        poses[:, :3, :3] = turned.as_matrix()
-    else:  # positions alone
-        poses[:, :3, :3] = np.nan
-    poses[:, :3, 3] = interpolated(queries, times, trajectory.map_T_lidar[:, :3, 3])
-    return Trajectory(np.asarray(stamps, np.int64), poses, trajectory.point)
-
-
 def matched_truth(trajectory: Trajectory, reference: Trajectory) -> Trajectory:
     """The reference at the stamps of a trajectory, for tools that pair equal stamps (evo).
 
     Poses outside the time span of the reference have none. Raises InputError if the stamps of the
     reference do not increase.
     """
-    _check_stamps("matched_truth", reference)
+    check_increasing(reference, "matched_truth")
     stamps = trajectory.stamps
     inside = (stamps >= reference.stamps[0]) & (stamps <= reference.stamps[-1])
-    return interpolate(reference, stamps[inside])
+    common: IntArray = stamps[inside]
+    return reference.at(common)
 
 
 def absolute_error(
@@ -152,15 +131,17 @@ def absolute_error(
     if aligned == "start":
         _need_orientation("absolute_error", truth)
         poses = truth[0] @ inverse_pose(poses[:1]) @ poses
+    poses = poses.copy()
     positions, rotations = poses[:, :3, 3], poses[:, :3, :3]
     if aligned is True and np.isfinite(truth).all():
-        rotations = align_rotations(rotations, truth[:, :3, :3]) @ rotations
+        rotations[:] = align_rotations(rotations, truth[:, :3, :3]) @ rotations
     if aligned is True:
-        positions = transform(align_positions(positions, truth[:, :3, 3]), positions)
+        positions[:] = transform(align_positions(positions, truth[:, :3, 3]), positions)
     errors = np.linalg.norm(positions - truth[:, :3, 3], axis=1)
     angles = _angles_deg(np.swapaxes(truth[:, :3, :3], 1, 2) @ rotations)
     median, maximum = float(np.median(errors)), float(errors.max())
-    return AbsoluteError(_rms(errors), median, maximum, _rms(angles), errors, stamps)
+    compared = Trajectory(stamps, poses)
+    return AbsoluteError(_rms(errors), median, maximum, _rms(angles), errors, stamps, compared)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,15 +273,15 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
         If no update lies inside the reference, its stamps do not increase, or it has positions
         alone.
     """
-    _check_stamps("nees", reference)
+    check_increasing(reference, "nees")
     first, last = reference.stamps[0], reference.stamps[-1]
     inside = [n for n, u in enumerate(updates) if u.status.has_pose and first <= u.stamp <= last]
     if not inside:
         raise InputError(f"nees: expected poses inside {first} to {last} ns, got none")
     chosen = [updates[n] for n in inside]
-    truth = interpolate(reference, np.array([update.stamp for update in chosen], np.int64))
+    truth = reference.at([update.stamp for update in chosen])
     _need_orientation("nees", truth.map_T_lidar)
-    found = dict(_errors(chosen, [gtsam.Pose3(pose) for pose in truth.map_T_lidar], window))
+    found = dict(_errors(chosen, list(truth), window))
     squared = np.array([_mahalanobis(*pair) for pair in found.values()], np.float64)
     errors = np.array([error for error, _ in found.values()]).reshape(-1, 6)
     variances = np.array([np.diag(covariance) for _, covariance in found.values()]).reshape(-1, 6)
@@ -377,7 +358,7 @@ def _common(
     """
     for trajectory in (estimate, reference):
         check_kind(trajectory, Trajectory, caller, "a run and a data set have one")
-    _check_stamps(caller, reference)
+    check_increasing(reference, caller)
     if len(reference) > 1 and np.median(np.diff(reference.stamps)) > _SPARSE_NS:
         fine, coarse, which = estimate, reference, "points of the sparse reference, inside the run"
     else:
@@ -396,7 +377,7 @@ def _common(
             f"{len(compared)} that are not; leave them out"
         )
     stamps = coarse.stamps[inside]
-    poses, truth = compared, interpolate(fine, stamps).map_T_lidar
+    poses, truth = compared, fine.at(stamps).map_T_lidar
     if coarse is reference:
         poses, truth = truth, reference.map_T_lidar[inside]
     if reference.point is not None:
@@ -416,20 +397,6 @@ def _need_orientation(caller: str, truth: FloatArray) -> None:
         raise InputError(
             f"{caller}: expected reference poses with orientation, got positions alone; only the "
             "absolute error of positions can be taken"
-        )
-
-
-def _check_stamps(caller: str, trajectory: Trajectory) -> None:
-    if len(trajectory) < 2:
-        raise InputError(
-            f"{caller}: expected 2 or more poses to interpolate between, got {len(trajectory)}"
-        )
-    repeated = np.flatnonzero(np.diff(trajectory.stamps) <= 0)
-    if len(repeated):
-        at = int(repeated[0]) + 1
-        raise InputError(
-            f"{caller}: expected increasing stamps, got {trajectory.stamps[at]} at index {at} "
-            f"after {trajectory.stamps[at - 1]}; sort the poses and drop repeated ones"
         )
 
 

@@ -35,7 +35,6 @@ from loam_gtsam.registration.solvers import (
     match_rows,
 )
 from loam_gtsam.studies.contenders import Contender
-from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.studies.report_html import TextTable, list_html, page, table_html
 from loam_gtsam.types import (
     FeatureSweep,
@@ -209,8 +208,7 @@ class _Placed:
         """The true ``map_T_lidar``; None outside the truth."""
         if not self.truth.stamps[0] <= stamp <= self.truth.stamps[-1]:
             return None
-        pose = interpolate(self.truth, np.array([stamp])).map_T_lidar[0]
-        return gtsam.Pose3(self.map_T_truth @ pose)
+        return gtsam.Pose3(self.map_T_truth).compose(self.truth.at(stamp))
 
 
 class _Timed(Matcher):

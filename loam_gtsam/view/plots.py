@@ -98,7 +98,7 @@ def plot_map(
     """
     points = np.concatenate((edges, planes)).astype(np.float64)
     points = points[np.isfinite(points).all(axis=1)]
-    way = np.zeros((0, 3)) if trajectory is None else trajectory.map_T_lidar[:, :3, 3]
+    way = np.zeros((0, 3)) if trajectory is None else trajectory.positions
     seen = _below_ceiling(points, way)
     note = "" if len(seen) == len(points) else ", without the ceiling"
     spread = np.concatenate((seen, way))[:, :2]
@@ -335,7 +335,7 @@ def _trajectory_figure(
     figure = empty_figure(9.0, high + 2.4)
     top, side = figure.subplots(2, 1, height_ratios=(high, 1.3))
     for name, trajectory, (colour, style), width in lines:
-        xyz = trajectory.map_T_lidar[:, :3, 3]
+        xyz = trajectory.positions
         top.plot(xyz[:, 0], xyz[:, 1], color=colour, ls=style, lw=width, label=name)
         travelled = np.cumsum(np.linalg.norm(np.diff(xyz, axis=0, prepend=xyz[:1]), axis=1))
         side.plot(travelled, xyz[:, 2], color=colour, ls=style, lw=width)

@@ -8,9 +8,10 @@ import pytest
 from support.receiver import ANTENNA, CONFIG, ENU_T_MAP, ORIGIN, Drive
 
 from loam_gtsam.aiding.gnss import ANTENNA_KEY, MAP_KEY, fix_factor, tie, write_enu
+from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.io.trajectories import write_tum
-from loam_gtsam.types import Trajectory
+from loam_gtsam.types import InputError, Trajectory
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -146,3 +147,13 @@ def test_poses_in_enu_are_written_with_their_origin(tmp_path):
     latitude = float(lines[0].split()[3])
     assert abs(latitude - tied.reference.origin[0]) < 1e-9
     assert lines[-1] == (tmp_path / "same.tum").read_text().splitlines()[-1]
+
+
+@pytest.mark.parametrize("known", [np.diag([1.0, 2.0, 3.0]), np.tile(np.eye(3), (2, 1, 1)), None])
+def test_fixes_have_covariances_of_their_own_one_for_all_or_none(known):
+    places = np.tile([47.5, 8.5, 450.0], (2, 1))
+    fixes = GnssFixes(np.arange(2), places, known)
+    wanted = np.broadcast_to(np.full((3, 3), np.nan) if known is None else known, (2, 3, 3))
+    np.testing.assert_array_equal(fixes.covariances, wanted)
+    with pytest.raises(InputError, match=r"expected \(2, 3, 3\), .* got \(2, 3\); variances"):
+        GnssFixes(np.arange(2), places, np.ones((2, 3)))

@@ -46,9 +46,8 @@ def test_a_truth_of_ones_own_is_compared_with_and_matched():
     world = SimulatedWorld("room", frames=8, columns=300)
     truth = world.truth
     late = np.asarray(truth.stamps, np.int64)[::2]  # not at the stamps of the sweeps
-    from loam_gtsam.studies.evaluation import interpolate
 
-    write_tum("mine.tum", interpolate(truth, late[:-1] + 7_000_000))
+    write_tum("mine.tum", truth.at(late[:-1] + 7_000_000))
     text = mapped("--truth", "mine.tum", "--truth-extrinsic", "0 0 0")
     assert "if not fitted" in text
     found, matched = (read_tum(f"out/{n}.tum") for n in ("trajectory", "truth_matched"))

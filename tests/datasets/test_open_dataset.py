@@ -98,6 +98,8 @@ def test_arrays() -> None:
     assert got[1].times is times[1]
     assert dataset.info().facts["point times"] == "given for 2 of 2 sweeps"
     again = ArrayDataset(iter(got))
+    assert repr(dataset) == "ArrayDataset('mine': 2 sweeps)"
+    assert repr(again.part(1)) == "PartOf('arrays from sweep 1': 1 sweeps)"
     assert len(again) == 2
     assert list(again) == list(again) == got
 
@@ -129,6 +131,14 @@ def test_array_disorder_is_reported() -> None:
         (([np.zeros((3, 3))], [0]), {"rings": [np.zeros(3)]}, r"scans\[0\]: Scan.rings"),
         (([Scan(np.zeros((3, 3)), 0)], [0]), {}, "carry their own"),
         (([Scan(np.zeros((3, 3)), 0), np.zeros((3, 3))],), {}, "only Scan objects"),
+        (([], []), {"imu": np.zeros((9, 7))}, r"imu: .* got ndarray; ImuSamples\(stamps, ori"),
+        (([], []), {"truth": np.zeros((9, 8))}, r"truth: .* got ndarray; Trajectory\(stamps, map"),
+        (([], []), {"gnss": np.zeros((9, 4))}, r"gnss: .* got ndarray; GnssFixes\(stamps, geo"),
+        (
+            ([], []),
+            {"wheels": np.zeros((9, 4))},
+            r"wheels: .* got ndarray; WheelSamples\(stamps, st",
+        ),
         (([np.zeros((3, 3))] * 3, [0, 10**5, 2 * 10**5]), {}, "100000 ns apart; expected nano"),
     ],
 )

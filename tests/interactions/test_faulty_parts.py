@@ -113,7 +113,8 @@ def undisturbed() -> list[np.ndarray]:
     ("place", "at", "passes", "named"),
     [
         ("factors", 2, 0, "extra_factors"),
-        ("residual", 2, 0, "solver"),
+        ("residual", 2, 0, "extra_factors"),
+        ("residual", 2, 1, "solver"),
         ("solver", 1, 1, "solver"),
         ("solver", 4, 2, "solver"),
         ("indeterminate", 2, 0, "solver"),

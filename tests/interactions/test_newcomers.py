@@ -25,7 +25,10 @@ from loam_gtsam import (
     optimize_graph,
     point_to_line_factor,
     run,
+    write_graph,
 )
+from loam_gtsam.io.trajectories import write_kitti, write_tum
+from loam_gtsam.maps import save_map
 from loam_gtsam.types import DatasetError
 
 WORLD = SimulatedWorld("room", frames=2, columns=400)
@@ -41,13 +44,20 @@ def row(_: gtsam.Values) -> tuple[np.ndarray, list[np.ndarray]]:
 MISTAKES: list[tuple[Callable[[], object], str]] = [
     (lambda: make_solver("loam"), r"a SolverConfig, got str; .* preset\(\"loam\"\).solver"),
     (lambda: GtsamSolver(Config()), "expected a SolverConfig, got Config"),
-    (lambda: run(WORLD, solver=GtsamSolver), r"got the class; GtsamSolver\(config.solver\)"),
+    (lambda: run(WORLD, solver=GtsamSolver), r"as make_solver\(.*, got the class GtsamSolver"),
+    (lambda: run(WORLD, solver="loam"), r"solver: .* make_solver\(config.solver\), got str"),
+    (lambda: Mapper(Config(), "loam"), r"solver: .* make_solver\(config.solver\), got str"),
+    (lambda: Mapper(extra_factors=[]), "extra_factors: expected a function, got list"),
+    (lambda: Pipeline(features=5), "features: expected a function, got int"),
+    (lambda: Pipeline(odometry=5), "odometry: .* got int without guess and remember"),
+    (lambda: Pipeline(loop_closer=5), "loop_closer: expected an object, got int without detect"),
     (lambda: run(WORLD, checkpoint="kept"), r"checkpoint: .* Checkpoint\(folder\) makes one"),
     (lambda: extract_features(SWEEP, "loam"), "expected a Config, got str 'loam'"),
     (lambda: extract_features(SWEEP.points, Config()), "scan: expected a Scan, got ndarray"),
     (lambda: Mapper().register(SWEEP.points), "expected a Features, got ndarray; extract_features"),
     (lambda: Pipeline(imu=WORLD.imu), "expected an ImuBuffer, got ImuSamples; ImuBuffer"),
     (lambda: ImuBuffer(Config()), 'the section "imu" of a Config is one'),
+    (lambda: ImuBuffer(Config().imu, np.zeros((5, 7))), "samples: expected an ImuSamples, got nd"),
     (lambda: checked_factor(0.1, [POSE_KEY], row), "noise: .* got float; .*Isotropic.Sigma"),
     (lambda: checked_factor(ONE, POSE_KEY, row), "keys: expected a list of keys, got int"),
     (lambda: checked_factor(ONE, [POSE_KEY], 3.0), "residual: expected a function, got float"),
@@ -55,6 +65,10 @@ MISTAKES: list[tuple[Callable[[], object], str]] = [
     (lambda: align(SWEEP.points, SWEEP.points, guess=np.eye(4)), r"gtsam.Pose3\(matrix\) makes"),
     (lambda: absolute_error(WORLD, WORLD.truth), "expected a Trajectory, got SimulatedWorld"),
     (lambda: optimize_graph("run.g2o"), r"a SavedGraph, got str; read_graph\(path\)"),
+    (lambda: write_graph("run.g2o", WORLD), "saved: expected a SavedGraph, got SimulatedWorld"),
+    (lambda: write_tum(WORLD.truth, "a.tum"), "a Trajectory, got str; the path comes first"),
+    (lambda: write_kitti(WORLD.truth, "a.txt"), "a Trajectory, got str; the path comes first"),
+    (lambda: save_map("a.lgmap", WORLD), "pipeline: expected that of a run, got SimulatedWorld"),
 ]
 
 

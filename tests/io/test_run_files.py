@@ -135,7 +135,7 @@ def test_the_frames_of_a_saved_run_are_those_of_the_run(result, tmp_path):
     told = replace(updates[1].uncertainty, in_doubt=not updates[1].uncertainty.in_doubt)
     updates[1] = replace(updates[1], uncertainty=told)
     run_files.write_npz(tmp_path / "run.npz", updates)
-    for here, there in zip(updates, read_updates(tmp_path / "run.npz"), strict=True):
+    for here, there in zip(updates, read_updates(tmp_path), strict=True):
         poses = ("map_T_lidar", "map_T_middle")
         for name in {item.name for item in fields(MapUpdate)} - {"uncertainty", "timings", *poses}:
             if name not in ("fault", "n_not_finite"):  # the file does not have them

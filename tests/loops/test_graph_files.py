@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import X
 from support.cli import loam
+from support.pose_graphs import filled, square
 
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
@@ -41,6 +42,13 @@ def saved_graph(wrong=0):
     for first in range(wrong):
         graph.add(gtsam.BetweenFactorPose3(X(first), X(first + 8), gtsam.Pose3(), noise))
     return SavedGraph(graph, poses, {X(n): 1_700_000_000_123_456_789 + n for n in range(20)})
+
+
+def test_a_pose_graph_is_written_as_what_it_saves(tmp_path):
+    graph = filled(square(4, 1))
+    write_graph(tmp_path / "one.g2o", graph)
+    write_graph(tmp_path / "two.g2o", graph.saved())
+    assert (tmp_path / "one.g2o").read_text() == (tmp_path / "two.g2o").read_text()
 
 
 @pytest.mark.parametrize("name", ["graph.g2o", "graph.graph"])

@@ -74,6 +74,9 @@ def test_the_map_follows_its_keyframes():
     mapper, loops, closed = driven(first=30)
     assert not any(closed[:30])
     assert all(closed[30:])
+    of = f"{len(loops.graph.loops)} of {len(loops.graph.loops)} loops"
+    graph = f"PoseGraph({len(loops.graph)} keyframes, {of})"
+    assert repr(loops) == f"LoopMapping({graph}, {loops.points_moved} map points moved)"
     wanted = loops.graph.poses()[:, :3, 3] + loops.graph.poses()[:, :3, :3] @ UP
     off = np.abs(marks(mapper) - np.sort(wanted, axis=0)).max()
     assert off > 1e-6  # the mapper's frame is another

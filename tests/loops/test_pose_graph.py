@@ -1,5 +1,6 @@
 """Pose graphs: keyframes, closed forms, marginals, sessions; reset and resumed ones."""
 
+import pickle
 from dataclasses import replace
 
 import gtsam
@@ -51,6 +52,14 @@ def test_frames_must_be_solved_and_come_in_order():
     assert graph.trajectory([lost]).map_T_lidar.shape == (1, 4, 4)
     with pytest.raises(InputError, match="expected a stamp after 200000000"):
         filled(square(4, 1)[:3]).add(frames(square(4, 1))[1])
+
+
+def test_a_pickled_graph_is_the_graph_with_its_configuration():
+    graph = filled(square(4, 1))
+    copy = pickle.loads(pickle.dumps(graph))
+    np.testing.assert_array_equal(copy.poses(), graph.poses())
+    assert copy.config == graph.config
+    assert copy.correction.equals(graph.correction, 1e-12)
 
 
 def test_frames_whose_first_motion_is_in_doubt_are_neither_keyframes_nor_places():

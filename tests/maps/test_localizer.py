@@ -454,7 +454,7 @@ def test_a_path_is_no_map_and_nothing_no_pipeline():
         Localizer("map.lgmap")
     with pytest.raises(InputError, match=r"maps\[0\]: expected a SavedMap, got str"):
         merge_maps(["a.lgmap", "b.lgmap"], "whole.lgmap")
-    with pytest.raises(InputError, match="pipeline: expected that of a run, got None"):
+    with pytest.raises(InputError, match="pipeline: expected that of a run, got NoneType"):
         save_map("none.lgmap", None)
 
 

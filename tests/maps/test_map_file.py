@@ -16,7 +16,7 @@ from loam_gtsam.io.run_files import write_run
 from loam_gtsam.maps.localizer import config_in
 from loam_gtsam.maps.map_file import LAYERS, SavedMap, save_map
 from loam_gtsam.maps.saved_maps import SavedMaps
-from loam_gtsam.types import DatasetError, OutputError
+from loam_gtsam.types import DatasetError, InputError, OutputError
 
 
 def test_all_of_a_map_comes_back(mapped, saved):
@@ -49,8 +49,22 @@ def test_all_of_a_map_comes_back(mapped, saved):
 
 def test_the_same_map_makes_the_same_file(mapped, tmp_path):
     again = tmp_path / "again.lgmap"
-    save_map(again, mapped.result.pipeline)
-    assert again.read_bytes() == mapped.path.read_bytes()
+    for made_by in (mapped.result.pipeline, mapped.result):
+        save_map(again, made_by)
+        assert again.read_bytes() == mapped.path.read_bytes()
+        again.unlink()
+
+
+def test_the_folder_of_a_run_is_opened_as_its_map_and_a_closed_map_says_so(mapped, tmp_path):
+    save_map(tmp_path / "map.lgmap", mapped.result)
+    with SavedMap(tmp_path) as saved:
+        cube = next(iter(saved.layers["planes"]))
+        assert len(saved.cube("planes", cube)) > 0
+        assert repr(saved).endswith(f"map.lgmap': {len(saved)} points, {len(saved.places)} places)")
+    with pytest.raises(InputError, match="this map was closed; use it inside its with block"):
+        saved.cube("planes", cube)
+    with pytest.raises(InputError, match="this map was closed"):
+        saved.write_part(tmp_path / "part.lgmap", {})
 
 
 def test_a_place_has_the_error_of_the_map_and_not_of_its_sweep(mapped):
@@ -189,11 +203,11 @@ def test_damage_is_found_by_the_checksums(mapped, tmp_path):
 def test_a_path_that_is_no_map(tmp_path):
     with pytest.raises(DatasetError, match="there is no such file"):
         SavedMap(tmp_path / "none.lgmap")
+    with pytest.raises(DatasetError, match="there is no such file"):
+        SavedMap(tmp_path)
     (tmp_path / "text.lgmap").write_text("ply")
     with pytest.raises(DatasetError, match="expected a map"):
         SavedMap(tmp_path / "text.lgmap")
-    with pytest.raises(DatasetError, match="expected a map"):
-        SavedMap(tmp_path)
 
 
 def test_a_map_that_cannot_be_written_leaves_the_old_one(mapped, tmp_path):

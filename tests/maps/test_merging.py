@@ -21,7 +21,7 @@ from loam_gtsam.maps.localizer import Localizer
 from loam_gtsam.maps.map_file import SavedMap, save_map
 from loam_gtsam.maps.merging import merge_maps
 from loam_gtsam.pipeline import RunResult, run
-from loam_gtsam.studies.evaluation import absolute_error, interpolate
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import DatasetError, InputError, Trajectory
 
 CUTS = (0, 35), (25, 60)
@@ -90,7 +90,7 @@ def test_the_whole_is_a_map_as_any_other(halves, merged):
         localizer = Localizer(whole)
         updates = [localizer.process(halves.world.sweep(number)) for number in range(50, 56)]
         found = [update for update in updates if update.status.solved]
-        true = interpolate(halves.world.truth, np.array([u.stamp for u in found], np.int64))
+        true = halves.world.truth.at([u.stamp for u in found])
         start = halves.world.truth.map_T_lidar[0]
         began = halves.runs[0].trajectory.map_T_lidar[0]
         for update, pose in zip(found, true.map_T_lidar, strict=True):

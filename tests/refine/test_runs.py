@@ -19,7 +19,7 @@ from loam_gtsam.pipeline import RunResult
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import RefinedRun, RunPoints, refine_run, refine_runs, run_points
 from loam_gtsam.refine.sweeps import Path
-from loam_gtsam.studies.evaluation import absolute_error, interpolate
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray, InputError
 
 CUTS = (0, 35), (25, 60)
@@ -46,7 +46,7 @@ class Two:
         """Metres of all poses from where they are, in the frame of the first pose of the first."""
         began = self.ways[0].map_T_lidar[0]
         map_T_world = began @ np.linalg.inv(self.truth.map_T_lidar[0])
-        true = [map_T_world @ interpolate(self.truth, way.stamps).map_T_lidar for way in ways]
+        true = [map_T_world @ self.truth.at(way.stamps).map_T_lidar for way in ways]
         return [way.map_T_lidar[:, :3, 3] - poses[:, :3, 3]
                 for way, poses in zip(ways, true, strict=True)]  # fmt: skip
 

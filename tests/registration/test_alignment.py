@@ -36,6 +36,7 @@ def test_a_known_pose_is_found_within_what_is_told():
     assert found.agreement > 0.98
     assert np.abs(error).max() < 2e-3
     assert error @ np.linalg.solve(found.covariance, error) / 6.0 < 4.0
+    assert repr(found).startswith("Alignment(converged, at [0.4")
 
 
 def test_a_guess_brings_clouds_together_that_are_far_apart():
@@ -94,10 +95,25 @@ def test_clouds_that_do_not_meet_are_not_solved():
     ("source", "says"),
     [
         (np.zeros((5, 2)), r"source: expected \(N, 3\)"),
-        (np.full((99, 3), np.nan), "source: .*finite"),
-        (np.zeros((49, 3)), "source: expected at least 50 points, got 49"),
+        ([[0.0, 0.0, 0.0], [0.0]], "source: expected an array"),
+        (np.zeros((99, 6)), r"source: expected \(N, 3\) .*; \[:, :3\] takes the first three"),
+        (np.full((99, 3), np.nan), "source: expected at least 50 finite points, got 0"),
+        (np.zeros((49, 3)), "source: expected at least 50 finite points, got 49"),
     ],
 )
 def test_what_is_no_cloud_is_refused(source, says):
     with pytest.raises(InputError, match=says):
         align(source, np.zeros((99, 3)))
+
+
+def test_points_that_are_not_finite_and_a_fourth_column_are_left_out():
+    rng = np.random.default_rng(0)
+    source, target = seen_from(TRUTH, walls(rng)), walls(rng)
+    found = align(np.insert(np.column_stack([source, source[:, 0]]), 5, np.nan, axis=0), target)
+    assert found.target_T_source.equals(align(source, target).target_T_source, 0.0)
+
+
+@pytest.mark.parametrize("distance", [-1.0, 0.0, np.nan])
+def test_a_distance_that_is_none_is_refused(distance):
+    with pytest.raises(InputError, match="max_distance: expected metres above 0, got"):
+        align(np.zeros((99, 3)), np.zeros((99, 3)), max_distance=distance)

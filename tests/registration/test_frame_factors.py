@@ -24,6 +24,7 @@ from loam_gtsam.types import Features, FrameStatus, InputError
 LAST = gtsam.Pose3(gtsam.Rot3.Ypr(0.4, -0.2, 0.1), np.array([3.0, -1.0, 0.5]))
 MOVED = gtsam.Pose3(gtsam.Rot3.Ypr(0.1, 0.05, -0.02), np.array([1.0, 0.2, -0.1]))
 SIGMAS = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
+NOT_A_NUMBER = gtsam.noiseModel.Isotropic.Sigma(6, np.nan)
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
 CONTEXT = PoseContext(POSE_KEY, 0, LAST, (0, LAST))
 
@@ -182,6 +183,8 @@ def test_a_sweep_that_is_lost_by_factors_says_so():
     [
         (None, "expected a list of factors.*got NoneType"),
         (["barometer"], r"got str on the keys \[\]"),
+        ([between(gtsam.noiseModel.Isotropic.Sigma(6, 0.0))], "got BetweenFactorPose3 with NaN"),
+        ([gtsam.PriorFactorPose3(POSE_KEY, LAST, NOISE), between(NOT_A_NUMBER)], "with NaN"),
         ([gtsam.GPSFactor(7, np.zeros(3), gtsam.noiseModel.Unit.Create(3))], r"on the keys \[7\]"),
         ([gtsam.GPSFactor(LAST_KEY, np.zeros(3), gtsam.noiseModel.Unit.Create(3))], "context.key"),
     ],
@@ -189,6 +192,15 @@ def test_a_sweep_that_is_lost_by_factors_says_so():
 def test_what_is_no_factor_of_the_frame_is_an_error(factors, says):
     with pytest.raises(InputError, match=f"extra_factors: .*{says}"):
         own_factors(lambda context: factors, CONTEXT)
+
+
+def test_factors_may_be_in_a_graph_or_yielded():
+    graph = gtsam.NonlinearFactorGraph()
+    graph.add(between())
+    graph.add(gtsam.GPSFactor(POSE_KEY, np.zeros(3), gtsam.noiseModel.Unit.Create(3)))
+    for factors in (graph, (graph.at(place) for place in range(2))):
+        found = own_factors(lambda context, factors=factors: factors, CONTEXT)
+        assert (len(found.alone), len(found.since_last)) == (1, 1)
 
 
 def test_the_solvers_of_the_documentation_keep_degenerate_frames_degenerate():

@@ -145,6 +145,7 @@ def test_a_live_run_is_that_of_the_bag_however_the_messages_come(
 ) -> None:
     live, results = lived(interleaved(messages_of(bag)), config=QUICK)
     assert_the_same(live, results, offline)
+    assert repr(results[-1]).startswith(f"LiveResult({results[-1].update}, ")
     report = live.report()
     assert report.statuses == {"first": 1, "ok": FRAMES - 1}
     assert report.received == {"imu": len(messages_of(bag)) - FRAMES, "cloud": FRAMES}

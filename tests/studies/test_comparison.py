@@ -30,7 +30,7 @@ from loam_gtsam.studies.contenders import (
     SolverRun,
     make_contender,
 )
-from loam_gtsam.studies.evaluation import absolute_error, interpolate
+from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.studies.peers import PEERS
 from loam_gtsam.types import (
     BadSweep,
@@ -331,7 +331,7 @@ def test_maps_are_judged_by_the_same_points_at_the_poses_of_each(world, sweeps):
     def quality(shift, noise):
         stamps = np.array([sweep.stamp + shift for sweep in sweeps], np.int64)
         stamps = np.clip(stamps, world.truth.stamps[0], world.truth.stamps[-1])
-        exact = interpolate(world.truth, stamps).map_T_lidar
+        exact = world.truth.at(stamps).map_T_lidar
         updates = []
         for stamp, pose in zip(stamps.tolist(), exact, strict=True):
             moved = gtsam.Pose3(pose).compose(gtsam.Pose3(gtsam.Rot3(), noise * rng.normal(size=3)))

@@ -9,7 +9,6 @@ from loam_gtsam.studies.evaluation import (
     absolute_error,
     align_positions,
     align_rotations,
-    interpolate,
     path_lengths,
     pose_differences,
     relative_error,
@@ -87,7 +86,7 @@ def test_interpolation_of_constant_velocity_and_rotation_is_exact():
         return Trajectory(stamps_, poses)
 
     between = stamps[0] + np.array([0, 33_333_333, 250_000_001, 400_000_000])
-    found = interpolate(at(stamps), between)
+    found = at(stamps).at(between)
     np.testing.assert_array_equal(found.stamps, between)
     np.testing.assert_allclose(found.map_T_lidar, at(between).map_T_lidar, atol=1e-12)
 
@@ -96,9 +95,9 @@ def test_interpolation_of_constant_velocity_and_rotation_is_exact():
 def test_interpolation_ends_where_the_trajectory_ends(outside):
     some = winding(11)
     start = some.stamps[0]
-    assert len(interpolate(some, start + np.array([0, 1_000_000_000]))) == 2
-    with pytest.raises(InputError, match="leave the trajectory"):
-        interpolate(some, start + np.array([5, outside]))
+    assert len(some.at(start + np.array([0, 1_000_000_000]))) == 2
+    with pytest.raises(InputError, match=f"expected stamps from {start} to {some.stamps[-1]} ns"):
+        some.at(start + np.array([5, outside]))
 
 
 @pytest.mark.parametrize(
@@ -112,8 +111,8 @@ def test_interpolation_ends_where_the_trajectory_ends(outside):
 )
 def test_a_reference_that_cannot_be_interpolated_is_refused(stamps, message):
     bad = Trajectory(np.array(stamps, np.int64), np.tile(np.eye(4), (len(stamps), 1, 1)))
-    with pytest.raises(InputError, match=f"interpolate: expected {message}"):
-        interpolate(bad, np.array([1]))
+    with pytest.raises(InputError, match=f"Trajectory.at: expected {message}"):
+        bad.at(1)
     with pytest.raises(InputError, match=f"absolute_error: expected {message}"):
         absolute_error(winding(), bad)
 
@@ -123,8 +122,10 @@ def test_a_rigid_change_is_no_error_unless_unaligned():
     error = absolute_error(moved(truth), truth)
     assert error.maximum < 1e-11
     assert error.rotation_rmse_deg < 1e-5
+    np.testing.assert_allclose(error.aligned.map_T_lidar, truth.map_T_lidar, atol=1e-9)
     raw = absolute_error(moved(truth), truth, aligned=False)
     assert raw.rmse > 1.0
+    np.testing.assert_array_equal(raw.aligned.map_T_lidar, moved(truth).map_T_lidar)
     assert raw.rotation_rmse_deg > 10.0
 
 

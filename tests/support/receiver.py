@@ -11,7 +11,6 @@ from loam_gtsam.datasets import ArrayDataset, SimulatedWorld
 from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.geodesy import GeoReference, east_north_up, geodetic_of
 from loam_gtsam.loops.pose_graph import PoseGraph
-from loam_gtsam.studies.evaluation import interpolate
 from loam_gtsam.types import FloatArray, IntArray, Scan, Trajectory
 
 ORIGIN = np.array([47.5, 8.5, 450.0])
@@ -81,7 +80,7 @@ def off_in_enu(
     """
     assert earth is not None
     inside = stamps <= truth.stamps[-1]
-    true = interpolate(truth, stamps[inside]).map_T_lidar[:, :3, 3]
+    true = truth.at(stamps[inside]).positions
     enu_T_map = gtsam.Pose3(earth.enu_T_map)
     found = np.array([enu_T_map.transformFrom(position) for position in positions[inside]])
     return found - east_north_up(geodetic_of(in_enu(true), ORIGIN), earth.origin)

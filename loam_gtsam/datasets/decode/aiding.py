@@ -29,7 +29,8 @@ class GnssFixes:
     ----------
     stamps : (N,) int64 nanoseconds, ascending
     geodetic : (N, 3) latitude, longitude (degrees), height above the ellipsoid of WGS 84 (metres)
-    covariances : (N, 3, 3) m^2 along east, north, up; NaN where the receiver tells none
+    covariances : (N, 3, 3) m^2 along east, north, up, or one (3, 3) for all; NaN where the receiver
+        tells none, which None or nothing stands for
 
     Raises
     ------
@@ -39,14 +40,18 @@ class GnssFixes:
 
     stamps: IntArray
     geodetic: FloatArray
-    covariances: FloatArray
+    covariances: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         stamps = as_stamps(self.stamps, "GnssFixes.stamps")
         places = as_array(self.geodetic, "GnssFixes.geodetic", (len(stamps), 3))
-        if np.shape(self.covariances) != (len(stamps), 3, 3):
-            got = np.shape(self.covariances)
-            raise InputError(f"GnssFixes.covariances: expected ({len(stamps)}, 3, 3), got {got}")
+        told = np.full((3, 3), np.nan) if self.covariances is None else self.covariances
+        if np.shape(told) not in ((3, 3), (len(stamps), 3, 3)):
+            raise InputError(
+                f"GnssFixes.covariances: expected ({len(stamps)}, 3, 3), (3, 3) or None, got "
+                f"{np.shape(told)}; variances[:, :, None] * np.eye(3) makes them of variances"
+            )
+        object.__setattr__(self, "covariances", np.broadcast_to(told, (len(stamps), 3, 3)))
         if (np.diff(stamps) <= 0).any():
             raise InputError("GnssFixes.stamps: expected ascending ones")
         if not is_place(places).all():

@@ -69,10 +69,6 @@ class GtsamSolver:
     def __init__(self, config: SolverConfig) -> None:
         check_settings(config)
         self.config = config
-        params = gtsam.LevenbergMarquardtParams()
-        params.setMaxIterations(config.inner_iterations)
-        params.setVerbosityLM("SILENT")
-        self._params = params
 
     def solve(
         self,
@@ -166,7 +162,10 @@ class GtsamSolver:
             added = along.information
         for factor in priors:
             graph.add(factor)
-        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, self._params)
+        params = gtsam.LevenbergMarquardtParams()
+        params.setMaxIterations(self.config.inner_iterations)
+        params.setVerbosityLM("SILENT")
+        optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values, params)
         before = optimizer.error()
         moved = optimizer.optimize().atPose3(POSE_KEY)
         after, steps = optimizer.error(), optimizer.iterations()

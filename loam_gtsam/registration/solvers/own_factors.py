@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -64,8 +64,8 @@ def _renamed(old: str, new: str) -> None:
     warnings.warn(what, DeprecationWarning, stacklevel=3)
 
 
-ExtraFactors = Callable[[PoseContext], Sequence[gtsam.NonlinearFactor]]
-"""A function that returns factors on ``context.key``, or on ``context.key`` and
+ExtraFactors = Callable[[PoseContext], Iterable[gtsam.NonlinearFactor] | gtsam.NonlinearFactorGraph]
+"""A function that returns or yields factors on ``context.key``, or on ``context.key`` and
 ``context.last_key``; the mapper calls the function once for every sweep that is solved."""
 
 
@@ -93,31 +93,44 @@ def own_factors(
     PartError
         If the callable raises.
     InputError
-        If the callable returns anything but a sequence of GTSAM factors on these keys; GTSAM's own
-        errors name no cause.
+        If the callable returns anything but GTSAM factors on these keys, or one of them is not
+        finite at the predicted pose; GTSAM's own errors name no cause.
     """
     with own_code("extra_factors", extra):
-        factors: object = extra(context)
-    if not isinstance(factors, Sequence):
+        given: object = extra(context)
+        if isinstance(given, gtsam.NonlinearFactorGraph):
+            given = [given.at(place) for place in range(given.size())]
+        factors = list(given) if isinstance(given, Iterable) else None
+    if factors is None:
         raise InputError(
             "extra_factors: expected a list of factors, empty if there are none; got "
-            f"{type(factors).__name__}"
+            f"{type(given).__name__}"
         )
+    near = gtsam.Values()
+    near.insert(context.key, context.map_T_middle)
+    near.insert(context.last_key, context.last[1])
     alone: list[gtsam.NonlinearFactor] = []
     since_last: list[gtsam.NonlinearFactor] = []
     for factor in factors:
         keys = list(factor.keys()) if isinstance(factor, gtsam.NonlinearFactor) else []
-        if keys == [context.key]:
-            alone.append(factor)
-        elif sorted(keys) == sorted([context.key, context.last_key]):
-            with own_code("extra_factors", extra):
-                since_last.append(_with_last_held(factor, context, error))
-        else:
+        both = sorted(keys) == sorted([context.key, context.last_key])
+        if keys != [context.key] and not both:
             raise InputError(
                 "extra_factors: expected GTSAM factors on context.key, or on context.key and "
                 f"context.last_key ({context.key} and {context.last_key}); got "
                 f"{type(factor).__name__} on the keys {keys}"
             )
+        with own_code("extra_factors", extra):
+            linear = factor.linearize(near)  # None if the factor does not act there
+            if linear is not None and not np.isfinite(np.column_stack(linear.jacobian())).all():
+                raise InputError(
+                    "extra_factors: expected factors that are finite at the predicted pose, got "
+                    f"{type(factor).__name__} with NaN in its error, Jacobian or noise (sigma 0?)"
+                )
+            if both:
+                since_last.append(_with_last_held(factor, context, error))
+            else:
+                alone.append(factor)
     return OwnFactors(alone, since_last)
 
 
@@ -159,11 +172,6 @@ class NamedSolver(ScanSolver):
 
     solver: ScanSolver
     factors: object
-
-    def __post_init__(self) -> None:
-        if isinstance(self.solver, type):
-            name = self.solver.__name__
-            raise InputError(f"solver: expected a solver, got the class; {name}(config.solver)")
 
     def solve(
         self,

@@ -23,6 +23,7 @@ from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_a
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint, Progress, checksum
 from loam_gtsam.io.rollback import whole
+from loam_gtsam.io.run_notes import run_notes
 from loam_gtsam.loops.closure import LoopCloser, NoLoops
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Places
@@ -102,6 +103,11 @@ class RunResult:
     def times_problem(self) -> str:
         """What is wrong with the times of the points, by how these move; empty if nothing is."""
         return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what is wrong or in doubt, as the command line shows them below a run."""
+        return run_notes(self)
 
     @property
     def status_counts(self) -> dict[str, int]:

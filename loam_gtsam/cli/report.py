@@ -193,14 +193,17 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     rows = {"path": info.path, **info.facts}
     problems = list(info.problems)
     facts: dict[str, str] = {}
+    unusable: dict[str, list[str]] = {}  # numbers of the sweeps, by what is wrong with them
     for number, sweep in enumerate(itertools.islice(dataset, _TRIED_SWEEPS)):
         try:
             facts = {"shown": f"sweep {number}"} | _sweep_facts(sweep, config)
         except SweepError as error:
-            problems.append(f"sweep {number}: {error}")
+            unusable.setdefault(str(error), []).append(str(number))
             continue
         problems += _imu_beside(dataset, config, sweep)
         break
+    for text, numbers in unusable.items():
+        problems.append(f"sweep{'s'[: len(numbers) - 1]} {', '.join(numbers)}: {text}")
     if len(dataset) == 0:
         problems.append("no sweeps in it")
     imu = imu_buffer(dataset, config)

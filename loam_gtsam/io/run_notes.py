@@ -22,7 +22,8 @@ _ADVICE = {
     FrameStatus.LOST: "too fast or too few matches: use every sweep, check sensor.* and the times "
     "of the points",
     FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",
-    FrameStatus.BAD_STAMP: "the stamps of the sweeps are wrong: see loam-gtsam inspect",
+    FrameStatus.BAD_STAMP: "the stamps of the sweeps, or the times of their points, are wrong: "
+    "see loam-gtsam inspect",
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _VAGUE = 1.0  # metres of standard deviation, and more than a hundredth of the path, that are said

@@ -437,12 +437,9 @@ def run(
     pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
     if parts.get("features") is not None:
         workers = 0
-    samples = imu if imu is None else dataset.imu, fixes, wheels
-    about = {
-        "data set": dataset.name,
-        "configuration": config.model_dump_json(),
-        "checksum of IMU, GNSS and wheels": f"{checksum(samples):08x}",
-    }
+    samples = None if imu is None else dataset.imu, fixes, wheels
+    about = {"data set": dataset.name, "configuration": config.model_dump_json()}
+    about["checksum of IMU, GNSS and wheels"] = f"{checksum(samples):08x}"
     progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
     interrupted, error = False, None

@@ -305,6 +305,7 @@ def test_wrong_options_say_what_was_expected(arguments, code, message):
     [
         ([BadSweep(0, "damaged"), 0], 0, ("sweep 0: damaged", "sweep 1", "can be run")),
         (DAMAGED, 1, ("sweep 4: damaged 4", "cannot be run")),
+        ([BadSweep(0, "cut"), BadSweep(1, "cut")], 1, ("problem: sweeps 0, 1: cut",)),
         ([Scan(np.full((50, 3), np.nan), 0)], 1, ("sweep of 50 points, 0 finite", "cannot be")),
         ([], 1, ("no sweeps", "cannot be run")),
     ],

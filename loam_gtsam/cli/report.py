@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -193,16 +194,17 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     rows = {"path": info.path, **info.facts}
     problems = list(info.problems)
     facts: dict[str, str] = {}
-    unusable: dict[str, list[str]] = {}  # numbers of the sweeps, by what is wrong with them
+    unusable: dict[str, tuple[str, list[str]]] = {}  # what is wrong, and numbers of the sweeps
     for number, sweep in enumerate(itertools.islice(dataset, _TRIED_SWEEPS)):
         try:
             facts = {"shown": f"sweep {number}"} | _sweep_facts(sweep, config)
         except SweepError as error:
-            unusable.setdefault(str(error), []).append(str(number))
+            alike = re.sub(r"\d+", "", str(error))
+            unusable.setdefault(alike, (str(error), []))[1].append(str(number))
             continue
         problems += _imu_beside(dataset, config, sweep)
         break
-    for text, numbers in unusable.items():
+    for text, numbers in unusable.values():
         problems.append(f"sweep{'s'[: len(numbers) - 1]} {', '.join(numbers)}: {text}")
     if len(dataset) == 0:
         problems.append("no sweeps in it")

@@ -122,7 +122,7 @@ def said(result: RunResult) -> tuple[str, ...]:
     if result.imu is None:
         return ()
     given_up = () if result.imu.gyro_trusted else ("gyro given up",)
-    return (*result.imu.report.problems, *result.imu.problems, *given_up)
+    return (*result.imu.problems, *given_up)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -15,14 +15,15 @@ import gtsam
 from loam_gtsam.aiding.gnss import TiedFixes, tie
 from loam_gtsam.aiding.imu_summary import ImuSummary, imu_summary
 from loam_gtsam.aiding.wheels import aided_odometry
-from loam_gtsam.config import Config, Section, as_config, with_implied
+from loam_gtsam.config import Config, as_config, named_sections, with_implied
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
 from loam_gtsam.errors import PartFaults, check_part, is_own, nearest, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
-from loam_gtsam.io.checkpoint import Checkpoint, Progress
+from loam_gtsam.io.checkpoint import Checkpoint, Progress, checksum
 from loam_gtsam.io.rollback import whole
+from loam_gtsam.io.run_notes import run_notes
 from loam_gtsam.loops.closure import LoopCloser, NoLoops
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Places
@@ -102,6 +103,11 @@ class RunResult:
     def times_problem(self) -> str:
         """What is wrong with the times of the points, by how these move; empty if nothing is."""
         return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what is wrong or in doubt, as the command line shows them below a run."""
+        return run_notes(self)
 
     @property
     def status_counts(self) -> dict[str, int]:
@@ -292,7 +298,7 @@ class Pipeline:
         roots: dict[str, Any] = {"pipeline": self, "mapper": mapper}
         if self.odometry is not None:
             roots["odometry"] = self.odometry
-        shared = {"solver": mapper.solver, **_sections("config", self.config)}
+        shared = {"solver": mapper.solver, **named_sections("config", self.config)}
         if self._features is not None:
             shared["features"] = self._features
         if self._wheels is not None:
@@ -348,15 +354,6 @@ class Pipeline:
 
 Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
 """Called after each frame with the sweep, its result and the pipeline, to look, not to change."""
-
-
-def _sections(name: str, config: Section) -> dict[str, Any]:
-    """A section of the configuration and those in it, by name."""
-    found = {name: config}
-    for key, value in config:
-        if isinstance(value, Section):
-            found |= _sections(f"{name}.{key}", value)
-    return found
 
 
 def effective_config(config: Config, dataset: Dataset) -> Config:
@@ -443,7 +440,9 @@ def run(
     pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
     if parts.get("features") is not None:
         workers = 0
+    samples = None if imu is None else dataset.imu, fixes, wheels
     about = {"data set": dataset.name, "configuration": config.model_dump_json()}
+    about["checksum of IMU, GNSS and wheels"] = f"{checksum(samples):08x}"
     progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
     interrupted, error = False, None

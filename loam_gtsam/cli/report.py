@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -19,6 +20,7 @@ from loam_gtsam.datasets.base import Dataset, PartOf
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, assign_times, usable_columns
 from loam_gtsam.io.run_files import position_sigmas, stage_seconds
+from loam_gtsam.io.run_notes import DO_NOT_TRUST
 from loam_gtsam.pipeline import RunResult, effective_config, imu_buffer, run
 from loam_gtsam.refine.map_quality import map_quality
 from loam_gtsam.types import (
@@ -33,23 +35,12 @@ from loam_gtsam.types import (
 )
 
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST)
-_TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
-_ADVICE = {
-    FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
-    "docs/imu.md, docs/gnss.md",
-    FrameStatus.LOST: "too fast or too few matches: use every sweep, check sensor.* and the times "
-    "of the points",
-    FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",
-    FrameStatus.BAD_STAMP: "the stamps of the sweeps are wrong: see loam-gtsam inspect",
-}
-_ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
 _MESSAGES, _TRIED_SWEEPS = 3, 5
 _MAPPED = 50  # sweeps from which the turns of the scans are told; a word needs 20
 _TIGHTER = 0.85
 """Share of the scatter: sweeps that were de-skewed before have 0.2 to 0.7 as they are."""
 _SOUGHT, _STEP = 30.0, 1.0  # seconds in which a start for them is sought, and between such starts
 _VOXELS = 4  # of the map along the edge of a cell in which a plane is looked for
-_VAGUE = 1.0  # metres of standard deviation, and more than a hundredth of the path, that are said
 _MIN_PATH = 10.0  # metres: an error in per cent of a shorter path says nothing
 
 
@@ -64,14 +55,13 @@ def summary(
 
     The name and the ``problems`` are those of the data set, the accuracy is as in ``summary.json``.
     """
-    frames, path = len(result.updates), result.trajectory.path_length
-    sigmas = position_sigmas(result.updates)
+    frames, sigmas = len(result.updates), position_sigmas(result.updates)
     rows = {
         "frames": f"{frames} in {seconds:.1f} s ({frames / seconds:.1f} frames/s)",
         "status": _counts(result.status_counts),
         "not used": _counts(result.faults),
         "weakly constrained": _weak_axes(result),
-        "path": f"{path:.1f} m",
+        "path": f"{result.trajectory.path_length:.1f} m",
         "map": f"{len(result.edge_points)} edge and {len(result.plane_points)} plane points",
         "map, planes": _thickness(result),
         "map, dropped": _dropped(result),
@@ -80,20 +70,13 @@ def summary(
         "loops": _loops(result),
         "GNSS": "" if result.fixes is None else str(result.fixes),
     }
-    notes = [f"input: {problem}" for problem in problems]
-    if sigmas is not None and sigmas["largest"] > max(_VAGUE, 0.01 * path):
-        told = f"positions are told to {sigmas['largest']:.2g} m at worst (sigma)"
-        notes.append(f"{told}: other first motions fit as well, or the way was blind")
     if result.imu is not None:
         rows |= _imu_facts(result.imu)
-        notes += _imu_problems(result.imu)
-    notes += _odd_frames(result.updates)
-    texts = [Text(f"  {note}", style="yellow") for note in notes]
-    if result.times_problem:
-        texts.append(Text(f"  DO NOT TRUST THIS RUN: {result.times_problem}", style="bold red"))
-    warning, doubted = _warning(result.updates)
-    if warning:
-        texts.append(Text(f"  {warning}", style="bold red" if doubted else "yellow"))
+    notes = [f"input: {problem}" for problem in problems] + _odd_frames(result.updates)
+    texts = [
+        Text(f"  {note}", style="bold red" if note.startswith(DO_NOT_TRUST) else "yellow")
+        for note in (*notes, *result.notes)
+    ]
     return Group(_table(name, rows), *texts)
 
 
@@ -102,26 +85,6 @@ def _told(sigmas: Mapping[str, float] | None) -> str:
     if sigmas is None:
         return ""
     return f"told to {sigmas['median']:.2g} m (sigma, median), {sigmas['largest']:.2g} m at worst"
-
-
-def _warning(updates: Sequence[MapUpdate]) -> tuple[str, bool]:
-    """One line on the frames that are not trustworthy, "" if there are none; whether too many."""
-    fixed = *_EXPECTED, FrameStatus.NOT_CONVERGED
-    odd = [number for number, update in enumerate(updates) if update.status not in fixed]
-    if not odd:
-        moving = sum(update.status is FrameStatus.NOT_CONVERGED for update in updates)
-        if moving <= _TOO_MANY * len(updates):
-            return "", False
-        share = f"{moving} of {len(updates)} poses still moved"
-        return f"{share} when solver.iterations ended: try more (not_converged)", False
-    doubted = len(odd) > _TOO_MANY * len(updates)
-    counts = Counter[str](updates[number].status for number in odd)
-    advice = _ADVICE[FrameStatus(counts.most_common(1)[0][0])]
-    return (
-        f"{'DO NOT TRUST THIS RUN: ' if doubted else ''}{len(odd)} of {len(updates)} poses "
-        f"({100.0 * len(odd) / len(updates):.0f} %) are not fixed by their scans "
-        f"({_counts(counts)}), first that of frame {odd[0]}; {advice}"
-    ), doubted
 
 
 def _weak_axes(result: RunResult) -> str:
@@ -203,22 +166,6 @@ def _counts(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{count} {name}" for name, count in counts.items())
 
 
-def _imu_problems(imu: ImuSummary) -> list[str]:
-    problems = list(imu.report.problems)
-    dropped = imu.tilt_priors.get("dropped", 0)
-    if dropped and imu.report.orientation != "none":
-        at = f"{dropped} of {sum(imu.tilt_priors.values())} sweeps"
-        why = "gaps longer than imu.max_gap, or another clock than that of the sweeps"
-        problems.append(f"IMU: no orientation at {at}: {why}")
-    if imu.gyro_left_out:
-        problems.append(
-            f"IMU: its gyro turned unlike the scans and was given up for {imu.gyro_left_out} "
-            "sweeps; check imu.lidar_R_imu_deg, units and stamps; if the gyro is right, the poses "
-            "are wrong"
-        )
-    return [*problems, *imu.problems]
-
-
 def _odd_frames(updates: Sequence[MapUpdate]) -> list[str]:
     odd = [f"frame {number}: {update.status}: {update.message}"
            for number, update in enumerate(updates) if update.status not in _EXPECTED]  # fmt: skip
@@ -247,14 +194,18 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
     rows = {"path": info.path, **info.facts}
     problems = list(info.problems)
     facts: dict[str, str] = {}
+    unusable: dict[str, tuple[str, list[str]]] = {}  # what is wrong, and numbers of the sweeps
     for number, sweep in enumerate(itertools.islice(dataset, _TRIED_SWEEPS)):
         try:
             facts = {"shown": f"sweep {number}"} | _sweep_facts(sweep, config)
         except SweepError as error:
-            problems.append(f"sweep {number}: {error}")
+            alike = re.sub(r"\d+", "", str(error))
+            unusable.setdefault(alike, (str(error), []))[1].append(str(number))
             continue
         problems += _imu_beside(dataset, config, sweep)
         break
+    for text, numbers in unusable.values():
+        problems.append(f"sweep{'s'[: len(numbers) - 1]} {', '.join(numbers)}: {text}")
     if len(dataset) == 0:
         problems.append("no sweeps in it")
     imu = imu_buffer(dataset, config)
@@ -305,7 +256,7 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
     result = run(part, config, max_frames=_MAPPED, keep_partial=True)
     if result.interrupted:
         raise KeyboardInterrupt
-    said, of_imu = result.times_problem, [] if result.imu is None else _imu_problems(result.imu)
+    said, of_imu = result.times_problem, () if result.imu is None else result.imu.problems
     if said:
         as_is = config.changed("sensor.times=none")
         without = run(part, as_is, max_frames=_MAPPED, keep_partial=True)

@@ -14,6 +14,7 @@ import numpy as np
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.config import Config, dump_config
 from loam_gtsam.datasets.base import Dataset, DatasetInfo
+from loam_gtsam.io.checkpoint import checksum
 from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.loops.files import write_graph
@@ -59,6 +60,7 @@ class Results:
     info: DatasetInfo
     truth: Trajectory | None
     last: LastFrame | None  # for the pictures; None draws none
+    checksum: str  # of the input, see :func:`_input_checksum`
     whole: bool = True  # the data set ended, and not the number of frames that was asked for
     accuracy: Mapping[str, Any] = field(default_factory=dict)  # or ``problem``; empty without truth
     error: evaluation.AbsoluteError | None = None
@@ -71,7 +73,8 @@ class Results:
         """Compare a run with the truth of its data set, if there is any."""
         trajectory, truth = run.trajectory, dataset.truth
         info = _input_info(dataset)
-        results = Results(run=run, info=info, truth=truth, last=last, whole=whole)
+        check = _input_checksum(dataset)
+        results = Results(run=run, info=info, truth=truth, last=last, checksum=check, whole=whole)
         if truth is None:
             return results
         try:
@@ -100,7 +103,7 @@ class Results:
     def write(self, folder: Path) -> list[str]:
         """Write all files into a folder; returns their names."""
         extra = {"whole": self.whole, "accuracy": self.accuracy or None}
-        extra["input"] = asdict(self.info)
+        extra["input"] = asdict(self.info) | {"checksum": self.checksum}
         files = list(BASE_FILES)
         write_run(self.run, folder, dataset=_described(self.info), extra=extra)
         if self.run.pipeline is not None:
@@ -171,16 +174,37 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
         return False
     if not summary or summary.get("interrupted") or summary.get("error"):
         return False
-    now = described(dataset), dump_config(effective_config(config, dataset))
-    frames, same = summary.get("frames", 0), (summary.get("dataset"), written) == now
-    if same and frames < total and not summary.get("whole", True):
+    differs = _differences(summary, dataset)
+    if written != dump_config(effective_config(config, dataset)):
+        differs.append("the configuration")
+    frames, whole = summary.get("frames", 0), summary.get("whole", True)
+    if not differs and frames < total and not whole:
         return False
-    if not same or not (frames == total or (summary.get("whole") and frames < total)):
+    if frames > total:
+        differs.append("the number of sweeps")
+    if differs:
         raise OutputError(
-            f"{folder}: holds the results of another run (data, configuration or number of "
-            "sweeps); choose another folder, or --overwrite without --resume"
+            f"{folder}: holds the results of another run ({', '.join(differs)}); choose another "
+            "folder, or --overwrite without --resume"
         )
     return True
+
+
+def _differences(summary: Mapping[str, Any], dataset: Dataset) -> list[str]:
+    """What of a data set differs from that of which the run with this summary was made."""
+    info, before = _input_info(dataset), summary.get("input") or {}
+    made_of = before.get("kind"), Path(before.get("path", "")).name
+    if made_of != (info.kind, Path(info.path).name):
+        return [f"the data set was {summary.get('dataset')}"]
+    facts = before.get("facts") or {}
+    differs = [
+        f"{label} was {facts.get(label)}, now {info.facts.get(label)}"
+        for label in facts | info.facts
+        if facts.get(label) != info.facts.get(label)
+    ]
+    if not differs and before.get("checksum") != _input_checksum(dataset):
+        return ["the first sweep, IMU, fixes or wheels"]
+    return differs
 
 
 def check_data(folder: Path, dataset: Dataset) -> None:
@@ -214,6 +238,16 @@ def _input_info(dataset: Dataset) -> DatasetInfo:
         return dataset.info()
     except LoamError as error:
         return DatasetInfo("data set", dataset.name, problems=[str(error)])
+
+
+def _input_checksum(dataset: Dataset) -> str:
+    """Of the first sweep, IMU, fixes and wheels, by which other data of the same name are told."""
+    try:
+        first = next(iter(dataset), None)
+        aids = dataset.imu, getattr(dataset, "gnss", None), getattr(dataset, "wheels", None)
+    except LoamError:  # then the run was not complete
+        return ""
+    return f"{checksum((first, aids)):08x}"
 
 
 def _described(info: DatasetInfo) -> str:

@@ -31,6 +31,7 @@ from loam_gtsam.config.tree import config_from_dict as config_from_dict
 from loam_gtsam.config.tree import config_to_dict as config_to_dict
 from loam_gtsam.config.tree import dump_config as dump_config
 from loam_gtsam.config.tree import load_config as load_config
+from loam_gtsam.config.tree import named_sections as named_sections
 from loam_gtsam.config.tree import parse_config as parse_config
 from loam_gtsam.config.tree import preset as preset
 from loam_gtsam.config.tree import with_implied as with_implied

@@ -104,6 +104,15 @@ def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
     return config.changed(sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
 
 
+def named_sections(name: str, section: Section) -> dict[str, Section]:
+    """A section of that name and those in it, by dotted name."""
+    found = {name: section}
+    for key, value in section:
+        if isinstance(value, Section):
+            found |= named_sections(f"{name}.{key}", value)
+    return found
+
+
 def _filled(section: Section, implied: Mapping[str, Any]) -> Section:
     default = type(section)()
     unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}

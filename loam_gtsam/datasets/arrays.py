@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from loam_gtsam.datasets.base import DatasetInfo, Loader
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
-from loam_gtsam.datasets.decode.point_times import shorter_period
+from loam_gtsam.datasets.decode.point_times import shorter_period, span_problem, usual_step
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.geometry import as_array, as_stamps
 from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory, check_kind
@@ -45,7 +45,8 @@ class ArrayDataset(Loader):
     Raises
     ------
     InputError
-        If a shape, a dtype, a number of entries or the class of a part is wrong.
+        If a shape, a dtype, a number of entries or the class of a part is wrong, or ``times`` span
+        several sweeps.
     """
 
     def __init__(
@@ -75,6 +76,7 @@ class ArrayDataset(Loader):
             self._scans = _ready(entries, (stamps, stamps_s, times, rings))
         else:
             self._scans = _made(entries, _stamps(stamps, stamps_s), times, rings)
+        _check_spans(self._scans)
         if any(scan.times is None for scan in self._scans):
             period = shorter_period([scan.stamp for scan in self._scans])
             self.sensor = {**period, **self.sensor}
@@ -133,6 +135,13 @@ def _made(
         except InputError as error:
             raise InputError(f"scans[{index}]: {error}") from error
     return scans
+
+
+def _check_spans(scans: Sequence[Scan]) -> None:
+    spans = [np.ptp(scan.times) for scan in scans if scan.times is not None and len(scan.times)]
+    step = usual_step([scan.stamp for scan in scans])
+    if spans and (problem := span_problem(float(np.median(spans)), step)):
+        raise InputError(f"times: {problem}")
 
 
 def _stamps(stamps: Any, stamps_s: Any) -> IntArray:

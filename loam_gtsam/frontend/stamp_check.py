@@ -62,7 +62,10 @@ class StampCheck:
         if 0 < step < _SHORTEST:
             return Refusal(SweepFault.TOO_SOON, f"{later}; expected nanoseconds")
         if 0 < step < _SOON * usual:
-            return Refusal(SweepFault.TOO_SOON, f"{later}; {usual * 1e-9:.3g} s are usual")
+            told = f"{usual * 1e-9:.3g} s are usual"
+            if not self._steps:
+                told = f"the times of its points span {seconds:.3g} s: are they seconds?"
+            return Refusal(SweepFault.TOO_SOON, f"{later}; {told}")
         if step > 0 and (step <= largest or not before):
             self._steps.append(step)
             self._doubted = None

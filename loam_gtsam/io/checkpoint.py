@@ -13,9 +13,12 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +26,7 @@ from loam_gtsam.errors import DAMAGED
 from loam_gtsam.io.atomic import atomic_file, lock_folder, make_folder, unlock_folder
 from loam_gtsam.io.state import STRUCTURE, Frozen, freeze, thaw
 from loam_gtsam.io.version import installed_version
-from loam_gtsam.types import DatasetError, MapUpdate, OutputError, Sweep, check_kind
+from loam_gtsam.types import BadSweep, DatasetError, MapUpdate, OutputError, Sweep, check_kind
 
 _HEADER = "header"
 _FILE = re.compile(r"(frames_\d+_\d+|state_\d+)\.npz")
@@ -31,11 +34,32 @@ _UNFINISHED = re.compile(rf"\.{_FILE.pattern}\.\d+\.tmp")
 _log = logging.getLogger(__name__)
 
 
-class _Frames:
-    """Stamps and updates of the frames between two checkpoints."""
+def checksum(contents: object, start: int = 0) -> int:
+    """CRC-32 of all that is in sweeps, samples of an IMU and the like, or in several of them.
 
-    def __init__(self, stamps: Sequence[int] = (), updates: Sequence[MapUpdate] = ()) -> None:
-        self.stamps, self.updates = list(stamps), list(updates)
+    Of a bad sweep the stamp counts alone: its message names the file, whose folder may move.
+    ``start`` is the checksum of what comes before.
+    """
+    if isinstance(contents, BadSweep):
+        contents = contents.stamp
+    if isinstance(contents, gtsam.Pose3):
+        contents = contents.matrix()
+    if is_dataclass(contents):
+        contents = tuple(getattr(contents, item.name) for item in fields(contents))
+    if isinstance(contents, tuple):
+        for part in contents:
+            start = checksum(part, start)
+        return start
+    if isinstance(contents, np.ndarray):
+        return crc32(contents.tobytes(), checksum((contents.dtype.str, contents.shape), start))
+    return crc32(repr(contents).encode(), start)
+
+
+class _Frames:
+    """Checksums of the sweeps and updates of the frames between two checkpoints."""
+
+    def __init__(self, sweeps: Sequence[int] = (), updates: Sequence[MapUpdate] = ()) -> None:
+        self.sweeps, self.updates = list(sweeps), list(updates)
 
 
 class Checkpoint:
@@ -80,7 +104,7 @@ class Checkpoint:
 
         Returns
         -------
-        Stamps of the sweeps that were processed, nanoseconds, and their updates.
+        Checksums of the sweeps that were processed, and their updates.
 
         Raises
         ------
@@ -110,23 +134,25 @@ class Checkpoint:
             self._parts = header["parts"]
             for start, end in zip([0, *self._parts], self._parts, strict=False):
                 thaw(_read(self._frames_file(start, end))[0], {"frames": part}, {})
-                frames.stamps += part.stamps
+                frames.sweeps += part.sweeps
                 frames.updates += part.updates
             thaw(state, roots, shared)
         except DAMAGED as error:
             problem = f"{newest}: the checkpoint cannot be read: {str(error)[:200]}"
             raise OutputError(f"{problem}; start again without resuming") from error
         self._written = time.monotonic()
-        return frames.stamps, frames.updates
+        return frames.sweeps, frames.updates
 
     def save(
         self,
-        stamps: Sequence[int],
+        sweeps: Sequence[int],
         updates: Sequence[MapUpdate],
         roots: Mapping[str, Any],
         shared: Mapping[str, Any],
     ) -> None:
         """Write the state after a frame: that of the roots, and what all sweeps so far gave.
+
+        ``sweeps`` are their checksums, see :func:`checksum`.
 
         If the state cannot be written, or something in it cannot be kept, the log says so once and
         the run goes on.
@@ -137,7 +163,7 @@ class Checkpoint:
         before = self._newest()
         try:
             state = freeze(roots, shared)
-            frames = freeze({"frames": _Frames(stamps[done:], updates[done:])}, {})
+            frames = freeze({"frames": _Frames(sweeps[done:], updates[done:])}, {})
             make_folder(self.folder)
             _write(self._frames_file(done, total), frames, {})
             header = {"about": self._about, "parts": [*self._parts, total]}
@@ -204,7 +230,7 @@ class Progress:
     ) -> None:
         self._checkpoint, self._state = checkpoint, state
         self.whole = True  # not in the middle of a frame
-        self.stamps: list[int] = []
+        self.sweeps: list[int] = []  # their checksums
         self.updates: list[MapUpdate] = []
         self._lock: int | None = None
         if checkpoint is not None:
@@ -213,28 +239,28 @@ class Progress:
                 checkpoint.folder.mkdir(parents=True, exist_ok=True)
             self._lock = lock_folder(checkpoint.folder)
             try:
-                self.stamps, self.updates = checkpoint.begin(about, *state())
+                self.sweeps, self.updates = checkpoint.begin(about, *state())
             except BaseException:
                 self.end()
                 raise
 
     def rest(self, sweeps: Iterator[tuple[Sweep, float]]) -> Iterator[tuple[Sweep, float]]:
-        """The sweeps after those that are done."""
-        for number, done in enumerate(self.stamps):
-            sweep = next(sweeps, None)
-            stamp = None if sweep is None else sweep[0].stamp
-            if stamp != done:
+        """The sweeps after those that are done, which must be the same; DatasetError if not."""
+        for number, done in enumerate(self.sweeps):
+            sweep, _ = next(sweeps, (None, 0.0))
+            if checksum(sweep) != done:
                 self.end()
+                got = "no more sweeps" if sweep is None else f"another one at {sweep.stamp} ns"
                 raise DatasetError(
-                    f"sweep {number}: expected the stamp {done} ns of the run to go on with, got "
-                    f"{'no more sweeps' if stamp is None else stamp}; resume with the same data "
-                    "and options, or start again"
+                    f"sweep {number}: expected that of the run to go on with, got {got}; resume "
+                    "with the same data and options of the loader, or start again"
                 )
         return sweeps
 
     def add(self, sweep: Sweep, update: MapUpdate) -> None:
         """A frame is done."""
-        self.stamps.append(sweep.stamp)
+        if self._checkpoint is not None:
+            self.sweeps.append(checksum(sweep))
         self.updates.append(update)
         self.whole = True
 
@@ -254,7 +280,7 @@ class Progress:
     def save(self) -> None:
         """Write a checkpoint, unless a frame was cut off in the middle."""
         if self._checkpoint is not None and self.whole:
-            self._checkpoint.save(self.stamps, self.updates, *self._state())
+            self._checkpoint.save(self.sweeps, self.updates, *self._state())
 
 
 def _is_ours(path: Path) -> bool:

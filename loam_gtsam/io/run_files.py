@@ -225,6 +225,7 @@ def summarise(result: RunResult) -> dict[str, Any]:
             "sweeps": sum(u.n_not_finite > 0 for u in result.updates),
             "points": sum(u.n_not_finite for u in result.updates),
         },
+        "notes": list(result.notes),
         "messages": [f"frame {n}: {u.status}: {u.message}" for n, u in told[:_MAX_MESSAGES]],
         "path_length_m": trajectory.path_length,
         "position_sigma_m": position_sigmas(result.updates),
@@ -291,5 +292,5 @@ def _imu_part(imu: ImuSummary) -> dict[str, Any]:
         "gyro_bias_rad_s": imu.gyro_bias.tolist(),
         "gyro_trusted": imu.gyro_trusted,
         "gyro_left_out": imu.gyro_left_out,
-        "problems": [*report.problems, *imu.problems],
+        "problems": list(imu.problems),
     }

@@ -304,7 +304,8 @@ def test_wrong_options_say_what_was_expected(arguments, code, message):
     ("items", "code", "words"),
     [
         ([BadSweep(0, "damaged"), 0], 0, ("sweep 0: damaged", "sweep 1", "can be run")),
-        (DAMAGED, 1, ("sweep 4: damaged 4", "cannot be run")),
+        (DAMAGED, 1, ("problem: sweeps 0, 1, 2, 3, 4: damaged 0", "cannot be run")),
+        ([BadSweep(0, "cut"), BadSweep(1, "torn")], 1, ("sweep 0: cut", "sweep 1: torn")),
         ([Scan(np.full((50, 3), np.nan), 0)], 1, ("sweep of 50 points, 0 finite", "cannot be")),
         ([], 1, ("no sweeps", "cannot be run")),
     ],

@@ -74,6 +74,15 @@ def test_a_run_of_fewer_frames_is_extended_from_its_checkpoint():
     assert "holds the results of another run" in mapped("--frames", 3, "--resume", code=1)
 
 
+@pytest.mark.parametrize(
+    ("option", "named"), [("seed=3", "seed was 0, now 3"), ("gyro_noise=0.1", "first sweep")]
+)
+def test_a_complete_run_is_not_taken_for_one_of_other_options(option, named):
+    mapped("--resume")
+    said = mapped("--resume", "--option", option, code=1)
+    assert named in " ".join(said.split())
+
+
 calls: list[str] = []
 
 

@@ -164,6 +164,21 @@ def test_bag_whose_times_fit_nothing(tmp_path: Path) -> None:
     assert len(list(open_dataset(path, time_field="none"))) == 1
 
 
+def test_a_bag_whose_times_are_fractions_of_the_sweep_is_refused(tmp_path: Path) -> None:
+    fractions = np.linspace(0.0, 1.0, 300).astype("f4")
+
+    def bag(name: str, step: int) -> Path:
+        stamps = [START + number * step for number in range(4)]
+        clouds = [(s, cloud(ROS1, s, sweep_points(0), time=fractions)) for s in stamps]
+        return write_bag(tmp_path / name, "ros1", [("/p", *entry) for entry in clouds])
+
+    path = bag("fast", 10**8)
+    with pytest.raises(DatasetError, match=r"/p: the times .* span 1 s.*; give time_field=none"):
+        open_dataset(path)
+    assert len(list(open_dataset(path, time_field="none"))) == 4
+    assert len(list(open_dataset(bag("slow", 10**9)))) == 4
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_undecodable_messages_are_bad_sweeps(tmp_path: Path, kind: str) -> None:
     recording = sweeps(kind, 5)

@@ -50,7 +50,10 @@ def test_files_that_tell_their_fields(tmp_path, suffix):
     (tmp_path / f"2{suffix}").write_bytes(b"nothing")
     (tmp_path / "times.txt").write_text("5\n5.1\n5.15\n5.2\n")
     dataset = open_dataset(tmp_path)
-    assert dataset.info().facts["fields"] == f"of {suffix} files"
+    info = dataset.info()
+    assert info.kind == f"folder of {suffix} files"
+    assert info.facts["fields"].endswith("z float32, ring uint16, t float32")
+    assert info.facts["point times"].startswith("field 't' in s, relative to the stamp: +0.0000 ..")
     first, second, bad, last = list(dataset)
     assert isinstance(bad, BadSweep)
     assert f"2{suffix}" in bad.message
@@ -59,6 +62,55 @@ def test_files_that_tell_their_fields(tmp_path, suffix):
         np.testing.assert_array_equal(scan.points, POINTS)
         np.testing.assert_array_equal(scan.rings, RINGS)
         np.testing.assert_allclose(scan.times, TIMES, atol=1e-7)
+
+
+def timed(folder: Path, times: np.ndarray, count: int = 4) -> Path:
+    """PCD files with a field ``time``, ten a second."""
+    cloud = np.zeros(COUNT, [*((name, "<f4") for name in "xyz"), ("time", times.dtype)])
+    for name, column in zip("xyz", POINTS.T, strict=True):
+        cloud[name] = column
+    cloud["time"] = times
+    kind, size = times.dtype.kind.upper(), times.dtype.itemsize
+    head = (
+        f"VERSION 0.7\nFIELDS x y z time\nSIZE 4 4 4 {size}\nTYPE F F F {kind}\nWIDTH {COUNT}\n"
+        f"HEIGHT 1\nPOINTS {COUNT}\nDATA binary\n"
+    )
+    for number in range(count):
+        (folder / f"{number}.pcd").write_bytes(head.encode() + cloud.tobytes())
+    return folder
+
+
+@pytest.mark.parametrize("kind", ["<u8", "<i8"])
+def test_times_of_eight_bytes_are_exact(tmp_path, kind):
+    began = 1_700_000_000_123_456_789
+    (tmp_path / "times.txt").write_text("1700000000.123456789\n")
+    nanoseconds = began + np.arange(COUNT) * 2_500_000
+    (scan,) = KittiDataset(timed(tmp_path, nanoseconds.astype(kind), 1))
+    np.testing.assert_allclose(scan.times, np.arange(COUNT) * 0.0025, atol=1e-12)
+
+
+def test_times_that_are_fractions_of_the_sweep_are_refused(tmp_path):
+    fractions = timed(tmp_path, np.linspace(0.0, 1.0, COUNT).astype("<f4"))
+    for sweep in KittiDataset(fractions):
+        assert isinstance(sweep, BadSweep)
+        assert "span 1 s, but a sweep follows each 0.1 s; expected seconds (frac" in sweep.message
+    assert all(sweep.times is None for sweep in KittiDataset(fractions, time_field="none"))
+    (fractions / "times.txt").write_text("0\n0.5\n1\n1.5\n")  # two lidars, or two sweeps a second
+    assert {np.ptp(sweep.times) for sweep in KittiDataset(fractions)} == {1.0}
+
+
+def test_times_of_files_are_read_as_asked(tmp_path):
+    zeros = timed(tmp_path, np.zeros(COUNT, "<f4"))
+    assert "time_field=none" in next(iter(KittiDataset(zeros))).message
+    assert next(iter(open_dataset(zeros, time_field="none"))).times is None
+    timed(tmp_path, np.linspace(0.0, 90.0, COUNT).astype("<f4"))
+    scan = next(iter(open_dataset(tmp_path, time_unit="ms", stamp_is="end")))
+    np.testing.assert_allclose((scan.times[0], scan.times[-1]), (-0.09, 0.0), atol=1e-9)
+    with pytest.raises(DatasetError, match="time_unit: expected one of"):
+        open_dataset(tmp_path, time_unit="h")
+    five(tmp_path)
+    with pytest.raises(DatasetError, match=r"\.bin files have no fields for time_field, time_unit"):
+        open_dataset(tmp_path, time_unit="ms")
 
 
 def test_plain_arrays_and_arrays_of_another_shape(tmp_path):

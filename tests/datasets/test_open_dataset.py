@@ -115,6 +115,28 @@ def test_array_disorder_is_reported() -> None:
     assert ArrayDataset([], []).info().problems == ["no sweeps"]
 
 
+@pytest.mark.parametrize(("step", "told"), [(1.0, False), (2.0, False), (100.0, True)])
+def test_stamps_too_far_apart_are_a_problem(step: float, told: bool) -> None:
+    stamps = np.arange(4) * round(step * 1e9)
+    problems = ArrayDataset([sweep_points(0)] * 4, stamps).info().problems
+    assert (problems == []) is not told
+    assert not told or problems[0].startswith("a sweep comes each 100 s: if the lidar is not that")
+
+
+def test_array_times_that_are_fractions_of_the_sweep_are_refused() -> None:
+    clouds, stamps = [sweep_points(0)] * 5, np.arange(5) * 10**8
+    fractions = [np.linspace(0.0, 1.0, 300)] * 5
+    with pytest.raises(InputError, match=r"times: .* span 1 s, but a sweep follows each 0\.1 s"):
+        ArrayDataset(clouds, stamps, times=fractions)
+    scans = [Scan(c, int(s), t) for c, s, t in zip(clouds, stamps, fractions, strict=True)]
+    with pytest.raises(InputError, match="multiplied by its duration"):
+        ArrayDataset(scans)
+    seconds = [0.1 * column for column in fractions]
+    ArrayDataset(clouds, stamps, times=seconds)
+    two_lidars = [0, 10**7, 10**8, 11 * 10**7, 2 * 10**8]
+    ArrayDataset(clouds, two_lidars, times=seconds)
+
+
 @pytest.mark.parametrize(
     ("arguments", "options", "match"),
     [

@@ -174,7 +174,7 @@ def stamped(**stamp: Any) -> Any:
     [
         (make_message({"x": SWEEP, "z": SWEEP}), "no field y; the message has: x, z"),
         (make_message({**xyz(), "x": np.arange(N, dtype="i4")}), "'x': expected float32"),
-        (changed("datatype", 9), "unknown datatype 9"),
+        (changed("datatype", 11), "unknown datatype 11, expected 1 to 10"),
         (changed("count", 3), "expected count 1, got 3"),
         (stamped(sec="now", nanosec=0), r"header\.stamp"),
         (with_time("time", np.full(N, np.nan)), "NaN"),

@@ -77,6 +77,9 @@ def test_before_an_interval_is_known_the_time_of_a_sweep_tells_what_is_too_soon(
         assert early.fault is SweepFault.TOO_SOON
         assert StampCheck().refuse(START + least, START, seconds) is None
     assert "expected nanoseconds" in early.message
+    early = StampCheck().refuse(START + TENTH, START, 1.0)
+    assert early is not None
+    assert early.message.endswith("the times of its points span 1 s: are they seconds?")
 
 
 def test_a_sensor_may_become_faster_and_a_gap_is_no_usual_interval():

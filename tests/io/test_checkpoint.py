@@ -223,6 +223,36 @@ def test_another_configuration_is_told(tmp_path):
         stopped(other, PREDICTED, tmp_path, None)
 
 
+@pytest.mark.parametrize("change", ["seed=3", "dropout=0.1", "gyro_noise=0.1"])
+def test_other_options_of_the_loader_are_told(change, tmp_path):
+    world = "sim:room?frames=4&columns=300"
+    folder = tmp_path / "checkpoint"
+    stopped(open_dataset(world), PREDICTED, folder, 2)
+    with pytest.raises(
+        (DatasetError, OutputError), match=r"of the run to go on with|checksum of IMU"
+    ):
+        stopped(open_dataset(f"{world}&{change}"), PREDICTED, folder, None)
+    assert len(stopped(open_dataset(world), PREDICTED, folder, None).updates) == 4
+
+
+def test_a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not(tmp_path):
+    for place, seed in (("monday", 0), ("tuesday", 1)):
+        (tmp_path / place / "drive").mkdir(parents=True)
+        for number, scan in enumerate(SimulatedWorld("room", frames=3, columns=300, seed=seed)):
+            np.save(tmp_path / place / "drive" / f"{number}.npy", scan.points)
+        (tmp_path / place / "drive" / "1.npy").write_text("damaged")
+
+    def gone_on(place, at):
+        folder = open_dataset(tmp_path / place / "drive")
+        return stopped(folder, PREDICTED, tmp_path / "checkpoint", at)
+
+    gone_on("monday", 2)
+    with pytest.raises(DatasetError, match="sweep 0: expected that of the run to go on with"):
+        gone_on("tuesday", None)
+    (tmp_path / "monday").rename(tmp_path / "moved")
+    assert len(gone_on("moved", None).updates) == 3
+
+
 @pytest.mark.parametrize("keep", [slice(1, None), slice(1)], ids=["other sweeps", "too few"])
 def test_other_sweeps_are_told(keep, tmp_path):
     scans = list(open_dataset("sim:room?frames=4&columns=300"))

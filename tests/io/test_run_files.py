@@ -13,6 +13,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.config import load_config
+from loam_gtsam.datasets.arrays import ArrayDataset
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io import run_files
@@ -247,3 +248,18 @@ def test_what_an_imu_did_is_summed_up(result):
     np.testing.assert_allclose(imu["level"]["map_up"], [0.0, 0.0, 1.0], atol=0.02)
     assert imu["level"]["roll_deg"] == pytest.approx(np.degrees(result.imu.level.roll))
     assert run_files.summarise(replace(result, imu=None))["imu"] is None
+
+
+def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path):
+    assert result.notes == ()
+    late = replace(WORLD.imu, stamps=WORLD.imu.stamps + 10**15)
+    apart = run(ArrayDataset(list(WORLD), imu=late, sensor=WORLD.sensor))
+    assert "IMU: no orientation at 7 of 8 sweeps: gaps" in apart.notes[0]
+    assert apart.imu.problems == apart.notes
+    lost = [replace(update, status=FrameStatus.LOST) for update in apart.updates[2:]]
+    doubted = replace(apart, updates=(*apart.updates[:2], *lost))
+    assert doubted.notes[1].startswith("DO NOT TRUST THIS RUN: 6 of 8 poses (75 %)")
+    run_files.write_run(doubted, tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["notes"] == list(doubted.notes)
+    assert summary["imu"]["problems"] == list(apart.imu.problems)

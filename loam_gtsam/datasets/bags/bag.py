@@ -19,7 +19,13 @@ from loam_gtsam.datasets.bags import bag_reader
 from loam_gtsam.datasets.base import BagOptions, DatasetInfo, Loader
 from loam_gtsam.datasets.decode import aiding, extrinsics, livox, pointcloud2, tables
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
-from loam_gtsam.datasets.decode.point_times import TimeDecision, check_time_options
+from loam_gtsam.datasets.decode.point_times import (
+    IGNORE_TIMES,
+    TimeDecision,
+    check_time_options,
+    span_problem,
+    usual_step,
+)
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, LoamError, Scan, Trajectory
 
 POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
@@ -169,6 +175,9 @@ class BagDataset(Loader):
         if not decoded:
             text = f"no sweep can be decoded: {failure or 'it has no messages'}"
             raise DatasetError(f"{self._path}, topic {self.topic}: {text}")
+        spans = [float(np.ptp(d.scan.times)) for d in decoded if d.scan.times is not None]
+        if spans and (problem := span_problem(float(np.median(spans)), usual_step(stamps))):
+            raise DatasetError(f"{self._path}, topic {self.topic}: {problem}; give {IGNORE_TIMES}")
         # The last one: near time zero an absolute time can still look like an offset.
         self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)
         self._facts = {"topic": self.topic, "sweeps": str(self._count)}

@@ -24,7 +24,12 @@ ANCHORS: dict[str, float] = {"start": 0.0, "middle": 0.5, "end": 1.0}
 _NANOSECONDS: dict[str, int] = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 _FOREIGN = "absolute, in another clock than the stamp"
 _CLOCKS = {"offset": "relative to the stamp", "stamp": "absolute", "own": _FOREIGN}
+IGNORE_TIMES = "time_field=none to ignore the field (on the command line --option time_field=none)"
+"""What can be done about times that cannot be understood."""
 _TRIM = 100  # one value in this many is set aside at either end before the span is measured
+_OVERLAP = 4.0
+"""Times of the points that span more than so many steps between sweeps are no seconds: the sweeps
+of two lidars overlap by half, and fractions of a sweep of 5 Hz span five steps."""
 _SHORTER = 0.75  # share of the usual time between two sweeps below which it is another
 
 
@@ -37,6 +42,29 @@ def shorter_period(stamps: Sequence[int] | IntArray) -> Mapping[str, float]:
     seconds = float(np.median(steps)) * 1e-9 if len(steps) else 0.0
     most = _SHORTER * SensorConfig().period
     return {"period": seconds} if SWEEP_SECONDS[0] <= seconds < most else {}
+
+
+def usual_step(stamps: Sequence[int] | IntArray) -> float:
+    """Seconds from a sweep to the next, on average where those of two lidars alternate.
+
+    0 if fewer than three stamps (nanoseconds) tell.
+    """
+    ordered = np.asarray(stamps, np.int64)
+    return 0.5e-9 * float(np.median(ordered[2:] - ordered[:-2])) if len(ordered) > 2 else 0.0
+
+
+def span_problem(seconds: float, step: float) -> str:
+    """What is wrong with times of points that span so many seconds, by the step between sweeps.
+
+    Empty if nothing is, or if such a step is that of no lidar.
+    """
+    if not SWEEP_SECONDS[0] <= step < seconds / _OVERLAP:
+        return ""
+    return (
+        f"the times of the points span {seconds:.3g} s, but a sweep follows each {step:.3g} s; "
+        "expected seconds (fractions of a sweep are to be multiplied by its duration), and stamps "
+        "of the sweeps that are right"
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +181,7 @@ def _fitting_unit(low: float, high: float, span: float, field: str) -> str:
         f"point-time field {field!r}: values {low:.9g} .. {high:.9g} (span {span:.6g}) fit no "
         f"unit; tried {', '.join(_NANOSECONDS)} for a sweep of {SWEEP_SECONDS[0]:g} to "
         f"{SWEEP_SECONDS[1]:g} s. Give time_unit if you know it, another time_field, or "
-        "time_field=none to ignore the field (on the command line --option time_field=none)"
+        f"{IGNORE_TIMES}"
     )
 
 

@@ -28,8 +28,11 @@ _OPEN = 10
 """Sweeps that decide for themselves: near time zero an absolute time can still look like an
 offset. A bag decides once, on the last of as many."""
 
-DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Numbers of ``sensor_msgs/PointField``, by numpy's codes."""
+DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"} | {
+    9: "i8",
+    10: "u8",
+}
+"""Numbers of ``sensor_msgs/PointField``, by numpy's codes; the last two are those of PCL alone."""
 
 
 def decode_pointcloud2(
@@ -232,7 +235,7 @@ class _Layout:
         """(height * width,) values of a field, in native byte order."""
         field = self.fields[name]
         if field.datatype not in DATATYPES:
-            problem = f"unknown datatype {field.datatype}, expected 1 to 8"
+            problem = f"unknown datatype {field.datatype}, expected 1 to {len(DATATYPES)}"
             raise DatasetError(f"PointCloud2 field {name!r}: {problem}")
         dtype = np.dtype(self.order + DATATYPES[field.datatype])
         if field.count > 1:  # 0 is what old PCL versions write for 1

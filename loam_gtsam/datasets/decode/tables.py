@@ -31,6 +31,7 @@ UNIT_TOLERANCE = 0.1
 _WHOLE = re.compile(r"[+-]?[0-9]+")
 _ROUNDED = 1e-2
 """Digits that are missing in the rotations of files."""
+_SLOW = 2.0  # seconds from a sweep to the next, above which the unit of the stamps is doubted
 _HUGE = 1e100  # its square is finite
 _LONGEST = 40  # characters of a number: of any stamp, with zeros before it
 
@@ -54,7 +55,8 @@ def seconds_to_ns(text: str) -> int:
         nanoseconds = Decimal(word) * 10**9
         # before it becomes an integer, which may have a million digits
         if not abs(nanoseconds) <= MAX_STAMP:
-            raise ValueError(f"out of range: {_shown(word)}")
+            hint = "; nanoseconds?" if _WHOLE.fullmatch(word) else ""
+            raise ValueError(f"out of range: {_shown(word)}{hint}")
         return int(nanoseconds.to_integral_value())
     except ArithmeticError as error:
         raise ValueError(f"not a time in seconds: {_shown(word)}") from error
@@ -258,7 +260,7 @@ def describe_rate(stamps: IntArray) -> str:
 
 
 def describe_stamps(stamps: IntArray, facts: dict[str, str], problems: list[str]) -> None:
-    """Range and rate of sweep stamps; disorder and gaps go to ``problems``."""
+    """Range and rate of sweep stamps; disorder, gaps and a doubtful unit go to ``problems``."""
     if len(stamps) == 0:
         return
     facts["stamps"] = f"{stamps[0] * 1e-9:.6f} .. {stamps[-1] * 1e-9:.6f} s"
@@ -270,8 +272,14 @@ def describe_stamps(stamps: IntArray, facts: dict[str, str], problems: list[str]
             "and only the first can be mapped; each needs a stamp of its own"
         )
         return
+    median = float(np.median(steps)) if len(steps) else 0.0
+    if median > _SLOW * 1e9:
+        problems.append(
+            f"a sweep comes each {median * 1e-9:g} s: if the lidar is not that slow, the stamps "
+            "are in another unit"
+        )
     # half a period late is jitter, a whole one is a missing sweep
-    gap = 1.8 * max(float(np.median(steps)), 1.0) if len(steps) > 2 else np.inf
+    gap = 1.8 * max(median, 1.0) if len(steps) > 2 else np.inf
     for what, which in (
         ("equal the one before", steps == 0),
         ("are earlier than the one before", steps < 0),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -23,12 +24,20 @@ from loam_gtsam.datasets.decode.packed_points import (
     read_records,
 )
 from loam_gtsam.datasets.decode.point_times import (
+    IGNORE_TIMES,
     TimeDecision,
     apply_times,
     decide_times,
     shorter_period,
+    span_problem,
+    usual_step,
 )
-from loam_gtsam.datasets.decode.pointcloud2 import CloudStream
+from loam_gtsam.datasets.decode.pointcloud2 import (
+    CloudStream,
+    TimeOptions,
+    decode_with_times,
+    describe_fields,
+)
 from loam_gtsam.datasets.kitti import drive
 from loam_gtsam.datasets.known.layouts import first_existing
 from loam_gtsam.types import DatasetError, ImuSamples, Scan, Trajectory
@@ -52,6 +61,7 @@ between 0.2 and 0.3."""
 READERS = {".pcd": read_pcd, ".ply": read_ply, ".npy": read_npy}
 """Readers of the files that tell their own fields."""
 SUFFIXES = (".bin", *READERS)
+_TRIED = 10  # sweeps looked at, at most, to describe their fields
 _MOST_RINGS = 256  # a fifth column with more different values is no beam
 
 _FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
@@ -71,6 +81,8 @@ class KittiDataset(SweepFiles):
     vertical_angle_offset_deg : raise every ray by this elevation; None takes
         :data:`ELEVATION_DEG` for KITTI's own layouts, and 0 for others
     columns : of a ``.bin`` file, 4 or 5; None tells it from the first file
+    time_field, time_unit, stamp_is : of the files that tell their own fields, see
+        :func:`~loam_gtsam.datasets.decode.pointcloud2.decode_pointcloud2`
 
     Notes
     -----
@@ -89,7 +101,8 @@ class KittiDataset(SweepFiles):
     Raises
     ------
     DatasetError
-        If there are no sweeps, or a file next to them cannot be understood.
+        If there are no sweeps, a file next to them cannot be understood, or an option is not one
+        of such files.
     """
 
     def __init__(
@@ -98,6 +111,9 @@ class KittiDataset(SweepFiles):
         *,
         vertical_angle_offset_deg: float | None = None,
         columns: int | None = None,
+        time_field: str | None = None,
+        time_unit: str | None = None,
+        stamp_is: str | None = None,
     ) -> None:
         self._path = given = Path(path)
         folder = _sweep_folder(given)
@@ -107,6 +123,14 @@ class KittiDataset(SweepFiles):
         self._files = sorted(folder.glob(f"*{suffix}"), key=_natural_order)
         if columns not in (None, 4, 5):
             raise DatasetError(f"columns: expected 4 or 5, got {columns!r}")
+        options: TimeOptions = {
+            "time_field": time_field,
+            "time_unit": time_unit,
+            "stamp_is": stamp_is,
+        }
+        if suffix == ".bin" and any(options.values()):
+            raise DatasetError(f"{given}: .bin files have no fields for {', '.join(options)}")
+        self._options, self._clouds = options, CloudStream(**options)
         self._record = XYZI
         if suffix == ".bin" and (columns or _columns_of(self._files)) == 5:
             self._record = XYZI_RING
@@ -132,7 +156,6 @@ class KittiDataset(SweepFiles):
         if not np.isfinite(self._offset):
             got = f"got {vertical_angle_offset_deg!r}"
             raise DatasetError(f"vertical_angle_offset_deg: expected degrees, {got}")
-        self._clouds = CloudStream()
         self._decision = self._decide_times() if self._times_folder.is_dir() else None
 
     @cached_property
@@ -159,15 +182,14 @@ class KittiDataset(SweepFiles):
         return drive.oxts_truth(*self._oxts, self._lidar_T_imu, self._problems)
 
     def info(self) -> DatasetInfo:
-        """Description of the folder; reads no sweep."""
+        """Description of the folder; reads the first sweep of files that tell their fields."""
         imu = self.imu  # first: it may find problems
-        info = DatasetInfo("KITTI folder", str(self._path), {"sweeps": str(len(self))})
+        suffix = self._files[0].suffix
+        kind = "KITTI folder" if suffix == ".bin" else f"folder of {suffix} files"
+        info = DatasetInfo(kind, str(self._path), {"sweeps": str(len(self))})
         tables.describe_stamps(self.stamps, info.facts, info.problems)
-        if self._files[0].suffix == ".bin":
-            info.facts["fields"] = f"{', '.join(self._record.names or ())} (float32)"
-        else:
-            info.facts["fields"] = f"of {self._files[0].suffix} files"
-        info.facts["point times"] = str(self._decision or "none recorded")
+        decision, info.facts["fields"] = self._first
+        info.facts["point times"] = str(decision or "none recorded")
         sensor = {key: value for key, value in self.sensor.items() if not key.startswith("imu.")}
         if sensor:
             info.facts["sensor"] = ", ".join(f"{key} {value}" for key, value in sensor.items())
@@ -181,6 +203,20 @@ class KittiDataset(SweepFiles):
         info.facts["reference poses"] = str(len(self.truth)) if self.truth is not None else "none"
         info.problems.extend(self._problems)
         return info
+
+    @cached_property
+    def _first(self) -> tuple[TimeDecision | None, str]:
+        """How the times are read, and the fields: from the first sweep that can be read."""
+        if self._files[0].suffix == ".bin":
+            return self._decision, f"{', '.join(self._record.names or ())} (float32)"
+        for file, stamp in zip(self._files[:_TRIED], self.stamps.tolist(), strict=False):
+            with suppress(DatasetError):
+                cloud = READERS[file.suffix](file, stamp)
+                decision = self._decision
+                with suppress(DatasetError):
+                    decision = decision or decode_with_times(cloud, **self._options).decision
+                return decision, describe_fields(cloud)
+        return self._decision, "not readable"
 
     def _implied(self, folder: Path) -> Mapping[str, Any]:
         sensor: dict[str, Any] = {}
@@ -208,6 +244,9 @@ class KittiDataset(SweepFiles):
             if self._offset:
                 points = raise_elevation(points, self._offset)
             if self._decision is None:
+                seconds = 0.0 if scan.times is None else float(np.ptp(scan.times))
+                if problem := span_problem(seconds, usual_step(self.stamps)):
+                    raise DatasetError(f"{problem}; give {IGNORE_TIMES}")
                 return replace(scan, points=points)
         else:
             width = len(self._record.names or ())

@@ -1,0 +1,63 @@
+"""Sentences on what is wrong or in doubt about a run."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from loam_gtsam.io.run_files import position_sigmas
+from loam_gtsam.types import FrameStatus, MapUpdate
+
+if TYPE_CHECKING:
+    from loam_gtsam.pipeline import RunResult
+
+DO_NOT_TRUST = "DO NOT TRUST THIS RUN: "
+"""What a sentence begins with that puts the whole run in doubt."""
+_EXPECTED = (FrameStatus.OK, FrameStatus.FIRST, FrameStatus.NOT_CONVERGED)
+_TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
+_ADVICE = {
+    FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
+    "docs/imu.md, docs/gnss.md",
+    FrameStatus.LOST: "too fast or too few matches: use every sweep, check sensor.* and the times "
+    "of the points",
+    FrameStatus.UNUSABLE_SCAN: "see loam-gtsam inspect",
+    FrameStatus.BAD_STAMP: "the stamps of the sweeps, or the times of their points, are wrong: "
+    "see loam-gtsam inspect",
+}
+_ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
+_VAGUE = 1.0  # metres of standard deviation, and more than a hundredth of the path, that are said
+
+
+def run_notes(result: RunResult) -> tuple[str, ...]:
+    """Sentences on positions, IMU, times of points and statuses; none if nothing is wrong."""
+    notes = []
+    sigmas = position_sigmas(result.updates)
+    if sigmas is not None:
+        largest = sigmas["largest"]
+        if largest > max(_VAGUE, 0.01 * result.trajectory.path_length):
+            told = f"positions are told to {largest:.2g} m at worst (sigma)"
+            notes.append(f"{told}: other first motions fit as well, or the way was blind")
+    if result.imu is not None:
+        notes += result.imu.problems
+    if result.times_problem:
+        notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
+    return (*notes, *_on_statuses(result.updates))
+
+
+def _on_statuses(updates: Sequence[MapUpdate]) -> list[str]:
+    """A sentence on the frames that are not trustworthy, or on those that still moved."""
+    odd = [number for number, update in enumerate(updates) if update.status not in _EXPECTED]
+    if not odd:
+        moving = sum(update.status is FrameStatus.NOT_CONVERGED for update in updates)
+        if moving <= _TOO_MANY * len(updates):
+            return []
+        share = f"{moving} of {len(updates)} poses still moved"
+        return [f"{share} when solver.iterations ended: try more (not_converged)"]
+    counts = Counter(updates[number].status for number in odd).most_common()
+    statuses = ", ".join(f"{count} {status}" for status, count in counts)
+    return [
+        f"{DO_NOT_TRUST if len(odd) > _TOO_MANY * len(updates) else ''}"
+        f"{len(odd)} of {len(updates)} poses ({100.0 * len(odd) / len(updates):.0f} %) are not "
+        f"fixed by their scans ({statuses}), first that of frame {odd[0]}; {_ADVICE[counts[0][0]]}"
+    ]

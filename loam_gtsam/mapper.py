@@ -267,18 +267,19 @@ class Mapper:
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""
         assert self.last is not None
-        found, twist = found_at(frame, frame.solve(self._named)), self.last.twist
+        found, twist, given = found_at(frame, frame.solve(self._named)), self.last.twist, frame
+        apart = MovingSweep(features, self.config), self.last, self._named
+        if _gyro_begins(self.last, frame.sweep):
+            frame, found = second_opinion(frame, found, *apart)
         if self._start is not None:
             found = self._start.first_motion(frame, found, self._named, self.imu)
         doubt = doubtful(frame, found.solution, self.monitor, twist)
-        now = self.last, self._moment, found.solution, frame.sweep
-        if self.imu is not None and (doubt is not None or _may_mislead(self.imu, *now)):
-            sweep, before = MovingSweep(features, self.config), (self.last, self._moment, None)
-            alone = predict(sweep, *before, self.config.solver)
-            frame, found = second_opinion(frame, found, alone, self._named)
-            if frame.predicted is alone:
-                self.imu.reject()
-                doubt = doubtful(frame, found.solution, self.monitor, twist)
+        now = self._moment, found.solution, frame.sweep.stamp
+        if self.imu is not None and (doubt is not None or self.imu.contradicted(*now)):
+            frame, found = second_opinion(frame, found, *apart)
+            doubt = doubtful(frame, found.solution, self.monitor, twist)
+        if self.imu is not None and frame is not given:
+            self.imu.reject()
         if doubt is not None:
             return frame, search(frame, found.solution, self.monitor, self._named, doubt)
         return frame, found
@@ -306,16 +307,10 @@ class Mapper:
         return update
 
     def _insert(
-        self,
-        posed: PosedSweep,
-        map_T_lidar: gtsam.Pose3,
-        status: FrameStatus,
-        message: str,
-        clock: Clock,
-        solution: Solution | None = None,
-        tilt: TiltPrior = TiltPrior.NONE,
+        self, posed: PosedSweep, map_T_lidar: gtsam.Pose3, status: FrameStatus, message: str,
+        clock: Clock, solution: Solution | None = None, tilt: TiltPrior = TiltPrior.NONE,
         scan: ScanError | None = None,
-    ) -> MapUpdate:
+    ) -> MapUpdate:  # fmt: skip
         """Add the sweep to the map; its update."""
         clock.lap("solve")
         middle = posed.map_T_middle(map_T_lidar)
@@ -335,15 +330,12 @@ def _with_settings_of(solver: ScanSolver | None, config: Config) -> Config:
     return config.changed(solver=settings) if isinstance(settings, SolverConfig) else config
 
 
-def _may_mislead(
-    imu: ImuTracker, update: MapUpdate, last: Moment | None, solution: Solution, sweep: MovingSweep
-) -> bool:
-    """Whether a gyro contradicts a solved sweep, or turned it and not the one before.
+def _gyro_begins(last: MapUpdate, sweep: MovingSweep) -> bool:
+    """Whether a gyro turned the points of a sweep, and not those of the one before.
 
     A sweep that a wrong gyro has bent is solved with the turn that bent it, if no sweep before was.
     """
-    begins = sweep.motion is SweepMotion.GYRO and update.sweep_motion is not SweepMotion.GYRO
-    return begins or imu.contradicted(last, solution, sweep.stamp)
+    return sweep.motion is SweepMotion.GYRO and last.sweep_motion is not SweepMotion.GYRO
 
 
 def _check_parts(

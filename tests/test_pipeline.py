@@ -32,6 +32,7 @@ from loam_gtsam.types import (
     ImuSamples,
     InputError,
     PartError,
+    SweepMotion,
 )
 
 QUICK = Config().changed("deskew.model=predicted")
@@ -434,6 +435,22 @@ def test_a_solver_that_was_made_brings_its_settings(sweeps, name):
     for update in result.updates[1:]:
         assert update.status.solved
         assert np.isfinite(update.covariance).all()
+
+
+@pytest.mark.parametrize("begins", [-1.0, 0.06, 0.25])
+@pytest.mark.parametrize("swapped", [True, False])
+def test_a_gyro_that_begins_is_held_against_the_sweep_without_it(swapped, begins):
+    """Gyro and accelerometer were swapped: the gyro says that it turns at 10 rad/s."""
+    world = SimulatedWorld("room", frames=12, columns=450)
+    sweeps, imu = list(world), world.imu
+    keep = (imu.stamps - sweeps[0].stamp) * 1e-9 >= begins
+    felt = imu.gyro[keep], imu.acceleration[keep]
+    samples = ImuSamples(imu.stamps[keep], None, *(felt[::-1] if swapped else felt))
+    result = run(ArrayDataset(sweeps, imu=samples))
+    assert ate(result, world) < 4e-3  # 2 mm without an IMU
+    assert (result.imu.gyro_left_out > 0) is swapped
+    turned = result.updates[-1].sweep_motion
+    assert turned is (SweepMotion.CONSTANT_VELOCITY if swapped else SweepMotion.GYRO)
 
 
 def test_recorded_features_are_levelled_too(shaken, sweeps):

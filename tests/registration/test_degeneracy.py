@@ -9,6 +9,7 @@ import pytest
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.frontend.features import extract_features
+from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config
 from loam_gtsam.registration.degeneracy import by_lines, localizability, unseen_by_planes
@@ -198,6 +199,29 @@ def test_no_direction_is_left_to_lines_that_vanish(left, weak):
     covariance = np.linalg.inv(solution.information)
     assert np.linalg.eigvalsh(covariance).max() < 1.0  # of the expected motion: 0.2 m, 0.2 rad
     assert np.linalg.norm(POSE.localCoordinates(solution.map_T_lidar)) < 1.0
+
+
+@pytest.mark.parametrize(("hilly", "weak"), [(True, 0), (False, 3)])
+def test_planes_are_tried_with_lines_that_do_not_hold_the_pose(hilly, weak):
+    """Lines in foliage are wherever the pose is; slopes, each lost in noise, are not."""
+    points, normals = ground(1500)
+    normals = normals + 0.08 * np.random.default_rng(5).normal(size=normals.shape)
+    planes, foliage = surfaces(points, normals), poles(30, True)
+
+    def associate(pose):
+        edges = replace(foliage, centres=transform(pose.matrix(), foliage.points))
+        here = transform(pose.matrix(), points)
+        held = -np.einsum("ij,ij->i", planes.normals, here)
+        return ScanMatches(edges, planes if hilly else replace(planes, offsets=held))
+
+    seen = found(planes, foliage)
+    assert len(seen.weak(LEAST)) == 0
+    assert len(unseen_by_planes(ScanMatches(foliage, planes), POSE, seen, LEAST)) == 3
+    prior = MotionPrior(GUESS, 25.0 * np.eye(6))
+    solution = GtsamSolver(SolverConfig(iterations=30)).solve(associate, GUESS, (), prior)
+    assert solution.n_weak == weak
+    error = np.abs(POSE.localCoordinates(solution.map_T_lidar))
+    assert (error.max() < 0.02) == hilly
 
 
 def test_what_lines_leave_open_is_a_turn_about_the_one_pole():

@@ -10,10 +10,10 @@ from enum import Enum
 import gtsam
 import numpy as np
 
-from loam_gtsam.frontend.deskew import PosedSweep
+from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
-from loam_gtsam.registration.odometry import Prediction, advance
+from loam_gtsam.registration.odometry import advance, predict
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
     AS_WELL,
@@ -107,13 +107,15 @@ def _another_optimum(frame: Frame, solution: Solution, monitor: FitMonitor, fit:
 
 
 def second_opinion(
-    frame: Frame, found: Found, alone: Prediction, solver: ScanSolver
+    frame: Frame, found: Found, sweep: MovingSweep, last: MapUpdate, solver: ScanSolver
 ) -> tuple[Frame, Found]:
     """The sweep as predicted and de-skewed without the IMU, if it clearly fits the map better so.
 
-    ``alone`` is that prediction; ``frame`` and ``found`` are returned if it does not.
+    ``sweep`` is without the IMU, and ``last`` the update of the one before; ``frame`` and ``found``
+    are returned if it does not.
     """
     m = frame.matcher
+    alone = predict(sweep, last, m.last, None, m.config.solver)
     parts = alone.posed, m.maps, m.config, m.last, m.clock
     matcher = FrameMatcher.of(*parts, refine=m.refine, accelerations=m.accelerations)
     other = replace(frame, matcher=matcher, predicted=alone)

@@ -50,8 +50,8 @@ class FeatureConfig(Section):
     """The curvature at a point takes this many neighbours on either side of it in its ring."""
     edge_curvature: float = parameter(0.1, unit="m^2", source="LOAM", low=0.0)
     """An edge point needs at least this curvature, the squared norm of the sum of differences."""
-    edge_reach: float = parameter(0.5, unit="beams", source="LOAM uses 0", low=0.0, high=1.0)
-    """An edge before a drop is this far beyond the last point on its surface, where it is at 0."""
+    beam_width: float = parameter(1e-3, unit="rad", source="half of data sheets", low=0.0, high=1.0)
+    """Edges before drops are moved outwards by half of the gap between beams of this width."""
     range_noise: float = parameter(0.02, unit="m", source="LOAM takes all that is no edge", low=0.0)
     """The ranges of the sensor have this standard deviation. A plane point lies where its ring
     scatters by less than four times this about a smooth surface; 0 turns the test off."""

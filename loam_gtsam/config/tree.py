@@ -134,7 +134,7 @@ SMALL = 0.5
 """Size of voxels and cells in small places over that in the open."""
 _WIDTH = 100
 _CLASSICAL = {
-    "features": {"edge_reach": 0.0, "range_noise": 0.0, "post_depth": 0.0, "thinning": "voxels"},
+    "features": {"beam_width": 1.0, "range_noise": 0.0, "post_depth": 0.0, "thinning": "voxels"},
     "deskew": {"model": "predicted", "rotation": "constant_velocity"},
     "odometry.method": "scan_to_scan",
     "map": {"insertion": "centroid", "small_below": 0.0, "insert_unmatched": True},

@@ -114,7 +114,7 @@ def prominence(xyz: NDArray[np.float32], half_window: int, chosen: IntArray) -> 
 
 
 def ends_of_surfaces(
-    xyz: NDArray[np.float32], half_window: int, chosen: IntArray, drop: float, beams: float
+    xyz: NDArray[np.float32], half_window: int, chosen: IntArray, drop: float, width: float
 ) -> tuple[FloatArray, FloatArray]:
     """Where the surfaces end on which some points are the last ones before a drop.
 
@@ -130,7 +130,8 @@ def ends_of_surfaces(
     chosen : (M,) indices of points whose windows stay within their rings
     drop : metres in range between two neighbours that may always be on one surface; far away it
         is what grazed surfaces have, ``LINKED_BEAMS`` times the way between two beams
-    beams : beam spacings by which a surface reaches beyond its last point
+    width : rad, of a beam, which meets a surface with any part of it, so that the last one misses
+        the end by half the spacing of the beams less half its width, in the mean
 
     Returns
     -------
@@ -156,7 +157,8 @@ def ends_of_surfaces(
         falls = (ranges[:, 0] - ranges[:, 1] > most) & (turn[:, 0] < LINKED_BEAMS * spacing)
         falls |= turn[:, 0] > EMPTY_BEAMS * spacing
         here = np.flatnonzero((count > 0) & falls)
-        beyond = last[:, here] + beams * step[:, here]
+        reach = np.maximum(0.5 - 0.5 * width / spacing[here], 0.0)
+        beyond = last[:, here] + reach * step[:, here]
         inverse = np.maximum(beyond[3], last[3, here] / _NEARER)
         inverse *= np.sqrt(squared_norm(beyond[:3]))
         ended[here] = (beyond[:3] / inverse).T

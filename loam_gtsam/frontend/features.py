@@ -295,9 +295,9 @@ def _assemble(
         flat = np.arange(len(flat))
     points, plane_times, plane_rings = planes
     stands_out = prominence(sweep.xyz, settings.half_window, edges)
-    drop, beams = math.sqrt(settings.occlusion_gap), settings.edge_reach
-    ends, apart = ends_of_surfaces(sweep.xyz, settings.half_window, edges, drop, beams)
-    edge_points = ends if beams > 0.0 else measured(edges)[0]
+    drop, width = math.sqrt(settings.occlusion_gap), settings.beam_width
+    ends, apart = ends_of_surfaces(sweep.xyz, settings.half_window, edges, drop, width)
+    edge_points = ends if width < 1.0 else measured(edges)[0]
     with_poles = np.concatenate((edges, poles.middles))
     return Features(
         stamp=scan.stamp + round(reference * 1e9),

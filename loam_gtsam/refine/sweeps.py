@@ -102,7 +102,7 @@ def extract_points(sweep: Sweep, config: Config, most: int = 3000) -> SweepPoint
     """The points of a sweep of a data set, not averaged.
 
     Of sweeps that come as features, only those on surfaces: LOAM's edges show up to a beam too
-    late, always to one side. For the same reason ``features.edge_reach`` is that of the default.
+    late, always to one side. For the same reason ``features.beam_width`` is that of the default.
 
     Raises
     ------
@@ -117,7 +117,7 @@ def extract_points(sweep: Sweep, config: Config, most: int = 3000) -> SweepPoint
     if not isinstance(sweep, Scan):
         raise InputError(f"sweep: expected a Scan or a FeatureSweep, got {type(sweep).__name__}")
     every = config.changed(
-        {"features.plane_voxel": 0.0, "features.edge_reach": FeatureConfig().edge_reach}
+        {"features.plane_voxel": 0.0, "features.beam_width": FeatureConfig().beam_width}
     )
     return sweep_points(extract_features(sweep, every), config, most)
 

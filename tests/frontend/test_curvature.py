@@ -164,7 +164,7 @@ def test_edges_before_a_drop_lie_where_walls_end_in_the_mean(behind, incidence) 
             assert len(number) == 31  # nothing is behind it: the ring goes on elsewhere
             xyz = np.concatenate((xyz[:, -10:], xyz), axis=1)
             chosen = chosen + 10
-        moved, apart = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.5)
+        moved, apart = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.0)
         before.append(xyz[:2, chosen[0]] - end)
         after.append(moved[0, :2] - end)
     late, right = (np.linalg.norm(np.mean(errors, axis=0)) for errors in (before, after))
@@ -178,25 +178,30 @@ def test_only_ends_of_surfaces_before_a_drop_are_moved() -> None:
     xyz, number, _ = wall_before(45.0, 0.3, 0.0)
     # The last points on either side, one within the wall, and one behind it.
     chosen = np.searchsorted(number, [20, 50, 35, 19])
-    moved, apart = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.5)
+    moved, apart = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.0)
     assert apart == pytest.approx(np.linalg.norm(xyz[:, chosen], axis=0) * STEP, rel=0.01)
     same = np.all(moved == xyz[:, chosen].T, axis=1)
     assert same.tolist() == [False, False, True, True]
     turned = np.arctan2(moved[:2, 1], moved[:2, 0]) / STEP
     assert turned == pytest.approx([19.5, 50.5], abs=1e-3)
-    assert ends_of_surfaces(xyz, 5, chosen, 0.3, 0.0)[0] == pytest.approx(xyz[:, chosen].T)
+    half = ends_of_surfaces(xyz, 5, chosen, 0.3, 0.5 * STEP)[0]  # beams with as much between them
+    turned = np.arctan2(half[:2, 1], half[:2, 0]) / STEP
+    assert turned == pytest.approx([19.75, 50.25], abs=1e-3)
+    for wide in (STEP, 1.0):  # without anything
+        found = ends_of_surfaces(xyz, 5, chosen, 0.3, wide)[0]
+        assert found == pytest.approx(xyz[:, chosen].T, abs=1e-4)
     # Nothing is known of a surface with one point, nor of what lies behind lost beams.
     alone = one_ring(number * STEP, np.where(number == 30, 20.0, 45.0))
     there = np.searchsorted(number, [30])
-    assert np.array_equal(ends_of_surfaces(alone, 5, there, 0.3, 0.5)[0], alone[:, there].T)
+    assert np.array_equal(ends_of_surfaces(alone, 5, there, 0.3, 0.0)[0], alone[:, there].T)
     xyz, number, _ = wall_before(45.0, 0.3, 0.0, lost=(17, 18, 19))
     first = np.searchsorted(number, [20])
-    assert np.array_equal(ends_of_surfaces(xyz, 5, first, 0.3, 0.5)[0], xyz[:, first].T)
+    assert np.array_equal(ends_of_surfaces(xyz, 5, first, 0.3, 0.0)[0], xyz[:, first].T)
 
 
 def test_a_lost_beam_on_the_wall_does_not_move_its_end() -> None:
     xyz, number, _ = wall_before(45.0, 0.3, 0.0, lost=(22,))
-    moved = ends_of_surfaces(xyz, 5, np.searchsorted(number, [20]), 0.3, 0.5)[0][0]
+    moved = ends_of_surfaces(xyz, 5, np.searchsorted(number, [20]), 0.3, 0.0)[0][0]
     assert np.arctan2(moved[1], moved[0]) / STEP == pytest.approx(19.5, abs=0.15)
 
 

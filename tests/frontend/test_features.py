@@ -164,7 +164,7 @@ class Picked:
 
     def __init__(self, scan: Scan, config: Config) -> None:
         # Both leave the points as they were measured.
-        config = config.changed("features.thinning=voxels", "features.edge_reach=0")
+        config = config.changed("features.thinning=voxels", "features.beam_width=1")
         self.sweep = organise(scan, config)
         self.features = extract_features(scan, config)
         where = {tuple(point): i for i, point in enumerate(scan.points[self.sweep.index])}

@@ -233,7 +233,7 @@ def test_edges_are_those_near_by_and_none_of_features_that_were_made_elsewhere(r
     made = extract_points(FeatureSweep(features, gtsam.Pose3()), result.config)
     assert made.edges == 0
     assert len(made.points) == 3000 < len(features.planes)
-    late = result.config.changed("features.edge_reach=0.0")  # as LOAM has them
+    late = result.config.changed("features.beam_width=1.0")  # as LOAM has them
     assert np.array_equal(extract_points(scan, late).points, points.points)
     some = points.chosen(np.arange(len(points.points)) % 2 == 0)
     assert some.edges == (points.edges + 1) // 2

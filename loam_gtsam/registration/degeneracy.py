@@ -42,6 +42,8 @@ class Localizability:
         motion, m^2
     by_planes : (6,) the part of ``aligned`` that comes from planes
     tilt : standard deviation of the matches' normals, rad (root mean square)
+    over_noise : (6,) the same information of all matches that do not see the motion, each by
+        itself, over what noise alone would make of it
     """
 
     directions: FloatArray
@@ -50,6 +52,7 @@ class Localizability:
     displacement: FloatArray
     by_planes: FloatArray
     tilt: float
+    over_noise: FloatArray
 
     def seen_from(self, a_T_b: gtsam.Pose3) -> Localizability:
         """The localizability about frame ``a``, of that about frame ``b``, fixed to each other."""
@@ -126,7 +129,7 @@ class Localizability:
         if not mask.any():
             return None
         shares: FloatArray = np.linalg.inv(self.directions.T).astype(np.float64, copy=False)
-        return Directions(self.directions[mask], shares[mask])
+        return Directions(self.directions[mask], shares[mask], self.over_noise[mask])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -137,10 +140,12 @@ class Directions:
     ----------
     vectors : (W, 6) rows, tangent vectors as in :class:`Localizability`
     shares : (W, 6) rows whose products with a tangent vector are its coefficients
+    over_noise : (W,) as of :class:`Localizability`; None if it is not known
     """
 
     vectors: FloatArray
     shares: FloatArray
+    over_noise: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.vectors)
@@ -172,14 +177,18 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     moved = np.sqrt(np.maximum(np.einsum("ik,ij,jk->k", columns, unit, columns), 0.0))
     directions = columns.T / np.maximum(moved, _STILL * np.linalg.norm(columns, axis=0))[:, None]
 
-    sight = _sight(points, normals, tilts, directions)
+    squared, moved = _cosines(points, normals, directions)
+    sight = _clear(squared, tilts)
     first = len(sight) - len(matches.planes)
     aligned, by_planes = sight.sum(axis=0), sight[first:].sum(axis=0)
     order = np.argsort(aligned, kind="stable")
     along = np.einsum("ki,ij,kj->k", directions, information, directions)
+    told = (np.where(sight > 0.0, 0.0, squared) * moved).T @ weights**2
+    of_noise = moved.T @ (weights * tilts) ** 2 + floor
     tilt = float(np.sqrt(np.mean(tilts**2))) if len(tilts) else 0.0
     shown = directions[order], aligned[order], along[order]
-    return Localizability(*shown, unit, by_planes[order], tilt)
+    over_noise = (told / of_noise)[order]
+    return Localizability(*shown, unit, by_planes[order], tilt, over_noise)
 
 
 def unseen_by_planes(
@@ -278,14 +287,25 @@ def _sight(
     points: FloatArray, normals: FloatArray, tilts: FloatArray, directions: FloatArray
 ) -> FloatArray:
     """(N, W) squared cosines between normals and displacements; 0 where noise may make them."""
+    return _clear(_cosines(points, normals, directions)[0], tilts)
+
+
+def _clear(squared: FloatArray, tilts: FloatArray) -> FloatArray:
+    return np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0)
+
+
+def _cosines(
+    points: FloatArray, normals: FloatArray, directions: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """(N, W) squared cosines between normals and displacements, and squared displacements."""
     turn, shift = directions[:, :3], directions[:, 3:]
     seen = cross(points.T, normals.T).T @ turn.T + normals @ shift.T
     # |shift + turn x p|^2 for all points and directions, as products of small matrices
     moved = np.outer(squared_norm(points.T), squared_norm(turn.T)) - (points @ turn.T) ** 2
     moved += 2.0 * points @ cross(shift.T, turn.T) + squared_norm(shift.T)
     moved = np.maximum(moved, _MOVED**2)
-    squared = seen**2 / moved
-    return np.where(squared > (_CLEAR * tilts[:, None]) ** 2, squared, 0.0)
+    squared: FloatArray = seen**2 / moved
+    return squared, moved
 
 
 def _eigenvectors(form: FloatArray, noise: FloatArray) -> FloatArray:

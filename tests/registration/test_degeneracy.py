@@ -180,11 +180,18 @@ class Vanishing(Matcher):
         keep = np.arange(len(self.matches.edges)) < left
         self.fewer = replace(self.matches, edges=subset(self.matches.edges, keep))
 
-    def __call__(self, _):
-        return self.matches
+    def __call__(self, pose):
+        found, self.matches = self.matches, self.fewer
+        return self.held_at(pose, found)
 
-    def again(self, _, __):
-        return self.fewer
+    def again(self, _, pose):
+        return self.held_at(pose, self.fewer)
+
+    def held_at(self, pose, matches):
+        """The planes are made anew, and hold the pose wherever it is."""
+        here = transform(pose.matrix(), matches.planes.points)
+        offsets = -np.einsum("ij,ij->i", matches.planes.normals, here)
+        return replace(matches, planes=replace(matches.planes, offsets=offsets))
 
 
 @pytest.mark.parametrize(("left", "weak"), [(60, 0), (10, 1), (0, 3)])
@@ -222,6 +229,29 @@ def test_planes_are_tried_with_lines_that_do_not_hold_the_pose(hilly, weak):
     assert solution.n_weak == weak
     error = np.abs(POSE.localCoordinates(solution.map_T_lidar))
     assert (error.max() < 0.02) == hilly
+
+
+@pytest.mark.parametrize(
+    ("slope", "follow", "weak"), [(0.08, False, 0), (0.08, True, 3), (0.04, False, 3)]
+)
+def test_slopes_that_together_stand_out_of_noise_are_tried(slope, follow, weak):
+    """Each slope is lost in noise of 0.05 rad; planes of noise follow the pose."""
+    points, normals = ground(1500)
+    tilted = normals + slope * np.random.default_rng(5).normal(size=normals.shape)
+    planes = surfaces(points, tilted)
+
+    def associate(pose):
+        held = -np.einsum("ij,ij->i", planes.normals, transform(pose.matrix(), points))
+        return ScanMatches(NO_EDGES, replace(planes, offsets=held) if follow else planes)
+
+    seen = found(planes)
+    assert len(seen.weak(LEAST)) == 3
+    assert (seen.over_noise[:3].min() > 4.0 / 3.0) == (slope > 0.05)
+    prior = MotionPrior(GUESS, 25.0 * np.eye(6))
+    solution = GtsamSolver(SolverConfig(iterations=30)).solve(associate, GUESS, (), prior)
+    assert solution.n_weak == weak
+    error = np.abs(POSE.localCoordinates(solution.map_T_lidar))
+    assert (error.max() < 0.02) == (weak == 0)
 
 
 def test_what_lines_leave_open_is_a_turn_about_the_one_pole():

@@ -92,24 +92,25 @@ class GtsamSolver:
         found = rematch(associate, guess, self.config, optimise)
         if sight is None or not found.solved or self.config.degeneracy == "off":
             return found
-        doubted = sight.doubted(found, self.config.min_aligned)
-        if doubted is None:
+        least, lost = self.config.min_aligned, np.zeros(0, np.bool_)
+        doubted = sight.doubted(found, least)
+        if doubted is not None:
+            lost = _contradicted(found, doubted, motion)
+            if lost.any():
+                sight = sight.without(lost, least)
+                return rematch(associate, guess, self.config, optimise)
+            lost = self._returns(associate, found, doubted, sight, expected) < _COMES_BACK
+        if not lost.any() and found.weak is None:
             return found
-        lost = _contradicted(found, doubted, motion)
-        if lost.any():
-            sight = sight.without(lost, self.config.min_aligned)
-            return rematch(associate, guess, self.config, optimise)
-        lost = self._returns(associate, found, doubted, sight, expected) < _COMES_BACK
-        if not lost.any():
-            return found
-        if sight.unseen is not None:  # many planes may see together what none sees alone
-            lines, sight = sight, replace(sight, unseen=None)
+        hidden, first = sight.hidden(self.config), sight
+        if hidden is not None:
+            sight = replace(sight, weak=None, unseen=None)
             whole = rematch(associate, guess, self.config, optimise)
-            returned = self._returns(associate, whole, doubted, sight, expected)
-            if whole.solved and (returned >= _COMES_BACK).all():
-                return whole
-            sight = lines
-        return sight.without(lost, self.config.min_aligned).told_of(found, expected)
+            if whole.solved and not _contradicted(whole, hidden, motion).any():
+                returned = self._returns(associate, whole, hidden, sight, expected)
+                if (returned >= _COMES_BACK).all():
+                    return whole
+        return first.without(lost, least).told_of(found, expected) if lost.any() else found
 
     def _returns(
         self,
@@ -201,6 +202,17 @@ class _Sight:
         if self.unseen is None:
             return self.scan.between(least, _FEW * least)
         return by_lines(found.matches, found.map_T_lidar, self.unseen, least)[1]
+
+    def hidden(self, config: SolverConfig) -> Directions | None:
+        """Directions that are weak, or left to lines, which all matches together may fix.
+
+        No match sees them better than noise would, and all together know more than noise makes.
+        """
+        if self.weak is not None:
+            over = self.weak.over_noise
+            if over is None or (over * (1.0 - _COMES_BACK) < 1.0).any():
+                return None
+        return None if config.degeneracy != "prior" else self.unseen or self.weak
 
     def without(self, lost: BoolArray, least: float) -> _Sight:
         """Such that the lost ones of the doubted directions are weak."""

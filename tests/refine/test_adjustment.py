@@ -227,7 +227,7 @@ def test_edges_are_those_near_by_and_none_of_features_that_were_made_elsewhere(r
     assert points.edges == len(features.edges) > 50
     assert np.array_equal(points.points[: points.edges], features.edges)
     moved = features.edges.copy()
-    moved[:7] *= 20.0 / np.linalg.norm(moved[:7], axis=1, keepdims=True)
+    moved[:7] *= 20.01 / np.linalg.norm(moved[:7], axis=1, keepdims=True)
     far = sweep_points(replace(features, edges=moved), result.config)
     assert np.array_equal(far.points[: far.edges], features.edges[7:])
     made = extract_points(FeatureSweep(features, gtsam.Pose3()), result.config)

@@ -154,7 +154,7 @@ def dot(a: FloatArray, b: FloatArray) -> FloatArray:
 
 def norm(vectors: FloatArray) -> FloatArray:
     """(...,) lengths of vectors (3, ...)."""
-    length: FloatArray = np.sqrt(dot(vectors, vectors))
+    length: FloatArray = np.sqrt(squared_norm(vectors))
     return length
 
 

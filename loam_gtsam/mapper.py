@@ -268,7 +268,7 @@ class Mapper:
         """Find the sweep: from the expected pose, without the IMU, or by a search."""
         assert self.last is not None
         found, twist, given = found_at(frame, frame.solve(self._named)), self.last.twist, frame
-        apart = MovingSweep(features, self.config), self.last, self._named
+        apart = features, self.config, self.last, self._named
         if _gyro_begins(self.last, frame.sweep):
             frame, found = second_opinion(frame, found, *apart)
         if self._start is not None:

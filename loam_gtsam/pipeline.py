@@ -440,9 +440,10 @@ def run(
     pipeline = Pipeline(config, imu=imu, wheels=wheels, **parts)
     if parts.get("features") is not None:
         workers = 0
-    samples = None if imu is None else dataset.imu, fixes, wheels
     about = {"data set": dataset.name, "configuration": config.model_dump_json()}
-    about["checksum of IMU, GNSS and wheels"] = f"{checksum(samples):08x}"
+    if checkpoint is not None:
+        samples = None if imu is None else dataset.imu, fixes, wheels
+        about["checksum of IMU, GNSS and wheels"] = f"{checksum(samples):08x}"
     progress = Progress(checkpoint, about, pipeline.state)
     updates = progress.updates
     interrupted, error = False, None

@@ -10,7 +10,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from loam_gtsam.errors import InputError, check_array, check_kind
+from loam_gtsam.errors import InputError, as_stamps, check_array, check_kind
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -105,17 +105,14 @@ class Trajectory:
             If a stamp lies outside the trajectory, or the trajectory's own stamps do not increase.
         """
         check_increasing(self, "Trajectory.at")
-        asked = np.atleast_1d(stamps)
-        if not asked.size:
-            asked = asked.astype(np.int64)
-        check_array(asked, "Trajectory.at", ("M",), "integer nanoseconds")
+        asked = as_stamps(np.atleast_1d(stamps), "Trajectory.at")
         first, last = self.stamps[[0, -1]]
         if asked.size and (asked.min() < first or asked.max() > last):
             raise InputError(
                 f"Trajectory.at: expected stamps from {first} to {last} ns, where the trajectory "
                 f"is, got {asked.min()} to {asked.max()}"
             )
-        found = self._interpolated(asked.astype(np.int64, copy=False))
+        found = self._interpolated(asked)
         return found[0] if np.ndim(stamps) == 0 else found
 
     def _interpolated(self, stamps: NDArray[np.int64]) -> Trajectory:

@@ -42,30 +42,32 @@ class ImuSummary:
 def imu_summary(aid: ImuTracker, updates: Sequence[MapUpdate]) -> ImuSummary:
     """Summary of a run, from its IMU and the results of its sweeps."""
     tilt_priors = Counter(str(update.tilt_prior) for update in updates)
+    report, left_out = aid.buffer.report, aid.gyro.left_out
+    in_the_run = _in_the_run(report, tilt_priors, left_out)
     return ImuSummary(
-        report=aid.buffer.report,
+        report=report,
         level=aid.level,
         map_up=aid.map_up,
         gyro_bias=aid.buffer.gyro_bias,
         sweep_motions=Counter(str(update.sweep_motion) for update in updates),
         tilt_priors=tilt_priors,
         gyro_trusted=aid.gyro.holds,
-        gyro_left_out=aid.gyro.left_out,
-        problems=(*aid.buffer.report.problems, *_in_the_run(aid, tilt_priors), *aid.problems),
+        gyro_left_out=left_out,
+        problems=(*report.problems, *in_the_run, *aid.problems),
     )
 
 
-def _in_the_run(aid: ImuTracker, tilt_priors: Mapping[str, int]) -> list[str]:
+def _in_the_run(report: ImuReport, tilt_priors: Mapping[str, int], left_out: int) -> list[str]:
     """Sentences on sweeps without an orientation, and on those without the gyro."""
     problems = []
     dropped = tilt_priors.get("dropped", 0)
-    if dropped and aid.buffer.report.orientation != "none":
+    if dropped and report.orientation != "none":
         at = f"{dropped} of {sum(tilt_priors.values())} sweeps"
         why = "gaps longer than imu.max_gap, or another clock than that of the sweeps"
         problems.append(f"IMU: no orientation at {at}: {why}")
-    if aid.gyro.left_out:
+    if left_out:
         problems.append(
-            f"IMU: its gyro turned unlike the scans and was given up for {aid.gyro.left_out} "
+            f"IMU: its gyro turned unlike the scans and was given up for {left_out} "
             "sweeps; check imu.lidar_R_imu_deg, units and stamps; if the gyro is right, the poses "
             "are wrong"
         )

@@ -150,7 +150,7 @@ def convert_map(options: ConvertOptions) -> int:
         if made.shift.any():
             said += f"; its origin is at {', '.join(f'{value:.0f}' for value in made.shift)}"
     else:
-        with SavedMap(map_of_run(source)) as saved:
+        with SavedMap(source) as saved:
             edges, planes = saved.points()
         write_cloud(target, edges, planes)
         said = f"{len(edges) + len(planes)} points"

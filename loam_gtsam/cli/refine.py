@@ -89,7 +89,7 @@ def _refined(
     points = [run.points(most, quiet=quiet) for run in runs]
     graph = survey = None
     if map_of_run(folder).exists():
-        with SavedMap(map_of_run(folder)) as saved:
+        with SavedMap(folder) as saved:
             graph, survey = saved.graph.held(), _survey(saved)
     with _progress(settings, quiet=quiet) as shown:
         return refine_runs(

@@ -205,7 +205,8 @@ def inspection(dataset: Dataset, config: Config) -> tuple[Group, bool]:
         problems += _imu_beside(dataset, config, sweep)
         break
     for text, numbers in unusable.values():
-        problems.append(f"sweep{'s'[: len(numbers) - 1]} {', '.join(numbers)}: {text}")
+        sweeps = "sweep" if len(numbers) == 1 else "sweeps"
+        problems.append(f"{sweeps} {', '.join(numbers)}: {text}")
     if len(dataset) == 0:
         problems.append("no sweeps in it")
     imu = imu_buffer(dataset, config)

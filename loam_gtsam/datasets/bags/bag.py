@@ -175,8 +175,7 @@ class BagDataset(Loader):
         if not decoded:
             text = f"no sweep can be decoded: {failure or 'it has no messages'}"
             raise DatasetError(f"{self._path}, topic {self.topic}: {text}")
-        spans = [float(np.ptp(d.scan.times)) for d in decoded if d.scan.times is not None]
-        if spans and (problem := span_problem(float(np.median(spans)), usual_step(stamps))):
+        if problem := span_problem((d.scan.times for d in decoded), usual_step(stamps)):
             raise DatasetError(f"{self._path}, topic {self.topic}: {problem}; give {IGNORE_TIMES}")
         # The last one: near time zero an absolute time can still look like an offset.
         self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)

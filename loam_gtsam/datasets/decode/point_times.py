@@ -5,7 +5,7 @@ Velodyne writes seconds from the stamp, Ouster nanoseconds, Hesai and Robosense 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -53,11 +53,13 @@ def usual_step(stamps: Sequence[int] | IntArray) -> float:
     return 0.5e-9 * float(np.median(ordered[2:] - ordered[:-2])) if len(ordered) > 2 else 0.0
 
 
-def span_problem(seconds: float, step: float) -> str:
-    """What is wrong with times of points that span so many seconds, by the step between sweeps.
+def span_problem(times: Iterable[NDArray[np.floating] | None], step: float) -> str:
+    """What is wrong with the times of the points of sweeps, by the seconds from sweep to sweep.
 
-    Empty if nothing is, or if such a step is that of no lidar.
+    Their median span counts. Empty if nothing is wrong, or if such a step is that of no lidar.
     """
+    spans = [float(np.ptp(some)) for some in times if some is not None and len(some)]
+    seconds = float(np.median(spans)) if spans else 0.0
     if not SWEEP_SECONDS[0] <= step < seconds / _OVERLAP:
         return ""
     return (

@@ -28,10 +28,8 @@ _OPEN = 10
 """Sweeps that decide for themselves: near time zero an absolute time can still look like an
 offset. A bag decides once, on the last of as many."""
 
-DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"} | {
-    9: "i8",
-    10: "u8",
-}
+_CODES = "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8"
+DATATYPES = dict(enumerate(_CODES, start=1))
 """Numbers of ``sensor_msgs/PointField``, by numpy's codes; the last two are those of PCL alone."""
 
 

@@ -205,6 +205,10 @@ class KittiDataset(SweepFiles):
         return info
 
     @cached_property
+    def _step(self) -> float:
+        return usual_step(self.stamps)
+
+    @cached_property
     def _first(self) -> tuple[TimeDecision | None, str]:
         """How the times are read, and the fields: from the first sweep that can be read."""
         if self._files[0].suffix == ".bin":
@@ -244,8 +248,7 @@ class KittiDataset(SweepFiles):
             if self._offset:
                 points = raise_elevation(points, self._offset)
             if self._decision is None:
-                seconds = 0.0 if scan.times is None else float(np.ptp(scan.times))
-                if problem := span_problem(seconds, usual_step(self.stamps)):
+                if problem := span_problem([scan.times], self._step):
                     raise DatasetError(f"{problem}; give {IGNORE_TIMES}")
                 return replace(scan, points=points)
         else:

@@ -10,6 +10,7 @@ from enum import Enum
 import gtsam
 import numpy as np
 
+from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
@@ -26,7 +27,7 @@ from loam_gtsam.registration.relocalization.fits import (
 from loam_gtsam.registration.relocalization.likely_poses import Field, likely_poses, sample_features
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
-from loam_gtsam.types import FloatArray, FrameStatus, MapUpdate
+from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
 
 _CLOSER = 3  # largest number of places that are looked at closer
 _BASIN = 0.5
@@ -107,15 +108,16 @@ def _another_optimum(frame: Frame, solution: Solution, monitor: FitMonitor, fit:
 
 
 def second_opinion(
-    frame: Frame, found: Found, sweep: MovingSweep, last: MapUpdate, solver: ScanSolver
-) -> tuple[Frame, Found]:
+    frame: Frame, found: Found, features: Features, config: Config, last: MapUpdate,
+    solver: ScanSolver,
+) -> tuple[Frame, Found]:  # fmt: skip
     """The sweep as predicted and de-skewed without the IMU, if it clearly fits the map better so.
 
-    ``sweep`` is without the IMU, and ``last`` the update of the one before; ``frame`` and ``found``
-    are returned if it does not.
+    ``features`` are of the sweep, ``config`` is that of the run, and ``last`` is the update of the
+    sweep before; ``frame`` and ``found`` are returned if it does not.
     """
     m = frame.matcher
-    alone = predict(sweep, last, m.last, None, m.config.solver)
+    alone = predict(MovingSweep(features, config), last, m.last, None, config.solver)
     parts = alone.posed, m.maps, m.config, m.last, m.clock
     matcher = FrameMatcher.of(*parts, refine=m.refine, accelerations=m.accelerations)
     other = replace(frame, matcher=matcher, predicted=alone)

@@ -34,13 +34,12 @@ from loam_gtsam.types import (
     IntArray,
     MapUpdate,
     SweepError,
+    SweepMotion,
     Trajectory,
 )
 
 _SEEN = (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
 """Statuses of frames that were not solved and are in the map all the same."""
-_AT_REST = 0.03
-"""Metres and radians: what the second sweep may tell of the first one's half before that moved."""
 _HELD = 5
 """Of so many points of a sweep on surfaces one is held out, to judge the map by."""
 
@@ -353,10 +352,7 @@ class _Run:
 
 
 def _to_middles(updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints]) -> list[gtsam.Pose3]:
-    """Poses of the middles of the sweeps, seen from their reference times, as the run had them.
-
-    A run that begins on the way did not know so in its first sweep; the next one tells.
-    """
+    """Poses of the middles of the sweeps, seen from their reference times, as the run had them."""
     steps = []
     for update, sweep in zip(updates, sweeps, strict=True):
         step = gtsam.Pose3.Expmap(update.twist * -sweep.reference)
@@ -364,10 +360,27 @@ def _to_middles(updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints]) -> 
             step = update.map_T_lidar.between(update.map_T_middle)
         steps.append(step)
     if len(updates) > 1 and updates[0].status is FrameStatus.FIRST and updates[1].status.solved:
-        moved = gtsam.Pose3.Expmap(updates[1].twist * -sweeps[0].reference)
-        if np.linalg.norm(gtsam.Pose3.Logmap(steps[0].between(moved))) > _AT_REST:
-            steps[0] = moved
+        steps[0] = _first_to_middle(updates, sweeps, steps)
     return steps
+
+
+def _first_to_middle(
+    updates: Sequence[MapUpdate], sweeps: Sequence[SweepPoints], steps: Sequence[gtsam.Pose3]
+) -> gtsam.Pose3:
+    """The step of the first sweep, whose motion the run did not know yet when it told the pose.
+
+    It lies on the parabola through the pose at the reference time and the middle of the second
+    sweep, with the velocity of that one; a rotation that a gyro told stays.
+    """
+    first, second = updates[:2]
+    seconds = (sweeps[1].stamp - first.stamp) * 1e-9
+    moved = gtsam.Pose3.Logmap(first.map_T_lidar.between(second.map_T_lidar.compose(steps[1])))
+    part = -sweeps[0].reference / seconds
+    more = second.twist * seconds - moved  # than with a constant velocity
+    step = gtsam.Pose3.Expmap(part * (moved - more) + part**2 * more)
+    if first.sweep_motion is SweepMotion.GYRO is second.sweep_motion:
+        step = gtsam.Pose3(steps[0].rotation(), step.translation())
+    return step
 
 
 def _starts(runs: Sequence[_Run]) -> list[int]:

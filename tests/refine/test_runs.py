@@ -159,6 +159,16 @@ def test_a_run_that_begins_on_the_way_begins_where_it_was(two) -> None:
     assert error.rmse < 0.004
 
 
+@pytest.mark.parametrize("start", ["rest", "moving"])
+def test_a_run_stays_where_its_first_pose_is(start) -> None:
+    """The first sweep's middle is where the next two poses tell, however slowly it began."""
+    drive = SimulatedWorld("room", frames=12, columns=300, speed=0.5, start=start)
+    done = run(drive, Config())
+    refined = refine_run(run_points(drive, done.updates, done.config), done.updates)
+    moved = (refined.trajectory.positions - done.trajectory.positions).mean(axis=0)
+    assert np.linalg.norm(moved[:2]) < 0.005  # 26 mm if it is taken for one at rest
+
+
 def test_covariances_of_a_later_run_stand_on_its_first_pose(two, refined) -> None:
     one = refined[1]
     between = one.refined.relative_covariance(35 + 2, 35 + 9)

@@ -95,7 +95,9 @@ class Localizability:
         pure = basis.copy()
         limit = _CLEAR**2 * shared * np.trace(turns @ self._turned_by_noise()[:3, :3])
         pure[:3, share < limit] = 0.0
-        cleaned: FloatArray = pure @ basis.T @ form @ blind
+        rows = basis.T @ form @ blind
+        # The shares that the expected motion decides, the eigenvalues, stay.
+        cleaned: FloatArray = pure @ rows @ basis @ np.linalg.solve(rows @ pure, rows)
         return cleaned
 
     def wander(self, moved: FloatArray) -> FloatArray:

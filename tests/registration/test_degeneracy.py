@@ -543,6 +543,19 @@ def test_a_translation_is_freed_of_the_rotation_that_noise_adds(mixed, pure):
     np.testing.assert_allclose(cleaned, expected, atol=1e-4)
 
 
+@pytest.mark.parametrize("share", [1.0, 0.4])
+def test_without_noise_the_expected_motion_decides_as_much_as_before(share):
+    """A share above 1 would let the velocity grow: it is taken to a high power."""
+    seen = found(surfaces(*room(), noise=0.02))
+    along = np.array([0.0, 0.0, 1e-3, 1.0, 0.0, 0.0])
+    row = np.array([0.0, 0.0, 20.0, 1.0, 0.1, 0.0])
+    blind = share * np.outer(along, row / (row @ along))
+    cleaned = seen.without_noise(blind, 1.0)
+    np.testing.assert_allclose(cleaned[:3], 0.0, atol=1e-9)
+    assert np.trace(cleaned) == pytest.approx(share)
+    np.testing.assert_allclose(cleaned @ cleaned, share * cleaned, atol=1e-12)
+
+
 def test_a_blind_way_turns_towards_translations_by_the_noise_of_the_normals():
     seen = found(surfaces(*room(), tilt=0.05, noise=0.02))
     wander = seen.wander(np.diag([0.0, 0.0, 0.0, 4.0, 0.0, 0.0]))

@@ -46,7 +46,7 @@ from loam_gtsam.registration.relocalization import (
 )
 from loam_gtsam.registration.relocalization.evidence import Evidence, favour
 from loam_gtsam.registration.report import Clock
-from loam_gtsam.registration.solvers import GtsamSolver
+from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior
 from loam_gtsam.types import FrameStatus, ImuSamples, TiltPrior, Trajectory
 
 AT = 22
@@ -423,6 +423,45 @@ def test_of_places_that_fit_as_well_the_nearest_comes_first(
     watch = SimpleNamespace(lost=lost, radius=10.0, around=lambda pose: [pose])
     found = doubtful_sweeps._places(frame, unsolved, watch, solver)
     assert [id(pose) for pose in found] == [id(places[k]) for k in order]
+
+
+@pytest.mark.parametrize(
+    ("metres", "measured", "left"),
+    [
+        ((0.0, 0.05, 4.0, 3.0), True, [0, 1, 2]),
+        ((0.0, 0.05, 4.0, 3.0), False, [0, 1, 2, 3]),  # a constant velocity measures nothing
+        ((3.0, -3.0), True, [0, 1]),  # an IMU that contradicts every place is not heeded
+    ],
+)
+def test_a_place_that_an_imu_contradicts_is_none(metres, measured, left):
+    """By what the IMU allows, 1 cm, and the scan: it knows its y to 4 cm, or at 4 m not at all."""
+    told = MotionPrior(gtsam.Pose3(), 1e4 * np.eye(6), measured=measured)
+    places = [
+        SimpleNamespace(
+            map_T_lidar=gtsam.Pose3(gtsam.Rot3(), [0.0, x, 0.0]),
+            information=np.diag([1e8, 1e8, 1e8, 1e8, 0.0 if x == 4.0 else 2500.0, 1e8]),
+        )
+        for x in metres
+    ]
+    assert doubtful_sweeps._as_measured(places, told) == [places[k] for k in left]
+
+
+@pytest.mark.parametrize("share", [0.9, 0.1])
+def test_a_sweep_that_fits_with_no_expected_motion_tells_one_by_itself(share, before, calm):
+    """After a blind way the velocity is anything; of what matches nothing, it is not asked."""
+    frame, monitor = frame_of(before, list(calm)[AT]), deepcopy(before.monitor)
+    solution = frame.solve(before.solver)
+    monitor.fits_again = lambda fit: fit.agreement > 0.97
+    monitor.might_agree = lambda fit: fit.share > 1.0 - share
+    wrong = frame.matcher.posed.twist + np.array([0.0, 0.0, 1.5, 0.0, 0.0, 0.0])
+    place = solution.map_T_lidar.retract([0.0, 0.0, 0.02, 0.05, 0.0, 0.0])
+    args = frame, place, [wrong], monitor, before.solver
+    found = doubtful_sweeps._with_motion(*args)
+    if share < 0.5:
+        assert found is None
+        return
+    assert np.linalg.norm(found.posed.twist[:3] - frame.posed_for(solution).twist[:3]) < 0.3
+    assert found.solution.map_T_lidar.range(solution.map_T_lidar) < 0.01
 
 
 def test_a_velocity_that_lasts_is_no_jump_from_the_second_sweep_on(before, calm, monkeypatch):

@@ -101,7 +101,7 @@ def test_a_first_motion_that_was_not_found_is_that_of_the_second_step(monkeypatc
 @pytest.fixture(scope="module")
 def features_ahead():
     """A drive whose lidar sees 70 degrees of an avenue."""
-    world = SimulatedWorld("avenue", frames=9, seed=4, columns=900, start="moving")
+    world = SimulatedWorld("avenue", frames=12, seed=4, columns=900, start="moving")
     features = []
     for scan in world:
         ahead = np.abs(np.arctan2(scan.points[:, 1], scan.points[:, 0])) < np.radians(35.0)
@@ -166,6 +166,52 @@ def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
         for one in features[number + 1 :]:
             assert mapper.register(one).status.solved
         assert mapper._start is None
+
+
+@pytest.mark.parametrize(
+    ("telling", "silent", "sweeps", "complete"),
+    [
+        (0, 0, 7, False),
+        (0, 0, 8, True),
+        (1, 0, 8, False),
+        (3, 2, 8, True),  # as along a tunnel
+        (0, 2, 8, True),  # of which no feature tells
+        (1, 0, 26, False),
+        (1, 0, 27, True),
+    ],
+)
+def test_a_start_goes_on_while_a_rival_may_be_refuted(
+    telling, silent, sweeps, complete, monkeypatch
+):
+    monkeypatch.setattr(first_sweeps, "kept_ways", lambda *ways: [*ways[0], *ways[2]])
+    monkeypatch.setattr(first_sweeps, "is_surely_beaten", lambda _: False)
+    nothing = dict.fromkeys(("map_T_lidar", "posed", "map_T_middle", "motion"))
+    start = first_sweeps.Start(SimpleNamespace(**nothing), 0)
+    ways = [(SimpleNamespace(sweeps=[]),) for _ in range(1 + telling + silent)]
+    start._best(ways[: 1 + telling], CONFIG, ways[1 + telling :])
+    start._sweeps = sweeps * start._sweeps
+    assert len(start._rivals) == telling + silent
+    assert start.complete is complete
+
+
+def test_a_rival_that_falls_late_leaves_no_doubt(features_ahead, monkeypatch):
+    """One is kept as if chance were for it until the twelfth sweep."""
+    (world, features), mapper, kept_ways = features_ahead, Mapper(CONFIG), first_sweeps.kept_ways
+    updates, going = [], []
+
+    def kept(ways, config, silent=()):
+        best, *rivals = kept_ways(ways, config, silent)
+        if len(best[-1].sweeps) < 12:
+            return [best, *[way for way in ways if way is not best][:1]]
+        return [best, *rivals]
+
+    monkeypatch.setattr(first_sweeps, "kept_ways", kept)
+    for one in features:
+        updates.append(mapper.register(one))
+        going.append(mapper._start is not None)
+    assert going == 11 * [True] + [False]
+    assert errors(world, updates)[-1] < 0.1
+    assert updates[-1].covariance[3, 3] < 0.01 * updates[-2].covariance[3, 3]
 
 
 @pytest.mark.parametrize("with_imu", [True, False])

@@ -6,15 +6,17 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
+from itertools import compress
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
+from loam_gtsam.geometry import five_sigma
 from loam_gtsam.registration.degeneracy import displacements
-from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
-from loam_gtsam.registration.odometry import advance, predict
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, timed_rows
+from loam_gtsam.registration.odometry import advance, predict, solved_twist
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
     AS_WELL,
@@ -27,12 +29,16 @@ from loam_gtsam.registration.relocalization.fits import (
 from loam_gtsam.registration.relocalization.likely_poses import Field, likely_poses, sample_features
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
-from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate
+from loam_gtsam.registration.solvers.base import SCAN_VARIANCE
+from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate, SweepMotion
 
 _CLOSER = 3  # largest number of places that are looked at closer
 _BASIN = 0.5
 """Part of the reach of a match, from within which a solve converges: as the spacing of trials."""
+_UNLIKELY = five_sigma(6)  # from which on a place contradicts an IMU
 _PLACES = 6  # largest number of places that are tried for a sweep that does not fit the map
+_TOLD = 3  # times that a sweep which fits with no expected motion tells one by itself
+_ANY = 1e3  # rad/s and m/s: standard deviation of a motion of which nothing is known
 RELOCALISED = "relocalised"  # begins the message of a frame that was found elsewhere in the map
 CLEARLY = 1.02  # by which another motion within a sweep must fit better than the motion before
 
@@ -248,21 +254,54 @@ def _with_motion(
 ) -> Found | None:  # fmt: skip
     """The sweep near a place, with the first velocity of those by which it clearly fits best.
 
-    None if it does not fit again with any.
+    If it fits again with none, it tells its velocity by itself, as what was blind may have shaken.
+    None if it does not fit then either.
     """
     matcher, best = frame.matcher, None
-    for twist in twists:
-        moving = matcher.moving_at(twist)
-        found = _solved_near(frame, moving, place, solver)
-        fit = Fit.of(found.matches, matcher.offered)
-        if not (found.solved and monitor.fits_again(fit)):
-            continue
-        if best is None or fit.total > CLEARLY * best[0].total:
-            best = fit, found, moving.posed
+    tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]
+    for fit, found, posed in tried:
+        if monitor.fits_again(fit) and (best is None or fit.total > CLEARLY * best[0].total):
+            best = fit, found, posed
+    if best is None:
+        best = _by_own_motion(frame, max(tried, key=lambda one: one[0].total), monitor, solver)
     if best is None:
         return None
     moved = distance_in_words(frame.predicted.map_T_middle, best[1].map_T_lidar)
     return Found(best[1], best[2], f"moved by {moved}")
+
+
+def _tried(
+    frame: Frame, matcher: FrameMatcher, place: gtsam.Pose3, solver: ScanSolver
+) -> tuple[Fit, Solution, PosedSweep]:
+    """The sweep near a place, as it is de-skewed; one that is not solved fits nothing."""
+    found = _solved_near(frame, matcher, place, solver)
+    fit = Fit.of(found.matches, matcher.offered) if found.solved else Fit(0.0, 0.0)
+    return fit, found, matcher.posed
+
+
+def _by_own_motion(
+    frame: Frame, closest: tuple[Fit, Solution, PosedSweep], monitor: FitMonitor, solver: ScanSolver
+) -> tuple[Fit, Solution, PosedSweep] | None:
+    """A sweep that hardly fits, de-skewed for the motion that its matches tell; None if in vain.
+
+    As it may tell any, it has to fit as sweeps usually do.
+    """
+    matcher, config = frame.matcher, frame.matcher.config
+    sweep, noise = matcher.posed.sweep, config.features.range_noise
+    if sweep.motion is not SweepMotion.CONSTANT_VELOCITY:
+        return None
+    for _ in range(_TOLD):
+        fit, near, posed = closest
+        if not monitor.might_agree(fit):
+            return None
+        rows, seconds = timed_rows(near.matches, sweep, config.solver)
+        motions = posed.twist, posed.twist, np.full(6, _ANY)
+        pose = near.map_T_lidar
+        twist = solved_twist(rows, near.matches.tilts, seconds, pose, *motions, noise)
+        closest = _tried(frame, matcher.moving_at(twist), pose, solver)
+        if monitor.fits_again(closest[0]) and not monitor.unusual(closest[0]):
+            return closest
+    return None
 
 
 def _solved_near(
@@ -330,15 +369,26 @@ def _places(
     starts += likely_poses(points, fields, around, _PLACES, as_well=as_well)
     matcher.clock.lap("relocalize")
     trial = replace(matcher, refine=False).with_few_matches()
-    places: list[tuple[float, gtsam.Pose3]] = []
-    for start in starts:
-        tried = _solved_near(frame, trial, start, solver)
-        if tried.solved:
-            places.append((Fit.of(tried.matches, trial.offered).total, tried.map_T_lidar))
+    tried = [_solved_near(frame, trial, start, solver) for start in starts]
+    solved = _as_measured([one for one in tried if one.solved], frame.predicted.motion)
+    places = [(Fit.of(one.matches, trial.offered).total, one.map_T_lidar) for one in solved]
     best = max((total for total, _ in places), default=0.0)
     as_good = [place for place in places if place[0] >= AS_WELL * best]
     ranks = [-total if monitor.lost else _moved(points, expected, pose) for total, pose in as_good]
     return [as_good[number][1] for number in np.argsort(ranks, kind="stable")]
+
+
+def _as_measured(places: list[Solution], expected: MotionPrior) -> list[Solution]:
+    """The places that gyro and accelerometer do not contradict; all, if they contradict each."""
+    if not expected.measured:
+        return places
+    told, agree = expected.information, []
+    for place in places:
+        step = expected.map_T_lidar.localCoordinates(place.map_T_lidar)
+        # The inverse of the sum of both covariances, without that of the scan's, which may be none.
+        by_both = told - told @ np.linalg.solve(told + place.information / SCAN_VARIANCE, told)
+        agree.append(step @ by_both @ step < _UNLIKELY)
+    return list(compress(places, agree)) or places
 
 
 def _moved(points: FloatArray, one: gtsam.Pose3, other: gtsam.Pose3) -> float:

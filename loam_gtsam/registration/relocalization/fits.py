@@ -154,6 +154,10 @@ class FitMonitor:
             and fit.total >= config.found_share * usual.total
         )
 
+    def might_agree(self, fit: Fit) -> bool:
+        """Whether enough features are matched for that, though they may not agree."""
+        return fit.share >= self.config.found_share * self.usual.share
+
     def jumped(self, step: FloatArray, seconds: float) -> bool:
         """Whether a pose is farther from its prediction than any acceleration explains.
 

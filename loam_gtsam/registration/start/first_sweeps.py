@@ -3,7 +3,7 @@
 A map of one sweep is thin, and distorted by a motion that nobody knows yet. An error made in it
 would stay for good. Therefore the first motion is searched for, and the first eight sweeps are
 registered again and again, each with the map of all the others. With the eighth, the motion is
-searched for once more.
+searched for once more. While another motion may be the true one, the start goes on.
 """
 
 from __future__ import annotations
@@ -52,9 +52,14 @@ from loam_gtsam.types import SweepMotion
 
 _TOGETHER = (2, 3, 5, 8)
 """Numbers of sweeps at which all are registered anew: each time half as many more or so."""
+_IN_DOUBT = (12, 18, 27)
+"""And at which they are once more, while features tell a rival from the way that was taken: what
+explains a few sweeps by chance is refuted by more. Past pylons one at 40 m/s is gone at 12."""
 _ONCE = (3, 5)
 """Numbers at which each is then registered with the map of the others once, and not twice, unless
 there are rivals: without them a second time makes no world's trajectory better by more than 3 %."""
+_FEW = 3
+"""Rivals beyond which a place is blind along the way, as a tunnel: further sweeps refute none."""
 _PLACES = 12  # most motions between the first two sweeps that are tried beside the expected one
 _LIKELY = 0.5
 """Part of the best place's score below which a place is not tried. The place next to the true one
@@ -87,6 +92,7 @@ class Start:
         self._sweeps = [EarlySweep(first.posed, first.map_T_middle, first.motion, keyframe)]
         self._rivals: list[list[EarlySweep]] = []
         """The sweeps on other ways, which explain them as well, but for chance."""
+        self._refutable = False  # whether features tell one of these from the way that was taken
         self._still = False  # whether an IMU was at rest when the run began, as far as scans tell
         self._heeds_gyro = False  # whether its rotation is a factor: the scans alone did not agree
         self._anew = False  # whether the sweeps are to be registered anew with the next one
@@ -99,8 +105,8 @@ class Start:
 
     @property
     def complete(self) -> bool:
-        """Whether all sweeps of the start are there."""
-        return len(self._sweeps) >= _TOGETHER[-1]
+        """Whether all sweeps of the start are there; more of them while they may refute a rival."""
+        return len(self._sweeps) >= (_IN_DOUBT if self._refutable else _TOGETHER)[-1]
 
     def first_motion(
         self, frame: Frame, expected: Found, solver: NamedSolver, imu: ImuTracker | None = None
@@ -190,16 +196,18 @@ class Start:
         if imu is not None and gyro is None:
             (new,) = without_turns([new])
         added = [*self._sweeps, new]
-        if len(added) not in _TOGETHER and not self._anew:
+        if len(added) not in _TOGETHER + _IN_DOUBT and not self._anew:
             self._sweeps = added
             return frame, found
         if gyro is not None:
             added, *self._rivals = (turned_anew(way, gyro) for way in (added, *self._rivals))
-        early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
-        sweeps = early.together(added, 1 if len(added) in _ONCE and not rivals else 2)
+        early, number = EarlyMap(frame, solver, self._map_T_first), len(added)
+        rivals = self._rivals
+        once = number in (_IN_DOUBT if rivals else _ONCE)
+        sweeps = early.together(added, 1 if once else 2)
         sweeps = early.with_motion(self._told_apart(early, sweeps))
-        number = len(sweeps) - 1
-        solution = early.solved(sweeps, number, early.matcher(sweeps, number, to_keep=True))
+        matcher = early.matcher(sweeps, number - 1, to_keep=True)
+        solution = early.solved(sweeps, number - 1, matcher)
         if not solution.solved:
             early.fill(self._sweeps)
             self._sweeps, self._rivals, self._anew = added, rivals, True
@@ -218,7 +226,8 @@ class Start:
         """The sweeps on the way that explains them best, of all that may be the true one."""
         if len(sweeps) == 2:
             return sweeps
-        others, self._rivals = [_moved(sweeps, rival) for rival in self._rivals], []
+        others = [_moved(sweeps, rival) for rival in self._rivals]
+        self._rivals, self._refutable = [], False
         others += by_second_step(sweeps)
         elsewhere = _elsewhere(early, sweeps) if len(sweeps) == _TOGETHER[-1] else []
         if not others and not elsewhere:
@@ -243,6 +252,8 @@ class Start:
             ways, silent = ways[:1], ()
         best, *rivals = kept_ways(ways, config, silent)
         self._rivals = [way[-1].sweeps for way in rivals]
+        told = any(rival is way for rival in rivals for way in ways)
+        self._refutable = told and len(rivals) <= _FEW
         return best
 
 

@@ -460,8 +460,18 @@ def test_a_sweep_that_fits_with_no_expected_motion_tells_one_by_itself(share, be
     if share < 0.5:
         assert found is None
         return
+    monitor.unusual = lambda fit: True
+    assert doubtful_sweeps._with_motion(*args) is None  # it may tell any, and has to fit as usual
     assert np.linalg.norm(found.posed.twist[:3] - frame.posed_for(solution).twist[:3]) < 0.3
     assert found.solution.map_T_lidar.range(solution.map_T_lidar) < 0.01
+
+
+def test_what_no_motion_solves_is_found_nowhere(before, calm):
+    """Nor while nothing is known of what is usual."""
+    frame, monitor = frame_of(before, list(calm)[AT]), FitMonitor(before.config.relocalization)
+    far = gtsam.Pose3(gtsam.Rot3(), [0.0, 0.0, 500.0])
+    twists = [frame.matcher.posed.twist]
+    assert doubtful_sweeps._with_motion(frame, far, twists, monitor, before.solver) is None
 
 
 def test_a_velocity_that_lasts_is_no_jump_from_the_second_sweep_on(before, calm, monkeypatch):

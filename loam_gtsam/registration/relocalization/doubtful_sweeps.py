@@ -260,7 +260,9 @@ def _with_motion(
     matcher, best = frame.matcher, None
     tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]
     for fit, found, posed in tried:
-        if monitor.fits_again(fit) and (best is None or fit.total > CLEARLY * best[0].total):
+        if not (found.solved and monitor.fits_again(fit)):
+            continue
+        if best is None or fit.total > CLEARLY * best[0].total:
             best = fit, found, posed
     if best is None:
         best = _by_own_motion(frame, max(tried, key=lambda one: one[0].total), monitor, solver)
@@ -273,10 +275,9 @@ def _with_motion(
 def _tried(
     frame: Frame, matcher: FrameMatcher, place: gtsam.Pose3, solver: ScanSolver
 ) -> tuple[Fit, Solution, PosedSweep]:
-    """The sweep near a place, as it is de-skewed; one that is not solved fits nothing."""
+    """The sweep near a place, as it is de-skewed, and how it fits there."""
     found = _solved_near(frame, matcher, place, solver)
-    fit = Fit.of(found.matches, matcher.offered) if found.solved else Fit(0.0, 0.0)
-    return fit, found, matcher.posed
+    return Fit.of(found.matches, matcher.offered), found, matcher.posed
 
 
 def _by_own_motion(
@@ -292,14 +293,14 @@ def _by_own_motion(
         return None
     for _ in range(_TOLD):
         fit, near, posed = closest
-        if not monitor.might_agree(fit):
+        if not (near.solved and monitor.might_agree(fit)):
             return None
         rows, seconds = timed_rows(near.matches, sweep, config.solver)
         motions = posed.twist, posed.twist, np.full(6, _ANY)
         pose = near.map_T_lidar
         twist = solved_twist(rows, near.matches.tilts, seconds, pose, *motions, noise)
-        closest = _tried(frame, matcher.moving_at(twist), pose, solver)
-        if monitor.fits_again(closest[0]) and not monitor.unusual(closest[0]):
+        closest = fit, near, _ = _tried(frame, matcher.moving_at(twist), pose, solver)
+        if near.solved and monitor.fits_again(fit) and not monitor.unusual(fit):
             return closest
     return None
 

@@ -29,9 +29,9 @@ from loam_gtsam.datasets.base import DatasetInfo, PartOf
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.datasets.truth import read_truth
+from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.maps.map_file import SavedMap
-from loam_gtsam.pipeline import run
 from loam_gtsam.refine.rounds import Settings
 from loam_gtsam.refine.runs import refine_run, run_points
 from loam_gtsam.types import BadSweep, DatasetError, ImuSamples, Scan, Trajectory
@@ -625,9 +625,8 @@ def test_odometry_back_to_places_visited_before_is_no_loop_for_refine() -> None:
     with SavedMap("out/map.lgmap") as saved:
         assert any(abs(link.later - link.earlier) > 1 for link in saved.graph.links)
     assert loam("refine", *spec, "out", "--rounds", "1", "--no-plot", "-q").exit_code == 0
-    dataset = PartOf(open_dataset(spec[0]), 0, 5)
-    result = run(dataset, Config().changed(*often))
-    points = run_points(dataset, result.updates, result.config)
-    alone = refine_run(points, result.updates, settings=Settings(rounds=1)).trajectory
+    updates, config = read_updates("out"), load_config("out/config.yaml")
+    points = run_points(PartOf(open_dataset(spec[0]), 0, 5), updates, config)
+    alone = refine_run(points, updates, settings=Settings(rounds=1)).trajectory
     refined = read_truth("out/refined/trajectory.tum")
     np.testing.assert_allclose(refined.map_T_lidar, alone.map_T_lidar, atol=1e-8)

@@ -194,6 +194,15 @@ def nearest_positive(matrix: FloatArray) -> FloatArray:
     return root @ root
 
 
+def parallel_sum(one: FloatArray, other: FloatArray) -> FloatArray:
+    """``(one^-1 + other^-1)^-1`` of two forms, of which only the first must have an inverse.
+
+    The information that is left of ``one`` when an error of the information ``other`` comes to it.
+    """
+    both: FloatArray = one - one @ np.linalg.inv(other + one) @ one
+    return both
+
+
 def positive_root(matrix: FloatArray) -> FloatArray:
     """The symmetric root of the nearest positive semi-definite matrix."""
     eigenvalues, vectors = np.linalg.eigh(symmetric(matrix))

@@ -16,6 +16,7 @@ from loam_gtsam.geometry import (
     inverse_pose,
     moments,
     move_points,
+    parallel_sum,
     symmetric_eigenvalues,
     symmetric_eigenvector,
     voxel_filter,
@@ -258,3 +259,12 @@ def test_integrals_are_those_of_scipy(count):
     times, values = np.sort(rng.random(count)), rng.normal(size=(count, 3))
     expected = cumulative_trapezoid(values, times, axis=0, initial=0.0)
     np.testing.assert_array_equal(integrated(values, times), expected)
+
+
+def test_the_parallel_sum_is_the_information_of_a_sum_of_errors():
+    rng = np.random.default_rng(0)
+    roots = rng.normal(size=(2, 4, 4))
+    one, other = roots @ np.swapaxes(roots, 1, 2)
+    both = np.linalg.inv(np.linalg.inv(one) + np.linalg.inv(other))
+    np.testing.assert_allclose(parallel_sum(one, other), both, rtol=1e-9)
+    np.testing.assert_allclose(parallel_sum(one, 0.0 * other), 0.0, atol=1e-12)

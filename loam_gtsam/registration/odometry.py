@@ -17,6 +17,7 @@ from loam_gtsam.geometry import (
     checked_pose,
     move_points,
     nearest_positive,
+    parallel_sum,
     squared_norm,
 )
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
@@ -280,8 +281,7 @@ def solved_twist(
     wrong = unseen_velocity(seconds, range_noise)
     far = float(np.median(np.sqrt(squared_norm(rows.points.T))))
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
-    # The inverse of information^-1 + limit^-1, without that of the information.
-    seen = limit - limit @ np.linalg.inv(information + limit) @ limit
+    seen = parallel_sum(limit, information)
     believed = np.diag(np.maximum(missed, _STEADIEST) ** -2.0)
     change = np.linalg.solve(believed + seen, believed @ (mean - twist) + seen @ step)
     solved: FloatArray = twist + change

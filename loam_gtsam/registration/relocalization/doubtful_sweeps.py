@@ -13,7 +13,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
-from loam_gtsam.geometry import five_sigma
+from loam_gtsam.geometry import five_sigma, parallel_sum
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, timed_rows
 from loam_gtsam.registration.odometry import advance, predict, solved_twist
@@ -291,17 +291,17 @@ def _by_own_motion(
     sweep, noise = matcher.posed.sweep, config.features.range_noise
     if sweep.motion is not SweepMotion.CONSTANT_VELOCITY:
         return None
+    fit, near, posed = closest
     for _ in range(_TOLD):
-        fit, near, posed = closest
         if not (near.solved and monitor.might_agree(fit)):
             return None
         rows, seconds = timed_rows(near.matches, sweep, config.solver)
         motions = posed.twist, posed.twist, np.full(6, _ANY)
         pose = near.map_T_lidar
         twist = solved_twist(rows, near.matches.tilts, seconds, pose, *motions, noise)
-        closest = fit, near, _ = _tried(frame, matcher.moving_at(twist), pose, solver)
+        fit, near, posed = _tried(frame, matcher.moving_at(twist), pose, solver)
         if near.solved and monitor.fits_again(fit) and not monitor.unusual(fit):
-            return closest
+            return fit, near, posed
     return None
 
 
@@ -383,11 +383,10 @@ def _as_measured(places: list[Solution], expected: MotionPrior) -> list[Solution
     """The places that gyro and accelerometer do not contradict; all, if they contradict each."""
     if not expected.measured:
         return places
-    told, agree = expected.information, []
+    agree = []
     for place in places:
         step = expected.map_T_lidar.localCoordinates(place.map_T_lidar)
-        # The inverse of the sum of both covariances, without that of the scan's, which may be none.
-        by_both = told - told @ np.linalg.solve(told + place.information / SCAN_VARIANCE, told)
+        by_both = parallel_sum(expected.information, place.information / SCAN_VARIANCE)
         agree.append(step @ by_both @ step < _UNLIKELY)
     return list(compress(places, agree)) or places
 

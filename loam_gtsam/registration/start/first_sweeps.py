@@ -196,13 +196,13 @@ class Start:
         if imu is not None and gyro is None:
             (new,) = without_turns([new])
         added = [*self._sweeps, new]
-        if len(added) not in _TOGETHER + _IN_DOUBT and not self._anew:
+        number = len(added)
+        if number not in _TOGETHER + _IN_DOUBT and not self._anew:
             self._sweeps = added
             return frame, found
         if gyro is not None:
             added, *self._rivals = (turned_anew(way, gyro) for way in (added, *self._rivals))
-        early, number = EarlyMap(frame, solver, self._map_T_first), len(added)
-        rivals = self._rivals
+        early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
         once = number in (_IN_DOUBT if rivals else _ONCE)
         sweeps = early.together(added, 1 if once else 2)
         sweeps = early.with_motion(self._told_apart(early, sweeps))
@@ -226,9 +226,8 @@ class Start:
         """The sweeps on the way that explains them best, of all that may be the true one."""
         if len(sweeps) == 2:
             return sweeps
-        others = [_moved(sweeps, rival) for rival in self._rivals]
+        others = [_moved(sweeps, rival) for rival in self._rivals] + by_second_step(sweeps)
         self._rivals, self._refutable = [], False
-        others += by_second_step(sweeps)
         elsewhere = _elsewhere(early, sweeps) if len(sweeps) == _TOGETHER[-1] else []
         if not others and not elsewhere:
             return sweeps

@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from loam_gtsam.io.run_files import position_sigmas
 from loam_gtsam.types import FrameStatus, MapUpdate
 
@@ -16,6 +18,7 @@ DO_NOT_TRUST = "DO NOT TRUST THIS RUN: "
 """What a sentence begins with that puts the whole run in doubt."""
 _EXPECTED = (FrameStatus.OK, FrameStatus.FIRST, FrameStatus.NOT_CONVERGED)
 _TOO_MANY = 0.05  # share of frames that are not trustworthy from which on a run is in doubt
+_PARTS = slice(0, 3), slice(3, 6)  # of a covariance: rotation and position
 _ADVICE = {
     FrameStatus.DEGENERATE: "another sensor (IMU, wheels, GPS) can tell what the scans do not: "
     "docs/imu.md, docs/gnss.md",
@@ -26,27 +29,33 @@ _ADVICE = {
     "see loam-gtsam inspect",
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
-_VAGUE = 1.0  # metres of standard deviation, and more than a hundredth of the path, that are said
+_VAGUE = 0.01  # standard deviation from which on a pose is vague: rad, and part of the path
+_SAID = 1.0  # metres of standard deviation from which on a vague one is said
+_SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground makes
 
 
 def run_notes(result: RunResult) -> tuple[str, ...]:
     """Sentences on positions, IMU, times of points and statuses; none if nothing is wrong."""
     notes = []
     sigmas = position_sigmas(result.updates)
+    path = result.trajectory.path_length
     if sigmas is not None:
         largest = sigmas["largest"]
-        if largest > max(_VAGUE, 0.01 * result.trajectory.path_length):
+        if largest > max(_SAID, _VAGUE * path):
             told = f"positions are told to {largest:.2g} m at worst (sigma)"
             notes.append(f"{told}: other first motions fit as well, or the way was blind")
     if result.imu is not None:
         notes += result.imu.problems
     if result.times_problem:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
-    return (*notes, *_on_statuses(result.updates))
+    return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
 
 
-def _on_statuses(updates: Sequence[MapUpdate]) -> list[str]:
-    """A sentence on the frames that are not trustworthy, or on those that still moved."""
+def _on_statuses(updates: Sequence[MapUpdate], path: float) -> list[str]:
+    """A sentence on the frames that no scan fixed, or on those that still moved.
+
+    Degenerate ones put the run in doubt if they are told to be vague, after so many metres.
+    """
     odd = [number for number, update in enumerate(updates) if update.status not in _EXPECTED]
     if not odd:
         moving = sum(update.status is FrameStatus.NOT_CONVERGED for update in updates)
@@ -54,10 +63,19 @@ def _on_statuses(updates: Sequence[MapUpdate]) -> list[str]:
             return []
         share = f"{moving} of {len(updates)} poses still moved"
         return [f"{share} when solver.iterations ended: try more (not_converged)"]
+    doubted = [updates[number] for number in odd if _doubtful(updates[number], path)]
     counts = Counter(updates[number].status for number in odd).most_common()
     statuses = ", ".join(f"{count} {status}" for status, count in counts)
     return [
-        f"{DO_NOT_TRUST if len(odd) > _TOO_MANY * len(updates) else ''}"
+        f"{DO_NOT_TRUST if len(doubted) > _TOO_MANY * len(updates) else ''}"
         f"{len(odd)} of {len(updates)} poses ({100.0 * len(odd) / len(updates):.0f} %) are not "
         f"fixed by their scans ({statuses}), first that of frame {odd[0]}; {_ADVICE[counts[0][0]]}"
     ]
+
+
+def _doubtful(update: MapUpdate, path: float) -> bool:
+    """Whether a pose was not found, or is vague by its covariance."""
+    if not update.status.solved:
+        return True
+    turn, shift = (np.sqrt(np.trace(update.covariance[part, part])) for part in _PARTS)
+    return not (turn <= _VAGUE and shift <= _VAGUE * path)

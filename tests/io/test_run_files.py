@@ -263,3 +263,21 @@ def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["notes"] == list(doubted.notes)
     assert summary["imu"]["problems"] == list(apart.imu.problems)
+
+
+def test_degenerate_poses_put_a_run_in_doubt_only_if_they_are_vague(result):
+    def distrusted(axis, variance):
+        told = np.full(6, 1e-6)
+        told[axis] = variance
+        others = [
+            replace(update, status=FrameStatus.DEGENERATE, covariance=np.diag(told))
+            for update in result.updates[1:]
+        ]
+        (note,) = replace(result, updates=(result.updates[0], *others)).notes
+        assert "7 of 8 poses (88 %) are not fixed by their scans (7 degenerate)" in note
+        return note.startswith("DO NOT TRUST")
+
+    assert not distrusted(4, 0.09**2)
+    assert distrusted(4, 0.11**2)  # a hundredth of ten metres
+    assert distrusted(2, 0.011**2)  # rad
+    assert distrusted(4, np.nan)

@@ -15,6 +15,7 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import (
     as_vector,
     checked_pose,
+    five_sigma,
     move_points,
     nearest_positive,
     parallel_sum,
@@ -283,6 +284,10 @@ def solved_twist(
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
     seen = parallel_sum(limit, information)
     believed = np.diag(np.maximum(missed, _STEADIEST) ** -2.0)
+    away = twist + step - mean
+    unlikely = float(away @ parallel_sum(seen, believed) @ away)
+    if unlikely > five_sigma(len(away)):  # another motion than usual: as likely as it looks
+        believed = believed * (len(away) / unlikely)
     change = np.linalg.solve(believed + seen, believed @ (mean - twist) + seen @ step)
     solved: FloatArray = twist + change
     return solved

@@ -11,6 +11,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
 from loam_gtsam.registration.relocalization.evidence import Evidence
 from loam_gtsam.registration.solvers import ScanSolver, Solution, trial_solver
+from loam_gtsam.registration.start.paths import on_paths, with_velocity
 from loam_gtsam.registration.start.ways import (
     EarlySweep,
     Tried,
@@ -18,7 +19,6 @@ from loam_gtsam.registration.start.ways import (
     continued,
     moved_with_first,
 )
-from loam_gtsam.types import FloatArray
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -52,13 +52,21 @@ class EarlyMap:
         for _ in range(rounds):
             moved = self.with_motion(moved)
             if (solutions := self.at_once(moved)) is not None:
+                for number, solution in enumerate(solutions):
+                    moved = self._with_velocity(moved, number, solution)
                 moved = moved_with_first(moved, solutions)
                 continue
             for number in range(1, len(moved)):
                 solution = self.solved(moved, number, self.matcher(moved, number))
                 if solution.solved:
+                    moved = self._with_velocity(moved, number, solution)
                     moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
         return moved
+
+    def _with_velocity(
+        self, sweeps: Sequence[EarlySweep], number: int, solution: Solution
+    ) -> list[EarlySweep]:
+        return with_velocity(sweeps, number, solution, self.map_T_first, self.config)
 
     def at_once(self, sweeps: Sequence[EarlySweep]) -> list[Solution] | None:
         """Each sweep, the first as well, registered with the map of the others as they are.
@@ -84,7 +92,7 @@ class EarlyMap:
         """Further sweeps of a way, each expected at constant velocity."""
         found: list[Tried] = []
         for sweep in sweeps:
-            expected = replace(sweep, map_T_middle=continued(way, sweep.moment.stamp))
+            expected = sweep.put(continued(way, sweep.moment.stamp))
             found.append(self.registered(self.with_motion([*way, expected])))
             way = found[-1].sweeps
         return tuple(found)
@@ -92,7 +100,7 @@ class EarlyMap:
     def tried(self, first: EarlySweep, later: EarlySweep) -> Tried:
         """A later sweep, registered with the first by few matches."""
         moved = first.map_T_middle.between(later.map_T_middle)
-        first, later = self.with_motion([first, later])
+        first, later = self.with_motion([one.put(one.map_T_middle) for one in (first, later)])
         later = replace(later, map_T_middle=first.map_T_middle.compose(moved))
         return self.registered([first, later], quickly=True)
 
@@ -139,25 +147,5 @@ class EarlyMap:
         self.frame.matcher.maps.recenter(self.map_T_first)
 
     def with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
-        """The sweeps, de-skewed for the motion between their poses."""
-        moved = list(sweeps)
-        for number in range(1, len(moved)):
-            last, now = moved[number - 1].moment, moved[number]
-            sweep = now.posed.sweep
-            if sweep.stamp > last.stamp:  # not for sweeps of unlike length
-                twist = sweep.twist_since(last[:2], now.map_T_middle)
-                moved[number] = replace(now, posed=sweep.at(twist))
-        posed = moved[0].posed.sweep.at(_first_twist(*moved[:2]))
-        middle = posed.map_T_middle(self.map_T_first)
-        moved[0] = replace(moved[0], posed=posed, map_T_middle=middle)
-        return moved
-
-
-def _first_twist(first: EarlySweep, second: EarlySweep) -> FloatArray:
-    """(6,) body velocity of the first sweep: that of the second, less what was felt in between."""
-    sweep, twist = second.posed.sweep, second.posed.twist
-    velocity = sweep.velocity_at((first.moment.stamp - sweep.stamp) * 1e-9, twist)
-    if velocity is None:
-        return twist
-    moved = first.map_T_middle.rotation().between(second.map_T_middle.rotation())
-    return first.posed.sweep.twist_at_reference(twist[:3], moved.matrix() @ velocity)
+        """The sweeps, de-skewed for the motion through their poses."""
+        return on_paths(sweeps, self.map_T_first)

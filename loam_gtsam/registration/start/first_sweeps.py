@@ -214,13 +214,14 @@ class Start:
             return frame, found
         last, posed = sweeps[-2].moment, sweeps[-1].posed
         sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)
+        sweeps[-1] = early.with_motion(sweeps)[-1]
         self._sweeps, self._anew = sweeps, False
         if imu is not None:
             imu.registered_anew(last.map_T_lidar)
         frame = replace(
             frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
         )
-        return frame, replace(found, solution=solution, posed=frame.posed_for(solution))
+        return frame, replace(found, solution=solution, posed=sweeps[-1].posed)
 
     def _told_apart(self, early: EarlyMap, sweeps: list[EarlySweep]) -> list[EarlySweep]:
         """The sweeps on the way that explains them best, of all that may be the true one."""
@@ -339,6 +340,6 @@ def _elsewhere(early: EarlyMap, sweeps: list[EarlySweep]) -> list[list[EarlySwee
 def _moved(sweeps: list[EarlySweep], to: list[EarlySweep]) -> list[EarlySweep]:
     """The first of some sweeps, with the motions and poses of others of the same time."""
     return [
-        replace(one, posed=other.posed, map_T_middle=other.map_T_middle)
+        replace(one, posed=other.posed, map_T_middle=other.map_T_middle, velocity=other.velocity)
         for one, other in zip(sweeps, to, strict=False)
     ]

@@ -38,6 +38,7 @@ class EarlySweep:
     told : what further factors say of the pose, whichever way leads there; None without any
     moved : what they say of the pose seen from the sweep before; None without any
     turned : what a gyro says of that pose, the rotation; None without one
+    velocity : (6,) rad/s and m/s in the middle of the sweep, as its matches tell; None if untold
     """
 
     posed: PosedSweep
@@ -47,6 +48,11 @@ class EarlySweep:
     told: MotionPrior | None = None
     moved: MotionPrior | None = None
     turned: MotionPrior | None = None
+    velocity: FloatArray | None = None
+
+    def put(self, map_T_middle: gtsam.Pose3) -> EarlySweep:
+        """The sweep at a pose of which nothing is known, nor of the velocity there."""
+        return replace(self, map_T_middle=map_T_middle, velocity=None)
 
     @property
     def moment(self) -> Moment:
@@ -103,7 +109,7 @@ def by_second_step(sweeps: Sequence[EarlySweep]) -> list[list[EarlySweep]]:
     first, second, third = sweeps
     seconds = first.moment.seconds_to(second.moment.stamp)
     place = advance(first.map_T_middle, mean_twist(second, third), seconds)
-    led = [first, replace(second, map_T_middle=place)]
+    led = [first.put(first.map_T_middle), second.put(place)]
     return [] if same(place, second.map_T_middle) else [led]
 
 
@@ -112,9 +118,8 @@ def steady(sweeps: Sequence[EarlySweep], moved: gtsam.Pose3) -> list[EarlySweep]
     first = sweeps[0].moment
     seconds = [first.seconds_to(one.moment.stamp) for one in sweeps]
     twist = gtsam.Pose3.Logmap(moved) / seconds[-1]
-    poses = [advance(first.map_T_lidar, twist, since) for since in seconds[1:]]
-    pairs = zip(sweeps[1:], poses, strict=True)
-    return [sweeps[0], *(replace(one, map_T_middle=pose) for one, pose in pairs)]
+    poses = [first.map_T_lidar, *(advance(first.map_T_lidar, twist, s) for s in seconds[1:])]
+    return [one.put(pose) for one, pose in zip(sweeps, poses, strict=True)]
 
 
 def moved_with_first(

@@ -78,19 +78,36 @@ class Scan:
             if isinstance(given := getattr(self, name), (list, tuple)):
                 object.__setattr__(self, name, np.array(given))
         check_array(self.points, "Scan.points", ("N", 3))
-        if not (isinstance(self.stamp, (int, np.integer)) and abs(int(self.stamp)) <= MAX_STAMP):
+        if not (_is_integer(self.stamp) and abs(int(self.stamp)) <= MAX_STAMP):
             raise InputError(
                 "Scan.stamp: expected integer nanoseconds up to 2^62 (the year 2116), got "
                 f"{self.stamp!r}; round(seconds * 1e9) makes them of seconds"
             )
+        object.__setattr__(self, "stamp", int(self.stamp))
         for name, numbers in (("times", "floats"), ("rings", "integers")):
             column = getattr(self, name)
             if column is not None:
                 check_array(column, f"Scan.{name}", (len(self.points),), numbers)
+        if self.span is not None and not _are_two_numbers(self.span):
+            raise InputError(f"Scan.span: expected (first, last) seconds, got {self.span!r}")
+        if not (_is_integer(self.rows) and self.rows >= 0):
+            raise InputError(f"Scan.rows: expected a number of rows, or 0, got {self.rows!r}")
         if self.rows and len(self.points) % self.rows:
             raise InputError(
                 f"Scan.rows: {len(self.points)} points do not divide into {self.rows} rows"
             )
+
+
+def _is_integer(value: object) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def _are_two_numbers(value: object) -> bool:
+    try:
+        numbers = np.asarray(value)
+    except ValueError:
+        return False
+    return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -31,6 +31,12 @@ POINTS = np.zeros((6, 3), np.float32)
         ({"rings": np.zeros(6)}, "Scan.rings: expected .* integers, got .*float64"),
         ({"stamp": 0.1}, "Scan.stamp: expected integer nanoseconds .* got 0.1"),
         ({"rows": 4}, "Scan.rows: 6 points do not divide into 4 rows"),
+        ({"rows": -1}, "Scan.rows: expected a number of rows, or 0, got -1"),
+        ({"rows": 2.0}, "Scan.rows: expected a number of rows, or 0, got 2.0"),
+        ({"stamp": True}, "Scan.stamp: expected integer nanoseconds .* got True"),
+        ({"span": (0.1,)}, r"Scan.span: expected \(first, last\) seconds, got \(0.1,\)"),
+        ({"span": ("a", "b")}, "Scan.span: expected .* got .'a', 'b'."),
+        ({"span": (0.1, (0.2, 0.3))}, "Scan.span: expected"),
     ],
 )
 def test_a_scan_of_wrong_shape_or_dtype_is_refused(fields, message):

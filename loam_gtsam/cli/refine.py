@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +36,6 @@ from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import (
     DatasetError,
     FloatArray,
-    FrameStatus,
     InputError,
     IntArray,
     MapUpdate,
@@ -220,8 +219,11 @@ def _write_trajectory(folder: Path, found: RefinedRun, names: Sequence[str]) -> 
         folder / names[0], trajectory, comments={"refined": "planes, lines and poses adjusted"}
     )
     write_kitti(folder / names[1], trajectory)
-    told = zip(trajectory.stamps, trajectory.map_T_lidar, found.covariances, strict=True)
-    poses = [MapUpdate(int(s), gtsam.Pose3(p), FrameStatus.OK, covariance=c) for s, p, c in told]
+    told = zip(found.updates, trajectory.map_T_lidar, found.covariances, strict=True)
+    poses = [
+        replace(update, map_T_lidar=gtsam.Pose3(pose), covariance=covariance)
+        for update, pose, covariance in told
+    ]
     write_covariances(folder / names[2], poses)
     if found.earth is not None:
         write_enu(folder / names[3], trajectory, found.earth)

@@ -132,20 +132,28 @@ class LoopSelection:
             self._graph.switch(number, True)
             self._settle(sorted(set(range(number)) - on))
             return self._graph.is_active(number)
-        agrees = on <= self._agreeing(number)
-        if agrees and distance <= self.config.max_chi2:
+        if on <= self._agreeing(number) and distance <= self.config.max_chi2:
             self._graph.switch(number, True)
         else:
             most = consistent_set(number, self._agreeing)
-            # The others were the wrong ones, or the odometry is worse than its covariance says.
-            if len(most) > max(len(on), self.config.believed_loops - 1 if agrees else 0):
-                for other in sorted(on - most):
-                    self._graph.switch(other, False)
-                for other in sorted(most - on):
-                    self._graph.switch(other, True)
+            if len(most) > len(on):
+                self._replace(on, most, number)
         if set(np.flatnonzero(self._graph.active).tolist()) != on:
             self._settle(range(len(self._loops)))
         return self._graph.is_active(number)
+
+    def _replace(self, on: set[int], most: set[int], number: int) -> None:
+        """Switch from some loop closures to more, a given one among them, which agree.
+
+        Either the others were wrong, or the odometry is worse than its covariance says. Only many
+        are believed against it.
+        """
+        for other in sorted(on - most):
+            self._graph.switch(other, False)
+        many = len(most) >= self.config.believed_loops
+        believed = many or self.chi_squared(number) <= self.config.max_chi2
+        for other in sorted(most - on if believed else on - most):
+            self._graph.switch(other, True)
 
     def forget(self, count: int) -> None:
         """Forget the last ``count`` loop closures, which the graph has none of any more."""

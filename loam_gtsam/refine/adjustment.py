@@ -28,7 +28,7 @@ from loam_gtsam.refine.rounds import (
     equations,
     factorised,
 )
-from loam_gtsam.refine.sweeps import Path, Stack, SweepPoints, stacked
+from loam_gtsam.refine.sweeps import Path, ReferenceSteps, Stack, SweepPoints, stacked
 from loam_gtsam.refine.ties import FixTies
 from loam_gtsam.refine.windows import in_windows
 from loam_gtsam.types import FloatArray, InputError, Trajectory
@@ -47,6 +47,7 @@ class Refined:
     landmarks : planes and lines of the last round
     sightings : which sweep saw which of them
     information : (6 N, 6 N) of the poses, landmarks eliminated, other factors included
+    steps : the motion from the middles to the reference times
     rounds : what each round did
     fixes : those of a GNSS receiver that took part
     """
@@ -56,6 +57,7 @@ class Refined:
     landmarks: Landmarks
     sightings: Sightings
     information: csc_array
+    steps: ReferenceSteps
     rounds: tuple[Round, ...] = field(default=())
     fixes: FixTies | None = None
 
@@ -63,7 +65,7 @@ class Refined:
     def trajectory(self) -> Trajectory:
         """Poses at the reference times of the sweeps."""
         stamps = [sweep.stamp + round(sweep.reference * 1e9) for sweep in self.sweeps]
-        poses = [self.path.at(n, sweep.reference) for n, sweep in enumerate(self.sweeps)]
+        poses = [self._reference(number) for number in range(len(self.sweeps))]
         return Trajectory.from_poses(stamps, poses)
 
     @cached_property
@@ -78,11 +80,10 @@ class Refined:
             return None
         return self.fixes.referenced(self.path.map_T_middle, self._solver)
 
-    @cached_property
-    def _path_errors(self) -> FloatArray:
-        """(N, 6) variances of the motion from the middles to the reference times."""
-        errors = self.path.errors(np.array([sweep.reference for sweep in self.sweeps]))
-        return errors
+    def _reference(self, number: int) -> gtsam.Pose3:
+        """The pose of a sweep at its reference time."""
+        led = self.path.at(number, self.sweeps[number].reference)
+        return led.compose(gtsam.Pose3.Expmap(self.steps.beyond[number]))
 
     def joint_covariance(self, numbers: Sequence[int]) -> FloatArray:
         """(6 K, 6 K) joint marginal of the poses of K sweeps at their reference times.
@@ -102,9 +103,9 @@ class Refined:
         turn = np.zeros_like(joint)
         for k, n in enumerate(numbers):
             pose = gtsam.Pose3(self.path.map_T_middle[n])
-            away = self.path.at(n, self.sweeps[n].reference).between(pose).AdjointMap()
+            away = self._reference(n).between(pose).AdjointMap()
             turn[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = away
-        joint = turn @ joint @ turn.T + np.diag(self._path_errors[list(numbers)].ravel())
+        joint = turn @ joint @ turn.T + np.diag(self.steps.variances[list(numbers)].ravel())
         return symmetric(joint)
 
     @cached_property
@@ -158,6 +159,7 @@ def refine(
     fixes: FixTies | None = None,
     ties: Sequence[Ties] = (),
     starts: Sequence[int] = (0,),
+    steps: tuple[Sequence[gtsam.Pose3], FloatArray] | None = None,
     on_round: Callable[[Round], None] | None = None,
     on_window: Callable[[int, int], None] | None = None,
 ) -> Refined:
@@ -178,6 +180,9 @@ def refine(
     fixes : of a GNSS receiver, on the poses
     ties : what else is known of them, with other variables
     starts : numbers of the first sweeps of the runs, if there are several
+    steps : N poses at the reference times of the sweeps, seen from their middles, as an IMU or the
+        points told them, and (N, 6) their variances, not finite where nothing did; if None, the
+        path through the poses tells
     on_round : called after each round of the whole, to show progress
     on_window : called after each window of a long drive with the number of those done, and of all
 
@@ -192,7 +197,7 @@ def refine(
     if len(sweeps) < 3:
         raise InputError(f"refine: expected 3 or more sweeps, got {len(sweeps)}")
     known: tuple[Ties, ...] = (*ties, *(() if fixes is None else (fixes,)))
-    others = OtherFactors(factors, poses, known=known)
+    others, begun = OtherFactors(factors, poses, known=known), poses
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
     asked = np.tile(np.eye(6), (len(sweeps), 1, 1))
     if keep is not None:
@@ -215,5 +220,9 @@ def refine(
     information, _ = equations(poses, found.landmarks, found.seen, found.clear, others)
     factorised(information)
     path = Path.through(stamps, poses, starts)
-    parts = found.landmarks, found.seen, information, found.rounds, fixes
+    reference = np.array([sweep.reference for sweep in sweeps])
+    moved = ReferenceSteps.along(path, reference)
+    if steps is not None:
+        moved = ReferenceSteps.told(Path.through(stamps, begun, starts), reference, *steps)
+    parts = found.landmarks, found.seen, information, moved, found.rounds, fixes
     return Refined(path, tuple(sweeps), *parts)

@@ -383,6 +383,26 @@ def _first_to_middle(
     return step
 
 
+def _to_references(runs: Sequence[_Run]) -> tuple[list[gtsam.Pose3], FloatArray]:
+    """Poses at the reference times, seen from the middles of the sweeps, and variances (N, 6).
+
+    The own error of a frame has the error of this step in it, which so is told to be larger.
+    """
+    steps = [step.inverse() for run in runs for step in run.to_middle]
+    return steps, np.concatenate([_step_variances(run.updates) for run in runs])
+
+
+def _step_variances(updates: Sequence[MapUpdate]) -> FloatArray:
+    """(N, 6), infinite where nothing is known; of the first sweep a gyro tells the rotation."""
+    found = np.full((len(updates), 6), np.inf)
+    for place, update in enumerate(updates):
+        if update.uncertainty is not None:
+            found[place] = np.diag(update.uncertainty.own)
+    if [update.sweep_motion for update in updates[:2]] == [SweepMotion.GYRO] * 2:
+        found[0, :3] = found[:2, :3].min(axis=0)
+    return found
+
+
 def _starts(runs: Sequence[_Run]) -> list[int]:
     """Numbers of the first frames of the runs."""
     counted: list[int] = np.cumsum([0, *(len(run.updates) for run in runs[:-1])]).tolist()
@@ -438,7 +458,7 @@ def _adjusted(
     found = refine(
         sweeps, before.map_T_middle, every, settings,
         keep=asked, for_covariances=told, fixes=fixes, ties=ties, starts=starts,
-        on_round=on_round, on_window=on_window,
+        steps=_to_references(runs), on_round=on_round, on_window=on_window,
     )  # fmt: skip
     refined = []
     for start, run, whole in zip(starts, runs, wholes, strict=True):

@@ -37,6 +37,8 @@ _NEAR = 10
 _MISSED, _AT_END = 0.3, 5.0
 """Error of the path over what a polynomial of degree two misses of it: within a stretch of sweeps
 (one of degree four remains), and at its ends, where it goes beyond the poses."""
+_CHANCE = 1.0 + np.sqrt(2.0 / (2.0 * _NEAR + 1.0))
+"""Times a variance that the mean square of so many errors reaches, a standard deviation above."""
 _GAP = 2.5
 """Sweeps, as the median from one to the next, across which no velocity is taken."""
 
@@ -233,12 +235,61 @@ def _missed(powers: FloatArray, coarse: FloatArray, seconds: FloatArray) -> Floa
     numbers = np.flatnonzero(whole)
     if not len(numbers):
         return np.zeros_like(missed)
-    window = np.ones(2 * _NEAR + 1)
-    sums = [np.convolve(column, window, "same") for column in (missed * whole[:, None]).T]
-    mean = np.stack(sums, axis=1) / np.maximum(np.convolve(whole, window, "same"), 1.0)[:, None]
+    mean = _mean_near(missed, np.repeat(whole[:, None], 6, axis=1))
     nearest = numbers[np.abs(np.arange(len(whole))[:, None] - numbers).argmin(axis=1)]
     variances: FloatArray = np.where(whole[:, None], _MISSED**2, _AT_END**2) * mean[nearest]
     return variances
+
+
+def _mean_near(values: FloatArray, counted: BoolArray) -> FloatArray:
+    """(N, 6) means over those of the sweeps near by that count (N, 6); zero if none does."""
+    window = np.ones(2 * _NEAR + 1)
+    summed, counts = (
+        np.stack([np.convolve(column, window)[_NEAR:-_NEAR] for column in columns.T], axis=1)
+        for columns in (np.where(counted, values, 0.0), counted.astype(np.float64))
+    )
+    means: FloatArray = summed / np.maximum(counts, 1.0)
+    return means
+
+
+class ReferenceSteps(NamedTuple):
+    """How the lidar moved from the middles of N sweeps to their reference times.
+
+    Attributes
+    ----------
+    beyond : (N, 6) of the motion, from where a path leads, tangent order of the package
+    variances : (N, 6) of the motion
+    """
+
+    beyond: FloatArray
+    variances: FloatArray
+
+    @classmethod
+    def along(cls, path: Path, seconds: FloatArray) -> ReferenceSteps:
+        """By a path alone, to times (N,) from the middles."""
+        return cls(np.zeros((len(seconds), 6)), path.errors(seconds))
+
+    @classmethod
+    def told(
+        cls, path: Path, seconds: FloatArray, steps: Sequence[gtsam.Pose3], variances: FloatArray
+    ) -> ReferenceSteps:
+        """By a path, and by ``steps`` as a run had them, with their ``variances`` (N, 6).
+
+        An IMU feels what is too fast for a path through one pose per sweep. The steps are farther
+        from the path than their own errors make them by what this misses; each has its share by
+        these variances. Those of what steps do not tell are not finite.
+        """
+        missed, known = path.errors(seconds), np.isfinite(variances)
+        beyond = np.zeros_like(missed)
+        for n in np.flatnonzero(known.any(axis=1)).tolist():
+            led = path.motion(n, seconds[n : n + 1])[0]
+            beyond[n] = gtsam.Pose3.Logmap(gtsam.Pose3.Expmap(led).between(steps[n]))
+        rows = _rows(path.starts, len(missed))
+        by_chance = _CHANCE * variances
+        near = [_mean_near(beyond[some] ** 2 - by_chance[some], known[some]) for some in rows]
+        missed = np.maximum(missed, np.concatenate(near))
+        share = missed / np.maximum(missed + variances, np.finfo(float).tiny)
+        return cls(share * beyond, (1.0 - share) * missed)
 
 
 def _moved(points: FloatArray, motions: FloatArray) -> FloatArray:

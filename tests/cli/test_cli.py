@@ -605,6 +605,7 @@ def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
     assert report["after"]["ate_rmse_m"] < 0.01
     lines = Path("out/refined/trajectory_covariance.csv").read_text().splitlines()
     assert len(lines) == 13
+    assert [line.split(",")[1] for line in lines[1:3]] == ["first", "ok"]
     told = loam("refine", spec, "out", "--rounds", "1", "--points", "500")
     assert told.exit_code == 0
     assert "thickness of common planes" in told.output

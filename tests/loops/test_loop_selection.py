@@ -154,3 +154,18 @@ def test_loops_that_agree_are_believed_against_an_odometry_worse_than_it_knows(c
     assert sum(graph.active[count:]) == 0
     if believed:
         assert off(graph.poses(), truth) < 0.5 * off(filled(odometry).poses(), truth)
+
+
+@pytest.mark.parametrize(("count", "believed"), [(5, False), (6, True)])
+def test_a_few_look_alike_places_do_not_displace_a_right_loop_that_the_odometry_backs(
+    count, believed
+):
+    truth = square(20, 2)
+    graph = filled(truth, believed_loops=6)
+    spread = np.diag(SIGMAS**2)
+    assert graph.add_loop(LoopClosure(3, 83, truth[3].between(truth[83]), spread))
+    aside = gtsam.Pose3(gtsam.Rot3(), np.array([0.0, 6.0, 0.0]))
+    for place in range(6, 6 + count):  # all along one side, off alike
+        seen = truth[place].compose(aside).between(truth[place + 80])
+        graph.add_loop(LoopClosure(place, place + 80, seen, spread))
+    assert graph.active == (not believed, *[believed] * count)

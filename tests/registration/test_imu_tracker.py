@@ -325,12 +325,15 @@ def test_the_bias_of_the_gyro_is_learnt():
 
 def test_a_gyro_that_turns_otherwise_is_given_up_after_five_frames_and_may_come_back():
     tracker = turning_tracker((0.0, 0.0, 0.8))
+    tracker.first_pose(NOW, None)
     wrong, right = frames((0.8, 0.0, 0.0), 30), frames((0.0, 0.0, 0.8), 60)
     compare(tracker, wrong[:5])
     assert tracker.trusted_gyro is tracker.buffer
     assert tracker.rotation_between(NOW, NOW + FRAME) is not None
+    assert tracker.map_up is not None
     compare(tracker, wrong[4:6])
     assert tracker.trusted_gyro is None
+    assert tracker.map_up is None
     assert tracker.rotation_between(NOW, NOW + FRAME) is None
     np.testing.assert_array_equal(tracker.buffer.gyro_bias, np.zeros(3))  # nothing learnt from it
     compare(tracker, wrong[5:])

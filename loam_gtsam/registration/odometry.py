@@ -251,6 +251,8 @@ def solved_twist(
     mean: FloatArray,
     missed: FloatArray,
     range_noise: float,
+    *,
+    heed_contradiction: bool = False,
 ) -> FloatArray:
     """(6,) body velocity in the middle of a sweep, by its matches and by the mean velocity.
 
@@ -268,6 +270,8 @@ def solved_twist(
     mean, missed : (6,) rad/s and m/s, the mean velocity since the last sweep and the standard
         deviation of its difference from that in the middle
     range_noise : metres, of a single range
+    heed_contradiction : whether the matches may contradict the mean velocity by five sigma. Then it
+        is less certain than ``missed``; else they are taken to be of a pose that has jumped
     """
     residuals, by_pose = rows.residuals(map_T_middle)
     both = np.hstack([by_pose, by_pose * seconds[:, None]])
@@ -284,10 +288,11 @@ def solved_twist(
     limit = np.diag(np.repeat([far / wrong, 1.0 / wrong], 3) ** 2)
     seen = parallel_sum(limit, information)
     believed = np.diag(np.maximum(missed, _STEADIEST) ** -2.0)
-    away = twist + step - mean
-    unlikely = float(away @ parallel_sum(seen, believed) @ away)
-    if unlikely > five_sigma(len(away)):  # another motion than usual: as likely as it looks
-        believed = believed * (len(away) / unlikely)
+    if heed_contradiction:
+        away = twist + step - mean
+        unlikely = float(away @ parallel_sum(seen, believed) @ away)
+        if unlikely > five_sigma(len(away)):
+            believed = believed * (len(away) / unlikely)
     change = np.linalg.solve(believed + seen, believed @ (mean - twist) + seen @ step)
     solved: FloatArray = twist + change
     return solved

@@ -52,15 +52,15 @@ class EarlyMap:
         for _ in range(rounds):
             moved = self.with_motion(moved)
             if (solutions := self.at_once(moved)) is not None:
+                moved = moved_with_first(moved, solutions)
                 for number, solution in enumerate(solutions):
                     moved = self._with_velocity(moved, number, solution)
-                moved = moved_with_first(moved, solutions)
                 continue
             for number in range(1, len(moved)):
                 solution = self.solved(moved, number, self.matcher(moved, number))
                 if solution.solved:
-                    moved = self._with_velocity(moved, number, solution)
                     moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
+                    moved = self._with_velocity(moved, number, solution)
         return moved
 
     def _with_velocity(
@@ -83,9 +83,13 @@ class EarlyMap:
         return solutions
 
     def way(self, sweeps: Sequence[EarlySweep]) -> Way:
-        """Each sweep after the first, registered with the map of those before it."""
+        """Each sweep after the first, registered with the map of those before it.
+
+        All at constant velocity: ways are compared that were adjusted more and less.
+        """
+        steady = [one.put(one.map_T_middle) for one in sweeps]
         return tuple(
-            self.registered(self.with_motion(sweeps[:count])) for count in range(2, len(sweeps) + 1)
+            self.registered(self.with_motion(steady[:count])) for count in range(2, len(steady) + 1)
         )
 
     def followed(self, way: list[EarlySweep], sweeps: Sequence[EarlySweep]) -> Way:

@@ -34,10 +34,13 @@ def on_paths(sweeps: Sequence[EarlySweep], map_T_first: gtsam.Pose3) -> list[Ear
             moved[number] = replace(now, posed=sweep.accelerated(np.zeros(6)).at(twist))
     sweep = moved[0].posed.sweep.accelerated(np.zeros(6))
     moved[0] = replace(moved[0], posed=sweep.at(_first_twist(*moved[:2])))
-    if moved[0].velocity is not None:
-        moved = [_on_path(moved, number, map_T_first) for number in range(len(moved))]
-    middle = moved[0].posed.map_T_middle(map_T_first)
-    return [replace(moved[0], map_T_middle=middle), *moved[1:]]
+    bent = moved[0].velocity is not None
+    if bent:
+        moved[0] = _on_path(moved, 0, map_T_first)
+    moved[0] = replace(moved[0], map_T_middle=moved[0].posed.map_T_middle(map_T_first))
+    if bent:
+        moved[1:] = [_on_path(moved, number, map_T_first) for number in range(1, len(moved))]
+    return moved
 
 
 def with_velocity(
@@ -58,14 +61,16 @@ def with_velocity(
     if len(sweeps) > 2:
         expected, _ = _parabola(sweeps, number, map_T_first)
         missed = 0.5 * _usual_change(sweeps)
-        velocity = solved_twist(*matches, one.posed.twist, expected, missed, noise)
+        velocity = solved_twist(
+            *matches, one.posed.twist, expected, missed, noise, heed_contradiction=True
+        )
         told[number] = replace(one, velocity=velocity)
         return told
     first, second = sweeps
     mean, now = mean_twist(first, second), second.posed.twist - first.posed.twist
     usual = np.repeat([solver.turn_sigma, solver.acceleration_sigma], 3)
     missed = first.moment.seconds_to(second.moment.stamp) * usual
-    change = solved_twist(*matches, now, np.zeros(6), missed, noise)
+    change = solved_twist(*matches, now, np.zeros(6), missed, noise, heed_contradiction=True)
     return [
         replace(first, velocity=mean - 0.5 * change),
         replace(second, velocity=mean + 0.5 * change),

@@ -203,6 +203,7 @@ class Start:
         if gyro is not None:
             added, *self._rivals = (turned_anew(way, gyro) for way in (added, *self._rivals))
         early, rivals = EarlyMap(frame, solver, self._map_T_first), self._rivals
+        refutable = self._refutable
         once = number in (_IN_DOUBT if rivals else _ONCE)
         sweeps = early.together(added, 1 if once else 2)
         sweeps = early.with_motion(self._told_apart(early, sweeps))
@@ -211,6 +212,7 @@ class Start:
         if not solution.solved:
             early.fill(self._sweeps)
             self._sweeps, self._rivals, self._anew = added, rivals, True
+            self._refutable = refutable
             return frame, found
         last, posed = sweeps[-2].moment, sweeps[-1].posed
         sweeps[-1] = replace(sweeps[-1], map_T_middle=solution.map_T_lidar)

@@ -141,8 +141,13 @@ class TightCoupling:
         variances = np.diag(self._odometry.state.covariance)[GRAVITY]
         return bool(variances.sum() > _UNFELT**2)
 
-    def up(self, level: Level) -> FloatArray:
-        """(3,) unit vector, map frame: as estimated, or by the ``level`` until it is."""
+    def up(self, level: Level | None) -> FloatArray | None:
+        """(3,) unit vector, map frame: as estimated, or by the ``level`` until it is.
+
+        None without a level, and while gyro and accelerometer are not trusted.
+        """
+        if level is None or not self.trusted:
+            return None
         if self._odometry is None:
             return level.map_up
         gravity = self._odometry.state.map_gravity

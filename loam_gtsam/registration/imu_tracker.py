@@ -117,13 +117,8 @@ class ImuTracker:
 
     @property
     def map_up(self) -> FloatArray | None:
-        """(3,) unit vector, map frame: as estimated, else as found at first.
-
-        None if it was not found, and while the IMU is not trusted.
-        """
-        if self.level is None or not (self.gyro.holds and self._coupling.trusted):
-            return None
-        return self._coupling.up(self.level)
+        """(3,) unit vector, map frame; None if it was not found, or the IMU is not trusted."""
+        return self._coupling.up(self.level if self.gyro.holds else None)
 
     @property
     def problems(self) -> tuple[str, ...]:

@@ -109,10 +109,10 @@ def test_what_is_merged_is_where_the_fixes_of_both_have_it(
 
 
 def test_of_two_maps_one_may_have_fixes(surveyed: Surveyed, tmp_path: Path) -> None:
-    without = surveyed.without_fixes()
-    done = merge_maps([without, surveyed.map("first")], tmp_path / "both.lgmap")
+    without = surveyed.without_fixes("first")
+    done = merge_maps([without, surveyed.map("second")], tmp_path / "both.lgmap")
     assert np.linalg.norm(surveyed.off(done.places(1), done.earth), axis=1).mean() < 0.05
-    neither = [without, surveyed.without_fixes("first")]
+    neither = [without, surveyed.without_fixes()]
     assert merge_maps(neither, tmp_path / "neither.lgmap").earth is None
 
 

@@ -53,7 +53,7 @@ def with_velocity(
     the same things at the same part of its sweep: of two sweeps both get theirs.
     """
     told, one, solver = list(sweeps), sweeps[number], config.solver
-    if not _tells(sweeps[:2] if len(sweeps) == 2 else [one], solution, config):
+    if not _tells(sweeps if len(sweeps) == 2 else [one], solution, config):
         return told
     rows, seconds = timed_rows(solution.matches, one.posed.sweep, solver)
     matches = rows, solution.matches.tilts, seconds, solution.map_T_lidar

@@ -135,8 +135,8 @@ class MovingSweep:
         sweep._turned = next(turned), next(turned)
         return sweep
 
-    def accelerated(self, acceleration: FloatArray) -> MovingSweep:
-        """The sweep of a lidar with a (6,) body acceleration, rad/s^2 and m/s^2.
+    def accelerated(self, acceleration: FloatArray | None) -> MovingSweep:
+        """The sweep of a lidar with a (6,) body acceleration, rad/s^2 and m/s^2, or with none.
 
         Nothing changes if a gyro knows the rotation, or without de-skewing.
         """

@@ -223,7 +223,8 @@ class Start:
         frame = replace(
             frame, matcher=replace(frame.matcher, posed=posed, last=last, inertial=None)
         )
-        return frame, replace(found, solution=solution, posed=sweeps[-1].posed)
+        posed = frame.posed_for(solution) if sweeps[0].velocity is None else sweeps[-1].posed
+        return frame, replace(found, solution=solution, posed=posed)
 
     def _told_apart(self, early: EarlyMap, sweeps: list[EarlySweep]) -> list[EarlySweep]:
         """The sweeps on the way that explains them best, of all that may be the true one."""

@@ -31,8 +31,8 @@ def on_paths(sweeps: Sequence[EarlySweep], map_T_first: gtsam.Pose3) -> list[Ear
         sweep = now.posed.sweep
         if sweep.stamp > last.stamp:  # not for sweeps of unlike length
             twist = sweep.twist_since(last[:2], now.map_T_middle)
-            moved[number] = replace(now, posed=sweep.accelerated(np.zeros(6)).at(twist))
-    sweep = moved[0].posed.sweep.accelerated(np.zeros(6))
+            moved[number] = replace(now, posed=sweep.accelerated(None).at(twist))
+    sweep = moved[0].posed.sweep.accelerated(None)
     moved[0] = replace(moved[0], posed=sweep.at(_first_twist(*moved[:2])))
     bent = moved[0].velocity is not None
     if bent:

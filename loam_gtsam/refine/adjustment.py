@@ -28,7 +28,14 @@ from loam_gtsam.refine.rounds import (
     equations,
     factorised,
 )
-from loam_gtsam.refine.sweeps import Path, ReferenceSteps, Stack, SweepPoints, stacked
+from loam_gtsam.refine.sweeps import (
+    Path,
+    ReferenceSteps,
+    Stack,
+    SweepPoints,
+    reference_seconds,
+    stacked,
+)
 from loam_gtsam.refine.ties import FixTies
 from loam_gtsam.refine.windows import in_windows
 from loam_gtsam.types import FloatArray, InputError, Trajectory
@@ -159,7 +166,7 @@ def refine(
     fixes: FixTies | None = None,
     ties: Sequence[Ties] = (),
     starts: Sequence[int] = (0,),
-    steps: tuple[Sequence[gtsam.Pose3], FloatArray] | None = None,
+    steps: ReferenceSteps | None = None,
     on_round: Callable[[Round], None] | None = None,
     on_window: Callable[[int, int], None] | None = None,
 ) -> Refined:
@@ -180,9 +187,8 @@ def refine(
     fixes : of a GNSS receiver, on the poses
     ties : what else is known of them, with other variables
     starts : numbers of the first sweeps of the runs, if there are several
-    steps : N poses at the reference times of the sweeps, seen from their middles, as an IMU or the
-        points told them, and (N, 6) their variances, not finite where nothing did; if None, the
-        path through the poses tells
+    steps : from the middles to the reference times, as an IMU or the points told them; if None, the
+        path through the adjusted poses tells
     on_round : called after each round of the whole, to show progress
     on_window : called after each window of a long drive with the number of those done, and of all
 
@@ -197,7 +203,7 @@ def refine(
     if len(sweeps) < 3:
         raise InputError(f"refine: expected 3 or more sweeps, got {len(sweeps)}")
     known: tuple[Ties, ...] = (*ties, *(() if fixes is None else (fixes,)))
-    others, begun = OtherFactors(factors, poses, known=known), poses
+    others = OtherFactors(factors, poses, known=known)
     stamps = np.array([sweep.stamp for sweep in sweeps], np.int64)
     asked = np.tile(np.eye(6), (len(sweeps), 1, 1))
     if keep is not None:
@@ -220,9 +226,6 @@ def refine(
     information, _ = equations(poses, found.landmarks, found.seen, found.clear, others)
     factorised(information)
     path = Path.through(stamps, poses, starts)
-    reference = np.array([sweep.reference for sweep in sweeps])
-    moved = ReferenceSteps.along(path, reference)
-    if steps is not None:
-        moved = ReferenceSteps.told(Path.through(stamps, begun, starts), reference, *steps)
-    parts = found.landmarks, found.seen, information, moved, found.rounds, fixes
+    steps = steps or ReferenceSteps.along(path, reference_seconds(sweeps))
+    parts = found.landmarks, found.seen, information, steps, found.rounds, fixes
     return Refined(path, tuple(sweeps), *parts)

@@ -23,7 +23,13 @@ from loam_gtsam.refine.motion_factors import (
     told_directions,
 )
 from loam_gtsam.refine.rounds import Round, Settings
-from loam_gtsam.refine.sweeps import Path, SweepPoints, extract_points
+from loam_gtsam.refine.sweeps import (
+    Path,
+    ReferenceSteps,
+    SweepPoints,
+    extract_points,
+    reference_seconds,
+)
 from loam_gtsam.refine.ties import FactorTies, FixTies, Survey, own_ties
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import (
@@ -383,17 +389,20 @@ def _first_to_middle(
     return step
 
 
-def _to_references(runs: Sequence[_Run]) -> tuple[list[gtsam.Pose3], FloatArray]:
-    """Poses at the reference times, seen from the middles of the sweeps, and variances (N, 6).
-
-    The own error of a frame has the error of this step in it, which so is told to be larger.
-    """
+def _to_references(
+    runs: Sequence[_Run], sweeps: Sequence[SweepPoints], before: Path
+) -> ReferenceSteps:
+    """The motion from the middles to the reference times, by the path and as the runs had it."""
     steps = [step.inverse() for run in runs for step in run.to_middle]
-    return steps, np.concatenate([_step_variances(run.updates) for run in runs])
+    variances = np.concatenate([_step_variances(run.updates) for run in runs])
+    return ReferenceSteps.told(before, reference_seconds(sweeps), steps, variances)
 
 
 def _step_variances(updates: Sequence[MapUpdate]) -> FloatArray:
-    """(N, 6), infinite where nothing is known; of the first sweep a gyro tells the rotation."""
+    """(N, 6), infinite where nothing is known; of the first sweep a gyro tells the rotation.
+
+    The own error of a frame has the error of this step in it, which so is told to be larger.
+    """
     found = np.full((len(updates), 6), np.inf)
     for place, update in enumerate(updates):
         if update.uncertainty is not None:
@@ -458,7 +467,7 @@ def _adjusted(
     found = refine(
         sweeps, before.map_T_middle, every, settings,
         keep=asked, for_covariances=told, fixes=fixes, ties=ties, starts=starts,
-        steps=_to_references(runs), on_round=on_round, on_window=on_window,
+        steps=_to_references(runs, sweeps, before), on_round=on_round, on_window=on_window,
     )  # fmt: skip
     refined = []
     for start, run, whole in zip(starts, runs, wholes, strict=True):

@@ -84,6 +84,11 @@ class SweepPoints:
         return replace(self, points=self.points[rows], seconds=self.seconds[rows], edges=edges)
 
 
+def reference_seconds(sweeps: Sequence[SweepPoints]) -> FloatArray:
+    """(N,) seconds from the middles of sweeps to their reference times."""
+    return np.array([sweep.reference for sweep in sweeps])
+
+
 def sweep_points(features: Features, config: Config, most: int = 3000) -> SweepPoints:
     """Edges near the lidar, and at most ``most`` plane points, evenly spread over the sweep."""
     first, end = features.span

@@ -148,11 +148,13 @@ class LoopSelection:
         Either the others were wrong, or the odometry is worse than its covariance says. Only many
         are believed against it.
         """
-        for other in sorted(on - most):
+        wrong = sorted(on - most)
+        for other in wrong:
             self._graph.switch(other, False)
-        many = len(most) >= self.config.believed_loops
-        believed = many or self.chi_squared(number) <= self.config.max_chi2
-        for other in sorted(most - on if believed else on - most):
+        believed = len(most) >= self.config.believed_loops
+        if wrong and not believed:  # without wrong ones it is as it was: too far away
+            believed = self.chi_squared(number) <= self.config.max_chi2
+        for other in sorted(most - on) if believed else wrong:
             self._graph.switch(other, True)
 
     def forget(self, count: int) -> None:

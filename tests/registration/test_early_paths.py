@@ -27,7 +27,7 @@ def _path(seconds):
     return FIRST.compose(gtsam.Pose3.Expmap(VELOCITY * seconds + 0.5 * ACCELERATION * seconds**2))
 
 
-def _sweep(number, at, velocity=None):
+def _sweep(number, at):
     """A sweep of 0.1 s from its reference time on, with a point in each tenth of it."""
     times = np.linspace(0.0, 0.1, 11)
     points = np.column_stack([np.full((11, 2), 5.0), times])
@@ -36,15 +36,15 @@ def _sweep(number, at, velocity=None):
         np.zeros(0, int), np.zeros(11, int), np.zeros(0, int), np.zeros(0, int), (0.0, 0.1),
     )  # fmt: skip
     posed = MovingSweep(features, CONFIG).at(np.zeros(6))
-    return EarlySweep(posed, at, None, number, velocity=velocity)
+    return EarlySweep(posed, at, None, number)
 
 
 @pytest.mark.parametrize("count", [3, 5])
 def test_the_path_is_the_parabola_through_the_poses(count):
     told = _path(0.0).localCoordinates(_path(1e-6)) / 1e-6
-    sweeps = [_sweep(n, _path(0.05 + 0.1 * n), VELOCITY if n == 0 else None) for n in range(count)]
-    sweeps[0] = sweeps[0].put(_path(0.02))  # where it would be at another velocity
-    sweeps[0] = replace(sweeps[0], velocity=VELOCITY + 0.05 * ACCELERATION)
+    first = _sweep(0, _path(0.02))  # where it would be at another velocity
+    first = replace(first, velocity=VELOCITY + 0.05 * ACCELERATION)
+    sweeps = [first, *(_sweep(n, _path(0.05 + 0.1 * n)) for n in range(1, count))]
     moved = on_paths(sweeps, FIRST)
     assert np.allclose(told, VELOCITY, atol=1e-4)
     for number, one in enumerate(moved):

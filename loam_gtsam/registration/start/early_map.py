@@ -87,7 +87,7 @@ class EarlyMap:
 
         All at constant velocity: ways are compared that were adjusted more and less.
         """
-        steady = [one.put(one.map_T_middle) for one in sweeps]
+        steady = [one.untold for one in sweeps]
         return tuple(
             self.registered(self.with_motion(steady[:count])) for count in range(2, len(steady) + 1)
         )
@@ -104,7 +104,7 @@ class EarlyMap:
     def tried(self, first: EarlySweep, later: EarlySweep) -> Tried:
         """A later sweep, registered with the first by few matches."""
         moved = first.map_T_middle.between(later.map_T_middle)
-        first, later = self.with_motion([one.put(one.map_T_middle) for one in (first, later)])
+        first, later = self.with_motion([first.untold, later.untold])
         later = replace(later, map_T_middle=first.map_T_middle.compose(moved))
         return self.registered([first, later], quickly=True)
 

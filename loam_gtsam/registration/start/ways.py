@@ -50,8 +50,13 @@ class EarlySweep:
     turned: MotionPrior | None = None
     velocity: FloatArray | None = None
 
+    @property
+    def untold(self) -> EarlySweep:
+        """The sweep where it is, as if its matches told no velocity."""
+        return replace(self, velocity=None)
+
     def put(self, map_T_middle: gtsam.Pose3) -> EarlySweep:
-        """The sweep at a pose of which nothing is known, nor of the velocity there."""
+        """The sweep at another pose, where its matches have told no velocity."""
         return replace(self, map_T_middle=map_T_middle, velocity=None)
 
     @property
@@ -109,7 +114,7 @@ def by_second_step(sweeps: Sequence[EarlySweep]) -> list[list[EarlySweep]]:
     first, second, third = sweeps
     seconds = first.moment.seconds_to(second.moment.stamp)
     place = advance(first.map_T_middle, mean_twist(second, third), seconds)
-    led = [first.put(first.map_T_middle), second.put(place)]
+    led = [first.untold, second.put(place)]
     return [] if same(place, second.map_T_middle) else [led]
 
 

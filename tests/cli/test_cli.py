@@ -434,7 +434,7 @@ def test_run_says_what_was_made_of_the_imu():
 
 def test_run_says_that_the_imu_is_mounted_otherwise():
     turned = ["--set", "imu.lidar_R_imu_deg=[180.0, 0.0, 0.0]"]
-    text = said("run", "sim:shaken?columns=300", "--frames", 40, "--no-plot", *QUICK_START, *turned)
+    text = said("run", "sim:shaken?columns=300", "--frames", 30, "--no-plot", *QUICK_START, *turned)
     assert "its gyro turned unlike the scans and was given up" in text
     assert re.search(r"fit those of the scans better by (179|180) degrees", text)
 
@@ -468,7 +468,7 @@ def test_inspect_takes_the_rate_of_the_recording(monkeypatch):
     monkeypatch.setattr(
         report, "where_it_turns", lambda *a: asked.append(a[2:]) or where_it_turns(*a)
     )
-    text = said("inspect", "sim:shaken?columns=300&frames=30", "--every", 2)
+    text = said("inspect", "sim:shaken?columns=300&frames=30", "--every", 2, *QUICK_START)
     assert asked == [(pytest.approx(10.0), pytest.approx(3.0))]
     assert "15 sweeps mapped, from 0 s on" in text
 
@@ -620,14 +620,15 @@ def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
 
 def test_odometry_back_to_places_visited_before_is_no_loop_for_refine() -> None:
     often = "pose_graph.keyframe_distance=1", "pose_graph.visits=1"
-    spec = "sim:room?frames=300&columns=200&speed=3", "--every", "5"
-    settings = [word for setting in often for word in ("--set", setting)]
+    spec = "sim:room?frames=160&columns=200&speed=3", "--every", "5"
+    settings = [*QUICK_START, *(word for setting in often for word in ("--set", setting))]
     assert loam("run", *spec, "--output", "out", "--no-plot", "-q", *settings).exit_code == 0
     with SavedMap("out/map.lgmap") as saved:
         assert any(abs(link.later - link.earlier) > 1 for link in saved.graph.links)
-    assert loam("refine", *spec, "out", "--rounds", "1", "--no-plot", "-q").exit_code == 0
+    few = "--rounds", "1", "--points", "500"
+    assert loam("refine", *spec, "out", *few, "--no-plot", "-q").exit_code == 0
     updates, config = read_updates("out"), load_config("out/config.yaml")
-    points = run_points(PartOf(open_dataset(spec[0]), 0, 5), updates, config)
+    points = run_points(PartOf(open_dataset(spec[0]), 0, 5), updates, config, most=500)
     alone = refine_run(points, updates, settings=Settings(rounds=1)).trajectory
     refined = read_truth("out/refined/trajectory.tum")
     np.testing.assert_allclose(refined.map_T_lidar, alone.map_T_lidar, atol=1e-8)

@@ -27,7 +27,7 @@ def test_the_rings_of_one_sweep_on_open_ground_are_enough_with_a_wide_search(wid
 
 
 def test_a_way_between_poles_on_rough_ground_holds():
-    world = SimulatedWorld("sparse_terrain", frames=60, columns=900)
+    world = SimulatedWorld("sparse_terrain", frames=40, columns=900)
     result = run(world, alone())
     error = absolute_error(result.trajectory, world.truth)
     assert error.rmse < 0.03
@@ -56,7 +56,7 @@ def things_far_apart():
     ("speed", "width", "held"), [(8, 2.0, True), (20, 2.0, True), (8, 0, False)]
 )
 def test_things_that_stand_alone_far_away_hold_a_drive_that_starts_at_speed(speed, width, held):
-    given = {"columns": 360, "max_range": 60.0, "start": "moving", "frames": 30}
+    given = {"columns": 360, "max_range": 60.0, "start": "moving", "frames": 20}
     world = SimulatedWorld(things_far_apart(), speed=speed, **given)
     result = run(world, alone().changed({"features.post_width": float(width)}))
     found, true = result.trajectory.map_T_lidar, world.truth.map_T_lidar

@@ -67,7 +67,7 @@ def test_only_the_sweeps_asked_for_are_read(sweeps):
                 read.append(number)
                 yield sweep
 
-    assert len(run(Watched(sweeps), max_frames=2, workers=1).updates) == 2
+    assert len(run(Watched(sweeps), QUICK, max_frames=2, workers=1).updates) == 2
     assert read == [0, 1]
 
 
@@ -174,7 +174,7 @@ def test_without_processes_nothing_is_read_ahead(sweeps):
 )
 def test_processes_hand_over_every_bit_of_the_features(sweeps, changes):
     config = Config().changed(*changes)
-    for sweep, _, found in extract_ahead(numbered(sweeps[:3]), config, 2):
+    for sweep, _, found in extract_ahead(numbered(sweeps[:3]), config, 1):
         here = extract(sweep, config).features
         for name in Features.__slots__:
             one, other = getattr(here, name), getattr(found.features, name)

@@ -141,7 +141,7 @@ def test_an_own_solver_is_given_again(tmp_path):
 def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):
     dataset = open_dataset("sim:room?frames=5&columns=300")
     checkpoint = Checkpoint(tmp_path / "checkpoint", seconds=0.0)
-    assert_same(run(dataset, checkpoint=checkpoint), run(dataset))
+    assert_same(run(dataset, PREDICTED, checkpoint=checkpoint), run(dataset, PREDICTED))
     names = sorted(path.name for path in checkpoint.folder.iterdir())
     frames = [f"frames_{n:07d}_{n + 1:07d}.npz" for n in range(5)]
     assert names == [*frames, "state_0000005.npz"]
@@ -302,16 +302,16 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
         return []
 
     checkpoint = Checkpoint(tmp_path, seconds=0.0)
-    assert run(dataset, extra_factors=interrupting, checkpoint=checkpoint).interrupted
+    assert run(dataset, PREDICTED, extra_factors=interrupting, checkpoint=checkpoint).interrupted
     again = Checkpoint(tmp_path, resume=True)
-    result = run(dataset, extra_factors=interrupting, checkpoint=again)
-    assert_same(result, run(dataset, extra_factors=lambda context: []))
+    result = run(dataset, PREDICTED, extra_factors=interrupting, checkpoint=again)
+    assert_same(result, run(dataset, PREDICTED, extra_factors=lambda context: []))
 
 
 # -- from the command line ----------------------------------------------------------------------
 
 QUICK_START = ("--set", "deskew.model=predicted")
-RUN = ("run", "sim:room?frames=40&columns=240", "--no-plot", *QUICK_START, "--output")
+RUN = ("run", "sim:room?frames=24&columns=240", "--no-plot", *QUICK_START, "--output")
 
 
 def arrays(folder):
@@ -323,7 +323,7 @@ def test_killed_again_and_again_a_run_comes_to_the_same_end(tmp_path):
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     assert loam(*RUN, whole).exit_code == 0
     again = [*RUN, killed, "--resume", "--checkpoint", "0.05"]
-    for wanted in (8, 20):
+    for wanted in (6, 14):
         command = [sys.executable, "-m", "loam_gtsam.cli", *again]
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         while process.poll() is None and not reached(killed, wanted):

@@ -257,7 +257,7 @@ def ring(laps, radius=35.0, step=2.0):
 def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     """Once round a ring, of which 20 m are in view, and on."""
     config = settings(turn_walk_deg=0.2)
-    config = config.changed("loops.min_way=60.0", "loops.min_share=0.4")
+    config = config.changed("loops.min_way=60.0", "loops.min_share=0.4", "deskew.model=predicted")
     poses, world = ring(1.15, radius=28.0, step=STEP), World(1)
 
     def rounds(closing):

@@ -123,7 +123,7 @@ def test_long_drives_leave_cubes_behind_and_keep_them(
     kept: list[GrowthResult] = []
     measure = growth.measure
     here.setattr(growth, "measure", lambda drive: kept.append(measure(drive)) or kept[-1])
-    here.setattr(growth, "QUICK", growth.QUICK[1:])
+    here.setattr(growth, "QUICK", (replace(growth.QUICK[1], frames=36),))
     assert growth.main(["--quick", "--output", str(tmp_path)]) == 0
     (avenue,) = kept
     assert (avenue.evicted > 20, avenue.dropped) == (True, 0)
@@ -218,10 +218,11 @@ def test_disturbed_runs_fill_the_page(tmp_path: Path, here: pytest.MonkeyPatch) 
         assert len(list(case.dataset)) == len(case.dataset) <= 24
 
 
-@pytest.mark.usefixtures("here")
 def test_drives_are_looked_through_for_loops(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, here: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    until = loops._until
+    here.setattr(loops, "_until", lambda world, metres: until(world, 0.5 * metres))
     assert loops.main(["--quick", "--output", str(tmp_path)]) == 0
     assert "| drift | drives | recall |" in capsys.readouterr().out
     assert table(tmp_path / "loops.csv")[0]["wrong"] == "0"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -37,7 +38,7 @@ def errors(world, updates):
     return np.array([u.map_T_lidar.range(t) for u, t in zip(updates, truth, strict=False)])
 
 
-@pytest.mark.parametrize("speed", [5.0, 20.0, 36.0])
+@pytest.mark.parametrize("speed", [5.0, 36.0])
 def test_a_run_may_start_at_any_speed(speed):
     world, features = features_of("avenue", 9, speed=speed, start="moving")
     mapper = Mapper(CONFIG)
@@ -112,16 +113,17 @@ def features_ahead():
 
 @pytest.fixture(scope="module")
 def ahead_only(features_ahead):
-    """Its updates, and the rivals after each: several first motions fit two sweeps."""
-    (world, features), mapper, states = features_ahead, Mapper(CONFIG), []
+    """Its updates, the rivals after each, and the mapper then: several motions fit two sweeps."""
+    (world, features), mapper, states, mappers = features_ahead, Mapper(CONFIG), [], []
     for one in features:
         update = mapper.register(one)
         states.append((update, mapper._start and len(mapper._start._rivals)))
-    return world, states
+        mappers.append(deepcopy(mapper))
+    return world, states, mappers
 
 
 def test_first_motions_that_fit_as_well_are_told(ahead_only):
-    world, states = ahead_only
+    world, states, _ = ahead_only
     (first, _), (second, rivals), *_ = states
     step = first.map_T_lidar.between(second.map_T_lidar)
     error = step.localCoordinates(gtsam.Pose3(world.truth.map_T_lidar[1]))
@@ -131,7 +133,7 @@ def test_first_motions_that_fit_as_well_are_told(ahead_only):
 
 
 def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_only):
-    world, states = ahead_only
+    world, states, _ = ahead_only
     updates = [update for update, _ in states]
     assert errors(world, updates)[-1] < 0.1
     assert states[4][1] < states[1][1]
@@ -140,13 +142,11 @@ def test_first_motions_that_fit_as_well_fall_with_the_sweeps_that_follow(ahead_o
 
 @pytest.mark.parametrize(("number", "refutable"), [(1, False), (2, False), (7, False), (7, True)])
 def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
-    features_ahead, monkeypatch, number, refutable
+    features_ahead, ahead_only, monkeypatch, number, refutable
 ):
     """The second, the third and the last of those that are registered together."""
-    mapper, made, solved = Mapper(CONFIG), [], early_map.EarlyMap.solved
     _, features = features_ahead
-    for one in features[:number]:
-        mapper.register(one)
+    mapper, made, solved = deepcopy(ahead_only[2][number - 1]), [], early_map.EarlyMap.solved
     fill = early_map.EarlyMap.fill
     mapper._start._refutable = refutable
 
@@ -792,7 +792,7 @@ def test_two_sweeps_or_a_first_that_does_not_see_all_are_registered_one_by_one(p
 def test_the_height_over_rolling_ground_is_as_good_as_told_from_the_start():
     """With 20 sweeps a second from rest it was 10 mm off among trees, told 2 (NEES/6 over 8)."""
     squared = []
-    for noise in (1, 101, 201, 301):
+    for noise in (1, 101):
         world = SimulatedWorld("trees", seed=1, frames=9, columns=720, rate=20.0)
         world._seed = noise
         updates = run(world, Config()).updates

@@ -252,7 +252,7 @@ def near_the_start(_: Any) -> list[gtsam.NonlinearFactor]:
     return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise)]
 
 
-AT_THE_END = DeskewConfig(rotation="orientation", reference="end")
+AT_THE_END = DeskewConfig(model="predicted", rotation="orientation", reference="end")
 PARTS: dict[str, tuple[Config, Any]] = {
     "loops": (
         Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9), deskew=DESKEW),

@@ -47,11 +47,12 @@ def test_the_id_depends_on_what_decides_the_result_and_on_no_name():
 
 def test_a_row_has_the_numbers_of_the_run():
     drive = "sim:room?frames=14&columns=300&speed=5&start=moving"
-    row = run_trial(trial_of(drive, seed=2, options={"dropout": 0.1}))
+    config = Config().changed("deskew.model=predicted")
+    row = run_trial(trial_of(drive, seed=2, options={"dropout": 0.1}, config=config))
     assert list(row) == list(COLUMNS)
     options = {"speed": 5, "start": "moving", "seed": 2, "dropout": 0.1}
     world = SimulatedWorld("room", frames=14, columns=300, **options)
-    result = run(world)
+    result = run(world, config)
     truth, found = world.truth, result.trajectory
     absolute, relative = absolute_error(found, truth), relative_error(found, truth)
     assert row["error"] is row["problem"] is row["peer"] is None

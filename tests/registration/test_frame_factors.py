@@ -27,6 +27,8 @@ SIGMAS = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
 NOT_A_NUMBER = gtsam.noiseModel.Isotropic.Sigma(6, np.nan)
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
 CONTEXT = PoseContext(POSE_KEY, 0, LAST, (0, LAST))
+QUICK = Config().changed("deskew.model=predicted")
+"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def between(noise=NOISE, *, turned=False):
@@ -131,7 +133,7 @@ def test_wheels_hold_the_pose_along_a_hall_without_ends():
 
     found = []
     for extra in (None, wheels):
-        mapper = Mapper(extra_factors=extra)
+        mapper = Mapper(QUICK, extra_factors=extra)
         for number in range(6):
             pose = gtsam.Pose3(gtsam.Rot3(), np.array([0.3 * number, 0.0, 0.0]))
             features = hall_features(pose, number * 10**8, rng)
@@ -168,7 +170,7 @@ def test_a_sweep_that_is_lost_by_factors_says_so():
         jump = 10.0 * bool(wrong[0] < context.middle_stamp < wrong[-1] + 10**8)
         return [gtsam.GPSFactor(context.key, where + jump, noise)]
 
-    config = Config().changed("imu.level=false")
+    config = QUICK.changed("imu.level=false")
     result = run(world, config, extra_factors=receiver)
     updates = result.updates
     lost = [update.status is FrameStatus.LOST for update in updates]
@@ -211,7 +213,7 @@ def test_the_solvers_of_the_documentation_keep_degenerate_frames_degenerate():
     exec(re.findall(r"^```python\n(.*?)^```", page, re.M | re.S)[-1], names)
     for kind in (names["Loud"], names["GaussNewton"]):
         rng = np.random.default_rng(1)
-        mapper = Mapper(solver=kind(Config().solver))
+        mapper = Mapper(QUICK, solver=kind(QUICK.solver))
         for number in range(3):
             update = mapper.register(hall_features(gtsam.Pose3(), number * 10**8, rng))
         assert update.status is FrameStatus.DEGENERATE

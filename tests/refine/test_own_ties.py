@@ -49,8 +49,8 @@ class Driven:
 def driven(tmp_path_factory) -> Driven:
     """A drive through rooms, of which a user says that its end is higher."""
     world = SimulatedWorld("rooms", frames=30, columns=300, speed=3.0, seed=1)
-    config = Config().changed("pose_graph.keyframe_distance=0.5", "loops.enabled=true")
-    result = run(world, config)
+    changes = "pose_graph.keyframe_distance=0.5", "loops.enabled=true", "deskew.model=predicted"
+    result = run(world, config := Config().changed(*changes))
     assert result.pipeline is not None
     assert result.pipeline.loops is not None
     graph = result.pipeline.loops.graph

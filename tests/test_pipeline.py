@@ -41,7 +41,7 @@ QUICK = Config().changed("deskew.model=predicted")
 
 @pytest.mark.parametrize(
     ("scene", "frames", "limit"),
-    [("room", 14, 0.01), ("street_loop", 28, 0.02), ("corridor", 28, 0.03), ("trees", 18, 0.05)],
+    [("room", 20, 0.01), ("street_loop", 28, 0.02), ("corridor", 40, 0.03), ("trees", 24, 0.05)],
 )
 def test_scene_is_mapped_to_centimetres(scene, frames, limit):
     world = SimulatedWorld(scene, frames=frames, columns=600)

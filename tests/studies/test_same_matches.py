@@ -19,7 +19,6 @@ from loam_gtsam.studies.same_matches import (
 )
 from loam_gtsam.types import FrameStatus, InputError
 
-
 QUICK = Config().changed("deskew.model=predicted")
 """The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 

@@ -33,7 +33,6 @@ from loam_gtsam.refine.sweeps import (
     ReferenceSteps,
     Stack,
     SweepPoints,
-    reference_seconds,
     stacked,
 )
 from loam_gtsam.refine.ties import FixTies
@@ -226,6 +225,6 @@ def refine(
     information, _ = equations(poses, found.landmarks, found.seen, found.clear, others)
     factorised(information)
     path = Path.through(stamps, poses, starts)
-    steps = steps or ReferenceSteps.along(path, reference_seconds(sweeps))
+    steps = steps or ReferenceSteps.along(path, sweeps)
     parts = found.landmarks, found.seen, information, steps, found.rounds, fixes
     return Refined(path, tuple(sweeps), *parts)

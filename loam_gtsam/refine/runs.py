@@ -28,7 +28,6 @@ from loam_gtsam.refine.sweeps import (
     ReferenceSteps,
     SweepPoints,
     extract_points,
-    reference_seconds,
 )
 from loam_gtsam.refine.ties import FactorTies, FixTies, Survey, own_ties
 from loam_gtsam.registration.uncertainty import relative_covariance
@@ -395,7 +394,7 @@ def _to_references(
     """The motion from the middles to the reference times, by the path and as the runs had it."""
     steps = [step.inverse() for run in runs for step in run.to_middle]
     variances = np.concatenate([_step_variances(run.updates) for run in runs])
-    return ReferenceSteps.told(before, reference_seconds(sweeps), steps, variances)
+    return ReferenceSteps.told(before, sweeps, steps, variances)
 
 
 def _step_variances(updates: Sequence[MapUpdate]) -> FloatArray:

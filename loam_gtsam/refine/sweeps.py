@@ -34,9 +34,8 @@ _NEAR_EDGES = 20.0
 or two, and the guess of its width puts its axis some millimetres too near, for every post."""
 _NEAR = 10
 """Sweeps before and after one over which errors of the path are averaged."""
-_MISSED, _AT_END = 0.3, 5.0
-"""Error of the path over what a polynomial of degree two misses of it: within a stretch of sweeps
-(one of degree four remains), and at its ends, where it goes beyond the poses."""
+_WITHIN: FloatArray = np.linspace(-1.0, 1.0, 9)
+"""Times of points, over half of a sweep, at which is looked what the path misses."""
 _CHANCE = 1.0 + np.sqrt(2.0 / (2.0 * _NEAR + 1.0))
 """Times a variance that the mean square of so many errors reaches, a standard deviation above."""
 _GAP = 2.5
@@ -84,11 +83,6 @@ class SweepPoints:
         return replace(self, points=self.points[rows], seconds=self.seconds[rows], edges=edges)
 
 
-def reference_seconds(sweeps: Sequence[SweepPoints]) -> FloatArray:
-    """(N,) seconds from the middles of sweeps to their reference times."""
-    return np.array([sweep.reference for sweep in sweeps])
-
-
 def sweep_points(features: Features, config: Config, most: int = 3000) -> SweepPoints:
     """Edges near the lidar, and at most ``most`` plane points, evenly spread over the sweep."""
     first, end = features.span
@@ -129,6 +123,62 @@ def extract_points(sweep: Sweep, config: Config, most: int = 3000) -> SweepPoint
     return sweep_points(extract_features(sweep, every), config, most)
 
 
+class Sway(NamedTuple):
+    """What is too fast for polynomials through the poses of N sweeps: a sine, by axis.
+
+    Attributes
+    ----------
+    squares : (N, 6) its mean square
+    turns : (N, 6) rad by which it goes on from one sweep to the next, at most pi
+    seconds : (N,) from one sweep to the next
+    reach : (N, 2) sweeps before and after each, as far as its polynomial goes through their poses
+    """
+
+    squares: FloatArray
+    turns: FloatArray
+    seconds: FloatArray
+    reach: IntArray
+
+    @classmethod
+    def of(cls, powers: FloatArray, reach: IntArray, seconds: float) -> Sway:
+        """The sine that has the fourth and sixth differences of the poses of a run.
+
+        Two more differences make it ``2 - 2 cos(turn)`` times as large. If sweeps are too few to
+        tell the turn, it is pi, the worst; with less than five nothing is known, and it is zero.
+        """
+        fourth = powers[:, 3] * 24.0 * seconds**4
+        sixth = np.zeros_like(fourth)
+        sixth[1:-1] = fourth[2:] - 2.0 * fourth[1:-1] + fourth[:-2]
+        whole = (reach == 2).all(axis=1)
+        amid = whole & np.roll(whole, 1) & np.roll(whole, -1)
+        amid[[0, -1]] = False
+        numbers = np.flatnonzero(whole) if whole.any() else np.zeros(1, np.int64)
+        nearest = numbers[np.abs(np.arange(len(whole))[:, None] - numbers).argmin(axis=1)]
+        fourths, sixths = (
+            _mean_near(squares, np.repeat(counted[:, None], 6, axis=1))[nearest]
+            for squares, counted in ((fourth**2, whole), (sixth**2, amid))
+        )
+        grown = np.full_like(fourths, 4.0)
+        told = (sixths > 0.0) & (fourths > 0.0)
+        grown[told] = np.minimum(np.sqrt(sixths[told] / fourths[told]), 4.0)
+        every = np.full(len(whole), seconds)
+        return cls(fourths / grown**4, np.arccos(1.0 - 0.5 * grown), every, reach)
+
+    def missed(self, seconds: FloatArray) -> FloatArray:
+        """(N, 6) mean squares of what the polynomials miss of it at times (N,) from the middles."""
+        times, missed = seconds / self.seconds, np.empty_like(self.squares)
+        for reach in np.unique(self.reach, axis=0):
+            rows = (self.reach == reach).all(axis=1)
+            nodes = np.arange(-reach[0], reach[1] + 1)
+            degrees = np.arange(len(nodes))[:, None]
+            shares = np.linalg.solve(nodes.astype(np.float64) ** degrees, times[rows] ** degrees)
+            turns = self.turns[rows]
+            led = np.einsum("kn,nak->na", shares, np.exp(1j * turns[:, :, None] * nodes))
+            true = np.exp(1j * turns * times[rows, None])
+            missed[rows] = self.squares[rows] * np.abs(true - led) ** 2
+        return missed
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Path:
     """The motion about the middles of N sweeps, from the poses around each.
@@ -138,13 +188,13 @@ class Path:
     map_T_middle : (N, 4, 4)
     powers : (N, 4, 6) coefficients of t, t^2, t^3, t^4, with t the seconds from the middle: the
         lidar is at ``map_T_middle Exp(xi(t))``, tangent order of the package
-    coarse : (N, 4, 6) the same through the two nearest neighbours alone
+    sway : what these miss
     starts : numbers of the first sweeps of the runs, which have clocks of their own
     """
 
     map_T_middle: FloatArray
     powers: FloatArray
-    coarse: FloatArray
+    sway: Sway
     starts: tuple[int, ...] = (0,)
 
     @classmethod
@@ -166,19 +216,9 @@ class Path:
         poses = as_array(map_T_middle, "map_T_middle", (len(stamps), 4, 4))
         rows = _rows(starts, len(poses))
         found = [_polynomials(stamps[some], poses[some]) for some in rows]
-        powers, coarse = (np.concatenate(parts) for parts in zip(*found, strict=True))
-        return cls(poses, powers, coarse, tuple(starts))
-
-    def errors(self, seconds: FloatArray) -> FloatArray:
-        """(N, 6) variances of the motion from the middles to times (N,) beside them.
-
-        A polynomial of degree two misses what the motion has of higher degrees, and one of degree
-        four some share of it. What the two differ by is averaged over the sweeps near by.
-        """
-        rows = _rows(self.starts, len(self.powers))
-        return np.concatenate(
-            [_missed(self.powers[some], self.coarse[some], seconds[some]) for some in rows]
-        )
+        powers = np.concatenate([part[0] for part in found])
+        sways = zip(*(part[1] for part in found), strict=True)
+        return cls(poses, powers, Sway(*map(np.concatenate, sways)), tuple(starts))
 
     def motion(self, number: int, seconds: FloatArray) -> FloatArray:
         """``xi`` (M, 6) at times (M,) from the middle of a sweep."""
@@ -207,8 +247,8 @@ def _rows(starts: Sequence[int], count: int) -> list[slice]:
     return [slice(*pair) for pair in pairwise(bounds)]
 
 
-def _polynomials(stamps: IntArray, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """``powers`` and ``coarse`` of one run."""
+def _polynomials(stamps: IntArray, poses: FloatArray) -> tuple[FloatArray, Sway]:
+    """``powers`` and ``sway`` of one run."""
     count = len(poses)
     seconds = (stamps - stamps[:1]) * 1e-9
     steps = np.diff(seconds)
@@ -217,33 +257,19 @@ def _polynomials(stamps: IntArray, poses: FloatArray) -> tuple[FloatArray, Float
     linked = steps <= _GAP * np.median(steps) if count > 1 else np.zeros(0, np.bool_)
     stretch = np.concatenate([[0], np.cumsum(~linked)])
     frames = [gtsam.Pose3(pose) for pose in poses]
-    powers, coarse = np.zeros((2, count, 4, 6))
+    powers, reach = np.zeros((count, 4, 6)), np.zeros((count, 2), np.int64)
     for k in range(count):
         near = [n for n in range(max(k - 2, 0), min(k + 3, count)) if stretch[n] == stretch[k]]
         near.remove(k)
         near = [near[n] for n in np.argsort(np.abs(np.array(near) - k), kind="stable")]
-        times = seconds[near] - seconds[k]
-        away = np.array([gtsam.Pose3.Logmap(frames[k].between(frames[n])) for n in near])
-        for found, most in ((powers, len(near) if len(near) == 4 else 2), (coarse, 2)):
-            degrees = np.arange(1, min(most, len(near)) + 1)
-            if len(degrees):
-                matrix = times[: len(degrees), None] ** degrees
-                found[k, : len(degrees)] = np.linalg.solve(matrix, away[: len(degrees)])
-    return powers, coarse
-
-
-def _missed(powers: FloatArray, coarse: FloatArray, seconds: FloatArray) -> FloatArray:
-    """Variances (N, 6) of one run, see :meth:`Path.errors`."""
-    times = seconds[:, None, None] ** np.arange(1, 5)[:, None]
-    missed = ((powers - coarse) * times).sum(axis=1) ** 2
-    whole = np.abs(powers[:, 2:]).max(axis=(1, 2)) > 0.0
-    numbers = np.flatnonzero(whole)
-    if not len(numbers):
-        return np.zeros_like(missed)
-    mean = _mean_near(missed, np.repeat(whole[:, None], 6, axis=1))
-    nearest = numbers[np.abs(np.arange(len(whole))[:, None] - numbers).argmin(axis=1)]
-    variances: FloatArray = np.where(whole[:, None], _MISSED**2, _AT_END**2) * mean[nearest]
-    return variances
+        near = near[: 4 if len(near) == 4 else 2]
+        degrees = np.arange(1, len(near) + 1)
+        if len(near):
+            away = np.array([gtsam.Pose3.Logmap(frames[k].between(frames[n])) for n in near])
+            matrix = (seconds[near] - seconds[k])[:, None] ** degrees
+            powers[k, : len(near)] = np.linalg.solve(matrix, away)
+            reach[k] = k - min(*near, k), max(*near, k) - k
+    return powers, Sway.of(powers, reach, float(np.median(steps)) if count > 1 else 1.0)
 
 
 def _mean_near(values: FloatArray, counted: BoolArray) -> FloatArray:
@@ -263,28 +289,34 @@ class ReferenceSteps(NamedTuple):
     Attributes
     ----------
     beyond : (N, 6) of the motion, from where a path leads, tangent order of the package
-    variances : (N, 6) of the motion
+    variances : (N, 6) of the poses there: what is not known of the motion, and as much for the
+        points, which were taken along the path and so misplace the middle
     """
 
     beyond: FloatArray
     variances: FloatArray
 
     @classmethod
-    def along(cls, path: Path, seconds: FloatArray) -> ReferenceSteps:
-        """By a path alone, to times (N,) from the middles."""
-        return cls(np.zeros((len(seconds), 6)), path.errors(seconds))
+    def along(cls, path: Path, sweeps: Sequence[SweepPoints]) -> ReferenceSteps:
+        """By a path alone."""
+        unknown = np.full((len(sweeps), 6), np.inf)
+        return cls.told(path, sweeps, [gtsam.Pose3()] * len(sweeps), unknown)
 
     @classmethod
     def told(
-        cls, path: Path, seconds: FloatArray, steps: Sequence[gtsam.Pose3], variances: FloatArray
-    ) -> ReferenceSteps:
+        cls, path: Path, sweeps: Sequence[SweepPoints], steps: Sequence[gtsam.Pose3],
+        variances: FloatArray,
+    ) -> ReferenceSteps:  # fmt: skip
         """By a path, and by ``steps`` as a run had them, with their ``variances`` (N, 6).
 
         An IMU feels what is too fast for a path through one pose per sweep. The steps are farther
         from the path than their own errors make them by what this misses; each has its share by
         these variances. Those of what steps do not tell are not finite.
         """
-        missed, known = path.errors(seconds), np.isfinite(variances)
+        seconds = np.array([sweep.reference for sweep in sweeps])
+        missed, known = path.sway.missed(seconds), np.isfinite(variances)
+        halves = np.array([np.abs(sweep.seconds).max(initial=0.0) for sweep in sweeps])
+        within = np.mean([path.sway.missed(part * halves) for part in _WITHIN], axis=0)
         beyond = np.zeros_like(missed)
         for n in np.flatnonzero(known.any(axis=1)).tolist():
             led = path.motion(n, seconds[n : n + 1])[0]
@@ -294,7 +326,7 @@ class ReferenceSteps(NamedTuple):
         near = [_mean_near(beyond[some] ** 2 - by_chance[some], known[some]) for some in rows]
         missed = np.maximum(missed, np.concatenate(near))
         share = missed / np.maximum(missed + variances, np.finfo(float).tiny)
-        return cls(share * beyond, (1.0 - share) * missed)
+        return cls(share * beyond, (1.0 - share) * (missed + within))
 
 
 def _moved(points: FloatArray, motions: FloatArray) -> FloatArray:

@@ -7,7 +7,7 @@ from scipy.stats import chi2
 
 from loam_gtsam import SimulatedWorld, run
 from loam_gtsam.refine.runs import refine_run, run_points
-from loam_gtsam.refine.sweeps import Path, ReferenceSteps
+from loam_gtsam.refine.sweeps import Path, ReferenceSteps, SweepPoints
 
 COUNT, PERIOD, AWAY = 60, 0.1, -0.05  # sweeps, seconds from one to the next, to the reference
 AXIS = np.array([0.3, -0.5, 0.8, 0.4, 0.2, -0.6])
@@ -19,26 +19,58 @@ def _pose(seconds, hertz):
     return bend.compose(gtsam.Pose3.Expmap(4e-3 * AXIS * np.sin(2.0 * np.pi * hertz * seconds)))
 
 
-def _errors(hertz, sigma):
-    """Of the path alone and of both together, (60, 6) each, and what the latter should be."""
-    rng = np.random.default_rng(3)
-    times = np.arange(COUNT) * PERIOD
+def _path(hertz, count=COUNT, begin=0.0):
+    """The path through the middles, the steps from these to the references, and the sweeps."""
+    times = begin + np.arange(count) * PERIOD
     middles = [_pose(t, hertz) for t in times]
     stamps = np.round(times * 1e9).astype(np.int64)
     path = Path.through(stamps, np.array([pose.matrix() for pose in middles]))
     true = [m.between(_pose(t + AWAY, hertz)) for t, m in zip(times, middles, strict=True)]
-    steps = [step.retract(sigma * rng.normal(size=6)) for step in true]
-    seconds, variances = np.full(COUNT, AWAY), np.full((COUNT, 6), sigma**2)
-    both = ReferenceSteps.told(path, seconds, steps, variances)
-    led = [gtsam.Pose3.Expmap(path.motion(n, seconds[:1])[0]) for n in range(COUNT)]
+    ends = np.array([AWAY, -AWAY])
+    sweeps = [SweepPoints(stamp, np.ones((2, 3)), ends, AWAY) for stamp in stamps.tolist()]
+    return path, true, sweeps
+
+
+def _off(path, true, beyond):
+    """(N, 6) errors of the steps along a path and beyond it."""
+    led = [path.motion(n, np.array([AWAY]))[0] for n in range(len(true))]
     moved = [
-        one.compose(gtsam.Pose3.Expmap(more)) for one, more in zip(led, both.beyond, strict=True)
+        gtsam.Pose3.Expmap(one).compose(gtsam.Pose3.Expmap(more))
+        for one, more in zip(led, beyond, strict=True)
     ]
-    off = [
-        np.array([one.localCoordinates(step) for one, step in zip(found, true, strict=True)])
-        for found in (led, moved)
-    ]
-    return *off, both.variances
+    return np.array([one.localCoordinates(step) for one, step in zip(moved, true, strict=True)])
+
+
+def _errors(hertz, sigma):
+    """Of the path alone and of both together, (60, 6) each, and what the latter should be."""
+    rng = np.random.default_rng(3)
+    path, true, sweeps = _path(hertz)
+    steps = [step.retract(sigma * rng.normal(size=6)) for step in true]
+    both = ReferenceSteps.told(path, sweeps, steps, np.full((COUNT, 6), sigma**2))
+    return (
+        _off(path, true, np.zeros((COUNT, 6))), _off(path, true, both.beyond), both.variances,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("hertz", [1.0, 2.0, 3.0, 4.0, 4.7])
+def test_what_a_path_misses_is_told_by_the_poses_alone(hertz):
+    off, told = [], []
+    for part in range(8):
+        path, true, _ = _path(hertz, begin=part / 8.0 / hertz)
+        off.append(_off(path, true, np.zeros((COUNT, 6))))
+        told.append(path.sway.missed(np.full(COUNT, AWAY)))
+    shares = (np.square(off).mean(axis=0) / np.mean(told, axis=0)).mean(axis=1)
+    # At both ends as well, where a polynomial of degree two is looked at beyond the poses.
+    assert (shares > 0.5).all()
+    assert (shares < 2.0).all()
+
+
+def test_a_path_through_few_poses_expects_the_worst_and_through_four_knows_nothing():
+    worst, _, _ = _path(4.0, 6)
+    assert (worst.sway.turns == np.pi).all()
+    assert (worst.sway.missed(np.full(6, AWAY)) > 0.0).all()
+    nothing, _, _ = _path(4.0, 4)
+    np.testing.assert_array_equal(nothing.sway.missed(np.full(4, AWAY)), np.zeros((4, 6)))
 
 
 @pytest.mark.parametrize("hertz", [4.0, 7.0, 12.0])
@@ -60,14 +92,13 @@ def test_a_smooth_motion_is_as_the_path_tells_it():
 
 
 def test_of_what_no_step_tells_the_path_does():
-    stamps = (np.arange(COUNT) * 1e8).astype(np.int64)
-    poses = np.array([_pose(t, 4.0).matrix() for t in stamps * 1e-9])
-    path, seconds = Path.through(stamps, poses), np.full(COUNT, AWAY)
-    alone = ReferenceSteps.along(path, seconds)
-    steps, nothing = [gtsam.Pose3()] * COUNT, np.full((COUNT, 6), np.inf)
-    for other in (ReferenceSteps.told(path, seconds, steps, nothing), alone):
-        np.testing.assert_array_equal(other.beyond, np.zeros((COUNT, 6)))
-        np.testing.assert_allclose(other.variances, path.errors(seconds))
+    path, _, sweeps = _path(4.0)
+    alone = ReferenceSteps.along(path, sweeps)
+    np.testing.assert_array_equal(alone.beyond, np.zeros((COUNT, 6)))
+    misses = path.sway.missed(np.full(COUNT, AWAY))
+    assert (alone.variances > misses).all()  # the middle is off as well
+    whole = [sweep.chosen(np.zeros(2, np.bool_)) for sweep in sweeps]  # no points, no motion
+    np.testing.assert_allclose(ReferenceSteps.along(path, whole).variances, misses)
 
 
 def test_a_shaken_run_with_an_imu_is_refined_as_it_was_felt():

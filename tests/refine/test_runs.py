@@ -212,8 +212,8 @@ def test_runs_on_one_clock_have_paths_of_their_own() -> None:
     alone = [Path.through(stamps, way) for way in ways]
     assert np.array_equal(both.powers, np.concatenate([one.powers for one in alone]))
     beside = np.full(24, -0.05)
-    errors = np.concatenate([one.errors(beside[:12]) for one in alone])
-    assert np.array_equal(both.errors(beside), errors)
+    missed = np.concatenate([one.sway.missed(beside[:12]) for one in alone])
+    np.testing.assert_allclose(both.sway.missed(beside), missed, rtol=1e-9, atol=1e-24)
     with pytest.raises(InputError, match="increasing nanoseconds"):
         Path.through(np.tile(stamps, 2), np.concatenate(ways))
     for starts in ((), (1, 12), (0, 12, 12), (0, 25)):

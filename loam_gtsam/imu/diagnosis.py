@@ -7,6 +7,7 @@ in time a clock (docs/maths/imu_buffer.md).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import gtsam
@@ -32,6 +33,7 @@ _WINDOWS = 8  # windows of orientation and gyro below which nothing is said
 _ALIKE = 0.8  # correlation of turns above which they are those of one body
 _SURE = 12.5  # gain in log-likelihood of a shift of five standard deviations
 _SHIFT_STEP, _SHIFT_LEAST = 0.01, 0.005  # seconds
+_SHIFTS: FloatArray = np.arange(-50.0, 51.0) * _SHIFT_STEP  # as far as LATEST
 _UNITS = np.pi / 180.0, 180.0 / np.pi  # factors between two sets of turns that have a reason
 _FORCE = 0.7, 1.4  # median specific force in multiples of gravity: no unit and no fault lies in it
 _HARDEST = 3.0  # multiples of gravity that no vehicle feels for long
@@ -120,15 +122,23 @@ def scans_problems(
     """
     if len(spans) < _PAIRS:
         return ()
-    shift, held = 0.0, _in_time(spans, by_scan, samples)
+    shift, halves, held = 0.0, None, _in_time(spans, by_scan, samples)
     if held is not None:
-        shift, by_scan, by_gyro = held
+        shift, halves, by_scan, by_gyro = held
     problem = _unlike(by_scan, by_gyro, config)
-    if not problem and shift:  # with wrong axes the scans are not what they should be
-        word = "late" if shift > 0.0 else "early"
+    if problem:  # with wrong axes the scans are not what they should be
+        pass
+    elif halves is not None:
+        first, second = map(_late, halves)
         problem = (
-            f"its clock is {1e3 * abs(shift):.0f} ms {word} against that of the sweeps: set "
-            f"imu.time_offset to {config.time_offset - shift:.3f}"
+            f"its clock jumps or drifts against that of the sweeps: {first} in one half of the "
+            f"run and {second} in the other, which no imu.time_offset puts right; check how both "
+            "are stamped"
+        )
+    elif shift:
+        problem = (
+            f"its clock is {_late(shift)} against that of the sweeps: set imu.time_offset to "
+            f"{config.time_offset - shift:.3f}"
         )
     return (f"IMU: {problem}",) if problem else ()
 
@@ -158,13 +168,21 @@ def _unlike(by_scan: FloatArray, by_gyro: FloatArray, config: ImuConfig) -> str:
     )
 
 
+def _late(shift: float) -> str:
+    """In words by how many seconds a clock is late."""
+    if abs(shift) < _SHIFT_LEAST:
+        return "in time"
+    return f"{1e3 * abs(shift):.0f} ms {'late' if shift > 0.0 else 'early'}"
+
+
 def _in_time(
     spans: IntArray, by_scan: FloatArray, samples: ImuSamples
-) -> tuple[float, FloatArray, FloatArray] | None:
+) -> tuple[float, tuple[float, float] | None, FloatArray, FloatArray] | None:
     """Seconds by which the samples are late; turns by scan and gyro with that put right.
 
     The turns are compared whatever the mounting and the unit. The shift is 0 if no other one is
-    surely better; None if too few samples are left.
+    surely better, or if one for each half of the time is: these come after it. None if too few
+    samples are left.
     """
     if not len(samples.stamps):
         return None
@@ -181,12 +199,11 @@ def _in_time(
     held = (spans[:, 0] - origin) * 1e-9 - LATEST > 0.0
     held &= (spans[:, 1] - origin) * 1e-9 + LATEST < times[-1]
     spans, by_scan = spans[held], by_scan[held]
-    shifts = _SHIFT_STEP * np.arange(-round(LATEST / _SHIFT_STEP), round(LATEST / _SHIFT_STEP) + 1)
     best = gains = None
     for _ in range(2):  # the second time without the pairs that fit nowhere
         if len(spans) < _PAIRS:
             return None
-        fits = [compare_turns(by_scan, gyro(shift)) for shift in shifts]
+        fits = [compare_turns(by_scan, gyro(shift)) for shift in _SHIFTS]
         gains = np.array([_gain(fit.likeness, 0.0, len(spans)) for fit in fits])
         best = int(gains.argmax())
         left = fits[best].residuals
@@ -194,13 +211,46 @@ def _in_time(
         spans, by_scan = spans[kept], by_scan[kept]
     assert best is not None
     assert gains is not None
-    if best in (0, len(shifts) - 1) or gains[best] - gains[len(shifts) // 2] < _SURE:
-        return 0.0, by_scan, gyro(0.0)
-    # The top of a parabola through the best shift and its neighbours.
-    before, top, after = gains[best - 1 : best + 2]
-    shift = float(shifts[best] + 0.5 * _SHIFT_STEP * (before - after) / (before - 2 * top + after))
+    halves = _halves(by_scan, [gyro(shift) for shift in _SHIFTS], best)
+    if halves is not None:
+        middle = len(spans) // 2
+        by_gyro = np.concatenate([gyro(halves[0])[:middle], gyro(halves[1])[middle:]])
+        return 0.0, halves, by_scan, by_gyro
+    if best in (0, len(_SHIFTS) - 1) or gains[best] - gains[len(_SHIFTS) // 2] < _SURE:
+        return 0.0, None, by_scan, gyro(0.0)
+    shift = _top(gains)
     shift = shift if abs(shift) >= _SHIFT_LEAST else 0.0
-    return shift, by_scan, gyro(shift)
+    return shift, None, by_scan, gyro(shift)
+
+
+def _halves(
+    by_scan: FloatArray, turns: Sequence[FloatArray], best: int
+) -> tuple[float, float] | None:
+    """Shifts of the halves of the pairs, if these are surely better than the ``best`` of all.
+
+    ``turns`` are those of the gyro at each shift.
+    """
+    middle = len(by_scan) // 2
+    if middle < _PAIRS:
+        return None
+    gains = [
+        np.array([
+            _gain(compare_turns(by_scan[half], one[half]).likeness, 0.0, len(by_scan[half]))
+            for one in turns
+        ])
+        for half in (slice(None, middle), slice(middle, None))
+    ]  # fmt: skip
+    first, second = map(_top, gains)
+    gained = sum(float(half.max() - half[best]) for half in gains)
+    return (first, second) if gained > _SURE and abs(first - second) > _SHIFT_STEP else None
+
+
+def _top(gains: FloatArray) -> float:
+    """The shift, seconds, at the top of a parabola through the best one and its neighbours."""
+    best = int(gains[1:-1].argmax()) + 1
+    before, top, after = gains[best - 1 : best + 2]
+    beside = 0.5 * (before - after) / min(before - 2 * top + after, -1e-12)
+    return float(_SHIFTS[best] + _SHIFT_STEP * np.clip(beside, -0.5, 0.5))
 
 
 def _gain(likeness: float, other: float, count: int) -> float:

@@ -80,6 +80,24 @@ def test_a_clock_that_is_right_or_nearly_so_is_left_alone(walk):
         assert said(walk, lambda imu, s=shift: replace(imu, stamps=imu.stamps + s)) == ""
 
 
+@pytest.mark.parametrize("milliseconds", [-60, 40])
+def test_a_clock_that_jumps_is_no_offset(walk, milliseconds):
+    """Whether the IMU's does, or that of the sweeps: what they say of each other is the same."""
+
+    def jumps(imu):
+        later = np.arange(len(imu.stamps)) > len(imu.stamps) // 2
+        stamps = imu.stamps + np.where(later, milliseconds * 10**6, 0)
+        order = np.argsort(stamps, kind="stable")
+        return replace(imu, stamps=stamps[order], gyro=imu.gyro[order])
+
+    told = said(walk, jumps)
+    assert "its clock jumps or drifts" in told
+    assert "in time in one half" in told
+    named = float(told.split("run and ")[1].split(" ms ")[0])
+    assert named == pytest.approx(abs(milliseconds), abs=3.0)
+    assert "set imu.time_offset" not in told
+
+
 def test_with_the_named_offset_the_samples_are_in_time():
     samples = moving()
     late = replace(samples, stamps=samples.stamps + 50_000_000)

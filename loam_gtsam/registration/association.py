@@ -10,6 +10,7 @@ from functools import partial
 
 import gtsam
 import numpy as np
+from scipy.spatial import cKDTree
 
 from loam_gtsam.config import MatchingConfig
 from loam_gtsam.cubemap import CubeMap
@@ -27,6 +28,8 @@ from loam_gtsam.registration.planes import leaves_open, match_surfaces, plane_we
 from loam_gtsam.types import BoolArray, FloatArray
 
 _TINY = 1e-9
+_ON_ONE = 32
+"""Features of a sweep at most on one upright thing: voxels on a pole."""
 _LEAN = 0.1
 """Standard deviation, rad, of the angle between the axis of the rings and what stands upright."""
 
@@ -92,13 +95,15 @@ def match_features(
             # A pole that few beams met has no five points within max_distance, or only these.
             poles = rows.alone is not None and rows.alone
             ways = (in_map, True, config.wide_search * limit), (match_uprights, poles, limit)
+            own = _own_reaches(edges, distinct if rows.alone is None else rows.alone, config)
             for match, among, far in ways:
                 chosen = np.flatnonzero(left & among)
                 if not len(chosen):
                     continue
-                near = edge_map.nearest(edges_map[chosen], k, far, around)
-                features = edges[chosen], edges_map[chosen], *near[:2]
-                more = match(*features, pose, config, far)
+                here = edges_map[chosen]
+                near, squared, _ = edge_map.nearest(here, k, far, around)
+                squared = _within(own[chosen], here, near, squared, pose[:3, 2])
+                more = match(edges[chosen], here, near, squared, pose, config, far)
                 lines = joined(lines, replace(more, indices=chosen[more.indices]))
                 left[lines.indices] = False
         lines = replace(lines, distinct=distinct[lines.indices])
@@ -112,6 +117,33 @@ def match_features(
         replace(surfaces, indices=rows.planes[surfaces.indices]),
         faces=faces._replace(rows=rows.planes[faces.rows]),
     )
+
+
+def _own_reaches(points: FloatArray, uprights: BoolArray, config: MatchingConfig) -> FloatArray:
+    """Metres (N,) across the axis of the rings, half way from each upright to the nearest other.
+
+    What is farther from where one is expected may as well be that other one: among clouds of dust,
+    or trunks, a wide search would find lines everywhere. Infinite for other features.
+    """
+    reaches = np.full(len(points), np.inf)
+    if uprights.any():
+        beside = points[uprights, :2]
+        count = min(_ON_ONE, len(beside))
+        apart = cKDTree(beside).query(beside, k=count)[0].reshape(len(beside), count)
+        others = np.where(apart > 3.0 * config.point_sigma, apart, np.inf)
+        reaches[uprights] = 0.5 * others.min(axis=1)
+    return reaches
+
+
+def _within(
+    reaches: FloatArray, points_map: FloatArray, neighbours: FloatArray,
+    squared_distances: FloatArray, axis: FloatArray,
+) -> FloatArray:  # fmt: skip
+    """The squared distances (N, k), infinite for what is beyond reach (N,) across an axis (3,)."""
+    away = neighbours - points_map[:, None]
+    across = away - (away @ axis)[:, :, None] * axis
+    near = np.einsum("nki,nki->nk", across, across) <= reaches[:, None] ** 2
+    return np.where(near, squared_distances, np.inf)
 
 
 def rematched(

@@ -475,6 +475,22 @@ def test_what_stands_alone_is_matched_with_the_few_points_near_by(count):
         assert len(found.edges) == count
 
 
+@pytest.mark.parametrize(("other", "found"), [(1.9, 0), (2.1, 1), (0.05, 1)])
+def test_what_may_as_well_be_another_pole_is_not_searched_for_more_widely(other, found):
+    """A pole is 1 m away from where it is expected, and stands ``other`` metres from the next."""
+    pose = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.2, -0.1, 0.7), np.array([1.0, 2.0, 0.5]))
+    _, side, up = pose.rotation().matrix().T
+    held = map_of(np.array([9.0, 0.0, 0.0]) + FAR_APART * np.outer(np.arange(-2, 3), up))
+    things = np.array([9.0, 0.0, 0.0]) - np.array([[1.0], [1.0 + other]]) * side
+    features = pose.transformTo(things.T).T
+    known = np.array([True, True])
+    rows = chosen_rows(2, 0, CONFIG, known, known)
+    config = changed(wide_search=2.0, weight_slope=0.5)
+    none = np.empty((0, 3))
+    edges = match_features(features, none, pose, held, held, config, rows).edges
+    assert np.count_nonzero(edges.indices == 0) == found  # 5 cm beside is the same pole
+
+
 def wall(across, count):
     """Points every 0.5 m on a wall 10 m ahead of the sensor, and features on it, off its edges."""
     along, up = np.delete(np.eye(3), np.argmax(across), axis=0)

@@ -260,8 +260,10 @@ class Mapper:
             own = own_factors(self.extra_factors, context, self._moment.error)
         factors = [*priors, *(self.imu.factors(stamp) if self.imu else ()), *own.alone]
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
-        steady = self.errors.accelerations
-        matcher = FrameMatcher.of(*args, inertial=predicted.inertial, accelerations=steady)
+        matcher = FrameMatcher.of(
+            *args, expected=self._start is None, inertial=predicted.inertial,
+            accelerations=self.errors.accelerations,
+        )  # fmt: skip
         return Frame(matcher, predicted, factors, own.since_last)
 
     def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:

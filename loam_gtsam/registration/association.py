@@ -69,6 +69,8 @@ def match_features(
     config: MatchingConfig,
     rows: ChosenRows,
     reach: float | None = None,
+    *,
+    expected: bool = False,
 ) -> ScanMatches:
     """Match chosen features; further parameters are those of :func:`associate`.
 
@@ -78,6 +80,8 @@ def match_features(
     rows : rows of these features in the sweep. Those that stand ``alone``, if the planes leave a
         translation open and they have no line, are matched with the map points near by.
     reach : metres to the farthest neighbour; ``config.max_distance`` if None
+    expected : whether the pose is one where a motion leads, and none on trial: nothing upright is
+        then matched with what may as well be the next one
     """
     pose = map_T_lidar.matrix()
     edges_map = transform(pose, edges)
@@ -95,7 +99,8 @@ def match_features(
             # A pole that few beams met has no five points within max_distance, or only these.
             poles = rows.alone is not None and rows.alone
             ways = (in_map, True, config.wide_search * limit), (match_uprights, poles, limit)
-            own = _own_reaches(edges, distinct if rows.alone is None else rows.alone, config)
+            crowd = rows.alone if expected and rows.alone is not None else np.zeros_like(distinct)
+            own = _own_reaches(edges, crowd, config)
             for match, among, far in ways:
                 chosen = np.flatnonzero(left & among)
                 if not len(chosen):

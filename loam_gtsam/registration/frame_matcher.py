@@ -213,6 +213,7 @@ class FrameMatcher(Matcher):
     refine: bool  # whether ``deskewed`` changes anything
     accelerations: Expected | None  # by which the velocity is not constant
     clock: Clock  # books the time of every call on the stage ``match``
+    expected: bool = False  # whether poses are where the last motion leads, and not on trial
     told: bool | None = None  # whether the matches tell the motion, if it is free; None: not known
 
     @classmethod
@@ -225,6 +226,7 @@ class FrameMatcher(Matcher):
         clock: Clock,
         *,
         refine: bool = True,
+        expected: bool = False,
         inertial: InertialPrediction | None = None,
         accelerations: Expected | None = None,
     ) -> FrameMatcher:
@@ -232,7 +234,8 @@ class FrameMatcher(Matcher):
         rows, model = _rows_to_match(posed.sweep, config.matching), config.deskew.model
         refine = refine and model != "predicted"
         steady, matching = accelerations if model == "linear" else None, config.matching
-        return cls(posed, maps, config, matching, rows, last, inertial, refine, steady, clock)
+        fixed = posed, maps, config, matching, rows, last, inertial, refine, steady, clock
+        return cls(*fixed, expected)
 
     @property
     def offered(self) -> int:
@@ -353,7 +356,7 @@ class FrameMatcher(Matcher):
     def _search(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:
         features = *self.posed.rows(self.rows.edges, self.rows.planes), map_T_lidar
         maps, config = (self.maps.edges, self.maps.planes), self.matching
-        matches = match_features(*features, *maps, config, self.rows)
+        matches = match_features(*features, *maps, config, self.rows, expected=self.expected)
         if config.wide_search > 1.0 and self.maps.planes.count() < _THIN:
             matches = self._with_wide_planes(matches, map_T_lidar)
         return replace(matches, search=Search(map_T_lidar, self.posed, matches))

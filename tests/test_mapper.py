@@ -306,9 +306,9 @@ def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres,
     calls = []
     real = frame_matcher.match_features
 
-    def count(*args):
+    def count(*args, **settings):
         calls.append(1)
-        return real(*args)
+        return real(*args, **settings)
 
     monkeypatch.setattr(frame_matcher, "match_features", count)
     truth = gtsam.Pose3(gtsam.Rot3(), np.array([0.1, 0.0, 0.0]))

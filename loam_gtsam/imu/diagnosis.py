@@ -33,7 +33,9 @@ _WINDOWS = 8  # windows of orientation and gyro below which nothing is said
 _ALIKE = 0.8  # correlation of turns above which they are those of one body
 _SURE = 12.5  # gain in log-likelihood of a shift of five standard deviations
 _SHIFT_STEP, _SHIFT_LEAST = 0.01, 0.005  # seconds
-_SHIFTS: FloatArray = np.arange(-50.0, 51.0) * _SHIFT_STEP  # as far as LATEST
+_SHIFTS: FloatArray = _SHIFT_STEP * np.arange(
+    -round(LATEST / _SHIFT_STEP), round(LATEST / _SHIFT_STEP) + 1, dtype=np.float64
+)
 _UNITS = np.pi / 180.0, 180.0 / np.pi  # factors between two sets of turns that have a reason
 _FORCE = 0.7, 1.4  # median specific force in multiples of gravity: no unit and no fault lies in it
 _HARDEST = 3.0  # multiples of gravity that no vehicle feels for long
@@ -122,24 +124,12 @@ def scans_problems(
     """
     if len(spans) < _PAIRS:
         return ()
-    shift, halves, held = 0.0, None, _in_time(spans, by_scan, samples)
+    shifts: tuple[float, ...] = (0.0,)
+    held = _in_time(spans, by_scan, samples)
     if held is not None:
-        shift, halves, by_scan, by_gyro = held
-    problem = _unlike(by_scan, by_gyro, config)
-    if problem:  # with wrong axes the scans are not what they should be
-        pass
-    elif halves is not None:
-        first, second = map(_late, halves)
-        problem = (
-            f"its clock jumps or drifts against that of the sweeps: {first} in one half of the "
-            f"run and {second} in the other, which no imu.time_offset puts right; check how both "
-            "are stamped"
-        )
-    elif shift:
-        problem = (
-            f"its clock is {_late(shift)} against that of the sweeps: set imu.time_offset to "
-            f"{config.time_offset - shift:.3f}"
-        )
+        shifts, by_scan, by_gyro = held
+    # With wrong axes the scans are not what they should be, and the clock is not named.
+    problem = _unlike(by_scan, by_gyro, config) or _clock_problem(shifts, config)
     return (f"IMU: {problem}",) if problem else ()
 
 
@@ -168,6 +158,24 @@ def _unlike(by_scan: FloatArray, by_gyro: FloatArray, config: ImuConfig) -> str:
     )
 
 
+def _clock_problem(shifts: tuple[float, ...], config: ImuConfig) -> str:
+    """By how much a clock is late, in all of the run or in each half of it."""
+    if len(shifts) > 1:
+        first, second = map(_late, shifts)
+        return (
+            f"its clock jumps or drifts against that of the sweeps: {first} in one half of the "
+            f"run and {second} in the other, which no imu.time_offset puts right; check how both "
+            "are stamped"
+        )
+    (shift,) = shifts
+    if not shift:
+        return ""
+    return (
+        f"its clock is {_late(shift)} against that of the sweeps: set imu.time_offset to "
+        f"{config.time_offset - shift:.3f}"
+    )
+
+
 def _late(shift: float) -> str:
     """In words by how many seconds a clock is late."""
     if abs(shift) < _SHIFT_LEAST:
@@ -177,11 +185,11 @@ def _late(shift: float) -> str:
 
 def _in_time(
     spans: IntArray, by_scan: FloatArray, samples: ImuSamples
-) -> tuple[float, tuple[float, float] | None, FloatArray, FloatArray] | None:
+) -> tuple[tuple[float, ...], FloatArray, FloatArray] | None:
     """Seconds by which the samples are late; turns by scan and gyro with that put right.
 
     The turns are compared whatever the mounting and the unit. The shift is 0 if no other one is
-    surely better, or if one for each half of the time is: these come after it. None if too few
+    surely better; there are two, one for each half of the time, if these are. None if too few
     samples are left.
     """
     if not len(samples.stamps):
@@ -203,7 +211,8 @@ def _in_time(
     for _ in range(2):  # the second time without the pairs that fit nowhere
         if len(spans) < _PAIRS:
             return None
-        fits = [compare_turns(by_scan, gyro(shift)) for shift in _SHIFTS]
+        turns = [gyro(shift) for shift in _SHIFTS]
+        fits = [compare_turns(by_scan, one) for one in turns]
         gains = np.array([_gain(fit.likeness, 0.0, len(spans)) for fit in fits])
         best = int(gains.argmax())
         left = fits[best].residuals
@@ -211,16 +220,16 @@ def _in_time(
         spans, by_scan = spans[kept], by_scan[kept]
     assert best is not None
     assert gains is not None
-    halves = _halves(by_scan, [gyro(shift) for shift in _SHIFTS], best)
+    halves = _halves(by_scan, [one[kept] for one in turns], best)
     if halves is not None:
         middle = len(spans) // 2
         by_gyro = np.concatenate([gyro(halves[0])[:middle], gyro(halves[1])[middle:]])
-        return 0.0, halves, by_scan, by_gyro
+        return halves, by_scan, by_gyro
     if best in (0, len(_SHIFTS) - 1) or gains[best] - gains[len(_SHIFTS) // 2] < _SURE:
-        return 0.0, None, by_scan, gyro(0.0)
+        return (0.0,), by_scan, gyro(0.0)
     shift = _top(gains)
     shift = shift if abs(shift) >= _SHIFT_LEAST else 0.0
-    return shift, None, by_scan, gyro(shift)
+    return (shift,), by_scan, gyro(shift)
 
 
 def _halves(

@@ -28,13 +28,7 @@ from loam_gtsam.refine.rounds import (
     equations,
     factorised,
 )
-from loam_gtsam.refine.sweeps import (
-    Path,
-    ReferenceSteps,
-    Stack,
-    SweepPoints,
-    stacked,
-)
+from loam_gtsam.refine.sweeps import Path, ReferenceSteps, Stack, SweepPoints, stacked
 from loam_gtsam.refine.ties import FixTies
 from loam_gtsam.refine.windows import in_windows
 from loam_gtsam.types import FloatArray, InputError, Trajectory

@@ -99,15 +99,17 @@ def match_features(
             # A pole that few beams met has no five points within max_distance, or only these.
             poles = rows.alone is not None and rows.alone
             ways = (in_map, True, config.wide_search * limit), (match_uprights, poles, limit)
-            crowd = rows.alone if expected and rows.alone is not None else np.zeros_like(distinct)
-            own = _own_reaches(edges, crowd, config)
+            own = None
+            if expected and rows.alone is not None:
+                own = _own_reaches(edges, rows.alone, config)
             for match, among, far in ways:
                 chosen = np.flatnonzero(left & among)
                 if not len(chosen):
                     continue
                 here = edges_map[chosen]
                 near, squared, _ = edge_map.nearest(here, k, far, around)
-                squared = _within(own[chosen], here, near, squared, pose[:3, 2])
+                if own is not None:
+                    squared = _within(own[chosen], here, near, squared, pose[:3, 2])
                 more = match(edges[chosen], here, near, squared, pose, config, far)
                 lines = joined(lines, replace(more, indices=chosen[more.indices]))
                 left[lines.indices] = False

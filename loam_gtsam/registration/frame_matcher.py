@@ -234,8 +234,9 @@ class FrameMatcher(Matcher):
         rows, model = _rows_to_match(posed.sweep, config.matching), config.deskew.model
         refine = refine and model != "predicted"
         steady, matching = accelerations if model == "linear" else None, config.matching
-        fixed = posed, maps, config, matching, rows, last, inertial, refine, steady, clock
-        return cls(*fixed, expected)
+        return cls(
+            posed, maps, config, matching, rows, last, inertial, refine, steady, clock, expected
+        )
 
     @property
     def offered(self) -> int:

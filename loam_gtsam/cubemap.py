@@ -206,12 +206,35 @@ class CubeMap:
             look(tags, points, seen_from)
             if faces is not None:
                 mark_second(CubePoints(points, tags), faces, self._cubes, self._grid)
-        self._put(CubePoints(points, tags))
+        self.insert_sorted(self.sorted(CubePoints(points, tags)))
+
+    def sorted(self, content: CubePoints, *, archive: bool = False) -> SortedPoints | None:
+        """Points for :meth:`insert_sorted`; None if no point is inside the window.
+
+        Those outside are counted, or put into the archive if asked.
+        """
+        new, away, beyond = SortedPoints.inside(content, self._window, self._grid)
+        if archive:
+            self._archive.settle(away)
+        self._outside += beyond + (0 if archive else len(away.points))
+        return new
+
+    def insert_sorted(self, new: SortedPoints | None, *, settle: bool = False) -> None:
+        """Add points that :meth:`sorted` returned for this window, by the policy or to settle."""
+        if new is None:
+            return
+        if settle or self._config.insertion == "settled":
+            firsts, held = new.firsts().items(), self._cubes
+            self._trees.add({at: held.setdefault(at, Cube()).settle(part) for at, part in firsts})
+        else:
+            for index, sums in new.sums().items():
+                self._cubes.setdefault(index, Cube()).average(sums)
+                self._trees.forget([index])
 
     def fill(self, other: CubeMap, *, archived: bool = False) -> None:
         """Add the points of another map, archived ones if asked, to free voxels: none is moved."""
         held = joined([*other.contents(archived=archived).values()])
-        self._put(held.without_seconds(), archive=archived, settle=True)
+        self.insert_sorted(self.sorted(held.without_seconds(), archive=archived), settle=True)
 
     def move(self, moves: Mapping[int, FloatArray]) -> int:
         """Move points of the window and of the archive, after a loop closure; return how many.
@@ -229,32 +252,9 @@ class CubeMap:
         content = joined(taken)
         self._trees = TreeCache()
         for owner in owners.tolist():
-            self._put(content.of(owner).moved(moves[owner]), archive=True)
+            moved = content.of(owner).moved(moves[owner])
+            self.insert_sorted(self.sorted(moved, archive=True))
         return len(content.points)
-
-    def _put(self, content: CubePoints, *, archive: bool = False, settle: bool = False) -> None:
-        """Insert points, by the policy or to ``settle``; with ``archive`` also those outside."""
-        # By component: numpy is several times slower along an axis of three.
-        axes = np.ascontiguousarray(content.points.T)
-        cells = self._grid.cells(axes)
-        within = self._grid.reaches(axes)
-        inside = within & self._window.holds(cells)
-        if not inside.all():
-            away = within & ~inside if archive else np.zeros_like(inside)
-            self._archive.settle(content.chosen(away))
-            self._outside += int(np.count_nonzero(~(inside | away)))
-            content, cells = content.chosen(inside), cells[:, inside]
-        if len(content.points) == 0:
-            return
-        new = SortedPoints.of(content, cells, self._grid)
-        cubes = [self._cubes.setdefault(index, Cube()) for index in new.cubes]
-        if settle or self._config.insertion == "settled":
-            parts = zip(new.cubes, cubes, new.firsts(), strict=True)
-            self._trees.add({index: cube.settle(part) for index, cube, part in parts})
-        else:
-            for cube, sums in zip(cubes, new.sums(), strict=True):
-                cube.average(sums)
-            self._trees.forget(new.cubes)
 
     def nearest(
         self, queries: NDArray[np.floating], k: int, max_distance: float, cubes: Iterable[CubeIndex]

@@ -32,6 +32,8 @@ from loam_gtsam.registration.planes import match_surfaces, translations_fixed
 from loam_gtsam.registration.report import Clock
 from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
 from loam_gtsam.types import FloatArray, SweepMotion
+from loam_gtsam.voxels.cubes import CubePoints, SortedPoints
+from loam_gtsam.voxels.tags import look, tags_of
 
 _PARTS = 6.0
 """Times ``min_aligned`` matches in the weakest direction: then each sixth of a sweep would fix the
@@ -41,6 +43,10 @@ _THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: 
 _OPEN = 1.5
 """A place is small until the reach of a sweep is this much above the limit: not each door that
 opens changes the maps in use."""
+
+
+TrialPoints = tuple[SortedPoints | None, SortedPoints | None]
+"""Edges and planes of sweeps, of which each owns its points by its number."""
 
 
 class MapPair:
@@ -124,18 +130,22 @@ class MapPair:
             plane_map.insert(planes, map_T_middle.translation(), faces)
         self._thinned = None
 
-    def insert_on_trial(self, sweeps: Sequence[tuple[PosedSweep, gtsam.Pose3]]) -> None:
-        """Add sweeps at their poses, as far as a solve reads them: the maps are none to keep.
-
-        All at once, which takes half the time of one after the other.
-        """
+    def sorted_on_trial(self, sweeps: Sequence[tuple[PosedSweep, gtsam.Pose3]]) -> TrialPoints:
+        """Sweeps at their poses, sorted for :meth:`insert_on_trial`, in half the time of each."""
         moved = [
             [transform(pose.matrix(), points) for points in posed.points] for posed, pose in sweeps
         ]
-        edges, planes = map(np.concatenate, zip(*moved, strict=True))
         origins = np.array([pose.translation() for _, pose in sweeps])
-        self.edges.insert(edges)
-        self.planes.insert(planes, origins.repeat([len(points) for _, points in moved], axis=0))
+        edges, planes = zip(*moved, strict=True)
+        viewed = origins if self.config.map.insertion == "settled" else None
+        return _owned(self.edges, edges), _owned(self.planes, planes, viewed)
+
+    def insert_on_trial(self, points: TrialPoints, without: int | None = None) -> None:
+        """Add sweeps, without one of them, as far as a solve reads them: no maps to keep."""
+        for cubes, new in zip((self.edges, self.planes), points, strict=True):
+            if new is not None and without is not None:
+                new = new.without(without)
+            cubes.insert_sorted(new)
         self._thinned = None
 
     def too_sparse(self, predicted: Prediction, config: Config) -> str:
@@ -186,6 +196,18 @@ class MapPair:
         if self._thinned is None:
             self._thinned = self.planes.thinned(factor)
         return self._thinned
+
+
+def _owned(
+    cubes: CubeMap, sweeps: Sequence[FloatArray], origins: FloatArray | None = None
+) -> SortedPoints | None:
+    """Points of sweeps, each owned by the number of its sweep, and seen from its origin."""
+    points, counts = np.concatenate(sweeps), [len(sweep) for sweep in sweeps]
+    owners = np.arange(len(sweeps)).repeat(counts)
+    tags = tags_of(len(points), owners)
+    if origins is not None:
+        look(tags, points, origins[owners])
+    return cubes.sorted(CubePoints(points, tags))
 
 
 def _points(cubes: CubeMap, small: CubeMap, moves: Mapping[int, FloatArray]) -> FloatArray:

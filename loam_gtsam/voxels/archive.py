@@ -164,7 +164,7 @@ class Archive:
         if len(content.points) == 0:
             return
         new = SortedPoints.of(content, self._grid.cells(content.points.T), self._grid)
-        for index, part in zip(new.cubes, new.firsts(), strict=True):
+        for index, part in new.firsts().items():
             cube = self.take(index) or Cube()
             cube.settle(part)
             self.store(index, cube.content)

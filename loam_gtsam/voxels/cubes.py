@@ -5,14 +5,14 @@ A voxel holds one point; where a thin wall passes through it, a second one, of t
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from loam_gtsam.geometry import find_in_sorted, run_starts, transform
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
-from loam_gtsam.voxels.grid import CubeIndex, Grid, cube_index
+from loam_gtsam.voxels.grid import CubeIndex, Grid, Window, cube_index
 from loam_gtsam.voxels.key_table import Columns, KeyTable
 from loam_gtsam.voxels.tags import Faces, Owners, Tags, second, sines, tags_of, turn, views
 
@@ -187,18 +187,17 @@ class SortedPoints(NamedTuple):
 
     Attributes
     ----------
-    points : (N, 3) metres
-    keys, tags : (V,) key of each voxel, and (V, 2) the tags of its first point
-    starts : (V,) the point with which each voxel begins
-    cubes, parts : the C cubes, and the voxels of each
+    content : the N points
+    keys : (N,) key of the voxel of each
+    numbers : (N,) of the cubes, in a box of them
+    box, low : number of cubes (3,) along the sides of the box, and its lowest cube (3, 1)
     """
 
-    points: FloatArray
+    content: CubePoints
     keys: IntArray
-    tags: Tags
-    starts: IntArray
-    cubes: list[CubeIndex]
-    parts: list[slice]
+    numbers: IntArray
+    box: tuple[int, ...]
+    low: FloatArray
 
     @classmethod
     def of(cls, content: CubePoints, cells: FloatArray, grid: Grid) -> SortedPoints:
@@ -211,31 +210,63 @@ class SortedPoints(NamedTuple):
         box = tuple((steps.max(axis=1) + 1).tolist())
         numbers = np.ravel_multi_index(tuple(steps), box)
         keys = content.keys(grid)
-        order = _order(keys, numbers)
-        keys, numbers = keys[order], numbers[order]
+        return cls(content, keys, numbers, box, low).chosen(_order(keys, numbers))
+
+    @classmethod
+    def inside(
+        cls, content: CubePoints, window: Window, grid: Grid
+    ) -> tuple[SortedPoints | None, CubePoints, int]:
+        """The points inside a window, those outside, and the number of those beyond the grid."""
+        # By component: numpy is several times slower along an axis of three.
+        axes = np.ascontiguousarray(content.points.T)
+        cells, within = grid.cells(axes), grid.reaches(axes)
+        inside = within & window.holds(cells)
+        away = content.chosen(within & ~inside)
+        if not inside.all():
+            content, cells = content.chosen(inside), cells[:, inside]
+        new = cls.of(content, cells, grid) if len(content.points) else None
+        return new, away, int(np.count_nonzero(~within))
+
+    def chosen(self, rows: IntArray) -> SortedPoints:
+        """Some of the points, in the order of ``rows``."""
+        points, tags = self.content  # ``take`` is several times faster than an index on rows
+        content = CubePoints(points.take(rows, axis=0), tags.take(rows, axis=0))
+        return self._replace(content=content, keys=self.keys[rows], numbers=self.numbers[rows])
+
+    def without(self, owner: int) -> SortedPoints | None:
+        """The points of all other owners; None if there are none."""
+        others = np.flatnonzero(self.content.tags[:, 0] != owner)
+        return self.chosen(others) if len(others) else None
+
+    def voxels(self) -> tuple[IntArray, dict[CubeIndex, slice]]:
+        """(V,) the point with which each voxel begins, and the voxels of each cube."""
+        keys, numbers = self.keys, self.numbers
         starts = run_starts((numbers[1:] != numbers[:-1]) | (keys[1:] != keys[:-1]))
         numbers = numbers[starts]
         heads = run_starts(numbers[1:] != numbers[:-1])
-        ends = zip(heads.tolist(), np.append(heads[1:], len(numbers)).tolist(), strict=True)
-        return cls(
-            content.points.take(order, axis=0),  # several times faster than an index on rows
-            keys[starts],
-            content.tags.take(order[starts], axis=0),
-            starts,
-            [cube_index(cell) for cell in (np.unravel_index(numbers[heads], box) + low).T],
-            [slice(*part) for part in ends],
-        )
+        cubes = (np.array(np.unravel_index(numbers[heads], self.box)) + self.low).T
+        ends = np.append(heads[1:], len(numbers))
+        parts = map(slice, heads.tolist(), ends.tolist())
+        return starts, dict(zip(map(cube_index, cubes), parts, strict=True))
 
-    def firsts(self) -> Iterator[VoxelPoints]:
-        """The first point of each voxel, cube by cube."""
-        firsts = self.points.take(self.starts, axis=0)
-        for part in self.parts:
-            yield VoxelPoints(self.keys[part], firsts[part], self.tags[part])
+    def firsts(self) -> dict[CubeIndex, VoxelPoints]:
+        """The first point of each voxel, by cube."""
+        starts, parts = self.voxels()
+        keys, points = self.keys[starts], self.content.points.take(starts, axis=0)
+        tags = self.content.tags.take(starts, axis=0)
+        return {
+            index: VoxelPoints(keys[part], points[part], tags[part])
+            for index, part in parts.items()
+        }
 
-    def sums(self) -> Iterator[VoxelSums]:
-        """Sums over the points of each voxel, cube by cube."""
+    def sums(self) -> dict[CubeIndex, VoxelSums]:
+        """Sums over the points of each voxel, by cube."""
+        starts, parts = self.voxels()
+        points, tags = self.content
         hows = np.add, np.minimum, np.maximum
-        sums = (how.reduceat(self.points, self.starts, axis=0) for how in hows)
-        counts = np.diff(np.append(self.starts, len(self.points))).astype(np.float64)
-        columns: Columns = self.keys, self.tags, *sums, counts
-        return (VoxelSums(*(column[part] for column in columns)) for part in self.parts)
+        sums = (how.reduceat(points, starts, axis=0) for how in hows)
+        counts = np.diff(np.append(starts, len(points))).astype(np.float64)
+        columns: Columns = self.keys[starts], tags.take(starts, axis=0), *sums, counts
+        return {
+            index: VoxelSums(*(column[part] for column in columns)) for index, part in parts.items()
+        }

@@ -42,8 +42,8 @@ class Faces(NamedTuple):
     least: FloatArray
 
 
-def tags_of(count: int, owner: int) -> Tags:
-    """Tags of so many points of an owner whose views are not known."""
+def tags_of(count: int, owner: int | IntArray) -> Tags:
+    """Tags of so many points of an owner, or (N,) owners, whose views are not known."""
     tags: Tags = np.zeros((count, 2), np.int32)
     tags[:, 0] = owner
     return tags

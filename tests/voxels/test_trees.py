@@ -43,7 +43,7 @@ class Cubes(dict):
 
     def insert(self, points: FloatArray) -> None:
         new = SortedPoints.of(tagged(points), GRID.cells(points.T), GRID)
-        parts = zip(new.cubes, new.firsts(), strict=True)
+        parts = new.firsts().items()
         self.trees.add({index: self.setdefault(index, Cube()).settle(p) for index, p in parts})
 
     def over(self, *indices) -> CubeTrees:

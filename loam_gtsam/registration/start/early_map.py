@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import gtsam
 
 from loam_gtsam.config import Config
-from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, TrialPoints
 from loam_gtsam.registration.relocalization.evidence import Evidence
 from loam_gtsam.registration.solvers import ScanSolver, Solution, trial_solver
 from loam_gtsam.registration.start.paths import on_paths, with_velocity
@@ -76,8 +76,10 @@ class EarlyMap:
         if len(sweeps) < 3:
             return None
         solutions: list[Solution] = []
-        for number in range(len(sweeps)):
-            solutions.append(self.solved(sweeps, number, self.matcher(sweeps, number)))
+        placed = self._placed(sweeps)
+        for number, one in enumerate(sweeps):
+            self._insert(placed, without=number)
+            solutions.append(self.solved(sweeps, number, self._matcher(one)))
             if not solutions[0].solved or solutions[0].weak is not None:
                 return None
         return solutions
@@ -134,17 +136,29 @@ class EarlyMap:
         if to_keep:
             self.fill(others)
         else:
-            self._clear()
-            placed = [(one.posed, one.map_T_middle) for one in others]
-            self.frame.matcher.maps.insert_on_trial(placed)
-        old, posed = self.frame.matcher, sweeps[number].posed
-        return FrameMatcher.of(posed, old.maps, old.config, old.last, old.clock, refine=False)
+            self._insert(self._placed(others))
+        return self._matcher(sweeps[number])
+
+    def _matcher(self, sweep: EarlySweep) -> FrameMatcher:
+        old = self.frame.matcher
+        return FrameMatcher.of(sweep.posed, old.maps, old.config, old.last, old.clock, refine=False)
 
     def fill(self, sweeps: Sequence[EarlySweep]) -> None:
         """Make the map of these sweeps."""
         self._clear()
         for sweep in sweeps:
             self.frame.matcher.maps.insert(sweep.posed, sweep.map_T_middle, sweep.keyframe)
+
+    def _placed(self, sweeps: Sequence[EarlySweep]) -> TrialPoints:
+        """The points of sweeps at their poses; clears the map."""
+        self._clear()
+        placed = [(one.posed, one.map_T_middle) for one in sweeps]
+        return self.frame.matcher.maps.sorted_on_trial(placed)
+
+    def _insert(self, points: TrialPoints, without: int | None = None) -> None:
+        """Make the map of these points, without those of one sweep."""
+        self._clear()
+        self.frame.matcher.maps.insert_on_trial(points, without)
 
     def _clear(self) -> None:
         self.frame.matcher.maps.clear()

@@ -758,7 +758,7 @@ def pushed(monkeypatch):
             pose = push.compose(sweeps[number].map_T_middle)
             return replace(Solution.unsolved(pose, None, 1, 1), solved=True, **seen)
 
-        monkeypatch.setattr(early_map.EarlyMap, "matcher", lambda *_: None)
+        monkeypatch.setattr(early_map.EarlyMap, "matchers", lambda _, sweeps: [None] * len(sweeps))
         monkeypatch.setattr(early_map.EarlyMap, "solved", solved)
         steps = [np.array([0.1 * number, 0.0, 0.0]) for number in range(count)]
         poses = [gtsam.Pose3(gtsam.Rot3.Yaw(0.1), step) for step in steps]

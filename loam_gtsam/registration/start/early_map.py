@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
@@ -76,10 +76,8 @@ class EarlyMap:
         if len(sweeps) < 3:
             return None
         solutions: list[Solution] = []
-        placed = self._placed(sweeps)
-        for number, one in enumerate(sweeps):
-            self._insert(placed, without=number)
-            solutions.append(self.solved(sweeps, number, self._matcher(one)))
+        for number, matcher in enumerate(self.matchers(sweeps)):
+            solutions.append(self.solved(sweeps, number, matcher))
             if not solutions[0].solved or solutions[0].weak is not None:
                 return None
         return solutions
@@ -138,6 +136,13 @@ class EarlyMap:
         else:
             self._insert(self._placed(others))
         return self._matcher(sweeps[number])
+
+    def matchers(self, sweeps: Sequence[EarlySweep]) -> Iterator[FrameMatcher]:
+        """As :meth:`matcher`, of one sweep after the other; each is of use until the next."""
+        placed = self._placed(sweeps)
+        for number, one in enumerate(sweeps):
+            self._insert(placed, without=number)
+            yield self._matcher(one)
 
     def _matcher(self, sweep: EarlySweep) -> FrameMatcher:
         old = self.frame.matcher

@@ -118,7 +118,7 @@ def localise_in_map(options: LocaliseOptions) -> int:
                 found = localise(
                     dataset, saved, config, max_frames=options.frames, on_frame=on_frame,
                     workers=worker_count(options.workers, total), extend=options.extend,
-                    inside=options.inside, **options.parts(config),
+                    inside=options.inside, near=options.position(), **options.parts(config),
                 )  # fmt: skip
             if not found.updates:
                 raise DatasetError(f"{dataset.name}: no sweeps in it; see loam-gtsam inspect")

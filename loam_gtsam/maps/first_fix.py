@@ -7,7 +7,7 @@ found.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -43,7 +43,8 @@ from loam_gtsam.voxels.grid import CubeIndex
 _ALIKE = 40  # number of places with the most similar heading-free keys that are compared in full
 _TRIES = 6  # number of places that are tried
 _STARTS = 18  # number of poses around all of these at which a registration starts
-_FIELDS = 12  # that are kept, of the places that were tried last
+_AROUND = 6  # number of places around one where a lidar is said to be
+_FIELDS = 18  # that are kept, of the places that were tried last
 _LEVEL = 0.7  # cosine between normal and up above which a plane is level
 
 
@@ -137,25 +138,35 @@ class PlaceSearch:
         """Whether a sweep speaks for a pose, against another one."""
         return speaks_for(one.evidence, other.evidence, self._config.solver.min_aligned)
 
-    def rivals(self, pose: gtsam.Pose3, found: list[Candidate], far: float) -> list[Candidate]:
+    def rivals(
+        self, pose: gtsam.Pose3, found: list[Candidate], far: float, *, inside: bool = False
+    ) -> list[Candidate]:
         """What may be right as well if a sweep is at a pose: all if it was not found there.
 
         Rivals are poses to which the sweep does not object. A place that is not in the map may look
         like one of those that are, if these look alike. So rivals are all poses, too, that fit
         nearly as well: to that share ``far`` away, or to :data:`AS_WELL` where the same is seen.
+        They are not if the lidar is surely ``inside`` the map.
         """
-        own = _at(pose, found)
+        own, surely = _at(pose, found), inside or self._inside
         if own is None:
             return found
-        return [c for c in found if c is not own and self._may_be(c, own, far)]
+        return [c for c in found if c is not own and self._may_be(c, own, far, surely)]
 
-    def _may_be(self, other: Candidate, own: Candidate, far: float) -> bool:
+    def _may_be(self, other: Candidate, own: Candidate, far: float, inside: bool) -> bool:
         """Whether another pose may be the right one as well; see :meth:`rivals`."""
         if not self._favoured(own, other):
             return True
         near = other.map_T_middle.range(own.map_T_middle) < self._config.loops.search
         nearly = (AS_WELL if near else far) * own.fit.total
-        return not self._inside and other.fit.total >= nearly
+        return not inside and other.fit.total >= nearly
+
+    def fits_better(self, pose: gtsam.Pose3, found: list[Candidate]) -> bool:
+        """Whether the map fits better at another pose, to which the sweep does not object."""
+        own = _at(pose, found)
+        return own is None or any(
+            c.fit.total > own.fit.total and not self._favoured(own, c) for c in found
+        )
 
     def refuted(self, pose: gtsam.Pose3, found: list[Candidate]) -> bool:
         """Whether a sweep speaks against a pose and for another one, or was not found there."""
@@ -170,12 +181,25 @@ class PlaceSearch:
         for number in np.sort(np.atleast_1d(near)).tolist():
             descriptor = places[number].descriptor.astype(np.float64)
             compared.append((*compare_descriptors(descriptor, own), number))
+        turned = (
+            places[number].map_T_middle.compose(gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.zeros(3)))
+            for _, turn, number in sorted(compared)
+        )
+        return self._apart(turned, _TRIES)
+
+    def around(self, pose: gtsam.Pose3) -> list[gtsam.Pose3]:
+        """Poses of places next to a pose, in which a lidar may be that is said to be there."""
+        most, places = 2.0 * self._config.loops.search, [one.map_T_middle for one in self._places]
+        near = sorted(places, key=pose.range)
+        return self._apart((one for one in near if pose.range(one) < most), _AROUND)
+
+    def _apart(self, poses: Iterable[gtsam.Pose3], most: int) -> list[gtsam.Pose3]:
+        """The first of some poses that are a radius of the search apart, so many at most."""
         chosen: list[gtsam.Pose3] = []
-        for _, turn, number in sorted(compared):
-            place = places[number].map_T_middle
-            if all(place.range(other) > self._config.loops.search for other in chosen):
-                chosen.append(place.compose(gtsam.Pose3(gtsam.Rot3.Yaw(turn), np.zeros(3))))
-            if len(chosen) == _TRIES:
+        for pose in poses:
+            if all(pose.range(other) > self._config.loops.search for other in chosen):
+                chosen.append(pose)
+            if len(chosen) == most:
                 break
         return chosen
 

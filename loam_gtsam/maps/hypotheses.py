@@ -83,6 +83,10 @@ class Motion:
     Where it was tracked before, that map begins with the last of those sweeps. As long as each one
     fits it, the lidar has moved there from where it was, and a place elsewhere that fits the saved
     map only looks the same.
+
+    Attributes
+    ----------
+    way : metres since the first of the sweeps; infinite after one that did not fit
     """
 
     def __init__(self, config: Config) -> None:
@@ -91,7 +95,8 @@ class Motion:
         self._mapper = Mapper(config.changed({"map.archive_megabytes": 0.0}, matching=few))
         self._map_T_own: gtsam.Pose3 | None = None  # frame of this map in the saved one, if known
         self._apart = APART  # metres and rad by which that may be wrong
-        self._last, self._way = gtsam.Pose3(), 0.0
+        self._last = gtsam.Pose3()
+        self.way = 0.0
 
     def begin(self, sweeps: Sequence[Features], known: MapUpdate) -> None:
         """Begin with tracked sweeps, and others after these; ``known`` is the last tracked one."""
@@ -113,9 +118,10 @@ class Motion:
         if not moved.status.solved or not self._fits(moved):
             self._mapper.reset()  # it may be anywhere now
             moved, self._map_T_own = self._mapper.register(features), None
-        self._way += self._last.range(moved.map_T_lidar)
+            self.way = np.inf
+        self.way += self._last.range(moved.map_T_lidar)
         self._last = moved.map_T_lidar
-        if self._way * self._config.loops.gate_drift > APART[0]:
+        if self.way * self._config.loops.gate_drift > APART[0]:
             self._map_T_own = None
         return moved
 
@@ -151,10 +157,18 @@ class Hypotheses:
     search : of the map
     maps : of the map
     config : of the mapper
+    start : pose about which the first sweep was taken, within ``loops.search`` and at any heading
     """
 
-    def __init__(self, search: PlaceSearch, maps: SavedMaps, config: Config) -> None:
+    def __init__(
+        self,
+        search: PlaceSearch,
+        maps: SavedMaps,
+        config: Config,
+        start: gtsam.Pose3 | None = None,
+    ) -> None:
         self._search, self._maps, self._config = search, maps, config
+        self._start = start
         self._motion = Motion(config)
         self._held: list[Hypothesis] = []
 
@@ -183,22 +197,36 @@ class Hypotheses:
         posed = MovingSweep(features, self._config).at(twist)
         near = self._motion.map_T_lidar or near
         known = [held.pose for held in standing] + ([] if near is None else [near])
+        if self._start is not None:  # and where it may be if what is said is wrong
+            known += [self._start, *self._search.around(self._start)]
         found = self._search.find(posed, features.reach, known)
         if not found:
             return None, "no place fits"
-        message = f"the best pose: {_told(found[0].fit)}"
+        here = [one for one in found if self._may_be_at(one.map_T_middle)]
+        message = "what fits is not where the lidar is said to be"
+        if here:
+            message = f"the best pose: {_told(here[0].fit)}"
         for held in standing:
-            rivals = self._search.rivals(held.pose, found, held.rivals_below())
+            surely = self._start is not None
+            rivals = self._search.rivals(held.pose, here, held.rivals_below(), inside=surely)
             if rivals:
                 fit = "pose fits" if len(rivals) == 1 else "poses fit"
                 message = f"{len(rivals)} other {fit} the map nearly as well as the best"
+            elif surely and self._search.fits_better(held.pose, found):
+                message = "the map fits better where the lidar is not said to be"
             elif self._motion.leads_to(held.last.map_T_lidar):
                 return held.last, ""
             else:
                 message = "a pose fits to which the motion does not lead, so it only looks the same"
         self._held = [h for h in self._held if not self._search.refuted(h.pose, found)]
-        self._begin(posed, features, found)
+        self._begin(posed, features, here)
         return None, message
+
+    def _may_be_at(self, pose: gtsam.Pose3) -> bool:
+        """Whether the lidar may have come to a pose from where it is said to have begun."""
+        if self._start is None:
+            return True
+        return self._start.range(pose) < self._config.loops.search + self._motion.way
 
     def _begin(self, posed: PosedSweep, features: Features, found: list[Candidate]) -> None:
         """Follow the best of what was found, if they are not followed already."""

@@ -17,12 +17,13 @@ from typing import Unpack
 
 import gtsam
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
-from loam_gtsam.geometry import symmetric
+from loam_gtsam.geometry import as_vector, symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
@@ -67,6 +68,9 @@ class Localizer:
     extend : add what the map does not have yet, to be saved by :meth:`save`
     inside : the lidar is surely in the map; else it may be in a place that looks like one of those
         in the map, and there is no fix where several of these fit nearly as well
+    near : (2,) or (3,) metres, map frame, x, y and z if there are several storeys: the lidar is at
+        the first sweep within ``loops.search`` (8 m) of that, at any heading. Then it is surely in
+        the map, and what looks the same elsewhere is no rival
     parts : of a user's own, see :class:`~loam_gtsam.pipeline.Parts`, for the tracking
 
     Attributes
@@ -78,7 +82,7 @@ class Localizer:
     Raises
     ------
     InputError
-        If the map has no places at which it can be recognised.
+        If the map has no places at which it can be recognised, or none about ``near``.
     ConfigError
         If the configured solver has no place for factors of the IMU, or of a user's own.
     """
@@ -91,6 +95,7 @@ class Localizer:
         imu: ImuBuffer | None = None,
         extend: bool = False,
         inside: bool = False,
+        near: ArrayLike | None = None,
         **parts: Unpack[Parts],
     ) -> None:
         check_kind(saved, SavedMap, "saved", "SavedMap(path) opens one")
@@ -105,13 +110,14 @@ class Localizer:
         self._tracking = Pipeline(self.config, imu=imu, **parts)
         positions = [place.map_T_middle.translation() for place in saved.places]
         self._tree = cKDTree(np.array(positions))
-        self.reset()
+        self.reset(near)
 
-    def reset(self) -> None:
-        """Forget where the lidar is, and what was added to the map."""
+    def reset(self, near: ArrayLike | None = None) -> None:
+        """Forget where the lidar is, and what was added to the map; ``near`` as in the class."""
+        start = None if near is None else self._about(near)
         self._maps = SavedMaps(self.config, self._saved, keep=self._extend)
         self._places, self._links = list(self._saved.places), list(self._saved.graph.links)
-        self._hypotheses: Hypotheses | None = self._new_search()  # None while the pose is known
+        self._hypotheses: Hypotheses | None = self._new_search(start)  # None while it is known
         self._last: MapUpdate | None = None  # that was solved
         self._seen: MapUpdate | None = None  # the last of some that saw all directions
         self._unsolved = self._sure = 0  # sweeps in a row, and those that saw all directions
@@ -119,13 +125,27 @@ class Localizer:
         self._recent: list[tuple[Features, MapUpdate | None]] = []
         self.fixes = 0
 
-    def _new_search(self) -> Hypotheses:
+    def _about(self, near: ArrayLike) -> gtsam.Pose3:
+        """A pose at a position, at the height and with the tilt of the nearest place."""
+        size = 2 if np.size(near) == 2 else 3
+        position = as_vector(near, "near", size)
+        away = np.linalg.norm(self._tree.data[:, :size] - position, axis=1)
+        most, number = 2.0 * self.config.loops.search, int(away.argmin())
+        if away[number] > most:
+            raise InputError(
+                f"near: expected a position in the frame of {self._saved.path}, within {most:g} m "
+                f"of the way of its run, got {position.tolist()}, {away[number]:.0f} m from it"
+            )
+        place = self._saved.places[number].map_T_middle
+        return gtsam.Pose3(place.rotation(), np.array([*position[:2], place.z()]))
+
+    def _new_search(self, start: gtsam.Pose3 | None = None) -> Hypotheses:
         """A search for the lidar in the whole map, which does not grow meanwhile."""
         self._maps.grows = False
         # A fix needs to know which directions are seen, which not every solver tells.
         config = self.config.changed(solver=SolverConfig())
         search = PlaceSearch(self._places, self._maps, config, inside=self._inside)
-        return Hypotheses(search, self._maps, config)
+        return Hypotheses(search, self._maps, config, start)
 
     @property
     def fixed(self) -> bool:
@@ -345,6 +365,7 @@ def localise(
     workers: int = 0,
     extend: bool = False,
     inside: bool = False,
+    near: ArrayLike | None = None,
     **parts: Unpack[Parts],
 ) -> Localisation:
     """Localise a data set in a saved map.
@@ -356,7 +377,7 @@ def localise(
     max_frames : stop after so many sweeps
     on_frame : e.g. to show progress
     workers : processes that extract the features of the sweeps to come
-    extend, inside, parts : see :class:`Localizer`
+    extend, inside, near, parts : see :class:`Localizer`
 
     Returns
     -------
@@ -365,7 +386,7 @@ def localise(
     """
     config = effective_config(config or own_settings(saved), dataset)
     imu = imu_buffer(dataset, config)
-    localizer = Localizer(saved, config, imu=imu, extend=extend, inside=inside, **parts)
+    localizer = Localizer(saved, config, imu=imu, extend=extend, inside=inside, near=near, **parts)
     if parts.get("features") is not None:
         workers = 0
     updates: list[MapUpdate] = []

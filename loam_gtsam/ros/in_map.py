@@ -16,7 +16,8 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.maps import Localizer, SavedMap
 from loam_gtsam.registration.odometry import Guess, Odometry, advance
-from loam_gtsam.types import Features, MapUpdate, Sweep
+from loam_gtsam.ros.messages import INITIAL_POSE
+from loam_gtsam.types import Features, FloatArray, InputError, MapUpdate, Sweep
 
 _log = logging.getLogger(__name__)
 _KEPT = 100  # results of the mapper, between two sweeps that were localised
@@ -44,13 +45,24 @@ class InMap(Odometry):
     def __init__(self, path: str | Path, config: Config, *, inside: bool = False) -> None:
         self._saved = SavedMap(path)
         self._localizer = Localizer(self._saved, config, inside=inside, odometry=self)
+        self._asked: FloatArray | None = None
         self._past: deque[MapUpdate] = deque(maxlen=_KEPT)
         self.map_T_odom: gtsam.Pose3 | None = None
+
+    def look_near(self, position: FloatArray) -> None:
+        """Look about a position (2,) in the saved map from the next sweep on; from any thread."""
+        self._asked = position
 
     def add(self, sweep: Sweep, update: MapUpdate) -> MapUpdate:
         """Localise a sweep that the live mapper has registered; its pose in the saved map."""
         if update.status.has_pose:
             self._past.append(update)
+        asked, self._asked = self._asked, None
+        if asked is not None:
+            try:
+                self._localizer.reset(asked)
+            except InputError as error:
+                _log.warning("%s: %s", INITIAL_POSE, error)
         fixed = self._localizer.fixed
         found = self._localizer.process(sweep)
         if found.status.solved and update.status.has_pose:

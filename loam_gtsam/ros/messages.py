@@ -36,6 +36,8 @@ TYPES = {
 
 IN_MAP_TYPES = {IN_MAP: "geometry_msgs/msg/PoseWithCovarianceStamped"}
 """The same of a node that localises in a saved map."""
+INITIAL_POSE = "/initialpose"
+"""Where a user says that the lidar is in that map, as RViz does; of the same type."""
 
 _PATH_STEP = 10
 """Poses by which the path grows at least before it is written again; later a tenth of its length,

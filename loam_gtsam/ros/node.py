@@ -15,6 +15,7 @@ from importlib import import_module
 from typing import Any
 
 import gtsam
+import numpy as np
 
 from loam_gtsam.config import Config, load_config, preset
 from loam_gtsam.datasets.decode.loam_messages import CLOUD, REQUIRED
@@ -26,7 +27,9 @@ from loam_gtsam.pipeline import Pipeline
 from loam_gtsam.ros.in_map import InMap
 from loam_gtsam.ros.live import LiveMapper
 from loam_gtsam.ros.messages import (
+    IN_MAP,
     IN_MAP_TYPES,
+    INITIAL_POSE,
     ODOMETRY,
     REGISTERED,
     TYPES,
@@ -94,7 +97,7 @@ class LiveNode:
         self._held = ExitStack()
         if self._output is not None:
             self._held.enter_context(used_alone(self._output))
-        self._in_map = None
+        self._in_map, self._map_frame = None, config.bag.map_frame
         if values["map"]:
             self._in_map = InMap(values["map"], config, inside=values["inside"])
             self._held.callback(self._in_map.close)
@@ -138,6 +141,8 @@ class LiveNode:
             kinds[LOAM_ODOMETRY] = TYPES[ODOMETRY]
         if imu:
             kinds[imu] = _IMU_TYPE
+        if self._in_map is not None:
+            kinds[INITIAL_POSE] = IN_MAP_TYPES[IN_MAP]
         for topic, kind in kinds.items():
             # Best effort, for it takes from reliable publishers too.
             depth = _IMU_DEPTH if kind == _IMU_TYPE else queue
@@ -153,10 +158,20 @@ class LiveNode:
             return
         if kind == _IMU_TYPE:
             self.live.add_imu(message)
+        elif topic == INITIAL_POSE:
+            self._look_near(message)
         elif topic in self._features:
             self.live.add_features(topic, message)
         else:
             self.live.add_cloud(message)
+
+    def _look_near(self, message: Any) -> None:
+        """Look for the lidar where a user says that it is; RViz tells no height."""
+        frame, at = message.header.frame_id, message.pose.pose.position
+        if frame != self._map_frame:
+            self.live.fault(f"{INITIAL_POSE}: expected the frame {self._map_frame}, got {frame!r}")
+        elif self._in_map is not None:
+            self._in_map.look_near(np.array([at.x, at.y]))
 
     def _work(self) -> None:
         try:

@@ -349,7 +349,9 @@ def test_places_are_looked_at_once_and_a_pose_beyond_the_map_harms_no_search(
         assert first[0].map_T_middle.equals(other[0].map_T_middle, 0.0)
 
 
-def test_where_bays_repeat_a_lidar_is_found_only_if_it_is_surely_in_the_map(tmp_path):
+def test_where_bays_repeat_a_lidar_is_found_if_it_is_surely_in_the_map_or_its_place_is_said(
+    tmp_path,
+):
     """Another storey would look the same but for what is parked there."""
     monday = SimulatedWorld("garage", seed=1, frames=50, columns=600)
     mapped = run(monday)
@@ -358,12 +360,33 @@ def test_where_bays_repeat_a_lidar_is_found_only_if_it_is_surely_in_the_map(tmp_
     drive = PartOf(tuesday, 30, 1, None, None)
     with SavedMap(tmp_path / "garage.lgmap") as saved:
         assert not localise(drive, saved, max_frames=8).fixes
-        found = localise(drive, saved, max_frames=8, inside=True)
-    assert found.fixes == 1
+        x, y, z = mapped.updates[30].map_T_lidar.translation()
+        found = [
+            localise(drive, saved, max_frames=8, inside=True),
+            localise(drive, saved, max_frames=8, near=(x - 3.0, y + 3.0)),
+        ]
+        assert not localise(drive, saved, max_frames=6, near=(x - 12.0, y, z)).fixes
     true = dict(zip(monday.truth.stamps.tolist(), monday.truth.map_T_lidar, strict=True))
     start = mapped.updates[0].map_T_lidar
-    off = [u.map_T_lidar.range(start.compose(gtsam.Pose3(true[u.stamp]))) for u in found.solved]
-    assert max(off) < NEAR
+    for one in found:
+        assert one.fixes == 1
+        off = [u.map_T_lidar.range(start.compose(gtsam.Pose3(true[u.stamp]))) for u in one.solved]
+        assert max(off) < NEAR
+
+
+@pytest.mark.parametrize(
+    ("near", "expected"),
+    [
+        ((900.0, 0.0), r"near: expected a position in the frame of .* got \[900.0, 0.0\], 8"),
+        ((0.0, 0.0, 40.0), "within 16 m of the way of its run"),
+        ((1.0,), r"near: expected \(3,\) numbers, got shape \(1,\)"),
+        ((np.nan, 0.0), "near: .*finite"),
+    ],
+)
+def test_a_place_that_is_said_must_be_in_the_map(saved, near, expected):
+    localizer = Localizer(saved)
+    with pytest.raises(InputError, match=expected):
+        localizer.reset(near)
 
 
 def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path):
@@ -444,6 +467,9 @@ def test_the_command_localises_in_the_map_that_a_run_wrote(mapped, tmp_path, mon
                      "--no-plot", "--quiet")  # fmt: skip
     assert elsewhere.exit_code == 1
     assert "no fix" in elsewhere.output
+    no_place = loam("localise", spec, mapped.path, "--near", "1,2,3,4")
+    assert no_place.exit_code == 2
+    assert "--near: expected metres X,Y or X,Y,Z, got '1,2,3,4'" in no_place.output
     missing = loam("localise", spec, "nothing.lgmap")
     assert missing.exit_code == 1
     assert "there is no such file" in missing.output

@@ -28,6 +28,7 @@ from loam_gtsam.ros.live_report import LiveReport
 from loam_gtsam.ros.messages import (
     IN_MAP,
     IN_MAP_TYPES,
+    INITIAL_POSE,
     ODOMETRY,
     PATH,
     REGISTERED,
@@ -269,6 +270,46 @@ def test_a_node_with_a_map_says_where_the_odometry_is_in_it(
         assert (sigmas < 0.1).all()
     with pytest.raises(DatasetError, match="there is no such file"):
         LiveNode(FakeNode(map=str(tmp_path / "none.lgmap")))
+
+
+def initial_pose(x: float, frame: str) -> bytes:
+    kinds = ROS2.types
+    stamp = kinds["builtin_interfaces/msg/Time"](0, 0)
+    pose = kinds["geometry_msgs/msg/Pose"](
+        kinds["geometry_msgs/msg/Point"](x, 0.0, 0.0),
+        kinds["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0),
+    )
+    kind = IN_MAP_TYPES[IN_MAP]
+    covered = kinds["geometry_msgs/msg/PoseWithCovariance"](pose, np.zeros(36))
+    message = kinds[kind](kinds["std_msgs/msg/Header"](stamp, frame), covered)
+    return bytes(ROS2.serialize_cdr(message, kind))
+
+
+def test_a_user_says_where_the_lidar_is_in_the_map(
+    bag: Path, offline: RunResult, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert offline.pipeline is not None
+    save_map(tmp_path / "map.lgmap", offline.pipeline)
+    node = FakeNode(map=str(tmp_path), map_frame="map", lidar_frame="lidar")
+    live = LiveNode(node)
+    for x, frame in ((1.0, "odom"), (800.0, "map")):
+        node.callbacks[INITIAL_POSE](initial_pose(x, frame))
+    messages = [(topic, raw) for topic, raw in raw_messages(bag) if topic == POINTS]
+    play(node, live, messages, FRAMES)
+    ((reason, count),) = live.live.report().faults.items()
+    assert (reason, count) == ("/initialpose: expected the frame map, got 'odom'", 1)
+    assert "/initialpose: near: expected a position" in caplog.text
+    assert any(topic == IN_MAP for topic, _ in node.published)  # found all the same
+
+    node = FakeNode(map=str(tmp_path), map_frame="map", lidar_frame="lidar")
+    live = LiveNode(node)
+    asked: list[Any] = []
+    assert live._in_map is not None
+    live._in_map._localizer.reset = asked.append  # type: ignore[method-assign]
+    node.callbacks[INITIAL_POSE](initial_pose(2.0, "map"))
+    play(node, live, messages, FRAMES)
+    ((x, y),) = asked
+    assert (x, y) == (2.0, 0.0)
 
 
 def stamp_of(message: Any) -> int:

@@ -126,12 +126,28 @@ class LocaliseOptions(OutputOptions, PartOptions):
         "looks alike, too.",
         "--inside",
     )
+    near: str | None = option(
+        "Where in the map the lidar is at first, to within 8 m: found where much looks alike, too.",
+        metavar="X,Y[,Z]",
+    )
     frames: int | None = option("Stop after so many sweeps.", min=1)
     workers: int | None = option(
         "Processes that extract features ahead; by default one for more than 200 sweeps.",
         min=0,
         max=16,
     )
+
+    def position(self) -> list[float] | None:
+        """The position ``near`` which the lidar is."""
+        if self.near is None:
+            return None
+        try:
+            numbers = [float(part) for part in self.near.split(",")]
+        except ValueError:
+            numbers = []
+        if len(numbers) not in (2, 3):
+            raise typer.BadParameter(f"--near: expected metres X,Y or X,Y,Z, got {self.near!r}")
+        return numbers
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,10 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import gtsam
+import numpy as np
 
 from loam_gtsam.config import Config
+from loam_gtsam.geometry import transform
 from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, TrialPoints
 from loam_gtsam.registration.relocalization.evidence import Evidence
 from loam_gtsam.registration.solvers import ScanSolver, Solution, trial_solver
@@ -19,6 +21,10 @@ from loam_gtsam.registration.start.ways import (
     continued,
     moved_with_first,
 )
+
+_SETTLED = 0.5
+"""Noises of a range below which sweeps that were moved need not be registered once more: the next
+time moves them by a third of that, and makes no trajectory better, but for chance."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -47,21 +53,34 @@ class EarlyMap:
         return replace(self, solver=trial_solver(self.config.solver))
 
     def together(self, sweeps: Sequence[EarlySweep], rounds: int) -> list[EarlySweep]:
-        """The sweeps, each registered with the map of all the others, so many times."""
+        """The sweeps, each registered with the map of all the others, so many times at most."""
         moved = list(sweeps)
         for _ in range(rounds):
-            moved = self.with_motion(moved)
-            if (solutions := self.at_once(moved)) is not None:
-                moved = moved_with_first(moved, solutions)
-                for number, solution in enumerate(solutions):
-                    moved = self._with_velocity(moved, number, solution)
-                continue
-            for number in range(1, len(moved)):
-                solution = self.solved(moved, number, self.matcher(moved, number))
-                if solution.solved:
-                    moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
-                    moved = self._with_velocity(moved, number, solution)
+            before = moved
+            moved = self._registered_once(moved)
+            if self._settled(before, moved):
+                break
         return moved
+
+    def _registered_once(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
+        """The sweeps, each registered with the map of all the others."""
+        moved = self.with_motion(sweeps)
+        if (solutions := self.at_once(moved)) is not None:
+            moved = moved_with_first(moved, solutions)
+            for number, solution in enumerate(solutions):
+                moved = self._with_velocity(moved, number, solution)
+            return moved
+        for number in range(1, len(moved)):
+            solution = self.solved(moved, number, self.matcher(moved, number))
+            if solution.solved:
+                moved[number] = replace(moved[number], map_T_middle=solution.map_T_lidar)
+                moved = self._with_velocity(moved, number, solution)
+        return moved
+
+    def _settled(self, before: Sequence[EarlySweep], after: Sequence[EarlySweep]) -> bool:
+        """Whether features came to lie where they were, to well below their noise."""
+        most = _SETTLED * self.config.features.range_noise
+        return all(_shift(*pair) < most for pair in zip(before, after, strict=True))
 
     def _with_velocity(
         self, sweeps: Sequence[EarlySweep], number: int, solution: Solution
@@ -172,3 +191,10 @@ class EarlyMap:
     def with_motion(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
         """The sweeps, de-skewed for the motion through their poses."""
         return on_paths(sweeps, self.map_T_first)
+
+
+def _shift(before: EarlySweep, after: EarlySweep) -> float:
+    """Metres (RMS) by which a new pose moves the features of a sweep."""
+    points = np.concatenate(after.posed.points)
+    old, new = (transform(one.map_T_middle.matrix(), points) for one in (before, after))
+    return float(np.sqrt(((new - old) ** 2).sum(axis=1).mean()))

@@ -85,7 +85,7 @@ class Mapper:
     config : ``map``, ``matching``, ``solver``, ``deskew`` and ``imu`` of it are used
     solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`; its settings,
         ``solver.config``, replace ``config.solver``. If None, :func:`make_solver` makes it
-    imu : samples may be added to it while the mapper runs
+    imu : for this mapper alone, which writes its bias; samples may be added while it runs
     extra_factors : a user's own factors for every sweep: GPS, ground level, wheels, ...
 
     Attributes
@@ -101,7 +101,8 @@ class Mapper:
     Raises
     ------
     InputError, ConfigError
-        If a part is none; if the configured solver has no place for factors of the IMU or your own.
+        If a part is none; if the IMU was made for other settings, or the configured solver has no
+        place for its factors or your own.
     """
 
     def __init__(
@@ -114,6 +115,7 @@ class Mapper:
     ) -> None:
         self.config = _with_settings_of(solver, as_config(config))
         self.solver = solver or make_solver(self.config.solver)
+        imu = None if self.config.imu.coupling == "off" else imu
         _check_parts(self.config, solver, imu, extra_factors)
         self.imu = None if imu is None else ImuTracker(self.config.imu, imu)
         self.extra_factors = extra_factors

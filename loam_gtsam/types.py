@@ -443,6 +443,9 @@ class MapUpdate:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "timings", Timings(self.timings))
+        twist = self.twist.copy()  # by which the next frame is predicted
+        twist.setflags(write=False)
+        object.__setattr__(self, "twist", twist)
 
     def __repr__(self) -> str:
         position = self.map_T_lidar.translation().round(3).tolist()

@@ -16,7 +16,7 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import imu_buffer
 from loam_gtsam.registration import frame_matcher
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
-from loam_gtsam.types import Features, FrameStatus, ImuSamples, TiltPrior
+from loam_gtsam.types import ConfigError, Features, FrameStatus, ImuSamples, TiltPrior
 
 SECOND = 1_000_000_000
 
@@ -533,3 +533,25 @@ def test_walls_that_lean_a_little_from_the_axes_of_the_map_do_not_turn_it():
         poses += [mapper.register(part).map_T_lidar for part in features[1:]]
         error = poses[0].between(poses[-1]).localCoordinates(truth[0].between(truth[-1]))
         assert np.degrees(np.abs(error[:3])).max() < 0.1
+
+
+def test_an_imu_that_is_off_is_none_and_one_made_for_other_settings_is_refused():
+    world = SimulatedWorld("room", frames=1, columns=300, imu="white")
+    config = Config()
+    buffer = ImuBuffer(config.imu, world.imu)
+    assert Mapper(config, imu=buffer).imu is not None
+    assert Mapper(config.changed("imu.coupling=off"), imu=buffer).imu is None
+    for setting, made in (
+        ("imu.lidar_R_imu_deg=[0,0,90]", "0.0, 0.0"),
+        ("imu.time_offset=0.2", "0.0"),
+    ):
+        expected = rf"{setting.partition('=')[0]}: expected that of the ImuBuffer, .*{made}"
+        with pytest.raises(ConfigError, match=expected):
+            Mapper(config.changed(setting), imu=buffer)
+
+
+def test_what_a_user_does_to_a_result_does_not_change_the_next_frame():
+    mapper, world = Mapper(), SimulatedWorld("room", frames=2, columns=300)
+    update = mapper.register(extract_features(world.sweep(0), mapper.config))
+    with pytest.raises(ValueError, match="read-only"):
+        update.twist[:3] *= 57.3

@@ -20,6 +20,7 @@ EMPTY_BEAMS = 5.5
 chance where one in four returns nothing, as on dark ground."""
 UNIFORM_SIGMA = 12.0**-0.5
 """Standard deviation of what is anywhere within a metre: where an edge is between two beams."""
+_NEAREST = 1e-9  # rad, from one beam to the next
 _NEARER = 2.0
 """A surface that is continued comes nearer by less than this factor."""
 _LINE_RESIDUALS = tuple(np.float32(factor) for factor in (0.4, 0.7, 0.8, 0.4))
@@ -157,7 +158,7 @@ def ends_of_surfaces(
         falls = (ranges[:, 0] - ranges[:, 1] > most) & (turn[:, 0] < LINKED_BEAMS * spacing)
         falls |= turn[:, 0] > EMPTY_BEAMS * spacing
         here = np.flatnonzero((count > 0) & falls)
-        reach = np.maximum(0.5 - 0.5 * width / spacing[here], 0.0)
+        reach = np.maximum(0.5 - 0.5 * width / np.maximum(spacing[here], _NEAREST), 0.0)
         beyond = last[:, here] + reach * step[:, here]
         inverse = np.maximum(beyond[3], last[3, here] / _NEARER)
         inverse *= np.sqrt(squared_norm(beyond[:3]))

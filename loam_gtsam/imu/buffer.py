@@ -133,18 +133,19 @@ class ImuBuffer:
     """IMU samples in lidar axes, in order of time, to be asked about any time.
 
     The answers for the same samples are the same to the last bit, however the samples came in.
-    ``lidar_R_imu`` is the configured rotation from IMU into lidar axes.
+    ``lidar_R_imu`` is the configured rotation from IMU into lidar axes. A mapper writes the bias
+    that it learns into its buffer: mappers that run side by side have a buffer each.
 
     Parameters
     ----------
-    config : section ``imu``
+    config : section ``imu``, of the mapper as well
     samples : the first samples, if there are some already; errors as of :meth:`add`
     """
 
     def __init__(self, config: ImuConfig, samples: ImuSamples | None = None) -> None:
         how = 'the section "imu" of a Config is one'
         check_kind(config, ImuConfig, "config of an ImuBuffer", how)
-        self._config, self._gap = config, round(config.max_gap * 1e9)
+        self.config, self._gap = config, round(config.max_gap * 1e9)
         self.lidar_R_imu = gtsam.Rot3.RzRyRx(*np.deg2rad(config.lidar_R_imu_deg))
         self._bias = np.zeros(3)
         self._counts: Counter[str] = Counter()
@@ -181,7 +182,7 @@ class ImuBuffer:
         stamps, values = _columns(samples)
         finite = (np.abs(values[:, 4:]) < _ABSURD).all(axis=1)  # NaN compares false
         finite &= (stamps >= -MAX_STAMP) & (stamps <= MAX_STAMP)
-        stamps = stamps + round(self._config.time_offset * 1e9)
+        stamps = stamps + round(self.config.time_offset * 1e9)
         counts["not_finite"] += len(stamps) - int(finite.sum())
         stamps, values = stamps[finite], values[finite]
         if len(stamps) == 0:
@@ -207,7 +208,7 @@ class ImuBuffer:
         ``stamp`` goes back as far, as it does after the clock was set back.
         """
         self._merge()
-        store, config = self._store, self._config
+        store, config = self._store, self.config
         needed = MEMORY + config.still_seconds + config.average_seconds + config.max_gap
         first = stamp - round(needed * 1e9)
         if store.accepts_from is not None and first < store.accepts_from:
@@ -236,7 +237,7 @@ class ImuBuffer:
         samples, rest = self._store.samples, self.first_rest()
         if not self._quality.measured:
             samples = replace(samples, orientation=None)
-        wrong = samples_problems(samples, self._config, rest)
+        wrong = samples_problems(samples, self.config, rest)
         return self._quality.report(samples.stamps, rest, filtered, wrong)
 
     @property
@@ -322,15 +323,15 @@ class ImuBuffer:
 
         :func:`loam_gtsam.imu.at_rest.find_rest` says what rest means.
         """
-        first = stamp - round(self._config.still_seconds * 1e9)
-        return find_rest(self._config, self.samples_between(first, stamp + round(REST_AHEAD * 1e9)))
+        first = stamp - round(self.config.still_seconds * 1e9)
+        return find_rest(self.config, self.samples_between(first, stamp + round(REST_AHEAD * 1e9)))
 
     def first_rest(self) -> RestWindow | None:
         """The rest at the start of all samples, dropped ones included; None if none."""
         self._merge()
         samples = self._store.samples
         held = self._start_is_held and len(samples.stamps)
-        return rest_at_start(self._config, samples) if held else self._rest
+        return rest_at_start(self.config, samples) if held else self._rest
 
     def _merge(self) -> None:
         changed = self._store.merge()

@@ -82,7 +82,8 @@ class Localizability:
 
         By noise, an eigenvector is a translation with a little of a rotation that the scan sees
         well. Over a long blind way that little would turn the pose. A direction whose rotation is
-        within three standard deviations of its noise (:meth:`wander`) is taken for a translation.
+        within three standard deviations of its noise (:meth:`wander`) is taken for a translation,
+        unless it moves the points by turning more than by translation: then it is a turn.
 
         ``shared`` is the number of matches over that of independent ones.
         """
@@ -94,7 +95,7 @@ class Localizability:
         share = np.einsum("ik,ij,jk->k", basis[:3], turns, basis[:3])
         pure = basis.copy()
         limit = _CLEAR**2 * shared * np.trace(turns @ self._turned_by_noise()[:3, :3])
-        pure[:3, share < limit] = 0.0
+        pure[:3, share < min(limit, 0.5)] = 0.0
         rows = basis.T @ form @ blind
         # The shares that the expected motion decides, the eigenvalues, stay.
         cleaned: FloatArray = pure @ rows @ basis @ np.linalg.solve(rows @ pure, rows)

@@ -29,7 +29,7 @@ from loam_gtsam.imu_prior import (
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution, fuse
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.types import FloatArray, TiltPrior, check_kind
+from loam_gtsam.types import ConfigError, FloatArray, TiltPrior, check_kind
 
 _BIAS_GAIN = 0.02  # share of a frame's difference of gyro and scan for the bias: 50 frames
 _DISAGREEMENT = (np.radians(0.3), 0.5)
@@ -80,8 +80,7 @@ class ImuTracker:
     """
 
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
-        check_kind(buffer, ImuBuffer, "imu", "ImuBuffer(config.imu, samples) makes one")
-        self.config, self.buffer = config, buffer
+        self.config, self.buffer = config, _checked(buffer, config)
         self._given_bias = buffer.gyro_bias
         self.reset()
 
@@ -318,6 +317,19 @@ class ImuTracker:
         assert self.level is not None
         sigma = float(np.radians(self.config.sigma_deg))
         return gravity_factor(POSE_KEY, measured, sigma, self.level.map_up)
+
+
+def _checked(buffer: ImuBuffer, config: ImuConfig) -> ImuBuffer:
+    """The buffer itself; ConfigError if it has brought its samples elsewhere than configured."""
+    check_kind(buffer, ImuBuffer, "imu", "ImuBuffer(config.imu, samples) makes one")
+    for name in ("lidar_R_imu_deg", "time_offset", "max_gap"):
+        made, wanted = getattr(buffer.config, name), getattr(config, name)
+        if made != wanted:
+            raise ConfigError(
+                f"imu.{name}: expected that of the ImuBuffer, {made}, got {wanted}; make the "
+                "buffer with the same configuration, ImuBuffer(config.imu, samples)"
+            )
+    return buffer
 
 
 def _turned_alike(

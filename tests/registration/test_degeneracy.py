@@ -556,6 +556,15 @@ def test_without_noise_the_expected_motion_decides_as_much_as_before(share):
     np.testing.assert_allclose(cleaned @ cleaned, share * cleaned, atol=1e-12)
 
 
+@pytest.mark.parametrize("moving", [0.0, 1e-3])
+def test_a_blind_turn_is_no_translation_however_large_the_noise(moving):
+    """Nothing would be left of it."""
+    seen = found(surfaces(*room(), noise=0.02))
+    turn = np.array([0.0, 0.0, 1.0, moving, 0.0, 0.0])
+    blind = np.outer(turn, [0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_allclose(seen.without_noise(blind, 1e9), blind, atol=1e-12)
+
+
 def test_a_blind_way_turns_towards_translations_by_the_noise_of_the_normals():
     seen = found(surfaces(*room(), tilt=0.05, noise=0.02))
     wander = seen.wander(np.diag([0.0, 0.0, 0.0, 4.0, 0.0, 0.0]))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.quick import PREDICTED
 from support.strategies import FEW, START, WILD, configs, generators, imu_streams, scans
 
 from loam_gtsam.config import (
@@ -51,8 +52,6 @@ def test_every_valid_configuration_survives_yaml(config: Config) -> None:
 
 WORLD = SimulatedWorld("room", frames=8, columns=240, sensor="vlp16")
 SWEEPS = [WORLD[number] for number in range(8)]
-QUICK = "deskew.model=predicted"
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def checked(update: MapUpdate) -> MapUpdate:
@@ -207,8 +206,8 @@ def test_absurd_imu_values_are_left_out_and_quaternions_of_absurd_length_unknown
 
 @FEW
 @given(samples=imu_streams(start=SWEEPS[0].stamp), changes=st.sampled_from([
-    ("imu.coupling=tight",), ("imu.prior=sigma", QUICK), ("imu.prior=blend", QUICK),
-    ("imu.coupling=loose", QUICK),
+    ("imu.coupling=tight",), ("imu.prior=sigma", PREDICTED), ("imu.prior=blend", PREDICTED),
+    ("imu.coupling=loose", PREDICTED),
 ]))  # fmt: skip
 def test_a_hostile_imu_never_raises(samples: Any, changes: tuple[str, ...]) -> None:
     config = Config().changed(*changes)

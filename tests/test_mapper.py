@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from support.quick import QUICK
 from support.worlds import room_features
 
 from loam_gtsam.config import Config, preset
@@ -290,9 +291,8 @@ def test_information_is_that_of_the_reference_time(driving):
 
 @pytest.mark.parametrize(("metres", "searches"), [(0.0, 2), (1.0, 1)])
 def test_a_search_is_skipped_only_while_the_pose_stays(rng, monkeypatch, metres, searches):
-    config = Config().changed(
+    config = QUICK.changed(
         {
-            "deskew.model": "predicted",
             "matching.keep_translation": metres,
             "matching.keep_rotation_deg": 5.0,
             "solver.iterations": 2,
@@ -451,12 +451,11 @@ def test_a_user_may_hand_priors_and_own_factors_together(mapped, rng):
 
 def with_coupling(world, count):
     """A tightly coupled mapper after some sweeps, and the features of the next one."""
-    config = Config().changed("deskew.model=predicted")
-    mapper = Mapper(config, imu=imu_buffer(world, config))
+    mapper = Mapper(QUICK, imu=imu_buffer(world, QUICK))
     for number in range(count):
-        mapper.register(extract_features(world[number], config))
+        mapper.register(extract_features(world[number], QUICK))
     assert mapper.last.status is FrameStatus.OK
-    return mapper, extract_features(world[count], config)
+    return mapper, extract_features(world[count], QUICK)
 
 
 def test_a_guess_is_used_under_pre_integration():

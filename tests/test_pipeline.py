@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support.list_dataset import ListDataset
+from support.quick import QUICK
 
 from loam_gtsam.config import Config, ImuConfig, preset
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -34,9 +35,6 @@ from loam_gtsam.types import (
     PartError,
     SweepMotion,
 )
-
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.mark.parametrize(

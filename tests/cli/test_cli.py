@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from support.cli import loam
 from support.list_dataset import ListDataset
+from support.quick import QUICK_START
 
 from loam_gtsam.cli import report
 from loam_gtsam.cli import run as run_command
@@ -76,10 +77,6 @@ def said(*arguments: object, code: int = 0) -> str:
     result = loam(*arguments)
     assert result.exit_code == code, result.output
     return " ".join(result.output.split())
-
-
-QUICK_START = ("--set", "deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def mapped(*more: object, code: int = 0) -> str:

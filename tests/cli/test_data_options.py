@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support.cli import loam
+from support.quick import QUICK_START
 
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -25,8 +26,7 @@ def empty_folder(tmp_path, monkeypatch):
 
 
 def mapped(*arguments, code=0, folder="out"):
-    quick = "--set", "deskew.model=predicted"  # no sweep is mapped anew with those that follow
-    result = loam("run", WORLD, "--no-plot", "--output", folder, *quick, *arguments)
+    result = loam("run", WORLD, "--no-plot", "--output", folder, *QUICK_START, *arguments)
     assert result.exit_code == code, result.output
     return result.output
 

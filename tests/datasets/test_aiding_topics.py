@@ -17,6 +17,7 @@ from support.bags import (
     write_bag,
 )
 from support.cli import loam
+from support.quick import QUICK_START
 
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
 from loam_gtsam.datasets.decode.geodesy import geodetic_of
@@ -85,7 +86,7 @@ def test_a_run_with_gnss_places_its_map_on_the_earth(tmp_path):
         recording.append(("/fix", int(stamp), fix(ROS1, int(stamp), place, covariance=known)))
     path = write_bag(tmp_path / "drive", "ros1", recording)
     near = ["--set", "pose_graph.keyframe_distance=0.1", "--set", "aiding.gnss_memory=0"]
-    near += ["--set", "deskew.model=predicted"]  # no first sweeps are mapped anew
+    near += QUICK_START
     done = loam("run", path, "--gnss", *near, "--output", tmp_path / "out", "--no-plot")
     assert done.exit_code == 0, done.output
     assert "fixes used" in " ".join(done.output.split())

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 from support import layout_writers as write
+from support.quick import QUICK
 
-from loam_gtsam.config import Config, ImuConfig
+from loam_gtsam.config import ImuConfig
 from loam_gtsam.datasets import KittiDataset, open_dataset
 from loam_gtsam.pipeline import run
 from loam_gtsam.studies.evaluation import absolute_error
@@ -120,9 +121,8 @@ def test_a_gps_imu_at_the_rate_of_the_sweeps_is_told(tmp_path: Path) -> None:
     root = write_drive(tmp_path, period=103_600_000)
     problems = " ".join(open_dataset(root).info().problems)
     assert "oxts: 9.65 Hz; gaps above imu.max_gap (0.1 s) are not bridged" in problems
-    quick = Config().changed("deskew.model=predicted")  # no first sweeps are mapped anew
-    wide = quick.changed(imu=ImuConfig(max_gap=0.25))
-    for config, used in ((quick, False), (wide, True)):
+    wide = QUICK.changed(imu=ImuConfig(max_gap=0.25))
+    for config, used in ((QUICK, False), (wide, True)):
         result = run(open_dataset(root), config)
         assert (result.imu.sweep_motions["gyro"] > 0) is used
 

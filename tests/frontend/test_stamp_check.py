@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 from support.list_dataset import ListDataset
+from support.quick import QUICK
 
 from loam_gtsam import Checkpoint, Features, FeatureSweep, Mapper, MapUpdate
 from loam_gtsam.cli.report import summary
-from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
 from loam_gtsam.frontend.stamp_check import IN_A_ROW, StampCheck
 from loam_gtsam.pipeline import Pipeline, run
@@ -138,10 +138,6 @@ def test_a_clock_set_back_is_said_and_not_followed():
     faults = judged([*steps(START, 5), *steps(START - DAY, 20), START + 5 * TENTH])
     back = 20 - IN_A_ROW + 1
     assert faults[4:] == ["stamp_back"] * (IN_A_ROW - 1) + ["clock_set_back"] * back + [""]
-
-
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.fixture(scope="module")

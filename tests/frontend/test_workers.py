@@ -9,6 +9,7 @@ import signal
 import numpy as np
 import pytest
 from support.list_dataset import ListDataset
+from support.quick import QUICK
 
 from loam_gtsam import Config, SimulatedWorld, run
 from loam_gtsam.frontend.features import extract_features, thinned
@@ -16,10 +17,6 @@ from loam_gtsam.frontend.workers import extract, extract_ahead
 from loam_gtsam.types import BadSweep, DatasetError, Features, FrameStatus, Scan
 
 pytestmark = pytest.mark.filterwarnings("error")
-
-
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.fixture(scope="module")

@@ -6,6 +6,7 @@ from functools import cache
 import gtsam
 import numpy as np
 import pytest
+from support.quick import PREDICTED
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -59,8 +60,6 @@ class Steady:
         self.sweeps = 0
 
 
-PREDICTED = "deskew.model=predicted"
-"""What runs beside the mapper does not meet the joint start of its map, half of a short run."""
 MODES = {
     "plain": ((), {}),
     "loose": (("imu.coupling=loose",), {}),
@@ -76,6 +75,7 @@ MODES = {
     "without rings": (("sensor.rings=none", PREDICTED), {}),
     "classical": (("solver.method=loam", "imu.prior=off", PREDICTED), {}),
 }
+"""What runs beside the mapper does not meet the joint start of its map, half of a short run."""
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from support.cli import loam
 from support.list_dataset import ListDataset
+from support.quick import QUICK, QUICK_START
 
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets import SimulatedWorld, open_dataset
@@ -20,9 +21,6 @@ from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.pipeline import Pipeline, run
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver
 from loam_gtsam.types import DatasetError, OutputError
-
-PREDICTED = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def assert_same(one, two):
@@ -78,25 +76,23 @@ def held_near_the_start(context):
     return [gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), noise), slow]
 
 
-LOOPS = PREDICTED.changed(
-    "loops.enabled=true", "loops.min_way=3", "pose_graph.keyframe_distance=0.7"
-)
+LOOPS = QUICK.changed("loops.enabled=true", "loops.min_way=3", "pose_graph.keyframe_distance=0.7")
 IMU = Config().changed("imu.lag=5")
 SCANS = Config().changed("odometry.method=scan_to_scan")
-DENSE = PREDICTED.changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
+DENSE = QUICK.changed("pose_graph.keyframe_distance=0.5", "solver.kernel=huber")
 CASES = {
     "plain": ("street_loop?frames=8&columns=300", Config(), [1, 2, 5]),
     "imu in the graph": ("corridor?frames=12&columns=300", IMU, [3, 10]),
     "scan to scan": (
         "trees?frames=6&columns=450",
-        PREDICTED.changed("odometry.method=scan_to_scan"),
+        QUICK.changed("odometry.method=scan_to_scan"),
         [4],
     ),
     "classical": ("room?frames=8&columns=400", preset("aloam"), [4]),
     "loops": ("room?frames=30&columns=240&speed=4&start=moving", LOOPS, [12, 24]),
     "own closer": ("room?frames=28&columns=240&speed=4&start=moving", DENSE, [9, 25]),
     "own factors": ("room?frames=9&columns=400", Config(), [2, 6]),
-    "workers": ("room?frames=6&columns=300", PREDICTED, [4]),
+    "workers": ("room?frames=6&columns=300", QUICK, [4]),
 }
 OPTIONS = {
     "own closer": lambda: {"loop_closer": NearestPlace(DENSE)},
@@ -141,7 +137,7 @@ def test_an_own_solver_is_given_again(tmp_path):
 def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):
     dataset = open_dataset("sim:room?frames=5&columns=300")
     checkpoint = Checkpoint(tmp_path / "checkpoint", seconds=0.0)
-    assert_same(run(dataset, PREDICTED, checkpoint=checkpoint), run(dataset, PREDICTED))
+    assert_same(run(dataset, QUICK, checkpoint=checkpoint), run(dataset, QUICK))
     names = sorted(path.name for path in checkpoint.folder.iterdir())
     frames = [f"frames_{n:07d}_{n + 1:07d}.npz" for n in range(5)]
     assert names == [*frames, "state_0000005.npz"]
@@ -153,18 +149,18 @@ def test_checkpoints_change_nothing_and_only_the_newest_state_stays(tmp_path):
 
 def test_without_resume_an_old_checkpoint_goes_but_only_files_of_checkpoints(tmp_path):
     dataset = open_dataset("sim:room?frames=3&columns=300")
-    stopped(dataset, PREDICTED, tmp_path / "old", 2)
+    stopped(dataset, QUICK, tmp_path / "old", 2)
     (tmp_path / "old" / ".state_0000003.npz.77.tmp").write_text("of a killed process")
-    assert len(run(dataset, PREDICTED, checkpoint=Checkpoint(tmp_path / "old")).updates) == 3
+    assert len(run(dataset, QUICK, checkpoint=Checkpoint(tmp_path / "old")).updates) == 3
     assert not (tmp_path / "old").exists()
     (tmp_path / "chapters").mkdir()
     for name in ("thesis.txt", "state.npz", "frames_of_mine.npz", "chapters/1.txt"):
         (tmp_path / name).write_text("mine")
     mine = {path.name for path in tmp_path.iterdir()}
-    stopped(dataset, PREDICTED, tmp_path, 2)
-    run(dataset, PREDICTED, checkpoint=Checkpoint(tmp_path))  # from the start: the checkpoint goes
+    stopped(dataset, QUICK, tmp_path, 2)
+    run(dataset, QUICK, checkpoint=Checkpoint(tmp_path))  # from the start: the checkpoint goes
     assert {path.name for path in tmp_path.iterdir()} == mine
-    stopped(dataset, PREDICTED, tmp_path, 2)
+    stopped(dataset, QUICK, tmp_path, 2)
     Checkpoint(tmp_path).remove()
     assert {path.name for path in tmp_path.iterdir()} == mine
 
@@ -206,7 +202,7 @@ def test_what_cannot_be_kept_later_costs_checkpoints_but_no_results(end, tmp_pat
     scans = list(open_dataset("sim:room?frames=4&columns=400"))
     dataset, checkpoint = ListDataset([*scans, end]), Checkpoint(tmp_path / "c", seconds=0.0)
     options = {"checkpoint": checkpoint, "keep_partial": True}
-    result = run(dataset, PREDICTED, loop_closer=Remembering(), **options)
+    result = run(dataset, QUICK, loop_closer=Remembering(), **options)
     assert len(result.updates) == 4
     assert caplog.text.count("no checkpoint: ") == 1
     assert "Foreign cannot be in a checkpoint" in caplog.text
@@ -216,23 +212,23 @@ def test_another_configuration_is_told(tmp_path):
     dataset, other = (
         open_dataset(f"sim:{world}?frames=3&columns=300") for world in ("room", "trees")
     )
-    stopped(dataset, PREDICTED, tmp_path, 2)
+    stopped(dataset, QUICK, tmp_path, 2)
     with pytest.raises(OutputError, match="another run: its configuration"):
-        stopped(dataset, PREDICTED.changed("solver.iterations=7"), tmp_path, None)
+        stopped(dataset, QUICK.changed("solver.iterations=7"), tmp_path, None)
     with pytest.raises(OutputError, match="another run: its data set was room"):
-        stopped(other, PREDICTED, tmp_path, None)
+        stopped(other, QUICK, tmp_path, None)
 
 
 @pytest.mark.parametrize("change", ["seed=3", "dropout=0.1", "gyro_noise=0.1"])
 def test_other_options_of_the_loader_are_told(change, tmp_path):
     world = "sim:room?frames=4&columns=300"
     folder = tmp_path / "checkpoint"
-    stopped(open_dataset(world), PREDICTED, folder, 2)
+    stopped(open_dataset(world), QUICK, folder, 2)
     with pytest.raises(
         (DatasetError, OutputError), match=r"of the run to go on with|checksum of IMU"
     ):
-        stopped(open_dataset(f"{world}&{change}"), PREDICTED, folder, None)
-    assert len(stopped(open_dataset(world), PREDICTED, folder, None).updates) == 4
+        stopped(open_dataset(f"{world}&{change}"), QUICK, folder, None)
+    assert len(stopped(open_dataset(world), QUICK, folder, None).updates) == 4
 
 
 def test_a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not(tmp_path):
@@ -244,7 +240,7 @@ def test_a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not(tmp_
 
     def gone_on(place, at):
         folder = open_dataset(tmp_path / place / "drive")
-        return stopped(folder, PREDICTED, tmp_path / "checkpoint", at)
+        return stopped(folder, QUICK, tmp_path / "checkpoint", at)
 
     gone_on("monday", 2)
     with pytest.raises(DatasetError, match="sweep 0: expected that of the run to go on with"):
@@ -257,9 +253,9 @@ def test_a_folder_that_moved_is_gone_on_with_and_another_of_its_name_is_not(tmp_
 def test_other_sweeps_are_told(keep, tmp_path):
     scans = list(open_dataset("sim:room?frames=4&columns=300"))
     folder = tmp_path / "checkpoint"
-    stopped(ListDataset(scans), PREDICTED, folder, 2)
+    stopped(ListDataset(scans), QUICK, folder, 2)
     with pytest.raises(DatasetError, match="of the run to go on with"):
-        stopped(ListDataset(scans[keep]), PREDICTED, folder, None, keep_partial=True)
+        stopped(ListDataset(scans[keep]), QUICK, folder, None, keep_partial=True)
 
 
 @pytest.mark.parametrize(
@@ -268,13 +264,13 @@ def test_other_sweeps_are_told(keep, tmp_path):
 )
 def test_a_damaged_checkpoint_is_told(pattern, damage, tmp_path):
     dataset = open_dataset("sim:room?frames=3&columns=300")
-    stopped(dataset, PREDICTED, tmp_path, 2)
+    stopped(dataset, QUICK, tmp_path, 2)
     file = next(tmp_path.glob(pattern))
     file.write_bytes(file.read_bytes()[:1000] if damage == "cut" else b"not an archive")
     if damage == "gone":
         file.unlink()
     with pytest.raises(OutputError, match="cannot be read"):
-        stopped(dataset, PREDICTED, tmp_path, None)
+        stopped(dataset, QUICK, tmp_path, None)
 
 
 def test_a_run_goes_on_without_checkpoints_if_they_cannot_be_written(tmp_path, caplog):
@@ -282,9 +278,7 @@ def test_a_run_goes_on_without_checkpoints_if_they_cannot_be_written(tmp_path, c
     checkpoint = Checkpoint(tmp_path / "file" / "checkpoint", seconds=0.0)
     assert (
         len(
-            run(
-                open_dataset("sim:room?frames=4&columns=300"), PREDICTED, checkpoint=checkpoint
-            ).updates
+            run(open_dataset("sim:room?frames=4&columns=300"), QUICK, checkpoint=checkpoint).updates
         )
         == 4
     )
@@ -302,15 +296,14 @@ def test_an_interrupt_in_the_middle_of_a_frame_keeps_the_last_whole_one(tmp_path
         return []
 
     checkpoint = Checkpoint(tmp_path, seconds=0.0)
-    assert run(dataset, PREDICTED, extra_factors=interrupting, checkpoint=checkpoint).interrupted
+    assert run(dataset, QUICK, extra_factors=interrupting, checkpoint=checkpoint).interrupted
     again = Checkpoint(tmp_path, resume=True)
-    result = run(dataset, PREDICTED, extra_factors=interrupting, checkpoint=again)
-    assert_same(result, run(dataset, PREDICTED, extra_factors=lambda context: []))
+    result = run(dataset, QUICK, extra_factors=interrupting, checkpoint=again)
+    assert_same(result, run(dataset, QUICK, extra_factors=lambda context: []))
 
 
 # -- from the command line ----------------------------------------------------------------------
 
-QUICK_START = ("--set", "deskew.model=predicted")
 RUN = ("run", "sim:room?frames=24&columns=240", "--no-plot", *QUICK_START, "--output")
 
 
@@ -352,14 +345,12 @@ def test_two_runs_at_a_time_do_not_share_a_checkpoint(tmp_path):
             with pytest.raises(OutputError, match="another run uses this folder"):
                 run(world, checkpoint=Checkpoint(tmp_path / "here"))
 
-    first = run(world, PREDICTED, checkpoint=Checkpoint(tmp_path / "here"), on_frame=second)
+    first = run(world, QUICK, checkpoint=Checkpoint(tmp_path / "here"), on_frame=second)
     assert len(first.updates) == 2
     assert not (tmp_path / "here").exists()  # for nothing was saved in it
     assert (
-        len(run(world, PREDICTED, checkpoint=Checkpoint(tmp_path / "here", seconds=0.0)).updates)
-        == 2
+        len(run(world, QUICK, checkpoint=Checkpoint(tmp_path / "here", seconds=0.0)).updates) == 2
     )
     assert (
-        len(run(world, PREDICTED, checkpoint=Checkpoint(tmp_path / "here", resume=True)).updates)
-        == 2
+        len(run(world, QUICK, checkpoint=Checkpoint(tmp_path / "here", resume=True)).updates) == 2
     )

@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from support.quick import PREDICTED
 from support.worlds import OWN, World, there_and_back, updates
 
 from loam_gtsam.config import Config
@@ -203,7 +204,7 @@ def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, coupling
     """With a loop closer of one's own, and looked at after every frame."""
     dataset = open_dataset("sim:corridor?frames=16&columns=300&speed=8")
     limits = {"keyframe_distance": 0.1, "follow_distance": 1e-4, "follow_angle_deg": 1e-4}
-    config = settings(**limits).changed({"imu.coupling": coupling, "deskew.model": "predicted"})
+    config = settings(**limits).changed(f"imu.coupling={coupling}", PREDICTED)
     sweeps = list(dataset)
 
     def pipeline():
@@ -257,7 +258,7 @@ def ring(laps, radius=35.0, step=2.0):
 def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     """Once round a ring, of which 20 m are in view, and on."""
     config = settings(turn_walk_deg=0.2)
-    config = config.changed("loops.min_way=60.0", "loops.min_share=0.4", "deskew.model=predicted")
+    config = config.changed("loops.min_way=60.0", "loops.min_share=0.4", PREDICTED)
     poses, world = ring(1.15, radius=28.0, step=STEP), World(1)
 
     def rounds(closing):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.cli import loam
+from support.quick import QUICK_START
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
@@ -78,8 +79,7 @@ def test_one_sweep_or_one_ring_votes_for_nothing_that_it_saw(square):
 
 def test_the_command_writes_a_clean_map(tmp_path):
     world = "sim:square?frames=8&columns=300"
-    quick = "--set", "deskew.model=predicted"  # no first sweeps are mapped anew
-    assert loam("run", world, "--output", tmp_path, "--no-plot", "-q", *quick).exit_code == 0
+    assert loam("run", world, "--output", tmp_path, "--no-plot", "-q", *QUICK_START).exit_code == 0
     done = loam("clean", world, tmp_path, "--plot")
     assert done.exit_code == 0, done.output
     report = json.loads((tmp_path / "cleaned" / "report.json").read_text())

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from support.bags import START, cloud, imu, make_message, store_of, write_bag, xyz
 from support.cli import loam
+from support.quick import QUICK_START
 
 from loam_gtsam.config import BagConfig, MapConfig
 from loam_gtsam.cubemap import CubeMap
@@ -185,10 +186,6 @@ def files_below(folder: Path) -> set[str]:
 
 
 EVIL = ["../../evil", "/a/../../../evil", "~/evil", "/[/evil]", "/$(evil)", "/\x1b[2Jevil"]
-
-
-QUICK_START = ("--set", "deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.mark.parametrize("topic", ["/../../evil", "/etc/[/evil]"])

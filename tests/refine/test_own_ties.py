@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 import pytest
+from support.quick import QUICK
 from support.ties import check_gradient
 
-from loam_gtsam.config import Config
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.loops.batch import SavedGraph
 from loam_gtsam.loops.keyframes import noise_model, pose_key
@@ -49,8 +49,8 @@ class Driven:
 def driven(tmp_path_factory) -> Driven:
     """A drive through rooms, of which a user says that its end is higher."""
     world = SimulatedWorld("rooms", frames=30, columns=300, speed=3.0, seed=1)
-    changes = "pose_graph.keyframe_distance=0.5", "loops.enabled=true", "deskew.model=predicted"
-    result = run(world, config := Config().changed(*changes))
+    changes = "pose_graph.keyframe_distance=0.5", "loops.enabled=true"
+    result = run(world, config := QUICK.changed(*changes))
     assert result.pipeline is not None
     assert result.pipeline.loops is not None
     graph = result.pipeline.loops.graph

@@ -8,6 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from support.quick import QUICK
 from support.worlds import seen_from_first
 
 from loam_gtsam.config import Config
@@ -27,8 +28,6 @@ SIGMAS = np.array([0.01, 0.02, 0.03, 0.1, 0.2, 0.3])
 NOT_A_NUMBER = gtsam.noiseModel.Isotropic.Sigma(6, np.nan)
 NOISE = gtsam.noiseModel.Diagonal.Sigmas(SIGMAS)
 CONTEXT = PoseContext(POSE_KEY, 0, LAST, (0, LAST))
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def between(noise=NOISE, *, turned=False):

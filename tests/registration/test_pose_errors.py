@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from support.jacobians import numerical
 from support.list_dataset import ListDataset
+from support.quick import PREDICTED
 
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -164,7 +165,7 @@ def test_who_stands_still_does_not_drift():
 def test_ground_that_is_new_drifts_by_the_factor():
     def drift(factor):
         world = SimulatedWorld("room", frames=6, columns=450)
-        config = no_imu(drift=factor).changed("deskew.model=predicted")
+        config = no_imu(drift=factor).changed(PREDICTED)
         return run(world, config).updates[-1].uncertainty.drift
 
     once = drift(1.0)

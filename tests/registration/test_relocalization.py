@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.quick import PREDICTED, QUICK
 
 from loam_gtsam.config import Config, RelocalizationConfig
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -58,8 +59,6 @@ def with_search(**changes):
 
 
 OFF = with_search(enabled=False)
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.fixture(scope="module")
@@ -660,7 +659,7 @@ def test_a_jump_is_no_motion(begun, drive, calm, move, turn_deg):
 def test_a_lost_lidar_leaves_the_map_alone_until_it_is_found(kidnapped):
     """A search too narrow at first: some sweeps are lost."""
     config = with_search(radius=0.0, radius_growth=1.0)
-    config = config.changed("solver.iterations=8", "deskew.model=predicted")
+    config = config.changed("solver.iterations=8", PREDICTED)
     pipeline, sizes, updates = Pipeline(config), [], []
     for sweep in kidnapped:
         updates.append(pipeline.process(sweep))

@@ -32,6 +32,7 @@ from support.live_replay import (
     recorded,
     replay,
 )
+from support.quick import QUICK
 
 from loam_gtsam.config import (
     Config,
@@ -57,9 +58,6 @@ from loam_gtsam.types import ConfigError, FrameStatus, InputError, MapUpdate, Sw
 
 FRAMES = 11
 SHORT = 6
-DESKEW = DeskewConfig(model="predicted")
-QUICK = Config(deskew=DESKEW)
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +152,7 @@ def test_a_live_run_is_that_of_the_bag_however_the_messages_come(
 
 
 def test_it_is_the_same_from_several_threads(bag: Path, offline: RunResult) -> None:
-    config = Config(live=LiveConfig(when_full="never", imu_wait=60.0), deskew=DESKEW)
+    config = QUICK.changed(live=LiveConfig(when_full="never", imu_wait=60.0))
     updates: list[MapUpdate] = []
     live = LiveMapper(config, imu=True, observe=lambda sweep, update, _: updates.append(update))
     stop = threading.Event()
@@ -255,7 +253,7 @@ def near_the_start(_: Any) -> list[gtsam.NonlinearFactor]:
 AT_THE_END = DeskewConfig(model="predicted", rotation="orientation", reference="end")
 PARTS: dict[str, tuple[Config, Any]] = {
     "loops": (
-        Config(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9), deskew=DESKEW),
+        QUICK.changed(pose_graph=PoseGraphConfig(keyframe_distance=1e-4, max_chi2=1e9)),
         lambda: {"loop_closer": OneLoop()},
     ),
     "tight": (
@@ -267,7 +265,7 @@ PARTS: dict[str, tuple[Config, Any]] = {
         dict,
     ),
     "longer averages": (
-        Config(imu=ImuConfig(average_seconds=0.2, still_seconds=0.3), deskew=DESKEW),
+        QUICK.changed(imu=ImuConfig(average_seconds=0.2, still_seconds=0.3)),
         dict,
     ),
     "own factors": (QUICK, lambda: {"extra_factors": near_the_start}),
@@ -424,7 +422,7 @@ def test_sweeps_wait_for_samples_by_the_clock_that_is_put_right() -> None:
 
 
 def test_impatience_is_counted_and_changes_the_result(bag: Path, offline: RunResult) -> None:
-    hasty = Config(live=LiveConfig(imu_wait=0.0), deskew=DESKEW)
+    hasty = QUICK.changed(live=LiveConfig(imu_wait=0.0))
     live, results = lived(late(messages_of(bag), IMU, 500 * MS), config=hasty)
     assert live.report().without_imu > FRAMES // 2
     assert live.report().late["imu"] > 0

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from support.cli import loam
 from support.contenders import FakePeer
+from support.quick import QUICK_START
 
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.studies.comparison_report import PICTURES, REPORT_FILE, TABLE_FILES
@@ -30,8 +31,7 @@ def command(tmp_path, monkeypatch, dataset):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("COLUMNS", "300")
     monkeypatch.setattr("loam_gtsam.datasets.open_dataset", lambda *a, **k: dataset)
-    quick = ("--set", "deskew.model=predicted")  # the first sweeps are not mapped anew
-    return lambda *arguments: loam("compare", "x", *quick, *arguments)
+    return lambda *arguments: loam("compare", "x", *QUICK_START, *arguments)
 
 
 def rows(path):

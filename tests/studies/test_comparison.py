@@ -8,6 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.contenders import Sweeps
+from support.quick import QUICK
 from support.trajectories import winding
 
 from loam_gtsam.config import Config, config_from_dict, preset
@@ -44,8 +45,6 @@ from loam_gtsam.types import (
 )
 
 FRAMES = 6
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def find_contender(name):

@@ -7,8 +7,8 @@ import csv
 import numpy as np
 import pytest
 from support.contenders import Sweeps
+from support.quick import QUICK
 
-from loam_gtsam.config import Config
 from loam_gtsam.pipeline import run
 from loam_gtsam.studies.contenders import METHODS, Contender, Group, make_contender
 from loam_gtsam.studies.same_matches import (
@@ -18,9 +18,6 @@ from loam_gtsam.studies.same_matches import (
     write_same_matches,
 )
 from loam_gtsam.types import FrameStatus, InputError
-
-QUICK = Config().changed("deskew.model=predicted")
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 def solvers(*names):

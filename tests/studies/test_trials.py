@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.list_dataset import ListDataset
+from support.quick import QUICK
 from support.trials import trial_of
 
 from loam_gtsam.config import Config, preset
@@ -47,12 +48,11 @@ def test_the_id_depends_on_what_decides_the_result_and_on_no_name():
 
 def test_a_row_has_the_numbers_of_the_run():
     drive = "sim:room?frames=14&columns=300&speed=5&start=moving"
-    config = Config().changed("deskew.model=predicted")
-    row = run_trial(trial_of(drive, seed=2, options={"dropout": 0.1}, config=config))
+    row = run_trial(trial_of(drive, seed=2, options={"dropout": 0.1}, config=QUICK))
     assert list(row) == list(COLUMNS)
     options = {"speed": 5, "start": "moving", "seed": 2, "dropout": 0.1}
     world = SimulatedWorld("room", frames=14, columns=300, **options)
-    result = run(world, config)
+    result = run(world, QUICK)
     truth, found = world.truth, result.trajectory
     absolute, relative = absolute_error(found, truth), relative_error(found, truth)
     assert row["error"] is row["problem"] is row["peer"] is None

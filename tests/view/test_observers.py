@@ -13,6 +13,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from support.cli import loam
 from support.list_dataset import ListDataset
+from support.quick import QUICK, QUICK_START
 from typer.testing import Result
 
 from loam_gtsam.config import Config, DeskewConfig
@@ -41,8 +42,6 @@ from loam_gtsam.view.frame_view import LARGE_RESIDUAL, residual_colours
 from loam_gtsam.view.observers import LastFrame, record, registered_cloud, surrounding_cloud, watch
 
 FRAMES = 6
-QUICK = Config(deskew=DeskewConfig(model="predicted"))
-"""The first sweeps are not mapped anew with each that follows, which takes most of a short run."""
 
 
 class Kept:
@@ -325,8 +324,7 @@ def _empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def run_command(*arguments: object) -> Result:
-    quick = "--set", "deskew.model=predicted"  # no sweep is mapped anew with those that follow
-    return loam("run", *arguments, "--no-plot", "--output", "out", *quick)
+    return loam("run", *arguments, "--no-plot", "--output", "out", *QUICK_START)
 
 
 ROOM = "sim:room?frames=3&columns=450"

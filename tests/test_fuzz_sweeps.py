@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.quick import PREDICTED
+from support.quick import PREDICTED, QUICK
 from support.strategies import FEW, START, WILD, configs, generators, imu_streams, scans
 
 from loam_gtsam.config import (
@@ -94,7 +94,7 @@ def test_hostile_sweeps_never_raise_and_the_next_good_one_is_fine(data: st.DataO
 
 
 def test_one_stamp_in_the_far_future_costs_one_sweep() -> None:
-    pipeline = Pipeline(Config())
+    pipeline = Pipeline(QUICK)
     for sweep in SWEEPS[:3]:
         pipeline.process(sweep)
     lost = pipeline.process(replace(SWEEPS[3], stamp=2**61))
@@ -115,8 +115,8 @@ def test_a_motion_is_not_extrapolated_for_ever() -> None:
 
 @pytest.mark.parametrize("metres", [1e6, np.inf, np.nan])
 def test_a_guess_outside_the_grid_is_a_status_and_the_map_stays(metres: float) -> None:
-    mapper = Pipeline(Config()).mapper
-    features = [extract_features(sweep, Config()) for sweep in SWEEPS[:3]]
+    mapper = Pipeline(QUICK).mapper
+    features = [extract_features(sweep, QUICK) for sweep in SWEEPS[:3]]
     mapper.register(features[0])
     before = mapper.map_points()[1]
     lost = mapper.register(features[1], gtsam.Pose3(gtsam.Rot3(), np.array([metres, 0.0, 0.0])))
@@ -165,7 +165,7 @@ def test_a_sweep_from_beyond_the_year_2116_is_refused(stamp: int) -> None:
 
 @pytest.mark.parametrize("span", [(-1e9, 1e9), (1.7e9, 1.7e9 + 0.1), (0.0, np.nan), (0.0, 3.0)])
 def test_a_sweep_far_from_its_stamp_is_a_status(span: tuple[float, float]) -> None:
-    pipeline = Pipeline(Config())
+    pipeline = Pipeline(QUICK)
     pipeline.process(SWEEPS[0])
     update = pipeline.process(replace(SWEEPS[1], span=span))
     assert update.status is FrameStatus.UNUSABLE_SCAN

@@ -259,7 +259,7 @@ def sweeps(shaken):
 @pytest.fixture(scope="module")
 def six(shaken, sweeps):
     """The first six sweeps, mapped without priors of roll and pitch."""
-    return run(data_of(shaken, sweeps[:6]), with_imu(prior="off"))
+    return run(data_of(shaken, sweeps[:6]), with_imu(QUICK, prior="off"))
 
 
 def with_imu(config=None, **changes):
@@ -317,7 +317,7 @@ def test_an_imu_levels_the_map_deskews_and_holds_the_tilt(shaken, sweeps):
 
 @pytest.mark.parametrize("prior", ["off", "blend", "equivalent", "sigma"])
 def test_every_mode_acts_and_says_so(shaken, sweeps, six, prior):
-    result = run(data_of(shaken, sweeps[:6]), with_imu(prior=prior))
+    result = run(data_of(shaken, sweeps[:6]), with_imu(QUICK, prior=prior))
     said = {"off": "none", "sigma": "gravity"}.get(prior, prior)
     assert {str(u.tilt_prior) for u in result.updates[1:]} == {said}
     moved = np.abs(result.trajectory.map_T_lidar - six.trajectory.map_T_lidar).max()
@@ -428,7 +428,7 @@ def test_a_solver_without_a_graph_cannot_have_a_prior(shaken, sweeps, method, pr
 @pytest.mark.parametrize("name", ["loam", "aloam", "default"])
 def test_a_solver_that_was_made_brings_its_settings(sweeps, name):
     settings = preset(name).solver
-    result = run(ArrayDataset(sweeps[:4]), solver=make_solver(settings))
+    result = run(ArrayDataset(sweeps[:4]), QUICK, solver=make_solver(settings))
     assert result.config.solver == settings
     for update in result.updates[1:]:
         assert update.status.solved

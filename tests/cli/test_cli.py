@@ -148,14 +148,14 @@ def test_text_of_the_data_is_never_taken_for_markup_and_quiet_prints_nothing(ope
     assert mapped("--quiet") == ""
     assert "summary.json" in files_in("out")
     assert "fake [bold]data[/bold]" in mapped()
-    text = said("inspect", "x")
+    text = said("inspect", "x", *QUICK_START)
     assert "x [y] z" in text
     assert "a [red]small[/red] problem" in text
 
 
 def test_inspect_tells_sweeps_that_cannot_be_used(opens, scans):
     opens([*scans[:3], BadSweep(scans[2].stamp + 10**8, "damaged")])
-    text = said("inspect", "x")
+    text = said("inspect", "x", *QUICK_START)
     assert "1 of 4 sweeps: 1 unusable_scan, the first: damaged" in text
 
 
@@ -472,17 +472,17 @@ def test_inspect_takes_the_rate_of_the_recording(monkeypatch):
 
 def test_inspect_shows_what_was_understood_of_sweeps_and_imu(opens, scans, monkeypatch):
     room = "sim:room?frames=3&columns=450"
-    text = said("inspect", room)
+    text = said("inspect", room, *QUICK_START)
     for part in ("simulated world", "16 rings from the ring field", "per-point times",
                  "samples at 200 Hz, orientation its own", "can be run"):  # fmt: skip
         assert part in text
-    assert "IMU, used" not in said("inspect", room, "--set", "imu.coupling=off")
+    assert "IMU, used" not in said("inspect", room, *QUICK_START, "--set", "imu.coupling=off")
     opens(scans[:1])
-    assert "IMU, used" not in said("inspect", "x")
+    assert "IMU, used" not in said("inspect", "x", *QUICK_START)
     imu = SimulatedWorld("room", frames=2).imu
     broken = ImuSamples(imu.stamps, 3.0 * imu.orientation, imu.gyro, imu.acceleration)
     monkeypatch.setattr(FakeDataset, "imu", broken)
-    assert "not of unit length" in said("inspect", "x")
+    assert "not of unit length" in said("inspect", "x", *QUICK_START)
 
 
 def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
@@ -491,7 +491,7 @@ def test_an_imu_on_another_clock_is_told(opens, scans, monkeypatch):
     late = ImuSamples(imu.stamps + 3600 * 10**9, imu.orientation, imu.gyro, imu.acceleration)
     for samples, told in ((imu, False), (late, True)):
         monkeypatch.setattr(FakeDataset, "imu", samples)
-        assert ("the clocks differ" in said("inspect", "x")) == told
+        assert ("the clocks differ" in said("inspect", "x", *QUICK_START)) == told
         text = mapped("--overwrite")
         assert ("no orientation at 3 of 4 sweeps" in text) == told
         assert ("IMU, level unknown: no samples about the first sweep" in text) == told

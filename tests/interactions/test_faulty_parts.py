@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import gtsam
 import numpy as np
 import pytest
+from support.quick import PREDICTED
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import open_dataset
@@ -24,6 +25,7 @@ from loam_gtsam.types import FrameStatus, InputError
 
 DATA = open_dataset("sim:room?frames=6&columns=200&imu=mems&speed=3&start=moving")
 CONFIG = effective_config(Config().changed("pose_graph.keyframe_distance=0.02"), DATA)
+QUICK = CONFIG.changed(PREDICTED)
 GOES_ON = CONFIG.changed("parts.on_error=continue")
 SWEEPS = list(DATA)
 NOISE = gtsam.noiseModel.Isotropic.Sigma(6, 1e3)
@@ -174,7 +176,7 @@ def test_a_run_goes_on_without_a_part_that_fails_and_says_so_once(place, used, c
     part = Faulty(place, for_good=True)
     part.armed = True
     with caplog.at_level(logging.WARNING, "loam_gtsam"):
-        result = run(DATA, GOES_ON, **part.parts())
+        result = run(DATA, GOES_ON.changed(PREDICTED) if used else GOES_ON, **part.parts())
     assert caplog.text.count("raised FaultError") == 1
     assert f"{place} of your own" in caplog.text
     first = 0 if place == "features" else 1
@@ -197,9 +199,9 @@ def test_a_part_that_returns_something_else_is_named(part, returned, said, caplo
         "loop_closer": SimpleNamespace(detect=lambda *_: returned, reset=own.reset),
     }
     with pytest.raises(InputError, match=said) as caught:
-        run(DATA, CONFIG, **{part: parts[part]})
+        run(DATA, QUICK, **{part: parts[part]})
     assert any(f"raised in {part} of your own" in note for note in caught.value.__notes__)
-    result = run(DATA, GOES_ON, **{part: parts[part]})
+    result = run(DATA, GOES_ON.changed(PREDICTED), **{part: parts[part]})
     assert len(result.updates) == len(SWEEPS)
     assert said in caplog.text
 
@@ -214,7 +216,7 @@ def test_a_part_that_returns_something_else_is_named(part, returned, said, caplo
 )
 def test_a_keyword_that_is_none_and_a_class_for_an_object_are_refused(keywords, error, said):
     with pytest.raises(error, match=said):
-        run(DATA, CONFIG, **keywords)
+        run(DATA, QUICK, **keywords)
 
 
 @pytest.mark.parametrize("name", ["observe", "on_frame"])
@@ -222,11 +224,11 @@ def test_an_observer_that_fails_costs_the_run_or_nothing(name, caplog):
     def broken(*_):
         raise FaultError("picture")
 
-    result = run(DATA, GOES_ON, max_frames=3, **{name: broken})
+    result = run(DATA, GOES_ON.changed(PREDICTED), max_frames=3, **{name: broken})
     assert len(result.updates) == 3
     assert caplog.text.count("raised FaultError: picture") == 1
     with pytest.raises(PartError, match=rf"{name} of your own \(.*broken\) raised FaultError"):
-        run(DATA, CONFIG, max_frames=3, **{name: broken})
+        run(DATA, QUICK, max_frames=3, **{name: broken})
 
 
 def test_a_run_that_a_fault_stopped_is_gone_on_with(tmp_path):

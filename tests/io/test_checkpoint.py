@@ -121,7 +121,7 @@ class OwnSolver(GtsamSolver):
 
 def test_an_own_solver_is_given_again(tmp_path):
     def pipeline():
-        return Pipeline(solver=OwnSolver(Config().solver))
+        return Pipeline(QUICK, solver=OwnSolver(QUICK.solver))
 
     scans = list(open_dataset("sim:room?frames=4&columns=400"))
     first, again, checkpoint = pipeline(), pipeline(), Checkpoint(tmp_path)

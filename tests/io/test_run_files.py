@@ -11,6 +11,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.quick import QUICK
 
 from loam_gtsam.config import load_config
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -29,7 +30,7 @@ WORLD = SimulatedWorld("room", frames=FRAMES, columns=450)
 
 @pytest.fixture(scope="module")
 def result() -> RunResult:
-    return run(WORLD)
+    return run(WORLD, QUICK)
 
 
 def read_ply(path: Path) -> tuple[list[str], np.ndarray]:

@@ -583,8 +583,8 @@ def test_damage_in_a_bag_has_the_same_effect_live(bag: Path, tmp_path: Path) -> 
         cut = replace(sweep.content, data=sweep.content.data[:1000])
         messages[messages.index(sweep)] = replace(sweep, content=cut)
     path = bag_of(tmp_path / "damaged", messages)
-    live, results = lived(late(messages_of(path), IMU, 150 * MS))
-    assert_the_same(live, results, run(open_dataset(path)))
+    live, results = lived(late(messages_of(path), IMU, 150 * MS), config=QUICK)
+    assert_the_same(live, results, run(open_dataset(path), QUICK))
     assert live.report().statuses["unusable_scan"] == 2
 
 
@@ -602,7 +602,7 @@ def test_faults_before_the_first_good_cloud_leave_no_frame(bag: Path) -> None:
 
 def test_sweeps_out_of_order_are_counted_and_skipped(bag: Path) -> None:
     sweeps = [m for m in messages_of(bag) if m.topic == POINTS]
-    live = LiveMapper()
+    live = LiveMapper(QUICK)
     for number in (0, 1, 3, 2, 3, 4):
         hand_over(live, sweeps[number])
     statuses = [result.update.status for result in iter(live.step, None)]
@@ -682,14 +682,16 @@ def test_a_live_run_of_loam_topics_is_that_of_the_bag(tmp_path: Path, loam_axes:
 
 @pytest.mark.parametrize(("offset", "matched"), [(5, True), (-5, True), (6, False), (-6, False)])
 def test_messages_make_a_sweep_if_their_stamps_agree_to_5_ms(offset: int, matched: bool) -> None:
-    _, results = replayed_topics(loam_recording(count=4, offsets={REQUIRED[1]: offset * MS}))
+    recording = loam_recording(count=4, offsets={REQUIRED[1]: offset * MS})
+    _, results = replayed_topics(recording, config=QUICK)
     assert len(results) == (4 if matched else 0)
 
 
 def test_messages_without_partners_are_counted_by_topic() -> None:
     recording = loam_recording(count=6)
     gone = [n for n, entry in enumerate(recording) if entry[0] == REQUIRED[2]][2]
-    live, results = replayed_topics([e for n, e in enumerate(recording) if n != gone])
+    others = [e for n, e in enumerate(recording) if n != gone]
+    live, results = replayed_topics(others, config=QUICK)
     assert len(results) == 5
     expected = dict.fromkeys((*REQUIRED, CLOUD), 1) | {REQUIRED[2]: 0}
     assert live.report().unmatched == expected
@@ -701,7 +703,7 @@ def test_faulty_features_are_counted_and_the_run_goes_on() -> None:
     recording[spoilt[1]] = (*recording[spoilt[1]][:2], None)
     place = recording[spoilt[2]]
     recording[spoilt[2]] = (*place[:2], without("x")(place[2]))
-    live, results = replayed_topics(recording)
+    live, results = replayed_topics(recording, config=QUICK)
     assert len(results) == 3
     assert results[1].update.status is FrameStatus.UNUSABLE_SCAN
     without_stamp, without_field = live.report().faults

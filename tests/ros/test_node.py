@@ -16,8 +16,9 @@ import pytest
 from rosbags.highlevel import AnyReader
 from support.bags import ROS2, loam_recording, write_bag
 from support.live_replay import IMU, POINTS, bag_of, recorded
+from support.quick import QUICK
 
-from loam_gtsam.config import LiveConfig
+from loam_gtsam.config import LiveConfig, dump_config
 from loam_gtsam.datasets import open_dataset
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -51,7 +52,15 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def offline(bag: Path) -> RunResult:
-    return run(open_dataset(bag))
+    return run(open_dataset(bag), QUICK)
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The file of the configuration of this run, for a node."""
+    file = tmp_path_factory.mktemp("node") / "quick.yaml"
+    file.write_text(dump_config(QUICK))
+    return str(file)
 
 
 def raw_messages(bag: Path) -> Raw:
@@ -165,9 +174,9 @@ def assert_published(published: Raw, offline: RunResult) -> None:
 
 
 def test_the_node_maps_what_it_hears(
-    monkeypatch: pytest.MonkeyPatch, rclpy: Any, bag: Path, offline: RunResult
+    monkeypatch: pytest.MonkeyPatch, rclpy: Any, bag: Path, offline: RunResult, quick: str
 ) -> None:
-    node = FakeNode(imu_topic=IMU)
+    node = FakeNode(imu_topic=IMU, config=quick)
 
     def spin(spun: object) -> None:
         assert spun is node
@@ -197,9 +206,9 @@ def test_the_node_maps_what_it_hears(
 
 
 def test_the_files_of_the_run_are_written_when_the_node_ends(
-    bag: Path, offline: RunResult, tmp_path: Path
+    bag: Path, offline: RunResult, quick: str, tmp_path: Path
 ) -> None:
-    node = FakeNode(imu_topic=IMU, output=str(tmp_path / "run"))
+    node = FakeNode(imu_topic=IMU, output=str(tmp_path / "run"), config=quick)
     live = LiveNode(node)
     for _ in range(2):  # a node that was refused holds nothing
         with pytest.raises(OutputError, match="another run uses this folder"):

@@ -288,7 +288,7 @@ def test_the_whole_of_a_run_is_recorded(tmp_path: Path) -> None:
 
     with BagWriter(tmp_path / "run.bag") as bag:
         recorded = record(bag)
-        outcome = run(ListDataset(sweeps), observe=observe)
+        outcome = run(ListDataset(sweeps), QUICK, observe=observe)
     counts = topics(tmp_path / "run.bag")
     assert (counts[ODOMETRY], counts[REGISTERED], counts[SURROUND]) == (6, 5, 2)
     surround = surrounding_cloud(outcome.updates[-1], mappers[-1])

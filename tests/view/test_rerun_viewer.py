@@ -12,6 +12,7 @@ import pytest
 from support.cli import loam
 from support.frames import STAMP, around, frame
 from support.list_dataset import ListDataset
+from support.quick import QUICK, QUICK_START
 
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.pipeline import run
@@ -103,7 +104,7 @@ def test_a_run_is_recorded_frame_by_frame(tmp_path, chunks):
     world = SimulatedWorld("room", frames=6, columns=450)
     path = tmp_path / "new" / "run.rrd"
     with RerunViewer(path, every=4) as viewer:
-        outcome = run(ListDataset(list(world)), observe=watch(viewer))
+        outcome = run(ListDataset(list(world)), QUICK, observe=watch(viewer))
     rows, found, blueprints = chunks(path)
     each = ("sweep", "covariance", "features/edges", "features/planes", "matches/points",
             "matches/residuals")  # fmt: skip
@@ -266,7 +267,8 @@ def test_without_a_screen_a_file_is_offered_instead_of_a_window(tmp_path, monkey
 
 def test_the_command_line_saves_a_recording_and_says_how_to_open_it(tmp_path, chunks):
     path = tmp_path / "run.rrd"
-    arguments = ("run", "sim:room?frames=3&columns=450", "--no-plot", "--output", tmp_path / "out")
+    world, folder = "sim:room?frames=3&columns=450", tmp_path / "out"
+    arguments = ("run", world, "--no-plot", *QUICK_START, "--output", folder)
     done = loam(*arguments, "--rrd", path)
     assert done.exit_code == 0, done.output
     assert "rerun" in done.output

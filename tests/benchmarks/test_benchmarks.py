@@ -13,6 +13,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from support.quick import begin_quickly
 
 from benchmarks import __main__ as tool
 from benchmarks import (
@@ -65,6 +66,7 @@ def here(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     for module in (drawn, growth, refining, refining_growth, robustness, soak, worlds, loops):
         if hasattr(module, "ProcessPoolExecutor"):
             monkeypatch.setattr(module, "ProcessPoolExecutor", InProcess)
+    begin_quickly(monkeypatch)
     return monkeypatch
 
 

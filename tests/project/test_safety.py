@@ -208,7 +208,7 @@ def test_names_in_a_bag_never_become_paths(
         recording += [(name, scan.stamp, imu(store, scan.stamp)) for name in EVIL]
     write_bag(here / "run", "mcap", recording)
     before = files_below(tmp_path)
-    assert loam("inspect", "run").exit_code == 0
+    assert loam("inspect", "run", *QUICK_START).exit_code == 0
     archive = f"map.archive_dir={here / 'archive'}"
     result = loam(
         "run", "run", "--output", "out", "--bag", "mapped.bag", "--set", archive, "--set",

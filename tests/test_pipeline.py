@@ -67,10 +67,10 @@ def test_scan_to_scan_guess_maps_as_well():
 
 
 @pytest.mark.parametrize("copied", [deepcopy, lambda result: pickle.loads(pickle.dumps(result))])
-@pytest.mark.parametrize("loops", ["true", "false"])
-def test_a_copy_of_a_result_goes_on_as_the_result_does(copied, loops):
+@pytest.mark.parametrize("config", [QUICK.changed("loops.enabled=true"), Config()])
+def test_a_copy_of_a_result_goes_on_as_the_result_does(copied, config):
     world = SimulatedWorld("room", frames=6, columns=300, imu="six_axis")
-    result = run(world, Config().changed(f"loops.enabled={loops}"), max_frames=5)
+    result = run(world, config, max_frames=5)
     copy = copied(result)
     before = copy.trajectory.map_T_lidar
     np.testing.assert_array_equal(before, result.trajectory.map_T_lidar)
@@ -507,8 +507,8 @@ def test_own_factors_are_asked_for_once_a_frame_and_act(shaken, sweeps):
 
 
 def test_a_run_without_own_factors_may_say_so_with_an_empty_list(shaken, sweeps):
-    plain = run(data_of(shaken, sweeps[:3]))
-    asked = run(data_of(shaken, sweeps[:3]), extra_factors=lambda context: [])
+    plain = run(data_of(shaken, sweeps[:3]), QUICK)
+    asked = run(data_of(shaken, sweeps[:3]), QUICK, extra_factors=lambda context: [])
     assert np.array_equal(plain.trajectory.map_T_lidar, asked.trajectory.map_T_lidar)
 
 

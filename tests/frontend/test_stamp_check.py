@@ -173,7 +173,7 @@ def test_a_run_goes_on_where_it_is_when_the_clock_is_set_ahead(drive):
 
 
 def test_a_clock_set_back_says_what_to_do_and_a_reset_does_it(drive):
-    pipeline = Pipeline()
+    pipeline = Pipeline(QUICK)
     for scan in drive[:4]:
         pipeline.process(scan)
     earlier = [replace(scan, stamp=scan.stamp - DAY) for scan in drive[4:12]]

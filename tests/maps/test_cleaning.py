@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 from support.cli import loam
-from support.quick import QUICK_START
+from support.quick import QUICK, QUICK_START
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets import SimulatedWorld
@@ -62,7 +62,7 @@ def test_people_go_and_houses_stay(square):
 
 def test_sweeps_without_rings_are_refused_with_the_reason():
     world = SimulatedWorld("room", sensor="mid360", frames=3)
-    result = run(world, Config().changed("imu.coupling=off"))
+    result = run(world, QUICK.changed("imu.coupling=off"))
     poses = np.stack([update.map_T_lidar.matrix() for update in result.updates])
     with pytest.raises(DatasetError, match=r"sweep 1: no rings .*; expected rings, between which"):
         list(views(world, result.updates, poses, result.config))

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from support.jacobians import numerical
 from support.pose_graphs import SIGMAS, drifted, frames, right_loops, settings, square
+from support.quick import QUICK
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import PartOf
@@ -199,7 +200,7 @@ def test_factors_on_what_is_not_there_are_refused(driven: Driven, name: str, wro
 
 
 CUTS = (0, 35), (25, 60)
-_CONFIG = Config().changed("pose_graph.keyframe_distance=0.5", "loops.enabled=true")
+_CONFIG = QUICK.changed("pose_graph.keyframe_distance=0.5", "loops.enabled=true")
 
 
 @pytest.fixture(scope="module")

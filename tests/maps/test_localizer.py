@@ -10,6 +10,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.cli import loam
+from support.quick import begin_quickly
 from support.rooms_map import FRAMES, Mapped, world
 from support.worlds import OWN
 from support.worlds import updates as made_up
@@ -389,8 +390,9 @@ def test_a_place_that_is_said_must_be_in_the_map(saved, near, expected):
         localizer.reset(near)
 
 
-def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path):
+def test_a_map_is_extended_by_what_it_does_not_have(mapped, tmp_path, monkeypatch):
     """The first third of a drive is mapped; a second drive adds the rest."""
+    begin_quickly(monkeypatch)
     short, long = tmp_path / "short.lgmap", tmp_path / "long.lgmap"
     result = run(PartOf(mapped.world, 0, 1, None, 1.0), mapped.result.config)
     save_map(short, result.pipeline)
@@ -488,6 +490,7 @@ def test_what_is_gone_since_the_map_was_made_is_cleaned_out_of_the_larger_map(
     tmp_path, monkeypatch
 ):
     """Of a cupboard of the first day, the drive of the second day sees what was behind it."""
+    begin_quickly(monkeypatch)
     monkeypatch.chdir(tmp_path)
     drive = world(frames=10)
     scene = drive.scene

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.cli import loam
+from support.quick import QUICK
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import PartOf
@@ -173,7 +174,7 @@ def test_maps_are_tied_by_loops_that_agree(agreeing, otherwise, tied):
 
 def test_maps_without_a_common_place_are_not_merged(halves, tmp_path):
     first, path = halves.maps()[0], tmp_path / "park.lgmap"
-    save_map(path, run(SimulatedWorld("park", frames=15, columns=300)).pipeline)
+    save_map(path, run(SimulatedWorld("park", frames=15, columns=300), QUICK).pipeline)
     saved = SavedMap(path)
     with pytest.raises(DatasetError, match=r"park\.lgmap: no place of it"):
         merge_maps([first, saved], tmp_path / "none.lgmap")

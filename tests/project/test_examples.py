@@ -10,6 +10,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from support.quick import begin_quickly
 
 from loam_gtsam import POSE_KEY, PoseContext
 
@@ -146,6 +147,13 @@ CHECKS: dict[str, Callable[[Names, str], None]] = {
     "13_refine_a_run.py": refined_run,
     "14_own_solver.py": own_solver,
 }
+BEGIN_QUICKLY = (
+    "02_numpy_arrays.py",
+    "04_own_prior.py",
+    "10_own_loop_closer.py",
+    "14_own_solver.py",
+)
+"""What these show is the same however a run begins."""
 
 
 def test_every_example_is_checked() -> None:
@@ -161,5 +169,7 @@ def test_example(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("sys.argv", [name])
+    if name in BEGIN_QUICKLY:
+        begin_quickly(monkeypatch)
     names = runpy.run_path(str(FOLDER / name), run_name="__main__")
     CHECKS[name](names, capsys.readouterr().out)

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from support.quick import begin_quickly
 
 ROOT = Path(__file__).resolve().parents[2]
 image = pytest.importorskip("matplotlib.image")
@@ -23,7 +24,10 @@ def figures() -> ModuleType:
     return module
 
 
-def test_one_command_makes_every_picture_of_the_readme(figures: ModuleType, tmp_path: Path) -> None:
+def test_one_command_makes_every_picture_of_the_readme(
+    figures: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begin_quickly(monkeypatch)
     assert figures.main(["--frames", "4", "--output", str(tmp_path)]) == 0
     made = {path.name for path in tmp_path.iterdir()}
     assert all(image.imread(tmp_path / name).std() > 0.02 for name in made)

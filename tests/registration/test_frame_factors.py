@@ -8,7 +8,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
-from support.quick import QUICK
+from support.quick import QUICK, begin_quickly
 from support.worlds import seen_from_first
 
 from loam_gtsam.config import Config
@@ -204,8 +204,9 @@ def test_factors_may_be_in_a_graph_or_yielded():
         assert (len(found.alone), len(found.since_last)) == (1, 1)
 
 
-def test_the_solvers_of_the_documentation_keep_degenerate_frames_degenerate():
+def test_the_solvers_of_the_documentation_keep_degenerate_frames_degenerate(monkeypatch):
     """A hall without ends; a solver that drops ``motion`` would call every frame ok."""
+    begin_quickly(monkeypatch)
     root = Path(__file__).resolve().parents[2]
     page = (root / "docs/own_factor.md").read_text("utf-8")
     names = runpy.run_path(str(root / "examples/14_own_solver.py"))

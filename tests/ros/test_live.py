@@ -738,9 +738,9 @@ def test_options_that_contradict_each_other_are_errors(options: Any, match: str)
 
 def test_sweeps_and_samples_need_no_messages() -> None:
     world = SimulatedWorld("room", frames=3, columns=300)
-    expected = run(world)
+    expected = run(world, QUICK)
     hurried = count(0, 10**10).__next__  # nothing waits for samples that never come
-    live = LiveMapper(effective_config(Config(), world), imu=True, clock=hurried)
+    live = LiveMapper(effective_config(QUICK, world), imu=True, clock=hurried)
     live.add_imu(world.imu)
     updates = []
     for scan in world:

@@ -8,7 +8,7 @@ import gtsam
 import numpy as np
 import pytest
 from support.contenders import Sweeps
-from support.quick import QUICK
+from support.quick import PREDICTED, QUICK
 from support.trajectories import winding
 
 from loam_gtsam.config import Config, config_from_dict, preset
@@ -115,6 +115,7 @@ def test_shared_guess_gives_all_the_guesses_of_the_first(dataset):
 
 def test_solvers_differ_in_the_solver_and_presets_in_everything(dataset):
     base = config_from_dict({"features": {"sectors": 4}, "sensor": {"max_range": 80.0}})
+    base = base.changed(PREDICTED)
     chosen = [make_contender(Group.SOLVER, name, base) for name in METHODS]
     chosen.append(make_contender(Group.PRESET, "loam", base))
     result = compare_solvers(dataset, chosen, max_frames=2)

@@ -393,7 +393,7 @@ def test_the_imu_moves_roll_and_pitch_of_a_frame_by_its_weight(rng):
     """Frames of one attitude, an IMU that changes its mind by 10 mrad after the start."""
     results = {}
     for weight in (0.0, 0.1):
-        config = Config().changed({"imu.weight": weight, "imu.still_seconds": 0.1})
+        config = QUICK.changed({"imu.weight": weight, "imu.still_seconds": 0.1})
         buffer = imu_of(gtsam.Rot3.Roll(0.01))
         start = imu_of(gtsam.Rot3(), seconds=0.75).samples_between(-SECOND // 2, SECOND // 8)
         late = buffer.samples_between(SECOND // 8 + 1, 2 * SECOND)

@@ -667,14 +667,16 @@ def replayed_topics(
     return lived(messages, imu=False, features=topics, **options)
 
 
-@pytest.mark.parametrize("loam_axes", [False, True])
-def test_a_live_run_of_loam_topics_is_that_of_the_bag(tmp_path: Path, loam_axes: bool) -> None:
+@pytest.mark.parametrize(("loam_axes", "config"), [(False, Config()), (True, QUICK)])
+def test_a_live_run_of_loam_topics_is_that_of_the_bag(
+    tmp_path: Path, loam_axes: bool, config: Config
+) -> None:
     recording = loam_recording(loam_axes=loam_axes)
-    offline = run(open_dataset(write_bag(tmp_path / "topics", "ros1", recording)))
+    offline = run(open_dataset(write_bag(tmp_path / "topics", "ros1", recording)), config)
     delays = {CLOUD: 250 * MS, REQUIRED[0]: 80 * MS}
     delayed = [(topic, at + delays.get(topic, 0), message) for topic, at, message in recording]
     for received in (recording, delayed):
-        live, results = replayed_topics(received)
+        live, results = replayed_topics(received, config=config)
         assert_the_same(live, results, offline)
         assert not any(live.report().unmatched.values())
     assert results[0].received == START + 250 * MS

@@ -349,9 +349,9 @@ def test_damaged_bytes_are_counted() -> None:
 
 
 def test_a_stamp_that_no_message_can_say_is_not_published_and_the_run_goes_on(
-    bag: Path, caplog: pytest.LogCaptureFixture
+    bag: Path, quick: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    node = FakeNode()
+    node = FakeNode(config=quick)
     published: list[str] = []
 
     def publish(topic: str, raw: bytes) -> None:

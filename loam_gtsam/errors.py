@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copyreg
 import difflib
 import logging
 import struct
@@ -12,6 +13,7 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from enum import StrEnum
 from functools import partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -27,7 +29,10 @@ _INDETERMINATE = "Indeterminate linear system"  # how a RuntimeError of GTSAM be
 
 
 class LoamError(Exception):
-    """Base of every error this package raises on purpose."""
+    """Base of every error this package raises on purpose; processes can hand one to another."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return copyreg.__newobj__, (type(self), *self.args), self.__dict__  # type: ignore[attr-defined]
 
 
 class ConfigError(LoamError, ValueError):

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import logging
+import pickle
+import pkgutil
+from contextlib import suppress
 from types import SimpleNamespace
 
 import gtsam
@@ -10,9 +14,11 @@ import numpy as np
 import pytest
 from support.quick import PREDICTED
 
+import loam_gtsam
 from loam_gtsam.config import Config
+from loam_gtsam.config.base import RefusedError
 from loam_gtsam.datasets import open_dataset
-from loam_gtsam.errors import PartError, is_own
+from loam_gtsam.errors import LoamError, PartError, SweepError, SweepFault, is_own
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.io.checkpoint import Checkpoint
@@ -259,3 +265,30 @@ def test_an_error_of_the_package_itself_is_not_called_the_users(monkeypatch):
     with pytest.raises(ZeroDivisionError):
         pipeline.process(SWEEPS[1])
     np.testing.assert_array_equal(pipeline.mapper.map_points()[1], before)
+
+
+def _all_errors(kind):
+    yield kind
+    for below in kind.__subclasses__():
+        yield from _all_errors(below)
+
+
+def test_every_error_passes_from_one_process_to_another():
+    for module in pkgutil.walk_packages(loam_gtsam.__path__, "loam_gtsam."):
+        if not module.name.endswith("__main__"):
+            with suppress(ImportError):  # of what is not installed
+                importlib.import_module(module.name)
+    made = {
+        PartError: lambda: PartError("solver", print, ValueError("no")),
+        RefusedError: lambda: RefusedError("Sensor", ("low", "high"), "no"),
+        SweepError: lambda: SweepError("no", SweepFault.EMPTY),
+    }
+    kinds = list(_all_errors(LoamError))
+    assert made.keys() < set(kinds)
+    for kind in kinds:
+        if kind.__module__.startswith("loam_gtsam"):
+            error = made.get(kind, lambda kind=kind: kind("no"))()
+            error.add_note("there")
+            copy = pickle.loads(pickle.dumps(error))
+            assert (type(copy), str(copy)) == (kind, str(error))
+            assert vars(copy) == vars(error)

@@ -92,9 +92,14 @@ def check_array(
 
 def as_stamps(value: ArrayLike, name: str) -> NDArray[np.int64]:
     """(N,) int64 nanoseconds; InputError for anything but integers."""
-    stamps = np.asarray(value)
+    try:
+        stamps = np.asarray(value)
+    except ValueError as error:
+        raise InputError(f"{name}: expected an array, got {error}") from error
     if not stamps.size:
         stamps = stamps.astype(np.int64)
+    elif stamps.dtype == np.uint64 and stamps.max() > np.iinfo(np.int64).max:
+        raise InputError(f"{name}: expected nanoseconds of 63 bits, got {stamps.max()}")
     try:
         check_array(stamps, name, ("N",), "integer nanoseconds")
     except InputError as error:

@@ -49,7 +49,7 @@ class Trajectory:
         for number, pose in enumerate(poses):
             how = "Trajectory(stamps, matrices) takes an array of (N, 4, 4)"
             check_kind(pose, gtsam.Pose3, f"poses[{number}]", how)
-        return cls(np.array(stamps, np.int64), stack_poses(poses))
+        return cls(as_stamps(stamps, "stamps"), stack_poses(poses))
 
     def __len__(self) -> int:
         return len(self.stamps)

@@ -78,12 +78,7 @@ class Scan:
             if isinstance(given := getattr(self, name), (list, tuple)):
                 object.__setattr__(self, name, np.array(given))
         check_array(self.points, "Scan.points", ("N", 3))
-        if not (_is_integer(self.stamp) and abs(int(self.stamp)) <= MAX_STAMP):
-            raise InputError(
-                "Scan.stamp: expected integer nanoseconds up to 2^62 (the year 2116), got "
-                f"{self.stamp!r}; round(seconds * 1e9) makes them of seconds"
-            )
-        object.__setattr__(self, "stamp", int(self.stamp))
+        _check_stamp(self)
         for name, numbers in (("times", "floats"), ("rings", "integers")):
             column = getattr(self, name)
             if column is not None:
@@ -100,6 +95,18 @@ class Scan:
 
 def _is_integer(value: object) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool)
+
+
+def _check_stamp(sweep: Scan | Features | BadSweep) -> None:
+    """InputError unless the stamp makes sense, which becomes an int; any may do for a bad sweep."""
+    stamp = sweep.stamp
+    bounded = not isinstance(sweep, BadSweep)
+    if not _is_integer(stamp) or (bounded and abs(int(stamp)) > MAX_STAMP):
+        raise InputError(
+            f"{type(sweep).__name__}.stamp: expected integer nanoseconds up to 2^62 (the year "
+            f"2116), got {stamp!r}; round(seconds * 1e9) makes them of seconds"
+        )
+    object.__setattr__(sweep, "stamp", int(stamp))
 
 
 def _are_two_numbers(value: object) -> bool:
@@ -155,6 +162,9 @@ class Features:
     voxel_sizes: tuple[float, float] | None = None
     reach: float = np.inf
 
+    def __post_init__(self) -> None:
+        _check_stamp(self)
+
     @classmethod
     def from_points(
         cls, stamp: int, edges: NDArray[np.floating], planes: NDArray[np.floating]
@@ -164,7 +174,8 @@ class Features:
         Raises
         ------
         InputError
-            If a shape or a dtype is wrong, or a point is not finite or farther than any lidar sees.
+            If a shape, a dtype or the stamp is wrong, or a point is not finite or farther than any
+            lidar sees.
         """
         for name, points in {"edges": edges, "planes": planes}.items():
             check_array(points, name, ("N", 3))
@@ -215,6 +226,9 @@ class BadSweep:
 
     stamp: int
     message: str
+
+    def __post_init__(self) -> None:
+        _check_stamp(self)
 
 
 Sweep = Scan | FeatureSweep | BadSweep

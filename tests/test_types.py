@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from loam_gtsam.types import (
+    BadSweep,
     Features,
     FrameStatus,
     ImuSamples,
@@ -15,6 +16,10 @@ from loam_gtsam.types import (
 )
 
 POINTS = np.zeros((6, 3), np.float32)
+
+
+def features_at(stamp):
+    return Features.from_points(stamp, POINTS, POINTS)
 
 
 @pytest.mark.parametrize(
@@ -96,6 +101,28 @@ def test_a_trajectory_is_made_of_poses_and_knows_the_length_of_its_path():
     np.testing.assert_array_equal(trajectory.map_T_lidar[1], poses[1].matrix())
     assert trajectory.path_length == pytest.approx(17.0)
     assert Trajectory.from_poses([], []).map_T_lidar.shape == (0, 4, 4)
+
+
+@pytest.mark.parametrize(
+    "stamps", [[0.1, 0.2], ["a", "b"], [2**63, 0], [2**70, 0], [[1], [2, 3]], iter([1, 2]), [1]]
+)
+def test_a_trajectory_is_not_made_of_stamps_that_are_no_integers(stamps):
+    with pytest.raises(InputError, match=r"expected .*, got"):
+        Trajectory.from_poses(stamps, [gtsam.Pose3()] * 2)
+
+
+@pytest.mark.parametrize("make", [lambda stamp: BadSweep(stamp, ""), features_at])
+def test_the_stamp_of_any_sweep_is_an_integer(make):
+    assert type(make(np.uint64(5)).stamp) is int
+    for bad in (0.1, None, "0", True):
+        with pytest.raises(InputError, match=r"stamp: expected integer nanoseconds .* got"):
+            make(bad)
+
+
+def test_only_the_stamp_of_a_bad_sweep_may_be_out_of_range():
+    assert BadSweep(2**63, "damaged").stamp == 2**63
+    with pytest.raises(InputError, match=r"Features.stamp: .* up to 2\^62"):
+        features_at(2**63)
 
 
 def test_a_trajectory_is_indexed_iterated_and_asked_for_other_times():

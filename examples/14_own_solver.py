@@ -46,7 +46,8 @@ class GaussNewton:
             step = linear.optimize().at(POSE_KEY)
             moved = gtsam.Values()
             moved.insert(POSE_KEY, pose.retract(step))
-            costs, small = (graph.error(values), graph.error(moved)), np.linalg.norm(step) < 1e-3
+            costs = graph.error(values), graph.error(moved)
+            small = bool(np.linalg.norm(step) < 1e-3)
             information = linear.hessian()[0]
             return Solution(
                 pose.retract(step), True, small, matches, 1, 1, *costs, information, scan, weak

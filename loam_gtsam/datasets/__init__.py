@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
-from loam_gtsam.datasets.base import BagOptions
+from loam_gtsam.datasets.base import BagOptions, LoadedDataset
 from loam_gtsam.datasets.base import Dataset as Dataset
 from loam_gtsam.datasets.base import DatasetInfo as DatasetInfo
 from loam_gtsam.datasets.known.layouts import known_loader
@@ -74,7 +74,7 @@ def __getattr__(name: str) -> Any:
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 
-def open_dataset(path: str | Path, **options: Any) -> Dataset:
+def open_dataset(path: str | Path, **options: Any) -> LoadedDataset:
     """Open whatever is at ``path``.
 
     Parameters
@@ -141,7 +141,7 @@ def _suggestion(path: Path) -> str:
     return f"Expected {_ACCEPTED}; {there}; {_OTHERS}"
 
 
-def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
+def _open_bag(path: Path, options: dict[str, Any]) -> LoadedDataset:
     from contextlib import closing
 
     from loam_gtsam.datasets.bags.bag import BagDataset
@@ -159,7 +159,7 @@ def _open_bag(path: Path, options: dict[str, Any]) -> Dataset:
     return _construct(LoamTopicsDataset if own else plain_bag, path, options)
 
 
-def _open_world(text: str, options: dict[str, Any]) -> Dataset:
+def _open_world(text: str, options: dict[str, Any]) -> LoadedDataset:
     scene, _, query = text.removeprefix("sim:").partition("?")
     try:
         pairs = parse_qsl(query, strict_parsing=bool(query))
@@ -185,7 +185,7 @@ def _number_or_text(value: str) -> int | float | str:
     return value
 
 
-def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> Dataset:
+def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> LoadedDataset:
     known = list(inspect.signature(loader).parameters)[1:]
     if "options" in known:
         known[known.index("options") :] = BagOptions.__annotations__
@@ -195,5 +195,5 @@ def _construct(loader: Any, source: str | Path, options: dict[str, Any]) -> Data
             f"{source}: {name} takes no option {', '.join(unknown)}; it takes {takes}"
             f"{nearest(unknown[0], known, listing=False)}"
         )
-    dataset: Dataset = loader(source, **options)
+    dataset: LoadedDataset = loader(source, **options)
     return dataset

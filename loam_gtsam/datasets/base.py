@@ -68,10 +68,18 @@ class BagOptions(TimeOptions, total=False):
 class Dataset(Protocol):
     """A sequence of sweeps. Iterating twice gives the same sweeps twice."""
 
-    name: str
-    sensor: Mapping[str, Any]
-    """Fields of ``SensorConfig``, and of ``ImuConfig`` as ``imu.NAME``, that the layout of the data
-    implies; the user's own win."""
+    @property
+    def name(self) -> str:
+        """For people."""
+        ...
+
+    @property
+    def sensor(self) -> Mapping[str, Any]:
+        """Fields of ``SensorConfig``, and of ``ImuConfig`` as ``imu.NAME``, that the data implies.
+
+        The user's own win.
+        """
+        ...
 
     def __len__(self) -> int: ...
 
@@ -108,7 +116,7 @@ def sweeps_of_run(dataset: Dataset, count: int) -> Iterator[Sweep]:
         )
 
 
-class Loader:
+class Loader(Protocol):
     """What every loader can do besides: be cut, be given reference poses, and show itself."""
 
     def __repr__(self) -> str:
@@ -142,6 +150,10 @@ class Loader:
     ) -> WithTruth:
         """The same data set with other reference poses, see :meth:`WithTruth.of`."""
         return WithTruth.of(cast(Dataset, self), truth, topic=topic, body_T_lidar=body_T_lidar)
+
+
+class LoadedDataset(Dataset, Loader, Protocol):
+    """A data set of a loader of this package, which has the methods of both."""
 
 
 class ChangedDataset(Loader):

@@ -10,11 +10,13 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from support import walk
 from support.quick import begin_quickly
 
 from loam_gtsam import POSE_KEY, PoseContext
 
-FOLDER = Path(__file__).resolve().parents[2] / "examples"
+ROOT = Path(__file__).resolve().parents[2]
+FOLDER = ROOT / "examples"
 Names = dict[str, Any]
 
 
@@ -173,3 +175,29 @@ def test_example(
         begin_quickly(monkeypatch)
     names = runpy.run_path(str(FOLDER / name), run_name="__main__")
     CHECKS[name](names, capsys.readouterr().out)
+
+
+OPENED = """
+from loam_gtsam import open_dataset, run
+
+dataset = open_dataset("folder")
+run(dataset.part(100, 2, end_s=60.0).with_truth("poses.tum"))
+"""
+
+
+def test_mypy_accepts_the_examples_and_the_data_sets_of_the_docs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    api = pytest.importorskip("mypy.api")
+    texts = {f"example_{file.name}": file.read_text("utf-8") for file in FOLDER.glob("*.py")}
+    for page in ("own_sensor", "inputs"):
+        for number, block in enumerate(walk.blocks(ROOT / f"docs/{page}.md", "python")):
+            texts[f"{page}_{number}.py"] = block.text
+    for name, text in (texts | {"opened.py": OPENED}).items():
+        (tmp_path / name).write_text(text, "utf-8")
+    monkeypatch.setenv("MYPYPATH", str(ROOT))
+    monkeypatch.chdir(tmp_path)
+    cache = f"--cache-dir={ROOT / '.mypy_cache/examples'}"
+    options = "--config-file=", "--check-untyped-defs", "--ignore-missing-imports"
+    found, errors, _ = api.run([*options, cache, *sorted(texts), "opened.py"])
+    assert (found.splitlines()[:-1], errors) == ([], "")

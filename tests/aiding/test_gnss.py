@@ -8,7 +8,7 @@ import pytest
 from support.receiver import ANTENNA, CONFIG, ENU_T_MAP, ORIGIN, Drive
 
 from loam_gtsam.aiding.gnss import ANTENNA_KEY, MAP_KEY, fix_factor, tie, write_enu
-from loam_gtsam.datasets.decode.aiding import GnssFixes
+from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.types import InputError, Trajectory
@@ -157,3 +157,15 @@ def test_fixes_have_covariances_of_their_own_one_for_all_or_none(known):
     np.testing.assert_array_equal(fixes.covariances, wanted)
     with pytest.raises(InputError, match=r"expected \(2, 3, 3\), .* got \(2, 3\); variances"):
         GnssFixes(np.arange(2), places, np.ones((2, 3)))
+
+
+def test_fixes_and_wheels_keep_arrays_of_what_was_given():
+    fixes = GnssFixes([0, 1], [[47.5, 8.5, 450.0]] * 2, [[[1, 0, 0], [0, 1, 0], [0, 0, 1]]] * 2)
+    assert fixes.stamps.dtype == np.int64
+    assert fixes.geodetic[1:].shape == (1, 3)
+    assert fixes.covariances[0, 0, 0] == 1.0
+    wheels = WheelSamples([0, 1], np.tile(np.eye(4), (2, 1, 1)).tolist())
+    assert (wheels.stamps[1:] - 1).tolist() == [0]
+    assert wheels.start_T_body.shape == (2, 4, 4)
+    with pytest.raises(InputError, match=r"covariances: expected .* numbers"):
+        GnssFixes([0], [[47.5, 8.5, 450.0]], [["a"] * 3] * 3)

@@ -14,7 +14,7 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.datasets.decode.tables import rows_in_time
 from loam_gtsam.geometry import as_array, as_stamps
-from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray
+from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray, check_array
 
 FIX = "sensor_msgs/msg/NavSatFix"
 TWIST, ODOMETRY = "geometry_msgs/msg/TwistStamped", "nav_msgs/msg/Odometry"
@@ -51,7 +51,10 @@ class GnssFixes:
                 f"GnssFixes.covariances: expected ({len(stamps)}, 3, 3), (3, 3) or None, got "
                 f"{np.shape(told)}; variances[:, :, None] * np.eye(3) makes them of variances"
             )
-        object.__setattr__(self, "covariances", np.broadcast_to(told, (len(stamps), 3, 3)))
+        told = np.broadcast_to(np.asarray(told), (len(stamps), 3, 3))
+        check_array(told, "GnssFixes.covariances", (len(stamps), 3, 3), "numbers")
+        for name, array in (("stamps", stamps), ("geodetic", places), ("covariances", told)):
+            object.__setattr__(self, name, array)
         if (np.diff(stamps) <= 0).any():
             raise InputError("GnssFixes.stamps: expected ascending ones")
         if not is_place(places).all():
@@ -88,7 +91,9 @@ class WheelSamples:
 
     def __post_init__(self) -> None:
         stamps = as_stamps(self.stamps, "WheelSamples.stamps")
-        as_array(self.start_T_body, "WheelSamples.start_T_body", (len(stamps), 4, 4))
+        poses = as_array(self.start_T_body, "WheelSamples.start_T_body", (len(stamps), 4, 4))
+        object.__setattr__(self, "stamps", stamps)
+        object.__setattr__(self, "start_T_body", poses)
         if (np.diff(stamps) <= 0).any():
             raise InputError("WheelSamples.stamps: expected ascending ones")
 

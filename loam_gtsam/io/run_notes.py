@@ -35,7 +35,7 @@ _SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground make
 
 
 def run_notes(result: RunResult) -> tuple[str, ...]:
-    """Sentences on positions, IMU, times of points and statuses; none if nothing is wrong."""
+    """Sentences on positions, IMU, fixes, times of points and statuses; none if all is well."""
     notes = []
     sigmas = position_sigmas(result.updates)
     path = result.trajectory.path_length
@@ -46,6 +46,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
             notes.append(f"{told}: other first motions fit as well, or the way was blind")
     if result.imu is not None:
         notes += result.imu.problems
+    if result.fixes is not None and result.fixes.reference is None:
+        notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.times_problem:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))

@@ -13,8 +13,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 from support.quick import QUICK
 
-from loam_gtsam.config import load_config
+from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.arrays import ArrayDataset
+from loam_gtsam.datasets.decode.aiding import GnssFixes
 from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.io import run_files
@@ -264,6 +265,14 @@ def test_what_is_in_doubt_is_said_in_python_and_in_the_summary(result, tmp_path)
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert summary["notes"] == list(doubted.notes)
     assert summary["imu"]["problems"] == list(apart.imu.problems)
+
+
+def test_fixes_that_were_asked_for_and_not_used_are_a_note(result):
+    fixes = GnssFixes(WORLD.truth.stamps, [[47.5, 8.5, 450.0]] * len(WORLD.truth))
+    config = Config().changed("aiding.gnss=true")
+    world = ArrayDataset(list(WORLD), gnss=fixes, sensor=WORLD.sensor)
+    (note,) = run(world, config).notes
+    assert note.startswith("fixes of the GNSS receiver not used: 0 keyframes have a fix")
 
 
 def test_degenerate_poses_put_a_run_in_doubt_only_if_they_are_vague(result):

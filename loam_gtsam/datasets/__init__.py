@@ -118,7 +118,8 @@ def open_dataset(path: str | Path, **options: Any) -> LoadedDataset:
     except DatasetError as error:
         if find_sweeps(path) is not None:
             raise
-        bags = [file.name for file in sorted(path.iterdir()) if file.suffix in _BAG_FILES]
+        shown = sorted(path.glob("[!.]*"))
+        bags = [file.name for file in shown if file.suffix in _BAG_FILES]
         if bags:
             names = ", ".join(bags[:5])
             raise DatasetError(f"{path}: open one of its bags instead: {names}") from error

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from loam_gtsam.datasets.decode import tables
-from loam_gtsam.datasets.decode.extrinsics import moved_to_lidar
+from loam_gtsam.datasets.decode.extrinsics import is_rigid, moved_to_lidar
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.geometry import inverse_pose
@@ -84,9 +84,7 @@ def extrinsic(text: str) -> FloatArray:
         if len(numbers) == 7:
             return tables.pose_matrix(numbers)
         matrix = np.vstack([np.reshape(numbers[:12], (3, 4)), [0.0, 0.0, 0.0, 1.0]])
-        rotation = matrix[:3, :3]
-        proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
-        if len(numbers) in (12, 16) and proper and np.linalg.det(rotation) > 0.0:
+        if len(numbers) in (12, 16) and is_rigid(matrix):
             return matrix
         raise ValueError(f"{len(numbers)} numbers that are no rigid transform")
     except ValueError as error:

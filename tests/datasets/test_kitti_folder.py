@@ -54,6 +54,15 @@ def test_files_are_read_in_order_of_their_number(tmp_path: Path) -> None:
     assert points == [[9.0], [10.0], [100.0], []]
 
 
+def test_hidden_files_are_no_sweeps_and_a_byte_order_mark_is_no_time(tmp_path: Path) -> None:
+    folder = write_sweeps(tmp_path / "a")
+    (folder / "._000000.bin").write_bytes(b"of macOS")
+    (folder / "times.txt").write_text("5\n5.1\n5.2\n", encoding="utf-8-sig")
+    dataset = open_dataset(folder)
+    assert dataset.stamps.tolist() == [5_000_000_000, 5_100_000_000, 5_200_000_000]
+    assert [len(scan.points) for scan in dataset] == [len(sweep_points(i, 50)) for i in range(3)]
+
+
 def test_without_times_file(tmp_path: Path) -> None:
     dataset = KittiDataset(write_sweeps(tmp_path / "a"))
     assert dataset.stamps.tolist() == [0, 100_000_000, 200_000_000]

@@ -40,7 +40,9 @@ def write_mulran(root: Path, below: str = "", count: int = write.COUNT) -> Path:
 
 
 def test_a_mulran_sequence_is_recognised_and_mapped_in_the_lidar_s_frame(tmp_path: Path) -> None:
-    dataset = open_dataset(write_mulran(tmp_path))
+    root = write_mulran(tmp_path)
+    next(root.rglob(f"{STAMPS[0]}.bin")).with_name(f"._{STAMPS[0]}.bin").write_bytes(b"of macOS")
+    dataset = open_dataset(root)
     assert isinstance(dataset, MulRanDataset)
     assert dataset.stamps.tolist() == STAMPS.tolist()
     write.expect_truth(dataset)

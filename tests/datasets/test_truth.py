@@ -72,6 +72,20 @@ def test_the_extrinsic_moves_the_poses_to_the_lidar(tmp_path):
             extrinsic(text)
 
 
+def test_a_byte_order_mark_costs_no_pose(tmp_path):
+    table = rows(tmp_path)
+    (tmp_path / "x.tum").write_text(
+        "".join(f"{int(row[0]) * 1e-9:.9f} {' '.join(row[1:])}\n" for row in table), "utf-8-sig"
+    )
+    assert len(read_truth(tmp_path / "x.tum")) == len(TRUTH)
+
+
+@pytest.mark.parametrize("matrix", [2.0 * np.eye(4), np.diag([1, 1, -1, 1]), np.ones((4, 4))])
+def test_poses_are_moved_by_a_rigid_transform_only(world, matrix):
+    with pytest.raises(InputError, match="body_T_lidar: expected a rigid transform"):
+        world.with_truth(TRUTH, body_T_lidar=matrix)
+
+
 def positions(tmp_path):
     file = tmp_path / "gps.txt"
     lines = [f"{s * 1e-9:.9f} {p[0]:.9f} {p[1]:.9f} {p[2]:.9f}" for s, p in

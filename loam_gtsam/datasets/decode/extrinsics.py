@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.geometry import as_array, inverse_pose
-from loam_gtsam.types import FloatArray, Trajectory
+from loam_gtsam.types import FloatArray, InputError, Trajectory
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +41,26 @@ def rigid_transform(rotation: Rotation, translation: Sequence[float] | FloatArra
     return matrix
 
 
+def is_rigid(matrix: FloatArray) -> bool:
+    """Whether a (4, 4) matrix is a rigid transform, up to what writing it has rounded."""
+    rotation = matrix[:3, :3]
+    proper = np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    return bool(proper and np.linalg.det(rotation) > 0.0 and (matrix[3] == [0, 0, 0, 1]).all())
+
+
 def moved_to_lidar(truth: Trajectory, body_T_lidar: FloatArray) -> Trajectory:
     """Poses of the lidar, from those of another frame of the same body.
 
-    Positions alone stay where they are, and are told to be of the origin of that frame.
+    Positions alone stay where they are, and are told to be of the origin of that frame. InputError
+    if the matrix is no rigid transform.
     """
     body_T_lidar = as_array(body_T_lidar, "body_T_lidar", (4, 4))
+    if not is_rigid(body_T_lidar):
+        shown = " ".join(np.array2string(body_T_lidar, precision=3).split())
+        raise InputError(
+            "body_T_lidar: expected a rigid transform, a rotation matrix and metres above 0 0 0 1, "
+            f"got {shown}"
+        )
     if np.isfinite(truth.map_T_lidar).all():
         return Trajectory(truth.stamps, truth.map_T_lidar @ body_T_lidar)
     return Trajectory(truth.stamps, truth.map_T_lidar, inverse_pose(body_T_lidar)[:3, 3])

@@ -67,9 +67,9 @@ def _shown(word: str) -> str:
 
 
 def read_lines(path: Path) -> list[str]:
-    """Lines of a text file without trailing blank ones."""
+    """Lines of a text file without trailing blank ones, and without a byte order mark."""
     try:
-        return path.read_text(encoding="utf-8").rstrip().splitlines()
+        return path.read_text(encoding="utf-8-sig").rstrip().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"{path}: cannot read: {error}") from error
 

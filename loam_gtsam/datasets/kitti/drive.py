@@ -106,7 +106,7 @@ def _of_files(listed: IntArray, files: Sequence[Path]) -> IntArray:
 def read_oxts(root: Path) -> tuple[IntArray, FloatArray] | None:
     """Stamps (ns) and the 30 values of each packet of ``oxts/``, or None without the folder."""
     folder = root / "oxts"
-    files = sorted((folder / "data").glob("*.txt"))
+    files = sorted((folder / "data").glob("[!.]*.txt"))
     if not files:
         return None
     stamps = read_dates(folder / "timestamps.txt")

@@ -64,6 +64,7 @@ SUFFIXES = (".bin", *READERS)
 _TRIED = 10  # sweeps looked at, at most, to describe their fields
 _MOST_RINGS = 256  # a fifth column with more different values is no beam
 
+_SHOWN = "[!.]*"  # not those that begin with a dot: macOS's ._000000.bin is no sweep
 _FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
 
 
@@ -120,7 +121,7 @@ class KittiDataset(SweepFiles):
         self._root = _root_of(folder, given)
         self.name = given.resolve().name or "sweeps"
         suffix = _suffix_in(folder)
-        self._files = sorted(folder.glob(f"*{suffix}"), key=_natural_order)
+        self._files = sorted(folder.glob(f"{_SHOWN}{suffix}"), key=_natural_order)
         if columns not in (None, 4, 5):
             raise DatasetError(f"columns: expected 4 or 5, got {columns!r}")
         options: TimeOptions = {
@@ -306,9 +307,9 @@ def find_sweeps(path: Path) -> Path | None:
 
 def _suffix_in(folder: Path) -> str:
     """The kind of file of which a folder has most, empty if it has none; .bin before others."""
-    if any(folder.glob("*.bin")):
+    if any(folder.glob(f"{_SHOWN}.bin")):
         return ".bin"
-    counts = {suffix: len(list(folder.glob(f"*{suffix}"))) for suffix in READERS}
+    counts = {suffix: len(list(folder.glob(f"{_SHOWN}{suffix}"))) for suffix in READERS}
     suffix = max(counts, key=counts.__getitem__)
     return suffix if counts[suffix] else ""
 

@@ -59,7 +59,7 @@ def newer_college_sequences(root: Path) -> Mapping[str, list[Path]]:
     """The bags of each sequence in a folder, or in its ``rosbag/``, in order."""
     for folder in (root, root / "rosbag"):
         found: dict[str, dict[int, Path]] = {}
-        for bag in sorted(folder.glob("*.bag")):
+        for bag in sorted(folder.glob("[!.]*.bag")):
             if (known := newer_college_sequence(bag)) is None:
                 continue
             parts = found.setdefault(known[0], {})
@@ -83,8 +83,8 @@ def spires_bags(root: Path) -> list[Path]:
     for folder in (root, root / "raw/rosbag", root / "raw/ros2bag"):
         if (folder / "metadata.yaml").is_file():
             return [folder]
-        inner = sorted(file.parent for file in folder.glob("*/metadata.yaml"))
-        if found := sorted(folder.glob("*.bag")) or inner:
+        inner = sorted(file.parent for file in folder.glob("[!.]*/metadata.yaml"))
+        if found := sorted(folder.glob("[!.]*.bag")) or inner:
             return found
     return []
 

@@ -83,7 +83,9 @@ class StampedFiles(SweepFiles):
         self._decode = partial(decode_with_times, time_unit=time_unit, stamp_is=stamp_is)
         self.name = path.resolve().name or "sweeps"
         self.sensor: Mapping[str, Any] = extrinsics.extrinsic_settings(rig.lidar_T_imu)
-        found = sorted((_stamp(file, name), file) for file in folder.glob(pattern))
+        # macOS's ._*.bin are no sweeps
+        files = [file for file in folder.glob(pattern) if not file.name.startswith(".")]
+        found = sorted((_stamp(file, name), file) for file in files)
         if not found:
             raise DatasetError(f"{folder}: no sweeps ({pattern})")
         self._files = [file for _, file in found]

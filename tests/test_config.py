@@ -118,7 +118,7 @@ def test_absent_keys_keep_the_default_an_integer_serves_as_a_float_and_null_as_n
 
 def test_the_tree_is_frozen():
     for section, name in ((Config(), "solver"), (Config().solver, "iterations")):
-        with pytest.raises(ValueError, match="frozen"):
+        with pytest.raises(ConfigError, match=rf"{name}: .* is frozen, got .*; config.changed\("):
             setattr(section, name, getattr(section, name))
 
 

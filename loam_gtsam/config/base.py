@@ -138,6 +138,12 @@ class Section(BaseModel):
                 raise out_of_order(keys, *keys, low, high)
         return self
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise ConfigError(
+            f"{type(self).__name__}.{name}: expected no assignment, for a configuration is frozen, "
+            f"got {shown(value)}; config.changed('sensor.min_range=3.0') makes a changed copy"
+        )
+
     def changed(self, /, **values: Any) -> Self:
         """A copy with other values, as ``config.solver.changed(iterations=5)``."""
         return type(self)(**{**vars(self), **values})

@@ -215,7 +215,7 @@ def checked_factor(
         For anything but a noise model, a list of keys and a function; and from GTSAM's error and
         linearize calls, when ``residual`` returns something unusable.
     """
-    rows = _noise_dimension(noise)
+    rows = noise_dimension(noise)
     if not isinstance(keys, Sequence):
         raise InputError(f"keys: expected a list of keys, got {type(keys).__name__} {keys!r}")
     if not callable(residual):
@@ -275,7 +275,7 @@ def point_to_plane_factor(
     p, n = as_vector(point, "point"), _unit(normal, "normal")
     if not np.isfinite(offset):
         raise InputError(f"offset: expected a finite number, got {offset}")
-    _noise_dimension(noise, 1)
+    noise_dimension(noise, 1)
     residual = partial(point_to_plane_residual, point=p, normal=n, offset=float(offset))
     return _pose_factor(key, noise, residual)
 
@@ -302,7 +302,7 @@ def point_to_line_factor(
         As :func:`point_to_plane_factor` does.
     """
     p, c, u = as_vector(point, "point"), as_vector(centre, "centre"), _unit(direction, "direction")
-    _noise_dimension(noise, 2)
+    noise_dimension(noise, 2)
     return _pose_factor(key, noise, partial(point_to_line_residual, point=p, centre=c, direction=u))
 
 
@@ -413,7 +413,8 @@ def _unit(value: ArrayLike, name: str) -> FloatArray:
     return vector
 
 
-def _noise_dimension(noise: gtsam.noiseModel.Base, dimension: int | None = None) -> int:
+def noise_dimension(noise: gtsam.noiseModel.Base, dimension: int | None = None) -> int:
+    """Rows of a noise model; InputError for anything else, or if they are not as many as said."""
     if not isinstance(noise, gtsam.noiseModel.Base):
         raise InputError(
             f"noise: expected a noise model of GTSAM, got {type(noise).__name__}; "

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
-from loam_gtsam.geometry import as_vector, symmetric
+from loam_gtsam.geometry import as_vector, checked_pose, symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.loops.keyframes import LoopClosure
 from loam_gtsam.maps.first_fix import PlaceSearch
@@ -282,7 +282,7 @@ class Localizer:
 
     def map_covariance(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(6, 6) of the saved map's own error at a pose, along its axes, about its origin."""
-        position = map_T_lidar.translation()
+        position = checked_pose(map_T_lidar, "map_T_lidar").translation()
         near = np.sort(self._tree.query_ball_point(position, _AROUND))
         if not len(near):
             return self._saved.places[int(self._tree.query(position)[1])].covariance

@@ -28,11 +28,12 @@ from numpy.typing import ArrayLike
 from loam_gtsam.factors import (
     MatchRows,
     checked_factor,
+    noise_dimension,
     point_to_line_residual,
     point_to_plane_residual,
     scan_match_residual,
 )
-from loam_gtsam.geometry import as_array, as_points, as_vector
+from loam_gtsam.geometry import as_array, as_points, as_vector, checked_pose
 from loam_gtsam.types import FloatArray, InputError
 
 OfPose = Callable[[gtsam.Pose3], tuple[FloatArray, FloatArray]]
@@ -134,7 +135,7 @@ def distribution_rows(
     shape = (len(p), 3, 3)
     of_points = as_array(point_covariances, "point_covariances", shape)
     of_targets = as_array(target_covariances, "target_covariances", shape)
-    turn = target_T_source.rotation().matrix()
+    turn = checked_pose(target_T_source, "target_T_source").rotation().matrix()
     try:
         roots = np.linalg.cholesky(np.linalg.inv(of_targets + turn @ of_points @ turn.T))
     except np.linalg.LinAlgError as error:
@@ -155,8 +156,7 @@ def _between(
     """The factor on two poses of a residual at ``target_T_source``."""
     if target == source:
         raise InputError("target, source: expected the keys of two poses, got the same one twice")
-    if noise.dim() != rows:
-        raise InputError(f"noise: expected dimension {rows}, got {noise.dim()}")
+    noise_dimension(noise, rows)
 
     def at(values: gtsam.Values) -> tuple[FloatArray, list[FloatArray]]:
         motion = values.atPose3(target).between(values.atPose3(source))

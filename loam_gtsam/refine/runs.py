@@ -23,12 +23,7 @@ from loam_gtsam.refine.motion_factors import (
     told_directions,
 )
 from loam_gtsam.refine.rounds import Round, Settings
-from loam_gtsam.refine.sweeps import (
-    Path,
-    ReferenceSteps,
-    SweepPoints,
-    extract_points,
-)
+from loam_gtsam.refine.sweeps import Path, ReferenceSteps, SweepPoints, extract_points
 from loam_gtsam.refine.ties import FactorTies, FixTies, Survey, own_ties
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import (
@@ -41,6 +36,7 @@ from loam_gtsam.types import (
     SweepError,
     SweepMotion,
     Trajectory,
+    check_kind,
 )
 
 _SEEN = (FrameStatus.FIRST, FrameStatus.SPARSE_MAP)
@@ -245,7 +241,8 @@ def refine_run(
     Raises
     ------
     InputError
-        As :func:`~loam_gtsam.refine.adjustment.refine` does, or if the trajectory has other stamps.
+        As :func:`~loam_gtsam.refine.adjustment.refine` does, or if updates are missing, or the
+        trajectory has other stamps.
     """
     run = _Run.of(points, updates, trajectory, "trajectory")
     further, own = gtsam.NonlinearFactorGraph(), list[FactorTies]()
@@ -254,6 +251,7 @@ def refine_run(
         further.push_back(loop_factors(graph, frames, run.to_middle))
         own = own_ties(graph, frames, run.to_middle)
     if factors is not None:
+        check_kind(factors, gtsam.NonlinearFactorGraph, "factors", "its push_back takes a factor")
         further.push_back(factors)
     ties = None if survey is None else _fix_ties(survey, [run])
     return _adjusted([run], further, ties, own, settings, min_aligned, on_round, on_window)[0]
@@ -313,6 +311,7 @@ def refine_runs(
         further.push_back(loop_factors(graph, frames, to_middle))
         own = own_ties(graph, frames, to_middle)
     if factors is not None:
+        check_kind(factors, gtsam.NonlinearFactorGraph, "factors", "its push_back takes a factor")
         further.push_back(factors)
     ties = None if survey is None else _fix_ties(survey, runs, starts)
     return _adjusted(runs, further, ties, own, settings, min_aligned, on_round, on_window)
@@ -333,6 +332,9 @@ class _Run:
     def of(
         points: RunPoints, updates: Sequence[MapUpdate], trajectory: Trajectory | None, name: str
     ) -> _Run:
+        if (needed := 1 + max(points.frames, default=-1)) > len(updates):
+            got = f"expected all of the run, {needed} or more, got {len(updates)}"
+            raise InputError(f"updates: {got}")
         frames = tuple(updates[number] for number in points.frames)
         stamps = np.array([update.stamp for update in frames], np.int64)
         poses = np.array([update.map_T_lidar.matrix() for update in frames])

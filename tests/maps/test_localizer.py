@@ -257,6 +257,8 @@ def test_the_maps_error_is_that_of_the_first_visit_near_by(saved, x, number):
     saved.graph = replace(saved.graph, places=places)
     found = Localizer(saved).map_covariance(at(x))
     np.testing.assert_array_equal(found, number * np.eye(6))
+    with pytest.raises(InputError, match=r"map_T_lidar: expected a gtsam.Pose3, got ndarray"):
+        Localizer(saved).map_covariance(np.eye(4))
 
 
 class Held:

@@ -106,6 +106,7 @@ def test_rows_of_distributions_are_mahalanobis_distances() -> None:
         ({"point": [0.0, 1.0]}, r"point: expected \(3,\)"),
         ({"offset": np.nan}, "offset: expected a finite number"),
         ({"noise": gtsam.noiseModel.Unit.Create(2)}, "noise: expected dimension 1, got 2"),
+        ({"noise": None}, "noise: expected a noise model of GTSAM, got NoneType"),
     ],
 )
 def test_what_makes_no_factor_is_refused(change, message) -> None:
@@ -119,3 +120,8 @@ def test_a_flat_covariance_is_refused() -> None:
     flat = np.array([np.diag([1.0, 1.0, 0.0])] * 20)
     with pytest.raises(InputError, match="positive definite"):
         distribution_rows(POINTS, POINTS, flat, flat, gtsam.Pose3())
+
+
+def test_a_matrix_is_no_pose() -> None:
+    with pytest.raises(InputError, match=r"target_T_source: expected a gtsam.Pose3, got ndarray"):
+        distribution_rows(POINTS, POINTS, COVARIANCES, COVARIANCES, np.eye(4))

@@ -192,6 +192,10 @@ def test_runs_that_do_not_belong_together_are_refused(two) -> None:
         refine_runs(two.points, updates, two.ways, graph=two.merged.graph.saved())
     with pytest.raises(InputError, match=r"trajectories\[1\]: expected the stamps"):
         refine_runs(two.points, updates, [two.ways[0], two.ways[0]])
+    with pytest.raises(InputError, match=r"updates: expected all of the run, 3. or more, got 5"):
+        refine_run(two.points[0], updates[0][:5])
+    with pytest.raises(InputError, match=r"factors: expected a gtsam.NonlinearFactorGraph, got l"):
+        refine_run(two.points[0], updates[0], factors=[])
     far = two.ways[1].map_T_lidar.copy()
     far[:, 0, 3] += 500.0
     ways = [two.ways[0], Trajectory(two.ways[1].stamps, far)]

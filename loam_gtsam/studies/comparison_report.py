@@ -6,6 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -203,8 +204,9 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
         name, found = file_name(run.name), run.trajectory
         trajectories[f"trajectory_{name}.tum"] = found
         if comparison.truth is not None:
-            matched = evaluation.matched_truth(found, comparison.truth)
-            trajectories[f"truth_matched_{name}.tum"] = matched
+            with suppress(InputError):  # of one pose, or in disorder: why, the scores say
+                matched = evaluation.matched_truth(found, comparison.truth)
+                trajectories[f"truth_matched_{name}.tum"] = matched
     if comparison.truth is not None:
         trajectories[TRUTH_FILE] = comparison.truth
     for name, trajectory in trajectories.items():

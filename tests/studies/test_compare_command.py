@@ -67,6 +67,14 @@ def test_command_writes_tables_pictures_and_report(command, fake, world):
         assert text in result.output
 
 
+def test_one_frame_is_compared_without_errors(command):
+    result = command("--solver", "gtsam", "--frames", "1", "--output", "out")
+    assert result.exit_code == 0, result.output
+    (row,) = rows("out/comparison.csv")
+    assert row["ate_m"] == ""
+    assert "expected" in row["problem"]
+
+
 def test_report_is_one_file_with_everything_escaped(command, fake):
     assert command("--solver", "gtsam", "--peer", "fake", "--output", "out").exit_code == 0
     page = Path("out/report.html").read_text()

@@ -36,7 +36,7 @@ from loam_gtsam.maps.map_graph import (
 )
 from loam_gtsam.pipeline import Pipeline, RunResult
 from loam_gtsam.registration.frame_matcher import MapPair
-from loam_gtsam.types import BoolArray, DatasetError, FloatArray, InputError
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray, InputError, OutputError
 from loam_gtsam.voxels.cubes import NO_POINTS, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex, Grid
 
@@ -46,6 +46,7 @@ VERSION = 3
 LAYERS = "edges", "planes", "small_edges", "small_planes"
 _FORMAT = "loam_gtsam map"
 _HEADER = "map.json"
+_CLOUDS = ".ply", ".pcd", ".las", ".laz"
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same map makes the same file
 _POINT = np.dtype([("xyz", "<f8", 3), ("owner", "<i4"), ("view", "i1", 4)])
 """A map point: metres, the number of its place, from where it was seen (voxels/tags.py)."""
@@ -86,7 +87,7 @@ def save_map(path: str | Path, pipeline: Pipeline | RunResult | None) -> None:
     InputError
         If ``pipeline`` is none, or the result has none.
     OutputError
-        If the file cannot be written; an old one is then as it was.
+        If the file cannot be written, an old one is then as it was; or its name is that of a cloud.
     """
     if isinstance(pipeline, RunResult):
         pipeline = pipeline.pipeline
@@ -145,6 +146,9 @@ def write_map(
     OutputError
         As :func:`save_map`.
     """
+    if Path(path).suffix.lower() in _CLOUDS:
+        cloud = "loam_gtsam.maps.write_cloud writes clouds"
+        raise OutputError(f"{path}: expected a name that ends in {SUFFIX}; {cloud}")
     up, earth = frame.up, frame.earth
     header = {
         "format": _FORMAT,

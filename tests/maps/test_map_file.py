@@ -55,6 +55,12 @@ def test_the_same_map_makes_the_same_file(mapped, tmp_path):
         again.unlink()
 
 
+def test_a_map_is_not_written_under_the_name_of_a_cloud(mapped, tmp_path):
+    with pytest.raises(OutputError, match=r"x.PLY: expected a name that ends in .lgmap; .*cloud"):
+        save_map(tmp_path / "x.PLY", mapped.result)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_folder_of_a_run_is_opened_as_its_map_and_a_closed_map_says_so(mapped, tmp_path):
     save_map(tmp_path / "map.lgmap", mapped.result)
     with SavedMap(tmp_path) as saved:

@@ -52,6 +52,7 @@ def test_a_scan_of_wrong_shape_or_dtype_is_refused(fields, message):
 def test_a_scan_takes_what_fits():
     scan = Scan(POINTS, 5, np.zeros(6), np.zeros(6, np.uint16), rows=3)
     assert scan.stamp == 5
+    assert Scan(POINTS, 0, np.zeros(6), span=np.array([0, 0.5])).span == (0.0, 0.5)
     assert len(Scan(POINTS[:0], 0).points) == 0
     listed = Scan([[1.0, 2.0, 3.0]], 0, [0.05], [7])
     assert (listed.points.shape, listed.times.tolist(), listed.rings.tolist()) == (

@@ -28,7 +28,7 @@ from loam_gtsam.loops.closure import LoopCloser, NoLoops
 from loam_gtsam.loops.map_correction import LoopMapping
 from loam_gtsam.loops.places import Places
 from loam_gtsam.mapper import Mapper
-from loam_gtsam.registration.odometry import Odometry, make_odometry
+from loam_gtsam.registration.odometry import Odometry, checked_guess, make_odometry
 from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
 from loam_gtsam.types import (
@@ -250,7 +250,7 @@ class Pipeline:
         started, guess = time.perf_counter(), None
         if self.odometry is not None:
             with self.faults.forgiven(), own_code("odometry", self.odometry):
-                guess = self.odometry.guess(features, last)
+                guess = checked_guess(self.odometry.guess(features, last))
         guessed = time.perf_counter() - started
         if guess is None:
             update = self.mapper.register(features)

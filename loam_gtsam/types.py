@@ -210,11 +210,22 @@ class FeatureSweep:
     features : de-skewed features
     odom_T_lidar : pose of the same moment in that front end's drifting frame
     cloud : (N, 3) de-skewed full-resolution points of the same moment, or None
+
+    Raises
+    ------
+    InputError
+        If the features or the pose are of another class.
     """
 
     features: Features
     odom_T_lidar: gtsam.Pose3
     cloud: NDArray[np.floating] | None = None
+
+    def __post_init__(self) -> None:
+        how = "Features.from_points makes them of points"
+        check_kind(self.features, Features, "FeatureSweep.features", how)
+        how = "gtsam.Pose3(matrix) makes one of a (4, 4) matrix"
+        check_kind(self.odom_T_lidar, gtsam.Pose3, "FeatureSweep.odom_T_lidar", how)
 
     @property
     def stamp(self) -> int:

@@ -7,6 +7,7 @@ import pytest
 from loam_gtsam.types import (
     BadSweep,
     Features,
+    FeatureSweep,
     FrameStatus,
     ImuSamples,
     InputError,
@@ -87,6 +88,14 @@ def test_features_of_wrong_shape_or_dtype_are_refused(bad):
         Features.from_points(0, bad, good)
     with pytest.raises(InputError, match="planes: expected"):
         Features.from_points(0, good, bad)
+
+
+def test_a_feature_sweep_has_features_and_a_pose():
+    features = Features.from_points(0, POINTS, POINTS)
+    with pytest.raises(InputError, match=r"odom_T_lidar: expected a gtsam.Pose3, got ndarray"):
+        FeatureSweep(features, np.eye(4))
+    with pytest.raises(InputError, match="features: expected a Features, got ndarray"):
+        FeatureSweep(POINTS, gtsam.Pose3())
 
 
 def test_a_trajectory_needs_one_pose_per_stamp():

@@ -24,7 +24,7 @@ from loam_gtsam.geometry import (
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
 from loam_gtsam.registration.solvers import MotionPrior
-from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate
+from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate, check_kind
 
 _STEADIEST = 1e-3  # rad/s, m/s and metres, far below what is measured: the least of some errors
 _UNEVEN = 0.5
@@ -48,6 +48,12 @@ class Guess:
 
     map_T_lidar: gtsam.Pose3
     twist: FloatArray
+
+
+def checked_guess(value: Guess) -> Guess:
+    """The guess itself; InputError for anything else."""
+    check_kind(value, Guess, "what guess returns", "Guess(map_T_lidar, twist) makes one")
+    return value
 
 
 class Odometry(Protocol):

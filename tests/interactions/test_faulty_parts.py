@@ -196,6 +196,8 @@ def test_a_run_goes_on_without_a_part_that_fails_and_says_so_once(place, used, c
     [
         ("features", None, "expected a Features, got NoneType"),
         ("loop_closer", (0, 1), "expected a LoopClosure, got tuple"),
+        ("solver", None, "expected a Solution, got NoneType"),
+        ("odometry", gtsam.Pose3(), "expected a Guess, got Pose3"),
     ],
 )
 def test_a_part_that_returns_something_else_is_named(part, returned, said, caplog):
@@ -203,6 +205,8 @@ def test_a_part_that_returns_something_else_is_named(part, returned, said, caplo
     parts = {
         "features": lambda scan: returned,
         "loop_closer": SimpleNamespace(detect=lambda *_: returned, reset=own.reset),
+        "solver": SimpleNamespace(solve=lambda *_: returned),
+        "odometry": SimpleNamespace(guess=lambda *_: returned, remember=own.remember),
     }
     with pytest.raises(InputError, match=said) as caught:
         run(DATA, QUICK, **{part: parts[part]})

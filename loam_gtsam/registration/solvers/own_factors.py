@@ -11,7 +11,7 @@ from typing import NamedTuple
 import gtsam
 import numpy as np
 
-from loam_gtsam.errors import PartError, is_own, own_code
+from loam_gtsam.errors import PartError, check_kind, is_own, own_code
 from loam_gtsam.factors import checked_factor
 from loam_gtsam.registration.solvers.base import (
     POSE_KEY,
@@ -184,7 +184,9 @@ class NamedSolver(ScanSolver):
         own = is_own(self.solver)
         part, code = ("solver", self.solver) if own else ("extra_factors", self.factors)
         with own_code(part, code):
-            return self.solver.solve(associate, guess, priors, motion)
+            found = self.solver.solve(associate, guess, priors, motion)
+            check_kind(found, Solution, "what solve returns", "rematch makes one, see ScanSolver")
+            return found
 
     def told(
         self, factors: Sequence[gtsam.NonlinearFactor], near: gtsam.Pose3

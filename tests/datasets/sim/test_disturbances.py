@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -166,7 +167,7 @@ def test_unreadable_sweeps_pass_and_features_are_refused(world):
     bad = BadSweep(1, "torn")
     assert list(disturbances.Disturbed(ListDataset([bad]), [disturbances.Outliers()])) == [bad]
     nothing = np.zeros((0, 3))
-    features = FeatureSweep(Features.from_points(0, nothing, nothing), None)
+    features = FeatureSweep(Features.from_points(0, nothing, nothing), gtsam.Pose3())
     with pytest.raises(InputError, match="raw sweeps"):
         list(disturbances.Disturbed(ListDataset([features]), [disturbances.Outliers()]))
     with pytest.raises(InputError, match="raw sweeps"):

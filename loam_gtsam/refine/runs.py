@@ -174,9 +174,10 @@ class RefinedRun:
         directions.
         """
         count = len(self.updates)
-        if not (0 <= earlier < count and 0 <= later < count):
+        if not 0 <= earlier < later < count:
             raise InputError(
-                f"expected numbers of sweeps from 0 to {count - 1}, got {earlier} and {later}"
+                f"expected earlier < later, numbers of sweeps from 0 to {count - 1}, got {earlier} "
+                f"and {later}" + ("; swap the two" if later < earlier else "")
             )
         if self.seen[earlier : later + 1].all():
             return self.refined.relative_covariance(self.first + earlier, self.first + later)

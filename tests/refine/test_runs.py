@@ -175,6 +175,8 @@ def test_covariances_of_a_later_run_stand_on_its_first_pose(two, refined) -> Non
     assert np.array_equal(one.relative_covariance(2, 9), between)
     with pytest.raises(InputError, match="from 0 to 34"):
         one.relative_covariance(-1, 9)
+    with pytest.raises(InputError, match=r"earlier < later, .* got 9 and 2; swap the two"):
+        one.relative_covariance(9, 2)
     blind = replace(one, seen=np.arange(35) != 4)
     assert np.array_equal(blind.covariances[:4], one.covariances[:4])
     told = np.array([update.covariance for update in two.runs[1].updates])

@@ -9,6 +9,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
+from copy import deepcopy
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, Literal
@@ -142,12 +143,13 @@ class LiveMapper:
     def add_scan(self, scan: Scan, received: int | None = None) -> None:
         """Queue a sweep that is no message: whatever there is a driver for, without ROS.
 
+        The sweep is copied: the arrays may be filled anew as soon as this returns.
         ``received`` is in nanoseconds of the clock; None is now. Raises InputError if it is no
         Scan, or this run is one of LOAM's topics.
         """
         if not isinstance(scan, Scan):
             raise InputError(f"add_scan: expected a Scan, got {type(scan).__name__}")
-        self.add_cloud(scan, received)
+        self.add_cloud(deepcopy(scan), received)
 
     def add_features(self, topic: str, message: Any, received: int | None = None) -> None:
         """Take a message of LOAM's front end; those whose stamps agree to 5 ms make a sweep.

@@ -59,6 +59,12 @@ def check_kind(value: object, kind: type, name: str, how: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(value).__name__}; {how}")
 
 
+def check_count(value: object, name: str) -> None:
+    """InputError for anything but a whole number, not negative, or None."""
+    if value is not None and not (isinstance(value, (int, np.integer)) and value >= 0):
+        raise InputError(f"{name}: expected a whole number, 0 or more, or None, got {value!r}")
+
+
 def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
     """InputError for a part of a user's own that is a class, or lacks methods; None is no part."""
     if isinstance(part, type):

@@ -16,9 +16,9 @@ from loam_gtsam.aiding.gnss import TiedFixes, tie
 from loam_gtsam.aiding.imu_summary import ImuSummary, imu_summary
 from loam_gtsam.aiding.wheels import aided_odometry
 from loam_gtsam.config import Config, as_config, named_sections, with_implied
-from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.datasets.base import Dataset, check_dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
-from loam_gtsam.errors import PartFaults, check_part, is_own, nearest, own_code
+from loam_gtsam.errors import PartFaults, check_count, check_part, is_own, nearest, own_code
 from loam_gtsam.frontend.workers import Extraction, FrontEnd, extract, extract_ahead, timed
 from loam_gtsam.imu.buffer import ImuBuffer
 from loam_gtsam.io.checkpoint import Checkpoint, Progress, checksum
@@ -359,8 +359,9 @@ Observer = Callable[[Sweep, MapUpdate, Pipeline], None]
 def effective_config(config: Config, dataset: Dataset) -> Config:
     """The configuration with what the data set's layout says about the sensor and its IMU.
 
-    A field the user changed from its default wins.
+    A field the user changed from its default wins. InputError if ``dataset`` is none.
     """
+    check_dataset(dataset)
     return with_implied(config, dataset.sensor)
 
 
@@ -421,7 +422,7 @@ def run(
     Raises
     ------
     InputError
-        If ``dataset`` is none.
+        If ``dataset`` is none, or ``max_frames`` no number of sweeps.
     DatasetError
         If the data set cannot be read.
     OutputError
@@ -429,11 +430,7 @@ def run(
     PartError
         If a part of your own raises, an observer included, and ``parts.on_error`` is ``stop``.
     """
-    if not hasattr(dataset, "sensor"):
-        raise InputError(
-            f"dataset: expected a Dataset, got {type(dataset).__name__} without 'sensor'; "
-            "open_dataset makes one of a path, ArrayDataset of arrays or Scan objects"
-        )
+    check_count(max_frames, "max_frames")
     config = effective_config(as_config(config), dataset)
     imu = imu_buffer(dataset, config)
     fixes, wheels = aids_of(dataset, config)

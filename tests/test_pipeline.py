@@ -156,12 +156,37 @@ def test_what_the_data_set_implies_yields_to_the_user():
 
 
 def test_what_is_no_data_set_and_no_sweep_is_told():
-    with pytest.raises(InputError, match="got str without 'sensor'; open_dataset makes one"):
+    with pytest.raises(
+        InputError, match="got str without 'name', 'sensor', 'imu'; open_dataset ma"
+    ):
         run("somewhere")
     with pytest.raises(InputError, match="expected a Config, got str 'loam'; preset"):
         run(SimulatedWorld("room", frames=1), "loam")
     with pytest.raises(InputError, match="expected a Scan, got ndarray"):
         Pipeline().process(np.zeros((5, 3)))
+
+
+@pytest.mark.parametrize(
+    ("sensor", "error", "said"),
+    [
+        ({"minrange": 2}, ConfigError, "sensor of the data set: minrange: .* mean 'min_range'"),
+        ({"sensor.min_range": 2}, ConfigError, "did you mean 'min_range'"),
+        ({"imu.prior": 2}, ConfigError, "sensor of the data set: prior: expected one of"),
+        ({5: 2}, ConfigError, "sensor of the data set: 5: unknown key"),
+        (None, InputError, "sensor of the data set: expected a Mapping, got NoneType"),
+    ],
+)
+def test_what_a_data_set_implies_by_mistake_is_told(sensor, error, said):
+    data = ListDataset([])
+    data.sensor = sensor
+    with pytest.raises(error, match=said):
+        run(data)
+
+
+@pytest.mark.parametrize("number", [-1, 2.0, "2"])
+def test_a_number_of_sweeps_that_is_none_is_told(number):
+    with pytest.raises(InputError, match=f"max_frames: expected a whole number, .* {number!r}"):
+        run(ListDataset([]), max_frames=number)
 
 
 def test_a_result_is_shown_in_a_line():

@@ -24,7 +24,7 @@ from loam_gtsam.config.base import (
     shown,
 )
 from loam_gtsam.config.own_parts import PartsConfig
-from loam_gtsam.errors import nearest
+from loam_gtsam.errors import check_kind, nearest
 from loam_gtsam.types import ConfigError, InputError
 
 
@@ -98,9 +98,13 @@ class Config(Section):
 
 
 def with_implied(config: Config, implied: Mapping[str, Any]) -> Config:
-    """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset."""
-    imu = {k.removeprefix("imu."): v for k, v in implied.items() if k.startswith("imu.")}
-    sensor = {k: v for k, v in implied.items() if not k.startswith("imu.")}
+    """The configuration with fields of ``sensor``, and of ``imu`` as ``imu.NAME``, where unset.
+
+    InputError if what a data set implies is no mapping, ConfigError if there is no such field.
+    """
+    check_kind(implied, Mapping, _IMPLIED, '{"min_range": 2.0} is one, {} if nothing is known')
+    imu = {k[4:]: v for k, v in implied.items() if str(k).startswith("imu.")}
+    sensor = {k: v for k, v in implied.items() if not str(k).startswith("imu.")}
     return config.changed(sensor=_filled(config.sensor, sensor), imu=_filled(config.imu, imu))
 
 
@@ -115,8 +119,9 @@ def named_sections(name: str, section: Section) -> dict[str, Section]:
 
 def _filled(section: Section, implied: Mapping[str, Any]) -> Section:
     default = type(section)()
-    unset = {k: v for k, v in implied.items() if getattr(section, k) == getattr(default, k)}
-    return section.changed(**unset)
+    now, unset = vars(section), vars(default)
+    values = {k: v for k, v in implied.items() if now.get(k) == unset.get(k)}
+    return override(section, values, lambda _: f"{_IMPLIED}: ")
 
 
 def _scaled(section: Section, factor: float, *names: str) -> Section:
@@ -132,6 +137,7 @@ def _scaled(section: Section, factor: float, *names: str) -> Section:
 
 SMALL = 0.5
 """Size of voxels and cells in small places over that in the open."""
+_IMPLIED = "sensor of the data set"
 _WIDTH = 100
 _CLASSICAL = {
     "features": {"beam_width": 1.0, "range_noise": 0.0, "post_depth": 0.0, "thinning": "voxels"},

@@ -100,6 +100,22 @@ class Dataset(Protocol):
         ...
 
 
+def check_dataset(dataset: object) -> None:
+    """InputError for anything without the members of a :class:`Dataset` that a run asks for."""
+    # Of the class first: a property of a bag reads all of its IMU.
+    missing = [
+        repr(name)
+        for name in ("name", "sensor", "imu", "__iter__")
+        if not (hasattr(type(dataset), name) or hasattr(dataset, name))
+    ]
+    if missing:
+        raise InputError(
+            f"dataset: expected a Dataset, got {type(dataset).__name__} without "
+            f"{', '.join(missing)}; open_dataset makes one of a path, ArrayDataset of arrays or "
+            "Scan objects, and docs/own_sensor.md shows one of your own"
+        )
+
+
 def sweeps_of_run(dataset: Dataset, count: int) -> Iterator[Sweep]:
     """The sweeps of so many frames of a run, from the data set that was run.
 

@@ -22,6 +22,7 @@ from scipy.spatial import cKDTree
 
 from loam_gtsam.config import AidingConfig, Config, ImuConfig, SensorConfig, SolverConfig
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.errors import check_count
 from loam_gtsam.frontend.workers import Extraction, extract, extract_ahead, timed
 from loam_gtsam.geometry import as_vector, checked_pose, symmetric
 from loam_gtsam.imu.buffer import ImuBuffer
@@ -384,6 +385,7 @@ def localise(
     Localisation
         On KeyboardInterrupt, what was computed until then, marked ``interrupted``.
     """
+    check_count(max_frames, "max_frames")
     config = effective_config(config or own_settings(saved), dataset)
     imu = imu_buffer(dataset, config)
     localizer = Localizer(saved, config, imu=imu, extend=extend, inside=inside, near=near, **parts)

@@ -19,6 +19,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.errors import check_count
 from loam_gtsam.pipeline import OnFrame, Parts, Pipeline, effective_config, imu_buffer
 from loam_gtsam.registration.odometry import ConstantVelocity
 from loam_gtsam.studies import evaluation
@@ -146,6 +147,7 @@ def compare_solvers(
         KeyboardInterrupt raised there ends the comparison, which then has the sweeps so far, as
         it has after an error later than the first sweep
     """
+    check_count(max_frames, "max_frames")
     _check_names(contenders)
     # Group by group, as the report shows them; the order within a group is the caller's.
     groups = list(dict.fromkeys(entry.group for entry in contenders))

@@ -18,6 +18,7 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.base import Dataset
+from loam_gtsam.errors import check_count
 from loam_gtsam.factors import scan_match_factor
 from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.frontend.workers import Extraction, extract
@@ -134,6 +135,7 @@ def compare_on_same_matches(
     InputError
         If a contender is no solver, two have the same name, or there is no such driver.
     """
+    check_count(max_frames, "max_frames")
     first = contenders[0].config if contenders else None
     names = [contender.name for contender in contenders]
     if first is None or any(c.config is None or "features" in c.parts for c in contenders):

@@ -87,11 +87,15 @@ class ArrayDataset(Loader):
     def __iter__(self) -> Iterator[Scan]:
         return iter(self._scans)
 
+    @property
+    def stamps(self) -> IntArray:
+        """(N,) nanoseconds of the sweeps."""
+        return np.array([scan.stamp for scan in self._scans], np.int64)
+
     def info(self) -> DatasetInfo:
         """Description of the arrays."""
         info = DatasetInfo("arrays", self.name, {"sweeps": str(len(self))})
-        stamps = np.array([scan.stamp for scan in self._scans], dtype=np.int64)
-        describe_stamps(stamps, info.facts, info.problems)
+        describe_stamps(self.stamps, info.facts, info.problems)
         for label in ("times", "rings"):
             missing = sum(getattr(scan, label) is None for scan in self._scans)
             info.facts[f"point {label}"] = (

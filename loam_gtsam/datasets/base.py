@@ -226,20 +226,26 @@ class PartOf(ChangedDataset):
             )
         said = [f"from sweep {start}"] if start else []
         said += [f"every {every}"] if every > 1 else []
-        said += [f"{low:g} to {high:g} s"] if low or np.isfinite(high) else []
+        said += [f"{low:g} to {high:g} s"] if np.isfinite(high) else []
+        said += [f"from {low:g} s"] if low and not np.isfinite(high) else []
         super().__init__(dataset, " ".join(said))
         self._said, self._slice, self._window = (
             ", ".join(said),
             slice(start, None, every),
             (low, high),
         )
+        if not len(self):
+            raise InputError(
+                f"part: expected some of the {len(dataset)} sweeps of {dataset.name}, got none "
+                f"({self._said or 'all'}); ask for others"
+            )
 
     def __len__(self) -> int:
         """Number of sweeps; the most there can be if only reading them tells their stamps."""
         stamps = getattr(self._dataset, "stamps", None)
-        if stamps is None or not len(stamps):
+        if stamps is None:
             return len(range(len(self._dataset))[self._slice])
-        seconds = (stamps[self._slice] - stamps[0]) * 1e-9
+        seconds = (stamps[self._slice] - stamps[:1]) * 1e-9
         return int(((seconds >= self._window[0]) & (seconds <= self._window[1])).sum())
 
     def __iter__(self) -> Iterator[Sweep]:
@@ -255,7 +261,9 @@ class PartOf(ChangedDataset):
 
     def info(self) -> DatasetInfo:
         """Of the whole data set, and which part of it is used."""
-        return self._info(used=f"{self._said}: {len(self)} sweeps")
+        known = self._window == (0.0, np.inf) or getattr(self._dataset, "stamps", None) is not None
+        most = "" if known else "at most "
+        return self._info(used=f"{self._said}: {most}{len(self)} sweeps")
 
 
 class WithTruth(ChangedDataset):
@@ -316,15 +324,17 @@ class WithTruth(ChangedDataset):
     def info(self) -> DatasetInfo:
         """Of the data set, and where the poses come from."""
         info = self._info(reference_poses=f"{len(self._truth)} ({self._source})")
-        span = self.stamps
-        if span is not None and len(span):
-            inside = (span >= self._truth.stamps[0]) & (span <= self._truth.stamps[-1])
-            if not inside.any():
-                self._problems.append(
-                    f"{self._source}: its stamps, {self._truth.stamps[0] * 1e-9:.3f} to "
-                    f"{self._truth.stamps[-1] * 1e-9:.3f} s, are none of the sweeps'"
+        span, problems = self.stamps, [*info.problems, *self._problems]
+        if not len(self._truth):
+            problems.append(f"{self._source}: no poses in it")
+        elif span is not None and len(span):
+            first, last = self._truth.stamps[[0, -1]]
+            if not ((span >= first) & (span <= last)).any():
+                problems.append(
+                    f"{self._source}: its stamps, {first * 1e-9:.3f} to {last * 1e-9:.3f} s, are "
+                    "none of the sweeps'"
                 )
-        return replace(info, problems=[*info.problems, *self._problems])
+        return replace(info, problems=problems)
 
 
 class SweepFiles(Loader, ABC):

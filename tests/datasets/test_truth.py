@@ -7,10 +7,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from support import bags
+from support.list_dataset import ListDataset
 from support.trajectories import winding
 
-from loam_gtsam.datasets import SimulatedWorld, open_dataset
-from loam_gtsam.datasets.base import PartOf
+from loam_gtsam.datasets import ArrayDataset, SimulatedWorld, open_dataset
+from loam_gtsam.datasets.base import DatasetInfo, PartOf
 from loam_gtsam.datasets.decode.geodesy import east_north_up
 from loam_gtsam.datasets.truth import extrinsic, read_truth
 from loam_gtsam.geometry import inverse_pose
@@ -197,6 +198,15 @@ def test_a_data_set_with_truth_is_judged_by_it(world, tmp_path):
     assert nees(result.updates, direct.truth).mean < 5.0
 
 
+def test_poses_of_another_time_and_none_at_all_are_a_problem_once(world):
+    other = Trajectory(np.arange(2), np.tile(np.eye(4), (2, 1, 1)))
+    data = ArrayDataset(list(world))
+    for truth, said in ((other, "none of the sweeps'"), (other[:0], "given: no poses in it")):
+        given = data.with_truth(truth)
+        for _ in range(2):
+            assert [said in problem for problem in given.info().problems] == [True]
+
+
 def test_parts_of_a_data_set(world):
     stamps = [scan.stamp for scan in world]
     for part, wanted in (
@@ -207,13 +217,16 @@ def test_parts_of_a_data_set(world):
         (world.with_truth(TRUTH).part(every=4), stamps[::4]),
     ):
         assert [scan.stamp for scan in part] == wanted
-        assert len(part) == len(wanted) or part._window != (0.0, np.inf)
+        assert len(part) == len(wanted)
         assert part.truth is not None
         assert part.name != world.name
         assert "sweeps" in part.info().facts["used"]
     for wrong in ({"start": -1}, {"every": 0}, {"begin_s": 3.0, "end_s": 2.0}):
         with pytest.raises(InputError, match="part: expected start of 0 or more"):
             world.part(**wrong)
+    for none in ({"start": 8}, {"begin_s": 0.8}, {"begin_s": 0.21, "end_s": 0.29}):
+        with pytest.raises(InputError, match=r"some of the 8 sweeps of .*, got none"):
+            world.part(**none)
 
 
 def test_the_length_of_a_time_window_is_exact_where_stamps_are_known(world):
@@ -221,4 +234,12 @@ def test_the_length_of_a_time_window_is_exact_where_stamps_are_known(world):
         name="x", sensor={}, stamps=np.arange(10) * 100_000_000, imu=None, truth=None
     )
     assert len(PartOf(known, 0, 2, 0.2, 0.7)) == 3
+    for data in (world, ArrayDataset(list(world))):
+        assert (
+            data.part(begin_s=0.15, end_s=0.35).info().facts["used"] == "0.15 to 0.35 s: 2 sweeps"
+        )
+    unknown = ListDataset(list(world))
+    unknown.info = lambda: DatasetInfo("list", "")
+    used = [PartOf(unknown, 0, 1, begin).info().facts["used"] for begin in (0.0, 0.15)]
+    assert used == [": 8 sweeps", "from 0.15 s: at most 8 sweeps"]
     assert len(open_dataset("sim:room?frames=8").part(1, 2)) == 4

@@ -207,10 +207,15 @@ class SimulatedWorld(Loader):
         other._motion = self._motion.seen_from(lidar_T_moved)
         return other
 
+    @property
+    def stamps(self) -> IntArray:
+        """(N,) nanoseconds of the sweeps."""
+        return np.array([self._stamp(i) for i in range(self._frames)], np.int64)
+
     @cached_property
     def truth(self) -> Trajectory:
         """Exact poses at the start of every sweep; the first is the identity."""
-        return self.truth_at(np.array([self._stamp(i) for i in range(self._frames)], np.int64))
+        return self.truth_at(self.stamps)
 
     def truth_at(self, stamps: IntArray) -> Trajectory:
         """Exact poses at any ``stamps`` (N,) in nanoseconds, relative to the first sweep's.

@@ -75,6 +75,15 @@ def check_part(part: object, name: str, wanted: str, *methods: str) -> None:
         raise InputError(f"{name}: expected {wanted}, got {type(part).__name__}{lacks}")
 
 
+def are_two_numbers(value: object) -> bool:
+    """Whether it is a pair of numbers that numpy understands."""
+    try:
+        numbers = np.asarray(value)
+    except ValueError:
+        return False
+    return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
+
+
 def check_array(
     value: object, name: str, shape: tuple[int | str, ...], numbers: str = "floats"
 ) -> None:

@@ -28,7 +28,7 @@ from loam_gtsam.errors import OutputError as OutputError
 from loam_gtsam.errors import PartError as PartError
 from loam_gtsam.errors import SweepError as SweepError
 from loam_gtsam.errors import SweepFault as SweepFault
-from loam_gtsam.errors import as_stamps
+from loam_gtsam.errors import are_two_numbers, as_stamps
 from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
 from loam_gtsam.trajectory import Trajectory as Trajectory
@@ -83,7 +83,7 @@ class Scan:
             column = getattr(self, name)
             if column is not None:
                 check_array(column, f"Scan.{name}", (len(self.points),), numbers)
-        if self.span is not None and not _are_two_numbers(self.span):
+        if self.span is not None and not are_two_numbers(self.span):
             raise InputError(f"Scan.span: expected (first, last) seconds, got {self.span!r}")
         if self.span is not None:
             object.__setattr__(self, "span", tuple(map(float, self.span)))
@@ -109,14 +109,6 @@ def _check_stamp(sweep: Scan | Features | BadSweep) -> None:
             f"2116), got {stamp!r}; round(seconds * 1e9) makes them of seconds"
         )
     object.__setattr__(sweep, "stamp", int(stamp))
-
-
-def _are_two_numbers(value: object) -> bool:
-    try:
-        numbers = np.asarray(value)
-    except ValueError:
-        return False
-    return numbers.shape == (2,) and numbers.dtype.kind in "iuf"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -210,11 +202,6 @@ class FeatureSweep:
     features : de-skewed features
     odom_T_lidar : pose of the same moment in that front end's drifting frame
     cloud : (N, 3) de-skewed full-resolution points of the same moment, or None
-
-    Raises
-    ------
-    InputError
-        If the features or the pose are of another class.
     """
 
     features: Features
@@ -222,8 +209,7 @@ class FeatureSweep:
     cloud: NDArray[np.floating] | None = None
 
     def __post_init__(self) -> None:
-        how = "Features.from_points makes them of points"
-        check_kind(self.features, Features, "FeatureSweep.features", how)
+        check_kind(self.features, Features, "FeatureSweep.features", "from_points makes them")
         how = "gtsam.Pose3(matrix) makes one of a (4, 4) matrix"
         check_kind(self.odom_T_lidar, gtsam.Pose3, "FeatureSweep.odom_T_lidar", how)
 

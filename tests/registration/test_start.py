@@ -219,9 +219,10 @@ def test_a_rival_that_falls_late_leaves_no_doubt(features_ahead, monkeypatch):
 def test_an_imu_at_rest_settles_first_motions_that_fit_as_well(with_imu):
     """Along a tunnel any motion fits two sweeps from rest."""
     world = SimulatedWorld("tunnel_pilasters", frames=2, seed=1, columns=450)
-    mapper = Mapper(CONFIG, imu=ImuBuffer(CONFIG.imu, world.imu) if with_imu else None)
+    config = Config()
+    mapper = Mapper(config, imu=ImuBuffer(config.imu, world.imu) if with_imu else None)
     for scan in world:
-        update = mapper.register(extract_features(scan, CONFIG))
+        update = mapper.register(extract_features(scan, config))
     assert bool(mapper._start._rivals) is not with_imu
     assert bool(update.uncertainty.in_doubt) is not with_imu
     assert update.map_T_lidar.range(gtsam.Pose3(world.truth.map_T_lidar[1])) < 0.1

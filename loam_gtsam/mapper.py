@@ -85,7 +85,7 @@ class Mapper:
     config : ``map``, ``matching``, ``solver``, ``deskew`` and ``imu`` of it are used
     solver : anything with :meth:`~loam_gtsam.registration.solvers.ScanSolver.solve`; its settings,
         ``solver.config``, replace ``config.solver``. If None, :func:`make_solver` makes it
-    imu : for this mapper alone, which writes its bias; samples may be added while it runs
+    imu : samples may be added to it while the mapper runs
     extra_factors : a user's own factors for every sweep: GPS, ground level, wheels, ...
 
     Attributes

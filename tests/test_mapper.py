@@ -549,3 +549,17 @@ def test_an_imu_that_is_off_is_none_and_one_made_for_other_settings_is_refused()
         expected = rf"{setting.partition('=')[0]}: expected that of the ImuBuffer, .*{made}"
         with pytest.raises(ConfigError, match=expected):
             Mapper(config.changed(setting), imu=buffer)
+
+
+def test_mappers_on_the_samples_of_one_imu_do_not_change_each_other():
+    world = SimulatedWorld("street_loop", frames=6, columns=450, imu="mems")
+    buffer = ImuBuffer(QUICK.imu, world.imu)
+    features = [extract_features(scan, QUICK) for scan in world]
+    other = QUICK.changed("imu.coupling=loose")
+    alone, one, two = (Mapper(config, imu=buffer) for config in (QUICK, QUICK, other))
+    expected = [alone.register(sweep).map_T_lidar for sweep in features]
+    for sweep, pose in zip(features, expected, strict=True):
+        assert one.register(sweep).map_T_lidar.equals(pose, 0.0)
+        two.register(sweep)
+    assert one.imu.buffer.gyro_bias.any()
+    assert not buffer.gyro_bias.any()

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import partial
 
 import gtsam
@@ -129,12 +130,19 @@ class SampleStore:
         self.accepts_from = int(self._room_stamps[0])
 
 
+@dataclass(slots=True)
+class _Start:
+    """The rest before the first motion, once the samples of that time are not held any more."""
+
+    rest: RestWindow | None = None
+    is_held: bool = True
+
+
 class ImuBuffer:
     """IMU samples in lidar axes, in order of time, to be asked about any time.
 
     The answers for the same samples are the same to the last bit, however the samples came in.
-    ``lidar_R_imu`` is the configured rotation from IMU into lidar axes. A mapper writes the bias
-    that it learns into its buffer: mappers that run side by side have a buffer each.
+    ``lidar_R_imu`` is the configured rotation from IMU into lidar axes.
 
     Parameters
     ----------
@@ -152,8 +160,7 @@ class ImuBuffer:
         self._store = SampleStore(self._counts)
         self._quality = QualityLog(config, self._counts)
         self._filter = GravityFilter(config)
-        self._rest: RestWindow | None = None
-        self._start_is_held = True
+        self._start = _Start()
         if samples is not None:
             self.add(samples)
 
@@ -167,6 +174,10 @@ class ImuBuffer:
     @gyro_bias.setter
     def gyro_bias(self, bias: FloatArray) -> None:
         self._bias = as_vector(bias, "gyro_bias").copy()
+
+    def with_own_bias(self) -> ImuBuffer:
+        """The same samples, those to come as well, with a bias that others do not change."""
+        return copy(self)
 
     def remember(self) -> Callable[[], None]:
         """A function that brings the bias back; samples do not depend on the frames."""
@@ -218,7 +229,7 @@ class ImuBuffer:
         count -= count % BLOCK
         if count <= 0:
             return
-        self._rest, self._start_is_held = self.first_rest(), False
+        self._start.rest, self._start.is_held = self.first_rest(), False
         if self._quality.constant:  # then the filter is in use, or may be later
             self._filter.orientations(store.samples)
             self._filter.drop(count)
@@ -330,8 +341,8 @@ class ImuBuffer:
         """The rest at the start of all samples, dropped ones included; None if none."""
         self._merge()
         samples = self._store.samples
-        held = self._start_is_held and len(samples.stamps)
-        return rest_at_start(self.config, samples) if held else self._rest
+        held = self._start.is_held and len(samples.stamps)
+        return rest_at_start(self.config, samples) if held else self._start.rest
 
     def _merge(self) -> None:
         changed = self._store.merge()

@@ -80,7 +80,7 @@ class ImuTracker:
     """
 
     def __init__(self, config: ImuConfig, buffer: ImuBuffer) -> None:
-        self.config, self.buffer = config, _checked(buffer, config)
+        self.config, self.buffer = config, _checked(buffer, config).with_own_bias()
         self._given_bias = buffer.gyro_bias
         self.reset()
 

@@ -206,8 +206,8 @@ class Hypotheses:
         message = "what fits is not where the lidar is said to be"
         if here:
             message = f"the best pose: {_told(here[0].fit)}"
+        surely = self._start is not None  # inside the map
         for held in standing:
-            surely = self._start is not None
             rivals = self._search.rivals(held.pose, here, held.rivals_below(), inside=surely)
             if rivals:
                 fit = "pose fits" if len(rivals) == 1 else "poses fit"

@@ -227,9 +227,9 @@ class CubeMap:
             firsts, held = new.firsts().items(), self._cubes
             self._trees.add({at: held.setdefault(at, Cube()).settle(part) for at, part in firsts})
         else:
-            for index, sums in new.sums().items():
-                self._cubes.setdefault(index, Cube()).average(sums)
-                self._trees.forget([index])
+            for index, part in (sums := new.sums()).items():
+                self._cubes.setdefault(index, Cube()).average(part)
+            self._trees.forget(sums)
 
     def fill(self, other: CubeMap, *, archived: bool = False) -> None:
         """Add the points of another map, archived ones if asked, to free voxels: none is moved."""

@@ -83,9 +83,9 @@ class Scan:
             column = getattr(self, name)
             if column is not None:
                 check_array(column, f"Scan.{name}", (len(self.points),), numbers)
-        if self.span is not None and not are_two_numbers(self.span):
-            raise InputError(f"Scan.span: expected (first, last) seconds, got {self.span!r}")
         if self.span is not None:
+            if not are_two_numbers(self.span):
+                raise InputError(f"Scan.span: expected (first, last) seconds, got {self.span!r}")
             object.__setattr__(self, "span", tuple(map(float, self.span)))
         if not (_is_integer(self.rows) and self.rows >= 0):
             raise InputError(f"Scan.rows: expected a number of rows, or 0, got {self.rows!r}")

@@ -138,28 +138,25 @@ class PlaceSearch:
         """Whether a sweep speaks for a pose, against another one."""
         return speaks_for(one.evidence, other.evidence, self._config.solver.min_aligned)
 
-    def rivals(
-        self, pose: gtsam.Pose3, found: list[Candidate], far: float, *, inside: bool = False
-    ) -> list[Candidate]:
+    def rivals(self, pose: gtsam.Pose3, found: list[Candidate], far: float) -> list[Candidate]:
         """What may be right as well if a sweep is at a pose: all if it was not found there.
 
         Rivals are poses to which the sweep does not object. A place that is not in the map may look
         like one of those that are, if these look alike. So rivals are all poses, too, that fit
         nearly as well: to that share ``far`` away, or to :data:`AS_WELL` where the same is seen.
-        They are not if the lidar is surely ``inside`` the map.
         """
-        own, surely = _at(pose, found), inside or self._inside
+        own = _at(pose, found)
         if own is None:
             return found
-        return [c for c in found if c is not own and self._may_be(c, own, far, surely)]
+        return [c for c in found if c is not own and self._may_be(c, own, far)]
 
-    def _may_be(self, other: Candidate, own: Candidate, far: float, inside: bool) -> bool:
+    def _may_be(self, other: Candidate, own: Candidate, far: float) -> bool:
         """Whether another pose may be the right one as well; see :meth:`rivals`."""
         if not self._favoured(own, other):
             return True
         near = other.map_T_middle.range(own.map_T_middle) < self._config.loops.search
         nearly = (AS_WELL if near else far) * own.fit.total
-        return not inside and other.fit.total >= nearly
+        return not self._inside and other.fit.total >= nearly
 
     def fits_better(self, pose: gtsam.Pose3, found: list[Candidate]) -> bool:
         """Whether the map fits better at another pose, to which the sweep does not object."""

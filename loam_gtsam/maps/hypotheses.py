@@ -169,6 +169,8 @@ class Hypotheses:
     ) -> None:
         self._search, self._maps, self._config = search, maps, config
         self._start = start
+        # Where the lidar is said to be, and where it may be if what is said is wrong.
+        self._said = [] if start is None else [start, *search.around(start)]
         self._motion = Motion(config)
         self._held: list[Hypothesis] = []
 
@@ -196,9 +198,7 @@ class Hypotheses:
             return None, f"{len(self._held)} poses are followed; the best: {_told(best)}"
         posed = MovingSweep(features, self._config).at(twist)
         near = self._motion.map_T_lidar or near
-        known = [held.pose for held in standing] + ([] if near is None else [near])
-        if self._start is not None:  # and where it may be if what is said is wrong
-            known += [self._start, *self._search.around(self._start)]
+        known = [held.pose for held in standing] + ([] if near is None else [near]) + self._said
         found = self._search.find(posed, features.reach, known)
         if not found:
             return None, "no place fits"
@@ -206,13 +206,12 @@ class Hypotheses:
         message = "what fits is not where the lidar is said to be"
         if here:
             message = f"the best pose: {_told(here[0].fit)}"
-        surely = self._start is not None  # inside the map
         for held in standing:
-            rivals = self._search.rivals(held.pose, here, held.rivals_below(), inside=surely)
+            rivals = self._search.rivals(held.pose, here, held.rivals_below())
             if rivals:
                 fit = "pose fits" if len(rivals) == 1 else "poses fit"
                 message = f"{len(rivals)} other {fit} the map nearly as well as the best"
-            elif surely and self._search.fits_better(held.pose, found):
+            elif self._said and self._search.fits_better(held.pose, found):
                 message = "the map fits better where the lidar is not said to be"
             elif self._motion.leads_to(held.last.map_T_lidar):
                 return held.last, ""

@@ -145,7 +145,8 @@ class Localizer:
         self._maps.grows = False
         # A fix needs to know which directions are seen, which not every solver tells.
         config = self.config.changed(solver=SolverConfig())
-        search = PlaceSearch(self._places, self._maps, config, inside=self._inside)
+        inside = self._inside or start is not None
+        search = PlaceSearch(self._places, self._maps, config, inside=inside)
         return Hypotheses(search, self._maps, config, start)
 
     @property

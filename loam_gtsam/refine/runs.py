@@ -251,11 +251,10 @@ def refine_run(
         frames = {key: run.frame[s] for key, s in graph.stamps.items() if s in run.frame}
         further.push_back(loop_factors(graph, frames, run.to_middle))
         own = own_ties(graph, frames, run.to_middle)
-    if factors is not None:
-        check_kind(factors, gtsam.NonlinearFactorGraph, "factors", "its push_back takes a factor")
-        further.push_back(factors)
     ties = None if survey is None else _fix_ties(survey, [run])
-    return _adjusted([run], further, ties, own, settings, min_aligned, on_round, on_window)[0]
+    return _adjusted(
+        [run], further, factors, ties, own, settings, min_aligned, on_round, on_window
+    )[0]
 
 
 def refine_runs(
@@ -311,11 +310,8 @@ def refine_runs(
         to_middle = [step for run in runs for step in run.from_places()]
         further.push_back(loop_factors(graph, frames, to_middle))
         own = own_ties(graph, frames, to_middle)
-    if factors is not None:
-        check_kind(factors, gtsam.NonlinearFactorGraph, "factors", "its push_back takes a factor")
-        further.push_back(factors)
     ties = None if survey is None else _fix_ties(survey, runs, starts)
-    return _adjusted(runs, further, ties, own, settings, min_aligned, on_round, on_window)
+    return _adjusted(runs, further, factors, ties, own, settings, min_aligned, on_round, on_window)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -441,11 +437,15 @@ def _fix_ties(survey: Survey, runs: Sequence[_Run], starts: Sequence[int] = (0,)
 
 
 def _adjusted(
-    runs: Sequence[_Run], further: gtsam.NonlinearFactorGraph, fixes: FixTies | None,
+    runs: Sequence[_Run], further: gtsam.NonlinearFactorGraph,
+    factors: gtsam.NonlinearFactorGraph | None, fixes: FixTies | None,
     ties: Sequence[FactorTies], settings: Settings | None, min_aligned: float,
     on_round: Callable[[Round], None] | None, on_window: Callable[[int, int], None] | None,
 ) -> tuple[RefinedRun, ...]:  # fmt: skip
-    """Runs adjusted with their odometry and further factors."""
+    """Runs adjusted with their odometry, further factors, and a user's own."""
+    if factors is not None:
+        check_kind(factors, gtsam.NonlinearFactorGraph, "factors", "its push_back takes a factor")
+        further.push_back(factors)
     starts = _starts(runs)
     every, told = gtsam.NonlinearFactorGraph(), gtsam.NonlinearFactorGraph()
     keeps = [told_directions(run.updates, min_aligned) for run in runs]

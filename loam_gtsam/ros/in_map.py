@@ -45,22 +45,21 @@ class InMap(Odometry):
     def __init__(self, path: str | Path, config: Config, *, inside: bool = False) -> None:
         self._saved = SavedMap(path)
         self._localizer = Localizer(self._saved, config, inside=inside, odometry=self)
-        self._asked: FloatArray | None = None
+        self._asked: deque[FloatArray] = deque(maxlen=1)  # of another thread
         self._past: deque[MapUpdate] = deque(maxlen=_KEPT)
         self.map_T_odom: gtsam.Pose3 | None = None
 
     def look_near(self, position: FloatArray) -> None:
         """Look about a position (2,) in the saved map from the next sweep on; from any thread."""
-        self._asked = position
+        self._asked.append(position)
 
     def add(self, sweep: Sweep, update: MapUpdate) -> MapUpdate:
         """Localise a sweep that the live mapper has registered; its pose in the saved map."""
         if update.status.has_pose:
             self._past.append(update)
-        asked, self._asked = self._asked, None
-        if asked is not None:
+        if self._asked:
             try:
-                self._localizer.reset(asked)
+                self._localizer.reset(self._asked.pop())
             except InputError as error:
                 _log.warning("%s: %s", INITIAL_POSE, error)
         fixed = self._localizer.fixed

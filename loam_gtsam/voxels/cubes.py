@@ -221,8 +221,9 @@ class SortedPoints(NamedTuple):
         axes = np.ascontiguousarray(content.points.T)
         cells, within = grid.cells(axes), grid.reaches(axes)
         inside = within & window.holds(cells)
-        away = content.chosen(within & ~inside)
+        away = Cube().content
         if not inside.all():
+            away = content.chosen(within & ~inside)
             content, cells = content.chosen(inside), cells[:, inside]
         new = cls.of(content, cells, grid) if len(content.points) else None
         return new, away, int(np.count_nonzero(~within))

@@ -54,12 +54,11 @@ class EarlyMap:
 
     def together(self, sweeps: Sequence[EarlySweep], rounds: int) -> list[EarlySweep]:
         """The sweeps, each registered with the map of all the others, so many times at most."""
-        moved = list(sweeps)
-        for _ in range(rounds):
-            before = moved
-            moved = self._registered_once(moved)
+        before, moved = sweeps, self._registered_once(sweeps)
+        for _ in range(rounds - 1):
             if self._settled(before, moved):
                 break
+            before, moved = moved, self._registered_once(moved)
         return moved
 
     def _registered_once(self, sweeps: Sequence[EarlySweep]) -> list[EarlySweep]:
@@ -153,14 +152,15 @@ class EarlyMap:
         if to_keep:
             self.fill(others)
         else:
-            self._insert(self._placed(others))
+            self.frame.matcher.maps.insert_on_trial(self._placed(others))
         return self._matcher(sweeps[number])
 
     def matchers(self, sweeps: Sequence[EarlySweep]) -> Iterator[FrameMatcher]:
         """As :meth:`matcher`, of one sweep after the other; each is of use until the next."""
         placed = self._placed(sweeps)
         for number, one in enumerate(sweeps):
-            self._insert(placed, without=number)
+            self._clear()
+            self.frame.matcher.maps.insert_on_trial(placed, without=number)
             yield self._matcher(one)
 
     def _matcher(self, sweep: EarlySweep) -> FrameMatcher:
@@ -179,11 +179,6 @@ class EarlyMap:
         placed = [(one.posed, one.map_T_middle) for one in sweeps]
         return self.frame.matcher.maps.sorted_on_trial(placed)
 
-    def _insert(self, points: TrialPoints, without: int | None = None) -> None:
-        """Make the map of these points, without those of one sweep."""
-        self._clear()
-        self.frame.matcher.maps.insert_on_trial(points, without)
-
     def _clear(self) -> None:
         self.frame.matcher.maps.clear()
         self.frame.matcher.maps.recenter(self.map_T_first)
@@ -196,5 +191,5 @@ class EarlyMap:
 def _shift(before: EarlySweep, after: EarlySweep) -> float:
     """Metres (RMS) by which a new pose moves the features of a sweep."""
     points = np.concatenate(after.posed.points)
-    old, new = (transform(one.map_T_middle.matrix(), points) for one in (before, after))
-    return float(np.sqrt(((new - old) ** 2).sum(axis=1).mean()))
+    moved = transform(after.map_T_middle.matrix() - before.map_T_middle.matrix(), points)
+    return float(np.sqrt((moved**2).sum(axis=1).mean()))

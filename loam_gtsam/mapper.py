@@ -295,7 +295,7 @@ class Mapper:
             self._start = None if self._start.complete else self._start
         solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
         accept(frame, found, self.monitor)
-        scan = self.errors.of_scan(solution, small=self.maps.small)
+        scan = self.errors.of_scan(solution, posed.sweep, small=self.maps.small)
         told = frame.matcher.last, solution, scan, frame.priors
         with own_code("extra_factors", self.extra_factors):
             posed, solution, pose, tilt, fused, unlike, of_imu = with_imu(self.imu, posed, *told)

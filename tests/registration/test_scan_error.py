@@ -7,28 +7,31 @@ import numpy as np
 import pytest
 
 from loam_gtsam.config import CovarianceConfig
+from loam_gtsam.factors import plane_rows
 from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import Solution, match_rows
-from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
+from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, facings, scan_error
 
 CONFIG = CovarianceConfig()
 SIGMA = 0.05
 """Metres: what the matches claim."""
+CELL = CONFIG.match_cell * np.array([5.0, 0.0, 1.0])
+"""Least corner of a cell."""
 POSE = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.4, 3.0, -2.0, 0.5]))
 
 
 NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
 
 
-def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
+def solved(points, normals, errors, pose=POSE, prior=None, weak=None, edges=NO_EDGES):
     """The optimum of plane matches whose points are off their planes by ``errors``, in metres."""
     count = len(points)
     there = pose.transformFrom(points.T).T
     offsets = errors - np.einsum("ij,ij->i", normals, there)
     planes = PlaneMatches(points, normals, offsets, errors, np.full(count, SIGMA), np.ones(count),
                           np.arange(count))  # fmt: skip
-    matches = ScanMatches(NO_EDGES, planes)
+    matches = ScanMatches(edges, planes)
     residuals, jacobian = match_rows(matches).residuals(pose)
     keep = np.eye(6) if weak is None else np.eye(6) - weak
     information = keep.T @ jacobian.T @ jacobian @ keep
@@ -37,7 +40,7 @@ def solved(points, normals, errors, pose=POSE, prior=None, weak=None):
     step = -np.linalg.solve(information, keep.T @ jacobian.T @ residuals)
     return Solution(
         pose.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information, weak=weak,
-        unseen=weak, beacons=np.zeros(count, np.bool_),
+        unseen=weak, beacons=np.zeros(len(residuals), np.bool_),
     ), step  # fmt: skip
 
 
@@ -114,6 +117,71 @@ def test_errors_that_neighbours_share_do_not_average_out():
     last = error_of(solution)
     assert 80 < last.effective_matches < 300  # 150 cells of ten
     assert last.residual_variance == pytest.approx((0.02 / SIGMA) ** 2, rel=0.4)
+
+
+def along_a_hall(rng):
+    """Points of walls that face along y and z, their normals, and where they are in the map."""
+    normals = np.eye(3)[1 + rng.integers(0, 2, 1500)]
+    there = rng.uniform(-15.0, 15.0, (1500, 3)) + POSE.translation()
+    return POSE.transformTo(there.T).T, normals, there
+
+
+def test_the_only_thing_that_tells_the_way_is_not_told_to_agree_with_itself():
+    """The scores of a cell that alone decides a direction sum to nothing at the optimum."""
+    rng = np.random.default_rng(5)
+    points, normals, there = along_a_hall(rng)
+    there[:20] = CELL + rng.uniform(0.1, 1.5, (20, 3))
+    points[:20], normals[:20] = POSE.transformTo(there[:20].T).T, [1.0, 0.0, 0.0]
+    told, steps = [], []
+    for _ in range(300):
+        solution, step = solved(points, normals, rng.normal(0.0, 0.02, 1500))
+        told.append(error_of(solution))
+        steps.append(step)
+    actual = np.cov(np.array(steps).T)
+    ratios = spread(np.mean([error.covariance for error in told], axis=0), actual)
+    assert ratios.min() > 0.6
+    assert ratios.max() < 1.4
+    # Nor does the map then know better where it is.
+    ratios = spread(np.mean([error.renewed for error in told], axis=0), actual)
+    assert ratios.max() < 1.4
+
+
+def test_edges_are_not_as_good_as_planes_only_because_these_are():
+    rng = np.random.default_rng(6)
+    points, normals, _ = along_a_hall(rng)
+    count, up = 40, [0.0, 0.0, 1.0]
+    centres = CELL + rng.uniform(0.1, 1.5, (count, 3))
+    told, steps = [], []
+    for _ in range(300):
+        off = rng.normal(0.0, SIGMA, (count, 3)) * [1.0, 1.0, 0.0]
+        edges = EdgeMatches(
+            POSE.transformTo((centres + off).T).T, centres, np.tile(up, (count, 1)),
+            np.linalg.norm(off, axis=1), np.full(count, SIGMA), np.ones(count), np.arange(count),
+        )  # fmt: skip
+        solution, step = solved(points, normals, rng.normal(0.0, 0.01, 1500), edges=edges)
+        told.append(error_of(solution).covariance)
+        steps.append(step)
+    ratios = spread(np.mean(told, axis=0), np.cov(np.array(steps).T))
+    assert ratios.min() > 0.6
+    assert ratios.max() < 1.4
+
+
+def test_a_motion_within_the_sweep_moves_the_pose_by_what_is_told():
+    """Each side is seen at its own time, so a roll that was not taken out looks like a height."""
+    points, normals, _ = surroundings(np.random.default_rng(7))
+    seconds = np.arctan2(points[:, 1], points[:, 0]) / (20.0 * np.pi)
+    _, jacobian = plane_rows(points, normals, np.zeros(1500), np.ones(1500), 1.0).residuals(POSE)
+    velocity, acceleration = [0.02, 0.0, 0.01, 0.1, 0.0, 0.0], [0.3, -0.1, 0.0, 0.0, 2.0, 1.0]
+    for motion, name, times in (
+        (velocity, "by_velocity", seconds),
+        (acceleration, "by_acceleration", 0.5 * seconds**2),
+    ):
+        solution, step = solved(points, normals, -times * (jacobian @ motion))
+        seen = SeenGround(0.8)
+        found = scan_error(solution, np.inf, seen, CONFIG, seconds=seconds)
+        np.testing.assert_allclose(getattr(found, name) @ motion, step, rtol=0.02, atol=1e-6)
+        assert abs(step[5]) > 1e-6
+    assert not scan_error(solution, np.inf, SeenGround(0.8), CONFIG).by_velocity.any()
 
 
 def test_matches_without_any_error_leave_a_covariance():
@@ -195,17 +263,28 @@ def test_only_new_ground_is_renewed():
 
 
 def test_ground_is_new_once_and_forgotten_in_time():
-    seen = SeenGround(1.0, remembered=3)
+    seen, same = SeenGround(1.0, remembered=3), np.ones(3, np.int64)
     row = np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [0.6, 0.5, 0.5]])
-    numbers, new = seen.cells(row)
+    numbers, new = seen.cells(row, same)
     assert numbers[0] == numbers[2] != numbers[1]
     assert new.all()
-    assert not seen.cells(row)[1].any()
-    seen.cells(row + np.array([10.0, 0.0, 0.0]))  # fills the generation
-    assert not seen.cells(row)[1].any()
+    assert not seen.cells(row, same)[1].any()
+    seen.cells(row + np.array([10.0, 0.0, 0.0]), same)  # fills the generation
+    assert not seen.cells(row, same)[1].any()
     for n in (20.0, 30.0, 40.0, 50.0):
-        assert seen.cells(row + np.array([n, 0.0, 0.0]))[1].all()
-    assert seen.cells(row)[1].all()
+        assert seen.cells(row + np.array([n, 0.0, 0.0]), same)[1].all()
+    assert seen.cells(row, same)[1].all()
+
+
+def test_a_wall_makes_neither_the_edge_at_its_end_nor_the_floor_known():
+    normals = np.array([[1.0, 0.0, 0.0], [0.1, 0.9, 0.0], [0.0, 0.2, -0.9], [-0.9, 0.3, 0.0]])
+    np.testing.assert_array_equal(facings(normals, 1), [0, 2, 3, 1])
+    seen, place = SeenGround(1.0), np.full((2, 3), 0.5)
+    assert seen.cells(place, np.array([1, 1]))[1].tolist() == [True]
+    numbers, new = seen.cells(place, np.array([0, 1]))
+    assert numbers[0] != numbers[1]
+    assert new[numbers].tolist() == [True, False]
+    assert seen.cells(place, np.array([3, 0]))[1].tolist() == [False, True]
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 
 import gtsam
 import numpy as np
@@ -15,16 +16,16 @@ from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 from loam_gtsam.voxels.key_table import KeyTable
 
-_PRIOR_CELLS = 6.0
-"""Weight, in cells, of the scatter of all residuals beside that of the cells: with fewer than six
-cells the scores alone do not span the six directions."""
-_LEAST_VARIANCE = 1e-6  # of whitened residuals: no covariance vanishes on data without noise
+_TOLD = 6.0
+"""Residuals as large as their standard deviations say that count beside those of the lines, and of
+the planes: the few that decide a pose may agree by chance."""
 _LEAST_POSE = 1e-30  # (1e-15 rad or m)^2: no pose is known as well
 _LEAST_SHARE = 1e-4  # of a pose, or of the ground: less is not told from none
 _BESIDE_IMU = 0.5
 """Share of ``covariance.drift`` that is left beside an accelerometer, which measures the motion
 within the sweep: nothing of it goes into the map."""
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
+_FACINGS = 4  # of :func:`facings`
 _NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
@@ -42,6 +43,8 @@ class ScanError:
     information : (6, 6) of the scan alone, for other factors; none along degenerate directions
     step : (6,) from the solved pose to the optimum of the scan alone
     residual_variance, effective_matches : see :class:`loam_gtsam.types.Uncertainty`
+    by_velocity, by_acceleration : (6, 6) s and s^2, by which a velocity and an acceleration in the
+        middle of the sweep that its points were not de-skewed for move the pose
     """
 
     covariance: FloatArray
@@ -53,6 +56,8 @@ class ScanError:
     step: FloatArray
     residual_variance: float
     effective_matches: float
+    by_velocity: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
+    by_acceleration: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
 
     def seen(self, weak: FloatArray | None) -> FloatArray:
         """(6, 6) the part of ``covariance`` across the degenerate directions, a projector."""
@@ -105,7 +110,10 @@ class ScanError:
 
 
 class SeenGround:
-    """Cells of the map that have been matched; cells not matched for long are forgotten.
+    """What has been matched of the map; what is not matched for long is forgotten.
+
+    A wall says nothing of the edge at its end, or of the floor at its foot. So what is kept are
+    cells of the map with what they were matched for: edges, or planes that face along one axis.
 
     Parameters
     ----------
@@ -117,29 +125,49 @@ class SeenGround:
     def __init__(self, size: float, remembered: int = _REMEMBERED) -> None:
         self._size = size
         self._remembered = remembered
-        self._younger, self._older = KeyTable(_NO_KEYS), KeyTable(_NO_KEYS)
+        self._tables = [(KeyTable(_NO_KEYS), KeyTable(_NO_KEYS)) for _ in range(_FACINGS)]
 
-    def cells(self, points_map: FloatArray) -> tuple[IntArray, BoolArray]:
-        """Cell numbers (N,) of points (N, 3), metres, and which of C cells are new; adds them."""
-        keys, numbers = np.unique(voxel_keys(points_map, self._size), return_inverse=True)
-        added = self._younger.add(keys)
-        new = np.zeros(len(keys), np.bool_)
-        new[added] = ~self._older.holds(keys[added])
-        if len(self._younger) > self._remembered:
-            self._younger, self._older = KeyTable(_NO_KEYS), self._younger
-        return numbers, new
+    def cells(self, points_map: FloatArray, facings: IntArray) -> tuple[IntArray, BoolArray]:
+        """Numbers (N,) of the cells of points (N, 3), metres, and which of C are new; adds them.
+
+        ``facings`` (N,) are those of :func:`facings`.
+        """
+        keys = voxel_keys(points_map, self._size)
+        numbers, news, count = np.empty(len(keys), np.int64), [], 0
+        for facing, (younger, older) in enumerate(self._tables):
+            rows = np.flatnonzero(facings == facing)
+            cells, inverse = np.unique(keys[rows], return_inverse=True)
+            numbers[rows] = count + inverse
+            count += len(cells)
+            added = younger.add(cells)
+            new = np.zeros(len(cells), np.bool_)
+            new[added] = ~older.holds(cells[added])
+            news.append(new)
+            if len(younger) > self._remembered:
+                self._tables[facing] = KeyTable(_NO_KEYS), younger
+        return numbers, np.concatenate(news)
+
+
+def facings(normals: FloatArray, lines: int) -> IntArray:
+    """What rows (N,) are of: 0 an edge, else a plane that faces most along axis 1, 2 or 3.
+
+    ``normals`` (N, 3) are those of the rows, map frame, of which the first ``lines`` are of edges.
+    """
+    axes: IntArray = 1 + np.abs(normals).argmax(axis=1)
+    axes[:lines] = 0
+    return axes
 
 
 def scan_error(
     solution: Solution, kernel_width: float, seen: SeenGround, config: CovarianceConfig,
-    *, kernel: str = "huber", with_priors: bool = True,
+    *, kernel: str = "huber", with_priors: bool = True, seconds: FloatArray | None = None,
 ) -> ScanError | None:  # fmt: skip
     """The error of one solved frame from its residuals; None if its information is singular.
 
     The sandwich ``B S B`` of robust statistics, with B the inverse information and S the scatter of
     the scores ``J^T r``, summed over cells of the map before they are squared: matches in one cell
     share map points, and their errors (Liang and Zeger, Biometrika 73, 1986; White, Econometrica
-    48, 1980).
+    48, 1980). What the fit has taken from the scores of a cell is added again.
 
     Parameters
     ----------
@@ -148,8 +176,10 @@ def scan_error(
     seen : ground matched so far; the cells of this frame are added
     config : ``match_cell`` is used
     with_priors : whether ``solution.information`` counts priors beside the matches
+    seconds : (R,) from the middle of the sweep to the points of the rows, two an edge and one a
+        plane; None if all are of one time
     """
-    pose = solution.map_T_lidar
+    pose, lines = solution.map_T_lidar, 2 * len(solution.matches.edges)
     rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
     residuals, jacobian = rows.residuals(pose)
     keep = np.eye(6) if solution.weak is None else np.eye(6) - solution.weak
@@ -158,21 +188,8 @@ def scan_error(
         without = jacobian @ (np.eye(6) - solution.unseen)
         jacobian = np.where(solution.beacons[:, None], jacobian @ keep, without)
     points = transform(pose.matrix(), rows.points)
-    scores = jacobian * residuals[:, None]
-    by_ground, new = seen.cells(points)
-    fresh = _sums(scores, by_ground, len(new))[new]
-    _, by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)
-    cells = int(by_cell.max(initial=-1)) + 1
-    scatter = _sums(scores, by_cell, cells)
+    by_ground, new = seen.cells(points, facings(rows.normals, lines))
     information: FloatArray = jacobian.T @ jacobian
-    variance = max(float(residuals @ residuals) / max(len(residuals) - 6, 1), _LEAST_VARIANCE)
-    meat: FloatArray = cells * scatter.T @ scatter + _PRIOR_CELLS * variance * information
-    meat = meat / (cells + _PRIOR_CELLS)
-    renewed: FloatArray = fresh.T @ fresh
-    # Least squares, because the matches alone may leave a direction free.
-    inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
-    effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
-
     expected = solution.expected
     total = solution.information if with_priors else information
     if expected is not None and not with_priors:
@@ -184,17 +201,73 @@ def scan_error(
     if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
     bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
-    user = keep.T @ priors @ keep
+
+    scaled = jacobian * np.sqrt(_variances(residuals, jacobian, bread, lines))[:, None]
+    scores = jacobian * residuals[:, None]
+    noise: FloatArray = scaled.T @ scaled
+    scale: FloatArray = np.linalg.inv(noise + priors).astype(np.float64, copy=False)
+    cells, by_cell = np.unique(voxel_keys(points, config.match_cell), return_inverse=True)
+    scatter, fitted = _scatter(scores, scaled, scale, by_cell, len(cells))
+    # How much more the cells scatter than they would with independent residuals.
+    alone = max(float(np.trace(scale @ (noise - fitted))), 1.0)
+    alike = max(float(np.trace(scale @ scatter)) / alone, 1.0)
+    meat = scatter + alike * fitted
+    fresh = np.flatnonzero(new[by_ground])
+    scatter, fitted = _scatter(scores[fresh], scaled[fresh], scale, by_ground[fresh], len(new))
+    renewed = scatter + alike * fitted
+
+    variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
+    # Least squares, because the matches alone may leave a direction free.
+    inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
+    effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
+    for_others = information / SCAN_VARIANCE
+    if solution.weak is None:
+        whole = meat + config.drift * renewed  # new ground has errors of its own
+        for_others = information @ np.linalg.lstsq(whole, information, rcond=None)[0]
+    step = np.linalg.lstsq(information, -jacobian.T @ residuals, rcond=None)[0]
     parts = meat + priors, renewed, total - expected
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
-    shares = bread @ user, bread @ expected
-    alone = information / SCAN_VARIANCE
-    if solution.weak is None:
-        scatter = meat + config.drift * fresh.T @ fresh  # new ground has errors of its own
-        alone = information @ np.linalg.lstsq(scatter, information, rcond=None)[0]
-    step = np.linalg.lstsq(information, -jacobian.T @ residuals, rcond=None)[0]
-    found = covariance, renewed, *shares, raw, symmetric(alone), step.astype(np.float64)
-    return ScanError(*found, variance, effective)
+    shares = bread @ keep.T @ priors @ keep, bread @ expected
+    found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
+    if seconds is None:
+        return ScanError(*found, variance, effective)
+    ways = (jacobian.T * power @ jacobian for power in (seconds, 0.5 * seconds**2))
+    return ScanError(*found, variance, effective, *(bread @ way for way in ways))
+
+
+def _variances(
+    residuals: FloatArray, jacobian: FloatArray, bread: FloatArray, lines: int
+) -> FloatArray:
+    """(R,) variances of whitened residuals: one for the rows of edges, the first, one for planes.
+
+    Told standard deviations of edges are too large by another factor than those of planes are.
+    """
+    free = 1.0 - np.einsum("ni,ni->n", jacobian @ bread, jacobian)  # what the fit has left of each
+    variances = np.empty(len(residuals))
+    for kind in (slice(lines), slice(lines, None)):
+        squares, left = float(residuals[kind] @ residuals[kind]), max(float(free[kind].sum()), 0.0)
+        variances[kind] = (squares + _TOLD) / (left + _TOLD)
+    return variances
+
+
+def _scatter(
+    scores: FloatArray, scaled: FloatArray, scale: FloatArray, cells: IntArray, count: int
+) -> tuple[FloatArray, FloatArray]:
+    """The scatter (6, 6) of the scores of cells, and what the fit has taken from it.
+
+    Parameters
+    ----------
+    scores, scaled : (N, 6) scores, and rows of the Jacobian times the deviations of the residuals
+    scale : (6, 6) inverse of the scatter of all scores if residuals are independent
+    cells : (N,) numbers below ``count``
+    """
+    row, column = np.triu_indices(6)
+    axes = np.ascontiguousarray(scaled.T)
+    halves = _sums((axes[row] * axes[column]).T, cells, count)
+    each = np.empty((count, 6, 6))
+    each[:, row, column] = each[:, column, row] = halves
+    sums = _sums(scores, cells, count)
+    return sums.T @ sums, (each @ scale @ each).sum(axis=0)
 
 
 def _through(matrix: FloatArray, covariance: FloatArray) -> FloatArray:

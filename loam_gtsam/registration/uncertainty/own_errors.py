@@ -12,6 +12,7 @@ from loam_gtsam.frontend.deskew import MovingSweep
 from loam_gtsam.geometry import positive_root, symmetric
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations
+from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.types import FloatArray, MapUpdate, SweepMotion
 
 _LASTING = 0.3
@@ -83,20 +84,20 @@ class OwnErrors:
         update: MapUpdate,
         sweep: MovingSweep,
         middle: gtsam.Pose3,
-        covariance: FloatArray,
+        scan: ScanError,
         motion: Accelerations,
         fused: Fused | None,
     ) -> OwnError:
         """The own error of a frame, each in turn.
 
-        ``covariance`` (6, 6) is that of its scan, at the pose of the ``middle``; ``fused`` is the
-        pose by scan and IMU together, None if there is none.
+        That of its ``scan`` is at the pose of the ``middle``; ``fused`` is the pose by scan and IMU
+        together, None if there is none.
         """
         last = self._last
         to_reference = update.map_T_lidar.between(middle).AdjointMap()
-        now = _Middle(sweep.stamp, middle, covariance, np.ones(6), to_reference, update.stamp)
+        now = _Middle(sweep.stamp, middle, scan.covariance, np.ones(6), to_reference, update.stamp)
         if fused is None:
-            now, own, shared = self._by_scan(now, sweep, motion)
+            now, own, shared = self._by_scan(now, sweep, motion, scan)
             if self._paused:
                 own = own + _changed(update.twist, sweep, motion.variances)
         else:
@@ -106,7 +107,7 @@ class OwnErrors:
         return OwnError(symmetric(own), to_reference, shared, follows)
 
     def _by_scan(
-        self, now: _Middle, sweep: MovingSweep, motion: Accelerations
+        self, now: _Middle, sweep: MovingSweep, motion: Accelerations, scan: ScanError
     ) -> tuple[_Middle, FloatArray, FloatArray]:
         """The frame, and its own and shared error, of a pose by its scan alone."""
         # The pose at the reference time follows from that at the middle by the velocity since the
@@ -126,7 +127,7 @@ class OwnErrors:
             own = own + across @ last.covariance @ across.T
             shared = to_reference @ across @ (last.covariance * last.kept) @ last.to_reference.T
         strayed = share * self._strayed
-        own = own + np.diag(self._missed(sweep, motion)) + np.outer(strayed, strayed)
+        own = own + self._missed(sweep, motion, scan) + np.outer(strayed, strayed)
         own = to_reference @ own @ to_reference.T
         return replace(now, kept=kept), own, shared
 
@@ -145,8 +146,9 @@ class OwnErrors:
         lasting = np.sqrt(_LASTING) * positive_root(of_scan)
         back = -sweep.middle * update.map_T_lidar.rotation().matrix().T
         of_state = np.hstack([to_reference, np.vstack([np.zeros((3, 3)), back])])
-        turned = np.concatenate([self._missed(sweep, motion)[:3], np.zeros(3)])
-        own = of_state @ fused.covariance @ of_state.T + np.diag(turned) + lasting @ lasting.T
+        turned = np.zeros((6, 6))
+        turned[:3, :3] = self._missed(sweep, motion)[:3, :3]
+        own = of_state @ fused.covariance @ of_state.T + turned + lasting @ lasting.T
         shared = np.zeros((6, 6))
         if last is not None and last.of_state is not None and last.lasting is not None:
             shared = of_state @ fused.across @ last.of_state.T + lasting @ last.lasting.T
@@ -157,20 +159,25 @@ class OwnErrors:
             shared,
         )
 
-    def _missed(self, sweep: MovingSweep, motion: Accelerations) -> FloatArray:
-        """(6,) variances of what the mean velocity misses from the middle to the reference time."""
-        # The acceleration times this is the distance of an arc from its chord: at the reference
-        # time, between the last two middles, and in the mean over the sweep.
-        bend = sweep.duration**2 / 24.0
+    def _missed(
+        self, sweep: MovingSweep, motion: Accelerations, scan: ScanError | None = None
+    ) -> FloatArray:
+        """(6, 6) covariance of what the mean velocity misses until the reference time."""
+        # Times the acceleration: how far the arc is from its chord between the last two middles at
+        # the reference time, and how far the points of the sweep draw its pose with them.
+        missed = np.zeros((6, 6)) if scan is None else scan.by_acceleration
         if self._last is not None and sweep.stamp > self._last.stamp:
             seconds = (sweep.stamp - self._last.stamp) * 1e-9
-            bend += 0.5 * sweep.middle * (seconds - sweep.middle)
-        missed = bend**2 * motion.missed(steady=sweep.acceleration is None)
+            missed = missed + 0.5 * sweep.middle * (seconds - sweep.middle) * np.eye(6)
+            if scan is not None:
+                missed = missed + 0.5 * seconds * scan.by_velocity
+        variances, noise = motion.missed(steady=sweep.acceleration is None), np.zeros(6)
         if rotation_is_known(sweep):
-            missed[:3] = 0.0
+            variances[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
-            missed[:3] = self._gyro_noise**2 * abs(sweep.middle)
-        return missed
+            noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
+        covariance: FloatArray = missed * variances @ missed.T + np.diag(noise)
+        return covariance
 
 
 def rotation_is_known(sweep: MovingSweep) -> bool:

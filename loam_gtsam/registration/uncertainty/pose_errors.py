@@ -19,7 +19,8 @@ from loam_gtsam.registration.acceleration import Accelerations, Expected
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import Solution
-from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, scan_error
+from loam_gtsam.registration.solvers.gtsam_solver import match_rows
+from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, facings, scan_error
 from loam_gtsam.registration.uncertainty.map_error import MapError
 from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
 from loam_gtsam.types import FloatArray, FrameStatus, InputError, MapUpdate, Uncertainty
@@ -97,8 +98,10 @@ class PoseErrors:
         """As :meth:`MapError.expected`."""
         return self._map.expected(stamp, last, imu)
 
-    def of_scan(self, solution: Solution, *, small: bool = False) -> ScanError | None:
-        """The error of a solved scan; to be called once for each, in order.
+    def of_scan(
+        self, solution: Solution, sweep: MovingSweep, *, small: bool = False
+    ) -> ScanError | None:
+        """The error of a solved sweep; to be called once for each, in order.
 
         ``small`` tells whether the place is small.
         """
@@ -106,13 +109,14 @@ class PoseErrors:
         config, seen = self._places[small]
         if small != self._small and self._scans > 1:
             # The ground is the same, only in other cells.
-            found = solution.matches
-            points = np.concatenate([found.edges.points, found.planes.points])
-            seen.cells(transform(solution.map_T_lidar.matrix(), points))
-        self._small = small
+            rows, lines = match_rows(solution.matches), 2 * len(solution.matches.edges)
+            points = transform(solution.map_T_lidar.matrix(), rows.points)
+            seen.cells(points, facings(rows.normals, lines))
+        self._small, matches = small, solution.matches
+        edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
         return scan_error(
-            solution, self._kernel_width, seen, config,
-            kernel=self._kernel, with_priors=self._with_priors,
+            solution, self._kernel_width, seen, config, kernel=self._kernel,
+            with_priors=self._with_priors, seconds=np.concatenate([edges.repeat(2), planes]),
         )  # fmt: skip
 
     def calibrated(
@@ -145,7 +149,7 @@ class PoseErrors:
         if fused is not None:
             self._map.set_velocity(middle.rotation().unrotate(fused.velocity))
         self._add_acceleration(sweep, middle, known, last)
-        own = self._own.of(update, sweep, middle, scan.covariance, self._motion, by_imu)
+        own = self._own.of(update, sweep, middle, scan, self._motion, by_imu)
         if self._scans == 1:
             self._map.set_origin(sweep, middle.AdjointMap(), scan.covariance, update.twist)
         self._map.add_rivals(sweep.stamp, doubt, parting)

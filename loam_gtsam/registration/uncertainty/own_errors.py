@@ -163,20 +163,22 @@ class OwnErrors:
         self, sweep: MovingSweep, motion: Accelerations, scan: ScanError | None = None
     ) -> FloatArray:
         """(6, 6) covariance of what the mean velocity misses until the reference time."""
-        # Times the acceleration: how far the arc is from its chord between the last two middles at
-        # the reference time, and how far the points of the sweep draw its pose with them.
-        missed = np.zeros((6, 6)) if scan is None else scan.by_acceleration
+        # The acceleration times this is the distance of an arc from its chord: at the reference
+        # time, between the last two middles, and in the mean over the sweep. What draws the pose
+        # along an axis by the same axis might cancel that: a stamp that is late would not.
+        arc, aside = sweep.duration**2 / 24.0, np.zeros((6, 6))
         if self._last is not None and sweep.stamp > self._last.stamp:
             seconds = (sweep.stamp - self._last.stamp) * 1e-9
-            missed = missed + 0.5 * sweep.middle * (seconds - sweep.middle) * np.eye(6)
+            arc += 0.5 * sweep.middle * (seconds - sweep.middle)
             if scan is not None:
-                missed = missed + 0.5 * seconds * scan.by_velocity
+                aside = scan.by_acceleration + 0.5 * seconds * scan.by_velocity
+        np.fill_diagonal(aside, arc)
         variances, noise = motion.missed(steady=sweep.acceleration is None), np.zeros(6)
         if rotation_is_known(sweep):
             variances[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
             noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
-        covariance: FloatArray = missed * variances @ missed.T + np.diag(noise)
+        covariance: FloatArray = aside * variances @ aside.T + np.diag(noise)
         return covariance
 
 

@@ -13,7 +13,7 @@ from loam_gtsam.geometry import nearest_positive, symmetric
 from loam_gtsam.registration.odometry import Moment, Turns
 from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError
-from loam_gtsam.registration.uncertainty.own_errors import rotation_is_known
+from loam_gtsam.registration.uncertainty.own_errors import rotation_is_known, unresolved
 from loam_gtsam.types import FloatArray
 
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
@@ -201,7 +201,8 @@ class _Origin:
         if seconds <= 0.0:  # sweeps of different length
             return cls()
         # From the middle between both sweeps back to the reference time.
-        bend = np.full(6, 0.5 * abs(middle) * (seconds + middle))
+        between, faster = unresolved(seconds, first.sweep.duration)
+        bend = np.full(6, faster * 0.5 * abs(middle) * (between + middle))
         back = np.full(6, middle)
         if rotation_is_known(first.sweep):
             back[:3] = bend[:3] = 0.0

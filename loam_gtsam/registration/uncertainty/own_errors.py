@@ -167,19 +167,31 @@ class OwnErrors:
         # time, between the last two middles, and in the mean over the sweep. What draws the pose
         # along an axis by the same axis might cancel that: a stamp that is late would not.
         arc, aside = sweep.duration**2 / 24.0, np.zeros((6, 6))
+        variances, noise = motion.missed(steady=sweep.acceleration is None), np.zeros(6)
         if self._last is not None and sweep.stamp > self._last.stamp:
-            seconds = (sweep.stamp - self._last.stamp) * 1e-9
+            seconds, faster = unresolved((sweep.stamp - self._last.stamp) * 1e-9, sweep.duration)
             arc += 0.5 * sweep.middle * (seconds - sweep.middle)
+            variances = faster**2 * variances
             if scan is not None:
                 aside = scan.by_acceleration + 0.5 * seconds * scan.by_velocity
-        np.fill_diagonal(aside, arc)
-        variances, noise = motion.missed(steady=sweep.acceleration is None), np.zeros(6)
+        np.fill_diagonal(aside, np.maximum(arc, np.diag(aside) + arc - sweep.duration**2 / 24.0))
         if rotation_is_known(sweep):
             variances[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
             noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
         covariance: FloatArray = aside * variances @ aside.T + np.diag(noise)
         return covariance
+
+
+def unresolved(seconds: float, duration: float) -> tuple[float, float]:
+    """The time in which a motion may change, and how much larger accelerations are in that.
+
+    Sweeps that follow each other after more ``seconds`` than one has (``duration``) do not show how
+    fast what sways between them does: it may do so within each of them.
+    """
+    if not 0.0 < duration < seconds:
+        return seconds, 1.0
+    return duration, (seconds / duration) ** 2
 
 
 def rotation_is_known(sweep: MovingSweep) -> bool:

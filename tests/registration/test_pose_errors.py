@@ -23,7 +23,7 @@ from loam_gtsam.registration.solvers import POSE_KEY, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.registration.uncertainty import PoseErrors, relative_covariance
 from loam_gtsam.registration.uncertainty import pose_errors as covariance_module
-from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
+from loam_gtsam.registration.uncertainty.own_errors import OwnErrors, unresolved
 from loam_gtsam.studies.evaluation import nees
 from loam_gtsam.types import Features, FrameStatus, InputError, MapUpdate, SweepMotion, Uncertainty
 
@@ -254,7 +254,7 @@ class _Sweep:
 
 def own_errors(
     acceleration, covariance, motion=SweepMotion.CONSTANT_VELOCITY, frames=30, begins=0, known=None,
-    across=0.0,
+    across=0.0, apart=1,
 ):  # fmt: skip
     """Own error at the start of the last of many sweeps along x, accelerated after some.
 
@@ -272,9 +272,9 @@ def own_errors(
         by_velocity=drawn, by_acceleration=0.1**2 / 24.0 * np.eye(6),
     )  # fmt: skip
     for k in range(frames):
-        x = 0.5 * acceleration * (0.1 * max(k - begins, 0)) ** 2
+        x = 0.5 * acceleration * (0.1 * apart * max(k - begins, 0)) ** 2
         middle = gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
-        sweep = _Sweep(k * FRAME, motion)
+        sweep = _Sweep(apart * k * FRAME, motion)
         sweep.acceleration = known
         if errors.last is not None:
             accelerations.add(*errors.last, sweep.stamp, middle, covariance)
@@ -300,6 +300,20 @@ def test_a_velocity_that_is_missed_draws_the_pose_aside():
     assert own[4, 4] == pytest.approx((3.0 * 0.1 / 2.0 * 0.02) ** 2, rel=1e-6)
     assert own[3, 4] == pytest.approx(np.sqrt(own[3, 3] * own[4, 4]), rel=1e-6)
     assert own_errors(3.0, np.zeros((6, 6)))[4, 4] == 0.0
+
+
+def test_sweeps_far_apart_do_not_show_how_fast_the_lidar_sways():
+    """The same second differences, as far apart as the sweeps are long, and five times as far."""
+    assert unresolved(0.1, 0.1) == (0.1, 1.0)
+    assert unresolved(0.05, 0.1) == (0.05, 1.0)  # sweeps that overlap
+    assert unresolved(0.5, 0.0) == (0.5, 1.0)  # all points at one time
+    assert unresolved(0.5, 0.1) == (0.1, pytest.approx(25.0))
+    near, far = (
+        own_errors(a, np.zeros((6, 6)), across=0.02, apart=apart)
+        for a, apart in ((3.0, 1), (3.0 / 25.0, 5))
+    )
+    np.testing.assert_allclose(far, near, rtol=1e-6)
+    assert near[3, 3] > 0.0
 
 
 def test_an_acceleration_that_has_just_begun_counts_in_full():

@@ -163,23 +163,24 @@ class OwnErrors:
         self, sweep: MovingSweep, motion: Accelerations, scan: ScanError | None = None
     ) -> FloatArray:
         """(6, 6) covariance of what the mean velocity misses until the reference time."""
-        # The acceleration times this is the distance of an arc from its chord: at the reference
-        # time, between the last two middles, and in the mean over the sweep. What draws the pose
-        # along an axis by the same axis might cancel that: a stamp that is late would not.
-        arc, aside = sweep.duration**2 / 24.0, np.zeros((6, 6))
+        # Times the acceleration: what the points of the sweep draw its pose by, and how far an arc
+        # is from its chord, between the last two middles, at the reference time.
         variances, noise = motion.missed(steady=sweep.acceleration is None), np.zeros(6)
+        drawn, chord = np.zeros((6, 6)), 0.0
         if self._last is not None and sweep.stamp > self._last.stamp:
             seconds, faster = unresolved((sweep.stamp - self._last.stamp) * 1e-9, sweep.duration)
-            arc += 0.5 * sweep.middle * (seconds - sweep.middle)
             variances = faster**2 * variances
+            chord = 0.5 * sweep.middle * (seconds - sweep.middle)
             if scan is not None:
-                aside = scan.by_acceleration + 0.5 * seconds * scan.by_velocity
-        np.fill_diagonal(aside, np.maximum(arc, np.diag(aside) + arc - sweep.duration**2 / 24.0))
+                drawn = scan.by_acceleration + 0.5 * seconds * scan.by_velocity
+        # Along one axis the two might cancel each other, which a stamp that is late does not.
+        least = sweep.duration**2 / 24.0
+        np.fill_diagonal(drawn, chord + np.maximum(np.diag(drawn), least))
         if rotation_is_known(sweep):
             variances[:3] = 0.0
         if sweep.motion is SweepMotion.GYRO:
             noise[:3] = self._gyro_noise**2 * abs(sweep.middle)
-        covariance: FloatArray = aside * variances @ aside.T + np.diag(noise)
+        covariance: FloatArray = drawn * variances @ drawn.T + np.diag(noise)
         return covariance
 
 

@@ -377,7 +377,7 @@ def test_the_error_of_the_origin_is_that_of_the_first_motion(monkeypatch):
     )
 
 
-def test_ground_that_replaces_none_counts_half(monkeypatch):
+def test_new_ground_adds_to_the_drift(monkeypatch):
     def error(solution, width, seen, config, **_):
         seen.cells(np.zeros((1, 3)), np.ones(1, np.int64))
         return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, np.zeros(6), 1.0, 10.0)
@@ -386,7 +386,7 @@ def test_ground_that_replaces_none_counts_half(monkeypatch):
     errors = PoseErrors(Config())
     drifts = [calibrated(errors, k).uncertainty.drift[0, 0] for k in range(3)]
     once = Config().covariance.drift * 1e-8
-    np.testing.assert_allclose(drifts, [0.5 * once, 1.5 * once, 2.5 * once])
+    np.testing.assert_allclose(drifts, [once, 2.0 * once, 3.0 * once])
 
 
 def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):

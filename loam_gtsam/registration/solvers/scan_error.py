@@ -21,9 +21,6 @@ _TOLD = 6.0
 the planes: the few that decide a pose may agree by chance."""
 _LEAST_POSE = 1e-30  # (1e-15 rad or m)^2: no pose is known as well
 _LEAST_SHARE = 1e-4  # of a pose, or of the ground: less is not told from none
-_BESIDE_IMU = 2.0 / 3.0
-"""Share of ``covariance.drift`` that is left beside an accelerometer: then a filter over a map that
-it makes itself drifts by what is told (in one dimension, by Monte Carlo)."""
 _REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
 _FACINGS = 4  # of :func:`facings`
 _NO_KEYS: IntArray = np.empty(0, np.int64)
@@ -85,7 +82,7 @@ class ScanError:
         out, back = turn * roots @ axes, axes.T @ (turn / roots).T
         pulled = _through(out * pulls @ back, self.renewed)
         taken_over = _through(out * left @ back, self.renewed @ share)
-        return symmetric(_BESIDE_IMU * factor * pulled + taken_over)
+        return symmetric(factor * pulled + taken_over)
 
     def with_factors(
         self, map_T_lidar: gtsam.Pose3, factors: Sequence[gtsam.NonlinearFactor]

@@ -80,9 +80,7 @@ class MapError:
         The scans are numbered from 1. ``settled`` (6, 6) is the covariance of the pose in the map
         if an IMU helped to find it.
         """
-        # At the first solve all ground is new but replaces none, which makes half the drift.
-        factor = 0.5 * self._drift_factor if number == 1 else self._drift_factor
-        renewed = scan.drift(factor, settled if number > self._lag else None)
+        renewed = scan.drift(self._drift_factor, settled if number > self._lag else None)
         to_map, share, seen = solution.map_T_lidar.AdjointMap(), scan.expected, None
         if solution.weak is not None and share.any():
             seen = solution.localizability

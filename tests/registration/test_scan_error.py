@@ -295,7 +295,7 @@ def test_drift_beside_an_imu_is_that_of_a_filter_that_makes_its_own_map(frames, 
     scan = ScanError(
         covariance=2.0 / frames * np.eye(6),  # of points and map, each of unit variance
         renewed=2.0 / frames**2 * np.eye(6),
-        information=np.eye(6) / (2.0 / frames + 12.0 / frames**2),
+        information=np.eye(6) / (2.0 / frames + 4.0 / frames**2),
         user=np.zeros((6, 6)), expected=np.zeros((6, 6)), raw=np.zeros((6, 6)), step=np.zeros(6),
         residual_variance=1.0, effective_matches=1.0,
     )  # fmt: skip

@@ -416,9 +416,14 @@ def timed_rows(
     matches: ScanMatches, sweep: MovingSweep, config: SolverConfig
 ) -> tuple[MatchRows, FloatArray]:
     """The rows of the matches of a sweep, and seconds (R,) from its middle to their points."""
+    rows = match_rows(matches, config.kernel_width, config.kernel)
+    return rows, row_seconds(matches, sweep)
+
+
+def row_seconds(matches: ScanMatches, sweep: MovingSweep) -> FloatArray:
+    """Seconds (R,) from the middle of a sweep to the points of its rows, two an edge."""
     edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
-    seconds = np.concatenate([np.repeat(edges, 2), planes])
-    return match_rows(matches, config.kernel_width, config.kernel), seconds
+    return np.concatenate([np.repeat(edges, 2), planes])
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:

@@ -119,17 +119,10 @@ def test_errors_that_neighbours_share_do_not_average_out():
     assert last.residual_variance == pytest.approx((0.02 / SIGMA) ** 2, rel=0.4)
 
 
-def along_a_hall(rng):
-    """Points of walls that face along y and z, their normals, and where they are in the map."""
-    normals = np.eye(3)[1 + rng.integers(0, 2, 1500)]
-    there = rng.uniform(-15.0, 15.0, (1500, 3)) + POSE.translation()
-    return POSE.transformTo(there.T).T, normals, there
-
-
 def test_the_only_thing_that_tells_the_way_is_not_told_to_agree_with_itself():
     """The scores of a cell that alone decides a direction sum to nothing at the optimum."""
     rng = np.random.default_rng(5)
-    points, normals, there = along_a_hall(rng)
+    points, normals, there = surroundings(rng, axes=2)  # along a hall
     there[:20] = CELL + rng.uniform(0.1, 1.5, (20, 3))
     points[:20], normals[:20] = POSE.transformTo(there[:20].T).T, [1.0, 0.0, 0.0]
     told, steps = [], []
@@ -148,7 +141,7 @@ def test_the_only_thing_that_tells_the_way_is_not_told_to_agree_with_itself():
 
 def test_edges_are_not_as_good_as_planes_only_because_these_are():
     rng = np.random.default_rng(6)
-    points, normals, _ = along_a_hall(rng)
+    points, normals, _ = surroundings(rng, axes=2)  # along a hall
     count, up = 40, [0.0, 0.0, 1.0]
     centres = CELL + rng.uniform(0.1, 1.5, (count, 3))
     told, steps = [], []

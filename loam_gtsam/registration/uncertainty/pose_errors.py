@@ -16,6 +16,7 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
+from loam_gtsam.registration.frame_matcher import row_seconds
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import Solution
@@ -112,11 +113,10 @@ class PoseErrors:
             rows, lines = match_rows(solution.matches), 2 * len(solution.matches.edges)
             points = transform(solution.map_T_lidar.matrix(), rows.points)
             seen.cells(points, facings(rows.normals, lines))
-        self._small, matches = small, solution.matches
-        edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
+        self._small = small
         return scan_error(
             solution, self._kernel_width, seen, config, kernel=self._kernel,
-            with_priors=self._with_priors, seconds=np.concatenate([edges.repeat(2), planes]),
+            with_priors=self._with_priors, seconds=row_seconds(solution.matches, sweep),
         )  # fmt: skip
 
     def calibrated(

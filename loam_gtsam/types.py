@@ -348,10 +348,10 @@ class Uncertainty:
         along the axes of the map, about its origin. It never shrinks.
     residual_variance : of the whitened residuals; 1 if their standard deviations are right
     effective_matches : independent rows that would know as much as the correlated ones do
-    blind : (6, 9) further drift, along directions that no scan saw, by errors of the velocity and
-        the linear acceleration that persist: ``blind @ u`` with u of unit covariance
-    forgotten : (9,) what was passed on of each u from frame to frame since the start, as the
-        negative logarithm of the correlation
+    blind : (6, 10) further drift to which scans are blind: ``blind @ u``, u of unit variance. Nine
+        are of velocity and linear acceleration where no scan saw, the last of an offset of ranges
+    forgotten : (10,) what was passed on of each u from frame to frame since the start, as the
+        negative logarithm of the correlation; of the ranges, that of the offset's deviation, m
     in_doubt : whether several places explain the sweep, of the first ones or of a search; ``own``
         has what they differ by
     """
@@ -362,8 +362,8 @@ class Uncertainty:
     drift: FloatArray
     residual_variance: float
     effective_matches: float
-    blind: FloatArray = field(default_factory=lambda: np.zeros((6, 9)))
-    forgotten: FloatArray = field(default_factory=lambda: np.zeros(9))
+    blind: FloatArray = field(default_factory=lambda: np.zeros((6, 10)))
+    forgotten: FloatArray = field(default_factory=lambda: np.zeros(10))
     in_doubt: bool = False
 
 

@@ -9,12 +9,12 @@ returns a named one; :meth:`Config.changed` and :meth:`Section.changed` change v
 from loam_gtsam.config.aiding import AidingConfig as AidingConfig
 from loam_gtsam.config.base import Section as Section
 from loam_gtsam.config.base import meaning as meaning
-from loam_gtsam.config.sections import BagConfig as BagConfig
+from loam_gtsam.config.output import BagConfig as BagConfig
+from loam_gtsam.config.output import LiveConfig as LiveConfig
 from loam_gtsam.config.sections import CovarianceConfig as CovarianceConfig
 from loam_gtsam.config.sections import DeskewConfig as DeskewConfig
 from loam_gtsam.config.sections import FeatureConfig as FeatureConfig
 from loam_gtsam.config.sections import ImuConfig as ImuConfig
-from loam_gtsam.config.sections import LiveConfig as LiveConfig
 from loam_gtsam.config.sections import LoopConfig as LoopConfig
 from loam_gtsam.config.sections import MapConfig as MapConfig
 from loam_gtsam.config.sections import MatchingConfig as MatchingConfig

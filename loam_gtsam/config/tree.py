@@ -23,6 +23,7 @@ from loam_gtsam.config.base import (
     override,
     shown,
 )
+from loam_gtsam.config.output import BagConfig, LiveConfig
 from loam_gtsam.config.own_parts import PartsConfig
 from loam_gtsam.errors import check_kind, nearest
 from loam_gtsam.types import ConfigError, InputError
@@ -44,8 +45,8 @@ class Config(Section):
     aiding: AidingConfig = AidingConfig()
     pose_graph: sections.PoseGraphConfig = sections.PoseGraphConfig()
     loops: sections.LoopConfig = sections.LoopConfig()
-    bag: sections.BagConfig = sections.BagConfig()
-    live: sections.LiveConfig = sections.LiveConfig()
+    bag: BagConfig = BagConfig()
+    live: LiveConfig = LiveConfig()
     parts: PartsConfig = PartsConfig()
 
     @model_validator(mode="after")

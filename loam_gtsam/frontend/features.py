@@ -269,7 +269,7 @@ def _assemble(
     ring = np.repeat(sweep.ring_of_start, np.diff(sweep.ring_starts))
 
     def measured(chosen: IntArray) -> tuple[FloatArray, FloatArray, IntArray]:
-        points = scan.points.take(sweep.index[chosen], axis=0).astype(np.float64)
+        points = sweep.xyz.take(chosen, axis=1).T.astype(np.float64, order="C")
         return points, times[chosen], ring[chosen]
 
     edges, flat, rest = rows

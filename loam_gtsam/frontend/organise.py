@@ -122,7 +122,7 @@ class OrganisedSweep:
 
 
 def usable_columns(scan: Scan, config: Config) -> SweepColumns:
-    """Drop points that are not finite, out of range, or have implausible times.
+    """Correct the ranges; drop points that are not finite, out of range, or of implausible times.
 
     SweepError if fewer than 11 points remain, or the times cannot be seconds.
     """
@@ -131,6 +131,10 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
     with np.errstate(over="ignore", invalid="ignore"):
         xyz = np.ascontiguousarray(scan.points.T, dtype=np.float32)
         squared = xyz[0] * xyz[0] + xyz[1] * xyz[1] + xyz[2] * xyz[2]
+        if sensor.range_offset:
+            ranges = np.sqrt(squared)
+            left = np.maximum(ranges - np.float32(sensor.range_offset), 0.0)
+            xyz, squared = xyz * (left / np.maximum(ranges, 1e-9)), left * left
     keep: BoolArray = (squared >= np.float32(sensor.min_range) ** 2) & (
         squared <= np.float32(min(sensor.max_range, 1e18)) ** 2
     )

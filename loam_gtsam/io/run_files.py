@@ -83,7 +83,7 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
     docs/outputs.md lists the keys; :class:`loam_gtsam.types.MapUpdate` says what the values mean.
     """
     nothing = np.full((6, 6), np.nan)
-    rest = np.nan, np.nan, np.full((6, 9), np.nan), np.full(9, np.nan)
+    rest = np.nan, np.nan, np.full((6, 10), np.nan), np.full(10, np.nan)
     unknown = Uncertainty(nothing, nothing, None, nothing, *rest)
     parts = [update.uncertainty or unknown for update in updates]
     follows = [-1 if part.follows is None else part.follows for part in parts]
@@ -104,8 +104,8 @@ def write_npz(path: str | Path, updates: Sequence[MapUpdate]) -> None:
         "own_covariances": _column(parts, "own", shape=(6, 6)),
         "shared_covariances": _column(parts, "shared", shape=(6, 6)),
         "drift_covariances": _column(parts, "drift", shape=(6, 6)),
-        "blind_drifts": _column(parts, "blind", shape=(6, 9)),
-        "forgotten": _column(parts, "forgotten", shape=(9,)),
+        "blind_drifts": _column(parts, "blind", shape=(6, 10)),
+        "forgotten": _column(parts, "forgotten", shape=(10,)),
         "follows": np.array(follows, np.int64),
         "residual_variances": _column(parts, "residual_variance"),
         "effective_matches": _column(parts, "effective_matches"),

@@ -35,7 +35,7 @@ _SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground make
 
 
 def run_notes(result: RunResult) -> tuple[str, ...]:
-    """Sentences on positions, IMU, fixes, times of points and statuses; none if all is well."""
+    """Sentences on positions, IMU, fixes, points and statuses; none if all is well."""
     notes = []
     sigmas = position_sigmas(result.updates)
     path = result.trajectory.path_length
@@ -50,6 +50,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.times_problem:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
+    if result.pipeline is not None and (odd := result.pipeline.mapper.errors.range_offset.problem):
+        notes.append(odd)
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
 
 

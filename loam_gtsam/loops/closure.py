@@ -26,7 +26,8 @@ from loam_gtsam.registration.degeneracy import localizability
 from loam_gtsam.registration.matches import ScanMatches, subset, trial_matching
 from loam_gtsam.registration.relocalization import Field, Fit, likely_poses, sample_features
 from loam_gtsam.registration.solvers import GtsamSolver, Solution, trial_solver
-from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
+from loam_gtsam.registration.solvers.scan_error import scan_error
+from loam_gtsam.registration.solvers.seen_ground import SeenGround
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
 
 _ALIKE = 10  # number of keyframes with the most similar heading-free keys that are compared in full
@@ -190,7 +191,7 @@ class Verifier:
         if seen.aligned[0] < self.config.min_aligned:
             return None
         config, solver = self._whole.covariance, self._whole.solver
-        ground = SeenGround(config.ground_cell)
+        ground = SeenGround()
         error = scan_error(solution, solver.kernel_width, ground, config, kernel=solver.kernel)
         return None if error is None else error.covariance
 

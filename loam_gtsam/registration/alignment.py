@@ -17,7 +17,8 @@ from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.relocalization import Fit
 from loam_gtsam.registration.solvers import GtsamSolver, MotionPrior, Solution
-from loam_gtsam.registration.solvers.scan_error import SeenGround, scan_error
+from loam_gtsam.registration.solvers.scan_error import scan_error
+from loam_gtsam.registration.solvers.seen_ground import SeenGround
 from loam_gtsam.types import FloatArray, InputError
 
 _NONE = np.empty((0, 3))
@@ -145,7 +146,7 @@ def _covariance(solution: Solution, config: Config) -> FloatArray:
     """The error of the source from its residuals, and that of the target, which is as new."""
     error = None
     if solution.solved:
-        solver, ground = config.solver, SeenGround(config.covariance.ground_cell)
+        solver, ground = config.solver, SeenGround()
         width, kernel = solver.kernel_width, solver.kernel
         error = scan_error(solution, width, ground, config.covariance, kernel=kernel)
     return np.full((6, 6), np.nan) if error is None else error.covariance + error.renewed

@@ -58,6 +58,8 @@ class PlaneMatches:
     normals, offsets : (M, 3) unit and (M,) metres, map frame
     distances : (M,) signed metres from the plane at the pose of the association
     tilts : (M,) standard deviation of the normal in its worst direction, rad
+    by_range : (M,) by which the distance changes with each metre that all ranges are too long, of
+        the sweep and of those in the map; zero where it is not known, None if it is nowhere
     """
 
     points: FloatArray
@@ -68,6 +70,7 @@ class PlaneMatches:
     weights: FloatArray
     indices: IntArray
     tilts: FloatArray | None = None
+    by_range: FloatArray | None = None
 
     def __len__(self) -> int:
         return len(self.points)

@@ -11,7 +11,7 @@ from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import dot, fit_planes, moments, norm, transform
 from loam_gtsam.registration.matches import PlaneMatches, deviations
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
-from loam_gtsam.voxels.tags import Faces, sines
+from loam_gtsam.voxels.tags import LEAST_ANGLE, Faces, sines
 from loam_gtsam.voxels.trees import Neighbours
 
 _TINY = 1e-9
@@ -78,7 +78,13 @@ def match_surfaces(
     spread = np.maximum(fits.eigenvalues[1], _TINY)
     least = _SURE * config.point_sigma / np.sqrt(k * spread)
     facing = fits.normals * (np.sign(side) * (np.abs(side) > least))
-    hidden = (sines(near.views.take(rows, axis=0), facing) < -least).any(axis=0)
+    seen = sines(near.views.take(rows, axis=0), facing)
+    hidden = (seen < -least).any(axis=0)
+    # A plane that is seen at a steeper angle now has moved more if ranges are too long.
+    sight = map_T_lidar[:3, 3:] - fits.centres
+    turned = seen.mean(axis=0) - dot(facing, sight) / np.maximum(norm(sight), _TINY)
+    known = seen.any(axis=0) & ~hidden & (np.abs(turned) > LEAST_ANGLE)
+    by_range = np.where(known, np.sign(side) * turned, 0.0)
     doubtful = np.flatnonzero(hidden & fits.planar)
     faces = Faces(rows[doubtful], facing.T[doubtful], least[doubtful])
     if len(doubtful):
@@ -89,7 +95,7 @@ def match_surfaces(
         better = again.planar
         for column, new in zip(fits, again, strict=True):
             column[..., doubtful[better]] = new[..., better]
-    return _matched_planes(points, points_map, rows, fits, map_T_lidar, config), faces
+    return _matched_planes(points, points_map, rows, fits, map_T_lidar, config, by_range), faces
 
 
 def translations_fixed(planes: PlaneMatches) -> FloatArray:
@@ -172,6 +178,7 @@ def _matched_planes(
     fits: _Fits,
     map_T_lidar: FloatArray,
     config: MatchingConfig,
+    by_range: FloatArray | None = None,
 ) -> PlaneMatches:
     """The matches of some rows of the points with the planes fitted to their neighbours."""
     normals, offsets, eigenvalues = fits.normals, fits.offsets, fits.eigenvalues
@@ -201,6 +208,7 @@ def _matched_planes(
         weights[keep],
         rows[keep],
         tilts[keep],
+        None if by_range is None else by_range[keep],
     )
 
 

@@ -25,6 +25,8 @@ Tags = NDArray[np.int32]
 """(..., 2) the owner of each point, and the four bytes of its view: one column is fast to sort."""
 
 _UNIT = 127.0
+LEAST_ANGLE = 1.0 / _UNIT
+"""Between views, rad: a smaller one may be none."""
 
 
 class Faces(NamedTuple):

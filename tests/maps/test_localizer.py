@@ -229,7 +229,7 @@ def test_what_a_hypothesis_has_drifted_until_the_fix_does_not_count(mapped, save
     def late(features, near):
         fix, why = add(features, near)
         if fix is not None:
-            long_ago = {"blind": np.ones((6, 9)), "forgotten": np.full(9, 1e3)}
+            long_ago = {"blind": np.ones((6, 10)), "forgotten": np.full(10, 1e3)}
             fix = replace(fix, uncertainty=replace(fix.uncertainty, **long_ago))
         return fix, why
 

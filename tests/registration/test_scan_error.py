@@ -11,7 +11,8 @@ from loam_gtsam.factors import plane_rows
 from loam_gtsam.geometry import voxel_keys
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.solvers import Solution, match_rows
-from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, facings, scan_error
+from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
+from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 
 CONFIG = CovarianceConfig()
 SIGMA = 0.05
@@ -60,7 +61,7 @@ def noisy_walls(**changes):
 
 def error_of(solution, **changes):
     config = CONFIG.changed(**changes)
-    found = scan_error(solution, np.inf, SeenGround(config.ground_cell), config)
+    found = scan_error(solution, np.inf, SeenGround(), config)
     assert found is not None
     return found
 
@@ -170,11 +171,11 @@ def test_a_motion_within_the_sweep_moves_the_pose_by_what_is_told():
         (acceleration, "by_acceleration", 0.5 * seconds**2),
     ):
         solution, step = solved(points, normals, -times * (jacobian @ motion))
-        seen = SeenGround(0.8)
+        seen = SeenGround()
         found = scan_error(solution, np.inf, seen, CONFIG, seconds=seconds)
         np.testing.assert_allclose(getattr(found, name) @ motion, step, rtol=0.02, atol=1e-6)
         assert abs(step[5]) > 1e-6
-    assert not scan_error(solution, np.inf, SeenGround(0.8), CONFIG).by_velocity.any()
+    assert not scan_error(solution, np.inf, SeenGround(), CONFIG).by_velocity.any()
 
 
 def test_matches_without_any_error_leave_a_covariance():
@@ -198,7 +199,7 @@ def test_information_of_another_scale_is_no_prior():
     solution = noisy_walls()
     scaled = dataclasses.replace(solution, information=solution.information * SIGMA**2)
     results = [
-        scan_error(one, np.inf, SeenGround(0.8), CONFIG, with_priors=False)
+        scan_error(one, np.inf, SeenGround(), CONFIG, with_priors=False)
         for one in (solution, scaled)
     ]
     np.testing.assert_array_equal(results[0].covariance, results[1].covariance)
@@ -242,12 +243,12 @@ def test_singular_information_gives_no_covariance(left, known):
     matches = solved(points, normals, np.zeros(1500), prior=np.eye(6))[0].matches
     information = np.diag([left, *[1e9] * 5])
     solution = Solution(POSE, True, True, matches, 1, 1, 0.0, 0.0, information)
-    assert (scan_error(solution, np.inf, SeenGround(0.8), CONFIG) is not None) == known
+    assert (scan_error(solution, np.inf, SeenGround(), CONFIG) is not None) == known
 
 
 def test_only_new_ground_is_renewed():
     solution = noisy_walls()
-    seen = SeenGround(CONFIG.ground_cell)
+    seen = SeenGround()
     first = scan_error(solution, np.inf, seen, CONFIG)
     again = scan_error(solution, np.inf, seen, CONFIG)
     assert np.linalg.eigvalsh(first.renewed).min() > 0.0
@@ -255,29 +256,48 @@ def test_only_new_ground_is_renewed():
     np.testing.assert_array_equal(first.covariance, again.covariance)
 
 
-def test_ground_is_new_once_and_forgotten_in_time():
-    seen, same = SeenGround(1.0, remembered=3), np.ones(3, np.int64)
+def test_ground_is_known_since_its_first_scan_and_forgotten_in_time():
+    seen, same = SeenGround(remembered=3), np.ones(3, np.int64)
     row = np.array([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5], [0.6, 0.5, 0.5]])
-    numbers, new = seen.cells(row, same)
-    assert numbers[0] == numbers[2] != numbers[1]
-    assert new.all()
-    assert not seen.cells(row, same)[1].any()
-    seen.cells(row + np.array([10.0, 0.0, 0.0]), same)  # fills the generation
-    assert not seen.cells(row, same)[1].any()
-    for n in (20.0, 30.0, 40.0, 50.0):
-        assert seen.cells(row + np.array([n, 0.0, 0.0]), same)[1].all()
-    assert seen.cells(row, same)[1].all()
+
+    def since(points, **changes):
+        numbers, found = seen.cells(points, same, 1.0, **changes)
+        assert numbers[0] == numbers[2] != numbers[1]
+        seen.add(np.full(6, seen.scans))
+        return found.tolist()
+
+    far = [row + np.array([n, 0.0, 0.0]) for n in (10.0, 20.0, 30.0, 40.0, 50.0)]
+    assert since(row) == [0, 0]
+    assert since(row) == [0, 0]
+    assert since(far[0]) == [2, 2]  # fills the generation
+    assert since(row) == [0, 0]
+    assert [since(points)[0] for points in far[1:]] == [4, 5, 6, 7]
+    assert since(row) == [8, 8]
+    assert since(far[0], new=3) == [3, 3]
+    assert seen.cells(row, same, 2.0)[1].tolist() == [10]  # other cells
+
+
+def test_what_is_known_since_a_scan_was_moved_as_the_one_before():
+    seen = SeenGround()
+    assert not seen.moved(np.array([0])).any()  # where the map begins
+    for scan in range(3):
+        seen.add(np.full(6, 10.0 + scan))
+    assert seen.moved(np.array([1, 0, 2, 3]))[:, 0].tolist() == [10.0, 0.0, 11.0, 12.0]
 
 
 def test_a_wall_makes_neither_the_edge_at_its_end_nor_the_floor_known():
     normals = np.array([[1.0, 0.0, 0.0], [0.1, 0.9, 0.0], [0.0, 0.2, -0.9], [-0.9, 0.3, 0.0]])
     np.testing.assert_array_equal(facings(normals, 1), [0, 2, 3, 1])
-    seen, place = SeenGround(1.0), np.full((2, 3), 0.5)
-    assert seen.cells(place, np.array([1, 1]))[1].tolist() == [True]
-    numbers, new = seen.cells(place, np.array([0, 1]))
-    assert numbers[0] != numbers[1]
-    assert new[numbers].tolist() == [True, False]
-    assert seen.cells(place, np.array([3, 0]))[1].tolist() == [False, True]
+    seen, place = SeenGround(), np.full((2, 3), 0.5)
+
+    def since(*facing):
+        numbers, found = seen.cells(place, np.array(facing), 1.0)
+        seen.add(np.zeros(6))
+        return found[numbers].tolist()
+
+    assert since(1, 1) == [0, 0]
+    assert since(0, 1) == [1, 0]
+    assert since(3, 0) == [2, 1]
 
 
 @pytest.mark.parametrize(

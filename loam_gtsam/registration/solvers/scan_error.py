@@ -10,20 +10,19 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import CovarianceConfig
+from loam_gtsam.factors import MatchRows
 from loam_gtsam.geometry import nearest_positive, symmetric, transform, voxel_keys
+from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.solvers.base import SCAN_VARIANCE, Solution, linearized
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
-from loam_gtsam.types import BoolArray, FloatArray, IntArray
-from loam_gtsam.voxels.key_table import KeyTable
+from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
+from loam_gtsam.types import FloatArray, IntArray
 
 _TOLD = 6.0
 """Residuals as large as their standard deviations say that count beside those of the lines, and of
 the planes: the few that decide a pose may agree by chance."""
 _LEAST_POSE = 1e-30  # (1e-15 rad or m)^2: no pose is known as well
 _LEAST_SHARE = 1e-4  # of a pose, or of the ground: less is not told from none
-_REMEMBERED = 500_000  # cells of one generation of :class:`SeenGround`: 4 MB
-_FACINGS = 4  # of :func:`facings`
-_NO_KEYS: IntArray = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +41,10 @@ class ScanError:
     residual_variance, effective_matches : see :class:`loam_gtsam.types.Uncertainty`
     by_velocity, by_acceleration : (6, 6) s and s^2, by which a velocity and an acceleration in the
         middle of the sweep that its points were not de-skewed for move the pose
+    by_offset : (6,) how far each metre that all ranges are too long, of this scan and of those
+        before, moves the pose, rad and m per metre
+    offset : metres that they are too long, by the residuals of this scan
+    offset_information : of that number, 1 / m^2, as far as it is none of scans before
     """
 
     covariance: FloatArray
@@ -55,6 +58,9 @@ class ScanError:
     effective_matches: float
     by_velocity: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
     by_acceleration: FloatArray = field(default_factory=partial(np.zeros, (6, 6)))
+    by_offset: FloatArray = field(default_factory=partial(np.zeros, 6))
+    offset: float = 0.0
+    offset_information: float = 0.0
 
     def seen(self, weak: FloatArray | None) -> FloatArray:
         """(6, 6) the part of ``covariance`` across the degenerate directions, a projector."""
@@ -106,55 +112,6 @@ class ScanError:
         return information, step.astype(np.float64, copy=False)
 
 
-class SeenGround:
-    """What has been matched of the map; what is not matched for long is forgotten.
-
-    A wall says nothing of the edge at its end, or of the floor at its foot. So what is kept are
-    cells of the map with what they were matched for: edges, or planes that face along one axis.
-
-    Parameters
-    ----------
-    size : edge length of a cell, metres
-    remembered : cells of a generation. When the younger generation is full, it becomes the older
-        one, and the older one is forgotten.
-    """
-
-    def __init__(self, size: float, remembered: int = _REMEMBERED) -> None:
-        self._size = size
-        self._remembered = remembered
-        self._tables = [(KeyTable(_NO_KEYS), KeyTable(_NO_KEYS)) for _ in range(_FACINGS)]
-
-    def cells(self, points_map: FloatArray, facings: IntArray) -> tuple[IntArray, BoolArray]:
-        """Numbers (N,) of the cells of points (N, 3), metres, and which of C are new; adds them.
-
-        ``facings`` (N,) are those of :func:`facings`.
-        """
-        keys = voxel_keys(points_map, self._size)
-        numbers, news, count = np.empty(len(keys), np.int64), [], 0
-        for facing, (younger, older) in enumerate(self._tables):
-            rows = np.flatnonzero(facings == facing)
-            cells, inverse = np.unique(keys[rows], return_inverse=True)
-            numbers[rows] = count + inverse
-            count += len(cells)
-            added = younger.add(cells)
-            new = np.zeros(len(cells), np.bool_)
-            new[added] = ~older.holds(cells[added])
-            news.append(new)
-            if len(younger) > self._remembered:
-                self._tables[facing] = KeyTable(_NO_KEYS), younger
-        return numbers, np.concatenate(news)
-
-
-def facings(normals: FloatArray, lines: int) -> IntArray:
-    """What rows (N,) are of: 0 an edge, else a plane that faces most along axis 1, 2 or 3.
-
-    ``normals`` (N, 3) are those of the rows, map frame, of which the first ``lines`` are of edges.
-    """
-    axes: IntArray = 1 + np.abs(normals).argmax(axis=1)
-    axes[:lines] = 0
-    return axes
-
-
 def scan_error(
     solution: Solution, kernel_width: float, seen: SeenGround, config: CovarianceConfig,
     *, kernel: str = "huber", with_priors: bool = True, seconds: FloatArray | None = None,
@@ -170,8 +127,8 @@ def scan_error(
     ----------
     solution : of the solver
     kernel_width, kernel : of the solver, for the weights of the matches if the solution has no rows
-    seen : ground matched so far; the cells of this frame are added
-    config : ``match_cell`` is used
+    seen : ground matched so far; this frame is added
+    config : its cells and ``drift`` are used
     with_priors : whether ``solution.information`` counts priors beside the matches
     seconds : (R,) from the middle of the sweep to the points of the rows, two an edge and one a
         plane; None if all are of one time
@@ -185,7 +142,6 @@ def scan_error(
         without = jacobian @ (np.eye(6) - solution.unseen)
         jacobian = np.where(solution.beacons[:, None], jacobian @ keep, without)
     points = transform(pose.matrix(), rows.points)
-    by_ground, new = seen.cells(points, facings(rows.normals, lines))
     information: FloatArray = jacobian.T @ jacobian
     expected = solution.expected
     total = solution.information if with_priors else information
@@ -197,9 +153,12 @@ def scan_error(
         expected = weak.T @ priors @ weak
     if np.linalg.matrix_rank(total, hermitian=True) < len(total):
         return None
+    by_ground, since = seen.cells(points, facings(rows.normals, lines), config.ground_cell)
+    new = since == seen.scans
     bread: FloatArray = np.linalg.inv(total).astype(np.float64, copy=False)
 
-    scaled = jacobian * np.sqrt(_variances(residuals, jacobian, bread, lines))[:, None]
+    deviations = np.sqrt(_variances(residuals, jacobian, bread, lines))
+    scaled = jacobian * deviations[:, None]
     scores = jacobian * residuals[:, None]
     noise: FloatArray = scaled.T @ scaled
     scale: FloatArray = np.linalg.inv(noise + priors).astype(np.float64, copy=False)
@@ -226,10 +185,48 @@ def scan_error(
     covariance, renewed, raw = (symmetric(bread @ part @ bread) for part in parts)
     shares = bread @ keep.T @ priors @ keep, bread @ expected
     found = covariance, renewed, *shares, raw, symmetric(for_others), step.astype(np.float64)
-    if seconds is None:
-        return ScanError(*found, variance, effective)
-    ways = (jacobian.T * power @ jacobian for power in (seconds, 0.5 * seconds**2))
-    return ScanError(*found, variance, effective, *(bread @ way for way in ways))
+    times = np.zeros(len(residuals)) if seconds is None else seconds
+    by_velocity, by_acceleration = (
+        bread @ (jacobian.T * by @ jacobian) for by in (times, 0.5 * times**2)
+    )
+    back, last = pose.inverse().AdjointMap(), seen.moved(np.array([seen.scans]))[0]
+    follows = np.einsum("ni,ni->n", jacobian @ back, seen.moved(since)[by_ground])
+    by_range = _by_range(solution.matches, rows) - follows
+    moved, offset, known = _offset(residuals, jacobian, bread, by_range, deviations)
+    moved = moved + shares[1] @ back @ last
+    seen.add(pose.AdjointMap() @ moved)
+    known *= float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / (6.0 * alike)
+    ways = by_velocity, by_acceleration, moved
+    return ScanError(*found, variance, effective, *ways, offset, known)
+
+
+def _by_range(matches: ScanMatches, rows: MatchRows) -> FloatArray:
+    """(R,) whitened, by which residuals change with each metre that all ranges are too long."""
+    by_range, planes = np.zeros(len(rows.scales)), matches.planes
+    if planes.by_range is not None:
+        first = 2 * len(matches.edges)  # corners show from all sides
+        by_range[first:] = rows.scales[first:] * planes.by_range
+    return by_range
+
+
+def _offset(
+    residuals: FloatArray, jacobian: FloatArray, bread: FloatArray,
+    by_range: FloatArray, deviations: FloatArray,
+) -> tuple[FloatArray, float, float]:  # fmt: skip
+    """The offset of all ranges that explains most of the residuals.
+
+    Returns
+    -------
+    moved : (6,) how far each metre of it moves the pose
+    offset, information : metres, and 1 / m^2 if residuals (R,) are independent and have these
+        ``deviations`` (R,)
+    """
+    moved: FloatArray = -bread @ (jacobian.T @ by_range)
+    left = by_range + jacobian @ moved
+    squares, scatter = float(left @ left), float(np.sum((left * deviations) ** 2))
+    if not scatter > 0.0:
+        return moved, 0.0, 0.0
+    return moved, float(left @ residuals) / squares, squares**2 / scatter
 
 
 def _variances(

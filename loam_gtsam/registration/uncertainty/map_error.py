@@ -14,6 +14,7 @@ from loam_gtsam.registration.odometry import Moment, Turns
 from loam_gtsam.registration.solvers import MotionFilter, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.registration.uncertainty.own_errors import rotation_is_known, unresolved
+from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
 from loam_gtsam.types import FloatArray
 
 _LEAST_KEPT = 1e-4  # below that correlation all is forgotten
@@ -25,23 +26,31 @@ class MapError:
     Attributes
     ----------
     drift : (6, 6) that came by new ground, blind ways, jumps and rivals
-    blind, forgotten : (6, 9) that the error of the velocity has made, by its causes, and how much
-        of each is forgotten, as the negative logarithm (9,)
+    offset : that all ranges have, as the scans tell it
     """
 
     def __init__(self, config: Config) -> None:
         self._drift_factor, self._lag = config.covariance.drift, config.imu.lag
         self._velocity = MotionFilter(config.solver)
-        self.drift, self.blind, self.forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
+        self.drift, self._blind, self._forgotten = np.zeros((6, 6)), np.zeros((6, 9)), np.zeros(9)
         self._rivals, self._moved = _Rivals(), np.zeros((6, 6))
         self._first: PosedSweep | None = None
         self._searches = config.deskew.model != "predicted"  # for the first motion
         self._origin = _Origin()
+        self.offset = RangeOffset(config.matching.point_sigma, config.sensor.range_offset)
+        self._by_offset = np.zeros(6)
 
     @property
     def doubt(self) -> FloatArray:
         """(6, 6) of the pose in the map, while other first motions may be the true one."""
         return self._rivals.doubt
+
+    @property
+    def blind(self) -> tuple[FloatArray, FloatArray]:
+        """``blind`` and ``forgotten`` of :class:`~loam_gtsam.types.Uncertainty`."""
+        sigma = self.offset.mean_square**0.5
+        blind = np.column_stack([self._blind, sigma * self._by_offset])
+        return blind, np.append(self._forgotten, -np.log(sigma))
 
     def begin(self, posed: PosedSweep) -> None:
         """The map begins with a sweep, if it has not begun yet."""
@@ -54,7 +63,8 @@ class MapError:
 
         ``first_accelerations`` (6,) are mean squares of those with which the run began.
         """
-        total = self.drift + self.blind @ self.blind.T + self._moved
+        blind = self.blind[0]
+        total = self.drift + blind @ blind.T + self._moved
         return total + self._origin.error(first_accelerations)
 
     def expected(self, stamp: int, last: Moment | None, imu: Turns | None) -> gtsam.Pose3 | None:
@@ -81,12 +91,15 @@ class MapError:
         if an IMU helped to find it.
         """
         renewed = scan.drift(self._drift_factor, settled if number > self._lag else None)
+        if solution.weak is None:
+            self.offset.add(scan)
         to_map, share, seen = solution.map_T_lidar.AdjointMap(), scan.expected, None
         if solution.weak is not None and share.any():
             seen = solution.localizability
         if seen is not None:
             rows = len(solution.matches) / max(scan.effective_matches, 1.0)
             share = seen.without_noise(share, rows)
+        self._by_offset = to_map @ scan.by_offset
         before = last.map_T_lidar if last is not None and self._follows(last) else None
         found = before, solution.map_T_lidar, share, scan.raw
         step = self._velocity.observe(sweep.stamp, *found, turned=rotation_is_known(sweep))
@@ -94,11 +107,11 @@ class MapError:
         if seen is not None:
             moved = step.by_velocity @ step.by_velocity.T + step.by_chance
             by_chance = by_chance + rows * seen.wander(moved)
-        blind = self.blind + to_map @ step.by_velocity
+        blind = self._blind + to_map @ step.by_velocity
         faded = nearest_positive(np.eye(9) - step.kept.T @ step.kept)
         self.drift = self.drift + symmetric(to_map @ by_chance @ to_map.T + blind @ faded @ blind.T)
-        self.blind = blind @ step.kept.T
-        self.forgotten = self.forgotten - np.log(np.clip(np.diag(step.kept), _LEAST_KEPT, 1.0))
+        self._blind = blind @ step.kept.T
+        self._forgotten = self._forgotten - np.log(np.clip(np.diag(step.kept), _LEAST_KEPT, 1.0))
 
     def set_velocity(self, velocity: FloatArray) -> None:
         """The velocity (3,) by scan and IMU together, m/s in lidar axes."""

@@ -21,9 +21,11 @@ from loam_gtsam.registration.odometry import Moment, Prediction, Turns
 from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
-from loam_gtsam.registration.solvers.scan_error import ScanError, SeenGround, facings, scan_error
+from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
+from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 from loam_gtsam.registration.uncertainty.map_error import MapError
 from loam_gtsam.registration.uncertainty.own_errors import OwnErrors
+from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
 from loam_gtsam.types import FloatArray, FrameStatus, InputError, MapUpdate, Uncertainty
 
 
@@ -61,7 +63,7 @@ def relative_covariance(earlier: MapUpdate, later: MapUpdate) -> FloatArray:
     to_later = later.map_T_lidar.between(earlier.map_T_lidar).AdjointMap()
     from_map = later.map_T_lidar.inverse().AdjointMap()
     covariance = second.own + to_later @ first.own @ to_later.T
-    # The error of the velocity was the same in both, but for what was forgotten in between.
+    # The errors of velocity and ranges were the same in both, but for what was forgotten since.
     blind = second.blind - first.blind * np.exp(first.forgotten - second.forgotten)
     covariance += from_map @ (second.drift - first.drift + blind @ blind.T) @ from_map.T
     if second.follows == earlier.stamp:
@@ -77,10 +79,8 @@ class PoseErrors:
     """
 
     def __init__(self, config: Config) -> None:
-        self._places = [
-            (place.covariance, SeenGround(place.covariance.ground_cell))
-            for place in (config, config.of_small_places())
-        ]
+        self._places = config.covariance, config.of_small_places().covariance
+        self._seen = SeenGround()
         self._small, self._scans = False, 0  # scans that :meth:`of_scan` was given
         self._kernel, graph = config.solver.kernel, config.solver.method == "gtsam"
         self._kernel_width = config.solver.kernel_width if graph else np.inf
@@ -95,6 +95,11 @@ class PoseErrors:
         """What the poses so far tell of the next acceleration; None at first."""
         return self._motion.next
 
+    @property
+    def range_offset(self) -> RangeOffset:
+        """By how much all ranges look too long."""
+        return self._map.offset
+
     def expected(self, stamp: int, last: Moment | None, imu: Turns | None) -> gtsam.Pose3 | None:
         """As :meth:`MapError.expected`."""
         return self._map.expected(stamp, last, imu)
@@ -107,12 +112,13 @@ class PoseErrors:
         ``small`` tells whether the place is small.
         """
         self._scans += 1
-        config, seen = self._places[small]
+        config, seen = self._places[small], self._seen
         if small != self._small and self._scans > 1:
-            # The ground is the same, only in other cells.
+            # The ground is the same as that of the last scan, only in other cells.
             rows, lines = match_rows(solution.matches), 2 * len(solution.matches.edges)
             points = transform(solution.map_T_lidar.matrix(), rows.points)
-            seen.cells(points, facings(rows.normals, lines))
+            facing, last = facings(rows.normals, lines), seen.scans - 1
+            seen.cells(points, facing, config.ground_cell, new=last)
         self._small = small
         return scan_error(
             solution, self._kernel_width, seen, config, kernel=self._kernel,
@@ -156,13 +162,14 @@ class PoseErrors:
         # A pose that own factors tell shares less of the map's error.
         from_map = own.to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()
         covariance = own.covariance + from_map @ self._map.doubt @ from_map.T
+        blind, forgotten = self._map.blind
         uncertainty = Uncertainty(
             own=covariance,
             shared=own.shared,
             follows=own.follows,
             drift=self._map.drift,
-            blind=self._map.blind,
-            forgotten=self._map.forgotten,
+            blind=blind,
+            forgotten=forgotten,
             residual_variance=scan.residual_variance,
             effective_matches=scan.effective_matches,
             in_doubt=bool(self._map.doubt.any()),

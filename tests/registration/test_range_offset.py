@@ -1,0 +1,254 @@
+"""Ranges that are all too long by the same: seen in the residuals, told by the covariances."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+import pytest
+
+from loam_gtsam import Config, RunResult, SimulatedWorld, relative_covariance, run
+from loam_gtsam.config import CovarianceConfig, MapConfig, MatchingConfig
+from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.datasets import ArrayDataset
+from loam_gtsam.registration.association import associate
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.solvers import Solution, match_rows
+from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
+from loam_gtsam.registration.solvers.seen_ground import SeenGround
+from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
+from loam_gtsam.types import FloatArray, Scan
+
+OFFSET = 0.03
+ALONE = Config().changed("imu.coupling=off")
+POSE = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.4, 3.0, -2.0, 0.5]))
+NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
+
+
+def farther(points: FloatArray, lidar: FloatArray, by: float) -> FloatArray:
+    """Points (N, 3) where they seem to be if ranges are too long."""
+    rays = points - lidar
+    return points + by * rays / np.linalg.norm(rays, axis=1)[:, None]
+
+
+# --- how much a match changes with it
+
+
+def wall_matches(offset: float, seen_from: FloatArray, lidar: FloatArray) -> PlaneMatches:
+    """Of the wall y = 0, mapped from one place and seen again from another."""
+    x, z = (axis.ravel() for axis in np.meshgrid(np.arange(-3, 3.1, 0.4), np.arange(-2, 2.1, 0.4)))
+    wall = np.column_stack([x, np.zeros(len(x)), z])
+    settings = MapConfig(field_of_view=False)
+    edges, planes = CubeMap(settings, 0.1), CubeMap(settings, 0.05)
+    planes.insert(farther(wall, seen_from, offset), seen_from)
+    new = wall[(np.abs(x) < 1.5) & (np.abs(z) < 1.5)] + np.array([0.13, 0.0, 0.17])
+    pose = gtsam.Pose3(gtsam.Rot3(), lidar)
+    points = farther(new, lidar, offset) - lidar
+    found = associate(np.empty((0, 3)), points, pose, edges, planes, MatchingConfig()).planes
+    assert len(found) == len(new)
+    return found
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_distances_change_by_what_matches_say_per_metre(side: float) -> None:
+    before, now = np.array([-6.0, 2.0 * side, 0.5]), np.array([1.0, 5.0 * side, 0.0])
+    small = 1e-3
+    with_it, without = (wall_matches(offset, before, now) for offset in (small, 0.0))
+    assert without.by_range is not None
+    changes = (with_it.distances - without.distances) / small
+    np.testing.assert_allclose(without.by_range, changes, atol=0.02)
+    assert np.abs(without.by_range).min() > 0.3
+
+
+def test_a_wall_seen_from_the_same_place_says_nothing_of_it() -> None:
+    here = np.array([1.0, 5.0, 0.0])
+    by_range = wall_matches(OFFSET, here, here + np.array([0.01, 0.0, 0.0])).by_range
+    assert by_range is not None
+    assert not by_range.any()
+
+
+# --- what a scan makes of it
+
+
+def solved(
+    by_range: FloatArray, errors: FloatArray, points: FloatArray, normals: FloatArray
+) -> tuple[Solution, FloatArray]:
+    """The optimum of planes that are ``errors`` off, and the step there from the true pose."""
+    count = len(points)
+    there = POSE.transformFrom(points.T).T
+    offsets = errors - np.einsum("ij,ij->i", normals, there)
+    planes = PlaneMatches(
+        points, normals, offsets, errors, np.full(count, 0.05), np.ones(count), np.arange(count),
+        by_range=by_range,
+    )  # fmt: skip
+    matches = ScanMatches(NO_EDGES, planes)
+    residuals, jacobian = match_rows(matches).residuals(POSE)
+    information = jacobian.T @ jacobian
+    step = -np.linalg.solve(information, jacobian.T @ residuals)
+    return Solution(POSE.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information), step
+
+
+def surroundings(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Points on walls around the lidar, their normals, and what their distances change by."""
+    normals = np.eye(3)[rng.integers(0, 3, 1500)]
+    there = rng.uniform(-15.0, 15.0, (1500, 3)) + POSE.translation()
+    return POSE.transformTo(there.T).T, normals, rng.uniform(-0.5, 1.0, 1500)
+
+
+def error_of(solution: Solution, seen: SeenGround) -> ScanError:
+    error = scan_error(solution, np.inf, seen, CovarianceConfig())
+    assert error is not None
+    return error
+
+
+def test_a_scan_tells_the_offset_and_how_far_it_has_moved_the_pose() -> None:
+    rng = np.random.default_rng(0)
+    points, normals, by_range = surroundings(rng)
+    solution, step = solved(by_range, OFFSET * by_range, points, normals)
+    error = error_of(solution, SeenGround())
+    np.testing.assert_allclose(OFFSET * error.by_offset, step, rtol=1e-2, atol=1e-6)
+    assert error.offset == pytest.approx(OFFSET, rel=1e-3)
+    assert np.linalg.norm(step[3:]) > 1e-3
+    told = []
+    for _ in range(200):
+        noise = rng.normal(0.0, 0.02, 1500)
+        error = error_of(
+            solved(by_range, OFFSET * by_range + noise, points, normals)[0], SeenGround()
+        )
+        told.append((error.offset, error.offset_information**-0.5))
+    offsets, sigmas = np.array(told).T
+    assert np.mean(offsets) == pytest.approx(OFFSET, abs=4.0 * offsets.std() / 200**0.5)
+    assert 0.8 < np.mean(sigmas) / offsets.std() < 1.6
+
+
+def test_a_scan_follows_what_it_is_matched_with() -> None:
+    """What it has moved the pose by goes into the map, and from there into the next pose."""
+    points, normals, by_range = surroundings(np.random.default_rng(1))
+    seen, none = SeenGround(), np.zeros(1500)
+    first = error_of(solved(by_range, none, points, normals)[0], seen)
+    again = error_of(solved(none, none, points, normals)[0], seen)  # new ground, mapped by then
+    np.testing.assert_allclose(again.by_offset, 0.0, atol=1e-9)  # it was all there before
+    moved = POSE.AdjointMap() @ first.by_offset
+    later, start = SeenGround(), SeenGround()
+    later.add(moved)
+    for ground, expected in ((later, first.by_offset), (start, np.zeros(6))):
+        followed = error_of(solved(none, none, points, normals)[0], ground)
+        np.testing.assert_allclose(followed.by_offset, expected, rtol=1e-6, atol=1e-9)
+        assert followed.offset_information < 1e-6
+
+
+def test_ground_seen_before_tells_nothing_new() -> None:
+    points, normals, by_range = surroundings(np.random.default_rng(2))
+    errors = np.random.default_rng(3).normal(0.0, 0.02, 1500)
+    seen = SeenGround()
+    first, again = (error_of(solved(by_range, errors, points, normals)[0], seen) for _ in range(2))
+    assert first.offset_information > 1e3
+    assert again.offset_information == pytest.approx(0.0, abs=1e-9)
+
+
+# --- what a run makes of it
+
+
+def told(offset: float, information: float) -> RangeOffset:
+    ranges = RangeOffset(0.03, removed=0.01)
+    nothing = np.zeros((6, 6))
+    error = ScanError(*[nothing] * 6, np.zeros(6), 1.0, 1.0)
+    ranges.add(replace(error, offset=offset, offset_information=information))
+    return ranges
+
+
+@pytest.mark.parametrize(
+    ("offset", "information", "said"),
+    [
+        (0.03, 1e6, "3.0 cm too long (standard deviation 0.1 cm)"),
+        (-0.05, 1e5, "4.9 cm too short (standard deviation 0.3 cm)"),
+        (0.015, 1e8, ""),  # within what data sheets promise
+        (0.03, 1e3, ""),  # may be chance
+    ],
+)
+def test_only_a_large_and_sure_offset_is_a_problem(offset, information, said) -> None:
+    problem = told(offset, information).problem
+    assert bool(problem) == bool(said)
+    assert said in problem
+    removed = f"sensor.range_offset={told(offset, information).mean + 0.01:.3f}"
+    assert (removed in problem) == bool(said)
+
+
+def test_the_square_of_the_offset_is_that_of_mean_and_deviation() -> None:
+    unknown = RangeOffset(0.03)
+    assert (unknown.mean, unknown.sigma) == (0.0, pytest.approx(0.03))
+    assert unknown.mean_square == pytest.approx(0.03**2)
+    assert told(0.05, 1e9).mean_square == pytest.approx(0.05**2, rel=1e-3)
+    assert told(0.05, 1e-9).mean_square == pytest.approx(0.03**2, rel=1e-3)
+
+
+@pytest.fixture(scope="module")
+def street() -> SimulatedWorld:
+    return SimulatedWorld("street_loop", frames=60, columns=900)
+
+
+@pytest.fixture(scope="module")
+def clean(street: SimulatedWorld) -> RunResult:
+    return run(street, ALONE)
+
+
+@pytest.fixture(scope="module")
+def too_long(street: SimulatedWorld) -> ArrayDataset:
+    def spoilt(sweep: Scan) -> Scan:
+        points = farther(sweep.points.astype(np.float64), np.zeros(3), OFFSET)
+        return replace(sweep, points=points.astype(np.float32))
+
+    return ArrayDataset([spoilt(s) for s in street], truth=street.truth, sensor=street.sensor)
+
+
+@pytest.fixture(scope="module")
+def mapped(too_long: ArrayDataset) -> RunResult:
+    return run(too_long, ALONE)
+
+
+def squared_error(street: SimulatedWorld, result: RunResult, *, known: bool = True) -> float:
+    """Of the motion since the second frame, over its told covariance, in degrees of freedom."""
+    first, last = result.updates[1], result.updates[-1]
+    if not known:
+        last, first = (
+            replace(u, uncertainty=replace(u.uncertainty, blind=np.zeros((6, 10))))
+            for u in (last, first)
+        )
+    assert street.truth is not None
+    true = [
+        gtsam.Pose3(street.truth.map_T_lidar[np.searchsorted(street.truth.stamps, u.stamp)])
+        for u in (first, last)
+    ]
+    error = first.map_T_lidar.between(last.map_T_lidar).localCoordinates(true[0].between(true[1]))
+    return float(error @ np.linalg.solve(relative_covariance(first, last), error)) / 6.0
+
+
+def test_a_run_tells_the_offset_of_its_ranges(clean: RunResult, mapped: RunResult) -> None:
+    for result, offset in ((clean, 0.0), (mapped, OFFSET)):
+        assert result.pipeline is not None
+        ranges = result.pipeline.mapper.errors.range_offset
+        assert ranges.mean == pytest.approx(offset, abs=0.007)
+        said = [note for note in result.notes if "the ranges look" in note]
+        assert len(said) == (offset > 0.0)
+
+
+def test_covariances_count_what_wrong_ranges_do(
+    street: SimulatedWorld, mapped: RunResult, clean: RunResult
+) -> None:
+    assert squared_error(street, mapped, known=False) > 3.0
+    assert squared_error(street, mapped) < 2.0
+    # Right ranges make the covariance hardly larger.
+    last = clean.updates[-1]
+    assert last.uncertainty is not None
+    blind = last.uncertainty.blind[3:, 9]
+    assert np.linalg.norm(blind) ** 2 < 0.2 * np.trace(last.covariance[3:, 3:])
+
+
+def test_ranges_are_made_right_by_the_configuration(
+    clean: RunResult, too_long: ArrayDataset
+) -> None:
+    made_right = run(too_long, ALONE.changed(f"sensor.range_offset={OFFSET}"))
+    assert not any("the ranges look" in note for note in made_right.notes)
+    for one, other in zip(clean.updates, made_right.updates, strict=True):
+        np.testing.assert_allclose(one.map_T_lidar.matrix(), other.map_T_lidar.matrix(), atol=5e-3)

@@ -1,10 +1,11 @@
 """Which directions a scan fixes: closed-form scenes, false information, and what takes over."""
 
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
+from support.matches import NO_EDGES
 
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -13,14 +14,13 @@ from loam_gtsam.geometry import transform
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import effective_config
 from loam_gtsam.registration.degeneracy import by_lines, localizability, unseen_by_planes
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, subset
+from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches, joined, subset
 from loam_gtsam.registration.report import status_of
 from loam_gtsam.registration.solvers import POSE_KEY, GtsamSolver, Matcher, MotionPrior
 from loam_gtsam.types import FrameStatus
 
 LEAST = SolverConfig().min_aligned
 POSE = gtsam.Pose3(gtsam.Rot3.RzRyRx(0.2, -0.3, 1.1), np.array([40.0, -7.0, 3.0]))
-NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
 
 
 def surfaces(points, normals, tilt=0.05, noise=0.0, seed=0):
@@ -280,11 +280,7 @@ def corridor_with_end(count, follows):
         here = pose.matrix()[:3, :3] @ end.T + pose.translation()[:, None]
         offsets = -np.einsum("ij,ij->i", wall.normals, here.T) if follows else wall.offsets
         parts = replace(walls, distances=walls.distances), replace(wall, offsets=offsets)
-        both = {
-            item.name: np.concatenate([getattr(part, item.name) for part in parts])
-            for item in fields(PlaneMatches)
-        }
-        return ScanMatches(NO_EDGES, PlaneMatches(**both))
+        return ScanMatches(NO_EDGES, joined(*parts))
 
     return associate
 

@@ -7,14 +7,14 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from support.solved import POSE, solved, surroundings
 
 from loam_gtsam import Config, RunResult, SimulatedWorld, relative_covariance, run
 from loam_gtsam.config import CovarianceConfig, MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import ArrayDataset
 from loam_gtsam.registration.association import associate
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
-from loam_gtsam.registration.solvers import Solution, match_rows
+from loam_gtsam.registration.matches import PlaneMatches
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
@@ -22,8 +22,6 @@ from loam_gtsam.types import FloatArray, Scan
 
 OFFSET = 0.03
 ALONE = Config().changed("imu.coupling=off")
-POSE = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.4, 3.0, -2.0, 0.5]))
-NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
 
 
 def farther(points: FloatArray, lidar: FloatArray, by: float) -> FloatArray:
@@ -71,51 +69,34 @@ def test_a_wall_seen_from_the_same_place_says_nothing_of_it() -> None:
 # --- what a scan makes of it
 
 
-def solved(
-    by_range: FloatArray, errors: FloatArray, points: FloatArray, normals: FloatArray
-) -> tuple[Solution, FloatArray]:
-    """The optimum of planes that are ``errors`` off, and the step there from the true pose."""
-    count = len(points)
-    there = POSE.transformFrom(points.T).T
-    offsets = errors - np.einsum("ij,ij->i", normals, there)
-    planes = PlaneMatches(
-        points, normals, offsets, errors, np.full(count, 0.05), np.ones(count), np.arange(count),
-        by_range=by_range,
-    )  # fmt: skip
-    matches = ScanMatches(NO_EDGES, planes)
-    residuals, jacobian = match_rows(matches).residuals(POSE)
-    information = jacobian.T @ jacobian
-    step = -np.linalg.solve(information, jacobian.T @ residuals)
-    return Solution(POSE.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information), step
-
-
-def surroundings(rng: np.random.Generator) -> tuple[FloatArray, FloatArray, FloatArray]:
+def around(seed: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Points on walls around the lidar, their normals, and what their distances change by."""
-    normals = np.eye(3)[rng.integers(0, 3, 1500)]
-    there = rng.uniform(-15.0, 15.0, (1500, 3)) + POSE.translation()
-    return POSE.transformTo(there.T).T, normals, rng.uniform(-0.5, 1.0, 1500)
+    rng = np.random.default_rng(seed)
+    points, normals, _ = surroundings(rng)
+    return points, normals, rng.uniform(-0.5, 1.0, len(points))
 
 
-def error_of(solution: Solution, seen: SeenGround) -> ScanError:
+def error_of(seed: int, errors: FloatArray, by_range: FloatArray, seen: SeenGround) -> ScanError:
+    """Of the scan ``around`` of a seed, whose matches are off by errors, metres."""
+    points, normals, _ = around(seed)
+    solution, _ = solved(points, normals, errors, by_range=by_range)
     error = scan_error(solution, np.inf, seen, CovarianceConfig())
     assert error is not None
     return error
 
 
 def test_a_scan_tells_the_offset_and_how_far_it_has_moved_the_pose() -> None:
-    rng = np.random.default_rng(0)
-    points, normals, by_range = surroundings(rng)
-    solution, step = solved(by_range, OFFSET * by_range, points, normals)
-    error = error_of(solution, SeenGround())
+    points, normals, by_range = around(1)
+    errors = OFFSET * by_range
+    step = solved(points, normals, errors)[1]
+    error = error_of(1, errors, by_range, SeenGround())
     np.testing.assert_allclose(OFFSET * error.by_offset, step, rtol=1e-2, atol=1e-6)
     assert error.offset == pytest.approx(OFFSET, rel=1e-3)
     assert np.linalg.norm(step[3:]) > 1e-3
-    told = []
+    rng, told = np.random.default_rng(0), []
     for _ in range(200):
-        noise = rng.normal(0.0, 0.02, 1500)
-        error = error_of(
-            solved(by_range, OFFSET * by_range + noise, points, normals)[0], SeenGround()
-        )
+        noise = rng.normal(0.0, 0.02, len(errors))
+        error = error_of(1, errors + noise, by_range, SeenGround())
         told.append((error.offset, error.offset_information**-0.5))
     offsets, sigmas = np.array(told).T
     assert np.mean(offsets) == pytest.approx(OFFSET, abs=4.0 * offsets.std() / 200**0.5)
@@ -124,25 +105,22 @@ def test_a_scan_tells_the_offset_and_how_far_it_has_moved_the_pose() -> None:
 
 def test_a_scan_follows_what_it_is_matched_with() -> None:
     """What it has moved the pose by goes into the map, and from there into the next pose."""
-    points, normals, by_range = surroundings(np.random.default_rng(1))
-    seen, none = SeenGround(), np.zeros(1500)
-    first = error_of(solved(by_range, none, points, normals)[0], seen)
-    again = error_of(solved(none, none, points, normals)[0], seen)  # new ground, mapped by then
-    np.testing.assert_allclose(again.by_offset, 0.0, atol=1e-9)  # it was all there before
-    moved = POSE.AdjointMap() @ first.by_offset
-    later, start = SeenGround(), SeenGround()
-    later.add(moved)
-    for ground, expected in ((later, first.by_offset), (start, np.zeros(6))):
-        followed = error_of(solved(none, none, points, normals)[0], ground)
-        np.testing.assert_allclose(followed.by_offset, expected, rtol=1e-6, atol=1e-9)
-        assert followed.offset_information < 1e-6
+    by_range, none = around(1)[2], np.zeros(1500)
+    first = error_of(1, none, by_range, SeenGround())
+    for before, expected in (([], np.zeros(6)), ([first.by_offset], first.by_offset)):
+        seen = SeenGround()
+        for moved in before:
+            seen.add(POSE.AdjointMap() @ moved)
+        for _ in range(2):  # what is matched again is where it was
+            found = error_of(1, none, none, seen)
+            np.testing.assert_allclose(found.by_offset, expected, rtol=1e-6, atol=1e-9)
+            assert found.offset_information < 1e-6  # all is moved alike
 
 
 def test_ground_seen_before_tells_nothing_new() -> None:
-    points, normals, by_range = surroundings(np.random.default_rng(2))
     errors = np.random.default_rng(3).normal(0.0, 0.02, 1500)
-    seen = SeenGround()
-    first, again = (error_of(solved(by_range, errors, points, normals)[0], seen) for _ in range(2))
+    seen, by_range = SeenGround(), around(2)[2]
+    first, again = (error_of(2, errors, by_range, seen) for _ in range(2))
     assert first.offset_information > 1e3
     assert again.offset_information == pytest.approx(0.0, abs=1e-9)
 

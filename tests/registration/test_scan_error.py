@@ -2,54 +2,21 @@
 
 import dataclasses
 
-import gtsam
 import numpy as np
 import pytest
+from support.solved import POSE, SIGMA, solved, surroundings
 
 from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.factors import plane_rows
 from loam_gtsam.geometry import voxel_keys
-from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
+from loam_gtsam.registration.matches import EdgeMatches
 from loam_gtsam.registration.solvers import Solution, match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
 
 CONFIG = CovarianceConfig()
-SIGMA = 0.05
-"""Metres: what the matches claim."""
 CELL = CONFIG.match_cell * np.array([5.0, 0.0, 1.0])
 """Least corner of a cell."""
-POSE = gtsam.Pose3.Expmap(np.array([0.02, -0.03, 0.4, 3.0, -2.0, 0.5]))
-
-
-NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
-
-
-def solved(points, normals, errors, pose=POSE, prior=None, weak=None, edges=NO_EDGES):
-    """The optimum of plane matches whose points are off their planes by ``errors``, in metres."""
-    count = len(points)
-    there = pose.transformFrom(points.T).T
-    offsets = errors - np.einsum("ij,ij->i", normals, there)
-    planes = PlaneMatches(points, normals, offsets, errors, np.full(count, SIGMA), np.ones(count),
-                          np.arange(count))  # fmt: skip
-    matches = ScanMatches(edges, planes)
-    residuals, jacobian = match_rows(matches).residuals(pose)
-    keep = np.eye(6) if weak is None else np.eye(6) - weak
-    information = keep.T @ jacobian.T @ jacobian @ keep
-    if prior is not None:
-        information = information + prior
-    step = -np.linalg.solve(information, keep.T @ jacobian.T @ residuals)
-    return Solution(
-        pose.retract(step), True, True, matches, 1, 1, 0.0, 0.0, information, weak=weak,
-        unseen=weak, beacons=np.zeros(len(residuals), np.bool_),
-    ), step  # fmt: skip
-
-
-def surroundings(rng, count=1500, axes=3):
-    """Points on walls along ``axes`` of the map, as seen from the pose, and their normals."""
-    normals = np.eye(3)[rng.integers(0, axes, count) + 3 - axes]
-    there = rng.uniform(-15.0, 15.0, (count, 3)) + POSE.translation()
-    return POSE.transformTo(there.T).T, normals, there
 
 
 def noisy_walls(**changes):

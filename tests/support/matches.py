@@ -6,6 +6,7 @@ import numpy as np
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 
 TRUTH = gtsam.Pose3.Expmap(np.array([0.1, -0.2, 0.7, 12.0, -5.0, 1.0]))
+NO_EDGES = EdgeMatches(*[np.zeros((0, 3))] * 3, *[np.zeros(0)] * 3, np.zeros(0, np.int64))
 
 
 def unit(rng, count):

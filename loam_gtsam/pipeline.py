@@ -64,8 +64,8 @@ class RunResult:
     interrupted : the run was stopped (Ctrl-C) before the data set ended
     error : what ended the run early, if it was to be kept (``keep_partial``)
     imu : what was made of the IMU; None without one
-    loops : keyframes and loops; None if none were looked for. ``updates`` are then in the frame
-        ``odom``; ``trajectory`` and the map are corrected
+    loops : keyframes and loops; None if none were looked for. ``updates`` are then in ``odom``,
+        ``trajectory`` and the map are corrected
     pipeline : as it is after the last sweep, for :func:`loam_gtsam.maps.map_file.save_map`
     fixes : what became of those of a GNSS receiver; None without ``aiding.gnss``
     """
@@ -103,6 +103,11 @@ class RunResult:
     def times_problem(self) -> str:
         """What is wrong with the times of the points, by how these move; empty if nothing is."""
         return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
+
+    @property
+    def ranges_problem(self) -> str:
+        """What is wrong with all ranges, by how planes seen from elsewhere move; else empty."""
+        return "" if self.pipeline is None else self.pipeline.mapper.errors.range_offset.problem
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -401,8 +406,7 @@ def run(
     dataset : see :mod:`loam_gtsam.datasets`
     max_frames : stop after so many sweeps
     on_frame : called as ``on_frame(number, update)`` after each frame, e.g. to show progress
-    keep_partial : if an error ends the run after some sweeps, return what was computed until
-        then, with ``error`` set, instead of raising
+    keep_partial : if an error ends the run, return what was computed before, with ``error`` set
     observe : called as ``observe(sweep, update, pipeline)`` after each frame, to look, not to
         change; e.g. :func:`loam_gtsam.view.observers.record`, for a bag
     workers : processes that extract the features of the sweeps to come (their ``timings`` then

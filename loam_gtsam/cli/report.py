@@ -264,7 +264,8 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         if _scatter(without) < _TIGHTER * _scatter(result):
             said = "the sweeps are de-skewed already: they fit better with sensor.times=none"
     mapped = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
-    return mapped, [*filter(None, (_not_placed(result.updates), said)), *of_imu]
+    problems = _not_placed(result.updates), said, result.ranges_problem, *of_imu
+    return mapped, [*filter(None, problems)]
 
 
 def _not_placed(updates: Sequence[MapUpdate]) -> str:

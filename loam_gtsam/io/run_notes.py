@@ -50,8 +50,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.times_problem:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
-    if result.pipeline is not None and (odd := result.pipeline.mapper.errors.range_offset.problem):
-        notes.append(odd)
+    if result.ranges_problem:
+        notes.append(result.ranges_problem)
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
 
 

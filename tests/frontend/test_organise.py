@@ -10,6 +10,7 @@ import pytest
 from loam_gtsam.config import Config, DeskewConfig, SensorConfig
 from loam_gtsam.datasets.sim.patterns import PATTERNS
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.features import extract_features
 from loam_gtsam.frontend.organise import assign_rings, organise, usable_columns
 from loam_gtsam.frontend.rings import ELEVATIONS, are_level, rings_from_file_order
 from loam_gtsam.types import Scan, SweepError
@@ -53,6 +54,27 @@ def test_drops_points_with_all_their_columns() -> None:
     assert np.array_equal(np.sort(sweep.index), kept)
     assert np.array_equal(sweep.times, times[sweep.index])
     assert np.array_equal(sweep.xyz.T, points[sweep.index])
+
+
+@pytest.mark.parametrize("offset", [0.2, -0.2])
+def test_takes_an_offset_from_all_ranges(offset: float) -> None:
+    points, rings, _ = firing(VLP16)
+    points[:3] = [[np.nan, 0, 0], [0.0, 0.0, 0.0], [0.0, 0.6, 0.0]]
+    sweep = organise(Scan(points, 0, rings=rings), sensor(times="none", range_offset=offset))
+    assert (2 in sweep.index) == (offset < 0.0)  # nearer than sensor.min_range only if made so
+    assert not np.isin([0, 1], sweep.index).any()
+    raw = points[sweep.index].astype(np.float64)
+    ranges = np.linalg.norm(raw, axis=1, keepdims=True)
+    np.testing.assert_allclose(sweep.xyz.T, raw * (1.0 - offset / ranges), atol=1e-5)
+    whole, again = (
+        extract_features(Scan(clouds, 0, rings=numbers), sensor(times="none", range_offset=removed))
+        for clouds, numbers, removed in (
+            (points, rings, offset),
+            (sweep.xyz.T, rings[sweep.index], 0.0),
+        )
+    )
+    np.testing.assert_array_equal(whole.planes, again.planes)
+    np.testing.assert_array_equal(whole.edges, again.edges)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e300])

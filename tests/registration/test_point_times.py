@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from rich.console import Console
+from support.cli import shown
 
 from loam_gtsam import Config, RunResult, SimulatedWorld, run
 from loam_gtsam.cli.report import inspection, summary
@@ -86,12 +85,6 @@ def test_sweeps_that_were_de_skewed_are_found_and_every_frame_says_so(mapped) ->
     told = summarise(mapped)
     assert told["point_times"] == mapped.times_problem
     assert sum(mapped.times_problem in message for message in told["messages"]) == 1
-
-
-def shown(group) -> str:
-    console = Console(width=500, file=io.StringIO())
-    console.print(group)
-    return console.file.getvalue()
 
 
 def test_the_summary_and_inspect_say_so(mapped, twice) -> None:

@@ -7,12 +7,15 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from support.cli import shown
 from support.solved import POSE, solved, surroundings
 
 from loam_gtsam import Config, RunResult, SimulatedWorld, relative_covariance, run
+from loam_gtsam.cli.report import inspection
 from loam_gtsam.config import CovarianceConfig, MapConfig, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import ArrayDataset
+from loam_gtsam.io.run_files import summarise
 from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import PlaneMatches
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
@@ -207,8 +210,13 @@ def test_a_run_tells_the_offset_of_its_ranges(clean: RunResult, mapped: RunResul
         assert result.pipeline is not None
         ranges = result.pipeline.mapper.errors.range_offset
         assert ranges.mean == pytest.approx(offset, abs=0.007)
-        said = [note for note in result.notes if "the ranges look" in note]
-        assert len(said) == (offset > 0.0)
+        assert bool(result.ranges_problem) == (offset > 0.0)
+        assert (result.ranges_problem in result.notes) == (offset > 0.0)
+        assert summarise(result)["ranges"] == (result.ranges_problem or None)
+
+
+def test_inspect_tells_it(too_long: ArrayDataset) -> None:
+    assert "problem: the ranges look" in shown(inspection(too_long, ALONE)[0])
 
 
 def test_covariances_count_what_wrong_ranges_do(
@@ -227,6 +235,6 @@ def test_ranges_are_made_right_by_the_configuration(
     clean: RunResult, too_long: ArrayDataset
 ) -> None:
     made_right = run(too_long, ALONE.changed(f"sensor.range_offset={OFFSET}"))
-    assert not any("the ranges look" in note for note in made_right.notes)
+    assert made_right.ranges_problem == ""
     for one, other in zip(clean.updates, made_right.updates, strict=True):
         np.testing.assert_allclose(one.map_T_lidar.matrix(), other.map_T_lidar.matrix(), atol=5e-3)

@@ -17,7 +17,7 @@ from rich.table import Table
 from loam_gtsam.aiding.gnss import write_enu
 from loam_gtsam.cli import console
 from loam_gtsam.cli.options import RefineOptions
-from loam_gtsam.cli.results import LOOP_FILES, check_data
+from loam_gtsam.cli.results import LOOP_FILES, check_data, summary_in
 from loam_gtsam.config import Config, load_config
 from loam_gtsam.datasets.base import Dataset
 from loam_gtsam.datasets.truth import read_truth
@@ -46,6 +46,10 @@ from loam_gtsam.view.sections import plot_section
 FOLDER = "refined"
 _OF_RUN = ".tum", "_kitti.txt", "_covariance.csv", "_enu.tum"
 _CLOUD, _PICTURE, _REPORT = "map.ply", "section.png", "report.json"
+
+_WRONG_RANGES = (
+    "What is refined has that error, and its covariances do not count it: map anew first"
+)
 
 
 def execute(options: RefineOptions) -> int:
@@ -196,6 +200,9 @@ def _write_all(
         files = console.write_results(target, known, _REPORT, write)
     if not quiet:
         Console().print(_table(report))
+        for run, ranges in zip(runs, report["ranges"], strict=True):
+            if ranges:
+                typer.echo(f"note: {run.folder}: {ranges}. {_WRONG_RANGES}")
         typer.echo(f"Written to {target}: {', '.join(files)}")
     return 0
 
@@ -258,6 +265,7 @@ def _report(
                    for done in all_of.refined.rounds],
         "thickness_bins_mm": edges[:-1],
         "enu": None if all_of.earth is None else all_of.earth.as_dict(),
+        "ranges": [summary_in(run.folder).get("ranges") for run in runs],
     }  # fmt: skip
     for name, quality, thickness in (
         ("before", before, common[0]), ("after", after, common[1])

@@ -167,7 +167,7 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
 
     Results that end earlier because fewer frames were asked for are not complete.
     """
-    summary = _summary_in(folder)
+    summary = summary_in(folder)
     try:
         written = (folder / "config.yaml").read_text(encoding="utf-8")
     except (OSError, ValueError):
@@ -209,7 +209,7 @@ def _differences(summary: Mapping[str, Any], dataset: Dataset) -> list[str]:
 
 def check_data(folder: Path, dataset: Dataset) -> None:
     """DatasetError if the run in a folder was made of another data set, by kind and name."""
-    made_of, info = str(_summary_in(folder).get("dataset", "")), _input_info(dataset)
+    made_of, info = str(summary_in(folder).get("dataset", "")), _input_info(dataset)
     names = {Path(path).name for path in (made_of.removeprefix(f"{info.kind} "), info.path)}
     if len(names) > 1 and "" not in names:
         raise DatasetError(
@@ -218,7 +218,7 @@ def check_data(folder: Path, dataset: Dataset) -> None:
         )
 
 
-def _summary_in(folder: Path) -> dict[str, Any]:
+def summary_in(folder: Path) -> dict[str, Any]:
     """The summary of the run in a folder; empty if there is none that can be read."""
     try:
         summary = json.loads((folder / "summary.json").read_text(encoding="utf-8"))

@@ -603,8 +603,12 @@ def test_a_run_is_refined_into_a_folder_of_its_own() -> None:
     lines = Path("out/refined/trajectory_covariance.csv").read_text().splitlines()
     assert len(lines) == 13
     assert [line.split(",")[1] for line in lines[1:3]] == ["first", "ok"]
+    summary = json.loads(Path("out/summary.json").read_text()) | {"ranges": "the ranges look odd"}
+    Path("out/summary.json").write_text(json.dumps(summary))
     told = loam("refine", spec, "out", "--rounds", "1", "--points", "500")
     assert told.exit_code == 0
+    assert report["ranges"] == [None]
+    assert "note: out: the ranges look odd" in told.output
     assert "thickness of common planes" in told.output
     assert Path("out/refined-2/section.png").stat().st_size > 1000
     for command in ("refine", "clean"):

@@ -46,7 +46,6 @@ from loam_gtsam.view.sections import plot_section
 FOLDER = "refined"
 _OF_RUN = ".tum", "_kitti.txt", "_covariance.csv", "_enu.tum"
 _CLOUD, _PICTURE, _REPORT = "map.ply", "section.png", "report.json"
-
 _WRONG_RANGES = (
     "What is refined has that error, and its covariances do not count it: map anew first"
 )

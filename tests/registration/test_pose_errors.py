@@ -10,6 +10,7 @@ import pytest
 from support.jacobians import numerical
 from support.list_dataset import ListDataset
 from support.quick import PREDICTED
+from support.solved import solved
 
 from loam_gtsam.config import Config, preset
 from loam_gtsam.datasets.sim.world import SimulatedWorld
@@ -20,7 +21,8 @@ from loam_gtsam.registration.acceleration import Accelerations
 from loam_gtsam.registration.matches import EdgeMatches, PlaneMatches, ScanMatches
 from loam_gtsam.registration.odometry import Moment
 from loam_gtsam.registration.solvers import POSE_KEY, Solution
-from loam_gtsam.registration.solvers.scan_error import ScanError
+from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
+from loam_gtsam.registration.solvers.seen_ground import SeenGround
 from loam_gtsam.registration.uncertainty import PoseErrors, relative_covariance
 from loam_gtsam.registration.uncertainty import pose_errors as covariance_module
 from loam_gtsam.registration.uncertainty.own_errors import OwnErrors, unresolved
@@ -377,9 +379,38 @@ def test_the_error_of_the_origin_is_that_of_the_first_motion(monkeypatch):
     )
 
 
+def test_a_lidar_that_turns_tilts_the_map_by_what_it_missed_in_its_first_sweep(monkeypatch):
+    """It sees the floor on either side at its own time: a height that is missed looks like a roll.
+
+    The floor as it was mapped, and as it was, by the reference that is held and the velocity from
+    the middle of the first sweep to that of the second.
+    """
+    seconds = np.linspace(-0.05, 0.05, 2000)
+    side, up = 5.0 * np.cos(20.0 * np.pi * seconds + 1.0), 3.0
+    floor = np.column_stack([5.0 * np.sin(40.0 * np.pi * seconds), side, np.full(2000, -1.0)])
+    walls = np.random.default_rng(0).uniform(-9.0, 9.0, (2000, 3))
+    points, normals = np.concatenate([floor, walls]), np.repeat(np.eye(3)[[2, 0]], 2000, axis=0)
+    normals[3000:] = [0.0, 1.0, 0.0]
+    way = up * ((seconds**2 - 0.05**2) / 2.0 - 0.5 * 0.1 * (seconds + 0.05))
+    errors = np.append(way, np.zeros(2000))  # how much higher it is than it was mapped
+    there = gtsam.Pose3()
+    step = solved(points, normals, -errors, there)[1]
+    solution = solved(points, normals, np.random.default_rng(1).normal(0, 1e-9, 4000), there)[0]
+    times = np.append(seconds, np.zeros(2000))
+    found = scan_error(solution, np.inf, SeenGround(), Config().covariance, seconds=times)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: found)
+    errors = PoseErrors(
+        Config().changed(f"solver.acceleration_sigma={up}", "solver.turn_sigma=0.001")
+    )
+    errors.skipped(PosedSweep(_Sweep(0, SweepMotion.CONSTANT_VELOCITY), np.zeros(6)))
+    update = calibrated(errors, 1, last=None)
+    told = np.sqrt(np.diag(update.covariance - update.uncertainty.own))
+    assert abs(step[0]) > 1e-4
+    np.testing.assert_allclose(told[[0, 5]], np.abs(step[[0, 5]]), rtol=0.05)
+
+
 def test_new_ground_adds_to_the_drift(monkeypatch):
     def error(solution, width, seen, config, **_):
-        seen.cells(np.zeros((1, 3)), np.ones(1, np.int64))
         return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, np.zeros(6), 1.0, 10.0)
 
     monkeypatch.setattr(covariance_module, "scan_error", error)
@@ -395,7 +426,9 @@ def test_ground_is_not_new_because_the_place_has_become_small(monkeypatch):
 
     def error(solution, width, seen, config, **_):
         points = solution.matches.planes.points
-        fresh.append(int(seen.cells(points, np.full(len(points), 3))[1].sum()))
+        since = seen.cells(points, np.full(len(points), 3), config.ground_cell)[1]
+        fresh.append(np.count_nonzero(since == seen.scans))
+        seen.add(np.zeros(6))
         return ScanError(1e-6 * np.eye(6), 1e-8 * np.eye(6), *NONE, np.zeros(6), 1.0, 10.0)
 
     monkeypatch.setattr(covariance_module, "scan_error", error)

@@ -68,7 +68,7 @@ class ScanError:
         return symmetric(_through(keep, self.covariance))
 
     def drift(self, factor: float, fused: FloatArray | None) -> FloatArray:
-        """(6, 6) what new ground adds to the map's error: docs/maths/covariance.md, (6), (12).
+        """(6, 6) what new ground adds to the map's error: docs/maths/covariance.md, (6), (13).
 
         ``factor`` is ``covariance.drift`` for a scan alone; ``fused`` (6, 6) is the covariance of
         the pose by scan and IMU together, None without one. Beside an IMU the ground pulls the pose

@@ -118,16 +118,16 @@ class MapError:
         self._velocity.told(velocity)
 
     def set_origin(
-        self, second: MovingSweep, to_map: FloatArray, covariance: FloatArray, twist: FloatArray
+        self, second: MovingSweep, scan: ScanError, middle: gtsam.Pose3, twist: FloatArray
     ) -> None:
         """The second sweep tells the first motion, by which the points of the first were placed.
 
-        ``covariance`` (6, 6) is that of the second scan, ``to_map`` its adjoint to the map, and
-        ``twist`` (6,) its velocity, rad/s and m/s.
+        ``scan`` is the error of the second, about its pose in the ``middle``, and ``twist`` (6,)
+        its velocity, rad/s and m/s.
         """
         if self._first is not None:
             velocity = None if self._searches else twist
-            self._origin = _Origin.of(self._first, second, to_map, covariance, velocity)
+            self._origin = _Origin.of(self._first, second, scan, middle, velocity)
 
     def add_rivals(self, stamp: int, doubt: FloatArray | None, parting: FloatArray | None) -> None:
         """What other first motions add: see :meth:`_Rivals.told`."""
@@ -191,16 +191,22 @@ class _Origin:
     """The error of the first pose, which is where the map is: all later poses have it in common.
 
     The pose at the reference time of the first sweep is held; the points of that sweep are where
-    they are by the motion from its middle, which is that to the middle of the second sweep.
+    they are by the motion within it, which is that from its middle to that of the second sweep.
+
+    Attributes
+    ----------
+    to_map : (6, 6) adjoint
+    velocity : (6, 6) covariance by the error of that velocity
+    bend : (6, 6) s^2, by which an acceleration moves what is seen
     """
 
     to_map: FloatArray = field(default_factory=lambda: np.eye(6))
     velocity: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
-    bend: FloatArray = field(default_factory=lambda: np.zeros(6))  # s^2, by axis
+    bend: FloatArray = field(default_factory=lambda: np.zeros((6, 6)))
 
     @classmethod
     def of(
-        cls, first: PosedSweep, second: MovingSweep, to_map: FloatArray, covariance: FloatArray,
+        cls, first: PosedSweep, second: MovingSweep, scan: ScanError, middle: gtsam.Pose3,
         velocity: FloatArray | None,
     ) -> _Origin:  # fmt: skip
         """Of :meth:`MapError.set_origin`.
@@ -208,23 +214,26 @@ class _Origin:
         ``velocity`` (6,) is that of the second sweep, rad/s and m/s, if the first one stays
         de-skewed for its own; None if it is de-skewed anew.
         """
-        seconds, middle = (second.stamp - first.sweep.stamp) * 1e-9, first.sweep.middle
+        seconds, start = (second.stamp - first.sweep.stamp) * 1e-9, first.sweep.middle
         if seconds <= 0.0:  # sweeps of different length
             return cls()
-        # From the middle between both sweeps back to the reference time.
+        # Of a point t after the middle, from the velocity between both middles: what the reference,
+        # ``start`` before the middle, has seen by then, t + start, and with an acceleration
+        # (t^2 - start^2) / 2 - between (t + start) / 2. The sides are seen at times of their own.
         between, faster = unresolved(seconds, first.sweep.duration)
-        bend = np.full(6, faster * 0.5 * abs(middle) * (between + middle))
-        back = np.full(6, middle)
+        by_velocity = scan.by_velocity + start * np.eye(6)
+        bend = scan.by_acceleration - 0.5 * between * scan.by_velocity
+        bend = faster * (bend - 0.5 * start * (between + start) * np.eye(6))
         if rotation_is_known(first.sweep):
-            back[:3] = bend[:3] = 0.0
-        own = (back / seconds)[:, None] * covariance * (back / seconds)
+            by_velocity[:, :3] = bend[:, :3] = 0.0
+        own = by_velocity @ scan.covariance @ by_velocity.T / seconds**2
         if velocity is not None:
-            aside = back * (velocity - first.twist)
+            aside = by_velocity @ (velocity - first.twist)
             own = own + np.outer(aside, aside)
-        return cls(to_map, own, bend)
+        return cls(middle.AdjointMap(), own, bend)
 
     def error(self, accelerations: FloatArray) -> FloatArray:
         """(6, 6) in the map, from the (6,) mean squared accelerations."""
-        own = self.velocity + np.diag(self.bend**2 * accelerations)
+        own = self.velocity + self.bend * accelerations @ self.bend.T
         in_map: FloatArray = self.to_map @ own @ self.to_map.T
         return in_map

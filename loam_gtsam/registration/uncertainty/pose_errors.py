@@ -157,7 +157,7 @@ class PoseErrors:
         self._add_acceleration(sweep, middle, known, last)
         own = self._own.of(update, sweep, middle, scan, self._motion, by_imu)
         if self._scans == 1:
-            self._map.set_origin(sweep, middle.AdjointMap(), scan.covariance, update.twist)
+            self._map.set_origin(sweep, scan, middle, update.twist)
         self._map.add_rivals(sweep.stamp, doubt, parting)
         # A pose that own factors tell shares less of the map's error.
         from_map = own.to_reference @ (np.eye(6) - scan.user) @ middle.inverse().AdjointMap()

@@ -157,6 +157,8 @@ def test_fixes_have_covariances_of_their_own_one_for_all_or_none(known):
     np.testing.assert_array_equal(fixes.covariances, wanted)
     with pytest.raises(InputError, match=r"expected \(2, 3, 3\), .* got \(2, 3\); variances"):
         GnssFixes(np.arange(2), places, np.ones((2, 3)))
+    with pytest.raises(InputError, match="got rows of different lengths"):
+        GnssFixes(np.arange(2), places, [[[1.0]], [[1.0, 2.0]]])
 
 
 def test_fixes_and_wheels_keep_arrays_of_what_was_given():

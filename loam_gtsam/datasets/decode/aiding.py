@@ -46,10 +46,14 @@ class GnssFixes:
         stamps = as_stamps(self.stamps, "GnssFixes.stamps")
         places = as_array(self.geodetic, "GnssFixes.geodetic", (len(stamps), 3))
         told = np.full((3, 3), np.nan) if self.covariances is None else self.covariances
-        if np.shape(told) not in ((3, 3), (len(stamps), 3, 3)):
+        try:
+            shape: object = np.shape(told)
+        except ValueError:
+            shape = "rows of different lengths"
+        if shape not in ((3, 3), (len(stamps), 3, 3)):
             raise InputError(
                 f"GnssFixes.covariances: expected ({len(stamps)}, 3, 3), (3, 3) or None, got "
-                f"{np.shape(told)}; variances[:, :, None] * np.eye(3) makes them of variances"
+                f"{shape}; variances[:, :, None] * np.eye(3) makes them of variances"
             )
         told = np.broadcast_to(np.asarray(told), (len(stamps), 3, 3))
         check_array(told, "GnssFixes.covariances", (len(stamps), 3, 3), "numbers")

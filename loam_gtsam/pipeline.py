@@ -31,6 +31,7 @@ from loam_gtsam.mapper import Mapper
 from loam_gtsam.registration.odometry import Odometry, checked_guess, make_odometry
 from loam_gtsam.registration.solvers import ScanSolver
 from loam_gtsam.registration.solvers.own_factors import ExtraFactors
+from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
 from loam_gtsam.types import (
     BadSweep,
     Features,
@@ -105,9 +106,9 @@ class RunResult:
         return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
 
     @property
-    def ranges_problem(self) -> str:
-        """What is wrong with all ranges, by how planes seen from elsewhere move; else empty."""
-        return "" if self.pipeline is None else self.pipeline.mapper.errors.range_offset.problem
+    def range_offset(self) -> RangeOffset | None:
+        """By how much all ranges look too long; None if nothing was mapped."""
+        return None if self.pipeline is None else self.pipeline.mapper.errors.range_offset
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -409,9 +410,8 @@ def run(
     keep_partial : if an error ends the run, return what was computed before, with ``error`` set
     observe : called as ``observe(sweep, update, pipeline)`` after each frame, to look, not to
         change; e.g. :func:`loam_gtsam.view.observers.record`, for a bag
-    workers : processes that extract the features of the sweeps to come (their ``timings`` then
-        count beside the others, not on top). The result is the same. A script that asks for any
-        needs the usual ``if __name__ == "__main__":``.
+    workers : processes that extract features ahead, whose ``timings`` count beside the others. The
+        result is the same; a script that asks for any needs ``if __name__ == "__main__":``.
     checkpoint : keeps the state of the run, and may begin with that of one that was stopped;
         ``on_frame`` and ``observe`` are then called for the frames that follow. With parts of your
         own, give the same ones again.

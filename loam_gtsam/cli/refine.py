@@ -46,9 +46,6 @@ from loam_gtsam.view.sections import plot_section
 FOLDER = "refined"
 _OF_RUN = ".tum", "_kitti.txt", "_covariance.csv", "_enu.tum"
 _CLOUD, _PICTURE, _REPORT = "map.ply", "section.png", "report.json"
-_WRONG_RANGES = (
-    "What is refined has that error, and its covariances do not count it: map anew first"
-)
 
 
 def execute(options: RefineOptions) -> int:
@@ -112,7 +109,10 @@ def _survey(saved: SavedMap) -> Survey | None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FinishedRun:
-    """The results of a run, and its data set."""
+    """The results of a run, and its data set.
+
+    Where all ranges looked too long, its ``config`` has the offset that the run has found.
+    """
 
     folder: Path
     dataset: Dataset
@@ -133,7 +133,10 @@ class FinishedRun:
         check_data(folder, dataset)
         if updates is None:
             updates = read_updates(folder / "run.npz")
-        return FinishedRun(folder, dataset, updates, load_config(folder / "config.yaml"))
+        config, ranges = load_config(folder / "config.yaml"), summary_in(folder).get("ranges")
+        if isinstance(ranges, dict) and "advised_offset_m" in ranges:
+            config = config.changed({"sensor.range_offset": ranges["advised_offset_m"]})
+        return FinishedRun(folder, dataset, updates, config)
 
     @property
     def trajectory(self) -> Trajectory:
@@ -199,9 +202,6 @@ def _write_all(
         files = console.write_results(target, known, _REPORT, write)
     if not quiet:
         Console().print(_table(report))
-        for run, ranges in zip(runs, report["ranges"], strict=True):
-            if ranges:
-                typer.echo(f"note: {run.folder}: {ranges}. {_WRONG_RANGES}")
         typer.echo(f"Written to {target}: {', '.join(files)}")
     return 0
 
@@ -264,7 +264,7 @@ def _report(
                    for done in all_of.refined.rounds],
         "thickness_bins_mm": edges[:-1],
         "enu": None if all_of.earth is None else all_of.earth.as_dict(),
-        "ranges": [summary_in(run.folder).get("ranges") for run in runs],
+        "range_offsets_m": [run.config.sensor.range_offset for run in runs],
     }  # fmt: skip
     for name, quality, thickness in (
         ("before", before, common[0]), ("after", after, common[1])

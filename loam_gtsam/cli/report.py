@@ -264,7 +264,8 @@ def _by_scans(dataset: Dataset, config: Config) -> tuple[str, list[str]]:
         if _scatter(without) < _TIGHTER * _scatter(result):
             said = "the sweeps are de-skewed already: they fit better with sensor.times=none"
     mapped = f"{len(result.updates)} sweeps mapped, from {begin:g} s on"
-    problems = _not_placed(result.updates), said, result.ranges_problem, *of_imu
+    ranges = "" if result.range_offset is None else result.range_offset.problem
+    problems = _not_placed(result.updates), said, ranges, *of_imu
     return mapped, [*filter(None, problems)]
 
 

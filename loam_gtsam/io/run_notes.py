@@ -50,8 +50,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
     if result.times_problem:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
-    if result.ranges_problem:
-        notes.append(result.ranges_problem)
+    if result.range_offset is not None and result.range_offset.problem:
+        notes.append(result.range_offset.problem)
     return (*notes, *_on_statuses(result.updates, max(path, _SHORT)))
 
 

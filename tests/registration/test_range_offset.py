@@ -152,8 +152,10 @@ def test_only_a_large_and_sure_offset_is_a_problem(offset, information, said) ->
     problem = told(offset, information).problem
     assert bool(problem) == bool(said)
     assert said in problem
-    removed = f"sensor.range_offset={told(offset, information).mean + 0.01:.3f}"
-    assert (removed in problem) == bool(said)
+    advised = told(offset, information).advised
+    assert (f"sensor.range_offset={advised:.3f}" in problem) == bool(said)
+    expected = 0.01 + (offset if said else 0.0)
+    assert advised == pytest.approx(expected, abs=1e-3)
 
 
 def test_the_square_of_the_offset_is_that_of_mean_and_deviation() -> None:
@@ -207,12 +209,12 @@ def squared_error(street: SimulatedWorld, result: RunResult, *, known: bool = Tr
 
 def test_a_run_tells_the_offset_of_its_ranges(clean: RunResult, mapped: RunResult) -> None:
     for result, offset in ((clean, 0.0), (mapped, OFFSET)):
-        assert result.pipeline is not None
-        ranges = result.pipeline.mapper.errors.range_offset
+        ranges = result.range_offset
+        assert ranges is not None
         assert ranges.mean == pytest.approx(offset, abs=0.007)
-        assert bool(result.ranges_problem) == (offset > 0.0)
-        assert (result.ranges_problem in result.notes) == (offset > 0.0)
-        assert summarise(result)["ranges"] == (result.ranges_problem or None)
+        assert bool(ranges.problem) == (offset > 0.0)
+        assert (ranges.problem in result.notes) == (offset > 0.0)
+        assert summarise(result)["ranges"] == ranges.as_dict()
 
 
 def test_inspect_tells_it(too_long: ArrayDataset) -> None:
@@ -235,6 +237,8 @@ def test_ranges_are_made_right_by_the_configuration(
     clean: RunResult, too_long: ArrayDataset
 ) -> None:
     made_right = run(too_long, ALONE.changed(f"sensor.range_offset={OFFSET}"))
-    assert made_right.ranges_problem == ""
+    assert made_right.range_offset is not None
+    assert made_right.range_offset.problem == ""
+    assert made_right.range_offset.advised == OFFSET
     for one, other in zip(clean.updates, made_right.updates, strict=True):
         np.testing.assert_allclose(one.map_T_lidar.matrix(), other.map_T_lidar.matrix(), atol=5e-3)

@@ -47,13 +47,28 @@ class RangeOffset:
         return self.mean**2 + self.sigma**2
 
     @property
+    def advised(self) -> float:
+        """Metres that ``sensor.range_offset`` should be; what it was, if there is no problem."""
+        mean = self.mean
+        return self._removed + (mean if abs(mean) > max(_LARGE, _ODD * self.sigma) else 0.0)
+
+    @property
     def problem(self) -> str:
         """What is wrong with the ranges, as a sentence; empty if nothing is."""
-        mean, sigma = self.mean, self.sigma
-        if abs(mean) < max(_LARGE, _ODD * sigma):
+        if self.advised == self._removed:
             return ""
+        long = "long" if self.mean > 0.0 else "short"
         return (
-            f"the ranges look {100.0 * abs(mean):.1f} cm too {'long' if mean > 0.0 else 'short'} "
-            f"(standard deviation {100.0 * sigma:.1f} cm), which the covariances count; if this "
-            f"lidar always does so, map with sensor.range_offset={self._removed + mean:.3f}"
+            f"the ranges look {100.0 * abs(self.mean):.1f} cm too {long} (standard deviation "
+            f"{100.0 * self.sigma:.1f} cm), which the covariances count; if this lidar always does "
+            f"so, map with sensor.range_offset={self.advised:.3f}"
         )
+
+    def as_dict(self) -> dict[str, float | str | None]:
+        """For the summary of a run."""
+        return {
+            "offset_m": self.mean,
+            "sigma_m": self.sigma,
+            "advised_offset_m": self.advised,
+            "problem": self.problem or None,
+        }

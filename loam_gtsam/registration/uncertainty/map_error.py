@@ -217,9 +217,9 @@ class _Origin:
         seconds, start = (second.stamp - first.sweep.stamp) * 1e-9, first.sweep.middle
         if seconds <= 0.0:  # sweeps of different length
             return cls()
-        # Of a point t after the middle, from the velocity between both middles: what the reference,
-        # ``start`` before the middle, has seen by then, t + start, and with an acceleration
-        # (t^2 - start^2) / 2 - between (t + start) / 2. The sides are seen at times of their own.
+        # A point that was seen t after the middle is where t + start times the velocity put it, seen
+        # from the reference, which is held. That between both middles misses, by an acceleration,
+        # (t^2 - start^2) / 2 - between (t + start) / 2. Each side is seen at its own time.
         between, faster = unresolved(seconds, first.sweep.duration)
         by_velocity = scan.by_velocity + start * np.eye(6)
         bend = scan.by_acceleration - 0.5 * between * scan.by_velocity

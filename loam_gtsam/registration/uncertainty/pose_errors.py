@@ -117,7 +117,7 @@ class PoseErrors:
             # The ground is the same as that of the last scan, only in other cells.
             rows, lines = match_rows(solution.matches), 2 * len(solution.matches.edges)
             points = transform(solution.map_T_lidar.matrix(), rows.points)
-            facing, last = facings(rows.normals, lines), seen.scans - 1
+            facing, last = facings(rows.normals, lines), max(seen.scans - 1, 0)
             seen.cells(points, facing, config.ground_cell, new=last)
         self._small = small
         return scan_error(

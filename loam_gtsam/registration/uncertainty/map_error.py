@@ -217,8 +217,8 @@ class _Origin:
         seconds, start = (second.stamp - first.sweep.stamp) * 1e-9, first.sweep.middle
         if seconds <= 0.0:  # sweeps of different length
             return cls()
-        # A point that was seen t after the middle is where t + start times the velocity put it, seen
-        # from the reference, which is held. That between both middles misses, by an acceleration,
+        # A point seen t after the middle is where t + start times the velocity has put it, seen from
+        # the reference, which is held. The velocity between both middles misses, by an acceleration,
         # (t^2 - start^2) / 2 - between (t + start) / 2. Each side is seen at its own time.
         between, faster = unresolved(seconds, first.sweep.duration)
         by_velocity = scan.by_velocity + start * np.eye(6)

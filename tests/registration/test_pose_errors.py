@@ -406,7 +406,8 @@ def test_a_lidar_that_turns_tilts_the_map_by_what_it_missed_in_its_first_sweep(m
     update = calibrated(errors, 1, last=None)
     told = np.sqrt(np.diag(update.covariance - update.uncertainty.own))
     assert abs(step[0]) > 1e-4
-    np.testing.assert_allclose(told[[0, 5]], np.abs(step[[0, 5]]), rtol=0.05)
+    assert told[0] == pytest.approx(abs(step[0]), rel=0.05)
+    assert 1.0 < told[5] / abs(step[5]) < 1.3  # what cancels along one axis is not counted on
 
 
 def test_new_ground_adds_to_the_drift(monkeypatch):

@@ -217,13 +217,15 @@ class _Origin:
         seconds, start = (second.stamp - first.sweep.stamp) * 1e-9, first.sweep.middle
         if seconds <= 0.0:  # sweeps of different length
             return cls()
-        # A point seen t after the middle is where t + start times the velocity has put it, seen from
-        # the reference, which is held. The velocity between both middles misses, by an acceleration,
+        # A point seen t after the middle is where t + start times the velocity has put it, from the
+        # reference, which is held. By an acceleration the velocity between both middles misses
         # (t^2 - start^2) / 2 - between (t + start) / 2. Each side is seen at its own time.
         between, faster = unresolved(seconds, first.sweep.duration)
         by_velocity = scan.by_velocity + start * np.eye(6)
         bend = scan.by_acceleration - 0.5 * between * scan.by_velocity
-        bend = faster * (bend - 0.5 * start * (between + start) * np.eye(6))
+        # Along one axis the two might cancel each other, which a stamp that is late does not.
+        np.fill_diagonal(bend, -0.5 * start * (between + start))
+        bend *= faster
         if rotation_is_known(first.sweep):
             by_velocity[:, :3] = bend[:, :3] = 0.0
         own = by_velocity @ scan.covariance @ by_velocity.T / seconds**2

@@ -198,7 +198,7 @@ def _elsewhere(
     other = np.zeros(6) if stays is None else stays.posed.twist
     for place in places[: 1 if monitor.lost else _CLOSER]:
         twists = _motions(frame, place, other)
-        found = _with_motion(frame, place, twists, monitor, solver)
+        found = _with_motion(frame, place, twists, monitor, solver, told=True)
         if found is None:
             continue
         matcher = frame.matcher.moving_at(found.posed.twist)
@@ -250,15 +250,19 @@ def _motions(frame: Frame, place: gtsam.Pose3, other: FloatArray) -> list[FloatA
 
 def _with_motion(
     frame: Frame, place: gtsam.Pose3, twists: Sequence[FloatArray],
-    monitor: FitMonitor, solver: ScanSolver,
+    monitor: FitMonitor, solver: ScanSolver, *, told: bool = False,
 ) -> Found | None:  # fmt: skip
     """The sweep near a place, with the first velocity of those by which it clearly fits best.
 
-    If it fits again with none, it tells its velocity by itself, as what was blind may have shaken.
-    None if it does not fit then either.
+    The last one is what its matches tell, if these are to be asked (``told``): after a gap the
+    velocity is none of those. If it fits again with none, it tells its velocity by itself, as what
+    was blind may have shaken. None if it does not fit then either.
     """
     matcher, best = frame.matcher, None
     tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]
+    if told and matcher.motion_is_free:
+        fit, near, _ = _tried(frame, matcher, place, solver)
+        tried.append((fit, near, matcher.posed_at(near.map_T_lidar, near.matches)))
     for fit, found, posed in tried:
         if not (found.solved and monitor.fits_again(fit)):
             continue

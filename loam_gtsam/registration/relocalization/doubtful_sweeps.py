@@ -26,7 +26,12 @@ from loam_gtsam.registration.relocalization.fits import (
     same,
     step_in_map,
 )
-from loam_gtsam.registration.relocalization.likely_poses import Field, likely_poses, sample_features
+from loam_gtsam.registration.relocalization.likely_poses import (
+    MORE_EDGES,
+    Field,
+    likely_poses,
+    sample_features,
+)
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.registration.solvers.base import SCAN_VARIANCE
@@ -367,11 +372,11 @@ def _places(
         for cubes in (matcher.maps.edges, matcher.maps.planes)
     ]
     starts = [solution.map_T_lidar] if solution.solved else []
-    points = sample_features(*matcher.posed.points)
+    points = sample_features(*matcher.posed.points, MORE_EDGES)
     as_well = None if monitor.lost else AS_WELL
     held = np.concatenate(known)
     fields = [Field.around(held, pose, monitor.radius) for pose in around]
-    starts += likely_poses(points, fields, around, _PLACES, as_well=as_well)
+    starts += likely_poses(points, fields, around, _PLACES, rare=True, as_well=as_well)
     matcher.clock.lap("relocalize")
     trial = replace(matcher, refine=False).with_few_matches()
     tried = [_solved_near(frame, trial, start, solver) for start in starts]

@@ -23,6 +23,8 @@ _TURN = np.radians(5.0)  # half of it moves a point at 15 m by little more than 
 _REACH = 40.0  # largest horizontal distance of a point that is scored, metres
 _HEIGHT = 10.0  # largest height above or below the lidar of a point that is scored, metres
 _SAMPLE = (60, 140)  # number of edge and plane features that are scored
+MORE_EDGES = (500, 140)
+"""The same if rare ones count more: ten of 500 edges may lie on posts."""
 _CHANCES = 20_000  # trial poses, or so, that tell how rarely a point hits
 _RAREST = 200  # number of points, those that hit most rarely, that are scored if rare ones count
 

@@ -29,6 +29,7 @@ from loam_gtsam.registration.relocalization import (
     sample_features,
 )
 from loam_gtsam.registration.relocalization.fits import APART
+from loam_gtsam.registration.relocalization.likely_poses import MORE_EDGES
 from loam_gtsam.registration.solvers import MotionPrior
 from loam_gtsam.registration.solvers.own_factors import NamedSolver
 from loam_gtsam.registration.start.early_map import EarlyMap
@@ -67,8 +68,6 @@ had 0.68 at least in 60 drawn starts; with 0.6, two of 18 with a view of 70 degr
 _NEAR = (0.8, APART[1])
 """Metres and rad within which a place leads where another one did: less than the 1 m between trial
 places. In a corridor two sweeps that are registered from 0.7 m away do not find each other."""
-_SAMPLE = (500, 140)
-"""Number of edges and planes that are looked at for these: ten of 500 edges may lie on posts."""
 _HOPEFUL = 0.5
 """Part of the best place's share, by few matches, below which a place is not looked at closer."""
 _ELSEWHERE = 4
@@ -305,7 +304,7 @@ def _likely(
     held = np.concatenate([transform(pose, points) for points in first.posed.points])
     fields = [Field.around(held, centre, radius) for centre in centres]
     return likely_poses(
-        sample_features(*later.posed.points, _SAMPLE), fields, centres, count,
+        sample_features(*later.posed.points, MORE_EDGES), fields, centres, count,
         most_turn=turn, rare=True, least=_LIKELY, apart=_NEAR,
     )  # fmt: skip
 

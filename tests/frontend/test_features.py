@@ -167,7 +167,7 @@ class Picked:
         config = config.changed("features.thinning=voxels", "features.beam_width=1")
         self.sweep = organise(scan, config)
         self.features = extract_features(scan, config)
-        where = {tuple(point): i for i, point in enumerate(scan.points[self.sweep.index])}
+        where = {tuple(point): i for i, point in enumerate(self.sweep.xyz.T.astype(np.float64))}
         rows = lambda points: sorted(where[tuple(point)] for point in points)  # noqa: E731
         self.edges = rows(self.features.edges)
         self.sharp = rows(self.features.edges[self.features.sharp])

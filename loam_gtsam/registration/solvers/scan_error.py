@@ -135,12 +135,8 @@ def scan_error(
     """
     pose, lines = solution.map_T_lidar, 2 * len(solution.matches.edges)
     rows = solution.rows or match_rows(solution.matches, kernel_width, kernel)
-    residuals, jacobian = rows.residuals(pose)
     keep = np.eye(6) if solution.weak is None else np.eye(6) - solution.weak
-    if solution.unseen is not None:
-        assert solution.beacons is not None
-        without = jacobian @ (np.eye(6) - solution.unseen)
-        jacobian = np.where(solution.beacons[:, None], jacobian @ keep, without)
+    residuals, jacobian = _as_solved(solution, rows, keep)
     points = transform(pose.matrix(), rows.points)
     information: FloatArray = jacobian.T @ jacobian
     expected = solution.expected
@@ -172,10 +168,7 @@ def scan_error(
     scatter, fitted = _scatter(scores[fresh], scaled[fresh], scale, by_ground[fresh], len(new))
     renewed = scatter + alike * fitted
 
-    variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
-    # Least squares, because the matches alone may leave a direction free.
-    inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
-    effective = len(residuals) * variance / inflation if inflation > 0.0 else 0.0
+    told = _told(residuals, information, meat)
     for_others = information / SCAN_VARIANCE
     if solution.weak is None:
         whole = meat + config.drift * renewed  # new ground has errors of its own
@@ -197,7 +190,27 @@ def scan_error(
     seen.add(pose.AdjointMap() @ moved)
     known *= float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / (6.0 * alike)
     ways = by_velocity, by_acceleration, moved
-    return ScanError(*found, variance, effective, *ways, offset, known)
+    return ScanError(*found, *told, *ways, offset, known)
+
+
+def _as_solved(
+    solution: Solution, rows: MatchRows, keep: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals (R,) and Jacobian (R, 6) of the rows as far as they counted in the solve."""
+    residuals, jacobian = rows.residuals(solution.map_T_lidar)
+    if solution.unseen is not None:
+        assert solution.beacons is not None
+        without = jacobian @ (np.eye(6) - solution.unseen)
+        jacobian = np.where(solution.beacons[:, None], jacobian @ keep, without)
+    return residuals, jacobian
+
+
+def _told(residuals: FloatArray, information: FloatArray, meat: FloatArray) -> tuple[float, float]:
+    """``residual_variance`` and ``effective_matches``."""
+    variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
+    # Least squares, because the matches alone may leave a direction free.
+    inflation = float(np.trace(np.linalg.lstsq(information, meat, rcond=None)[0])) / 6.0
+    return variance, len(residuals) * variance / inflation if inflation > 0.0 else 0.0
 
 
 def _by_range(matches: ScanMatches, rows: MatchRows) -> FloatArray:

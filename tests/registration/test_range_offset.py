@@ -168,7 +168,7 @@ def test_the_square_of_the_offset_is_that_of_mean_and_deviation() -> None:
 
 @pytest.fixture(scope="module")
 def street() -> SimulatedWorld:
-    return SimulatedWorld("street_loop", frames=60, columns=900)
+    return SimulatedWorld("street_loop", frames=45, columns=720)
 
 
 @pytest.fixture(scope="module")

@@ -191,8 +191,8 @@ class Verifier:
         if seen.aligned[0] < self.config.min_aligned:
             return None
         config, solver = self._whole.covariance, self._whole.solver
-        ground = SeenGround()
-        error = scan_error(solution, solver.kernel_width, ground, config, kernel=solver.kernel)
+        width, kernel = solver.kernel_width, solver.kernel
+        error = scan_error(solution, width, SeenGround(), config, kernel=kernel)
         return None if error is None else error.covariance
 
 

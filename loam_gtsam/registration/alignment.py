@@ -146,7 +146,6 @@ def _covariance(solution: Solution, config: Config) -> FloatArray:
     """The error of the source from its residuals, and that of the target, which is as new."""
     error = None
     if solution.solved:
-        solver, ground = config.solver, SeenGround()
-        width, kernel = solver.kernel_width, solver.kernel
-        error = scan_error(solution, width, ground, config.covariance, kernel=kernel)
+        width, kernel = config.solver.kernel_width, config.solver.kernel
+        error = scan_error(solution, width, SeenGround(), config.covariance, kernel=kernel)
     return np.full((6, 6), np.nan) if error is None else error.covariance + error.renewed

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
-import gtsam
 import numpy as np
 import pytest
 from support.cli import shown
 from support.solved import POSE, solved, surroundings
+from support.walls import MAP, MIDDLE, face, matched
 
-from loam_gtsam import Config, RunResult, SimulatedWorld, relative_covariance, run
+from loam_gtsam import Config, RunResult, SimulatedWorld, run
 from loam_gtsam.cli.report import inspection
-from loam_gtsam.config import CovarianceConfig, MapConfig, MatchingConfig
+from loam_gtsam.config import CovarianceConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets import ArrayDataset
 from loam_gtsam.io.run_files import summarise
-from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.matches import PlaneMatches
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
-from loam_gtsam.types import FloatArray, Scan
+from loam_gtsam.studies.evaluation import nees
+from loam_gtsam.types import FloatArray, MapUpdate, Scan
 
 OFFSET = 0.03
 ALONE = Config().changed("imu.coupling=off")
@@ -38,16 +39,10 @@ def farther(points: FloatArray, lidar: FloatArray, by: float) -> FloatArray:
 
 def wall_matches(offset: float, seen_from: FloatArray, lidar: FloatArray) -> PlaneMatches:
     """Of the wall y = 0, mapped from one place and seen again from another."""
-    x, z = (axis.ravel() for axis in np.meshgrid(np.arange(-3, 3.1, 0.4), np.arange(-2, 2.1, 0.4)))
-    wall = np.column_stack([x, np.zeros(len(x)), z])
-    settings = MapConfig(field_of_view=False)
-    edges, planes = CubeMap(settings, 0.1), CubeMap(settings, 0.05)
-    planes.insert(farther(wall, seen_from, offset), seen_from)
-    new = wall[(np.abs(x) < 1.5) & (np.abs(z) < 1.5)] + np.array([0.13, 0.0, 0.17])
-    pose = gtsam.Pose3(gtsam.Rot3(), lidar)
-    points = farther(new, lidar, offset) - lidar
-    found = associate(np.empty((0, 3)), points, pose, edges, planes, MatchingConfig()).planes
-    assert len(found) == len(new)
+    planes = CubeMap(MAP, 0.05)
+    planes.insert(farther(face(0.0), seen_from, offset), seen_from)
+    found = matched(planes, farther(MIDDLE, lidar, offset), lidar).planes
+    assert len(found) == len(MIDDLE)
     return found
 
 
@@ -190,21 +185,10 @@ def mapped(too_long: ArrayDataset) -> RunResult:
     return run(too_long, ALONE)
 
 
-def squared_error(street: SimulatedWorld, result: RunResult, *, known: bool = True) -> float:
+def squared_error(street: SimulatedWorld, updates: Sequence[MapUpdate]) -> float:
     """Of the motion since the second frame, over its told covariance, in degrees of freedom."""
-    first, last = result.updates[1], result.updates[-1]
-    if not known:
-        last, first = (
-            replace(u, uncertainty=replace(u.uncertainty, blind=np.zeros((6, 10))))
-            for u in (last, first)
-        )
     assert street.truth is not None
-    true = [
-        gtsam.Pose3(street.truth.map_T_lidar[np.searchsorted(street.truth.stamps, u.stamp)])
-        for u in (first, last)
-    ]
-    error = first.map_T_lidar.between(last.map_T_lidar).localCoordinates(true[0].between(true[1]))
-    return float(error @ np.linalg.solve(relative_covariance(first, last), error)) / 6.0
+    return nees(updates[1:], street.truth, window=len(updates) - 2).mean
 
 
 def test_a_run_tells_the_offset_of_its_ranges(clean: RunResult, mapped: RunResult) -> None:
@@ -224,8 +208,14 @@ def test_inspect_tells_it(too_long: ArrayDataset) -> None:
 def test_covariances_count_what_wrong_ranges_do(
     street: SimulatedWorld, mapped: RunResult, clean: RunResult
 ) -> None:
-    assert squared_error(street, mapped, known=False) > 3.0
-    assert squared_error(street, mapped) < 2.0
+    unknown = [
+        u
+        if u.uncertainty is None
+        else replace(u, uncertainty=replace(u.uncertainty, blind=np.zeros((6, 10))))
+        for u in mapped.updates
+    ]
+    assert squared_error(street, unknown) > 3.0
+    assert squared_error(street, mapped.updates) < 2.0
     # Right ranges make the covariance hardly larger.
     last = clean.updates[-1]
     assert last.uncertainty is not None

@@ -6,29 +6,20 @@ The wall stands along x, its front at y = 0 and its back at y = 0.2; it ends at 
 import gtsam
 import numpy as np
 import pytest
+from support.walls import CONFIG, MAP, MIDDLE, NONE, face, matched
 
-from loam_gtsam.config import Config, MapConfig, MatchingConfig
+from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.geometry import OBLIQUE_EDGE
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.association import associate
-from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray
 from loam_gtsam.voxels.tags import Faces, second
 
-CONFIG = MatchingConfig(plane_tolerance=0.2)  # planes may lie between two faces
-MAP = MapConfig(field_of_view=False)
 FRONT, BACK = np.array([0.0, -2.0, 0.0]), np.array([0.0, 2.2, 0.0])  # positions of the lidar
 THICKNESS = 0.2
-NONE = np.empty((0, 3))
-
-
-def face(y: float, step: float = 0.4, first: float = -3.0) -> FloatArray:
-    """Points on the wall at this y, on a grid."""
-    x, z = np.meshgrid(np.arange(first, 3.0 + 1e-9, step), np.arange(-1.8, 1.81, step))
-    return np.column_stack([x.ravel(), np.full(x.size, y), z.ravel()])
 
 
 def wall(*seen: tuple[float, FloatArray | None], voxel: float = 0.05) -> CubeMap:
@@ -37,19 +28,6 @@ def wall(*seen: tuple[float, FloatArray | None], voxel: float = 0.05) -> CubeMap
     for y, lidar in seen:
         planes.insert(face(y), lidar)
     return planes
-
-
-def matched(
-    planes: CubeMap, points_map: FloatArray, lidar: FloatArray, config: MatchingConfig = CONFIG
-) -> ScanMatches:
-    """The matches of points as a lidar without rotation sees them."""
-    edges = CubeMap(MAP, 0.1)
-    pose = gtsam.Pose3(gtsam.Rot3(), lidar)
-    return associate(NONE, points_map - lidar, pose, edges, planes, config)
-
-
-MIDDLE = np.array([[x, 0.0, z] for x in np.arange(-1.3, 1.4, 0.33) for z in (-0.7, 0.1, 0.6)])
-"""Points on the front, in the middle of it."""
 
 
 def at(y: float, points: FloatArray = MIDDLE) -> FloatArray:

@@ -267,7 +267,7 @@ def _with_motion(
     tried = [_tried(frame, matcher.moving_at(twist), place, solver) for twist in twists]
     if told and matcher.motion_is_free:
         fit, near, _ = _tried(frame, matcher, place, solver)
-        tried.append((fit, near, matcher.posed_at(near.map_T_lidar, near.matches)))
+        tried.append((fit, near, frame.posed_for(near)))
     for fit, found, posed in tried:
         if not (found.solved and monitor.fits_again(fit)):
             continue

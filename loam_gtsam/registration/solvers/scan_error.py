@@ -168,7 +168,7 @@ def scan_error(
     scatter, fitted = _scatter(scores[fresh], scaled[fresh], scale, by_ground[fresh], len(new))
     renewed = scatter + alike * fitted
 
-    told = _told(residuals, information, meat)
+    scattered = _variance_and_matches(residuals, information, meat)
     for_others = information / SCAN_VARIANCE
     if solution.weak is None:
         whole = meat + config.drift * renewed  # new ground has errors of its own
@@ -190,7 +190,7 @@ def scan_error(
     seen.add(pose.AdjointMap() @ moved)
     known *= float(np.trace(bread @ jacobian[fresh].T @ jacobian[fresh])) / (6.0 * alike)
     ways = by_velocity, by_acceleration, moved
-    return ScanError(*found, *told, *ways, offset, known)
+    return ScanError(*found, *scattered, *ways, offset, known)
 
 
 def _as_solved(
@@ -205,7 +205,9 @@ def _as_solved(
     return residuals, jacobian
 
 
-def _told(residuals: FloatArray, information: FloatArray, meat: FloatArray) -> tuple[float, float]:
+def _variance_and_matches(
+    residuals: FloatArray, information: FloatArray, meat: FloatArray
+) -> tuple[float, float]:
     """``residual_variance`` and ``effective_matches``."""
     variance = float(residuals @ residuals) / max(len(residuals) - 6, 1)
     # Least squares, because the matches alone may leave a direction free.

@@ -256,10 +256,17 @@ class CubeMap:
             self.insert_sorted(self.sorted(moved, archive=True))
         return len(content.points)
 
+    def give_to(self, owner: int) -> None:
+        """Let all points of the window belong to an owner."""
+        for cube in self._cubes.values():
+            cube.give_to(owner)
+
     def nearest(
         self, queries: NDArray[np.floating], k: int, max_distance: float, cubes: Iterable[CubeIndex]
     ) -> Neighbours:
         """The k nearest points of the given cubes to each query, exactly, also across borders.
+
+        Points at equal distance come in any order, but in the same one for the same calls.
 
         Parameters
         ----------
@@ -272,10 +279,6 @@ class CubeMap:
         ------
         InputError
             If ``queries`` is not (M, 3) finite floats, ``k`` < 1 or ``max_distance`` not positive.
-
-        Notes
-        -----
-        Points at equal distance come in any order, but in the same one for the same calls.
         """
         queries = as_points(queries, "queries")
         if k < 1:

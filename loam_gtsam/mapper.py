@@ -24,14 +24,12 @@ from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
 from loam_gtsam.registration.point_times import PointTimes
 from loam_gtsam.registration.relocalization import (
+    CONTINUED,
     FitMonitor,
     Found,
-    Lost,
+    NextPiece,
     accept,
-    doubtful,
-    found_at,
-    search,
-    second_opinion,
+    placed,
     unplaced,
 )
 from loam_gtsam.registration.report import Clock, make_update, problem_of, status_of
@@ -55,7 +53,6 @@ from loam_gtsam.types import (
     InputError,
     MapUpdate,
     SweepFault,
-    SweepMotion,
     TiltPrior,
 )
 
@@ -96,7 +93,7 @@ class Mapper:
     monitor : tells whether sweeps fit the map
     errors, point_times : calibrate the covariances, and ask whether points move as the lidar does
     maps : the map of edges and that of planes
-    keyframe : number of the keyframe to which the points of the next frames belong
+    start : the first sweeps of a map; None once all are there
 
     Raises
     ------
@@ -122,13 +119,15 @@ class Mapper:
         self._forget()
 
     def _forget(self) -> None:
-        self.keyframe, self.maps = 0, MapPair(self.config)
+        self.maps = MapPair(self.config)
         self.last: MapUpdate | None = None
         self.registered: Registered | None = None
         self.monitor, self.errors = FitMonitor(self.config.relocalization), PoseErrors(self.config)
         self._stamps, self.point_times = StampCheck(), PointTimes(self.config)
-        self._start: Start | None = None
+        self.start: Start | None = None
         self._moment: Moment | None = None
+        self._found: MapUpdate | None = None  # the last one that was
+        self._next: NextPiece | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         # For checkpoints: no frame depends on what is only there to be looked at.
@@ -182,17 +181,19 @@ class Mapper:
         except InputError as error:
             return self._unused(features.stamp, str(error), None)
         clock.lap("prepare")
-        placed = predicted.posed, predicted.map_T_lidar
+        expected_at = predicted.posed, predicted.map_T_lidar
         if self.last is None:
-            self._start = Start.of_map(predicted, self.keyframe, self.maps)
-            update = self._insert(*placed, FrameStatus.FIRST, "the map starts here", clock)
+            self.start = Start.of_map(predicted, self.maps)
+            update = self._insert(*expected_at, FrameStatus.FIRST, "the map starts here", clock)
         elif sparse := not self.monitor.lost and self.maps.too_sparse(predicted, self.config):
-            self._start = None
-            update = self._insert(*placed, FrameStatus.SPARSE_MAP, sparse, clock)
+            self.start = None
+            update = self._insert(*expected_at, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
             with own_priors(priors):
                 frame = self._frame(predicted, priors, clock)
-                frame, outcome = self._placed(frame, features)
+                apart = features, self.config, self.last, self._named
+                first = None if self.start is None else self.start.first_motion
+                frame, outcome = placed(frame, apart, self.monitor, self.imu, first)
                 clock.lap("solve")
                 if isinstance(outcome, Found) and outcome.solution.solved:
                     update = self._with_pose(frame, outcome, clock)
@@ -201,8 +202,13 @@ class Mapper:
                     update = unplaced(frame, outcome, self.monitor)
                     few = update.status is FrameStatus.FEW_MATCHES
                     if few and self.config.map.insert_unmatched:
-                        self._start = None
-                        self._insert(*placed, update.status, update.message, clock)
+                        self.start = None
+                        self._insert(*expected_at, update.status, update.message, clock)
+                    elif self.monitor.lost and self._found and not self.maps.given:
+                        self._next = self._next or NextPiece.since(self._found, self.errors)
+                        if self._next.add(self, features, predicted, guess, twist):
+                            update = self._go_on(self._next.mapper)
+                        clock.lap("relocalize")
         if not update.status.solved:
             self.errors.skipped(predicted.posed)
         self.last = replace(update, timings=clock.seconds)
@@ -263,36 +269,16 @@ class Mapper:
         factors = [*priors, *(self.imu.factors(stamp) if self.imu else ()), *own.alone]
         args = predicted.posed, self.maps, self.maps.config, self._moment, clock
         matcher = FrameMatcher.of(
-            *args, expected=self._start is None, inertial=predicted.inertial,
+            *args, expected=self.start is None, inertial=predicted.inertial,
             accelerations=self.errors.accelerations,
         )  # fmt: skip
         return Frame(matcher, predicted, factors, own.since_last)
 
-    def _placed(self, frame: Frame, features: Features) -> tuple[Frame, Found | Lost]:
-        """Find the sweep: from the expected pose, without the IMU, or by a search."""
-        assert self.last is not None
-        found, twist, given = found_at(frame, frame.solve(self._named)), self.last.twist, frame
-        apart = features, self.config, self.last, self._named
-        if _gyro_begins(self.last, frame.sweep):
-            frame, found = second_opinion(frame, found, *apart)
-        if self._start is not None:
-            found = self._start.first_motion(frame, found, self._named, self.imu)
-        doubt = doubtful(frame, found.solution, self.monitor, twist)
-        now = self._moment, found.solution, frame.sweep.stamp
-        if self.imu is not None and (doubt is not None or self.imu.contradicted(*now)):
-            frame, found = second_opinion(frame, found, *apart)
-            doubt = doubtful(frame, found.solution, self.monitor, twist)
-        if self.imu is not None and frame is not given:
-            self.imu.reject()
-        if doubt is not None:
-            return frame, search(frame, found.solution, self.monitor, self._named, doubt)
-        return frame, found
-
     def _with_pose(self, frame: Frame, found: Found, clock: Clock) -> MapUpdate:
         """The update of a sweep that was found: it goes into the map."""
-        if self._start is not None:
-            frame, found = self._start.add(frame, found, self.keyframe, self._named, self.imu)
-            self._start = None if self._start.complete else self._start
+        if self.start is not None:
+            frame, found = self.start.add(frame, found, self.maps.keyframe, self._named, self.imu)
+            self.start = None if self.start.complete else self.start
         solution, posed, rivals = found.solution, found.posed, (found.doubt, found.parting)
         accept(frame, found, self.monitor)
         scan = self.errors.of_scan(solution, posed.sweep, small=self.maps.small)
@@ -301,14 +287,28 @@ class Mapper:
             posed, solution, pose, tilt, fused, unlike, of_imu = with_imu(self.imu, posed, *told)
         if found.message or unlike:
             self.errors.jumped(frame.predicted, posed, solution.map_T_lidar, unlike=unlike)
-        if self._start is None and not found.message:
+        if self.start is None and not found.message:
             self.point_times.add(posed, solution)
         status, message = status_of(solution, found.message or self.point_times.problem or of_imu)
         update = self._insert(posed, pose, status, message, clock, solution, tilt, scan)
         last = None if found.message else frame.matcher.last
         update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)
         clock.lap("covariance")
+        self._found, self._next = update, None
         return update
+
+    def _go_on(self, piece: Mapper) -> MapUpdate:
+        """Go on in another piece of map: the update of the sweep that was found there."""
+        message = f"after {self.monitor.lost} lost sweeps {CONTINUED}"
+        piece.maps.begin_after(self.maps)
+        self.maps = piece.maps
+        self.monitor, self.errors, self._moment = piece.monitor, piece.errors, piece._moment
+        self.registered, self._found, self._next = piece.registered, piece._found, None
+        if self.imu is not None and piece.imu is not None:
+            self.imu.__setstate__(piece.imu.__getstate__())
+        assert piece.last is not None
+        message = "; ".join(filter(None, (message, piece.last.message)))
+        return replace(piece.last, message=message)
 
     def _insert(
         self, posed: PosedSweep, map_T_lidar: gtsam.Pose3, status: FrameStatus, message: str,
@@ -319,7 +319,7 @@ class Mapper:
         clock.lap("solve")
         middle = posed.map_T_middle(map_T_lidar)
         matches = None if solution is None else solution.matches
-        self.maps.insert(posed, middle, self.keyframe, matches)
+        self.maps.insert(posed, middle, self.maps.keyframe, matches)
         known = status.solved or status is FrameStatus.FIRST
         error = None if scan is None or solution is None else scan.seen(solution.weak)
         self._moment = Moment(posed.sweep.stamp, middle, known, error)
@@ -332,14 +332,6 @@ def _with_settings_of(solver: ScanSolver | None, config: Config) -> Config:
     """The configuration with the settings that a solver brings, by which its results are judged."""
     settings = getattr(solver, "config", None)
     return config.changed(solver=settings) if isinstance(settings, SolverConfig) else config
-
-
-def _gyro_begins(last: MapUpdate, sweep: MovingSweep) -> bool:
-    """Whether a gyro turned the points of a sweep, and not those of the one before.
-
-    A sweep that a wrong gyro has bent is solved with the turn that bent it, if no sweep before was.
-    """
-    return sweep.motion is SweepMotion.GYRO and last.sweep_motion is not SweepMotion.GYRO
 
 
 def _check_parts(

@@ -290,7 +290,7 @@ class Pipeline:
         if self.loops is None:
             place = self.places.add(update, self.mapper.registered)
             if place is not None:
-                self.mapper.keyframe = place
+                self.mapper.maps.keyframe = place
             return update
         if not update.status.solved:
             return update

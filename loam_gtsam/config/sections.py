@@ -189,6 +189,9 @@ class RelocalizationConfig(Section):
     """The radius of the search grows by this with every lost sweep."""
     max_radius: float = parameter(30.0, unit="m", low=0.0, high=100.0)
     """The radius of the search does not grow beyond this."""
+    new_piece: int = parameter(20, low=0, high=1_000_000)
+    """After so many sweeps in a row that are not found, the run goes on in another piece of map,
+    that of these sweeps, with a covariance of where it is; 0: never."""
 
 
 class MatchingConfig(Section):

@@ -55,7 +55,7 @@ class LoopMapping:
         self.graph.reset()
         if (reset_closer := getattr(self.closer, "reset", None)) is not None:
             reset_closer()
-        self.points_moved = self._mapper.keyframe = 0
+        self.points_moved = self._mapper.maps.keyframe = 0
         self._placed = {}
 
     @property
@@ -80,7 +80,7 @@ class LoopMapping:
         if keyframe is None:
             return False
         self._placed[keyframe.index] = keyframe.odom_T_lidar
-        self._mapper.keyframe = keyframe.index
+        self._mapper.maps.keyframe = keyframe.index
         loop: LoopClosure | None = None
         with self._faults.forgiven(), own_code("loop_closer", self.closer):
             found = self.closer.detect(keyframe, self.graph)
@@ -94,7 +94,7 @@ class LoopMapping:
         # What ties a graph without loops, as a receiver does in the end, ties every visit anew.
         place = None if isinstance(self.closer, NoLoops) else self.graph.visit()
         if place is not None:  # the points to come belong to a keyframe that stays
-            self._mapper.keyframe = place
+            self._mapper.maps.keyframe = place
             del self._placed[keyframe.index]
         return is_closed
 

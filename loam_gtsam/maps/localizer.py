@@ -221,7 +221,7 @@ class Localizer:
     def _begin(self, features: Features, fix: MapUpdate) -> MapUpdate:
         """Track from a fix on."""
         self._maps.grows = self._extend
-        self._maps.owners = [self._nearest(fix.map_T_lidar)[0]]
+        self._maps.owners, self._maps.keyframe = [self._nearest(fix.map_T_lidar)[0]], 0
         self._tracking.reset()
         self._tracking.mapper.maps = self._maps
         self._tracking.mapper.register(features, fix.map_T_lidar, fix.twist)

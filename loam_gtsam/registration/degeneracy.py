@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import gtsam
 import numpy as np
 
+from loam_gtsam.config import SolverConfig
 from loam_gtsam.factors import complement_basis
 from loam_gtsam.geometry import cross, cross_matrix, squared_norm
 from loam_gtsam.registration.matches import EdgeMatches, ScanMatches, subset
@@ -24,6 +25,9 @@ _STILL = 0.01
 """Metres by which a motion of one rad or metre moves the matched points (root mean square), at
 least: a turn about the only few points there are does not move them at all."""
 _RANK = 1e-6  # singular value over the largest one, below which there is no direction
+_PARTS = 6.0
+"""Times ``min_aligned`` matches in the weakest direction: then each sixth of a sweep would fix the
+pose, and what these parts differ by tells a velocity. Sparse terrain has half of that."""
 _HELD = 0.5  # share of ``min_aligned`` that lines alone must reach before planes are left out
 
 
@@ -192,6 +196,11 @@ def localizability(matches: ScanMatches, map_T_lidar: gtsam.Pose3) -> Localizabi
     shown = directions[order], aligned[order], along[order]
     over_noise = (told / of_noise)[order]
     return Localizability(*shown, unit, by_planes[order], tilt, over_noise)
+
+
+def tells_motion(seen: Localizability, config: SolverConfig) -> bool:
+    """Whether a sweep of some localizability tells how fast its pose changes."""
+    return bool(seen.aligned[0] >= _PARTS * config.min_aligned)
 
 
 def unseen_by_planes(

@@ -10,15 +10,14 @@ from typing import Any
 import gtsam
 import numpy as np
 
-from loam_gtsam.config import Config, MatchingConfig, SolverConfig
+from loam_gtsam.config import Config, MatchingConfig
 from loam_gtsam.cubemap import CubeMap
-from loam_gtsam.factors import MatchRows
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import transform
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.acceleration import Expected
 from loam_gtsam.registration.association import match_features, rematched
-from loam_gtsam.registration.degeneracy import Localizability, localizability
+from loam_gtsam.registration.degeneracy import localizability, tells_motion
 from loam_gtsam.registration.matches import (
     ChosenRows,
     ScanMatches,
@@ -27,17 +26,20 @@ from loam_gtsam.registration.matches import (
     joined,
     trial_matching,
 )
-from loam_gtsam.registration.odometry import Moment, Prediction, solved_twist, twist_to
+from loam_gtsam.registration.odometry import (
+    Moment,
+    Prediction,
+    solved_twist,
+    timed_rows,
+    twist_to,
+)
 from loam_gtsam.registration.planes import match_surfaces, translations_fixed
 from loam_gtsam.registration.report import Clock
-from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution, match_rows
+from loam_gtsam.registration.solvers import Matcher, ScanSolver, Solution
 from loam_gtsam.types import FloatArray, SweepMotion
 from loam_gtsam.voxels.cubes import CubePoints, SortedPoints
 from loam_gtsam.voxels.tags import look, tags_of
 
-_PARTS = 6.0
-"""Times ``min_aligned`` matches in the weakest direction: then each sixth of a sweep would fix the
-pose, and what these parts differ by tells a velocity. Sparse terrain has half of that."""
 _FEW = 0.5  # share of the plane features with planes near by below which wider ones are looked for
 _THIN = 50_000  # plane points of a map that is thin, and quickly made coarser: some twenty sweeps
 _OPEN = 1.5
@@ -58,13 +60,17 @@ class MapPair:
     Attributes
     ----------
     small : whether the place is small, so that the maps with small voxels are in use
+    keyframe : number of the keyframe to which the points of the next sweeps belong
     given : whether the maps were there before the first sweep
+    earlier : the piece of map in which the run was before it went on in this one
     """
 
     given = False
 
     def __init__(self, config: Config) -> None:
         self._configs = config, config.of_small_places()
+        self.earlier: MapPair | None = None
+        self._keyframe, self._owned = 0, True
         self.small = False
         self.clear()
 
@@ -78,6 +84,25 @@ class MapPair:
             (CubeMap(grid, grid.edge_voxel), CubeMap(grid, grid.plane_voxel)) for grid in grids
         )
         self._thinned: CubeMap | None = None
+
+    def begin_after(self, earlier: MapPair) -> None:
+        """Take up a run that was in an earlier piece: the next keyframe is the first of this one.
+
+        Until then points belong to the last keyframe of the earlier piece, which is elsewhere.
+        """
+        self.earlier, self._keyframe, self._owned = earlier, earlier.keyframe, False
+
+    @property
+    def keyframe(self) -> int:
+        """See the class."""
+        return self._keyframe
+
+    @keyframe.setter
+    def keyframe(self, number: int) -> None:
+        if not self._owned:
+            for cubes in (*self._open, *self._small):
+                cubes.give_to(number)
+        self._keyframe, self._owned = number, True
 
     @property
     def config(self) -> Config:
@@ -167,13 +192,18 @@ class MapPair:
 
         They are where :meth:`move` would bring them with ``moves``; the map does not change.
         """
-        kinds = zip(self._open, self._small, strict=True)
-        edges, planes = (_points(*maps, moves or {}) for maps in kinds)
+        maps = self
+        if moves or self.earlier is not None:
+            maps = deepcopy(self)
+            maps.move(moves or {})
+            maps = maps._with_earlier()
+        edges, planes = (_points(*pair) for pair in zip(maps._open, maps._small, strict=True))
         return edges, planes
 
     def layers(self) -> dict[str, CubeMap]:
-        """All maps: edges and planes of the open, and of small places."""
-        (edges, planes), (small_edges, small_planes) = self._open, self._small
+        """All maps: edges and planes of the open, and of small places; to be looked at."""
+        maps = self if self.earlier is None else deepcopy(self)._with_earlier()
+        (edges, planes), (small_edges, small_planes) = maps._open, maps._small
         return {
             "edges": edges,
             "planes": planes,
@@ -189,7 +219,17 @@ class MapPair:
         self._thinned = None
         for cubes in self._small:
             cubes.move(moves)
-        return sum(cubes.move(moves) for cubes in self._open)
+        earlier = 0 if self.earlier is None else self.earlier.move(moves)
+        return earlier + sum(cubes.move(moves) for cubes in self._open)
+
+    def _with_earlier(self) -> MapPair:
+        """These maps themselves, with the points of earlier pieces in voxels that are free."""
+        if self.earlier is not None:
+            earlier, self.earlier = self.earlier._with_earlier(), None
+            kinds = zip((*self._open, *self._small), (*earlier._open, *earlier._small), strict=True)
+            for cubes, before in kinds:
+                cubes.fill(before, archived=True)
+        return self
 
     def thinned(self, factor: float) -> CubeMap:
         """The planes with voxels larger by a factor, the same at every call; made once a sweep."""
@@ -210,13 +250,11 @@ def _owned(
     return cubes.sorted(CubePoints(points, tags))
 
 
-def _points(cubes: CubeMap, small: CubeMap, moves: Mapping[int, FloatArray]) -> FloatArray:
-    """(N, 3) all points of small places, and those that only the map of the open holds, moved."""
-    has_small = small.count() or small.stats.archived
-    if moves or has_small:
-        whole = deepcopy(small if has_small else cubes)
+def _points(cubes: CubeMap, small: CubeMap) -> FloatArray:
+    """(N, 3) all points of small places, and those that only the map of the open holds."""
+    if small.count() or small.stats.archived:
+        whole = deepcopy(small)
         whole.fill(cubes, archived=True)
-        whole.move(moves)
         cubes = whole
     return cubes.points(archived=True)
 
@@ -405,25 +443,6 @@ class FrameMatcher(Matcher):
         both = joined(near, replace(wide, indices=left[wide.indices]))
         closed = (translations_fixed(both) >= config.wide_below) > (fixed >= config.wide_below)
         return replace(matches, planes=both) if few or closed.any() else matches
-
-
-def tells_motion(seen: Localizability, config: SolverConfig) -> bool:
-    """Whether a sweep of some localizability tells how fast its pose changes."""
-    return bool(seen.aligned[0] >= _PARTS * config.min_aligned)
-
-
-def timed_rows(
-    matches: ScanMatches, sweep: MovingSweep, config: SolverConfig
-) -> tuple[MatchRows, FloatArray]:
-    """The rows of the matches of a sweep, and seconds (R,) from its middle to their points."""
-    rows = match_rows(matches, config.kernel_width, config.kernel)
-    return rows, row_seconds(matches, sweep)
-
-
-def row_seconds(matches: ScanMatches, sweep: MovingSweep) -> FloatArray:
-    """Seconds (R,) from the middle of a sweep to the points of its rows, two an edge."""
-    edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
-    return np.concatenate([np.repeat(edges, 2), planes])
 
 
 def _rows_to_match(sweep: MovingSweep, matching: MatchingConfig) -> ChosenRows:

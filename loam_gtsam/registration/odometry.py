@@ -23,7 +23,8 @@ from loam_gtsam.geometry import (
 )
 from loam_gtsam.imu.preintegration import Prediction as InertialPrediction
 from loam_gtsam.registration.degeneracy import displacements
-from loam_gtsam.registration.solvers import MotionPrior
+from loam_gtsam.registration.matches import ScanMatches
+from loam_gtsam.registration.solvers import MotionPrior, match_rows
 from loam_gtsam.types import BoolArray, Features, FloatArray, IntArray, MapUpdate, check_kind
 
 _STEADIEST = 1e-3  # rad/s, m/s and metres, far below what is measured: the least of some errors
@@ -33,7 +34,7 @@ sheets state an accuracy of 2 to 3 cm as the bound of both."""
 _RANK = 1e-9  # of the largest eigenvalue, below which a scan has no information on a pose
 _NODES = 41  # of the path between the middle of the last sweep and the end of this one
 _BENT = 1.0  # longest time over which accelerations are integrated for that, seconds
-_LONGEST = 10.0  # seconds of extrapolation: after more the pose would be anywhere
+LONGEST = 10.0  # seconds of extrapolation: after more the pose would be anywhere
 _SHORTEST = 1e-3  # least seconds between the middles of two sweeps
 _REASSOCIATE_EVERY = 5  # gauss-Newton iterations per association of scan to scan (LOAM)
 _WEIGHT_SLOPE = 1.8  # weight 1 - 1.8 |d| after the first association of scan to scan (LOAM)
@@ -102,7 +103,7 @@ class ConstantVelocity(Odometry):
         """The guess for a stamp, nanoseconds."""
         if last is None:
             return Guess(gtsam.Pose3(), np.zeros(6))
-        seconds = min((stamp - last.stamp) * 1e-9, _LONGEST)
+        seconds = min((stamp - last.stamp) * 1e-9, LONGEST)
         turned = None if self.imu is None else self.imu.rotation_between(last.stamp, stamp)
         if turned is None:
             return Guess(advance(last.map_T_lidar, last.twist, seconds), last.twist)
@@ -224,6 +225,20 @@ def _bent(
     map_R_middle = map_R_lidar.compose(middle_R_reference.inverse()).matrix()
     path = imu.bend(sweep.stamp, seconds, map_R_middle)
     return sweep if path is None else sweep.bent(seconds, path)
+
+
+def timed_rows(
+    matches: ScanMatches, sweep: MovingSweep, config: SolverConfig
+) -> tuple[MatchRows, FloatArray]:
+    """The rows of the matches of a sweep, and seconds (R,) from its middle to their points."""
+    rows = match_rows(matches, config.kernel_width, config.kernel)
+    return rows, row_seconds(matches, sweep)
+
+
+def row_seconds(matches: ScanMatches, sweep: MovingSweep) -> FloatArray:
+    """Seconds (R,) from the middle of a sweep to the points of its rows, two an edge."""
+    edges, planes = sweep.seconds(matches.edges.indices, matches.planes.indices)
+    return np.concatenate([np.repeat(edges, 2), planes])
 
 
 def twist_to(

@@ -12,8 +12,8 @@ import numpy as np
 
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import PosedSweep
-from loam_gtsam.registration.frame_matcher import tells_motion, timed_rows
-from loam_gtsam.registration.odometry import unseen_velocity
+from loam_gtsam.registration.degeneracy import tells_motion
+from loam_gtsam.registration.odometry import timed_rows, unseen_velocity
 from loam_gtsam.registration.solvers import Solution
 
 _LEAST = 1.0

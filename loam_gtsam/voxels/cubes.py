@@ -140,6 +140,13 @@ class Cube(KeyTable):
         self.append(*(column.take(free, axis=0) for column in (new.keys, means, new.tags)))
         self.merge()
 
+    def give_to(self, owner: int) -> None:
+        """Let all points belong to an owner."""
+        *columns, tags = self.columns
+        tags = tags.copy()
+        tags[:, 0] = owner
+        self._put(*columns, tags)
+
     def take_out(self, owners: Owners) -> CubePoints:
         """Remove the points of some owners, and return them."""
         columns, content = self.columns, self.content

@@ -58,7 +58,7 @@ def driven(first, look=False, **pose_graph):
     for update in updates(POSES, DRIFT):
         features = world.seen(gtsam.Pose3(), update.stamp, rng)
         closed.append(loops.add(update, features))
-        mapper.maps.edges.owner = mapper.keyframe
+        mapper.maps.edges.owner = mapper.maps.keyframe
         mapper.maps.edges.insert((update.map_T_lidar.translation() + UP)[None])
         if look:
             loops.map_points()
@@ -349,7 +349,7 @@ def test_odometry_back_to_a_known_place_is_no_loop():
 def test_points_seen_from_a_forgotten_keyframe_belong_to_its_place():
     mapper, loops, _ = driven_round(4, visits=1)
     assert loops.counts()["forgotten"] == 2 * len(PLACES) - 1
-    assert mapper.keyframe == len(PLACES) - 1
+    assert mapper.maps.keyframe == len(PLACES) - 1
     assert set(loops._placed) == set(range(2 * len(PLACES)))
 
 

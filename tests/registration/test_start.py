@@ -117,7 +117,7 @@ def ahead_only(features_ahead):
     (world, features), mapper, states, mappers = features_ahead, Mapper(CONFIG), [], []
     for one in features:
         update = mapper.register(one)
-        states.append((update, mapper._start and len(mapper._start._rivals)))
+        states.append((update, mapper.start and len(mapper.start._rivals)))
         mappers.append(deepcopy(mapper))
     return world, states, mappers
 
@@ -148,7 +148,7 @@ def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
     _, features = features_ahead
     mapper, made, solved = deepcopy(ahead_only[2][number - 1]), [], early_map.EarlyMap.solved
     fill = early_map.EarlyMap.fill
-    mapper._start._refutable = refutable
+    mapper.start._refutable = refutable
 
     def not_in_the_map_that_is_kept(*args):
         return replace(solved(*args), solved=not made)
@@ -158,7 +158,7 @@ def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
         patch.setattr(early_map.EarlyMap, "solved", not_in_the_map_that_is_kept)
         assert mapper.register(features[number]).status.solved
     assert made
-    start = mapper._start
+    start = mapper.start
     assert (start is None) == (number == 7 and not refutable)
     if number < 7:
         assert len(start._sweeps) == number + 1
@@ -166,7 +166,7 @@ def test_a_start_in_doubt_goes_on_if_its_last_sweep_is_not_found_anew(
         assert start._rivals
         for one in features[number + 1 :]:
             assert mapper.register(one).status.solved
-        assert mapper._start is None
+        assert mapper.start is None
 
 
 @pytest.mark.parametrize(
@@ -209,7 +209,7 @@ def test_a_rival_that_falls_late_leaves_no_doubt(features_ahead, monkeypatch):
     monkeypatch.setattr(first_sweeps, "kept_ways", kept)
     for one in features:
         updates.append(mapper.register(one))
-        going.append(mapper._start is not None)
+        going.append(mapper.start is not None)
     assert going == 11 * [True] + [False]
     assert errors(world, updates)[-1] < 0.1
     assert updates[-1].covariance[3, 3] < 0.01 * updates[-2].covariance[3, 3]
@@ -223,7 +223,7 @@ def test_an_imu_at_rest_settles_first_motions_that_fit_as_well(with_imu):
     mapper = Mapper(config, imu=ImuBuffer(config.imu, world.imu) if with_imu else None)
     for scan in world:
         update = mapper.register(extract_features(scan, config))
-    assert bool(mapper._start._rivals) is not with_imu
+    assert bool(mapper.start._rivals) is not with_imu
     assert bool(update.uncertainty.in_doubt) is not with_imu
     assert update.map_T_lidar.range(gtsam.Pose3(world.truth.map_T_lidar[1])) < 0.1
 
@@ -233,7 +233,7 @@ def test_one_first_motion_leaves_no_doubt():
     mapper = Mapper(CONFIG)
     for one in features:
         mapper.register(one)
-    assert not mapper._start._rivals
+    assert not mapper.start._rivals
 
 
 @pytest.mark.parametrize(
@@ -534,7 +534,7 @@ def test_a_gyro_is_heeded_where_the_scans_alone_turn_otherwise_unless_they_are_s
     samples = replace(world.imu, gyro=unit * world.imu.gyro)
     mapper = Mapper(Config(), imu=ImuBuffer(Config().imu, samples))
     updates = [mapper.register(extract_features(scan, Config())) for scan in world]
-    assert mapper._start._heeds_gyro is heeded
+    assert mapper.start._heeds_gyro is heeded
     assert (mapper.imu.trusted_gyro is not None) is trusted
     moved = updates[0].map_T_lidar.between(updates[2].map_T_lidar)
     before, _, now = map(gtsam.Pose3, world.truth.map_T_lidar)

@@ -8,6 +8,7 @@ from loam_gtsam.registration.relocalization.doubtful_sweeps import accept as acc
 from loam_gtsam.registration.relocalization.doubtful_sweeps import any_of as any_of
 from loam_gtsam.registration.relocalization.doubtful_sweeps import doubtful as doubtful
 from loam_gtsam.registration.relocalization.doubtful_sweeps import found_at as found_at
+from loam_gtsam.registration.relocalization.doubtful_sweeps import placed as placed
 from loam_gtsam.registration.relocalization.doubtful_sweeps import search as search
 from loam_gtsam.registration.relocalization.doubtful_sweeps import second_opinion as second_opinion
 from loam_gtsam.registration.relocalization.doubtful_sweeps import unplaced as unplaced
@@ -20,3 +21,6 @@ from loam_gtsam.registration.relocalization.likely_poses import Field as Field
 from loam_gtsam.registration.relocalization.likely_poses import likely_poses as likely_poses
 from loam_gtsam.registration.relocalization.likely_poses import one_per_cell as one_per_cell
 from loam_gtsam.registration.relocalization.likely_poses import sample_features as sample_features
+from loam_gtsam.registration.relocalization.next_piece import CONTINUED as CONTINUED
+from loam_gtsam.registration.relocalization.next_piece import Gap as Gap
+from loam_gtsam.registration.relocalization.next_piece import NextPiece as NextPiece

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import compress
@@ -15,8 +15,9 @@ from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import five_sigma, parallel_sum
 from loam_gtsam.registration.degeneracy import displacements
-from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher, timed_rows
-from loam_gtsam.registration.odometry import advance, predict, solved_twist
+from loam_gtsam.registration.frame_matcher import Frame, FrameMatcher
+from loam_gtsam.registration.imu_tracker import ImuTracker
+from loam_gtsam.registration.odometry import advance, predict, solved_twist, timed_rows
 from loam_gtsam.registration.relocalization.evidence import Evidence, speaks_for
 from loam_gtsam.registration.relocalization.fits import (
     AS_WELL,
@@ -35,6 +36,7 @@ from loam_gtsam.registration.relocalization.likely_poses import (
 from loam_gtsam.registration.report import distance_in_words, make_update
 from loam_gtsam.registration.solvers import MotionPrior, ScanSolver, Solution
 from loam_gtsam.registration.solvers.base import SCAN_VARIANCE
+from loam_gtsam.registration.solvers.own_factors import NamedSolver
 from loam_gtsam.types import Features, FloatArray, FrameStatus, MapUpdate, SweepMotion
 
 _CLOSER = 3  # largest number of places that are looked at closer
@@ -141,6 +143,48 @@ def second_opinion(
     )
     better = not found.solution.solved or fit.total > CLEARLY * before.total
     return (other, found_at(other, solution)) if better else (frame, found)
+
+
+FirstMotion = Callable[[Frame, Found, NamedSolver, ImuTracker | None], Found]
+"""As :meth:`loam_gtsam.registration.start.Start.first_motion`."""
+
+
+def placed(
+    frame: Frame, apart: tuple[Features, Config, MapUpdate, NamedSolver], monitor: FitMonitor,
+    imu: ImuTracker | None, first_motion: FirstMotion | None,
+) -> tuple[Frame, Found | Lost]:  # fmt: skip
+    """Find a sweep: from the expected pose, without the IMU, or by a search.
+
+    Parameters
+    ----------
+    apart : what :func:`second_opinion` needs: features, configuration, update of the sweep before,
+        solver
+    first_motion : searches for the motion with which a map begins, while it does
+    """
+    last, solver = apart[2:]
+    found, given = found_at(frame, frame.solve(solver)), frame
+    if _gyro_begins(last, frame.sweep):
+        frame, found = second_opinion(frame, found, *apart)
+    if first_motion is not None:
+        found = first_motion(frame, found, solver, imu)
+    doubt = doubtful(frame, found.solution, monitor, last.twist)
+    now = frame.matcher.last, found.solution, frame.sweep.stamp
+    if imu is not None and (doubt is not None or imu.contradicted(*now)):
+        frame, found = second_opinion(frame, found, *apart)
+        doubt = doubtful(frame, found.solution, monitor, last.twist)
+    if imu is not None and frame is not given:
+        imu.reject()
+    if doubt is not None:
+        return frame, search(frame, found.solution, monitor, solver, doubt)
+    return frame, found
+
+
+def _gyro_begins(last: MapUpdate, sweep: MovingSweep) -> bool:
+    """Whether a gyro turned the points of a sweep, and not those of the one before.
+
+    A sweep that a wrong gyro has bent is solved with the turn that bent it, if no sweep before was.
+    """
+    return sweep.motion is SweepMotion.GYRO and last.sweep_motion is not SweepMotion.GYRO
 
 
 def search(

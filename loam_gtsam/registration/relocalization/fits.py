@@ -166,6 +166,11 @@ class FitMonitor:
         return self.ready and beyond_any_motion(step, seconds, self.config)
 
     @property
+    def gives_up(self) -> bool:
+        """Whether so many sweeps did not fit that the run is to go on in another piece of map."""
+        return 0 < self.config.new_piece <= self.lost
+
+    @property
     def radius(self) -> float:
         """Search radius around the prediction, metres; grows with every lost sweep."""
         config = self.config

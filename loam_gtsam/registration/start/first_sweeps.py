@@ -97,10 +97,10 @@ class Start:
         self._anew = False  # whether the sweeps are to be registered anew with the next one
 
     @classmethod
-    def of_map(cls, first: Prediction, keyframe: int, maps: MapPair) -> Start | None:
+    def of_map(cls, first: Prediction, maps: MapPair) -> Start | None:
         """The start of a map; None if no sweep is de-skewed anew, or the map is there already."""
         begins = maps.config.deskew.model != "predicted" and not maps.given
-        return cls(first, keyframe) if begins else None
+        return cls(first, maps.keyframe) if begins else None
 
     @property
     def complete(self) -> bool:

@@ -10,8 +10,8 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.config import Config
-from loam_gtsam.registration.frame_matcher import tells_motion, timed_rows
-from loam_gtsam.registration.odometry import solved_twist
+from loam_gtsam.registration.degeneracy import tells_motion
+from loam_gtsam.registration.odometry import solved_twist, timed_rows
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.start.ways import EarlySweep, mean_twist
 from loam_gtsam.types import FloatArray, SweepMotion

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from copy import deepcopy
 from dataclasses import dataclass, field
 
 import gtsam
@@ -57,6 +58,17 @@ class MapError:
         if self._first is None:
             self._first = PosedSweep(posed.sweep, posed.twist)  # without the points it has made
             self._velocity.begin(posed.sweep.stamp)
+
+    def begin_after(
+        self, before: MapError, first_accelerations: FloatArray, uncertain: FloatArray
+    ) -> None:
+        """Begin another map, so uncertain, (6, 6) on the left, beside what ``before`` holds.
+
+        ``first_accelerations`` are those of :meth:`total` there.
+        """
+        self.drift = before.total(first_accelerations) + uncertain
+        self._forgotten = before._forgotten - np.log(_LEAST_KEPT)
+        self.offset = deepcopy(before.offset)
 
     def total(self, first_accelerations: FloatArray) -> FloatArray:
         """(6, 6) the error of the map now, seen from the first pose; map axes, as all in here.

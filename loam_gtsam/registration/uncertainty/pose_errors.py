@@ -16,8 +16,7 @@ from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
-from loam_gtsam.registration.frame_matcher import row_seconds
-from loam_gtsam.registration.odometry import Moment, Prediction, Turns
+from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seconds
 from loam_gtsam.registration.relocalization import same
 from loam_gtsam.registration.solvers import Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
@@ -87,7 +86,8 @@ class PoseErrors:
         # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
         self._with_priors = graph
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
-        self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
+        self._usual: FloatArray = np.repeat(expected, 3) ** 2
+        self._motion = Accelerations(config.covariance.window, self._usual)
         self._map, self._own = MapError(config), OwnErrors(config.imu.gyro_noise)
 
     @property
@@ -99,6 +99,15 @@ class PoseErrors:
     def range_offset(self) -> RangeOffset:
         """By how much all ranges look too long."""
         return self._map.offset
+
+    @property
+    def likely_accelerations(self) -> FloatArray:
+        """(6,) mean squares of those that are likely later, (rad/s^2)^2 and (m/s^2)^2."""
+        return np.maximum(self._motion.variances, self._usual)
+
+    def begin_after(self, before: PoseErrors, uncertain: FloatArray) -> None:
+        """Begin another map, so uncertain, (6, 6) on the left, beside what ``before`` holds."""
+        self._map.begin_after(before._map, before._motion.at_first, uncertain)
 
     def expected(self, stamp: int, last: Moment | None, imu: Turns | None) -> gtsam.Pose3 | None:
         """As :meth:`MapError.expected`."""

@@ -1,0 +1,155 @@
+"""Another piece of map: of sweeps that fit the map nowhere, with which the run goes on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Self
+
+import gtsam
+import numpy as np
+
+from loam_gtsam.geometry import symmetric
+from loam_gtsam.registration.odometry import LONGEST, Prediction
+from loam_gtsam.types import Features, FloatArray, MapUpdate
+
+if TYPE_CHECKING:
+    from loam_gtsam.mapper import Mapper
+    from loam_gtsam.registration.uncertainty import PoseErrors
+
+CONTINUED = "the run goes on in another piece of map"
+"""Is in the message of the first frame that has its pose in another piece of map."""
+_KNOWN = 3  # sweeps by which the velocity after a gap is known
+_FARTHEST = 1e4  # metres: largest standard deviation of a position, for the sake of its digits
+_ANYWHERE = np.pi / 3.0**0.5  # rad: standard deviation of an angle of which nothing is known
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Gap:
+    """The time since the last sweep that was found.
+
+    Attributes
+    ----------
+    stamp, map_T_lidar : nanoseconds, and the pose then
+    twist : (6,) body velocity then, rad/s and m/s
+    accelerations : (6,) mean squares of those that are to be expected, (rad/s^2)^2 and (m/s^2)^2
+    """
+
+    stamp: int
+    map_T_lidar: gtsam.Pose3
+    twist: FloatArray
+    accelerations: FloatArray
+
+    def bridged(
+        self, stamp: int, twist: FloatArray, turned: gtsam.Rot3 | None = None
+    ) -> tuple[gtsam.Pose3, FloatArray]:
+        """The pose after the gap, and its covariance (6, 6) on the left, in map axes.
+
+        ``twist`` (6,) is the body velocity then, and ``turned`` the rotation in between, if a gyro
+        tells it. The mean of both velocities leads to the pose. An acceleration ``a`` that brings
+        the velocity away from a straight line between them, and back again, moves it by
+        ``a T^2 / 4``, with the rotation that the lidar has half way.
+        """
+        seconds = (stamp - self.stamp) * 1e-9
+        before = self.map_T_lidar.rotation()
+        seconds = seconds if seconds > 0.0 else LONGEST  # a clock that was set back
+        steady = min(seconds, LONGEST)
+        by_mean = gtsam.Rot3.Expmap(0.5 * steady * (self.twist[:3] + twist[:3]))
+        after = before.compose(by_mean if turned is None else turned)
+        way = 0.5 * steady * (before.rotate(self.twist[3:]) + after.rotate(twist[3:]))
+        start = self.map_T_lidar.translation()
+        half = gtsam.Pose3(before.slerp(0.5, after), start + 0.5 * way)
+        squares = np.maximum(self.accelerations, ((twist - self.twist) / seconds) ** 2)
+        sigmas = 0.25 * seconds**2 * np.sqrt(squares)
+        sigmas = np.minimum(sigmas, np.repeat([_ANYWHERE, _FARTHEST], 3))
+        if turned is not None:
+            sigmas[:3] = 0.0
+        to_map = half.AdjointMap() * sigmas
+        return gtsam.Pose3(after, start + way), symmetric(to_map @ to_map.T)
+
+
+class NextPiece:
+    """What is mapped of sweeps that are not found, beside the map in which they are looked for.
+
+    It begins with the first of them, and anew with each that does not fit those before. Where it
+    is, the velocity after the gap tells, which the third sweep knows.
+
+    Attributes
+    ----------
+    gap : since the last sweep that was found
+    mapper : of the piece
+    """
+
+    mapper: Mapper
+
+    def __init__(self, gap: Gap) -> None:
+        self.gap = gap
+        self._last: MapUpdate | None = None  # None before the first sweep
+        self._first: list[Features] = []  # sweeps whose place is not known yet
+        self._turned: gtsam.Rot3 | None = None  # in the gap, by a gyro
+
+    @classmethod
+    def since(cls, found: MapUpdate, errors: PoseErrors) -> Self:
+        """Of sweeps that are not found since a frame that was."""
+        assert found.map_T_middle is not None
+        known = found.middle_stamp, found.map_T_middle, found.twist
+        return cls(Gap(*known, errors.likely_accelerations))
+
+    def add(
+        self, beside: Mapper, features: Features, predicted: Prediction,
+        guess: gtsam.Pose3 | None, twist: FloatArray | None,
+    ) -> bool:  # fmt: skip
+        """Map a further sweep; whether the run is to go on in this piece.
+
+        Parameters
+        ----------
+        beside : in whose map the sweep is not found
+        predicted : where it is expected there
+        guess, twist : as given to :meth:`loam_gtsam.mapper.Mapper.register` there
+        """
+        assert beside.last is not None
+        if self._last is not None:
+            if guess is not None:
+                moved = beside.last.map_T_lidar.between(guess)
+                guess = self._last.map_T_lidar.compose(moved)
+            self._last = self.mapper.register(features, guess, twist)
+            if self._last.status.solved:
+                self._place(beside, features)
+                return self._is_map and beside.monitor.gives_up
+        uncertain, self._first = np.zeros((6, 6)), [features]
+        if (known := predicted.inertial) is not None:
+            to_map = known.map_T_lidar.AdjointMap()
+            uncertain, self._first = symmetric(to_map @ known.covariance @ to_map.T), []
+        if (gyro := beside.imu) is not None:
+            self._turned = gyro.rotation_between(self.gap.stamp, features.stamp)
+        self.mapper = _another(beside, uncertain)
+        self._last = self.mapper.register(features, predicted.map_T_lidar, twist)
+        return False
+
+    @property
+    def _is_map(self) -> bool:
+        """Whether its place is known, and further sweeps are judged by its map."""
+        return not self._first and self.mapper.start is None and self.mapper.monitor.ready
+
+    def _place(self, beside: Mapper, features: Features) -> None:
+        """Begin anew where the velocity leads, once it is known."""
+        if not self._first:
+            return
+        assert self._last is not None
+        self._first.append(features)
+        if len(self._first) < _KNOWN:
+            return
+        sweeps, self._first, twist = self._first, [], self._last.twist
+        pose, covariance = self.gap.bridged(sweeps[0].stamp, twist, self._turned)
+        self.mapper = _another(beside, covariance)
+        self.mapper.register(sweeps[0], pose, twist)
+        for sweep in sweeps[1:]:
+            self._last = self.mapper.register(sweep)
+
+
+def _another(beside: Mapper, uncertain: FloatArray) -> Mapper:
+    """A mapper like another one, of a map that is so uncertain, (6, 6) on the left, in map axes."""
+    imu = None if beside.imu is None else beside.imu.buffer
+    parts = beside.config, beside.solver
+    mapper = type(beside)(*parts, imu=imu, extra_factors=beside.extra_factors)
+    mapper.errors.begin_after(beside.errors, uncertain)
+    return mapper

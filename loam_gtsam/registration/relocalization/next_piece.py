@@ -19,6 +19,10 @@ if TYPE_CHECKING:
 CONTINUED = "the run goes on in another piece of map"
 """Is in the message of the first frame that has its pose in another piece of map."""
 _KNOWN = 3  # sweeps by which the velocity after a gap is known
+_USUAL = 3.0  # times the root mean square of the accelerations before a gap that are likely in it
+_LIKELY = 0.5, 2.0
+"""rad/s^2 and m/s^2 that are likely in any gap: a car brakes and turns at a crossing, and what stood
+still is carried away."""
 _FARTHEST = 1e4  # metres: largest standard deviation of a position, for the sake of its digits
 _ANYWHERE = np.pi / 3.0**0.5  # rad: standard deviation of an angle of which nothing is known
 
@@ -31,7 +35,7 @@ class Gap:
     ----------
     stamp, map_T_lidar : nanoseconds, and the pose then
     twist : (6,) body velocity then, rad/s and m/s
-    accelerations : (6,) mean squares of those that are to be expected, (rad/s^2)^2 and (m/s^2)^2
+    accelerations : (6,) mean squares of those that are likely, (rad/s^2)^2 and (m/s^2)^2
     """
 
     stamp: int
@@ -91,8 +95,8 @@ class NextPiece:
     def since(cls, found: MapUpdate, errors: PoseErrors) -> Self:
         """Of sweeps that are not found since a frame that was."""
         assert found.map_T_middle is not None
-        known = found.middle_stamp, found.map_T_middle, found.twist
-        return cls(Gap(*known, errors.likely_accelerations))
+        likely = np.maximum(_USUAL**2 * errors.usual_accelerations, np.repeat(_LIKELY, 3) ** 2)
+        return cls(Gap(found.middle_stamp, found.map_T_middle, found.twist, likely))
 
     def add(
         self, beside: Mapper, features: Features, predicted: Prediction,

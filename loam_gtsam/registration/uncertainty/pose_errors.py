@@ -86,8 +86,7 @@ class PoseErrors:
         # Rows of the classical solvers count as measured to 1 m; they have no priors to find.
         self._with_priors = graph
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
-        self._usual: FloatArray = np.repeat(expected, 3) ** 2
-        self._motion = Accelerations(config.covariance.window, self._usual)
+        self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._map, self._own = MapError(config), OwnErrors(config.imu.gyro_noise)
 
     @property
@@ -101,9 +100,9 @@ class PoseErrors:
         return self._map.offset
 
     @property
-    def likely_accelerations(self) -> FloatArray:
-        """(6,) mean squares of those that are likely later, (rad/s^2)^2 and (m/s^2)^2."""
-        return np.maximum(self._motion.variances, self._usual)
+    def usual_accelerations(self) -> FloatArray:
+        """(6,) mean squares of the last ones, (rad/s^2)^2 and (m/s^2)^2."""
+        return self._motion.variances
 
     def begin_after(self, before: PoseErrors, uncertain: FloatArray) -> None:
         """Begin another map, so uncertain, (6, 6) on the left, beside what ``before`` holds."""

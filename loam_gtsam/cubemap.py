@@ -124,15 +124,12 @@ class CubeMap:
     def recenter(self, position: FloatArray) -> int:
         """Shift the window, no farther than needed, if its edge is within ``window_margin`` cubes.
 
-        Cubes that fall out are archived, archived ones that fall in are restored.
+        Cubes that fall out are archived, archived ones that fall in are restored. Returns the
+        number of cubes evicted.
 
         Parameters
         ----------
         position : (3,) sensor position, metres, map frame
-
-        Returns
-        -------
-        Cubes evicted by this call.
 
         Raises
         ------

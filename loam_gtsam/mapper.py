@@ -24,11 +24,11 @@ from loam_gtsam.registration.matches import ScanMatches
 from loam_gtsam.registration.odometry import ConstantVelocity, Moment, Prediction, predict
 from loam_gtsam.registration.point_times import PointTimes
 from loam_gtsam.registration.relocalization import (
-    CONTINUED,
     FitMonitor,
     Found,
     NextPiece,
     accept,
+    goes_on,
     placed,
     unplaced,
 )
@@ -87,7 +87,7 @@ class Mapper:
 
     Attributes
     ----------
-    last : the last update
+    last, found : the last update, and the last one whose sweep was found
     registered : the last sweep as it went into the map; None if it did not
     imu : what the mapper makes of the IMU; None without one
     monitor : tells whether sweeps fit the map
@@ -126,7 +126,7 @@ class Mapper:
         self._stamps, self.point_times = StampCheck(), PointTimes(self.config)
         self.start: Start | None = None
         self._moment: Moment | None = None
-        self._found: MapUpdate | None = None  # the last one that was
+        self.found: MapUpdate | None = None
         self._next: NextPiece | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -182,10 +182,11 @@ class Mapper:
             return self._unused(features.stamp, str(error), None)
         clock.lap("prepare")
         expected_at = predicted.posed, predicted.map_T_lidar
+        can_go_on = goes_on(self, features)
         if self.last is None:
             self.start = Start.of_map(predicted, self.maps)
             update = self._insert(*expected_at, FrameStatus.FIRST, "the map starts here", clock)
-        elif sparse := not self.monitor.lost and self.maps.too_sparse(predicted, self.config):
+        elif not (can_go_on or self.monitor.lost) and (sparse := self.maps.too_sparse(predicted)):
             self.start = None
             update = self._insert(*expected_at, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
@@ -204,13 +205,15 @@ class Mapper:
                     if few and self.config.map.insert_unmatched:
                         self.start = None
                         self._insert(*expected_at, update.status, update.message, clock)
-                    elif self.monitor.lost and self._found and not self.maps.given:
-                        self._next = self._next or NextPiece.since(self._found, self.errors)
-                        if self._next.add(self, features, predicted, guess, twist):
-                            update = self._go_on(self._next.mapper)
+                    elif self.monitor.lost and can_go_on:
+                        self._next = self._next or NextPiece.since(self)
+                        found = self._next.add(self, features, predicted, guess, twist)
+                        if found is not None:
+                            update = found
+                            self._go_on(self._next.mapper)
                         clock.lap("relocalize")
         if not update.status.solved:
-            self.errors.skipped(predicted.posed)
+            self.errors.skipped(predicted.posed, predicted.motion if self.registered else None)
         self.last = replace(update, timings=clock.seconds)
         return self.last
 
@@ -294,21 +297,17 @@ class Mapper:
         last = None if found.message else frame.matcher.last
         update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)
         clock.lap("covariance")
-        self._found, self._next = update, None
+        self.found, self._next = update, None
         return update
 
-    def _go_on(self, piece: Mapper) -> MapUpdate:
-        """Go on in another piece of map: the update of the sweep that was found there."""
-        message = f"after {self.monitor.lost} lost sweeps {CONTINUED}"
+    def _go_on(self, piece: Mapper) -> None:
+        """Go on in another piece of map."""
         piece.maps.begin_after(self.maps)
-        self.maps = piece.maps
-        self.monitor, self.errors, self._moment = piece.monitor, piece.errors, piece._moment
-        self.registered, self._found, self._next = piece.registered, piece._found, None
-        if self.imu is not None and piece.imu is not None:
+        self.maps, self.monitor, self.errors = piece.maps, piece.monitor, piece.errors
+        self.registered, self._moment = piece.registered, piece._moment
+        self.found, self._next = piece.found, None
+        if self.imu and piece.imu:
             self.imu.__setstate__(piece.imu.__getstate__())
-        assert piece.last is not None
-        message = "; ".join(filter(None, (message, piece.last.message)))
-        return replace(piece.last, message=message)
 
     def _insert(
         self, posed: PosedSweep, map_T_lidar: gtsam.Pose3, status: FrameStatus, message: str,

@@ -173,9 +173,9 @@ class MapPair:
             cubes.insert_sorted(new)
         self._thinned = None
 
-    def too_sparse(self, predicted: Prediction, config: Config) -> str:
+    def too_sparse(self, predicted: Prediction) -> str:
         """Why there are too few points around a sweep to solve in; empty if there are enough."""
-        pose, solver = predicted.map_T_middle.matrix(), config.solver
+        pose, solver = predicted.map_T_middle.matrix(), self.config.solver
         maps = self.edges, self.planes
         edges, planes = (cubes.count(cubes.neighbourhood(pose)) for cubes in maps)
         if edges >= solver.min_map_edges and planes >= solver.min_map_planes:
@@ -278,18 +278,10 @@ class FrameMatcher(Matcher):
 
     @classmethod
     def of(
-        cls,
-        posed: PosedSweep,
-        maps: MapPair,
-        config: Config,
-        last: Moment | None,
-        clock: Clock,
-        *,
-        refine: bool = True,
-        expected: bool = False,
-        inertial: InertialPrediction | None = None,
-        accelerations: Expected | None = None,
-    ) -> FrameMatcher:
+        cls, posed: PosedSweep, maps: MapPair, config: Config, last: Moment | None, clock: Clock,
+        *, refine: bool = True, expected: bool = False,
+        inertial: InertialPrediction | None = None, accelerations: Expected | None = None,
+    ) -> FrameMatcher:  # fmt: skip
         """The matcher with the configured matching and, if it is to ``refine``, de-skew."""
         rows, model = _rows_to_match(posed.sweep, config.matching), config.deskew.model
         refine = refine and model != "predicted"

@@ -95,14 +95,14 @@ class ImuTracker:
     def __reduce__(self) -> tuple[Any, ...]:
         return type(self), (self.config, self.buffer), self.__getstate__()
 
-    # For checkpoints: of a tracker that is there again, with its buffer.
+    # For checkpoints, in which the buffer may be one that is there again, with another bias.
     def __getstate__(self) -> dict[str, Any]:
-        learnt = {"gyro_bias": self.buffer.gyro_bias}
-        return learnt | {k: v for k, v in vars(self).items() if k not in ("buffer", "config")}
+        return vars(self) | {"gyro_bias": self.buffer.gyro_bias}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.buffer.gyro_bias = state.pop("gyro_bias")
+        bias = state.pop("gyro_bias")
         vars(self).update(state)
+        self.buffer.gyro_bias = bias
 
     @property
     def trusted_gyro(self) -> ImuBuffer | None:

@@ -35,6 +35,8 @@ _RANK = 1e-9  # of the largest eigenvalue, below which a scan has no information
 _NODES = 41  # of the path between the middle of the last sweep and the end of this one
 _BENT = 1.0  # longest time over which accelerations are integrated for that, seconds
 LONGEST = 10.0  # seconds of extrapolation: after more the pose would be anywhere
+ANYWHERE: FloatArray = np.repeat([np.pi / 3.0**0.5, 1e4], 3)
+"""rad and m: standard deviations of a pose of which nothing is known, as far as digits allow."""
 _SHORTEST = 1e-3  # least seconds between the middles of two sweeps
 _REASSOCIATE_EVERY = 5  # gauss-Newton iterations per association of scan to scan (LOAM)
 _WEIGHT_SLOPE = 1.8  # weight 1 - 1.8 |d| after the first association of scan to scan (LOAM)

@@ -24,3 +24,4 @@ from loam_gtsam.registration.relocalization.likely_poses import sample_features 
 from loam_gtsam.registration.relocalization.next_piece import CONTINUED as CONTINUED
 from loam_gtsam.registration.relocalization.next_piece import Gap as Gap
 from loam_gtsam.registration.relocalization.next_piece import NextPiece as NextPiece
+from loam_gtsam.registration.relocalization.next_piece import goes_on as goes_on

@@ -2,29 +2,27 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Self
 
 import gtsam
 import numpy as np
 
 from loam_gtsam.geometry import symmetric
-from loam_gtsam.registration.odometry import LONGEST, Prediction
+from loam_gtsam.registration.odometry import ANYWHERE, LONGEST, Prediction
 from loam_gtsam.types import Features, FloatArray, MapUpdate
 
 if TYPE_CHECKING:
     from loam_gtsam.mapper import Mapper
-    from loam_gtsam.registration.uncertainty import PoseErrors
+    from loam_gtsam.registration.relocalization.fits import FitMonitor
 
 CONTINUED = "the run goes on in another piece of map"
 """Is in the message of the first frame that has its pose in another piece of map."""
 _KNOWN = 3  # sweeps by which the velocity after a gap is known
 _USUAL = 3.0  # times the root mean square of the accelerations before a gap that are likely in it
 _LIKELY = 0.5, 2.0
-"""rad/s^2 and m/s^2 that are likely in any gap: a car brakes and turns at a crossing, and what stood
-still is carried away."""
-_FARTHEST = 1e4  # metres: largest standard deviation of a position, for the sake of its digits
-_ANYWHERE = np.pi / 3.0**0.5  # rad: standard deviation of an angle of which nothing is known
+"""rad/s^2 and m/s^2 that are likely in any gap: a car brakes and turns at a crossing, and what
+stood still is carried away."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,12 +61,20 @@ class Gap:
         start = self.map_T_lidar.translation()
         half = gtsam.Pose3(before.slerp(0.5, after), start + 0.5 * way)
         squares = np.maximum(self.accelerations, ((twist - self.twist) / seconds) ** 2)
-        sigmas = 0.25 * seconds**2 * np.sqrt(squares)
-        sigmas = np.minimum(sigmas, np.repeat([_ANYWHERE, _FARTHEST], 3))
+        sigmas = np.minimum(0.25 * seconds**2 * np.sqrt(squares), ANYWHERE)
         if turned is not None:
             sigmas[:3] = 0.0
         to_map = half.AdjointMap() * sigmas
         return gtsam.Pose3(after, start + way), symmetric(to_map @ to_map.T)
+
+
+def goes_on(mapper: Mapper, features: Features) -> bool:
+    """Whether sweeps that are not found can make another piece of map, as these features can."""
+    config, found = mapper.config.relocalization, mapper.found is not None
+    allowed = config.enabled and config.new_piece > 0 and not mapper.maps.given
+    enough = 2 * mapper.config.solver.min_matches
+    many = len(features.edges) + len(features.planes) >= enough
+    return allowed and found and many and mapper.start is None
 
 
 class NextPiece:
@@ -92,17 +98,19 @@ class NextPiece:
         self._turned: gtsam.Rot3 | None = None  # in the gap, by a gyro
 
     @classmethod
-    def since(cls, found: MapUpdate, errors: PoseErrors) -> Self:
-        """Of sweeps that are not found since a frame that was."""
+    def since(cls, mapper: Mapper) -> Self:
+        """Of sweeps that are not found since the last one that was."""
+        found, usual = mapper.found, mapper.errors.usual_accelerations
+        assert found is not None
         assert found.map_T_middle is not None
-        likely = np.maximum(_USUAL**2 * errors.usual_accelerations, np.repeat(_LIKELY, 3) ** 2)
+        likely = np.maximum(_USUAL**2 * usual, np.repeat(_LIKELY, 3) ** 2)
         return cls(Gap(found.middle_stamp, found.map_T_middle, found.twist, likely))
 
     def add(
         self, beside: Mapper, features: Features, predicted: Prediction,
         guess: gtsam.Pose3 | None, twist: FloatArray | None,
-    ) -> bool:  # fmt: skip
-        """Map a further sweep; whether the run is to go on in this piece.
+    ) -> MapUpdate | None:  # fmt: skip
+        """Map a further sweep; its update if the run is to go on in this piece.
 
         Parameters
         ----------
@@ -118,7 +126,7 @@ class NextPiece:
             self._last = self.mapper.register(features, guess, twist)
             if self._last.status.solved:
                 self._place(beside, features)
-                return self._is_map and beside.monitor.gives_up
+                return self._found_after(beside.monitor)
         uncertain, self._first = np.zeros((6, 6)), [features]
         if (known := predicted.inertial) is not None:
             to_map = known.map_T_lidar.AdjointMap()
@@ -127,12 +135,16 @@ class NextPiece:
             self._turned = gyro.rotation_between(self.gap.stamp, features.stamp)
         self.mapper = _another(beside, uncertain)
         self._last = self.mapper.register(features, predicted.map_T_lidar, twist)
-        return False
+        return None
 
-    @property
-    def _is_map(self) -> bool:
-        """Whether its place is known, and further sweeps are judged by its map."""
-        return not self._first and self.mapper.start is None and self.mapper.monitor.ready
+    def _found_after(self, beside: FitMonitor) -> MapUpdate | None:
+        """The last update, once sweeps are judged by this map and not looked for in the other."""
+        last, mapper = self._last, self.mapper
+        begun = not self._first and mapper.start is None and mapper.monitor.ready
+        if last is None or not begun or not beside.gives_up:
+            return None
+        message = f"after {beside.lost} lost sweeps {CONTINUED}"
+        return replace(last, message="; ".join(filter(None, (message, last.message))))
 
     def _place(self, beside: Mapper, features: Features) -> None:
         """Begin anew where the velocity leads, once it is known."""

@@ -11,8 +11,8 @@ import numpy as np
 from loam_gtsam.config import Config
 from loam_gtsam.frontend.deskew import MovingSweep, PosedSweep
 from loam_gtsam.geometry import nearest_positive, symmetric
-from loam_gtsam.registration.odometry import Moment, Turns
-from loam_gtsam.registration.solvers import MotionFilter, Solution
+from loam_gtsam.registration.odometry import ANYWHERE, Moment, Turns
+from loam_gtsam.registration.solvers import MotionFilter, MotionPrior, Solution
 from loam_gtsam.registration.solvers.scan_error import ScanError
 from loam_gtsam.registration.uncertainty.own_errors import rotation_is_known, unresolved
 from loam_gtsam.registration.uncertainty.range_offset import RangeOffset
@@ -152,6 +152,13 @@ class MapError:
         """
         in_map = pose.AdjointMap() * step
         self.drift = self.drift + 0.5 * in_map @ in_map.T
+
+    def add_expected(self, motion: MotionPrior) -> None:
+        """A sweep went into the map where it was expected, which nothing else tells."""
+        if motion.information.any():
+            unknown = np.linalg.inv(motion.information + np.diag(ANYWHERE**-2.0))
+            to_map = motion.map_T_lidar.AdjointMap()
+            self.drift = self.drift + symmetric(to_map @ unknown @ to_map.T)
 
     def add_move(self, step: gtsam.Pose3) -> None:
         """A loop closure moved points of the map by a step, in map axes.

@@ -18,7 +18,7 @@ from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seconds
 from loam_gtsam.registration.relocalization import same
-from loam_gtsam.registration.solvers import Solution
+from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
 from loam_gtsam.registration.solvers.seen_ground import SeenGround, facings
@@ -217,8 +217,13 @@ class PoseErrors:
         """As :meth:`MapError.add_move`."""
         self._map.add_move(step)
 
-    def skipped(self, posed: PosedSweep) -> None:
-        """Account for a sweep whose pose is the expected one; the very first begins the map."""
+    def skipped(self, posed: PosedSweep, motion: MotionPrior | None = None) -> None:
+        """Account for a sweep whose pose is the expected one; the very first begins the map.
+
+        ``motion`` is what led to that pose, if the sweep went into the map.
+        """
+        if motion is not None:
+            self._map.add_expected(motion)
         if not self._scans:
             self._map.begin(posed)
 

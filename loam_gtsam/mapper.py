@@ -207,8 +207,7 @@ class Mapper:
                         self._insert(*expected_at, update.status, update.message, clock)
                     elif self.monitor.lost and can_go_on:
                         self._next = self._next or NextPiece.since(self)
-                        found = self._next.add(self, features, predicted, guess, twist)
-                        if found is not None:
+                        if found := self._next.add(self, features, predicted, guess, twist):
                             update = found
                             self._go_on(self._next.mapper)
                         clock.lap("relocalize")

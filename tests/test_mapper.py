@@ -203,7 +203,18 @@ def test_sparse_map_inserts_at_the_guess(rng):
     assert update.status is FrameStatus.SPARSE_MAP
     assert "50" in update.message
     assert update.map_T_lidar.equals(guess, 1e-12)
-    assert mapper.register(room_features(guess, SECOND // 5, rng), guess=guess).status.solved
+    after = mapper.register(room_features(guess, SECOND // 5, rng), guess=guess)
+    assert after.status.solved
+    # Nothing but an expected motion, to 2 m/s^2, has led to the map that it was found in.
+    assert (np.sqrt(np.diag(after.covariance))[3:] > 0.5 * 2.0 * 0.1**2).all()
+
+
+def test_where_nothing_is_mapped_a_known_sweep_does_not_go_into_the_map(mapped, rng):
+    points, far = mapped.maps.planes.count(), gtsam.Pose3(gtsam.Rot3(), [900.0, 0.0, 0.0])
+    update = mapped.register(room_features(gtsam.Pose3(), SECOND, rng), guess=far)
+    assert update.status is FrameStatus.FEW_MATCHES
+    assert mapped.monitor.lost == 1
+    assert len(mapped.map_points()[1]) == points
 
 
 def test_few_matches_keep_the_guess_and_do_not_insert(mapped, rng):

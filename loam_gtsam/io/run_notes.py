@@ -29,6 +29,7 @@ _ADVICE = {
     "see loam-gtsam inspect",
 }
 _ADVICE[FrameStatus.FEW_MATCHES] = _ADVICE[FrameStatus.SPARSE_MAP] = _ADVICE[FrameStatus.LOST]
+_PIECE = " in another piece of map"  # in the message of the first frame there
 _VAGUE = 0.01  # standard deviation from which on a pose is vague: rad, and part of the path
 _SAID = 1.0  # metres of standard deviation from which on a vague one is said
 _SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground makes
@@ -43,7 +44,12 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         largest = sigmas["largest"]
         if largest > max(_SAID, _VAGUE * path):
             told = f"positions are told to {largest:.2g} m at worst (sigma)"
-            notes.append(f"{told}: other first motions fit as well, or the way was blind")
+            notes.append(f"{told}: other first motions fit as well, or the way was blind or missing")
+    pieces = [number for number, one in enumerate(result.updates) if _PIECE in one.message]
+    if pieces:
+        frames = ", ".join(map(str, pieces))
+        tell = "where it is, loops.enabled or a GNSS receiver may tell"
+        notes.append(f"the run goes on{_PIECE} from frame {frames} on: {tell}")
     if result.imu is not None:
         notes += result.imu.problems
     if result.fixes is not None and result.fixes.reference is None:

@@ -69,12 +69,15 @@ class Gap:
 
 
 def goes_on(mapper: Mapper, features: Features) -> bool:
-    """Whether sweeps that are not found can make another piece of map, as these features can."""
+    """Whether sweeps that are not found can make another piece of map, as these features can.
+
+    In the first sweeps of a map there may be too little of it around without a gap.
+    """
     config, found = mapper.config.relocalization, mapper.found is not None
     allowed = config.enabled and config.new_piece > 0 and not mapper.maps.given
     enough = 2 * mapper.config.solver.min_matches
     many = len(features.edges) + len(features.planes) >= enough
-    return allowed and found and many and mapper.start is None
+    return allowed and found and many and (mapper.start is None or mapper.monitor.lost > 0)
 
 
 class NextPiece:

@@ -1,0 +1,185 @@
+"""Runs that go on in another piece of map, when sweeps fit the one before nowhere."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import gtsam
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from loam_gtsam.config import Config
+from loam_gtsam.datasets.arrays import ArrayDataset
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.io.state import freeze, thaw
+from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
+from loam_gtsam.registration.relocalization import CONTINUED, FitMonitor, Gap, goes_on
+from loam_gtsam.registration.uncertainty import relative_covariance
+from loam_gtsam.types import FrameStatus
+
+AT, AGAIN, LOST = 8, 20, 9
+"""The first missing sweep, the first one after the gap, and how many are lost then."""
+CONFIG = Config().changed(
+    f"relocalization.new_piece={LOST}", "relocalization.radius=0", "relocalization.max_radius=0"
+)
+"""With a quick search."""
+FORWARD = np.array([0.0, 0.0, 0.0, 10.0, 0.0, 0.0])
+USUAL = np.repeat([0.5, 2.0], 3) ** 2
+
+
+@pytest.fixture(scope="module")
+def avenue():
+    """At 30 m/s, where hardly anything is seen again after a second."""
+    world = SimulatedWorld("avenue", frames=36, columns=450, start="moving", speed=30.0, imu="mems")
+    return world, list(world)
+
+
+def with_gap(avenue, sweeps, *, imu=False):
+    world, samples = avenue[0], avenue[0].imu if imu else None
+    return ArrayDataset(sweeps, sensor=world.sensor, truth=world.truth, imu=samples)
+
+
+@pytest.fixture(scope="module")
+def result(avenue):
+    return run(with_gap(avenue, avenue[1][:AT] + avenue[1][AGAIN:]), CONFIG)
+
+
+def squared_distance(truth, earlier, later):
+    """Squared Mahalanobis distance of the motion between two frames from the true one."""
+    one, two = (gtsam.Pose3(pose) for pose in truth.at([earlier.stamp, later.stamp]).map_T_lidar)
+    away = earlier.map_T_lidar.between(later.map_T_lidar).localCoordinates(one.between(two))
+    return away @ np.linalg.solve(relative_covariance(earlier, later), away)
+
+
+def test_a_run_goes_on_after_a_gap_and_tells_how_well_it_knows_where(avenue, result):
+    truth, updates = avenue[0].truth, result.updates
+    lost, after = updates[AT : AT + LOST - 1], updates[AT + LOST - 1 :]
+    assert {update.status for update in lost} == {FrameStatus.LOST}
+    assert {update.status for update in after} == {FrameStatus.OK}
+    assert after[0].message == f"after {LOST} lost sweeps {CONTINUED}"
+    assert [note for note in result.notes if CONTINUED in note]
+    # Within a piece a motion is known as ever, across the gap as well as a car's is.
+    assert squared_distance(truth, after[0], after[-1]) < 25.0
+    assert squared_distance(truth, updates[AT - 1], after[0]) < 25.0
+    within, across = (
+        np.sqrt(np.diag(relative_covariance(*pair)))
+        for pair in (after[:2], (updates[AT - 1], after[0]))
+    )
+    assert (within < np.repeat([2e-3, 0.05], 3)).all()
+    assert (across > np.repeat([0.05, 0.3], 3)).all()
+    assert (np.sqrt(np.diag(after[-1].covariance))[:3] > 0.05).all()
+
+
+def test_both_pieces_are_in_the_map_and_points_belong_to_keyframes_of_their_own(avenue, result):
+    maps = result.pipeline.mapper.maps
+    owners, earlier = (
+        np.unique(np.concatenate([part.tags[:, 0] for part in piece.planes.contents().values()]))
+        for piece in (maps, maps.earlier)
+    )
+    assert owners.min() > earlier.max()
+    for update in (result.updates[0], result.updates[-1]):
+        place = update.map_T_lidar.translation()
+        assert np.linalg.norm(result.plane_points - place, axis=1).min() < 5.0
+    whole = {name: cubes.count() for name, cubes in maps.layers().items()}
+    assert whole["planes"] > maps.planes.count()
+    assert maps.earlier is not None  # which stays as it was
+    assert maps.layers()["planes"].count() == whole["planes"]
+    moved = result.pipeline.mapper.maps.points(
+        {0: gtsam.Pose3(gtsam.Rot3(), [0, 0, 50.0]).matrix()}
+    )
+    assert moved[1][:, 2].max() > result.plane_points[:, 2].max() + 20.0
+
+
+def test_a_checkpoint_holds_the_piece_that_is_not_used_yet(avenue):
+    dataset = with_gap(avenue, avenue[1][:AT] + avenue[1][AGAIN:], imu=True)
+    config = effective_config(CONFIG, dataset)
+    one, two = (Pipeline(config, imu=imu_buffer(dataset, config)) for _ in range(2))
+    sweeps = list(dataset)
+    for sweep in sweeps[: AT + LOST - 1]:
+        one.process(sweep)
+    thaw(freeze(*one.state()), *two.state())
+    for sweep in sweeps[AT + LOST - 1 : AT + LOST + 2]:
+        updates = [pipeline.process(sweep) for pipeline in (one, two)]
+        np.testing.assert_array_equal(*(update.map_T_lidar.matrix() for update in updates))
+        np.testing.assert_array_equal(*(update.covariance for update in updates))
+    assert two.mapper.maps.earlier is not None
+
+
+def test_sweeps_that_do_not_fit_each_other_make_no_piece(avenue):
+    rng = np.random.default_rng(1)
+    pipeline = Pipeline(effective_config(CONFIG, avenue[0]))
+    for sweep in avenue[1][:AT]:
+        pipeline.process(sweep)
+    for sweep in avenue[1][AT : AT + LOST + 2]:
+        turn = Rotation.from_euler("z", rng.uniform(0.0, 360.0), degrees=True).as_matrix()
+        anyhow = rng.uniform(0.3, 1.0, (len(sweep.points), 1)) * sweep.points @ turn.T
+        update = pipeline.process(replace(sweep, points=anyhow))
+        assert not update.status.solved
+    assert pipeline.mapper.maps.earlier is None
+
+
+def test_loops_tie_the_pieces():
+    """The lidar is carried back while nothing is seen, and the same street is mapped once more."""
+    world = SimulatedWorld("street_loop", frames=26, columns=450, start="moving", speed=10.0)
+    sweeps = list(world)
+    later = [replace(sweep, stamp=sweep.stamp + round(6e9)) for sweep in sweeps]
+    config = CONFIG.changed("loops.enabled=true", "pose_graph.keyframe_distance=1")
+    result = run(ArrayDataset(sweeps + later, sensor=world.sensor), config)
+    assert any(CONTINUED in update.message for update in result.updates)
+    before, end = (updates[-1] for updates in (result.updates[: len(sweeps)], result.updates))
+    assert end.map_T_lidar.range(before.map_T_lidar) > 20.0
+    closed = gtsam.Pose3(result.trajectory.map_T_lidar[-1])
+    assert closed.range(before.map_T_lidar) < 0.05
+
+
+def gap(twist=FORWARD, stamp=0):
+    return Gap(stamp, gtsam.Pose3(gtsam.Rot3.Rz(0.3), [1.0, 2.0, 3.0]), twist, USUAL)
+
+
+def test_both_velocities_lead_across_a_gap():
+    start = gap().map_T_lidar
+    pose, covariance = gap().bridged(2_000_000_000, FORWARD)
+    assert pose.equals(start.compose(gtsam.Pose3(gtsam.Rot3(), [20.0, 0.0, 0.0])), 1e-9)
+    # It brakes steadily: the mean of both is exact.
+    pose, _ = gap().bridged(2_000_000_000, 0.4 * FORWARD)
+    assert pose.equals(start.compose(gtsam.Pose3(gtsam.Rot3(), [14.0, 0.0, 0.0])), 1e-9)
+    # One that stops for a while in the middle, at the likely acceleration, is one sigma off.
+    aside = gtsam.Pose3(gtsam.Rot3(), start.rotation().rotate([0.25 * 2.0 * 2.0**2, 0, 0]))
+    step = gtsam.Pose3.Logmap(aside)
+    assert np.isclose(step @ np.linalg.pinv(covariance) @ step, 1.0, rtol=1e-6)
+    # A turn in the gap is seen from half way.
+    turned = gtsam.Rot3.Rz(0.5)
+    pose, known = gap().bridged(1_000_000_000, FORWARD, turned)
+    assert pose.rotation().equals(start.rotation().compose(turned), 1e-9)
+    assert np.allclose(known[:3], 0.0)
+
+
+@pytest.mark.parametrize("seconds", [-5.0, 3600.0])
+def test_after_a_gap_of_unknown_length_the_lidar_may_be_anywhere(seconds):
+    pose, covariance = gap().bridged(round(seconds * 1e9), FORWARD)
+    assert np.isfinite(pose.matrix()).all()
+    assert np.sqrt(np.linalg.eigvalsh(covariance)[-1]) > 40.0
+    assert np.linalg.eigvalsh(covariance)[-1] < 1e10
+
+
+def test_when_a_run_goes_on():
+    for new_piece, lost, expected in ((3, 2, False), (3, 3, True), (0, 1000, False)):
+        monitor = FitMonitor(Config().relocalization.changed(new_piece=new_piece))
+        monitor.lost = lost
+        assert monitor.gives_up is expected
+    sweep = SimpleNamespace(edges=np.zeros((20, 3)), planes=np.zeros((200, 3)))
+    mapper = SimpleNamespace(
+        config=Config(), found=object(), start=None,
+        maps=SimpleNamespace(given=False), monitor=SimpleNamespace(lost=0),
+    )  # fmt: skip
+    assert goes_on(mapper, sweep)
+    few = SimpleNamespace(edges=np.zeros((20, 3)), planes=np.zeros((20, 3)))
+    assert not goes_on(mapper, few)
+    for name, value in (
+        ("found", None),
+        ("start", object()),
+        ("maps", SimpleNamespace(given=True)),
+        ("config", Config().changed("relocalization.enabled=false")),
+        ("config", Config().changed("relocalization.new_piece=0")),
+    ):
+        assert not goes_on(SimpleNamespace(**{**vars(mapper), name: value}), sweep), name

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 
 from loam_gtsam.geometry import symmetric
+from loam_gtsam.imu.preintegration import StartSigmas
 from loam_gtsam.registration.odometry import ANYWHERE, LONGEST, Prediction
 from loam_gtsam.types import Features, FloatArray, MapUpdate
 
@@ -47,7 +48,7 @@ class Gap:
         """The pose after the gap, and its covariance (6, 6) on the left, in map axes.
 
         ``twist`` (6,) is the body velocity then, and ``turned`` the rotation in between, if a gyro
-        tells it. The mean of both velocities leads to the pose. An acceleration ``a`` that brings
+        tells it, to an unknown bias. The mean of both velocities leads to the pose. An acceleration ``a`` that brings
         the velocity away from a straight line between them, and back again, moves it by
         ``a T^2 / 4``, with the rotation that the lidar has half way.
         """
@@ -61,9 +62,10 @@ class Gap:
         start = self.map_T_lidar.translation()
         half = gtsam.Pose3(before.slerp(0.5, after), start + 0.5 * way)
         squares = np.maximum(self.accelerations, ((twist - self.twist) / seconds) ** 2)
-        sigmas = np.minimum(0.25 * seconds**2 * np.sqrt(squares), ANYWHERE)
+        sigmas = 0.25 * seconds**2 * np.sqrt(squares)
         if turned is not None:
-            sigmas[:3] = 0.0
+            sigmas[:3] = StartSigmas().gyro_bias * seconds
+        sigmas = np.minimum(sigmas, ANYWHERE)
         to_map = half.AdjointMap() * sigmas
         return gtsam.Pose3(after, start + way), symmetric(to_map @ to_map.T)
 

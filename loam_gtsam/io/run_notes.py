@@ -44,7 +44,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         largest = sigmas["largest"]
         if largest > max(_SAID, _VAGUE * path):
             told = f"positions are told to {largest:.2g} m at worst (sigma)"
-            notes.append(f"{told}: other first motions fit as well, or the way was blind or missing")
+            why = "other first motions fit as well, or the way was blind or is missing"
+            notes.append(f"{told}: {why}")
     pieces = [number for number, one in enumerate(result.updates) if _PIECE in one.message]
     if pieces:
         frames = ", ".join(map(str, pieces))

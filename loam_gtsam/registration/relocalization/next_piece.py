@@ -47,10 +47,10 @@ class Gap:
     ) -> tuple[gtsam.Pose3, FloatArray]:
         """The pose after the gap, and its covariance (6, 6) on the left, in map axes.
 
-        ``twist`` (6,) is the body velocity then, and ``turned`` the rotation in between, if a gyro
-        tells it, to an unknown bias. The mean of both velocities leads to the pose. An acceleration ``a`` that brings
-        the velocity away from a straight line between them, and back again, moves it by
-        ``a T^2 / 4``, with the rotation that the lidar has half way.
+        ``twist`` (6,) is the body velocity then, and ``turned`` the rotation in between by a gyro,
+        of an unknown bias, if it tells. The mean of both velocities leads to the pose. An
+        acceleration ``a`` that brings the velocity away from a straight line between them, and back
+        again, moves it by ``a T^2 / 4``, with the rotation that the lidar has half way.
         """
         seconds = (stamp - self.stamp) * 1e-9
         before = self.map_T_lidar.rotation()

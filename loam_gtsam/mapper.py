@@ -87,7 +87,7 @@ class Mapper:
 
     Attributes
     ----------
-    last, found : the last update, and the last one whose sweep was found
+    last : the last update
     registered : the last sweep as it went into the map; None if it did not
     imu : what the mapper makes of the IMU; None without one
     monitor : tells whether sweeps fit the map
@@ -126,7 +126,6 @@ class Mapper:
         self._stamps, self.point_times = StampCheck(), PointTimes(self.config)
         self.start: Start | None = None
         self._moment: Moment | None = None
-        self.found: MapUpdate | None = None
         self._next: NextPiece | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -206,7 +205,7 @@ class Mapper:
                         self.start = None
                         self._insert(*expected_at, update.status, update.message, clock)
                     elif self.monitor.lost and can_go_on:
-                        self._next = self._next or NextPiece.since(self)
+                        self._next = self._next or NextPiece(self.errors.gap)
                         if found := self._next.add(self, features, predicted, guess, twist):
                             update = found
                             self._go_on(self._next.mapper)
@@ -296,15 +295,14 @@ class Mapper:
         last = None if found.message else frame.matcher.last
         update = self.errors.calibrated(update, posed.sweep, solution, scan, last, fused, *rivals)
         clock.lap("covariance")
-        self.found, self._next = update, None
+        self._next = None
         return update
 
     def _go_on(self, piece: Mapper) -> None:
         """Go on in another piece of map."""
         piece.maps.begin_after(self.maps)
         self.maps, self.monitor, self.errors = piece.maps, piece.monitor, piece.errors
-        self.registered, self._moment = piece.registered, piece._moment
-        self.found, self._next = piece.found, None
+        self.registered, self._moment, self._next = piece.registered, piece._moment, None
         if self.imu and piece.imu:
             self.imu.__setstate__(piece.imu.__getstate__())
 

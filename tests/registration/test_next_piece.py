@@ -169,14 +169,14 @@ def test_when_a_run_goes_on():
         assert monitor.gives_up is expected
     sweep = SimpleNamespace(edges=np.zeros((20, 3)), planes=np.zeros((200, 3)))
     mapper = SimpleNamespace(
-        config=Config(), found=object(), start=None,
+        config=Config(), start=None, errors=SimpleNamespace(gap=gap()),
         maps=SimpleNamespace(given=False), monitor=SimpleNamespace(lost=0),
     )  # fmt: skip
     assert goes_on(mapper, sweep)
     few = SimpleNamespace(edges=np.zeros((20, 3)), planes=np.zeros((20, 3)))
     assert not goes_on(mapper, few)
     for name, value in (
-        ("found", None),
+        ("errors", SimpleNamespace(gap=None)),
         ("start", object()),
         ("maps", SimpleNamespace(given=True)),
         ("config", Config().changed("relocalization.enabled=false")),

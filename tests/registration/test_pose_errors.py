@@ -343,10 +343,10 @@ def test_a_gyro_leaves_its_noise():
 def calibrated(errors, number, map_T_lidar=None, twist=None, x=0.0, last=None, **more):
     """A frame at rest or at ``x``, whatever its matches are."""
     pose, twist = map_T_lidar or gtsam.Pose3(), np.zeros(6) if twist is None else twist
-    update = MapUpdate(number * FRAME, pose, FrameStatus.OK, twist=twist)
-    solution = Solution.unsolved(
-        gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0])), NO_MATCHES, 1, 1
-    )
+    stamp, middle = number * FRAME, gtsam.Pose3(gtsam.Rot3(), np.array([x, 0.0, 0.0]))
+    moment = {"middle_stamp": stamp, "map_T_middle": middle}
+    update = MapUpdate(stamp, pose, FrameStatus.OK, twist=twist, **moment)
+    solution = Solution.unsolved(middle, NO_MATCHES, 1, 1)
     sweep = _Sweep(number * FRAME, SweepMotion.CONSTANT_VELOCITY)
     return errors.calibrated(update, sweep, solution, errors.of_scan(solution, sweep), last, **more)
 
@@ -483,10 +483,11 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     stamp = before.stamp + round(seconds * 1e9)
     posed = PosedSweep(SimpleNamespace(stamp=stamp), np.zeros(6))
     expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed)
+    _, by_motion = errors.gap.bridged(stamp, np.ones(6))
     errors.jumped(expected, replace(posed, twist=np.ones(6)), found, unlike=unlike)
     after = calibrated(errors, 6, found)
     added = np.diag(after.uncertainty.drift - before.uncertainty.drift)
-    expected = 0.5 * np.square(step) if told else np.zeros(6)
+    expected = told * 0.5 * (np.square(step) + np.diag(by_motion))
     np.testing.assert_allclose(added, expected, atol=1e-6)
     # The motion after it is as well known as ever.
     later = calibrated(errors, 7, found)

@@ -42,6 +42,13 @@ class Gap:
     twist: FloatArray
     accelerations: FloatArray
 
+    @classmethod
+    def since(cls, found: MapUpdate, usual: FloatArray) -> Self:
+        """Since a sweep, before which accelerations had ``usual`` mean squares (6,)."""
+        assert found.map_T_middle is not None
+        likely = np.maximum(_USUAL**2 * usual, np.repeat(_LIKELY, 3) ** 2)
+        return cls(found.middle_stamp, found.map_T_middle, found.twist, likely)
+
     def bridged(
         self, stamp: int, twist: FloatArray, turned: gtsam.Rot3 | None = None
     ) -> tuple[gtsam.Pose3, FloatArray]:
@@ -75,11 +82,12 @@ def goes_on(mapper: Mapper, features: Features) -> bool:
 
     In the first sweeps of a map there may be too little of it around without a gap.
     """
-    config, found = mapper.config.relocalization, mapper.found is not None
+    config = mapper.config.relocalization
     allowed = config.enabled and config.new_piece > 0 and not mapper.maps.given
     enough = 2 * mapper.config.solver.min_matches
     many = len(features.edges) + len(features.planes) >= enough
-    return allowed and found and many and (mapper.start is None or mapper.monitor.lost > 0)
+    begun = mapper.start is None or mapper.monitor.lost > 0
+    return allowed and many and begun and mapper.errors.gap is not None
 
 
 class NextPiece:
@@ -96,20 +104,12 @@ class NextPiece:
 
     mapper: Mapper
 
-    def __init__(self, gap: Gap) -> None:
+    def __init__(self, gap: Gap | None) -> None:
+        assert gap is not None  # or no run goes on
         self.gap = gap
         self._last: MapUpdate | None = None  # None before the first sweep
         self._first: list[Features] = []  # sweeps whose place is not known yet
         self._turned: gtsam.Rot3 | None = None  # in the gap, by a gyro
-
-    @classmethod
-    def since(cls, mapper: Mapper) -> Self:
-        """Of sweeps that are not found since the last one that was."""
-        found, usual = mapper.found, mapper.errors.usual_accelerations
-        assert found is not None
-        assert found.map_T_middle is not None
-        likely = np.maximum(_USUAL**2 * usual, np.repeat(_LIKELY, 3) ** 2)
-        return cls(Gap(found.middle_stamp, found.map_T_middle, found.twist, likely))
 
     def add(
         self, beside: Mapper, features: Features, predicted: Prediction,

@@ -145,13 +145,14 @@ class MapError:
         """What other first motions add: see :meth:`_Rivals.told`."""
         self.drift = self.drift + self._rivals.told(self._first, stamp, doubt, parting)
 
-    def add_jump(self, pose: gtsam.Pose3, step: FloatArray) -> None:
+    def add_jump(self, pose: gtsam.Pose3, step: FloatArray, expected: FloatArray) -> None:
         """A pose was found a ``step`` (6,) from the expected one, and may only look alike.
 
-        The mean squared error is half the square of the step, along each axis.
+        The other one is as likely, with its covariance (6, 6) on the left, in map axes. The mean
+        squared error is half the square of the step, along each axis, and half of that.
         """
         in_map = pose.AdjointMap() * step
-        self.drift = self.drift + 0.5 * in_map @ in_map.T
+        self.drift = self.drift + 0.5 * (in_map @ in_map.T + expected)
 
     def add_expected(self, motion: MotionPrior) -> None:
         """A sweep went into the map where it was expected, which nothing else tells."""

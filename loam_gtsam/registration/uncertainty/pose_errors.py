@@ -17,7 +17,7 @@ from loam_gtsam.geometry import symmetric, transform
 from loam_gtsam.imu.preintegration import Fused
 from loam_gtsam.registration.acceleration import Accelerations, Expected
 from loam_gtsam.registration.odometry import Moment, Prediction, Turns, row_seconds
-from loam_gtsam.registration.relocalization import same
+from loam_gtsam.registration.relocalization import Gap, same
 from loam_gtsam.registration.solvers import MotionPrior, Solution
 from loam_gtsam.registration.solvers.gtsam_solver import match_rows
 from loam_gtsam.registration.solvers.scan_error import ScanError, scan_error
@@ -88,6 +88,7 @@ class PoseErrors:
         expected = [config.solver.turn_sigma, config.solver.acceleration_sigma]
         self._motion = Accelerations(config.covariance.window, np.repeat(expected, 3) ** 2)
         self._map, self._own = MapError(config), OwnErrors(config.imu.gyro_noise)
+        self._found: MapUpdate | None = None  # the last update of a sweep that was found
 
     @property
     def accelerations(self) -> Expected | None:
@@ -100,9 +101,9 @@ class PoseErrors:
         return self._map.offset
 
     @property
-    def usual_accelerations(self) -> FloatArray:
-        """(6,) mean squares of the last ones, (rad/s^2)^2 and (m/s^2)^2."""
-        return self._motion.variances
+    def gap(self) -> Gap | None:
+        """The time since the last sweep that was found; None before the first."""
+        return None if self._found is None else Gap.since(self._found, self._motion.variances)
 
     def begin_after(self, before: PoseErrors, uncertain: FloatArray) -> None:
         """Begin another map, so uncertain, (6, 6) on the left, beside what ``before`` holds."""
@@ -152,6 +153,7 @@ class PoseErrors:
         start of the run is over, and None from then on; ``parting`` is the mean square (6, 6) of a
         velocity at which the pose may go on elsewhere, rad/s and m/s, told with these.
         """
+        self._found = update
         if scan is None:
             self._own.cut()
             return update
@@ -209,7 +211,10 @@ class PoseErrors:
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step = before.localCoordinates(pose)
         if unlike or not (same(before, pose) or self._motion.explains(step, now)):
-            self._map.add_jump(pose, step)
+            missed = np.zeros((6, 6))
+            if self.gap is not None:
+                missed = self.gap.bridged(now, posed.twist)[1]
+            self._map.add_jump(pose, step, missed)
         elif np.array_equal(posed.twist, expected.posed.twist):
             self._own.stray(step)
 

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from support.quick import begin_quickly
 
 from loam_gtsam.config import Config
 from loam_gtsam.datasets.arrays import ArrayDataset
@@ -30,18 +31,14 @@ USUAL = np.repeat([0.5, 2.0], 3) ** 2
 @pytest.fixture(scope="module")
 def avenue():
     """At 30 m/s, where hardly anything is seen again after a second."""
-    world = SimulatedWorld("avenue", frames=36, columns=450, start="moving", speed=30.0, imu="mems")
+    world = SimulatedWorld("avenue", frames=34, columns=450, start="moving", speed=30.0)
     return world, list(world)
-
-
-def with_gap(avenue, sweeps, *, imu=False):
-    world, samples = avenue[0], avenue[0].imu if imu else None
-    return ArrayDataset(sweeps, sensor=world.sensor, truth=world.truth, imu=samples)
 
 
 @pytest.fixture(scope="module")
 def result(avenue):
-    return run(with_gap(avenue, avenue[1][:AT] + avenue[1][AGAIN:]), CONFIG)
+    world, sweeps = avenue
+    return run(ArrayDataset(sweeps[:AT] + sweeps[AGAIN:], sensor=world.sensor), CONFIG)
 
 
 def squared_distance(truth, earlier, later):
@@ -90,21 +87,6 @@ def test_both_pieces_are_in_the_map_and_points_belong_to_keyframes_of_their_own(
     assert moved[1][:, 2].max() > result.plane_points[:, 2].max() + 20.0
 
 
-def test_a_checkpoint_holds_the_piece_that_is_not_used_yet(avenue):
-    dataset = with_gap(avenue, avenue[1][:AT] + avenue[1][AGAIN:], imu=True)
-    config = effective_config(CONFIG, dataset)
-    one, two = (Pipeline(config, imu=imu_buffer(dataset, config)) for _ in range(2))
-    sweeps = list(dataset)
-    for sweep in sweeps[: AT + LOST - 1]:
-        one.process(sweep)
-    thaw(freeze(*one.state()), *two.state())
-    for sweep in sweeps[AT + LOST - 1 : AT + LOST + 2]:
-        updates = [pipeline.process(sweep) for pipeline in (one, two)]
-        np.testing.assert_array_equal(*(update.map_T_lidar.matrix() for update in updates))
-        np.testing.assert_array_equal(*(update.covariance for update in updates))
-    assert two.mapper.maps.earlier is not None
-
-
 def test_sweeps_that_do_not_fit_each_other_make_no_piece(avenue):
     rng = np.random.default_rng(1)
     pipeline = Pipeline(effective_config(CONFIG, avenue[0]))
@@ -118,18 +100,42 @@ def test_sweeps_that_do_not_fit_each_other_make_no_piece(avenue):
     assert pipeline.mapper.maps.earlier is None
 
 
-def test_loops_tie_the_pieces():
-    """The lidar is carried back while nothing is seen, and the same street is mapped once more."""
-    world = SimulatedWorld("street_loop", frames=26, columns=450, start="moving", speed=10.0)
-    sweeps = list(world)
-    later = [replace(sweep, stamp=sweep.stamp + round(6e9)) for sweep in sweeps]
-    config = CONFIG.changed("loops.enabled=true", "pose_graph.keyframe_distance=1")
-    result = run(ArrayDataset(sweeps + later, sensor=world.sensor), config)
-    assert any(CONTINUED in update.message for update in result.updates)
-    before, end = (updates[-1] for updates in (result.updates[: len(sweeps)], result.updates))
+@pytest.fixture(scope="module")
+def carried():
+    """Back to where it began while nothing is seen, and then the same way once more."""
+    options = {"start": "moving", "speed": 5.0, "imu": "mems"}
+    world = SimulatedWorld("street_loop", frames=24, columns=450, **options)
+    later = [replace(sweep, stamp=sweep.stamp + round(6e9)) for sweep in world]
+    return ArrayDataset([*world, *later], sensor=world.sensor, imu=world.imu)
+
+
+QUICK = CONFIG.changed("relocalization.new_piece=5")
+"""With :func:`support.quick.begin_quickly` a piece is there after as many sweeps."""
+
+
+def test_loops_tie_the_pieces(carried, monkeypatch):
+    begin_quickly(monkeypatch)
+    config = QUICK.changed("loops.enabled=true", "pose_graph.keyframe_distance=0.5")
+    result = run(carried, config.changed("imu.coupling=off"))
+    assert CONTINUED in result.updates[24 + 4].message
+    before, end = result.updates[24 - 1], result.updates[-1]
     assert end.map_T_lidar.range(before.map_T_lidar) > 20.0
     closed = gtsam.Pose3(result.trajectory.map_T_lidar[-1])
     assert closed.range(before.map_T_lidar) < 0.05
+
+
+def test_a_checkpoint_holds_the_piece_that_is_not_used_yet(carried, monkeypatch):
+    begin_quickly(monkeypatch)
+    config, sweeps = effective_config(QUICK, carried), list(carried)
+    one, two = (Pipeline(config, imu=imu_buffer(carried, config)) for _ in range(2))
+    for sweep in sweeps[12 : 24 + 4]:
+        one.process(sweep)
+    thaw(freeze(*one.state()), *two.state())
+    for sweep in sweeps[24 + 4 : 24 + 6]:
+        updates = [pipeline.process(sweep) for pipeline in (one, two)]
+        np.testing.assert_array_equal(*(update.map_T_lidar.matrix() for update in updates))
+        np.testing.assert_array_equal(*(update.covariance for update in updates))
+    assert two.mapper.maps.earlier is not None
 
 
 def gap(twist=FORWARD, stamp=0):

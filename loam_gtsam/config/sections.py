@@ -191,7 +191,7 @@ class RelocalizationConfig(Section):
     """The radius of the search does not grow beyond this."""
     new_piece: int = parameter(20, low=0, high=1_000_000)
     """After so many sweeps in a row that are not found, the run goes on in another piece of map,
-    that of these sweeps, with a covariance of where it is; 0: never."""
+    that of these sweeps, with a covariance of where it is. With 0 it stays lost."""
 
 
 class MatchingConfig(Section):

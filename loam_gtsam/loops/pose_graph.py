@@ -33,7 +33,15 @@ from loam_gtsam.loops.keyframes import (
 )
 from loam_gtsam.loops.loop_selection import LoopSelection
 from loam_gtsam.loops.own_factors import FactorGraph
-from loam_gtsam.types import Features, FloatArray, InputError, MapUpdate, Trajectory, stack_poses
+from loam_gtsam.types import (
+    Features,
+    FloatArray,
+    InputError,
+    IntArray,
+    MapUpdate,
+    Trajectory,
+    stack_poses,
+)
 
 _ANYWHERE = np.repeat([np.pi, 100.0], 3)  # rad and m: sigmas of the first pose of another run
 
@@ -312,26 +320,43 @@ def _corrections(graph: PoseGraph, session: int) -> list[tuple[int, gtsam.Pose3]
 def corrected_trajectory(
     updates: Sequence[MapUpdate], known: Sequence[tuple[int, gtsam.Pose3]]
 ) -> Trajectory:
-    """The frames of a run where ``known`` has them: stamps in order, and ``map_T_odom`` at each."""
+    """The frames of a run where ``known`` has them: stamps in order, and ``map_T_odom`` at each.
+
+    The corrections of two keyframes differ by the error of the motion between them. A frame there
+    has its share in that, by the drift that is told: after a gap, nearly all of it.
+    """
     good = [update for update in updates if update.status.has_pose]
     stamps = np.array([update.stamp for update in good], np.int64)
     starts = np.array([start for start, _ in known], np.int64)
     nexts = np.searchsorted(starts, stamps, side="right").tolist()
-    poses = [
-        _corrected(update, known[max(after - 1, 0) : after + 1])
-        for update, after in zip(good, nexts, strict=True)
-    ]
+    drifts = _drifts(good, stamps, starts)
+    poses = []
+    for number, (update, after) in enumerate(zip(good, nexts, strict=True)):
+        found = [
+            map_T_odom.compose(update.map_T_lidar)
+            for _, map_T_odom in known[max(after - 1, 0) : after + 1]
+        ]
+        pose = found[0] if found else update.map_T_lidar
+        if len(found) == 2:
+            before, until, now = drifts[1][after - 1], drifts[1][after], drifts[0][number]
+            if until <= before:  # none is told
+                before, until, now = starts[after - 1], starts[after], update.stamp
+            pose = pose.slerp(float((now - before) / (until - before)), found[1])
+        poses.append(pose)
     return Trajectory.from_poses(stamps, poses)
 
 
-def _corrected(update: MapUpdate, around: Sequence[tuple[int, gtsam.Pose3]]) -> gtsam.Pose3:
-    """The pose of a frame between two keyframes or beside one, ``map_T_odom`` of which is known."""
-    pose = update.map_T_lidar
-    found = [map_T_odom.compose(pose) for _, map_T_odom in around]
-    if len(found) < 2:
-        return found[0] if found else pose
-    share = (update.stamp - around[0][0]) / (around[1][0] - around[0][0])
-    return found[0].slerp(share, found[1])
+def _drifts(
+    updates: Sequence[MapUpdate], stamps: IntArray, others: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """The size of the drift at the stamps of frames and at other ones, zero where none is told."""
+    known = [one.uncertainty for one in updates]
+    told = [(n, float(np.trace(one.drift))) for n, one in enumerate(known) if one is not None]
+    if not told:
+        return np.zeros(len(stamps)), np.zeros(len(others))
+    numbers, sizes = zip(*told, strict=True)
+    at = stamps[list(numbers)]
+    return np.interp(stamps, at, sizes), np.interp(others, at, sizes)
 
 
 def _place(graph: PoseGraph, newest: Keyframe) -> int | None:

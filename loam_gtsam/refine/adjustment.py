@@ -179,7 +179,8 @@ def refine(
         sure than they are given weight
     fixes : of a GNSS receiver, on the poses
     ties : what else is known of them, with other variables
-    starts : numbers of the first sweeps of the runs, if there are several
+    starts : numbers of the first sweeps of the runs, if there are several, or of other stretches
+        between which no motion is known
     steps : from the middles to the reference times, as an IMU or the points told them; if None, the
         path through the adjusted poses tells
     on_round : called after each round of the whole, to show progress

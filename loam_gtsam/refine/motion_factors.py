@@ -13,7 +13,7 @@ from loam_gtsam.geometry import symmetric
 from loam_gtsam.loops.batch import SavedGraph, optimize_graph
 from loam_gtsam.loops.keyframes import noise_model
 from loam_gtsam.registration.uncertainty import relative_covariance
-from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate
+from loam_gtsam.types import BoolArray, FloatArray, IntArray, MapUpdate, SweepMotion
 
 _UNKNOWN: FloatArray = np.diag(np.repeat([0.1, 1.0], 3) ** 2)
 """Covariance of a motion to or from a sweep that was not solved."""
@@ -48,7 +48,8 @@ def odometry_factors(
     """Between factors of consecutive sweeps, with the covariances that the run calibrated.
 
     They come from the same points as the planes, so that where the planes decide, they add little
-    that is new; they decide along directions that no plane fixes.
+    that is new; they decide along directions that no plane fixes. After sweeps that were not found,
+    the next one that was is tied to the last one before.
 
     Parameters
     ----------
@@ -63,14 +64,17 @@ def odometry_factors(
     blind = np.eye(6) - keep
     length = _stretches(np.abs(blind).max(axis=(1, 2)) > 0.0)
     graph = gtsam.NonlinearFactorGraph()
+    last: int | None = None  # number of the last one that was found
     for number, (earlier, later) in enumerate(pairwise(updates)):
-        known = earlier.uncertainty is not None and later.uncertainty is not None
-        covariance = relative_covariance(earlier, later) if known else _UNKNOWN
+        last = last if earlier.uncertainty is None else number
+        tied = number if later.uncertainty is None or last is None else last
+        known = later.uncertainty is not None and last is not None
+        covariance = relative_covariance(updates[tied], later) if known else _UNKNOWN
         left_out = blind[number + 1]
         extra = max(length[number + 1] - 1, 0) * left_out @ covariance @ left_out.T
         covariance = symmetric(covariance + extra)
-        motion = gtsam.Pose3(map_T_middle[number]).between(gtsam.Pose3(map_T_middle[number + 1]))
-        keys = gtsam.symbol("x", start + number), gtsam.symbol("x", start + number + 1)
+        motion = gtsam.Pose3(map_T_middle[tied]).between(gtsam.Pose3(map_T_middle[number + 1]))
+        keys = gtsam.symbol("x", start + tied), gtsam.symbol("x", start + number + 1)
         graph.add(gtsam.BetweenFactorPose3(*keys, motion, noise_model(covariance)))
     return graph
 
@@ -95,6 +99,20 @@ def long_motion_factors(
         keys = gtsam.symbol("x", start + first), gtsam.symbol("x", start + last)
         graph.add(gtsam.BetweenFactorPose3(*keys, motion, noise))
     return graph
+
+
+def step_variances(updates: Sequence[MapUpdate]) -> FloatArray:
+    """(N, 6), infinite where nothing is known; of the first sweep a gyro tells the rotation.
+
+    The own error of a frame has the error of this step in it, which so is told to be larger.
+    """
+    found = np.full((len(updates), 6), np.inf)
+    for place, update in enumerate(updates):
+        if update.uncertainty is not None:
+            found[place] = np.diag(update.uncertainty.own)
+    if [update.sweep_motion for update in updates[:2]] == [SweepMotion.GYRO] * 2:
+        found[0, :3] = found[:2, :3].min(axis=0)
+    return found
 
 
 def _stretches(mask: BoolArray) -> IntArray:

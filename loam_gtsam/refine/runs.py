@@ -20,10 +20,17 @@ from loam_gtsam.refine.motion_factors import (
     long_motion_factors,
     loop_factors,
     odometry_factors,
+    step_variances,
     told_directions,
 )
 from loam_gtsam.refine.rounds import Round, Settings
-from loam_gtsam.refine.sweeps import Path, ReferenceSteps, SweepPoints, extract_points
+from loam_gtsam.refine.sweeps import (
+    Path,
+    ReferenceSteps,
+    SweepPoints,
+    extract_points,
+    path_starts,
+)
 from loam_gtsam.refine.ties import FactorTies, FixTies, Survey, own_ties
 from loam_gtsam.registration.uncertainty import relative_covariance
 from loam_gtsam.types import (
@@ -347,6 +354,11 @@ class _Run:
         number = {int(stamp): place for place, stamp in enumerate(stamps)}
         return _Run(points, frames, number, steps, np.array(first), np.array(odometry))
 
+    @property
+    def found(self) -> BoolArray:
+        """(N,) which frames are where their sweeps, or the map, begin or were found."""
+        return np.array([one.status.solved or one.status in _SEEN for one in self.updates])
+
     def from_places(self) -> list[gtsam.Pose3]:
         """Poses of the middles of the sweeps, seen from where the map of the run has its places."""
         return [
@@ -392,22 +404,8 @@ def _to_references(
 ) -> ReferenceSteps:
     """The motion from the middles to the reference times, by the path and as the runs had it."""
     steps = [step.inverse() for run in runs for step in run.to_middle]
-    variances = np.concatenate([_step_variances(run.updates) for run in runs])
+    variances = np.concatenate([step_variances(run.updates) for run in runs])
     return ReferenceSteps.told(before, sweeps, steps, variances)
-
-
-def _step_variances(updates: Sequence[MapUpdate]) -> FloatArray:
-    """(N, 6), infinite where nothing is known; of the first sweep a gyro tells the rotation.
-
-    The own error of a frame has the error of this step in it, which so is told to be larger.
-    """
-    found = np.full((len(updates), 6), np.inf)
-    for place, update in enumerate(updates):
-        if update.uncertainty is not None:
-            found[place] = np.diag(update.uncertainty.own)
-    if [update.sweep_motion for update in updates[:2]] == [SweepMotion.GYRO] * 2:
-        found[0, :3] = found[:2, :3].min(axis=0)
-    return found
 
 
 def _starts(runs: Sequence[_Run]) -> list[int]:
@@ -460,7 +458,8 @@ def _adjusted(
     sweeps = [sweep for run in runs for sweep in run.points.used]
     middles = np.array([sweep.stamp for sweep in sweeps], np.int64)
     first = np.concatenate([run.map_T_middle for run in runs])
-    before = Path.through(middles, first, starts)
+    paths = path_starts([run.found for run in runs])
+    before = Path.through(middles, first, paths)
     # A sweep that the run did not see whole stays as the run had it, relative to its neighbours.
     wholes = [(keep == np.eye(6)).all(axis=(1, 2)) for keep in keeps]
     asked = np.concatenate([
@@ -468,12 +467,11 @@ def _adjusted(
     ])  # fmt: skip
     found = refine(
         sweeps, before.map_T_middle, every, settings,
-        keep=asked, for_covariances=told, fixes=fixes, ties=ties, starts=starts,
+        keep=asked, for_covariances=told, fixes=fixes, ties=ties, starts=paths,
         steps=_to_references(runs, sweeps, before), on_round=on_round, on_window=on_window,
     )  # fmt: skip
     refined = []
     for start, run, whole in zip(starts, runs, wholes, strict=True):
-        solved = [update.status.solved or update.status in _SEEN for update in run.updates]
-        seen: BoolArray = whole & np.array(solved)
+        seen: BoolArray = whole & run.found
         refined.append(RefinedRun(run.points, before, found, run.updates, seen, start))
     return tuple(refined)

@@ -189,7 +189,8 @@ class Path:
     powers : (N, 4, 6) coefficients of t, t^2, t^3, t^4, with t the seconds from the middle: the
         lidar is at ``map_T_middle Exp(xi(t))``, tangent order of the package
     sway : what these miss
-    starts : numbers of the first sweeps of the runs, which have clocks of their own
+    starts : numbers of the first sweeps of the runs, which have clocks of their own, and of other
+        stretches between which no motion is known
     """
 
     map_T_middle: FloatArray
@@ -235,6 +236,15 @@ class Path:
         """``map_T_lidar`` so many seconds from the middle of a sweep."""
         step = self.motion(number, np.array([seconds]))[0]
         return gtsam.Pose3(self.map_T_middle[number]).compose(gtsam.Pose3.Expmap(step))
+
+
+def path_starts(found: Sequence[BoolArray]) -> list[int]:
+    """Numbers of the first sweeps of paths: of runs, and of stretches that were ``found`` or not.
+
+    No motion is known of a stretch that was not, nor to it or from it.
+    """
+    begins = [np.diff(one.astype(np.int8), prepend=2) != 0 for one in found]
+    return np.flatnonzero(np.concatenate(begins)).tolist()
 
 
 def _rows(starts: Sequence[int], count: int) -> list[slice]:

@@ -74,6 +74,12 @@ class Prediction:
     covariance: FloatArray
     across: FloatArray
 
+    @property
+    def covariance_in_map(self) -> FloatArray:
+        """(6, 6) of the pose, left perturbation: along the axes of the map, about its origin."""
+        to_map = self.map_T_lidar.AdjointMap()
+        return symmetric(to_map @ self.covariance @ to_map.T)
+
     def velocity_at(self, map_T_lidar: gtsam.Pose3) -> FloatArray:
         """(3,) m/s of the lidar, map frame: what is expected if this is the pose."""
         away = self.map_T_lidar.localCoordinates(map_T_lidar)

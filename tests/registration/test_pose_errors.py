@@ -482,7 +482,7 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     errors._motion._mean[:] = [0.0, 0.0, usual**2, usual**2, 0.0, 0.0]
     stamp = before.stamp + round(seconds * 1e9)
     posed = PosedSweep(SimpleNamespace(stamp=stamp), np.zeros(6))
-    expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed)
+    expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed, inertial=None)
     _, by_motion = errors.gap.bridged(stamp, np.ones(6))
     errors.jumped(expected, replace(posed, twist=np.ones(6)), found, unlike=unlike)
     after = calibrated(errors, 6, found)
@@ -492,6 +492,23 @@ def test_a_pose_found_where_no_motion_leads_may_be_wrong_by_the_step(
     # The motion after it is as well known as ever.
     later = calibrated(errors, 7, found)
     assert np.abs(relative_covariance(after, later)).max() < 0.1
+
+
+@pytest.mark.parametrize("unlike", [False, True])
+def test_an_imu_tells_what_may_have_happened_unless_the_pose_contradicts_it(unlike, monkeypatch):
+    good = ScanError(1e-6 * np.eye(6), np.zeros((6, 6)), *NONE, np.zeros(6), 1.0, 10.0)
+    monkeypatch.setattr(covariance_module, "scan_error", lambda *_, **__: good)
+    errors = PoseErrors(Config())
+    before = [calibrated(errors, k) for k in range(6)][-1]
+    stamp, step = before.stamp + 10 * FRAME, np.array([0.0, 0.0, 0.0, 5.0, 0.0, 0.0])
+    posed = PosedSweep(SimpleNamespace(stamp=stamp), np.zeros(6))
+    by_imu = SimpleNamespace(covariance_in_map=0.04 * np.eye(6))
+    expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=posed, inertial=by_imu)
+    missed = errors.gap.bridged(stamp, posed.twist)[1] if unlike else by_imu.covariance_in_map
+    found = gtsam.Pose3().retract(step)
+    errors.jumped(expected, posed, found, unlike=unlike)
+    added = calibrated(errors, 15, found).uncertainty.drift - before.uncertainty.drift
+    np.testing.assert_allclose(np.diag(added), 0.5 * (step**2 + np.diag(missed)), rtol=0.01)
 
 
 @pytest.mark.parametrize("kept", [True, False])
@@ -507,7 +524,7 @@ def test_a_sweep_that_was_moved_but_keeps_its_motion_was_hardly_taken_in_that(ke
             calibrated(errors, k)
         before = PosedSweep(SimpleNamespace(stamp=6 * FRAME), np.zeros(6))
         after = before if kept else replace(before, twist=np.ones(6))
-        expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=before)
+        expected = SimpleNamespace(map_T_middle=gtsam.Pose3(), posed=before, inertial=None)
         if moved:
             errors.jumped(expected, after, found, unlike=False)
         own.append(calibrated(errors, 6).uncertainty.own)

@@ -133,9 +133,8 @@ class NextPiece:
                 self._place(beside, features)
                 return self._found_after(beside.monitor)
         uncertain, self._first = np.zeros((6, 6)), [features]
-        if (known := predicted.inertial) is not None:
-            to_map = known.map_T_lidar.AdjointMap()
-            uncertain, self._first = symmetric(to_map @ known.covariance @ to_map.T), []
+        if predicted.inertial is not None:
+            uncertain, self._first = predicted.inertial.covariance_in_map, []
         if (gyro := beside.imu) is not None:
             self._turned = gyro.rotation_between(self.gap.stamp, features.stamp)
         self.mapper = _another(beside, uncertain)

@@ -211,8 +211,10 @@ class PoseErrors:
         before, now = expected.map_T_middle, expected.posed.sweep.stamp
         step = before.localCoordinates(pose)
         if unlike or not (same(before, pose) or self._motion.explains(step, now)):
-            missed = np.zeros((6, 6))
-            if self.gap is not None:
+            missed, inertial = np.zeros((6, 6)), None if unlike else expected.inertial
+            if inertial is not None:
+                missed = inertial.covariance_in_map
+            elif self.gap is not None:
                 missed = self.gap.bridged(now, posed.twist)[1]
             self._map.add_jump(pose, step, missed)
         elif np.array_equal(posed.twist, expected.posed.twist):

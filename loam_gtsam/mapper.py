@@ -206,7 +206,7 @@ class Mapper:
                         self._insert(*expected_at, update.status, update.message, clock)
                     elif self.monitor.lost and can_go_on:
                         self._next = self._next or NextPiece(self.errors.gap)
-                        if found := self._next.add(self, features, predicted, guess, twist):
+                        if found := self._next.add(self, features, predicted):
                             update = found
                             self._go_on(self._next.mapper)
                         clock.lap("relocalize")

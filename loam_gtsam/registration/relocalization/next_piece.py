@@ -111,24 +111,18 @@ class NextPiece:
         self._first: list[Features] = []  # sweeps whose place is not known yet
         self._turned: gtsam.Rot3 | None = None  # in the gap, by a gyro
 
-    def add(
-        self, beside: Mapper, features: Features, predicted: Prediction,
-        guess: gtsam.Pose3 | None, twist: FloatArray | None,
-    ) -> MapUpdate | None:  # fmt: skip
+    def add(self, beside: Mapper, features: Features, predicted: Prediction) -> MapUpdate | None:
         """Map a further sweep; its update if the run is to go on in this piece.
+
+        Its poses are predicted by itself: an odometry may have lost its way as well.
 
         Parameters
         ----------
         beside : in whose map the sweep is not found
         predicted : where it is expected there
-        guess, twist : as given to :meth:`loam_gtsam.mapper.Mapper.register` there
         """
-        assert beside.last is not None
         if self._last is not None:
-            if guess is not None:
-                moved = beside.last.map_T_lidar.between(guess)
-                guess = self._last.map_T_lidar.compose(moved)
-            self._last = self.mapper.register(features, guess, twist)
+            self._last = self.mapper.register(features)
             if self._last.status.solved:
                 self._place(beside, features)
                 return self._found_after(beside.monitor)
@@ -138,7 +132,7 @@ class NextPiece:
         if (gyro := beside.imu) is not None:
             self._turned = gyro.rotation_between(self.gap.stamp, features.stamp)
         self.mapper = _another(beside, uncertain)
-        self._last = self.mapper.register(features, predicted.map_T_lidar, twist)
+        self._last = self.mapper.register(features, predicted.map_T_lidar)
         return None
 
     def _found_after(self, beside: FitMonitor) -> MapUpdate | None:

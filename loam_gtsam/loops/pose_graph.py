@@ -329,7 +329,7 @@ def corrected_trajectory(
     stamps = np.array([update.stamp for update in good], np.int64)
     starts = np.array([start for start, _ in known], np.int64)
     nexts = np.searchsorted(starts, stamps, side="right").tolist()
-    drifts = _drifts(good, stamps, starts)
+    drifts, at_starts = _drifts(good, stamps, starts)
     poses = []
     for number, (update, after) in enumerate(zip(good, nexts, strict=True)):
         found = [
@@ -338,7 +338,7 @@ def corrected_trajectory(
         ]
         pose = found[0] if found else update.map_T_lidar
         if len(found) == 2:
-            before, until, now = drifts[1][after - 1], drifts[1][after], drifts[0][number]
+            before, until, now = at_starts[after - 1], at_starts[after], drifts[number]
             if until <= before:  # none is told
                 before, until, now = starts[after - 1], starts[after], update.stamp
             pose = pose.slerp(float((now - before) / (until - before)), found[1])

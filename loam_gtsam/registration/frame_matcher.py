@@ -88,7 +88,7 @@ class MapPair:
     def begin_after(self, earlier: MapPair) -> None:
         """Take up a run that was in an earlier piece: the next keyframe is the first of this one.
 
-        Until then points belong to the last keyframe of the earlier piece, which is elsewhere.
+        Until then its points have none of their own, and move with one that is elsewhere.
         """
         self.earlier, self._keyframe, self._owned = earlier, earlier.keyframe, False
 

@@ -81,9 +81,7 @@ def test_both_pieces_are_in_the_map_and_points_belong_to_keyframes_of_their_own(
     assert whole["planes"] > maps.planes.count()
     assert maps.earlier is not None  # which stays as it was
     assert maps.layers()["planes"].count() == whole["planes"]
-    moved = result.pipeline.mapper.maps.points(
-        {0: gtsam.Pose3(gtsam.Rot3(), [0, 0, 50.0]).matrix()}
-    )
+    moved = maps.points({0: gtsam.Pose3(gtsam.Rot3(), [0, 0, 50.0]).matrix()})
     assert moved[1][:, 2].max() > result.plane_points[:, 2].max() + 20.0
 
 

@@ -214,8 +214,8 @@ class PoseErrors:
             missed, inertial = np.zeros((6, 6)), None if unlike else expected.inertial
             if inertial is not None:
                 missed = inertial.covariance_in_map
-            elif self.gap is not None:
-                missed = self.gap.bridged(now, posed.twist)[1]
+            elif (gap := self.gap) is not None:
+                missed = gap.bridged(now, posed.twist)[1]
             self._map.add_jump(pose, step, missed)
         elif np.array_equal(posed.twist, expected.posed.twist):
             self._own.stray(step)

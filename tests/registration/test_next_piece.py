@@ -16,6 +16,7 @@ from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
 from loam_gtsam.registration.relocalization import CONTINUED, FitMonitor, Gap, goes_on
 from loam_gtsam.registration.uncertainty import relative_covariance
+from loam_gtsam.studies.evaluation import nees
 from loam_gtsam.types import FrameStatus
 
 AT, AGAIN, LOST = 8, 20, 8
@@ -43,9 +44,7 @@ def result(avenue):
 
 def squared_distance(truth, earlier, later):
     """Squared Mahalanobis distance of the motion between two frames from the true one."""
-    one, two = (gtsam.Pose3(pose) for pose in truth.at([earlier.stamp, later.stamp]).map_T_lidar)
-    away = earlier.map_T_lidar.between(later.map_T_lidar).localCoordinates(one.between(two))
-    return away @ np.linalg.solve(relative_covariance(earlier, later), away)
+    return 6.0 * nees([earlier, later], truth, window=1).mean
 
 
 def test_a_run_goes_on_after_a_gap_and_tells_how_well_it_knows_where(avenue, result):

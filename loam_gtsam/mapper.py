@@ -248,6 +248,7 @@ class Mapper:
             self.last = replace(last, stamp=last.stamp + refusal.clock_step)
             if self._moment is not None:
                 self._moment = self._moment._replace(stamp=self._moment.stamp + refusal.clock_step)
+            self.start = self._next = None  # their sweeps have stamps of before
             self.errors.cut()
         bad, message, fault = FrameStatus.BAD_STAMP, refusal.message, refusal.fault
         return MapUpdate(stamp, last.map_T_lidar, bad, message, twist=last.twist, fault=fault)
@@ -301,10 +302,11 @@ class Mapper:
     def _go_on(self, piece: Mapper) -> None:
         """Go on in another piece of map."""
         piece.maps.begin_after(self.maps)
-        self.maps, self.monitor, self.errors = piece.maps, piece.monitor, piece.errors
-        self.registered, self._moment, self._next = piece.registered, piece._moment, None
+        self.maps, self.start, self.monitor = piece.maps, piece.start, piece.monitor
+        self.errors, self.registered, self._moment = piece.errors, piece.registered, piece._moment
+        self._next = None
         if self.imu and piece.imu:
-            self.imu.__setstate__(piece.imu.__getstate__())
+            self.imu.learn_from(piece.imu)
 
     def _insert(
         self, posed: PosedSweep, map_T_lidar: gtsam.Pose3, status: FrameStatus, message: str,

@@ -58,19 +58,29 @@ def write_results(
     """Replace earlier results by new ones, which took long to compute; returns their names.
 
     ``write`` writes all files into the folder that it is given, and returns their names; for the
-    others see :func:`~loam_gtsam.io.atomic.staged_files`. If that fails, the results are written
-    into a temporary folder, which the OutputError names.
+    others see :func:`~loam_gtsam.io.atomic.staged_files`. If that fails, for whatever reason, the
+    results, or what can be written of them, go into a temporary folder, which the OutputError
+    names.
     """
     try:
         with staged_files(folder, known, last) as new:
             return write(new)
-    except OutputError as problem:
+    except Exception as problem:
+        told = str(problem) if isinstance(problem, OutputError) else repr(problem)
         try:
             there = Path(tempfile.mkdtemp(prefix=f"loam_gtsam_{folder.name}_"))
-            write(there)
-        except (OSError, OutputError):
+        except OSError:
             raise problem from None
-        raise OutputError(f"{problem}. The results were written to {there} instead") from problem
+        try:
+            write(there)
+        except Exception:
+            if not any(there.iterdir()):
+                there.rmdir()
+                raise problem from None
+            told = f"{told}. What could be written of the results is in {there}"
+        else:
+            told = f"{told}. The results were written to {there} instead"
+        raise OutputError(told) from problem
 
 
 def draws_pictures(asked: bool | None) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
 from scipy.spatial.transform import Rotation
 
 from loam_gtsam.io.atomic import write_text
@@ -26,6 +27,9 @@ def write_tum(
 ) -> None:
     """Write ``stamp x y z qx qy qz qw`` per line (TUM format, as evo reads it).
 
+    An attitude that is not known, as that of a prism or an antenna, is written as none at all: the
+    quaternion 0 0 0 1, and a comment.
+
     Parameters
     ----------
     trajectory : stamps become seconds with nine decimals, exactly
@@ -34,9 +38,14 @@ def write_tum(
     """
     check_kind(trajectory, Trajectory, "trajectory", _ORDER)
     notes = dict(comments or {}) | {"columns": f"stamp_s x y z qx qy qz qw ({pose})"}
-    lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
     poses = trajectory.map_T_lidar
-    quaternions = Rotation.from_matrix(poses[:, :3, :3]).as_quat() if len(poses) else []
+    rotations = poses[:, :3, :3].copy()
+    unknown = ~np.isfinite(rotations).all(axis=(1, 2))
+    rotations[unknown] = np.eye(3)
+    if unknown.any():
+        notes["attitude"] = f"not known in {np.count_nonzero(unknown)} lines (0 0 0 1)"
+    lines = [f"# {key}: {' '.join(str(value).split())}" for key, value in notes.items()]
+    quaternions = Rotation.from_matrix(rotations).as_quat() if len(poses) else []
     for stamp, xyz, quaternion in zip(
         trajectory.stamps.tolist(), poses[:, :3, 3], quaternions, strict=True
     ):

@@ -104,6 +104,10 @@ class ImuTracker:
         vars(self).update(state)
         self.buffer.gyro_bias = bias
 
+    def learn_from(self, other: ImuTracker) -> None:
+        """Know what another tracker knows of the same IMU."""
+        self.__setstate__(other.__getstate__() | {"_given_bias": self._given_bias})
+
     @property
     def trusted_gyro(self) -> ImuBuffer | None:
         """The buffer, while its gyro agrees with the scans."""
@@ -238,12 +242,9 @@ class ImuTracker:
         self._coupling.moved(map_T_lidar, self.buffer)
 
     def add_scan(
-        self,
-        posed: PosedSweep,
-        last: Moment | None,
-        solution: Solution,
+        self, posed: PosedSweep, last: Moment | None, solution: Solution,
         alone: tuple[FloatArray, FloatArray] | None = None,
-    ) -> Registration:
+    ) -> Registration:  # fmt: skip
         """Learn from a solved sweep, and bring the IMU into its pose.
 
         ``posed`` has the final motion; ``solution`` and ``last`` are of the middles of this and the

@@ -27,6 +27,20 @@ def test_results_that_cannot_be_written_or_moved_to_their_places_go_elsewhere(pr
     assert written == ["all of it"]
 
 
+def test_what_can_be_written_is_kept_whatever_goes_wrong(tmp_path):
+    def write(there):
+        (there / "results").write_text("most of it")
+        raise ZeroDivisionError("a picture")
+
+    wanted = tmp_path / "wanted"
+    wanted.mkdir()
+    with pytest.raises(OutputError, match=r"ZeroDivisionError\('a picture'\)\. What could be"):
+        write_results(wanted, [], "results", write)
+    written = [path.read_text() for path in tmp_path.glob("loam_gtsam_wanted_*/results")]
+    assert written == ["most of it"]
+    assert not list(wanted.iterdir())
+
+
 def test_if_nothing_can_be_written_the_first_problem_is_told(tmp_path):
     def write(there):
         raise OutputError("disk full")

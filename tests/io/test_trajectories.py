@@ -31,6 +31,18 @@ def test_tum_poses_survive(tmp_path):
     assert first[1].startswith("# columns:")
 
 
+def test_positions_alone_are_written_without_an_attitude(tmp_path):
+    known = winding(3)
+    poses = known.map_T_lidar.copy()
+    poses[1, :3, :3] = np.nan  # of a prism
+    write_tum(tmp_path / "t.tum", Trajectory(known.stamps, poses))
+    assert "# attitude: not known in 1 lines" in (tmp_path / "t.tum").read_text()
+    again = read_tum(tmp_path / "t.tum").map_T_lidar
+    np.testing.assert_allclose(again[[0, 2]], known.map_T_lidar[[0, 2]], atol=1e-9)
+    np.testing.assert_allclose(again[1, :3, 3], poses[1, :3, 3], atol=1e-9)
+    np.testing.assert_array_equal(again[1, :3, :3], np.eye(3))
+
+
 def test_kitti_has_twelve_numbers_a_line(tmp_path):
     trajectory = winding(3)
     write_kitti(tmp_path / "t.txt", trajectory)

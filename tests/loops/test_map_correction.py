@@ -20,6 +20,7 @@ from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.registration.uncertainty import PoseErrors
 from loam_gtsam.types import InputError
+from loam_gtsam.voxels.grid import STEP
 
 UP = np.array([0.0, 0.0, 3.0])
 POSES = there_and_back(np.pi)
@@ -84,7 +85,7 @@ def test_the_map_follows_its_keyframes():
     corrected = np.sort(loops.map_points()[0], axis=0)
     np.testing.assert_allclose(corrected, np.sort(wanted, axis=0), atol=2e-3)
     saved = np.sort(loops.corrected_maps().points()[0], axis=0)
-    np.testing.assert_allclose(saved, corrected, atol=1e-9)
+    np.testing.assert_allclose(saved, corrected, atol=STEP)
     truth = np.array([pose.translation() for pose in POSES])
     odometry = np.array([update.map_T_lidar.translation() for update in updates(POSES, DRIFT)])
     before = np.linalg.norm(odometry - truth, axis=1).max()
@@ -120,7 +121,7 @@ def test_the_newest_keyframe_and_its_points_stay():
     np.testing.assert_allclose(newest.matrix(), last.odom_T_lidar.matrix(), atol=1e-9)
     points = mapper.map_points()[0]
     mark = last.odom_T_lidar.translation() + UP
-    assert np.linalg.norm(points - mark, axis=1).min() < 1e-9
+    assert np.linalg.norm(points - mark, axis=1).min() < STEP
     assert loops.points_moved > 0
 
 

@@ -527,6 +527,19 @@ def test_after_a_reset_the_tracker_is_a_new_one_to_the_last_bit():
         np.testing.assert_array_equal(one, two)
 
 
+def test_what_was_learnt_from_another_tracker_is_forgotten_by_a_reset():
+    tracker = new_tracker(turning(rot3(3, -2, 0), (0.0, 0.0, 0.8), seconds=3.0))
+    given, learnt = tracker.buffer.gyro_bias, np.full(3, 0.01)
+    tracker.buffer.gyro_bias = learnt
+    other = ImuTracker(tracker.config, tracker.buffer)
+    other.first_pose(NOW)
+    tracker.learn_from(other)
+    assert tracker.level is other.level
+    tracker.reset()
+    assert tracker.level is None
+    np.testing.assert_array_equal(tracker.buffer.gyro_bias, given)
+
+
 def test_the_state_of_a_tight_coupling_does_not_grow():
     tracker = tracker_for(accelerating(0.1, seconds=8.0), lag=5)
     sizes = []

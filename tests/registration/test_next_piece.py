@@ -66,6 +66,17 @@ def test_a_run_goes_on_after_a_gap_and_tells_how_well_it_knows_where(avenue, res
     assert (np.sqrt(np.diag(after[-1].covariance))[:3] > 0.05).all()
 
 
+def test_a_start_that_a_gap_interrupts_ends_with_its_piece(avenue):
+    """Its sweeps, of another place, must not be registered with those of the new piece."""
+    world, sweeps = avenue
+    pipeline = Pipeline(effective_config(CONFIG, world))
+    updates = [pipeline.process(sweep) for sweep in sweeps[:4] + sweeps[AGAIN:]]
+    after = [update for update in updates[4:] if update.status is FrameStatus.OK]
+    assert CONTINUED in after[0].message
+    assert pipeline.mapper.start is None
+    assert squared_distance(world.truth, after[0], after[-1]) < 25.0
+
+
 def test_both_pieces_are_in_the_map_and_points_belong_to_keyframes_of_their_own(avenue, result):
     maps = result.pipeline.mapper.maps
     owners, earlier = (

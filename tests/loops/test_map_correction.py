@@ -230,7 +230,7 @@ def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, coupling
     assert_same((whole.mapper, whole.loops, 0), (other.mapper, other.loops, 0))
 
 
-BETWEEN = 2.5  # metres from one sweep to the next
+PACE = 2.5  # metres from one sweep to the next
 
 
 class Drifting:
@@ -242,7 +242,7 @@ class Drifting:
     def solve(self, associate, guess, priors=(), motion=None):
         found = self.solver.solve(associate, guess, priors, motion)
         if self.last is not None:
-            way = min(BETWEEN, self.last.range(found.map_T_lidar))  # a start solves any of its sweeps
+            way = min(PACE, self.last.range(found.map_T_lidar))  # a start solves any of its sweeps
             turn = gtsam.Pose3(gtsam.Rot3.Yaw(0.002 * way), np.zeros(3))
             found = replace(found, map_T_lidar=found.map_T_lidar.compose(turn))
         self.last = found.map_T_lidar
@@ -260,7 +260,7 @@ def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     """Once round a ring, of which 20 m are in view, and on."""
     config = settings(turn_walk_deg=0.2)
     config = config.changed("loops.min_way=60.0", "loops.min_share=0.4", PREDICTED)
-    poses, world = ring(1.15, radius=28.0, step=BETWEEN), World(1)
+    poses, world = ring(1.15, radius=28.0, step=PACE), World(1)
 
     def rounds(closing):
         rng, odometry, jumps = np.random.default_rng(0), [], []

@@ -403,7 +403,8 @@ class FrameMatcher(Matcher):
             return search
         e, p = search.found.edges, search.found.planes
         edges, planes = self.posed.rows(e.indices, p.indices)
-        found = ScanMatches(replace(e, points=edges), replace(p, points=planes))
+        moved = replace(e, points=edges), replace(p, points=planes)
+        found = ScanMatches(*moved, faces=search.found.faces)
         return replace(search, posed=self.posed, found=found)
 
     def _search(self, map_T_lidar: gtsam.Pose3) -> ScanMatches:

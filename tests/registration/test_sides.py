@@ -11,9 +11,11 @@ from support.walls import CONFIG, MAP, MIDDLE, NONE, face, matched
 from loam_gtsam.config import Config
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.frontend.deskew import PosedSweep
 from loam_gtsam.geometry import OBLIQUE_EDGE
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.association import associate
+from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray
 from loam_gtsam.voxels.tags import Faces, second
@@ -228,3 +230,16 @@ def test_what_fills_a_map_is_second_in_no_voxel_of_it() -> None:
     before = small.count()
     small.fill(large)
     assert small.count() == before
+
+
+def test_a_sweep_brings_its_faces_into_the_map_however_it_was_de_skewed(monkeypatch) -> None:
+    brought, insert = [], MapPair.insert
+
+    def noted(maps: MapPair, posed: PosedSweep, pose: gtsam.Pose3, keyframe: int, matches=None):
+        brought.append(matches is not None and matches.faces is not None)
+        insert(maps, posed, pose, keyframe, matches)
+
+    monkeypatch.setattr(MapPair, "insert", noted)
+    run(SimulatedWorld("room", frames=14, columns=450), Config())
+    assert len(brought) > 10
+    assert all(brought[-6:])

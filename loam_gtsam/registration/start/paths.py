@@ -17,6 +17,9 @@ from loam_gtsam.registration.start.ways import EarlySweep, mean_twist
 from loam_gtsam.types import FloatArray, SweepMotion
 
 _APART = 0.5  # durations of a sweep that the middles at least are apart from which a path is told
+_AHEAD = 0.75
+"""Durations after the reference time of the first sweep from which middles count for its path: from
+poses that are nearer to each other than to its middle, a path would be continued backwards."""
 
 
 def on_paths(sweeps: Sequence[EarlySweep], map_T_first: gtsam.Pose3) -> list[EarlySweep]:
@@ -109,7 +112,11 @@ def _parabola(
     begins = min(max(number - 1, 0), len(sweeps) - 3)
     through = [sweep.moment[:2] for sweep in sweeps[begins : begins + 3]]
     if number == 0:
-        through[0] = one.posed.sweep.reference_stamp, map_T_first
+        held, ahead = one.posed.sweep.reference_stamp, _AHEAD * one.posed.sweep.duration
+        later = [at for sweep in sweeps if (at := sweep.moment[:2])[0] - held >= 1e9 * ahead]
+        through = [(held, map_T_first), *later[:2]]
+    if len(through) < 3:
+        return one.posed.twist, np.zeros(6)
     times = np.array([(near - stamp) * 1e-9 for near, _ in through])
     if np.diff(times).min() < _APART * one.posed.sweep.duration:
         return one.posed.twist, np.zeros(6)

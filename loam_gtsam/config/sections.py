@@ -26,8 +26,9 @@ class SensorConfig(Section):
     tries the two in this order, and none maps the sweeps without de-skewing."""
     spin: Literal["auto", "clockwise", "counterclockwise"] = parameter("auto")
     """The lidar rotates in this sense, seen from above; it is used for times from azimuths."""
-    start_azimuth_deg: float = parameter(180.0, unit="degrees", low=-360.0, high=360.0)
-    """A sweep starts at this azimuth, counted from x towards y."""
+    start_azimuth_deg: float | None = parameter(None, unit="degrees", low=-360.0, high=360.0)
+    """A sweep starts at this azimuth, counted from x towards y, for times from azimuths; null takes
+    where rings begin that go all around in the order of firing, else 180."""
     period: float = parameter(0.1, unit="s", low=1e-4, high=1e3)
     """A sweep lasts this long; the duration is used for times from azimuths."""
     stamp: Literal["auto", "start", "middle", "end"] = parameter("auto")

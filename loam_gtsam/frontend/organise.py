@@ -46,6 +46,7 @@ _MAX_OUTLIERS = 0.01
 """Largest fraction of points with implausible times that are dropped without an error."""
 _ONE_WAY = 0.8
 """Least fraction of azimuth steps with the same sign that shows the sense of rotation."""
+_ALL_AROUND = 0.98 * 2.0 * np.pi  # rad
 _SEAM = 0.9
 """Fraction of a turn: between consecutive points of a ring, a larger step crosses the start of the
 sweep."""
@@ -138,6 +139,7 @@ def usable_columns(scan: Scan, config: Config) -> SweepColumns:
     keep: BoolArray = (squared >= np.float32(sensor.min_range) ** 2) & (
         squared <= np.float32(min(sensor.max_range, 1e18)) ** 2
     )
+    keep &= squared > 0.0  # where a driver puts beams that did not return
     times = None if sensor.times in ("azimuth", "none") else scan.times
     if times is not None:
         keep &= _plausible_times(times, keep)
@@ -345,7 +347,9 @@ def _times_from_azimuth(
     same_ring = number[1:] == number[:-1]
     clockwise, in_order, why = _sense(columns.azimuth[order], same_ring, rings, sensor)
     sign = -1.0 if clockwise else 1.0
-    start = np.deg2rad(sensor.start_azimuth_deg)
+    start = None if sensor.start_azimuth_deg is None else np.deg2rad(sensor.start_azimuth_deg)
+    if start is None:
+        start = _beginning(columns.azimuth[order], same_ring) if in_order else np.pi
     turned = columns.azimuth * np.float32(sign / (2.0 * np.pi)) - sign * start / (2.0 * np.pi)
     fraction = (turned - np.floor(turned)).astype(np.float64)
     if in_order:
@@ -355,7 +359,7 @@ def _times_from_azimuth(
     span = (offset * sensor.period, (offset + 1.0) * sensor.period)
     note = (
         f"times from azimuth: {'clockwise' if clockwise else 'counterclockwise'} ({why}) from "
-        f"{sensor.start_azimuth_deg:g} degrees, {sensor.period:g} s, stamp at sweep {moment}"
+        f"{np.rad2deg(start):.4g} degrees, {sensor.period:g} s, stamp at sweep {moment}"
     )
     return TimeAssignment((fraction + offset) * sensor.period, span, "azimuth", note)
 
@@ -382,6 +386,15 @@ def _sense(
         "go down; set sensor.spin, give per-point times, or set sensor.times to none",
         SweepFault.BAD_TIMES,
     )
+
+
+def _beginning(azimuth: NDArray[np.float32], same_ring: BoolArray) -> float:
+    """Azimuth, rad, at which rings begin that go all around; that of Velodyne if none does."""
+    turned = np.concatenate(([0.0], np.cumsum(azimuth_steps(azimuth) * same_ring, dtype=float)))
+    first = run_starts(~same_ring)
+    after = np.append(first[1:], len(azimuth))
+    whole = first[np.abs(turned[after - 1] - turned[first]) >= _ALL_AROUND]
+    return float(np.angle(np.exp(1j * azimuth[whole]).sum())) if len(whole) else np.pi
 
 
 def _seam_turns(fraction: FloatArray, same_ring: BoolArray) -> FloatArray:

@@ -72,7 +72,9 @@ def make_update(
 def problem_of(features: Features) -> tuple[str, SweepFault] | None:
     """The reason why features cannot be used, as a sentence and as a fault; None if usable."""
     points = features.edges, features.planes, features.edge_times, features.plane_times
-    if not all(np.isfinite(part).all() for part in points):
+    told = features.edge_prominence, features.edge_sigmas  # infinite ones say something
+    unknown = any(part is not None and np.isnan(part).any() for part in told)
+    if unknown or not all(np.isfinite(part).all() for part in points):
         return "features of the sweep are NaN or infinite", SweepFault.NOT_FINITE
     if not len(features.edges) + len(features.planes):
         return "the sweep has no features", SweepFault.NO_FEATURES

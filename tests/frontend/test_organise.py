@@ -56,6 +56,18 @@ def test_drops_points_with_all_their_columns() -> None:
     assert np.array_equal(sweep.xyz.T, points[sweep.index])
 
 
+def test_beams_that_did_not_return_are_no_points_at_any_least_range() -> None:
+    points, rings, fraction = firing(VLP16)
+    points[::7] = 0.0
+    scan = Scan(points, 0, times=0.1 * fraction, rings=rings)
+    config = Config().changed("sensor.min_range=0")
+    assert organise(scan, config).dropped == len(points[::7])
+    features = extract_features(scan, config)
+    for part in (features.edge_prominence, features.edge_sigmas):
+        assert part is not None
+        assert np.isfinite(part).all()
+
+
 @pytest.mark.parametrize("offset", [0.2, -0.2])
 def test_takes_an_offset_from_all_ranges(offset: float) -> None:
     points, rings, _ = firing(VLP16)
@@ -313,6 +325,25 @@ def test_times_from_azimuth(clockwise: bool, start_deg: float, stamp: str, offse
     assert sweep.times == pytest.approx(0.2 * (fraction[sweep.index] + offset), abs=1e-6)
     assert sweep.span == pytest.approx((0.2 * offset, 0.2 * (offset + 1.0)))
     assert ("counterclockwise" in sweep.timing.note) != clockwise
+
+
+@pytest.mark.parametrize("clockwise", [True, False])
+@pytest.mark.parametrize("start_deg", [170.0, 45.0, -90.0])
+def test_points_in_firing_order_show_where_a_sweep_begins(
+    clockwise: bool, start_deg: float
+) -> None:
+    points, rings, fraction = firing(VLP16, clockwise, start_deg)
+    rng = np.random.default_rng(1)
+    seen = (rings < 4) | (points[:, 0] > 0.0)  # beams above the ground see things ahead only
+    seen &= rng.random(len(seen)) < 0.9
+    scan = Scan(points[seen], 0, rings=rings[seen])
+    sweep = organise(scan, sensor(times="azimuth"))
+    np.testing.assert_allclose(sweep.times, 0.1 * fraction[seen][sweep.index], atol=5e-4)
+    told = float(sweep.timing.note.split(" from ")[-1].split()[0])
+    assert told == pytest.approx(start_deg, abs=1.0)
+    # Without rings that go all around it is not known.
+    ahead = Scan(points[points[:, 0] > 0.0], 0, rings=rings[points[:, 0] > 0.0])
+    assert "from 180 degrees" in organise(ahead, sensor(times="azimuth")).timing.note
 
 
 def test_sweep_that_overlaps_its_start_keeps_its_order() -> None:

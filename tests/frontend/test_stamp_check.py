@@ -231,8 +231,10 @@ def test_features_that_are_not_finite_are_a_fault(rng):
     mapper = Mapper()
     points = rng.uniform(-5.0, 5.0, (300, 3))
     mapper.register(Features.from_points(0, points[:100], points))
-    for number, name in enumerate(("edges", "planes", "edge_times", "plane_times"), 1):
+    names = "edges", "planes", "edge_times", "plane_times", "edge_prominence", "edge_sigmas"
+    for number, name in enumerate(names, 1):
         features = Features.from_points(number * TENTH, points[:100], points)
+        features = replace(features, edge_prominence=np.ones(100), edge_sigmas=np.ones(100))
         spoilt = getattr(features, name).copy()
         spoilt[7] = np.nan
         update = mapper.register(replace(features, **{name: spoilt}))

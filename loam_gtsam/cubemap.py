@@ -198,12 +198,12 @@ class CubeMap:
             If the array is not (N, 3) floats, all finite; the map is then unchanged.
         """
         points = as_points(points_map, "points_map")
-        content = CubePoints.at(points, tags_of(len(points), self.owner))
+        tags = tags_of(len(points), self.owner)
         if seen_from is not None and self._config.insertion == "settled":
-            look(content.tags, points, seen_from)
+            look(tags, points, seen_from)
             if faces is not None:
-                mark_second(content, faces, self._cubes, self._grid)
-        self.insert_sorted(self.sorted(content))
+                mark_second(CubePoints(points, tags), faces, self._cubes, self._grid)
+        self.insert_sorted(self.sorted(CubePoints(points, tags)))
 
     def sorted(self, content: CubePoints, *, archive: bool = False) -> SortedPoints | None:
         """Points for :meth:`insert_sorted`; None if no point is inside the window.
@@ -213,7 +213,7 @@ class CubeMap:
         new, away, beyond = SortedPoints.inside(content, self._window, self._grid)
         if archive:
             self._archive.settle(away)
-        self._outside += beyond + (0 if archive else len(away.steps))
+        self._outside += beyond + (0 if archive else len(away.points))
         return new
 
     def insert_sorted(self, new: SortedPoints | None, *, settle: bool = False) -> None:
@@ -251,7 +251,7 @@ class CubeMap:
         for owner in owners.tolist():
             moved = content.of(owner).moved(moves[owner])
             self.insert_sorted(self.sorted(moved, archive=True))
-        return len(content.steps)
+        return len(content.points)
 
     def give_to(self, owner: int) -> None:
         """Let all points of the window belong to an owner."""

@@ -238,7 +238,7 @@ def import_cloud(
         tags = tags_of(len(found), 0)
         tags[:, 0] = tree.query(found)[1] if len(found) else 0
         archive = Archive(grid, np.inf, None)
-        archive.settle(CubePoints.at(found, tags))
+        archive.settle(CubePoints(found, tags))
         contents[layer] = dict(sorted(archive.contents()))
     poses = [place.map_T_middle for place in places]
     links = [
@@ -247,7 +247,7 @@ def import_cloud(
     ]
     frame = MapFrame(up=np.array([0.0, 0.0, 1.0]))
     write_map(path, contents, MapGraph(places, links, []), config, frame)
-    kept = [sum(len(c.steps) for c in contents[layer].values()) for layer in ("edges", "planes")]
+    kept = [sum(len(c.points) for c in contents[layer].values()) for layer in ("edges", "planes")]
     return ImportedCloud(shift, kept[0], kept[1], len(places))
 
 

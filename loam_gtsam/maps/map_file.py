@@ -42,15 +42,14 @@ from loam_gtsam.voxels.grid import CubeIndex, Grid
 
 SUFFIX = ".lgmap"
 MAP_FILE = f"map{SUFFIX}"
-VERSION = 4
+VERSION = 3
 LAYERS = "edges", "planes", "small_edges", "small_planes"
 _FORMAT = "loam_gtsam map"
 _HEADER = "map.json"
 _CLOUDS = ".ply", ".pcd", ".las", ".laz"
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same map makes the same file
-_POINT = np.dtype([("steps", "<i4", 3), ("owner", "<i4"), ("view", "i1", 4)])
-"""A map point: coordinates in units of 2^-14 m (voxels/grid.py), the number of its place, and from
-where it was seen (voxels/tags.py)."""
+_POINT = np.dtype([("xyz", "<f8", 3), ("owner", "<i4"), ("view", "i1", 4)])
+"""A map point: metres, the number of its place, from where it was seen (voxels/tags.py)."""
 _FARTHEST = 1e12
 """Beyond all numbers of a map; their voxels still have numbers."""
 
@@ -163,7 +162,7 @@ def write_map(
         "config": config_to_dict(config),
         **graph.sizes,
         "layers": {
-            name: [[*index, len(cube.steps)] for index, cube in cubes.items()]
+            name: [[*index, len(cube.points)] for index, cube in cubes.items()]
             for name, cubes in contents.items()
         },
     }
@@ -296,7 +295,7 @@ class SavedMap:
         except DAMAGED as error:
             raise self._damaged(name, error) from error
         tags = np.column_stack([rows["owner"], rows["view"].view("<i4")[:, 0]]).astype(np.int32)
-        return CubePoints(rows["steps"].astype(np.int32), tags)
+        return CubePoints(np.ascontiguousarray(rows["xyz"]), tags)
 
     def points(self) -> tuple[FloatArray, FloatArray]:
         """Edge and plane points of the whole map but those of small places, (E, 3) and (P, 3)."""
@@ -373,8 +372,8 @@ class SavedMap:
 
 def _rows(cube: CubePoints) -> NDArray[Any]:
     """The points of a cube as they are in the file."""
-    rows = np.zeros(len(cube.steps), _POINT)
-    rows["steps"] = cube.steps
+    rows = np.zeros(len(cube.points), _POINT)
+    rows["xyz"] = cube.points
     rows["owner"] = cube.tags[:, 0]
     rows["view"] = np.ascontiguousarray(cube.tags[:, 1:], "<i4").view(np.int8)
     return rows

@@ -431,4 +431,4 @@ def _carried(content: CubePoints, moves: np.ndarray) -> CubePoints:
     move = moves[content.tags[:, 0]]
     tags = content.tags.copy()
     turn(tags, move[:, :3, :3])
-    return CubePoints.at(transform_each(move, content.points), tags)
+    return CubePoints(transform_each(move, content.points), tags)

@@ -247,7 +247,7 @@ def _owned(
     tags = tags_of(len(points), owners)
     if origins is not None:
         look(tags, points, origins[owners])
-    return cubes.sorted(CubePoints.at(points, tags))
+    return cubes.sorted(CubePoints(points, tags))
 
 
 def _points(cubes: CubeMap, small: CubeMap) -> FloatArray:

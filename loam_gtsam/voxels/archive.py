@@ -19,7 +19,7 @@ from loam_gtsam.voxels.grid import CubeIndex, Grid
 from loam_gtsam.voxels.tags import Owners
 
 _log = logging.getLogger(__name__)
-_COLUMNS = 5  # of a file: the steps of a point and its tags
+_COLUMNS = 5  # of a file: a point and its tags
 
 
 class Archive:
@@ -100,7 +100,7 @@ class Archive:
     def count(self) -> int:
         """Points in the archive."""
         on_disk = sum(count for count, _ in self._disk.values())
-        return sum(len(held.steps) for held in self._memory.values()) + on_disk
+        return sum(len(held.points) for held in self._memory.values()) + on_disk
 
     def store(self, index: CubeIndex, content: CubePoints) -> None:
         """Keep a cube that is not in the archive; the oldest cubes make room for it."""
@@ -119,13 +119,13 @@ class Archive:
             # Mapped, so that a damaged header cannot claim more memory than the file has bytes.
             rows = np.load(path, mmap_mode="r", allow_pickle=False)
             expected = (count, _COLUMNS)
-            if rows.shape != expected or rows.dtype != np.int32:
-                raise ValueError(f"expected {expected} int32, got {rows.shape} {rows.dtype}")
+            if rows.shape != expected or rows.dtype != np.float64:
+                raise ValueError(f"expected {expected} float64, got {rows.shape} {rows.dtype}")
         except DAMAGED as error:
             del self._disk[index]
             self._drop(count, f"cannot read {path}: {error}")
             return None
-        return CubePoints(*(np.array(part, order="C") for part in (rows[:, :3], rows[:, 3:])))
+        return CubePoints(np.array(rows[:, :3], order="C"), rows[:, 3:].astype(np.int32))
 
     def contents(self) -> Iterator[tuple[CubeIndex, CubePoints]]:
         """The readable cubes and their points, in the order of :meth:`indices`."""
@@ -161,7 +161,7 @@ class Archive:
 
     def settle(self, content: CubePoints) -> None:
         """Add points within the grid's limit to archived cubes where voxels are free."""
-        if len(content.steps) == 0:
+        if len(content.points) == 0:
             return
         new = SortedPoints.of(content, self._grid.cells(content.points.T), self._grid)
         for index, part in new.firsts().items():
@@ -171,10 +171,10 @@ class Archive:
 
     def _spill(self, index: CubeIndex, content: CubePoints) -> None:
         """Write a cube to disk; without a folder it is lost."""
-        count = len(content.steps)
+        points = content.points
         self._bytes -= content.nbytes
         if self._folder is None:
-            self._drop(count, "archive_megabytes is used up and archive_dir is not set")
+            self._drop(len(points), "archive_megabytes is used up and archive_dir is not set")
             return
         path = self._folder / "cube_{}_{}_{}.npy".format(*index)
         while path in (self._stale or ()):  # what is remembered may need the old file
@@ -185,9 +185,9 @@ class Archive:
                 np.save(file, np.column_stack(content), allow_pickle=False)
             os.replace(temporary, path)  # a file under its final name is always whole
         except OSError as error:
-            self._drop(count, f"cannot write {path}: {error}")
+            self._drop(len(points), f"cannot write {path}: {error}")
         else:
-            self._disk[index] = count, path
+            self._disk[index] = len(points), path
 
     def _drop(self, n_points: int, reason: str) -> None:
         """Count a loss; say it once, as a full disk would say it for every cube."""

@@ -9,49 +9,34 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from loam_gtsam.geometry import find_in_sorted, run_starts, transform
 from loam_gtsam.types import BoolArray, FloatArray, IntArray
-from loam_gtsam.voxels.grid import MOST_STEPS, STEP, CubeIndex, Grid, Window, cube_index
+from loam_gtsam.voxels.grid import CubeIndex, Grid, Window, cube_index
 from loam_gtsam.voxels.key_table import Columns, KeyTable
 from loam_gtsam.voxels.tags import Faces, Owners, Tags, second, sines, tags_of, turn, views
 
 NO_POINTS: FloatArray = np.empty((0, 3))
-Steps = NDArray[np.int32]
-"""(N, 3) coordinates of map points, map frame, in units of :data:`loam_gtsam.voxels.grid.STEP`."""
 _NO_KEYS: IntArray = np.empty(0, np.int64)
-_NO_STEPS: Steps = np.empty((0, 3), np.int32)
 _NO_TAGS = tags_of(0, 0)
 _SECOND = np.int64(-(1 << 63))
 """The sign bit: it is set in the keys of points that are second in their voxels."""
 
 
 class CubePoints(NamedTuple):
-    """Points of cubes, (N, 3), and their tags, (N, 2)."""
+    """Points of cubes, (N, 3) metres, and their tags, (N, 2)."""
 
-    steps: Steps
+    points: FloatArray
     tags: Tags
-
-    @classmethod
-    def at(cls, points: FloatArray, tags: Tags) -> CubePoints:
-        """Points (N, 3), metres, to the next step; those too far away come beyond all grids."""
-        steps = np.rint(points / STEP).clip(-MOST_STEPS, MOST_STEPS)
-        return cls(steps.astype(np.int32), tags)
-
-    @property
-    def points(self) -> FloatArray:
-        """(N, 3) metres, map frame."""
-        return np.multiply(self.steps, STEP, dtype=np.float64)
 
     @property
     def nbytes(self) -> int:
         """Bytes."""
-        return self.steps.nbytes + self.tags.nbytes
+        return self.points.nbytes + self.tags.nbytes
 
     def chosen(self, which: BoolArray | IntArray) -> CubePoints:
         """The points for which a mask is true, or those of some rows."""
-        return CubePoints(self.steps[which], self.tags[which])
+        return CubePoints(self.points[which], self.tags[which])
 
     def of(self, owner: int) -> CubePoints:
         """The points of one owner."""
@@ -61,13 +46,13 @@ class CubePoints(NamedTuple):
         """The points after a rigid transform (4, 4)."""
         tags = self.tags.copy()
         turn(tags, move[:3, :3])
-        return CubePoints.at(transform(move, self.points), tags)
+        return CubePoints(transform(move, self.points), tags)
 
     def without_seconds(self) -> CubePoints:
         """The points for other voxels, where none of them is known to be second."""
         tags = self.tags.copy()
         views(tags)[..., 3] = 0
-        return CubePoints(self.steps, tags)
+        return CubePoints(self.points, tags)
 
     def keys(self, grid: Grid) -> IntArray:
         """(N,) under which cubes hold the points."""
@@ -80,17 +65,19 @@ class VoxelPoints(NamedTuple):
     """Ascending keys (V,) of voxels, a point (V, 3) of each, and the tags (V, 2) of the points."""
 
     keys: IntArray
-    steps: Steps
+    points: FloatArray
     tags: Tags
 
 
 class VoxelSums(NamedTuple):
-    """Sums (V, 3) of the steps and counts (V,) of the points of voxels, by ascending key (V,)."""
+    """Sums (V, 3), bounds (V, 3) and counts (V,) of the points of voxels, by ascending key (V,)."""
 
     keys: IntArray
     tags: Tags
-    sums: IntArray
-    counts: IntArray
+    sums: FloatArray
+    lows: FloatArray
+    highs: FloatArray
+    counts: FloatArray
 
 
 class Cube(KeyTable):
@@ -99,9 +86,9 @@ class Cube(KeyTable):
     __slots__ = ()
 
     def __init__(
-        self, keys: IntArray = _NO_KEYS, steps: Steps = _NO_STEPS, tags: Tags = _NO_TAGS
+        self, keys: IntArray = _NO_KEYS, points: FloatArray = NO_POINTS, tags: Tags = _NO_TAGS
     ) -> None:
-        super().__init__(keys, steps, tags)
+        super().__init__(keys, points, tags)
 
     @classmethod
     def of(cls, content: CubePoints, grid: Grid) -> Cube:
@@ -113,7 +100,8 @@ class Cube(KeyTable):
     @property
     def points(self) -> FloatArray:
         """(N, 3) metres, in the order of their keys."""
-        return self.content.points
+        points: FloatArray = self.columns[1]
+        return points
 
     @property
     def content(self) -> CubePoints:
@@ -129,7 +117,7 @@ class Cube(KeyTable):
     def settle(self, new: VoxelPoints) -> CubePoints:
         """Add the points whose places in their voxels are free, and return them."""
         added = self.add(*new)
-        return CubePoints(new.steps.take(added, axis=0), new.tags.take(added, axis=0))
+        return CubePoints(new.points.take(added, axis=0), new.tags.take(added, axis=0))
 
     def average(self, new: VoxelSums) -> None:
         """Put into each voxel the mean of its point, if it has one, and the new ones.
@@ -138,10 +126,13 @@ class Cube(KeyTable):
         """
         keys, held = self.columns[:2]
         at, taken = find_in_sorted(keys, new.keys)
-        new.sums[taken] += held[at[taken]]
-        new.counts[taken] += 1
-        # Between the least and the largest step of the points, and so in their voxel and cube.
-        means = np.rint(new.sums / new.counts[:, None]).astype(np.int32)
+        old = held[at[taken]]
+        new.sums[taken] += old
+        new.counts[taken] += 1.0
+        new.lows[taken] = np.minimum(new.lows[taken], old)
+        new.highs[taken] = np.maximum(new.highs[taken], old)
+        # Rounding may put a mean just outside its points, and so into another voxel or cube.
+        means = np.clip(new.sums / new.counts[:, None], new.lows, new.highs)
         held = held.copy()
         held[at[taken]] = means[taken]
         self._put(keys, held, *self.columns[2:])
@@ -185,10 +176,9 @@ def mark_second(
     content: CubePoints, faces: Faces, cubes: Mapping[CubeIndex, Cube], grid: Grid
 ) -> None:
     """Mark points as second if the first ones of their voxels are on the other side of a face."""
-    points = content.chosen(faces.rows).points
-    near = grid.reaches(points.T)
+    near = grid.reaches(content.points[faces.rows].T)
     rows, normals, least = faces.rows[near], faces.normals[near], faces.least[near]
-    points = points[near]
+    points = content.points[rows]
     cells, keys = grid.cells(points), grid.keys(points)
     held = tags_of(len(rows), 0)
     for cell in set(map(tuple, cells.tolist())):
@@ -242,13 +232,13 @@ class SortedPoints(NamedTuple):
         if not inside.all():
             away = content.chosen(within & ~inside)
             content, cells = content.chosen(inside), cells[:, inside]
-        new = cls.of(content, cells, grid) if len(content.steps) else None
+        new = cls.of(content, cells, grid) if len(content.points) else None
         return new, away, int(np.count_nonzero(~within))
 
     def chosen(self, rows: IntArray) -> SortedPoints:
         """Some of the points, in the order of ``rows``."""
-        steps, tags = self.content  # ``take`` is several times faster than an index on rows
-        content = CubePoints(steps.take(rows, axis=0), tags.take(rows, axis=0))
+        points, tags = self.content  # ``take`` is several times faster than an index on rows
+        content = CubePoints(points.take(rows, axis=0), tags.take(rows, axis=0))
         return self._replace(content=content, keys=self.keys[rows], numbers=self.numbers[rows])
 
     def without(self, owner: int) -> SortedPoints | None:
@@ -270,19 +260,21 @@ class SortedPoints(NamedTuple):
     def firsts(self) -> dict[CubeIndex, VoxelPoints]:
         """The first point of each voxel, by cube."""
         starts, parts = self.voxels()
-        keys, steps = self.keys[starts], self.content.steps.take(starts, axis=0)
+        keys, points = self.keys[starts], self.content.points.take(starts, axis=0)
         tags = self.content.tags.take(starts, axis=0)
         return {
-            index: VoxelPoints(keys[part], steps[part], tags[part]) for index, part in parts.items()
+            index: VoxelPoints(keys[part], points[part], tags[part])
+            for index, part in parts.items()
         }
 
     def sums(self) -> dict[CubeIndex, VoxelSums]:
         """Sums over the points of each voxel, by cube."""
         starts, parts = self.voxels()
-        steps, tags = self.content
-        sums = np.add.reduceat(steps, starts, axis=0, dtype=np.int64)
-        counts = np.diff(np.append(starts, len(steps)))
-        columns: Columns = self.keys[starts], tags.take(starts, axis=0), sums, counts
+        points, tags = self.content
+        hows = np.add, np.minimum, np.maximum
+        sums = (how.reduceat(points, starts, axis=0) for how in hows)
+        counts = np.diff(np.append(starts, len(points))).astype(np.float64)
+        columns: Columns = self.keys[starts], tags.take(starts, axis=0), *sums, counts
         return {
             index: VoxelSums(*(column[part] for column in columns)) for index, part in parts.items()
         }

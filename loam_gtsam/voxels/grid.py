@@ -19,11 +19,6 @@ _CORNERS = np.array(list(product((-0.5, 0.5), repeat=3))).T[:, None]
 """(3, 1, 8) corners of a cube of unit size, from its centre."""
 _MOST_VOXELS = (1 << 20) - 1
 """Voxels on either side of the origin that ``voxel_keys`` tells apart."""
-STEP = 2.0**-14
-"""Metres, 0.06 mm: coordinates of map points are multiples of it, in four bytes. As a power of two
-it adds no rounding of its own."""
-MOST_STEPS = (1 << 31) - 1
-"""That four bytes hold."""
 
 
 class Grid(NamedTuple):
@@ -39,11 +34,10 @@ class Grid(NamedTuple):
 
     @property
     def limit(self) -> float:
-        """Metres from the origin along an axis up to which there are points whatever the others."""
+        """Metres from the origin along an axis up to which there are voxels whatever the others."""
         most = _MOST_VOXELS * self.voxel_size
         # (2, 2, -1) / 3 times (1, 1, -1) is 5 / 3.
-        voxels = 0.6 * OBLIQUE_EDGE * most if self.oblique else most
-        return min(voxels, MOST_STEPS * STEP)
+        return 0.6 * OBLIQUE_EDGE * most if self.oblique else most
 
     def keys(self, points: FloatArray) -> IntArray:
         """(N,) keys of the voxels of points (N, 3)."""
@@ -59,8 +53,9 @@ class Grid(NamedTuple):
         position = as_vector(position, "position")
         if np.abs(position).max() >= self.limit:
             raise InputError(
-                f"position: expected coordinates within {self.limit:.0f} m of the map origin (its "
-                f"grid ends there), got {position.tolist()}; start the map nearer"
+                f"position: expected coordinates within {self.limit:.0f} m of the map origin (the "
+                f"voxel grid ends there), got {position.tolist()}; start the map nearer, or use a "
+                "larger voxel"
             )
         return cube_index(self.cells(position))
 

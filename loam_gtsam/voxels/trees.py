@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from loam_gtsam.types import FloatArray, IntArray
 from loam_gtsam.voxels.cubes import Cube, CubePoints
 from loam_gtsam.voxels.grid import CubeIndex
-from loam_gtsam.voxels.tags import Tags, Views, tags_of, views
+from loam_gtsam.voxels.tags import Views, tags_of, views
 
 _RECENT = 0.1
 """A tree is rebuilt when the points added since exceed this share of the points in it."""
@@ -62,7 +62,7 @@ class Tree:
     @property
     def content(self) -> CubePoints:
         """The points and their tags."""
-        return CubePoints.at(self._points[:-1], self._tags[:-1])
+        return CubePoints(self._points[:-1], self._tags[:-1])
 
     def nearest(
         self, queries: FloatArray, k: int, max_distance: float
@@ -71,10 +71,10 @@ class Tree:
         distances, found = self._tree.query(queries, k, distance_upper_bound=max_distance)
         return distances.reshape(-1, k), found.reshape(-1, k)
 
-    def at(self, rows: IntArray) -> tuple[FloatArray, Tags]:
+    def at(self, rows: IntArray) -> CubePoints:
         """Points (..., 3) and tags (..., 2) at rows (...); those of negative rows mean nothing."""
         points = self._points.take(rows, axis=0, mode="clip")
-        return points, self._tags.take(rows, axis=0, mode="clip")
+        return CubePoints(points, self._tags.take(rows, axis=0, mode="clip"))
 
 
 class CubeTrees:
@@ -100,7 +100,7 @@ class CubeTrees:
 
     def add(self, points: Mapping[CubeIndex, CubePoints]) -> None:
         """Take in points that were added to cubes; cubes that are not searched do not matter."""
-        new = [part for index, part in points.items() if index in self.cubes and len(part.steps)]
+        new = [part for index, part in points.items() if index in self.cubes and len(part.points)]
         if new:
             self._recent += new
             self._recent_tree = None
@@ -108,7 +108,7 @@ class CubeTrees:
     @property
     def is_stale(self) -> bool:
         """Whether a new tree of all the points is due."""
-        return sum(len(part.steps) for part in self._recent) > _RECENT * len(self._tree)
+        return sum(len(part.points) for part in self._recent) > _RECENT * len(self._tree)
 
     def nearest(self, queries: FloatArray, k: int, max_distance: float) -> Neighbours:
         """As :meth:`loam_gtsam.cubemap.CubeMap.nearest`, in these cubes."""

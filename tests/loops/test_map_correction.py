@@ -20,7 +20,6 @@ from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.registration.solvers import GtsamSolver
 from loam_gtsam.registration.uncertainty import PoseErrors
 from loam_gtsam.types import InputError
-from loam_gtsam.voxels.grid import STEP
 
 UP = np.array([0.0, 0.0, 3.0])
 POSES = there_and_back(np.pi)
@@ -85,7 +84,7 @@ def test_the_map_follows_its_keyframes():
     corrected = np.sort(loops.map_points()[0], axis=0)
     np.testing.assert_allclose(corrected, np.sort(wanted, axis=0), atol=2e-3)
     saved = np.sort(loops.corrected_maps().points()[0], axis=0)
-    np.testing.assert_allclose(saved, corrected, atol=STEP)
+    np.testing.assert_allclose(saved, corrected, atol=1e-9)
     truth = np.array([pose.translation() for pose in POSES])
     odometry = np.array([update.map_T_lidar.translation() for update in updates(POSES, DRIFT)])
     before = np.linalg.norm(odometry - truth, axis=1).max()
@@ -121,7 +120,7 @@ def test_the_newest_keyframe_and_its_points_stay():
     np.testing.assert_allclose(newest.matrix(), last.odom_T_lidar.matrix(), atol=1e-9)
     points = mapper.map_points()[0]
     mark = last.odom_T_lidar.translation() + UP
-    assert np.linalg.norm(points - mark, axis=1).min() < STEP
+    assert np.linalg.norm(points - mark, axis=1).min() < 1e-9
     assert loops.points_moved > 0
 
 
@@ -230,7 +229,7 @@ def test_a_run_with_loops_goes_on_or_begins_anew_to_the_last_bit(begin, coupling
     assert_same((whole.mapper, whole.loops, 0), (other.mapper, other.loops, 0))
 
 
-PACE = 2.5  # metres from one sweep to the next
+STEP = 2.5  # metres from one sweep to the next
 
 
 class Drifting:
@@ -242,7 +241,7 @@ class Drifting:
     def solve(self, associate, guess, priors=(), motion=None):
         found = self.solver.solve(associate, guess, priors, motion)
         if self.last is not None:
-            way = min(PACE, self.last.range(found.map_T_lidar))  # a start solves any of its sweeps
+            way = min(STEP, self.last.range(found.map_T_lidar))  # a start solves any of its sweeps
             turn = gtsam.Pose3(gtsam.Rot3.Yaw(0.002 * way), np.zeros(3))
             found = replace(found, map_T_lidar=found.map_T_lidar.compose(turn))
         self.last = found.map_T_lidar
@@ -260,7 +259,7 @@ def test_a_run_that_drifts_is_corrected_and_goes_on_without_a_jump():
     """Once round a ring, of which 20 m are in view, and on."""
     config = settings(turn_walk_deg=0.2)
     config = config.changed("loops.min_way=60.0", "loops.min_share=0.4", PREDICTED)
-    poses, world = ring(1.15, radius=28.0, step=PACE), World(1)
+    poses, world = ring(1.15, radius=28.0, step=STEP), World(1)
 
     def rounds(closing):
         rng, odometry, jumps = np.random.default_rng(0), [], []

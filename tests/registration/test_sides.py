@@ -18,7 +18,6 @@ from loam_gtsam.registration.association import associate
 from loam_gtsam.registration.frame_matcher import MapPair
 from loam_gtsam.studies.evaluation import absolute_error
 from loam_gtsam.types import FloatArray
-from loam_gtsam.voxels.grid import STEP
 from loam_gtsam.voxels.tags import Faces, second
 
 FRONT, BACK = np.array([0.0, -2.0, 0.0]), np.array([0.0, 2.2, 0.0])  # positions of the lidar
@@ -59,7 +58,7 @@ def test_of_both_faces_the_visible_one_is_matched(y: float, lidar: FloatArray) -
     matches = matched(planes, points, lidar)
     assert len(matches.planes) == len(points)
     np.testing.assert_allclose(np.abs(matches.planes.normals[:, 1]), 1.0, atol=1e-9)
-    np.testing.assert_allclose(matches.planes.distances, 0.0, atol=STEP)
+    np.testing.assert_allclose(matches.planes.distances, 0.0, atol=1e-9)
     # Without views the planes lie between the faces.
     blind = matched(wall((0.0, None), (THICKNESS, None)), points, lidar)
     assert np.abs(blind.planes.distances).mean() > 0.03
@@ -131,7 +130,7 @@ def test_the_second_face_enters_voxels_that_the_first_one_holds() -> None:
     points = at(0.1 + THICKNESS)
     found = matched(planes, points, BACK).planes
     assert len(found) > 0.6 * len(points) > len(matched(first_only, points, BACK).planes)
-    np.testing.assert_allclose(found.distances, 0.0, atol=STEP)
+    np.testing.assert_allclose(found.distances, 0.0, atol=1e-9)
     # A second time there is no place left, nor anything new.
     planes.insert(behind, BACK, matches.faces)
     assert planes.count() <= 2 * held

@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.cubes import SMALL, moved_by, stored
+from support.cubes import SMALL, moved_by
 
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import OBLIQUE_EDGE, voxel_keys
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ConfigError
-from loam_gtsam.voxels.grid import STEP
 
 
 @pytest.fixture
@@ -64,12 +63,12 @@ def test_two_maps_share_an_archive_folder(tmp_path: Path) -> None:
         cube_map.recenter(np.array([100.0, 0.0, 0.0]))
     for shift, cube_map in enumerate(maps):
         cube_map.recenter(np.zeros(3))
-        np.testing.assert_array_equal(cube_map.points(), stored([[0.1 * shift, 0.0, 0.0]]))
+        np.testing.assert_array_equal(cube_map.points(), [[0.1 * shift, 0.0, 0.0]])
 
 
 def test_budget_drops_the_oldest_counts_and_says_so(caplog: pytest.LogCaptureFixture) -> None:
-    """Each stop leaves one cube of 7 points, 140 bytes; two of them fit into 300 bytes."""
-    cube_map = CubeMap(SMALL.changed(archive_megabytes=300e-6), 0.5 / OBLIQUE_EDGE)
+    """Each stop leaves one cube of 7 points, 224 bytes; two of them fit into 500 bytes."""
+    cube_map = CubeMap(SMALL.changed(archive_megabytes=500e-6), 0.5 / OBLIQUE_EDGE)
     heap = np.arange(-1.4, 1.7, 0.5)[:, None] * np.ones(3)
     with caplog.at_level(logging.WARNING, logger="loam_gtsam.cubemap"):
         for stop in range(5):
@@ -160,13 +159,13 @@ def test_moved_points_join_those_of_a_cube_in_the_archive(small, megabytes):
     union = np.concatenate([there, arrived])
     _, first = np.unique(voxel_keys(union, 0.5 / OBLIQUE_EDGE, oblique=True), return_index=True)
     assert sorted(first) == [0, 1, 2, 3, 5]
-    np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=STEP)
+    np.testing.assert_allclose(cubes.points(archived=True), union[first], atol=1e-12)
     cubes.recenter(np.array([100.0, 0.0, 0.0]))
     assert cubes.count() == 5
     # They can move on, each with its owner.
     assert cubes.move({1: moved_by(-100.0)}) == 2
     left = cubes.points()
-    np.testing.assert_array_equal(left[left[:, 0].argsort()], stored(there))
+    np.testing.assert_allclose(left[left[:, 0].argsort()], there, atol=1e-12)
 
 
 def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path, small):
@@ -181,9 +180,9 @@ def test_archived_cubes_without_a_moved_point_are_left_alone(tmp_path, small):
     files[2].write_bytes(damaged)
     assert cubes.move({1: moved_by(0.7), 2: moved_by(0.7)}) == 1
     assert files[0].stat().st_ino == before[0]
-    np.testing.assert_array_equal(np.load(files[1])[:, 0], np.rint([100.7 / STEP]))
+    np.testing.assert_allclose(np.load(files[1])[:, 0], [100.7])
     assert (cubes.stats.dropped_cubes, cubes.stats.dropped_points) == (1, 1)
-    np.testing.assert_array_equal(cubes.points(archived=True)[:, 0], stored([0.0, 100.7, 300.0]))
+    np.testing.assert_allclose(cubes.points(archived=True)[:, 0], [0.0, 100.7, 300.0])
 
 
 @pytest.mark.parametrize("insertion", ["centroid", "settled"])

@@ -31,7 +31,7 @@ def brute_force(
 
 
 def tagged(points: FloatArray) -> CubePoints:
-    return CubePoints.at(points, tags_of(len(points), 0))
+    return CubePoints(points, tags_of(len(points), 0))
 
 
 class Cubes(dict):

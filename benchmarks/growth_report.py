@@ -21,7 +21,7 @@ and an empty map)."""
 _ROWS = 500
 """Of a CSV at most, and points of a curve."""
 _POINT, _KEYED = 32e-6, 40e-6
-"""MB of a point in the archive (three doubles, an owner and a view), and in the window, where it has a
+"""MB of a point in the archive (three doubles, an owner, a view), and in the window, where it has a
 voxel key."""
 
 

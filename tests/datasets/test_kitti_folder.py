@@ -54,6 +54,24 @@ def test_files_are_read_in_order_of_their_number(tmp_path: Path) -> None:
     assert points == [[9.0], [10.0], [100.0], []]
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["scan_2", "scan_10", "scan_100"],
+        ["day1_scan9", "day1_scan10", "day2_scan1"],
+        ["000009", "000010", "000100"],
+        ["17_5000", "17_123456789", "18_0"],  # seconds and nanoseconds
+        ["17.123", "17.2", "17.45", "18.0"],  # seconds
+        ["1_000000000000000000001", "1_000000000000000000002"],
+        ["0a10", "0a9f", "0b1", "1c"],  # no numbers: by name
+    ],
+)
+def test_numbers_in_names_tell_the_order(tmp_path: Path, names: list[str]) -> None:
+    for i in reversed(range(len(names))):
+        np.full((1, 4), i, "<f4").tofile(tmp_path / f"{names[i]}.bin")
+    assert [scan.points[0, 0] for scan in KittiDataset(tmp_path)] == list(range(len(names)))
+
+
 def test_hidden_files_are_no_sweeps_and_a_byte_order_mark_is_no_time(tmp_path: Path) -> None:
     folder = write_sweeps(tmp_path / "a")
     (folder / "._000000.bin").write_bytes(b"of macOS")

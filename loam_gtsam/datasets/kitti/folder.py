@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from decimal import Decimal
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -65,6 +67,7 @@ _TRIED = 10  # sweeps looked at, at most, to describe their fields
 _MOST_RINGS = 256  # a fifth column with more different values is no beam
 
 _SHOWN = "[!.]*"  # not those that begin with a dot: macOS's ._000000.bin is no sweep
+_NUMBER = re.compile(r"(\d+(?:\.\d+)?)")
 _FOLDERS = ("", "velodyne", "scans", "velodyne_points/data")
 
 
@@ -121,7 +124,7 @@ class KittiDataset(SweepFiles):
         self._root = _root_of(folder, given)
         self.name = given.resolve().name or "sweeps"
         suffix = _suffix_in(folder)
-        self._files = sorted(folder.glob(f"{_SHOWN}{suffix}"), key=_natural_order)
+        self._files = _in_order(list(folder.glob(f"{_SHOWN}{suffix}")))
         if columns not in (None, 4, 5):
             raise DatasetError(f"columns: expected 4 or 5, got {columns!r}")
         options: TimeOptions = {
@@ -354,5 +357,13 @@ def _root_of(folder: Path, given: Path) -> Path:
     return given if inner is None else folder.parents[inner.count("/")]
 
 
-def _natural_order(file: Path) -> tuple[int, str]:
+def _in_order(files: Sequence[Path]) -> list[Path]:
+    """By the numbers in the names where all else in these is the same (``scan_9, scan_10``)."""
+    parts = {file: _NUMBER.split(file.stem) for file in files}
+    if len({tuple(part[::2]) for part in parts.values()}) == 1:
+        return sorted(files, key=lambda file: ([Decimal(n) for n in parts[file][1::2]], file.name))
+    return sorted(files, key=_by_name)
+
+
+def _by_name(file: Path) -> tuple[int, str]:
     return (int(file.stem) if file.stem.isdecimal() else -1, file.name)

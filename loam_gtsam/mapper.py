@@ -248,8 +248,8 @@ class Mapper:
             self.last = replace(last, stamp=last.stamp + refusal.clock_step)
             if self._moment is not None:
                 self._moment = self._moment._replace(stamp=self._moment.stamp + refusal.clock_step)
-            self.start = self._next = None  # their sweeps have stamps of before
-            self.errors.cut()
+            self.start, self._next = self.start and self.start.later(refusal.clock_step), None
+            self.errors.cut(refusal.clock_step)
         bad, message, fault = FrameStatus.BAD_STAMP, refusal.message, refusal.fault
         return MapUpdate(stamp, last.map_T_lidar, bad, message, twist=last.twist, fault=fault)
 

@@ -146,6 +146,13 @@ class MovingSweep:
         sweep.acceleration = acceleration
         return sweep
 
+    def later(self, nanoseconds: int) -> MovingSweep:
+        """The sweep on a clock that was set ahead by so much."""
+        sweep = copy(self)
+        sweep.stamp += nanoseconds
+        sweep.reference_stamp += nanoseconds
+        return sweep
+
     def without_turns(self) -> MovingSweep:
         """The sweep as if no IMU had been there."""
         if self._turned is None:
@@ -266,6 +273,10 @@ class PosedSweep:
     def middle_T_reference(self) -> gtsam.Pose3:
         """The pose of the lidar at the reference time, seen from the middle of the sweep."""
         return self.sweep.middle_T_reference(self.twist)
+
+    def later(self, nanoseconds: int) -> PosedSweep:
+        """The sweep on a clock that was set ahead by so much."""
+        return PosedSweep(self.sweep.later(nanoseconds), self.twist)
 
     def map_T_middle(self, map_T_lidar: gtsam.Pose3) -> gtsam.Pose3:
         """The pose at the middle of the sweep, from the pose at the reference time."""

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import dataclass
-from statistics import median
+from statistics import median_low
 
 from loam_gtsam.types import SweepFault
 
 LARGEST_STEP = 10.0
 """Seconds between two sweeps above which a stamp is doubted: in 10 s an acceleration of 1 m/s^2
-leads 50 m away from the prediction. For a slow sensor the limit is ten of its own intervals."""
+leads 50 m away from the prediction. For a slow sensor the limit is ten of its own intervals, of
+which the second sweep, which is doubted, and the third tell one."""
 IN_A_ROW = 5
 """Number of consecutive doubted sweeps with consistent stamps that shows that the clock was set."""
 _STEPS = 10  # intervals of the sensor between two sweeps above which a stamp is doubted
@@ -55,9 +56,9 @@ class StampCheck:
         None for a sweep that counts as used from now on. ``seconds`` is how long it took, 0 if that
         is not known.
         """
-        step, before = stamp - last, self._steps[-1] if self._steps else 0
+        step, before = stamp - last, self._before(stamp)
         largest = max(round(LARGEST_STEP * 1e9), _STEPS * before)
-        usual = median(self._steps) if self._steps else seconds * 1e9
+        usual = self._usual(round(seconds * 1e9))
         later = f"stamp {stamp} ns is {step * 1e-9:.6g} s after the last one, {last} ns"
         if 0 < step < _SHORTEST:
             return Refusal(SweepFault.TOO_SOON, f"{later}; expected nanoseconds")
@@ -66,7 +67,7 @@ class StampCheck:
             if not self._steps:
                 told = f"the times of its points span {seconds:.3g} s: are they seconds?"
             return Refusal(SweepFault.TOO_SOON, f"{later}; {told}")
-        if step > 0 and (step <= largest or not before):
+        if 0 < step <= largest:
             self._steps.append(step)
             self._doubted = None
             return None
@@ -95,6 +96,21 @@ class StampCheck:
             "was a long pause; the run goes on from the last pose",
             ahead,
         )
+
+    def _before(self, stamp: int) -> int:
+        """The last step, ns; as long as there is none, that since the newest doubted sweep."""
+        if self._steps:
+            return self._steps[-1]
+        return 0 if self._doubted is None else stamp - self._doubted[1]
+
+    def _usual(self, seconds: int) -> int:
+        """Interval between two sweeps, ns; at first the time that a sweep takes, if that is less.
+
+        One step alone may be a gap, as at the beginning of a recording.
+        """
+        if not self._steps:
+            return seconds
+        return median_low(self._steps) if len(self._steps) > 1 else min(*self._steps, seconds)
 
     def _agreeing(self, stamp: int, largest: int) -> tuple[int, int]:
         """First stamp and number of the consistent doubted sweeps, this sweep included."""

@@ -25,11 +25,11 @@ DAY = 86_400 * SECOND
 START = 1_700_000_000 * SECOND
 
 
-def judged(stamps: list[int]) -> list[str]:
+def judged(stamps: list[int], seconds: float = 0.0) -> list[str]:
     """The fault of each stamp after the first, empty if it was used."""
     check, last, faults = StampCheck(), stamps[0], []
     for stamp in stamps[1:]:
-        refusal = check.refuse(stamp, last)
+        refusal = check.refuse(stamp, last, seconds)
         faults.append("" if refusal is None else str(refusal.fault))
         if refusal is None:
             last = stamp
@@ -92,9 +92,34 @@ def test_a_sensor_may_become_faster_and_a_gap_is_no_usual_interval():
 
 def test_a_slow_sensor_may_take_ten_of_its_steps():
     good = steps(START, 4, 60 * SECOND)
-    assert judged([*good, good[-1] + 600 * SECOND]) == [""] * 4
+    assert judged([*good, good[-1] + 600 * SECOND]) == ["stamp_ahead", "", "", ""]
     assert judged([*good, good[-1] + 601 * SECOND])[-1] == "stamp_ahead"
     assert judged([*good, good[-1] - 600 * SECOND])[-1] == "late"
+
+
+@pytest.mark.parametrize("gap", [0.5, 1.0, 2.0, 9.9])
+@pytest.mark.parametrize("seconds", [0.0, 0.1])
+@pytest.mark.parametrize("before", [1, 2])
+def test_a_gap_among_the_first_sweeps_costs_none(gap, seconds, before):
+    after = steps(START + (before - 1) * TENTH + round(gap * 1e9), 20)
+    assert judged([*steps(START, before), *after], seconds) == [""] * (before + 19)
+
+
+def test_after_one_step_the_time_of_a_sweep_tells_what_is_too_soon():
+    soon = START + SECOND + TENTH // 5
+    assert judged([START, START + SECOND, soon], 0.1) == ["", "too_soon"]
+    assert judged([START, START + SECOND, START + SECOND], 0.1) == ["", "duplicate_stamp"]
+    assert judged([START, START + TENTH, START + TENTH + TENTH // 5], 1.0) == ["too_soon"] * 2
+
+
+@pytest.mark.parametrize("early", [DAY, 60 * SECOND, START])
+def test_a_first_stamp_long_before_the_others_is_a_clock_set_ahead(early):
+    faults = judged([START - TENTH - early, *steps(START, 20)], 0.1)
+    assert faults == ["stamp_ahead"] * (IN_A_ROW - 1) + ["clock_set_ahead"] + [""] * 15
+
+
+def test_a_wrong_second_stamp_costs_one_sweep():
+    assert judged([START, START + DAY, *steps(START + 2 * TENTH, 9)]) == ["stamp_ahead"] + [""] * 9
 
 
 def test_a_clock_set_ahead_is_followed_after_some_sweeps():
@@ -170,6 +195,17 @@ def test_a_run_goes_on_where_it_is_when_the_clock_is_set_ahead(drive):
     before = result.updates[14]
     np.testing.assert_allclose(first.twist[3:], before.twist[3:], atol=0.6)  # not over a year
     assert (np.diff(result.trajectory.stamps) > 0).all()
+
+
+def test_a_run_whose_first_stamp_is_wrong_begins_there_all_the_same(drive):
+    result = run(ListDataset([replace(drive[0], stamp=0), *drive[1:]]))
+    assert result.faults == {"stamp_ahead": IN_A_ROW - 1, "clock_set_ahead": 1}
+    for number in range(1 + IN_A_ROW, len(drive)):
+        update = result.updates[number]
+        assert update.status is FrameStatus.OK
+        away = update.map_T_lidar.translation() - truth()[number, :3, 3]
+        assert np.linalg.norm(away) < 0.15
+    assert np.sqrt(np.diag(update.covariance)).max() < 2.0  # of the first motion, not of 54 years
 
 
 def test_a_clock_set_back_says_what_to_do_and_a_reset_does_it(drive):

@@ -107,6 +107,17 @@ class Start:
         """Whether all sweeps of the start are there; more of them while they may refute a rival."""
         return len(self._sweeps) >= (_IN_DOUBT if self._refutable else _TOGETHER)[-1]
 
+    def later(self, nanoseconds: int) -> Start | None:
+        """The start on a clock that was set ahead by so much; None if it has begun to move.
+
+        The motion between its sweeps does not go on over a clock that is set, or a long pause.
+        """
+        if len(self._sweeps) > 1:
+            return None
+        (first,) = self._sweeps
+        self._sweeps = [replace(first, posed=first.posed.later(nanoseconds))]
+        return self
+
     def first_motion(
         self, frame: Frame, expected: Found, solver: NamedSolver, imu: ImuTracker | None = None
     ) -> Found:

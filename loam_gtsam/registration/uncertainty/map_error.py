@@ -169,9 +169,11 @@ class MapError:
         in_map = gtsam.Pose3.Logmap(step)
         self._moved = self._moved + np.outer(in_map, in_map)
 
-    def cut(self) -> None:
-        """The next sweep is on another clock."""
+    def cut(self, ahead: int) -> None:
+        """The next sweep is on a clock that was set ahead by so many nanoseconds."""
         self._velocity.cut()
+        if self._first is not None:
+            self._first = self._first.later(ahead)
 
 
 class _Rivals:

@@ -234,7 +234,7 @@ class PoseErrors:
         if not self._scans:
             self._map.begin(posed)
 
-    def cut(self) -> None:
-        """Start anew in time: the next frame is on another clock."""
+    def cut(self, ahead: int) -> None:
+        """Start anew in time: the next frame is on a clock that was set ahead, nanoseconds."""
         self._own.cut(paused=True)
-        self._map.cut()
+        self._map.cut(ahead)

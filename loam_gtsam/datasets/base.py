@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import importlib
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import islice
+from itertools import chain, islice, pairwise
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Protocol, cast, runtime_checkable
+from statistics import median_low
+from typing import Any, Protocol, TypeVar, cast, runtime_checkable
 
 import numpy as np
 
@@ -26,6 +28,12 @@ from loam_gtsam.types import (
     Sweep,
     Trajectory,
 )
+
+_T = TypeVar("_T")
+_IN_A_ROW = 5
+"""Number of sweeps at the beginning whose stamps are compared, and of consecutive ones beyond the
+end of a part after which no more are read; one wrong stamp is no end."""
+_FAR, _STEPS = 10 * 10**9, 10  # nanoseconds, and usual steps, beyond which a first stamp is wrong
 
 
 @dataclass(slots=True)
@@ -153,7 +161,7 @@ class Loader(Protocol):
         ----------
         start, every : number of the first sweep that is used, and the step to the next
         begin_s, end_s : seconds after the first sweep of the data set between which sweeps are
-            used
+            used; a first sweep whose stamp is far from those of the next ones does not count
         """
         return PartOf(cast(Dataset, self), start, every, begin_s, end_s)
 
@@ -243,27 +251,45 @@ class PartOf(ChangedDataset):
     def __len__(self) -> int:
         """Number of sweeps; the most there can be if only reading them tells their stamps."""
         stamps = getattr(self._dataset, "stamps", None)
-        if stamps is None:
+        if stamps is None or not self._timed:
             return len(range(len(self._dataset))[self._slice])
-        seconds = (stamps[self._slice] - stamps[:1]) * 1e-9
-        return int(((seconds >= self._window[0]) & (seconds <= self._window[1])).sum())
+        return sum(1 for _ in self._inside(stamps.tolist(), int))
 
     def __iter__(self) -> Iterator[Sweep]:
-        first: int | None = None
-        for number, sweep in enumerate(self._dataset):
-            first = sweep.stamp if first is None else first
-            seconds = (sweep.stamp - first) * 1e-9
-            if seconds > self._window[1]:
+        every = islice(self._dataset, self._slice.start, None, self._slice.step)
+        return self._inside(self._dataset, attrgetter("stamp")) if self._timed else every
+
+    @property
+    def _timed(self) -> bool:
+        return self._window != (0.0, np.inf)
+
+    def _inside(self, sweeps: Iterable[_T], stamp_of: Callable[[_T], int]) -> Iterator[_T]:
+        """Those of the sweeps that are in the part."""
+        rest = iter(sweeps)
+        begin = list(islice(rest, _IN_A_ROW))
+        first, beyond = _first_stamp([stamp_of(sweep) for sweep in begin]), 0
+        for number, sweep in enumerate(chain(begin, rest), -self._slice.start):
+            seconds = (stamp_of(sweep) - first) * 1e-9
+            beyond = beyond + 1 if seconds > self._window[1] else 0
+            if beyond == _IN_A_ROW:
                 return
-            beyond = number - self._slice.start
-            if beyond >= 0 and beyond % self._slice.step == 0 and seconds >= self._window[0]:
+            taken = number >= 0 and number % self._slice.step == 0
+            if taken and self._window[0] <= seconds <= self._window[1]:
                 yield sweep
 
     def info(self) -> DatasetInfo:
         """Of the whole data set, and which part of it is used."""
-        known = self._window == (0.0, np.inf) or getattr(self._dataset, "stamps", None) is not None
+        known = not self._timed or getattr(self._dataset, "stamps", None) is not None
         most = "" if known else "at most "
         return self._info(used=f"{self._said}: {most}{len(self)} sweeps")
+
+
+def _first_stamp(stamps: Sequence[int]) -> int:
+    """The first of the stamps of the first sweeps, ns, that is not far from the others."""
+    middle = median_low(stamps or [0])
+    steps = [abs(after - before) for before, after in pairwise(stamps)]
+    near = max(_FAR, _STEPS * median_low(steps or [0]))
+    return next((stamp for stamp in stamps if abs(stamp - middle) <= near), middle)
 
 
 class WithTruth(ChangedDataset):

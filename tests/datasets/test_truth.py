@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,7 +19,7 @@ from loam_gtsam.geometry import inverse_pose
 from loam_gtsam.io.trajectories import write_tum
 from loam_gtsam.pipeline import run
 from loam_gtsam.studies.evaluation import absolute_error, nees, relative_error
-from loam_gtsam.types import DatasetError, InputError, Trajectory
+from loam_gtsam.types import DatasetError, InputError, Scan, Trajectory
 
 TRUTH = winding(12)
 
@@ -227,6 +228,27 @@ def test_parts_of_a_data_set(world):
     for none in ({"start": 8}, {"begin_s": 0.8}, {"begin_s": 0.21, "end_s": 0.29}):
         with pytest.raises(InputError, match=r"some of the 8 sweeps of .*, got none"):
             world.part(**none)
+
+
+@pytest.mark.parametrize("wrong", [0, 1, 4, 7, 19])
+@pytest.mark.parametrize("by", [-(10**12), 10**12])
+@pytest.mark.parametrize("known", [True, False])
+def test_one_wrong_stamp_costs_a_part_one_sweep(wrong, by, known):
+    scans = [Scan(points=np.zeros((1, 3)), stamp=10**13 + k * 10**8) for k in range(20)]
+    spoilt = [replace(s, stamp=s.stamp + by * (k == wrong)) for k, s in enumerate(scans)]
+    data = ArrayDataset(spoilt) if known else ListDataset(spoilt)
+    assert list(PartOf(data, 0, 2)) == spoilt[::2]
+    begins = 1 if wrong == 0 else 0  # the first stamp that is right counts as the beginning
+    inside = spoilt[begins + 2 : begins + 11]
+    part = PartOf(data, 0, 1, 0.2, 1.0)
+    assert list(part) == [scan for scan in inside if scan is not spoilt[wrong]]
+    assert len(part) == (len(list(part)) if known else 20)
+
+
+def test_a_part_is_not_read_to_the_end_of_the_data():
+    scans = [Scan(points=np.zeros((1, 3)), stamp=k * 10**8) for k in range(20)]
+    unread = ListDataset([*scans, RuntimeError("read on")])
+    assert len(list(PartOf(unread, 0, 1, end_s=1.0))) == 11
 
 
 def test_the_length_of_a_time_window_is_exact_where_stamps_are_known(world):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import gtsam
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from support.receiver import ANTENNA, CONFIG, ENU_T_MAP, ORIGIN, Drive
 
 from loam_gtsam.aiding.gnss import ANTENNA_KEY, MAP_KEY, fix_factor, tie, write_enu
@@ -159,6 +160,27 @@ def test_fixes_have_covariances_of_their_own_one_for_all_or_none(known):
         GnssFixes(np.arange(2), places, np.ones((2, 3)))
     with pytest.raises(InputError, match="got rows of different lengths"):
         GnssFixes(np.arange(2), places, [[[1.0]], [[1.0, 2.0]]])
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.zeros((3, 3)),
+        -np.eye(3),
+        np.diag([1.0, 1.0, 0.0]),
+        np.diag([np.inf] * 3),
+        np.diag([1.0, np.nan, 1.0]),
+        [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]],
+    ],
+)
+def test_covariances_of_fixes_that_are_none_are_refused(wrong):
+    places = np.tile([47.5, 8.5, 450.0], (3, 1))
+    turn = Rotation.from_euler("xyz", [0.3, 0.2, 1.0]).as_matrix()
+    good = turn @ np.diag([0.01, 4.0, 900.0]) @ turn.T
+    unknown = np.full((3, 3), np.nan)
+    GnssFixes(np.arange(3), places, [good, unknown, good])
+    with pytest.raises(InputError, match=r"positive definite .* for fix 2 \(1 of 3 are none"):
+        GnssFixes(np.arange(3), places, [good, unknown, wrong])
 
 
 def test_fixes_and_wheels_keep_arrays_of_what_was_given():

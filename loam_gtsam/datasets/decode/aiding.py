@@ -14,10 +14,11 @@ from loam_gtsam.config import Config
 from loam_gtsam.datasets.decode.pointcloud2 import message_stamp
 from loam_gtsam.datasets.decode.tables import rows_in_time
 from loam_gtsam.geometry import as_array, as_stamps
-from loam_gtsam.types import DatasetError, FloatArray, InputError, IntArray, check_array
+from loam_gtsam.types import BoolArray, DatasetError, FloatArray, InputError, IntArray, check_array
 
 FIX = "sensor_msgs/msg/NavSatFix"
 TWIST, ODOMETRY = "geometry_msgs/msg/TwistStamped", "nav_msgs/msg/Odometry"
+_SYMMETRIC = 1e-6  # of its largest element, by which a covariance may be asymmetric
 _STILL = 1e-6  # metres: a pose that changes by less than this has not been filled in
 
 
@@ -35,7 +36,8 @@ class GnssFixes:
     Raises
     ------
     InputError
-        If a shape is wrong, a position is not finite or on no earth, or stamps do not ascend.
+        If a shape is wrong, a position is not finite or on no earth, a covariance is none, or
+        stamps do not ascend.
     """
 
     stamps: IntArray
@@ -65,6 +67,14 @@ class GnssFixes:
             raise InputError(
                 "GnssFixes.geodetic: expected latitudes within 90 and longitudes within 360 degrees"
             )
+        wrong = ~(_is_covariance(told) | np.isnan(told).all(axis=(1, 2)))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            raise InputError(
+                "GnssFixes.covariances: expected symmetric, positive definite ones, or NaN alone "
+                f"where none is known; got {np.asarray(told[row]).tolist()} for fix {row} "
+                f"({np.count_nonzero(wrong)} of {len(stamps)} are none)"
+            )
 
     def __len__(self) -> int:
         return len(self.stamps)
@@ -73,6 +83,17 @@ class GnssFixes:
 def is_place(geodetic: FloatArray) -> Any:
     """(N,) whether latitudes and longitudes in degrees, and heights in metres, can be on earth."""
     return (np.abs(geodetic) <= np.array([90.0, 360.0, 1e5])).all(axis=1)
+
+
+def _is_covariance(matrices: FloatArray) -> BoolArray:
+    """(N,) whether matrices (N, 3, 3) are finite, symmetric and positive definite."""
+    finite = np.asarray(np.isfinite(matrices).all(axis=(1, 2)))
+    known = np.where(finite[:, None, None], matrices, 0.0)
+    across = known.swapaxes(1, 2)
+    apart, largest = (np.abs(part).max(axis=(1, 2)) for part in (known - across, known))
+    least = np.linalg.eigvalsh(0.5 * (known + across))[:, 0]
+    good: BoolArray = (least > 0.0) & (apart <= _SYMMETRIC * largest)
+    return good
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,8 +152,7 @@ def fixes_of(messages: Sequence[Any], topic: str, problems: list[str]) -> GnssFi
         if message.status.status < 0 or not is_place(np.array([place])).all():
             continue
         covariance = np.reshape(np.asarray(message.position_covariance, np.float64), (3, 3))
-        known = message.position_covariance_type > 0 and np.isfinite(covariance).all()
-        if not (known and np.linalg.eigvalsh(0.5 * (covariance + covariance.T))[0] > 0.0):
+        if message.position_covariance_type <= 0 or not _is_covariance(covariance[None]).all():
             covariance = np.full((3, 3), np.nan)
         stamps.append(message_stamp(message))
         rows.append(place)

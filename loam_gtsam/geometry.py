@@ -7,13 +7,13 @@ from __future__ import annotations
 
 from typing import TypeVar
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, ndtr
 
 from loam_gtsam.errors import as_stamps as as_stamps
-from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array, check_kind
+from loam_gtsam.trajectory import checked_pose as checked_pose
+from loam_gtsam.types import BoolArray, FloatArray, InputError, IntArray, check_array
 
 _Real = TypeVar("_Real", np.float32, np.float64)
 MAD_TO_SIGMA = 1.4826
@@ -53,12 +53,6 @@ def as_points(value: ArrayLike, name: str) -> FloatArray:
 def as_vector(value: ArrayLike, name: str, size: int = 3) -> FloatArray:
     """(size,) finite float64, checked as by :func:`as_array`."""
     return as_array(value, name, (size,))
-
-
-def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
-    """The pose itself; InputError for anything else."""
-    check_kind(value, gtsam.Pose3, name, "gtsam.Pose3(matrix) makes one of a (4, 4) matrix")
-    return value
 
 
 def transform(a_T_b: FloatArray, points: NDArray[np.floating]) -> FloatArray:

@@ -12,6 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from loam_gtsam.errors import InputError, as_stamps, check_array, check_kind
 
+_ROUNDED = 1e-5  # by which numbers of a rotation may be rounded
+
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Trajectory:
@@ -134,6 +136,22 @@ class Trajectory:
 def stack_poses(poses: Iterable[gtsam.Pose3]) -> NDArray[np.float64]:
     """(N, 4, 4) matrices of N poses; (0, 4, 4) if there are none."""
     return np.array([pose.matrix() for pose in poses], np.float64).reshape(-1, 4, 4)
+
+
+def checked_pose(value: gtsam.Pose3, name: str) -> gtsam.Pose3:
+    """The pose itself; InputError for anything else, or if its rotation is none."""
+    check_kind(value, gtsam.Pose3, name, "gtsam.Pose3(matrix) makes one of a (4, 4) matrix")
+    rotation = value.rotation().matrix()
+    with np.errstate(over="ignore", invalid="ignore"):
+        off = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        determinant = np.linalg.det(rotation)
+    if not (off <= _ROUNDED and determinant > 0.0):
+        raise InputError(
+            f"{name}: expected a rotation of orthogonal unit axes and determinant 1, got one that "
+            f"is {off:.2g} off, with determinant {determinant:.3g}; gtsam.Rot3.ClosestTo(matrix) "
+            "makes one of axes that are rounded"
+        )
+    return value
 
 
 def check_increasing(trajectory: Trajectory, caller: str) -> None:

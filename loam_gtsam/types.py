@@ -32,6 +32,7 @@ from loam_gtsam.errors import are_two_numbers, as_stamps
 from loam_gtsam.errors import check_array as check_array
 from loam_gtsam.errors import check_kind as check_kind
 from loam_gtsam.trajectory import Trajectory as Trajectory
+from loam_gtsam.trajectory import checked_pose
 from loam_gtsam.trajectory import stack_poses as stack_poses
 
 FloatArray = NDArray[np.float64]
@@ -210,8 +211,7 @@ class FeatureSweep:
 
     def __post_init__(self) -> None:
         check_kind(self.features, Features, "FeatureSweep.features", "from_points makes them")
-        how = "gtsam.Pose3(matrix) makes one of a (4, 4) matrix"
-        check_kind(self.odom_T_lidar, gtsam.Pose3, "FeatureSweep.odom_T_lidar", how)
+        checked_pose(self.odom_T_lidar, "FeatureSweep.odom_T_lidar")
 
     @property
     def stamp(self) -> int:

@@ -9,6 +9,7 @@ from loam_gtsam.geometry import (
     as_points,
     as_stamps,
     as_vector,
+    checked_pose,
     find_in_sorted,
     fit_lines,
     fit_planes,
@@ -100,6 +101,17 @@ def test_the_inverse_of_a_pose_undoes_it_for_one_and_for_many():
 def test_a_wrong_array_is_refused_by_its_name(check, value, message):
     with pytest.raises(InputError, match="^" + message):
         check(value, "scan")
+
+
+@pytest.mark.parametrize(("off", "right"), [(0.0, True), (4e-6, True), (6e-6, False)])
+def test_axes_of_a_pose_may_be_rounded(off, right):
+    rotation = gtsam.Rot3.RzRyRx(0.3, -1.0, 2.0).matrix() * (1.0 + off)
+    pose = gtsam.Pose3(gtsam.Rot3(rotation), np.ones(3))
+    if right:
+        assert checked_pose(pose, "here") is pose
+        return
+    with pytest.raises(InputError, match=r"here: .* 1.2e-05 off, with determinant 1; "):
+        checked_pose(pose, "here")
 
 
 def test_a_right_array_becomes_float64_or_int64_and_is_not_copied_if_it_is_so_already():

@@ -96,6 +96,8 @@ def test_a_feature_sweep_has_features_and_a_pose():
         FeatureSweep(features, np.eye(4))
     with pytest.raises(InputError, match="features: expected a Features, got ndarray"):
         FeatureSweep(POINTS, gtsam.Pose3())
+    with pytest.raises(InputError, match=r"odom_T_lidar: expected a rotation .* determinant -1"):
+        FeatureSweep(features, gtsam.Pose3(np.diag([1.0, 1.0, -1.0, 1.0])))
 
 
 def test_a_trajectory_needs_one_pose_per_stamp():

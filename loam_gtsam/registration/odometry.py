@@ -56,6 +56,7 @@ class Guess:
 def checked_guess(value: Guess) -> Guess:
     """The guess itself; InputError for anything else."""
     check_kind(value, Guess, "what guess returns", "Guess(map_T_lidar, twist) makes one")
+    checked_pose(value.map_T_lidar, "what guess returns")
     return value
 
 

@@ -25,7 +25,7 @@ from loam_gtsam.io.checkpoint import Checkpoint
 from loam_gtsam.loops.closure import ScanLoopCloser
 from loam_gtsam.mapper import Mapper
 from loam_gtsam.pipeline import Pipeline, effective_config, imu_buffer, run
-from loam_gtsam.registration.odometry import ConstantVelocity
+from loam_gtsam.registration.odometry import ConstantVelocity, Guess
 from loam_gtsam.registration.solvers import POSE_KEY, make_solver
 from loam_gtsam.types import FrameStatus, InputError
 
@@ -35,6 +35,7 @@ QUICK = CONFIG.changed(PREDICTED)
 GOES_ON = CONFIG.changed("parts.on_error=continue")
 SWEEPS = list(DATA)
 NOISE = gtsam.noiseModel.Isotropic.Sigma(6, 1e3)
+MIRROR = gtsam.Pose3(np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
 class FaultError(Exception):
@@ -198,6 +199,7 @@ def test_a_run_goes_on_without_a_part_that_fails_and_says_so_once(place, used, c
         ("loop_closer", (0, 1), "expected a LoopClosure, got tuple"),
         ("solver", None, "expected a Solution, got NoneType"),
         ("odometry", gtsam.Pose3(), "expected a Guess, got Pose3"),
+        ("odometry", Guess(MIRROR, np.zeros(6)), "what guess returns: expected a rotation"),
     ],
 )
 def test_a_part_that_returns_something_else_is_named(part, returned, said, caplog):

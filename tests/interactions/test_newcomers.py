@@ -35,6 +35,7 @@ WORLD = SimulatedWorld("room", frames=2, columns=400)
 SWEEP = WORLD[0]
 ONE = gtsam.noiseModel.Isotropic.Sigma(1, 0.1)
 X = np.array([1.0, 0.0, 0.0])
+MIRROR = gtsam.Pose3(np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
 def row(_: gtsam.Values) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -80,7 +81,12 @@ def test_a_mistake_is_an_input_error(mistake: Callable[[], object], answer: str)
 
 @pytest.mark.parametrize(
     ("guess", "twist", "answer"),
-    [(np.eye(4), None, "guess: expected a gtsam.Pose3"), (None, np.zeros(3), r"twist: .*\(6,\)")],
+    [
+        (np.eye(4), None, "guess: expected a gtsam.Pose3"),
+        (MIRROR, None, "guess: expected a rotation .* determinant -1;"),
+        (gtsam.Pose3(np.diag([2.0, 2.0, 2.0, 1.0])), None, "guess: .* is 3 off"),
+        (None, np.zeros(3), r"twist: .*\(6,\)"),
+    ],
 )
 def test_guess_and_twist_of_a_sweep(guess: object, twist: object, answer: str) -> None:
     mapper = Mapper()

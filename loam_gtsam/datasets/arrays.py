@@ -13,8 +13,17 @@ from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples
 from loam_gtsam.datasets.decode.point_times import shorter_period, span_problem, usual_step
 from loam_gtsam.datasets.decode.tables import describe_imu, describe_stamps
 from loam_gtsam.geometry import as_array, as_stamps
-from loam_gtsam.types import ImuSamples, InputError, IntArray, Scan, Trajectory, check_kind
+from loam_gtsam.types import (
+    MAX_STAMP,
+    ImuSamples,
+    InputError,
+    IntArray,
+    Scan,
+    Trajectory,
+    check_kind,
+)
 
+_LATEST = MAX_STAMP * 1e-9  # seconds
 _SHORTEST = 1_000_000
 """Nanoseconds between sweeps; no spinning lidar turns a thousand times a second."""
 
@@ -159,6 +168,14 @@ def _stamps(stamps: Any, stamps_s: Any) -> IntArray:
             raise InputError(f"stamps: {apart}; expected nanoseconds, stamps_s takes seconds")
         return values
     seconds = as_array(stamps_s, "stamps_s", ("N",))
+    largest = float(np.abs(seconds).max(initial=0.0))
+    if largest > _LATEST:
+        units = ("milliseconds", 1e3), ("microseconds", 1e6), ("nanoseconds", 1e9)
+        unit = next((unit for unit, times in units if largest <= times * _LATEST), "another unit")
+        raise InputError(
+            f"stamps_s: expected seconds, {_LATEST:.2g} at most, got {largest:.10g}, probably "
+            f"{unit}; stamps takes integer nanoseconds"
+        )
     # Whole and fractional seconds apart: their product with 1e9 would lose the last digits.
     whole = np.floor(seconds)
     fraction = np.rint((seconds - whole) * 1e9)

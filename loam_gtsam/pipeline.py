@@ -14,7 +14,7 @@ import gtsam
 
 from loam_gtsam.aiding.gnss import TiedFixes, tie
 from loam_gtsam.aiding.imu_summary import ImuSummary, imu_summary
-from loam_gtsam.aiding.wheels import aided_odometry
+from loam_gtsam.aiding.wheels import aided_odometry, wheels_problem
 from loam_gtsam.config import Config, as_config, named_sections, with_implied
 from loam_gtsam.datasets.base import Dataset, check_dataset
 from loam_gtsam.datasets.decode.aiding import GnssFixes, WheelSamples, aids_of
@@ -106,6 +106,11 @@ class RunResult:
         return "" if self.pipeline is None else self.pipeline.mapper.point_times.problem
 
     @property
+    def wheels_problem(self) -> str:
+        """That the scans contradicted the wheels; empty if they did not, or there are none."""
+        return "" if self.pipeline is None else wheels_problem(self.pipeline.odometry)
+
+    @property
     def range_offset(self) -> RangeOffset | None:
         """By how much all ranges look too long; None if nothing was mapped."""
         return None if self.pipeline is None else self.pipeline.mapper.errors.range_offset
@@ -173,13 +178,9 @@ class Pipeline:
     """
 
     def __init__(
-        self,
-        config: Config | None = None,
-        *,
-        imu: ImuBuffer | None = None,
-        wheels: WheelSamples | None = None,
-        **parts: Unpack[Parts],
-    ) -> None:
+        self, config: Config | None = None, *, imu: ImuBuffer | None = None,
+        wheels: WheelSamples | None = None, **parts: Unpack[Parts],
+    ) -> None:  # fmt: skip
         _check_parts(parts)
         self.config = as_config(config)
         self.faults = PartFaults(self.config.parts.on_error)
@@ -331,12 +332,9 @@ class Pipeline:
         return (self.mapper if self.loops is None else self.loops).map_points()
 
     def result(
-        self,
-        updates: Sequence[MapUpdate],
-        *,
-        interrupted: bool = False,
+        self, updates: Sequence[MapUpdate], *, interrupted: bool = False,
         error: Exception | None = None,
-    ) -> RunResult:
+    ) -> RunResult:  # fmt: skip
         """A whole run, from what :meth:`process` said about each of its sweeps."""
         mapper = self.mapper
         edges, planes = self.map_points()

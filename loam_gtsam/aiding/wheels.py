@@ -131,6 +131,18 @@ class WheelOdometry(Odometry):
         return start.slerp(share, end)
 
 
+def wheels_problem(odometry: object) -> str:
+    """A sentence on wheels that were not believed for most sweeps; empty if they were, or none."""
+    if not isinstance(odometry, WheelOdometry) or odometry.refused <= odometry.used:
+        return ""
+    told = odometry.used + odometry.refused
+    return (
+        f"wheels: not believed for {odometry.refused} of {told} sweeps: they contradicted the "
+        "scans, or changed their speed as no vehicle can; check aiding.lidar_R_wheels_deg, their "
+        "unit (m/s, rad/s) and stamps"
+    )
+
+
 def aided_odometry(
     config: Config, wheels: WheelSamples | None, imu: Turns | None
 ) -> WheelOdometry | None:

@@ -36,7 +36,7 @@ _SHORT = 10.0  # metres: a hundredth of a shorter path is what rough ground make
 
 
 def run_notes(result: RunResult) -> tuple[str, ...]:
-    """Sentences on positions, IMU, fixes, points and statuses; none if all is well."""
+    """Sentences on positions, IMU, fixes, wheels, points and statuses; none if all is well."""
     notes = []
     sigmas = position_sigmas(result.updates)
     path = result.trajectory.path_length
@@ -55,6 +55,8 @@ def run_notes(result: RunResult) -> tuple[str, ...]:
         notes += result.imu.problems
     if result.fixes is not None and result.fixes.reference is None:
         notes.append(f"fixes of the GNSS receiver {result.fixes}")
+    if result.wheels_problem:
+        notes.append(result.wheels_problem)
     if result.times_problem:
         notes.append(f"{DO_NOT_TRUST}{result.times_problem}")
     if result.range_offset is not None and result.range_offset.problem:

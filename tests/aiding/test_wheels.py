@@ -61,6 +61,8 @@ def test_wheels_that_contradict_the_scans_are_not_believed():
         assert error.maximum < 0.03
         assert (odometry.refused > 5) == refused
         assert (odometry.used > 20) != refused
+        said = [note for note in result.notes if note.startswith("wheels: not believed for")]
+        assert said == ([result.wheels_problem] if refused else [])
 
 
 def test_twists_are_integrated():

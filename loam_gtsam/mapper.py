@@ -189,8 +189,8 @@ class Mapper:
             self.start = None
             update = self._insert(*expected_at, FrameStatus.SPARSE_MAP, sparse, clock)
         else:
-            with own_priors(priors):
-                frame = self._frame(predicted, priors, clock)
+            with own_priors(priors, predicted.map_T_middle) as factors:
+                frame = self._frame(predicted, factors, clock)
                 apart = features, self.config, self.last, self._named
                 first = None if self.start is None else self.start.first_motion
                 frame, outcome = placed(frame, apart, self.monitor, self.imu, first)

@@ -156,6 +156,9 @@ def test_a_prior_that_fails_is_named_and_the_sweep_can_be_tried_again():
             mapper.register(sweep)
         priors = part.factors(SimpleNamespace(key=POSE_KEY))
         part.armed, part.passes = True, 0
+        with pytest.raises(PartError, match="priors of your own"):  # where they are checked
+            mapper.register(features[2], priors=priors)
+        part.armed, part.passes = True, 1
         with pytest.raises(PartError, match="raised FaultError") as caught:
             mapper.register(features[2], priors=priors)
         assert caught.value.part == ("priors" if others is None else "extra_factors")
@@ -167,10 +170,16 @@ def test_a_prior_that_fails_is_named_and_the_sweep_can_be_tried_again():
     mapper = Mapper(CONFIG)
     for sweep in features[:2]:
         mapper.register(sweep)
-    for wrong in (1, [1], [gtsam.PriorFactorPose3(5, gtsam.Pose3(), NOISE)]):
-        with pytest.raises(InputError, match="factors on POSE_KEY"):
+    alone = gtsam.PriorFactorPose3(POSE_KEY, gtsam.Pose3(), NOISE)
+    for wrong in (1, None, [1], alone, [gtsam.PriorFactorPose3(5, gtsam.Pose3(), NOISE)]):
+        with pytest.raises(InputError, match="a list of GTSAM factors on POSE_KEY"):
             mapper.register(features[2], priors=wrong)
-    undisturbed = mapper.register(features[2], priors=priors)
+    nowhere = gtsam.Pose3(gtsam.Rot3(), np.array([np.nan, 0.0, 0.0]))
+    exact = gtsam.noiseModel.Isotropic.Sigma(6, 0.0)
+    for pose, noise in ((nowhere, NOISE), (gtsam.Pose3(), exact)):
+        with pytest.raises(InputError, match=r"priors: .* PriorFactorPose3 with NaN .*sigma 0"):
+            mapper.register(features[2], priors=[gtsam.PriorFactorPose3(POSE_KEY, pose, noise)])
+    undisturbed = mapper.register(features[2], priors=(factor for factor in priors))
     np.testing.assert_array_equal(undisturbed.map_T_lidar.matrix(), found[0])
     np.testing.assert_array_equal(np.sort(mapper.map_points()[1], axis=0), found[1])
 

@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
@@ -98,9 +98,7 @@ def own_factors(
     """
     with own_code("extra_factors", extra):
         given: object = extra(context)
-        if isinstance(given, gtsam.NonlinearFactorGraph):
-            given = [given.at(place) for place in range(given.size())]
-        factors = list(given) if isinstance(given, Iterable) else None
+        factors = _listed(given)
     if factors is None:
         raise InputError(
             "extra_factors: expected a list of factors, empty if there are none; got "
@@ -121,12 +119,7 @@ def own_factors(
                 f"{type(factor).__name__} on the keys {keys}"
             )
         with own_code("extra_factors", extra):
-            linear = factor.linearize(near)  # None if the factor does not act there
-            if linear is not None and not np.isfinite(np.column_stack(linear.jacobian())).all():
-                raise InputError(
-                    "extra_factors: expected factors that are finite at the predicted pose, got "
-                    f"{type(factor).__name__} with NaN in its error, Jacobian or noise (sigma 0?)"
-                )
+            _check_finite(factor, near, "extra_factors")
             if both:
                 since_last.append(_with_last_held(factor, context, error))
             else:
@@ -134,9 +127,29 @@ def own_factors(
     return OwnFactors(alone, since_last)
 
 
+def _listed(given: object) -> list[gtsam.NonlinearFactor] | None:
+    """What a user gave as factors, of a graph as well; None if they are no several."""
+    if isinstance(given, gtsam.NonlinearFactorGraph):
+        return [given.at(place) for place in range(given.size())]
+    return list(given) if isinstance(given, Iterable) else None
+
+
+def _check_finite(factor: gtsam.NonlinearFactor, near: gtsam.Values, name: str) -> None:
+    linear = factor.linearize(near)  # None if the factor does not act there
+    if linear is not None and not np.isfinite(np.column_stack(linear.jacobian())).all():
+        raise InputError(
+            f"{name}: expected factors that are finite at the predicted pose, got "
+            f"{type(factor).__name__} with NaN in its error, Jacobian or noise (sigma 0?)"
+        )
+
+
 @contextmanager
-def own_priors(priors: object) -> Iterator[None]:
+def own_priors(
+    priors: object, map_T_middle: gtsam.Pose3
+) -> Iterator[Sequence[gtsam.NonlinearFactor]]:
     """A block in which factors that a user gave with a sweep are evaluated, under their name.
+
+    It yields a list of them; ``map_T_middle`` is the predicted pose.
 
     Raises
     ------
@@ -144,21 +157,29 @@ def own_priors(priors: object) -> Iterator[None]:
         What such a factor raises. Beside ``extra_factors`` or a solver of the user's own nobody
         can tell whose exception it was: then the error has the name of that part, and a note.
     InputError
-        If they are anything but a sequence of GTSAM factors on :data:`POSE_KEY`.
+        If they are anything but GTSAM factors on :data:`POSE_KEY`, or one of them is not finite at
+        the predicted pose.
     """
-    given: Sequence[object] = priors if isinstance(priors, Sequence) else [priors]
-    for factor in given:
-        if not isinstance(factor, gtsam.NonlinearFactor) or list(factor.keys()) != [POSE_KEY]:
+    with own_code("priors", "given to register"):
+        factors = _listed(priors)
+    near = gtsam.Values()
+    near.insert(POSE_KEY, map_T_middle)
+    factor: Any
+    for factor in [priors] if factors is None else factors:
+        keys = list(factor.keys()) if isinstance(factor, gtsam.NonlinearFactor) else None
+        if factors is None or keys != [POSE_KEY]:
             raise InputError(
                 "priors: expected a list of GTSAM factors on POSE_KEY of "
                 f"loam_gtsam.registration.solvers alone, got {type(factor).__name__}"
-                + (f" on {factor.keys()}" if isinstance(factor, gtsam.NonlinearFactor) else "")
+                + ("" if keys is None else f" on {keys}")
             )
+        with own_code("priors", "given to register"):
+            _check_finite(factor, near, "priors")
     try:
-        with own_code("priors", "given to register" if given else None):
-            yield
+        with own_code("priors", "given to register" if factors else None):
+            yield factors or ()
     except PartError as error:
-        if given and error.part != "priors":
+        if factors and error.part != "priors":
             error.add_note("or raised by one of the priors given to register")
         raise
 

@@ -63,6 +63,21 @@ def test_bag_round_trip(tmp_path: Path, kind: str) -> None:
     assert info.problems == []
 
 
+@pytest.mark.parametrize(
+    ("step", "times", "period"), [(50, False, 0.05), (50, True, None), (100, False, None)]
+)
+def test_sweeps_without_times_take_no_longer_than_until_the_next_one(
+    tmp_path: Path, step: int, times: bool, period: float | None
+) -> None:
+    recording: Recording = []
+    for i in range(4):
+        stamp = START + i * step * 1_000_000
+        columns = {"time": np.linspace(0, 0.05, 300, dtype="f4")} if times else {}
+        recording.append(("/points", stamp, cloud(ROS1, stamp, sweep_points(i), **columns)))
+    dataset = open_dataset(write_bag(tmp_path / "run", "ros1", recording))
+    assert dataset.sensor.get("period") == (None if period is None else pytest.approx(period))
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_the_message_of_a_livox_is_read_with_its_times_and_without_rings(
     tmp_path: Path, kind: str

@@ -23,6 +23,7 @@ from loam_gtsam.datasets.decode.point_times import (
     IGNORE_TIMES,
     TimeDecision,
     check_time_options,
+    shorter_period,
     span_problem,
     usual_step,
 )
@@ -179,6 +180,8 @@ class BagDataset(Loader):
             raise DatasetError(f"{self._path}, topic {self.topic}: {problem}; give {IGNORE_TIMES}")
         # The last one: near time zero an absolute time can still look like an offset.
         self._decision = next((d.decision for d in reversed(decoded) if d.decision), None)
+        if self._decision is None:
+            self.sensor = shorter_period(stamps)
         self._facts = {"topic": self.topic, "sweeps": str(self._count)}
         tables.describe_stamps(np.array(stamps, dtype=np.int64), self._facts, self._problems)
         self._facts |= {
@@ -218,7 +221,7 @@ class BagSequence(BagDataset):
         self._truth_source = "" if truth is None else truth.name
         self.name = path.resolve().name if path.is_dir() else path.stem
         if self.imu_topic == rig.imu_topic:
-            self.sensor: Mapping[str, Any] = extrinsics.extrinsic_settings(rig.lidar_T_imu)
+            self.sensor = {**self.sensor, **extrinsics.extrinsic_settings(rig.lidar_T_imu)}
         elif self.imu_topic is not None:
             self._problems.append(
                 f"IMU: not the {rig.imu_topic} of {rig.kind}, so its rotation to the lidar is "
@@ -240,7 +243,7 @@ class BagSequence(BagDataset):
         info.kind = f"{self._rig.kind}, {info.kind}"
         if len(self._parts) > 1:
             info.facts["bags"] = f"{self._parts[0].name} and {len(self._parts) - 1} more"
-        if self.sensor:
+        if "imu.lidar_t_imu" in self.sensor:
             where = extrinsics.describe_extrinsics(self.sensor, self._rig.source)
             info.facts["IMU to lidar"] = where
         info.facts["reference poses"] = "none"

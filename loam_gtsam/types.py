@@ -241,8 +241,8 @@ class ImuSamples:
     Attributes
     ----------
     stamps : (N,) int64 nanoseconds
-    orientation : (N, 4) quaternions x y z w of ``world_R_imu`` (world z up), or None if the IMU
-        has no attitude output
+    orientation : (N, 4) quaternions x y z w of ``world_R_imu`` (world z up), NaN where unknown, or
+        None if the IMU has no attitude output
     gyro : (N, 3) rad/s, imu frame
     acceleration : (N, 3) m/s^2, imu frame, reads +9.8 upwards at rest; zero for an IMU without an
         accelerometer, which None or nothing stands for

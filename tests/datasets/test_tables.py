@@ -78,6 +78,23 @@ def test_imu_samples_are_put_in_order() -> None:
     assert clean == []
 
 
+@pytest.mark.parametrize("bad", [0, 1, 2, 3, 5])
+def test_orientations_of_another_length_cost_no_others(bad: int) -> None:
+    problems: list[str] = []
+    values = imu_values(5)
+    values[:bad, :4] *= np.array([0.0, 0.5, 1.1, 3.0, 2.0])[:bad, None]
+    samples = clean_imu(np.arange(5), values, problems)
+    assert len(samples.stamps) == 5
+    if bad > 2:
+        assert samples.orientation is None
+        assert problems == ["IMU: no orientation in it (not given, or not of unit length)"]
+        return
+    assert np.isnan(samples.orientation[:bad]).all()
+    np.testing.assert_array_equal(samples.orientation[bad:], imu_values(5 - bad)[:, :4])
+    told = f"IMU: {bad} of 5 orientations are not of unit length, left out"
+    assert problems == ([told] if bad else [])
+
+
 def test_imu_in_g_is_converted_and_an_empty_one_is_none() -> None:
     problems: list[str] = []
     values = imu_values(4)

@@ -229,7 +229,13 @@ def clean_imu(stamps: IntArray, values: FloatArray, problems: list[str]) -> ImuS
     stamps, values = stamps[order], values[order]
     orientation, gyro, acceleration = values[:, :4].copy(), values[:, 4:7], values[:, 7:]
     norms = np.linalg.norm(orientation, axis=1, keepdims=True)
-    unknown = bool((np.abs(norms - 1.0) > UNIT_TOLERANCE).any())
+    bad = np.abs(norms[:, 0] - 1.0) > UNIT_TOLERANCE
+    orientation[bad] = np.nan
+    unknown = bool(2 * bad.sum() > len(bad))
+    if bad.any() and not unknown:
+        problems.append(
+            f"IMU: {bad.sum()} of {len(bad)} orientations are not of unit length, left out"
+        )
     if unknown:
         problems.append("IMU: no orientation in it (not given, or not of unit length)")
     if is_in_g(acceleration):

@@ -117,8 +117,8 @@ def absolute_error(
 ) -> AbsoluteError:
     """Absolute error (ATE) of the poses inside the reference, interpolated at their stamps.
 
-    Raises InputError if fewer than three poses overlap in time, or the reference's stamps do not
-    increase.
+    Raises InputError if fewer than three poses overlap in time, the reference's stamps do not
+    increase, or positions are not finite.
 
     Parameters
     ----------
@@ -375,6 +375,13 @@ def _common(
         raise InputError(
             f"{caller}: expected poses of finite numbers, got {int(unknown.sum())} of "
             f"{len(compared)} that are not; leave them out"
+        )
+    nowhere = np.flatnonzero(~np.isfinite(reference.positions).all(axis=1))
+    if len(nowhere):
+        raise InputError(
+            f"{caller}: expected a reference with positions of finite numbers, got "
+            f"{len(nowhere)} of {len(reference)} that are not, the first of them at "
+            f"{reference.stamps[nowhere[0]]} ns; leave them out"
         )
     stamps = coarse.stamps[inside]
     poses, truth = compared, fine.at(stamps).map_T_lidar

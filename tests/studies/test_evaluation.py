@@ -306,3 +306,5 @@ def test_poses_that_are_no_numbers_have_no_error():
     for error in (absolute_error, relative_error):
         with pytest.raises(InputError, match="expected poses of finite numbers, got 1 of"):
             error(changed(truth, poses), truth)
+        with pytest.raises(InputError, match=r"a reference with .* got 1 of .* leave them out"):
+            error(truth, changed(truth, poses))

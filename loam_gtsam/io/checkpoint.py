@@ -31,6 +31,7 @@ from loam_gtsam.types import BadSweep, DatasetError, MapUpdate, OutputError, Swe
 _HEADER = "header"
 _FILE = re.compile(r"(frames_\d+_\d+|state_\d+)\.npz")
 _UNFINISHED = re.compile(rf"\.{_FILE.pattern}\.\d+\.tmp")
+_SHOWN = 5  # parameters of two configurations that differ, in a message
 _log = logging.getLogger(__name__)
 
 
@@ -205,10 +206,10 @@ class Checkpoint:
     def _check(self, about: Mapping[str, str]) -> None:
         for name, now in self._about.items():
             if about.get(name) != now:
+                was, is_now = _unlike(about.get(name), now)
                 raise OutputError(
-                    f"{self.folder}: the checkpoint is of another run: its {name} was "
-                    f"{_shorten(about.get(name))}, now it is {_shorten(now)}; resume with the "
-                    "same, or start again"
+                    f"{self.folder}: the checkpoint is of another run: its {name} was {was}, now "
+                    f"it is {is_now}; resume with the same, or start again"
                 )
 
 
@@ -300,6 +301,31 @@ def _read(path: Path) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     return arrays, json.loads(arrays.pop(_HEADER).tobytes())
+
+
+def _unlike(before: object, now: object) -> tuple[str, str]:
+    """Two values to be shown; of mappings as JSON, the first few entries that differ."""
+    one, other = {}, {}
+    with suppress(ValueError):
+        one, other = (_entries(json.loads(str(value))) for value in (before, now))
+    names = [name for name in one | other if one.get(name) != other.get(name)]
+    if not (one and other and names):
+        return _shorten(before), _shorten(now)
+    shown, more = names[:_SHOWN], len(names) - _SHOWN
+    rest = f" and {more} more" if more > 0 else ""
+    texts = [
+        ", ".join(f"{name} {_shorten(part.get(name))}" for name in shown) + rest
+        for part in (one, other)
+    ]
+    return texts[0], texts[1]
+
+
+def _entries(value: object, name: str = "") -> dict[str, object]:
+    """The values of nested mappings by dotted name; nothing of a value that is none."""
+    if not isinstance(value, Mapping):
+        return {name: value} if name else {}
+    inner = {f"{name}.{key}".lstrip("."): part for key, part in value.items()}
+    return {key: end for n, part in inner.items() for key, end in _entries(part, n).items()}
 
 
 def _shorten(value: object) -> str:

@@ -213,8 +213,13 @@ def test_another_configuration_is_told(tmp_path):
         open_dataset(f"sim:{world}?frames=3&columns=300") for world in ("room", "trees")
     )
     stopped(dataset, QUICK, tmp_path, 2)
-    with pytest.raises(OutputError, match="another run: its configuration"):
+    before, told = QUICK.solver.iterations, "another run: its configuration was solver.iterations"
+    with pytest.raises(OutputError, match=f"{told} {before}, now it is solver.iterations 7; "):
         stopped(dataset, QUICK.changed("solver.iterations=7"), tmp_path, None)
+    many = ["solver.iterations=7", "solver.min_matches=21", "imu.coupling=off"]
+    many += ["loops.enabled=true", "map.edge_voxel=0.3", "map.plane_voxel=0.7"]
+    with pytest.raises(OutputError, match=r"solver.iterations 7.* and 1 more; resume with"):
+        stopped(dataset, QUICK.changed(*many), tmp_path, None)
     with pytest.raises(OutputError, match="another run: its data set was room"):
         stopped(other, QUICK, tmp_path, None)
 

@@ -7,6 +7,7 @@ Every file is written beside its final name and then renamed, see :mod:`loam_gts
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -179,7 +180,7 @@ def write_run(
 ) -> None:
     """Write all of :data:`RUN_FILES`; files of the same names are replaced.
 
-    ``summary.json`` comes last: where it is, the others are complete.
+    ``summary.json`` is removed first and comes last: where it is, the others are complete.
 
     Parameters
     ----------
@@ -189,6 +190,8 @@ def write_run(
     extra : further entries of the summary (plain numbers, strings, lists and mappings)
     """
     folder = make_folder(directory)
+    with suppress(OSError):  # what cannot be removed cannot be replaced, which is told then
+        (folder / "summary.json").unlink(missing_ok=True)
     trajectory = result.trajectory
     records = {"made by": f"loam_gtsam {installed_version()}", "data set": dataset}
     moment = result.config.deskew.reference

@@ -23,7 +23,14 @@ from loam_gtsam.io.read_run import read_updates
 from loam_gtsam.io.trajectories import write_kitti, write_tum
 from loam_gtsam.pipeline import RunResult, run
 from loam_gtsam.studies.evaluation import absolute_error
-from loam_gtsam.types import DatasetError, FrameStatus, InputError, MapUpdate, Trajectory
+from loam_gtsam.types import (
+    DatasetError,
+    FrameStatus,
+    InputError,
+    MapUpdate,
+    OutputError,
+    Trajectory,
+)
 
 FRAMES = 8
 WORLD = SimulatedWorld("room", frames=FRAMES, columns=450)
@@ -203,6 +210,18 @@ def test_ply_refuses_other_shapes(tmp_path):
     with pytest.raises(InputError, match=r"planes: expected \(N, 3\) floats, got shape \(4, 2\)"):
         run_files.write_ply(tmp_path / "map.ply", np.zeros((1, 3)), np.zeros((4, 2)))
     assert list(tmp_path.iterdir()) == []
+
+
+def test_results_that_fail_half_way_have_no_summary_of_earlier_ones(result, tmp_path, monkeypatch):
+    def full(*_):
+        raise OutputError("no space")
+
+    run_files.write_run(result, tmp_path)
+    assert (tmp_path / "summary.json").exists()
+    monkeypatch.setattr(run_files, "write_ply", full)
+    with pytest.raises(OutputError, match="no space"):
+        run_files.write_run(result, tmp_path)
+    assert not (tmp_path / "summary.json").exists()
 
 
 def test_write_run_writes_all_files(result, tmp_path):

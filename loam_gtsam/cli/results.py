@@ -17,6 +17,7 @@ from loam_gtsam.datasets.base import Dataset, DatasetInfo
 from loam_gtsam.io.checkpoint import checksum
 from loam_gtsam.io.run_files import RUN_FILES, write_run
 from loam_gtsam.io.trajectories import write_tum
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.files import write_graph
 from loam_gtsam.maps.map_file import MAP_FILE, save_map
 from loam_gtsam.pipeline import RunResult, effective_config
@@ -177,6 +178,9 @@ def is_complete(folder: Path, config: Config, dataset: Dataset, total: int) -> b
     differs = _differences(summary, dataset)
     if written != dump_config(effective_config(config, dataset)):
         differs.append("the configuration")
+    made_by, now = summary.get("loam_gtsam"), installed_version()
+    if made_by != now:
+        differs.append(f"by version {made_by}, now {now}")
     frames, whole = summary.get("frames", 0), summary.get("whole", True)
     if not differs and frames < total and not whole:
         return False

@@ -31,6 +31,7 @@ from loam_gtsam.datasets.decode.tables import read_tum
 from loam_gtsam.datasets.sim.world import SimulatedWorld
 from loam_gtsam.datasets.truth import read_truth
 from loam_gtsam.io.read_run import read_updates
+from loam_gtsam.io.version import installed_version
 from loam_gtsam.loops.files import read_graph
 from loam_gtsam.maps.map_file import SavedMap
 from loam_gtsam.refine.rounds import Settings
@@ -529,6 +530,15 @@ def test_resume_does_not_take_another_run_for_its_own(opens, scans, change):
     opens(scans[:3])
     mapped()
     assert "out: holds the results of another run" in mapped("--resume", *change, code=1)
+
+
+def test_resume_does_not_take_results_of_another_version_for_its_own(opens, scans):
+    opens(scans[:3])
+    mapped()
+    summary = summary_in(Path("out")) | {"loam_gtsam": "0.0.1"}
+    Path("out/summary.json").write_text(json.dumps(summary), encoding="utf-8")
+    told = f"another run (by version 0.0.1, now {installed_version()})"
+    assert told in mapped("--resume", code=1)
 
 
 def test_resume_does_over_what_has_a_damaged_summary(opens, scans):

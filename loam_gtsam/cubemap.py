@@ -85,7 +85,7 @@ class CubeMap:
     Raises
     ------
     ConfigError
-        If ``voxel_size`` is not positive, or no folder can be made in ``config.archive_dir``.
+        If ``voxel_size`` is not positive, or nothing can be written in ``config.archive_dir``.
     """
 
     def __init__(self, config: MapConfig, voxel_size: float, archive: Archive | None = None):

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import logging
 import os
+import shutil
 import tempfile
+import weakref
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -31,7 +33,8 @@ class Archive:
     ----------
     grid : of the map
     megabytes : memory for points; when it is used up, the oldest cubes go to disk
-    folder : in which a folder of this archive's own is made; None to drop cubes instead
+    folder : in which the archive makes a folder of its own for the first cube that goes to disk,
+        and removes it when the archive is gone; None to drop cubes instead
     """
 
     def __init__(self, grid: Grid, megabytes: float, folder: str | None) -> None:
@@ -41,15 +44,16 @@ class Archive:
         self._memory: dict[CubeIndex, CubePoints] = {}  # oldest first
         self._disk: dict[CubeIndex, tuple[int, Path]] = {}  # number of points, and the file
         self._stale: list[Path] | None = None  # to be removed, once nothing is remembered
-        self._folder: Path | None = None
+        self._parent = None if folder is None else Path(folder).absolute()
+        self._own: Path | None = None  # in the parent, once a cube went there
         self.dropped_cubes = self.dropped_points = 0
-        if folder is not None:
+        if self._parent is not None:
             try:
-                Path(folder).mkdir(parents=True, exist_ok=True)
-                self._folder = Path(tempfile.mkdtemp(prefix="cubes_", dir=folder))
+                self._parent.mkdir(parents=True, exist_ok=True)
+                tempfile.TemporaryFile(dir=self._parent).close()
             except OSError as error:
                 raise ConfigError(
-                    f"map.archive_dir: cannot make a folder in {folder!r} ({error}); name one that "
+                    f"map.archive_dir: cannot write to {folder!r} ({error}); name a folder that "
                     "can be written to, or null to keep the archive in memory"
                 ) from error
 
@@ -91,6 +95,7 @@ class Archive:
             "_disk": self._disk.copy(),
             "_stale": [],  # the files are in use again
         }
+        del before["_own"]  # which stays, once it is made
         return partial(vars(self).update, before)
 
     def indices(self) -> list[CubeIndex]:
@@ -173,21 +178,27 @@ class Archive:
         """Write a cube to disk; without a folder it is lost."""
         points = content.points
         self._bytes -= content.nbytes
-        if self._folder is None:
+        if self._parent is None:
             self._drop(len(points), "archive_megabytes is used up and archive_dir is not set")
             return
-        path = self._folder / "cube_{}_{}_{}.npy".format(*index)
-        while path in (self._stale or ()):  # what is remembered may need the old file
-            path = path.with_stem(f"{path.stem}_")
-        temporary = path.with_suffix(".tmp")
         try:
+            path = self._folder(self._parent) / "cube_{}_{}_{}.npy".format(*index)
+            while path in (self._stale or ()):  # what is remembered may need the old file
+                path = path.with_stem(f"{path.stem}_")
+            temporary = path.with_suffix(".tmp")
             with temporary.open("wb") as file:
                 np.save(file, np.column_stack(content), allow_pickle=False)
             os.replace(temporary, path)  # a file under its final name is always whole
         except OSError as error:
-            self._drop(len(points), f"cannot write {path}: {error}")
+            self._drop(len(points), f"cannot write to {self._own or self._parent}: {error}")
         else:
             self._disk[index] = len(points), path
+
+    def _folder(self, parent: Path) -> Path:
+        if self._own is None:
+            self._own = Path(tempfile.mkdtemp(prefix="cubes_", dir=parent))
+            weakref.finalize(self, shutil.rmtree, self._own, ignore_errors=True)
+        return self._own
 
     def _drop(self, n_points: int, reason: str) -> None:
         """Count a loss; say it once, as a full disk would say it for every cube."""

@@ -1,7 +1,9 @@
 """Cubes that left the window: they come back bit by bit, or their loss is counted."""
 
 import logging
+import pickle
 from collections.abc import Callable
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ from support.cubes import SMALL, moved_by
 from loam_gtsam.config import MapConfig
 from loam_gtsam.cubemap import CubeMap
 from loam_gtsam.geometry import OBLIQUE_EDGE, voxel_keys
+from loam_gtsam.io.rollback import Before
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ConfigError
 
@@ -124,16 +127,36 @@ def test_archive_that_cannot_be_written_is_counted(
 ) -> None:
     cube_map = CubeMap(small, 0.5)
     cube_map.insert(np.zeros((1, 3)))
-    next(tmp_path.glob("cubes_*")).rmdir()
+    tmp_path.rmdir()
     cube_map.recenter(np.array([100.0, 0.0, 0.0]))
     assert (cube_map.stats.dropped_cubes, cube_map.stats.archived) == (1, 0)
     assert "cannot write" in caplog.text
 
 
-def test_bad_archive_dir(tmp_path: Path) -> None:
+@pytest.mark.parametrize("place", ["{}/file", "{}/file/below", "/proc"])
+def test_bad_archive_dir(tmp_path: Path, place: str) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ConfigError, match=r"map\.archive_dir"):
-        CubeMap(MapConfig(archive_dir=str(tmp_path / "file")), 0.4)
+        CubeMap(MapConfig(archive_dir=place.format(tmp_path)), 0.4)
+
+
+def test_an_archive_has_a_folder_from_its_first_cube_on_disk_as_long_as_it_lives(
+    tmp_path: Path, small: MapConfig
+) -> None:
+    cube_map, unused = CubeMap(small, 0.5), CubeMap(small, 0.5)
+    cube_map.insert(np.zeros((1, 3)))
+    before = Before(cube_map)
+    assert list(tmp_path.iterdir()) == []
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    (folder,) = tmp_path.iterdir()
+    before.restore()
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    copy, pickled = deepcopy(cube_map), pickle.dumps(cube_map)
+    assert list(tmp_path.iterdir()) == [folder]
+    del cube_map, before, unused
+    assert list(tmp_path.iterdir()) == []
+    for again in (copy, pickle.loads(pickled)):
+        np.testing.assert_array_equal(again.points(archived=True), np.zeros((1, 3)))
 
 
 @pytest.mark.parametrize("megabytes", [100.0, 0.0])

@@ -7,9 +7,10 @@ import pytest
 from support.cubes import SMALL, moved_by
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.cubemap import CubeMap, grid_of
 from loam_gtsam.geometry import voxel_filter, voxel_keys
 from loam_gtsam.types import ConfigError, InputError
+from loam_gtsam.voxels.archive import Archive
 
 ALL_AROUND = MapConfig(field_of_view=False)
 CENTROID = MapConfig(insertion="centroid")
@@ -137,6 +138,14 @@ def test_points_outside_are_counted() -> None:
     fine = CubeMap(MapConfig(), 1e-5)
     fine.insert(np.array([[7.8, 0.0, 0.0], [7.7, 7.7, -7.7]]))
     assert (fine.stats.outside, fine.count()) == (1, 1)
+
+
+def test_an_archive_that_is_given_is_used_though_it_is_empty() -> None:
+    archive = Archive(grid_of(SMALL, 0.5), np.inf, None)
+    cube_map = CubeMap(SMALL, 0.5, archive)
+    cube_map.insert(np.zeros((1, 3)))
+    cube_map.recenter(np.array([100.0, 0.0, 0.0]))
+    assert archive.count() == 1
 
 
 def test_results_do_not_share_memory_with_the_map() -> None:

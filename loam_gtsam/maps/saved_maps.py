@@ -18,8 +18,8 @@ from loam_gtsam.voxels.grid import CubeIndex, Grid
 class SavedCubes(Archive):
     """The cubes of one layer of a saved map, read when they are taken.
 
-    ``keep`` tells whether a cube that is stored stays as it is then, in memory; else it is read
-    again when it is next taken.
+    ``keep`` tells whether a cube of the file that is stored stays as it is then, in memory; else it
+    is read again when it is next taken. Cubes that the file does not have stay.
     """
 
     def __init__(self, grid: Grid, saved: SavedMap, layer: str, *, keep: bool) -> None:
@@ -46,7 +46,7 @@ class SavedCubes(Archive):
 
     def store(self, index: CubeIndex, content: CubePoints) -> None:
         """Take a cube back."""
-        if self._keep:
+        if self._keep or index not in self._saved.layers[self._layer]:
             super().store(index, content)
         else:
             self._out -= {index}
@@ -95,7 +95,7 @@ class SavedMaps(MapPair):
         for number, (layer, grid) in enumerate(grids(self._configs[0]).items()):
             archive = SavedCubes(grid, self._saved, layer, keep=self._keep)
             config = self._configs[number // 2].map
-            maps.append(CubeMap(config, grid.voxel_size, archive if len(archive) else None))
+            maps.append(CubeMap(config, grid.voxel_size, archive))
         self._open, self._small = (maps[0], maps[1]), (maps[2], maps[3])
         self._thinned = None
 

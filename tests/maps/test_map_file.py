@@ -111,6 +111,19 @@ def test_cubes_are_read_where_the_lidar_is(mapped, saved, monkeypatch):
         assert cubes.count() == sum(saved.layers[layer].values())
 
 
+@pytest.mark.parametrize("emptied", [False, True])
+def test_cubes_that_the_file_does_not_have_stay(mapped, saved, emptied):
+    if emptied:
+        saved.layers["planes"].clear()
+    cubes = SavedMaps(config_in(saved, None), saved).layers()["planes"]
+    far = np.array([[5000.0, 0.0, 0.0]])
+    cubes.recenter(far[0])
+    cubes.insert(far)
+    cubes.recenter(np.zeros(3))
+    cubes.recenter(far[0])
+    np.testing.assert_allclose(cubes.points(), far, atol=1e-3)
+
+
 def edited(path: Path, target: Path, edit: Callable[[dict[str, bytes]], None]) -> Path:
     """The map with other members, whose checksums are right."""
     with zipfile.ZipFile(path) as archive:

@@ -116,9 +116,14 @@ class Archive:
             self._spill(oldest, self._memory.pop(oldest))
 
     def read(self, index: CubeIndex) -> CubePoints | None:
-        """Points of an archived cube; None, and the cube counts as dropped, if unreadable."""
+        """Points of an archived cube; None, and the cube counts as dropped, if unreadable.
+
+        None as well if the cube is not in the archive, or no longer.
+        """
         if index in self._memory:
             return self._memory[index]
+        if index not in self._disk:
+            return None
         count, path = self._disk[index]
         try:
             # Mapped, so that a damaged header cannot claim more memory than the file has bytes.
@@ -141,8 +146,6 @@ class Archive:
 
     def take(self, index: CubeIndex) -> Cube | None:
         """Take a cube out of the archive; None if it is not there or cannot be read."""
-        if index not in self._memory and index not in self._disk:
-            return None
         content = self.read(index)
         if index in self._memory:
             self._bytes -= self._memory.pop(index).nbytes

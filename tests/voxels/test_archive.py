@@ -12,11 +12,14 @@ import pytest
 from support.cubes import SMALL, moved_by
 
 from loam_gtsam.config import MapConfig
-from loam_gtsam.cubemap import CubeMap
+from loam_gtsam.cubemap import CubeMap, grid_of
 from loam_gtsam.geometry import OBLIQUE_EDGE, voxel_keys
 from loam_gtsam.io.rollback import Before
 from loam_gtsam.io.state import freeze, thaw
 from loam_gtsam.types import ConfigError
+from loam_gtsam.voxels.archive import Archive
+from loam_gtsam.voxels.cubes import CubePoints
+from loam_gtsam.voxels.tags import tags_of
 
 
 @pytest.fixture
@@ -131,6 +134,20 @@ def test_archive_that_cannot_be_written_is_counted(
     cube_map.recenter(np.array([100.0, 0.0, 0.0]))
     assert (cube_map.stats.dropped_cubes, cube_map.stats.archived) == (1, 0)
     assert "cannot write" in caplog.text
+
+
+def test_a_cube_that_is_dropped_while_the_archive_is_read_is_skipped() -> None:
+    archive = Archive(grid_of(SMALL, 0.5), 50e-6, None)  # room for two points
+    one, two = (CubePoints(np.zeros((n, 3)), tags_of(n, 0)) for n in (1, 2))
+    archive.store((0, 0, 0), one)
+    archive.store((1, 0, 0), one)
+    seen = []
+    for index, _ in archive.contents():
+        seen.append(index)
+        archive.store((2, 0, 0), two)
+    assert seen == [(0, 0, 0)]
+    assert archive.indices() == [(2, 0, 0)]
+    assert archive.take((0, 0, 0)) is None
 
 
 @pytest.mark.parametrize("place", ["{}/file", "{}/file/below", "/proc"])

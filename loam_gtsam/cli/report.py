@@ -119,6 +119,8 @@ def _accuracy(accuracy: Mapping[str, Any]) -> str:
         text += f"; {accuracy['not_fitted_rmse_m']:.3f} m if not fitted"
     if accuracy.get("nees") is not None:
         text += f"; NEES {accuracy['nees']:.2f} a degree of freedom (1 is consistent)"
+    if accuracy.get("broken_covariances"):
+        text += f"; {accuracy['broken_covariances']} covariances are not positive definite"
     if accuracy.get("ok_beyond_five_sigma"):
         text += f"; {accuracy['ok_beyond_five_sigma']} frames ok are off by more than 5 told sigma"
     return text

@@ -160,6 +160,7 @@ def _without_fit(run: RunResult, truth: Trajectory) -> dict[str, float]:
             nees = evaluation.nees(run.updates, truth)
             ok = [n for n in nees.beyond if run.updates[n].status is FrameStatus.OK]
             found |= {"nees": nees.mean, "ok_beyond_five_sigma": len(ok)}
+            found |= {"broken_covariances": nees.broken}
     return found
 
 

@@ -88,7 +88,9 @@ class Scores:
     beyond : frames ``ok`` whose pose is off by more than five told standard deviations; NaN
         without truth or without covariances
     nees, nees_step : mean squared error over covariance, in degrees of freedom, of the poses since
-        the start and of the motions from frame to frame: 1 if the covariances are right
+        the start and of the motions from frame to frame: 1 if the covariances are right, infinite
+        if one is broken
+    broken : covariances of these poses and motions that are not positive definite
     iterations, solver_iterations : associations and solver steps, mean of the solved frames
     matches : number of matches of the last association, median of the solved frames
     ms_median, ms_95 : milliseconds per frame without reading, the first frame left out
@@ -112,6 +114,7 @@ class Scores:
     beyond: float = np.nan
     nees: float = np.nan
     nees_step: float = np.nan
+    broken: float = np.nan
     iterations: float = np.nan
     solver_iterations: float = np.nan
     matches: float = np.nan
@@ -340,7 +343,9 @@ def _consistency(run: SolverRun, truth: Trajectory) -> dict[str, Any]:
     since_start = evaluation.nees(run.updates, truth)
     ok = [n for n in since_start.beyond if run.updates[n].status is FrameStatus.OK]
     step = evaluation.nees(run.updates, truth, window=1)
-    return {"nees": since_start.mean, "nees_step": step.mean, "beyond": float(len(ok))}
+    broken = float(since_start.broken + step.broken)
+    found = {"nees": since_start.mean, "nees_step": step.mean}
+    return found | {"broken": broken, "beyond": float(len(ok))}
 
 
 @dataclass(frozen=True, slots=True, eq=False)

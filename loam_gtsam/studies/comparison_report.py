@@ -86,6 +86,8 @@ FRAMES = (
             "poses since the start; 1 if the covariances are right, above if they are too small",
             2),
     Column("nees_step", "NEES/6, step", "the same of the motions from frame to frame", 2),
+    Column("broken", "broken", "covariances of these poses and motions that are not positive "
+            "definite; NEES/6 is infinite with one", 0),
     Column("statuses", "frames", "number of frames by status", 0),
     Column("faults", "unused", "number of sweeps that could not be used, by cause", 0),
 )  # fmt: skip

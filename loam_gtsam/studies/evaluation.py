@@ -232,7 +232,7 @@ class Nees:
     Attributes
     ----------
     mean : mean of ``squared`` over the six degrees of freedom: 1 if the covariances are right,
-        larger if they are too small; NaN without samples
+        larger if they are too small, infinite if one is broken; NaN without samples
     frames : (N,) numbers of the frames, solved ones with a covariance, and reference poses at both
         ends of the window
     squared : (N,) squared Mahalanobis distances of the errors; infinite where the covariance is
@@ -251,6 +251,11 @@ class Nees:
     def beyond(self) -> IntArray:
         """(M,) numbers of the frames that are off by more than five told standard deviations."""
         return self.frames[self.squared > FIVE_SIGMA]
+
+    @property
+    def broken(self) -> int:
+        """Number of covariances that are not positive definite."""
+        return int(np.isinf(self.squared).sum())
 
 
 def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0) -> Nees:
@@ -285,8 +290,7 @@ def nees(updates: Sequence[MapUpdate], reference: Trajectory, *, window: int = 0
     squared = np.array([_mahalanobis(*pair) for pair in found.values()], np.float64)
     errors = np.array([error for error, _ in found.values()]).reshape(-1, 6)
     variances = np.array([np.diag(covariance) for _, covariance in found.values()]).reshape(-1, 6)
-    finite = squared[np.isfinite(squared)]
-    mean = float(finite.mean()) / FREEDOM if len(finite) else np.nan
+    mean = float(squared.mean()) / FREEDOM if len(squared) else np.nan
     numbers = np.array([inside[k] for k in found], np.int64)
     return Nees(mean, numbers, squared, errors, np.sqrt(np.maximum(variances, 0.0)))
 

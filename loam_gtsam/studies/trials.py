@@ -39,7 +39,7 @@ VERSIONS = ("loam_gtsam", "gtsam", "numpy")
 """Packages whose version decides the numbers of the solvers of this package."""
 METRICS = (
     "ate_m", "ate_max_m", "start_m", "rotation_deg", "rpe_percent", "rpe_deg_per_m",
-    "drift_percent", "solved", "beyond", "nees", "nees_step",
+    "drift_percent", "solved", "beyond", "nees", "nees_step", "broken",
     "thickness_mm", "planar_share", "entropy",
     "iterations", "solver_iterations", "matches", "ms_median", "ms_95",
 )  # fmt: skip

@@ -310,6 +310,7 @@ def test_what_is_off_by_more_than_is_told_is_counted(dataset):
     good = score(ours, dataset.truth)
     assert good.beyond == 0
     assert 0.05 < good.nees < 5.0
+    assert good.broken == 0
     poses = dataset.truth.map_T_lidar.copy()
     poses[:, 0, 3] += np.linspace(0.0, 2.0, len(poses))
     wrong = Trajectory(dataset.truth.stamps, poses)

@@ -1,14 +1,20 @@
 """Trajectory errors: closed forms, degenerate paths, and evo where it is installed."""
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 import pytest
+from support.quick import QUICK
 from support.trajectories import disturbed, moved, straight, winding
 
+from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.pipeline import run
 from loam_gtsam.studies.evaluation import (
     absolute_error,
     align_positions,
     align_rotations,
+    nees,
     path_lengths,
     pose_differences,
     relative_error,
@@ -297,6 +303,19 @@ def test_relative_errors_are_those_of_evo():
             rpe.process_data((reference, other))
             assert len(rpe.error) == found.pairs[0]
             assert ours == pytest.approx(float(np.mean(rpe.error)), rel=1e-6)
+
+
+def test_a_covariance_that_is_not_positive_definite_does_not_improve_the_nees():
+    world = SimulatedWorld("room", frames=5, columns=180, sensor="vlp16")
+    updates, truth = [*run(world, QUICK).updates], world.truth
+    good = nees(updates, truth)
+    last = updates[-1]
+    updates[-1] = replace(last, covariance=-last.covariance)
+    bad = nees(updates, truth)
+    assert (good.broken, bad.broken) == (0, 1)
+    assert np.isfinite(good.mean)
+    assert bad.mean == np.inf
+    assert len(updates) - 1 in bad.beyond
 
 
 def test_poses_that_are_no_numbers_have_no_error():

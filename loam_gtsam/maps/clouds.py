@@ -152,7 +152,8 @@ def _check_counts(path: Path) -> None:
 def _write_las(path: Path, points: FloatArray) -> None:
     laspy = _laspy(path)
     header = laspy.LasHeader(point_format=0, version="1.2")
-    header.scales, header.offsets = np.full(3, 1e-3), np.floor(points.min(axis=0, initial=0.0))
+    header.scales = np.full(3, 1e-3)
+    header.offsets = np.floor(points.min(axis=0)) if len(points) else np.zeros(3)
     cloud = laspy.LasData(header)
     cloud.xyz = points
     with atomic_file(path) as file:

@@ -18,6 +18,19 @@ from loam_gtsam.maps.map_file import SavedMap
 from loam_gtsam.types import DatasetError, FrameStatus, OutputError, stack_poses
 
 
+@pytest.mark.parametrize("middle", [(0.0, 0.0, 0.0), (5e5, 5.4e6, 300.0), (-5e6, 0.0, 0.0)])
+@pytest.mark.parametrize("kind", [".pcd", ".las", ".laz"])
+def test_a_cloud_comes_back_from_anywhere_on_earth(tmp_path, kind, middle):
+    if kind in (".las", ".laz"):
+        pytest.importorskip("laspy")
+    rng = np.random.default_rng(3)
+    points = middle + rng.uniform(-900.0, 900.0, (100, 3))
+    path = tmp_path / f"cloud{kind}"
+    write_cloud(path, points[:40], points[40:])
+    np.testing.assert_allclose(read_cloud(path), points, rtol=0.0, atol=6e-4)
+    write_cloud(path, points[:0], points[:0])
+
+
 @pytest.mark.parametrize("kind", [".ply", ".pcd", ".las", ".laz"])
 def test_a_cloud_comes_back(tmp_path, kind):
     if kind in (".las", ".laz"):

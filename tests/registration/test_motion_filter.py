@@ -9,6 +9,7 @@ from support.list_dataset import ListDataset
 
 from loam_gtsam.config import Config, SolverConfig
 from loam_gtsam.datasets.sim.world import SimulatedWorld
+from loam_gtsam.io.rollback import Before
 from loam_gtsam.pipeline import run
 from loam_gtsam.registration.solvers import MotionFilter
 from loam_gtsam.registration.uncertainty import relative_covariance
@@ -69,6 +70,14 @@ def test_along_what_scans_hardly_fix_the_velocity_is_that_of_many_poses():
 def test_what_no_scan_sees_goes_on_as_it_was():
     ways = np.repeat([0.5, 3.0], [10, 30])
     np.testing.assert_allclose(follow(ways, 1e-3, blind=30)[10:], 0.5, atol=0.01)
+
+
+def test_a_velocity_that_an_imu_told_can_be_taken_back():
+    motion, _ = after([False] * 3)
+    before = Before(motion)
+    motion.told(np.array([4.0, 0.0, 0.0]))
+    before.restore()
+    assert motion.expected(4 * FRAME, moved(0)).x() == 0.0
 
 
 def test_a_velocity_that_an_imu_told_goes_on_and_is_as_badly_known_as_without():

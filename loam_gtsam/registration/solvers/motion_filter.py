@@ -112,7 +112,7 @@ class MotionFilter:
 
         The covariance stays that of the scans alone, the larger one.
         """
-        self._twist[3:] = velocity
+        self._twist = np.concatenate([self._twist[:3], velocity])
 
     def observe(
         self,

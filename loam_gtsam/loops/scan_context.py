@@ -26,7 +26,7 @@ def scan_context(points: FloatArray, config: LoopConfig) -> FloatArray:
     ranges = np.hypot(points[:, 0], points[:, 1])
     near = ranges < config.reach
     turns = np.arctan2(points[near, 1], points[near, 0]) / (2.0 * np.pi)
-    row = (ranges[near] * (rings / config.reach)).astype(np.int64)
+    row = np.minimum((ranges[near] * (rings / config.reach)).astype(np.int64), rings - 1)
     column = np.floor((turns % 1.0) * sectors).astype(np.int64) % sectors
     heights = np.clip(points[near, 2] + _BELOW, 0.0, _HIGHEST)
     grid = np.zeros(rings * sectors)

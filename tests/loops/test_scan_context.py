@@ -36,6 +36,12 @@ def test_a_cell_has_the_height_of_its_highest_point():
     np.testing.assert_array_equal(scan_context(points, config), expected)
 
 
+def test_a_point_that_is_just_within_reach_is_in_the_last_ring():
+    config = LoopConfig(rings=24)
+    point = np.array([[np.nextafter(config.reach, 0.0), 0.0, 1.0]])
+    assert scan_context(point, config)[-1, 0] == 4.0
+
+
 @pytest.mark.parametrize("sectors", [7, -13, 30])
 def test_a_turn_is_found_and_changes_nothing_else(sectors):
     config = LoopConfig()

@@ -198,9 +198,9 @@ def write_comparison(results: ScoredComparison, folder: Path, plot: bool) -> lis
         [run.name, str(run.group), run.version, *(getattr(s, key) for key in keys)]
         for run, s in results.rows
     )
-    _write_csv(folder / "comparison.csv", ["solver", "group", "version", *keys], rows)
+    write_csv(folder / "comparison.csv", ["solver", "group", "version", *keys], rows)
     write_json(folder / "comparison.json", _summary(results))
-    _write_csv(folder / "frames.csv", _FRAME_COLUMNS, _frame_rows(results))
+    write_csv(folder / "frames.csv", _FRAME_COLUMNS, _frame_rows(results))
     trajectories = {}
     for run in comparison.runs:
         name, found = file_name(run.name), run.trajectory
@@ -277,7 +277,9 @@ def _frame_rows(results: ScoredComparison) -> Iterable[list[Any]]:
             ]  # fmt: skip
 
 
-def _write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
+def write_csv(path: Path, header: Iterable[str], rows: Iterable[list[Any]]) -> None:
+    """Write a table of texts and numbers, see :func:`~loam_gtsam.io.atomic.atomic_file`."""
+
     def field(value: Any) -> Any:  # a number that is not known is an empty field
         if isinstance(value, Mapping):
             return " ".join(f"{name}={count}" for name, count in value.items())

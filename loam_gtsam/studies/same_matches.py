@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -35,6 +36,7 @@ from loam_gtsam.registration.solvers import (
     make_solver,
     match_rows,
 )
+from loam_gtsam.studies.comparison_report import write_csv
 from loam_gtsam.studies.contenders import Contender
 from loam_gtsam.studies.report_html import TextTable, list_html, page, table_html
 from loam_gtsam.types import (
@@ -400,12 +402,12 @@ def write_same_matches(results: SameMatches, folder: Path) -> list[str]:
     """Write a table of all frames, and the report; returns the names of the files."""
     keys = [item.name for item in fields(Solve) if item.name != "returned"]
     away = [f"back_{m:g}m_{deg:g}deg" for m, deg in results.disturbances]
-    rows = [",".join(["solver", "frame", *keys, *away])]
+    rows: list[list[Any]] = []
     for name, solves in results.solves.items():
         for number, solve in zip(results.frames, solves, strict=True):
             values = [getattr(solve, key) for key in keys] + list(solve.returned)
-            rows.append(",".join([name, str(number), *(f"{float(v):.9g}" for v in values)]))
-    write_text(folder / FILES[0], "\n".join(rows).replace("nan", "") + "\n")
+            rows.append([name, number, *map(float, values)])
+    write_csv(folder / FILES[0], ["solver", "frame", *keys, *away], rows)
     meaning = {title: text for title, _, _, text in _SHOWN.values()}
     meaning["back from"] = (
         f"share of the solves from a guess disturbed by so much, in a random direction, that end "

@@ -13,6 +13,8 @@ from loam_gtsam.pipeline import run
 from loam_gtsam.studies.contenders import METHODS, Contender, Group, make_contender
 from loam_gtsam.studies.same_matches import (
     TRUTH,
+    SameMatches,
+    Solve,
     compare_on_same_matches,
     table_of,
     write_same_matches,
@@ -68,6 +70,18 @@ def test_the_truth_can_make_the_map_and_is_what_errors_are_taken_from(dataset, t
         rows = list(csv.DictReader(file))
     assert len(rows) == len(METHODS) * len(result.frames)
     assert "the map is made by truth" in (tmp_path / "report.html").read_text()
+
+
+def test_the_table_has_the_names_as_they_are_and_nothing_for_what_is_not_known(tmp_path):
+    name = "mine:make_nano_solver, quick"
+    solve = Solve(True, True, 3, 4, 50, 0.0, 0.0, np.nan, np.nan, 1.0, 2.0, 3.0, (True, False))
+    write_same_matches(
+        SameMatches("room", name, {name: [solve]}, [7], ((1.0, 5.0), (2.0, 9.0))), tmp_path
+    )
+    with open(tmp_path / "same_matches.csv", newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert (row["solver"], row["frame"], row["matches"], row["error_m"]) == (name, "7", "50", "")
+    assert (row["converged"], row["back_1m_5deg"], row["back_2m_9deg"]) == ("1", "1", "0")
 
 
 def test_what_cannot_be_asked_is_refused(dataset, sweeps):

@@ -90,7 +90,11 @@ class LoamGtsam(EvalioPipeline):
     def set_params(
         self, params: Mapping[str, bool | int | float | str]
     ) -> dict[str, bool | int | float | str]:
-        """Set parameters; returns the parameters that are unknown."""
+        """Set parameters; returns the parameters that are unknown.
+
+        evalio hands over all of them, those that are not set with their defaults. So only what
+        differs from these can be set on top of a preset.
+        """
         self._params |= {key: value for key, value in params.items() if key in self._params}
         return {key: value for key, value in params.items() if key not in self._params}
 

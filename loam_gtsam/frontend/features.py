@@ -64,8 +64,8 @@ def extract_features(scan: Scan, config: Config) -> Features:
 
     Those of a sweep without rings are found by :mod:`loam_gtsam.frontend.unorganised`, and have no
     ``sharp`` and no ``flat``. Positions stay raw, and every feature keeps its time, so that
-    :func:`loam_gtsam.geometry.move_points` can de-skew them. ``sharp`` and ``flat`` are the first
-    rows of ``edges`` and ``planes``.
+    :func:`loam_gtsam.geometry.move_points` can de-skew them. ``sharp`` are the first rows of
+    ``edges``; ``flat`` are the rows of ``planes`` with the flattest points in them, and may be any.
 
     Parameters
     ----------

@@ -157,8 +157,8 @@ def optimize_graph(
 def _check(saved: SavedGraph) -> None:
     check_kind(saved, SavedGraph, "graph", "read_graph(path) reads one")
     keys = sorted(saved.poses.keys())
-    if not keys:
-        raise InputError("graph: expected poses, got none")
+    if not saved.keys:
+        raise InputError(f"graph: expected poses, got none among {len(keys)} variables")
     name = gtsam.DefaultKeyFormatter
     rank = {key: place for place, key in enumerate(keys)}
     pairs: list[tuple[int, int]] = []

@@ -127,6 +127,8 @@ class PoseGraph(FactorGraph):
         If ``pose_graph.visits`` keyframes have come back to a place, the one after it hangs on that
         with which it closed a loop. Returns the number of the first one there if so, else None.
         """
+        if not self.keyframes:
+            return None
         newest, most = self.keyframes[-1], self.config.visits
         place = _place(self, newest)
         return place if place is not None and self.visits.add(newest.index, place, most) else None

@@ -48,6 +48,10 @@ def test_a_graph_that_nothing_holds_is_held_at_its_first_pose():
 def test_graphs_that_cannot_be_solved_are_refused():
     with pytest.raises(InputError, match="expected poses, got none"):
         optimize_graph(SavedGraph(gtsam.NonlinearFactorGraph(), gtsam.Values()))
+    points = gtsam.Values()
+    points.insert(1, np.zeros(3))
+    with pytest.raises(InputError, match="expected poses, got none among 1 variables"):
+        optimize_graph(SavedGraph(gtsam.NonlinearFactorGraph(), points))
     noise = gtsam.noiseModel.Isotropic.Sigma(6, 0.1)
     poses = gtsam.Values()
     for key in range(3):

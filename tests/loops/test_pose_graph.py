@@ -47,6 +47,7 @@ def test_frames_must_be_solved_and_come_in_order():
     lost = MapUpdate(5, gtsam.Pose3(), FrameStatus.LOST)
     assert graph.add(lost) is None
     assert len(graph) == 0
+    assert graph.visit() is None
     assert graph.correction.equals(gtsam.Pose3(), 0.0)
     assert graph.poses().shape == (0, 4, 4)
     assert graph.trajectory([lost]).map_T_lidar.shape == (1, 4, 4)

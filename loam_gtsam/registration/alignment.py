@@ -112,7 +112,8 @@ def align(
         cubes.recenter(pose.translation())
         cubes.insert(cloud)
     # Nothing is known before but that the clouds overlap.
-    sigmas = np.repeat([np.pi, float(np.ptp(target, axis=0).max())], 3)
+    extent = max(float(np.ptp(target, axis=0).max()), config.map.plane_voxel)
+    sigmas = np.repeat([np.pi, extent], 3)
     solver = GtsamSolver(config.solver)
     first = max(max_distance, config.matching.max_distance)
     for reach in (first, config.matching.max_distance):

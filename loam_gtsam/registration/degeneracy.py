@@ -70,10 +70,12 @@ class Localizability:
         The directions v and their counts a make the form ``(sum v v^T / a)^-1``. The result is the
         Schur complement of each axis in this form, for a motion along the axis that displaces the
         matched points by 1 m. A direction counts at least one match. Otherwise an axis a fraction
-        of a degree off a direction without matches would have none either.
+        of a degree off a direction without matches would have none either. So does a turn about an
+        axis on which all points are.
         """
         spread = (self.directions**2 / np.maximum(self.aligned, 1.0)[:, None]).sum(axis=0)
-        counts: FloatArray = 1.0 / (spread * np.diagonal(self.displacement))
+        moved = np.maximum(np.diagonal(self.displacement), _STILL**2)
+        counts: FloatArray = 1.0 / (spread * moved)
         return counts
 
     def weak(self, least: float) -> FloatArray:

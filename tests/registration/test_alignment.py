@@ -91,6 +91,15 @@ def test_clouds_that_do_not_meet_are_not_solved():
     assert np.isnan(found.covariance).all()
 
 
+@pytest.mark.parametrize("sides", [(0,), (1,), (0, 1)])
+def test_clouds_of_one_place_alone_are_not_solved(sides):
+    clouds = [walls(np.random.default_rng(3)) for _ in range(2)]
+    for side in sides:
+        clouds[side] = np.ones((99, 3))
+    with np.errstate(all="raise"):
+        assert not align(*clouds).solved
+
+
 @pytest.mark.parametrize(
     ("source", "says"),
     [

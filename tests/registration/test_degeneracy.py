@@ -425,6 +425,14 @@ def test_per_axis_the_count_of_a_pure_translation_is_that_of_its_normals():
     np.testing.assert_allclose(found(matches).axes()[3:], 400.0, rtol=1e-3)
 
 
+def test_per_axis_a_turn_about_the_line_that_all_points_lie_on_is_not_fixed():
+    post = np.linspace(-1.0, 1.0, 20)[:, None] * np.eye(3)[2]
+    with np.errstate(all="raise"):
+        axes = found(surfaces(post[:0], post[:0]), lines(post)).axes()
+    assert axes[2] <= 1.0
+    assert axes[[0, 1, 3, 4]].min() > 10.0
+
+
 def test_information_along_a_direction_is_that_of_the_factor():
     points, normals = room()
     planes = surfaces(points, normals, noise=0.05)

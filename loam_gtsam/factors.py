@@ -331,21 +331,27 @@ def _compressed(rows: MatchRows) -> tuple[FloatArray, FloatArray]:
     """An anchor (3,) in the map and S (13, 13) with ``|S z|^2 = sum r^2``.
 
     Map coordinates are taken from the anchor, a point on the planes, so that the entries of L stay
-    of the size of a scan however far the map extends, and the squared form loses no digits.
+    of the size of a scan. Where the planes hardly fix the anchor, the scan may be far from it. So
+    these coordinates are along the eigenvectors of what the planes fix, and each column of L is
+    scaled to its own size: the squared form loses no digits, however far the map extends.
     """
     normals = np.ascontiguousarray(rows.normals.T) * rows.scales
     offsets = rows.offsets * rows.scales
-    across = normals @ normals.T
-    # Where no plane fixes the anchor it stays near the origin.
-    held = across + (_RIDGE * np.trace(across)) * np.eye(3)
-    anchor: FloatArray = np.linalg.solve(held, -normals @ offsets).astype(np.float64, copy=False)
     matrix = np.empty((13, len(offsets)))
     np.multiply(normals[:, None], rows.points.T, out=matrix[:9].reshape(3, 3, -1))
-    matrix[9:12] = normals
-    matrix[12] = offsets + anchor @ normals
-    values, vectors = np.linalg.eigh(matrix @ matrix.T)
-    root: FloatArray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T
-    return anchor, root
+    fixed, axes = np.linalg.eigh(normals @ normals.T)
+    # Where no plane fixes the anchor it stays near the origin.
+    held = fixed + _RIDGE * fixed.sum()
+    along = matrix[9:12] = axes.T @ normals
+    anchor = -(along @ offsets) / np.where(held > 0.0, held, 1.0)  # 0 if no row counts
+    matrix[12] = offsets + anchor @ along
+    form = matrix @ matrix.T
+    sizes = np.sqrt(form.diagonal())
+    sizes[sizes == 0.0] = 1.0
+    values, vectors = np.linalg.eigh(form / np.outer(sizes, sizes))
+    root: FloatArray = np.sqrt(np.maximum(values, 0.0))[:, None] * vectors.T * sizes
+    root[:, 9:12] = root[:, 9:12] @ axes.T
+    return axes @ anchor, root
 
 
 _GENERATORS = np.zeros((3, 3, 3))

@@ -11,6 +11,7 @@ from support.jacobians import numerical
 from support.matches import unit
 
 from loam_gtsam import factors
+from loam_gtsam.geometry import transform
 from loam_gtsam.types import InputError
 
 KEY = gtsam.symbol("x", 0)
@@ -154,6 +155,27 @@ def test_a_scan_far_from_the_map_origin_loses_no_digits():
     _, _, _, _, planes, normals, offsets, weights = make_matches(rng, pose)
     rows = factors.plane_rows(planes, normals, offsets, weights, 0.1)
     expect_the_error_of_the_rows(rows, pose, 1e-8)
+
+
+@pytest.mark.parametrize("turn", [gtsam.Rot3(), gtsam.Rot3.RzRyRx(0.3, 0.5, 0.7)])
+@pytest.mark.parametrize("noise", [1e-3, 1e-4, 1e-5, 0.0])
+@pytest.mark.parametrize("metres", [0.0, 1e5, 5e6])
+def test_nor_does_one_in_a_corridor_whose_walls_hardly_fix_the_way_along_it(turn, noise, metres):
+    rng = np.random.default_rng(8)
+    pose = gtsam.Pose3(turn, turn.rotate(np.array([metres, 2.0, 3.0])))
+    points = rng.uniform(-20.0, 20.0, (400, 3))
+    normals = np.repeat(np.eye(3)[1:], 200, axis=0) + noise * rng.normal(size=(400, 3))
+    normals = normals / np.linalg.norm(normals, axis=1)[:, None] @ turn.matrix().T
+    offsets = rng.normal(0.0, 0.03, 400) - np.sum(normals * transform(pose.matrix(), points), 1)
+    rows = factors.plane_rows(points, normals, offsets, np.ones(400), 0.03)
+    expect_the_error_of_the_rows(rows, pose, 1e-7)
+
+
+def test_rows_that_weigh_nothing_are_a_factor_that_says_nothing():
+    rows = factors.plane_rows(np.eye(3), np.eye(3), np.ones(3), np.zeros(3), 1.0)
+    factor = factors.scan_match_factor(KEY, rows)
+    assert factor.error(at(POSES[2])) == 0.0
+    assert np.all(factor.linearize(at(POSES[2])).information() == 0.0)
 
 
 def test_nearly_parallel_planes_do_not_send_the_anchor_away():

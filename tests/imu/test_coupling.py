@@ -342,6 +342,21 @@ def test_while_a_gyro_is_given_up_that_is_said_and_counted():
     assert gyro.left_out < 20
 
 
+def test_a_gyro_that_is_given_up_again_has_to_agree_for_longer_each_time():
+    gyro, waited = GyroTrust(), []
+    for disagreements in (5, 1, 1, 3, 1, 1, 1, 1):
+        for _ in range(disagreements - 1):
+            gyro.compared(agree=True)  # which allows one more
+        for number in range(disagreements):
+            assert gyro.holds, number
+            gyro.compared(agree=False)
+        waited.append(0)
+        while not gyro.holds:
+            gyro.compared(agree=True)
+            waited[-1] += 1
+    assert waited == [6, 16, 36, 76, 156, 316, 636, 636]
+
+
 # -- the scan beside further factors ---------------------------------------------------------------
 
 

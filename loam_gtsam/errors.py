@@ -195,6 +195,10 @@ class PartFaults:
         self._stop = on_error == "stop"
         self._told: set[str] = set()
 
+    def reset(self) -> None:
+        """Begin another run: the log has the first exception of each part again."""
+        self._told.clear()
+
     def take(self, error: LoamError) -> None:
         """Raise an exception, or log it if it is the first of its part."""
         if self._stop:

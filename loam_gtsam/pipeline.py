@@ -211,8 +211,8 @@ class Pipeline:
         if self.loops is not None:
             self.loops.reset()
         self.places.reset()
-        self._last_odom = self.fixes = None
-        self._to_reference = 0
+        self.faults.reset()
+        self._last_odom, self.fixes, self._to_reference = None, None, 0
 
     def process(self, sweep: Sweep, extraction: Extraction | None = None) -> MapUpdate:
         """Register one sweep; what it contains never raises, see the status of the result.

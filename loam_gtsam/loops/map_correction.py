@@ -55,6 +55,7 @@ class LoopMapping:
         self.graph.reset()
         if (reset_closer := getattr(self.closer, "reset", None)) is not None:
             reset_closer()
+        self._faults.reset()
         self.points_moved = self._mapper.maps.keyframe = 0
         self._placed = {}
 

@@ -201,6 +201,18 @@ def test_a_run_goes_on_without_a_part_that_fails_and_says_so_once(place, used, c
     assert result.faults == ({} if used else {"part_failed": len(SWEEPS) - first})
 
 
+@pytest.mark.parametrize("place", ["features", "loop_closer"])
+def test_after_a_reset_a_part_that_fails_is_told_anew(place, caplog):
+    part = Faulty(place, for_good=True)
+    part.armed = True
+    pipeline = Pipeline(GOES_ON.changed(PREDICTED), **part.parts())
+    for run_number in (1, 2):
+        for sweep in SWEEPS[:3]:
+            pipeline.process(sweep)
+        assert caplog.text.count("raised FaultError") == run_number
+        pipeline.reset()
+
+
 @pytest.mark.parametrize(
     ("part", "returned", "said"),
     [

@@ -206,7 +206,7 @@ class PartFaults:
         part = error.part if isinstance(error, PartError) else type(error).__name__
         if part not in self._told:
             self._told.add(part)
-            _log.warning("%s; the run goes on without, and does not say so again", error)
+            _log.warning("%s; the run goes on, and does not say so again", error)
 
     @contextmanager
     def forgiven(self) -> Iterator[None]:
